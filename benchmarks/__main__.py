@@ -1,13 +1,13 @@
-"""Measures every promised figure of timing and cost, beside a bare reference, and writes them on one page.
+"""Measures every published figure of timing and cost beside a bare reference, and writes one page.
 
     python -m benchmarks                      # everything: 14 minutes, 10 of them a hover
     python -m benchmarks --quick              # the hover lasts one minute
-    python -m benchmarks --only core          # one part, beside what an earlier run has left of the others
+    python -m benchmarks --only core          # one part; the others are kept from an earlier run
     python -m benchmarks --page               # docs/benchmarks.md from the last run; nothing is measured
 
-Leaves results.json and results.md in --out, and what each part left in a folder of its own there. Every part runs in a process of its
-own and is written down as soon as it is measured: one that fails is a line on the page and ends no other. Ctrl-C lands the flight,
-ends everything that was started, and keeps what was measured. Exit code 0 only if everything was measured and every target is met.
+Writes results.json and results.md into --out, and the files of each part into a folder of its own there. Every part runs in a separate
+process and is saved as soon as it is measured; a failed part is one line on the page and does not end the others. Ctrl-C lands the
+flight, ends all processes, and keeps the measured parts. Exit code 0 only if everything was measured and every target is met.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def run_part(name: str, folder: Path, quick: bool) -> int:
         figures = PARTS[name](folder, quick, say)
     except KeyboardInterrupt:
         return 130
-    except Exception as error:  # whatever it was, it is one line on the page, and the other parts go on
+    except Exception as error:  # any error is one line on the page, and the other parts continue
         print(" ".join(str(error).split()) or type(error).__name__, file=sys.stderr)
         return 1
     _write(folder / "figures.json", json.dumps(figures, indent=1) + "\n")
@@ -129,10 +129,10 @@ def measure(name: str, out: Path, quick: bool) -> dict[str, Any]:
         "figures": {},
     }
     if code is None:
-        entry["failed"] = f"it took longer than {DEADLINE_S[name]:g} s"
+        entry["failed"] = f"the part took longer than {DEADLINE_S[name]:g} s"
     elif code != 0:
         said = (folder / "stderr.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        entry["failed"] = said[-1] if said else f"it ended with exit code {code}"
+        entry["failed"] = said[-1] if said else f"the part ended with exit code {code}"
     else:
         entry["figures"] = json.loads((folder / "figures.json").read_text(encoding="utf-8"))
     return entry
@@ -215,12 +215,12 @@ def main(argv: list[str] | None = None) -> int:
         "--out", type=Path, default=OUT, metavar="DIR", help="for results and logs (default: build/benchmarks)"
     )
     parser.add_argument(
-        "--page", action="store_true", help="write docs/benchmarks.md from what lies there; measure nothing"
+        "--page", action="store_true", help="write docs/benchmarks.md from the results in --out; measure nothing"
     )
     parser.add_argument("--part", choices=list(PARTS), help=argparse.SUPPRESS)
     options = parser.parse_args(argv)
     out: Path = options.out.resolve()
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background a shell has it ignored
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it
     if options.part is not None:
         return run_part(options.part, out / options.part, options.quick)
     results = read_results(out)
@@ -245,7 +245,7 @@ def main(argv: list[str] | None = None) -> int:
                     f"  {name} was not measured: {entry['failed']}", style="red", highlight=False, soft_wrap=True
                 )
     except KeyboardInterrupt:
-        console.print(f"ended; what was measured is in {options.out}", highlight=False)
+        console.print(f"cancelled; the measured parts are in {options.out}", highlight=False)
         return 130
     tables = tables_of(results)
     show(results, tables, console if console.is_terminal else Console(width=200))

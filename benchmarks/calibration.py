@@ -1,10 +1,10 @@
-"""Flies laws in the laboratory and shows their errors before the catch beside those that the paper prints.
+"""Flies laws in the laboratory and shows their errors before the catch beside the paper's.
 
     python -m benchmarks.calibration --laboratories 20
 
 The laboratory is calibrated on these figures alone. Each is the median over laboratories of an RMS from the end of the take-off to the
-catch. The paper does not say what its attitude error refers to: the second figure is against the attitude that the law commands, the
-third against level flight along x. The soft laws are CSC and PSC with the position stiffness Lambda Phi and the damping
+catch. The paper does not define the reference of its attitude error: the second figure is relative to the law's commanded attitude,
+the third to level flight along x. The soft laws are CSC and PSC with the position stiffness Lambda Phi and the damping
 Lambda + M_d Phi that the paper's printed gains give its own law.
 """
 
@@ -42,7 +42,7 @@ LAWS = {
     "csc/tuned": ("csc", "tuned", (), "93 to 100", "2.8 to 3.3"),
     "psc/tuned": ("psc", "tuned", (), "84 to 99", "2.4 to 3.3"),
 }
-"""Law, preset, what is set, and what the paper prints for the law: ||e_p|| in mm and ||e_q|| in deg."""
+"""Law, preset, overrides, and the paper's figures of the law: ||e_p|| in mm and ||e_q|| in deg."""
 
 
 def errors(name: str, world: str, seed: int) -> tuple[float, float, float]:
@@ -60,7 +60,7 @@ def errors(name: str, world: str, seed: int) -> tuple[float, float, float]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Return 0."""
+    """Print the table and return 0."""
     parser = argparse.ArgumentParser(description="Show the errors before the catch beside the paper's.")
     parser.add_argument("--world", default="lab", help="lab, ideal or a world file (%(default)s)")
     parser.add_argument("--laboratories", type=int, default=20, help="flights per law (%(default)s)")

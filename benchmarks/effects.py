@@ -1,4 +1,4 @@
-"""Flies the catch in the ideal world with one effect of the laboratory at a time, and shows what each costs in position error.
+"""Flies the catch in the ideal world with one effect of the laboratory at a time, and shows the position error that each causes.
 
     python -m benchmarks.effects --table effects.md --picture docs/pictures/effects.png
 

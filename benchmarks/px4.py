@@ -1,11 +1,11 @@
 """Flies the same flights on the stub and on a real PX4 (SITL) and tabulates the differences.
 
     PX4_SITL=.../build/px4_sitl_default python -m benchmarks.px4 --keep flights/px4           # 36 flights, half an hour
-    python -m benchmarks.px4 --keep flights/px4 --table                                       # only what lies there
+    python -m benchmarks.px4 --keep flights/px4 --table                                       # only flights in the folder
     python -m benchmarks.px4 --keep flights/lab --world lab --case catch-0.1kg --case catch-0.2kg --case catch-0.3kg
 
-Flights that lie in the folder already are not flown again. Times after a fault are on the autopilot's own clock: of a real PX4 by its
-ULog (needs pyulog), of the stub by the world's. Exit code 0: every flight ended as it must, 1: not, or one could not be flown.
+Flights in the folder are not flown again. Times after a fault are on the autopilot's own clock: from the ULog of a real PX4 (needs
+pyulog), from the world for the stub. Exit code 0: every flight ended as expected; 1: a flight did not, or could not be flown.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ CASES = (
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One flight. Times `*_s` of faults count from the fault; None means unknown, or that it never happened."""
+    """One flight. Times `*_s` of faults count from the fault; None means unknown or never."""
 
     case: str
     autopilot: str
@@ -73,7 +73,7 @@ class Row:
     e_q_deg: float | None
     e_alpha_deg: float | None
     latency_p50_ms: float | None
-    """Motion capture to setpoint."""
+    """Latency from motion capture to setpoint, median."""
     latency_p99_ms: float | None
     modes: str
     last_setpoint_s: float | None = None

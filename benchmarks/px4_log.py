@@ -1,4 +1,4 @@
-"""Reads a flight from a real PX4's own log (ULog): modes, arming, and when messages reached PX4.
+"""Reads a flight from a real PX4's own log (ULog): modes, arming, and arrival times of messages at PX4.
 
 PX4's clock begins with `sitl.px4.hil_link.CLOCK_ORIGIN_S` at its first sample: times here are world times. Needs `pyulog`.
 """
@@ -50,7 +50,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class AfterFault:
-    """PX4's reaction to a fault; times in s since the fault, None for what never happened."""
+    """PX4's reaction to a fault; times in s since the fault, None for a reaction that never happened."""
 
     last_setpoint_s: float | None
     """Last SET_ATTITUDE_TARGET before the longest pause, or before the mode changed."""
@@ -82,20 +82,20 @@ class Px4Log:
         """Read a ULog.
 
         Args:
-            path: of the log.
+            path: path of the log.
             clock_begun_s: world time at which PX4's clock began, `autopilot.clock_begun_s` of `summary.json`.
 
         Raises:
-            Px4Error: no pyulog, no such file, or not one of a flight.
+            Px4Error: pyulog or the file is missing, or the file is not the log of a flight.
         """
         try:
-            ulog = importlib.import_module("pyulog")  # of the tests' extra: a flight does not need it
+            ulog = importlib.import_module("pyulog")  # in the tests' extra, because a flight does not need it
         except ImportError:
             raise Px4Error(
                 "PX4's log: expected the package pyulog, found none; pip install 'companion[test]'"
             ) from None
         try:
-            with open(path, "rb") as file:  # by name pyulog would leave a damaged one open
+            with open(path, "rb") as file:  # given a name, pyulog would leave a damaged file open
                 log = ulog.ULog(file, _TOPICS)
         except (OSError, TypeError, ValueError, LookupError, struct.error, ulog.exceptions.ULogException) as error:
             raise Px4Error(f"{path}: expected a ULog of PX4, found something that cannot be read ({error})") from None
@@ -140,13 +140,11 @@ def newest(flight: Path) -> Path:
     """Return the newest PX4 log in a flight's folder; PX4 writes one at every start, and the last is the flight's.
 
     Raises:
-        Px4Error: there is none.
+        Px4Error: the folder has no log.
     """
     logs = sorted((flight / PX4_FOLDER / "log").rglob("*.ulg"), key=lambda path: path.stat().st_mtime_ns)
     if not logs:
-        raise Px4Error(
-            f"{flight}: expected a log of PX4 in {PX4_FOLDER}/log, found none; was it flown with --sitl=px4?"
-        )
+        raise Px4Error(f"{flight}: expected a log of PX4 in {PX4_FOLDER}/log, found none; fly it with --sitl=px4")
     return logs[-1]
 
 

@@ -1,4 +1,4 @@
-"""What the measuring commands share: a table in the terminal, and the same rows as JSON."""
+"""Shared output of the measuring commands: a table in the terminal, and the same rows as JSON."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LEFT = ("", "condition", "fault", "loop", "outcome", "process", "target")
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """A figure for a table; None is a dash."""
+    """Return a figure as text for a table; None is a dash."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 

@@ -1,10 +1,10 @@
-"""Flies for an hour over real wires, and checks that memory and lateness do not grow and that nothing is missed.
+"""Flies for an hour over real wires, and checks that memory and lateness do not grow and that no tick or catch is missed.
 
     python -m benchmarks.soak                             # 60 minutes: configs/missions/soak.yaml, 150 catches
     python -m benchmarks.soak --minutes 3 --json FILE --plot FILE.png
-    python -m benchmarks.soak --read DIR                  # the figures of a flight that was kept, once more
+    python -m benchmarks.soak --read DIR                  # evaluate an earlier flight again
 
-Exit code 0 only if the mission was completed, every throw was caught, nothing was missed, and neither memory nor lateness grew.
+Exit code 0 only if the mission was completed, every throw was caught, no tick was missed, and neither memory nor lateness grew.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _HEARD = re.compile(r"heard (\d+) (?:heart)?beats, (\d+) missed, silent for (\d+
 
 
 def repetitions(minutes: float) -> tuple[int, float]:
-    """Return how many repetitions of the mission fit into the time (2 at least), and their planned duration, s."""
+    """Return the number of repetitions of the mission that fit into the time, at least 2, and their planned duration, s."""
     once, twice = (_planned_s(count) for count in (1, 2))
     count = max(2, min(1000, 1 + int((60.0 * minutes - once) / (twice - once))))
     return count, _planned_s(count)
@@ -113,7 +113,7 @@ def _watch(
         if len(pids) < 5 or number % 10 == 0:
             pids = family(flight.pid)
         if flew and "flight" not in pids:
-            _end(empty)  # the flight is over; what follows is the grading of its log
+            _end(empty)  # the flight is over; its log is being graded
         found = {role: used for role, pid in pids.items() if (used := usage(pid)) is not None}
         row: dict[str, Any] = {
             "t_s": now_s - begun_s,
@@ -188,7 +188,7 @@ def problems_of(result: dict[str, Any], growth: Sequence[Growth], ticks: Ticks, 
         if result[name] != 0:
             found.append(f"{name.replace('_', ' ')}: {result[name]}")
     if not growth:
-        found.append("too short to tell whether memory grows")
+        found.append("too short to show growth of memory")
     found += [
         f"memory of the {row.role} process grew {row.ratio:.3f} times"
         for row in growth
@@ -219,13 +219,13 @@ def show(result: dict[str, Any], folder: Path, plot: Path | None, console: Conso
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.soak", description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--minutes", type=float, default=60.0, help="in the air, as near as whole repetitions come")
+    parser.add_argument("--minutes", type=float, default=60.0, help="time in the air, rounded to whole repetitions")
     parser.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
         help="of the flight; e.g. wider time-outs on a machine that is held up as a whole now and then",
     )  # fmt: skip
     parser.add_argument("--out", type=Path, help="folder for log and samples; must not exist")
-    parser.add_argument("--read", type=Path, help="a folder of an earlier run: no flight")
+    parser.add_argument("--read", type=Path, help="evaluate the folder of an earlier run, without a flight")
     parser.add_argument("--json", type=Path, help="write the figures here as well")
     parser.add_argument("--plot", type=Path, help="draw memory and lateness over time as a PNG")
     parser.add_argument("--empty-loop", type=Path, help=argparse.SUPPRESS)
@@ -246,7 +246,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         result = judge(folder, console)
     except OSError as error:
-        parser.exit(1, f"soak: {error.filename}: {error.strerror}; the flight left nothing to judge\n")
+        parser.exit(1, f"soak: {error.filename}: {error.strerror}; the flight left no data to evaluate\n")
     show(result, folder, arguments.plot, console)
     write_json(arguments.json, result)
     return 1 if result["problems"] else 0

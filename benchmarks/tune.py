@@ -9,8 +9,8 @@ or the safety supervisor does more than warn costs `FAILURE_COST`. Cost of a poi
 0.1, 0.2 and 0.3 kg in turn; every point flies the same ones.
 
 Flights of the search end `SEARCH_FLIGHT_S` after power-on, some 5 s after the catch. Of each generation all points fly the first
-half of the laboratories and the better half of the points the rest, because CMA-ES needs only the order of the points. A found point
-is judged on whole missions in laboratories that the search has not seen, beside the point it started from. Parameters are searched on
+half of the laboratories and the better half of the points the rest, because CMA-ES needs only the order of the points. The result
+is evaluated on whole missions in laboratories outside the search, beside the start point. Parameters are searched on
 a logarithmic scale; one that ends near a bound is named, so that the bound can be widened.
 """
 
@@ -46,11 +46,11 @@ MISSION = Path(__file__).parents[1] / "configs" / "missions" / "catch.yaml"
 PAYLOADS_KG = (0.1, 0.2, 0.3)
 BEFORE_SHARE, ARM_WEIGHT_M_NM, ACTIVITY_WEIGHT_M_NM, FAILURE_COST = 0.3, 0.1, 0.5, 1.0
 HELD_OUT_FROM = 1001
-"""First laboratory of the judgement."""
+"""First laboratory of the final evaluation."""
 SEARCH_FLIGHT_S, MISSION_LIMIT_S = 15.0, 90.0
-"""Longest flights of the search and of the judgement, from power-on; the catch is at about 10 s."""
+"""Longest flights of the search and of the final evaluation, from power-on; the catch is at about 10 s."""
 FIRST_STEP, NEAR_BOUND = 0.1, 0.03
-"""Initial standard deviation, and what counts as near, as shares of the logarithmic range."""
+"""Initial standard deviation, and distance that counts as near a bound, as shares of the logarithmic range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,16 +64,16 @@ class Parameter:
 
     @property
     def name(self) -> str:
-        """Name in the output."""
+        """Return the name in the output."""
         return f"{self.key}{list(self.rows) if self.rows else ''}"
 
     def read(self, gains: Gains) -> float:
-        """Return its value in a controller file."""
+        """Return the parameter's value in a controller file."""
         value = gains[self.key]
         return float(value[self.rows[0]] if self.rows else value)
 
     def write(self, gains: Gains, value: float) -> None:
-        """Set it in a controller file."""
+        """Set the parameter in a controller file."""
         if not self.rows:
             gains[self.key] = value
             return
@@ -155,7 +155,7 @@ def cost(config: SitlConfig, limit_s: float, gains: Gains, laboratory: int) -> f
     """Return the cost of one flight, which ends at `limit_s` if it has not ended before."""
     try:
         controller = LAWS[gains["law"]].model_validate(gains)
-    except ValidationError:  # the law's own conditions refuse the point
+    except ValidationError:  # the law's own conditions reject the point
         return FAILURE_COST
     world = {"seed": laboratory, "payload_kg": PAYLOADS_KG[laboratory % len(PAYLOADS_KG)]}
     flown = fly_to_end(with_world(config.model_copy(update={"controller": controller}), world), limit_s)
@@ -207,11 +207,11 @@ class Judge:
 
 @dataclass
 class Progress:
-    """A search between two generations, as it is written to its state file."""
+    """State of a search between two generations, as in its state file."""
 
     strategy: Any
     start: Gains
-    """The controller file that the search began with."""
+    """Controller file at the start of the search."""
     best: Gains
     best_cost: float
 
@@ -223,7 +223,7 @@ class Search:
         base: controller file with the start and everything that is not searched.
         parameters: the search space.
         budget: points to try, the start included.
-        seed: of the search.
+        seed: seed of the search.
     """
 
     def __init__(self, base: Gains, parameters: Sequence[Parameter], budget: int, seed: int) -> None:
@@ -300,18 +300,18 @@ def controller_yaml(gains: Gains, found: str) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Return 0, or 2 on bad input."""
+    """Run the search and return 0, or 2 on bad input."""
     parser = argparse.ArgumentParser(description="Tune one law on the fast closed loop.")
     parser.add_argument("search", choices=list(SEARCHES))
     parser.add_argument("--world", default="lab", help="lab, ideal or a world file (%(default)s)")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--budget", type=int, default=300, help="points to try (%(default)s)")
     parser.add_argument("--laboratories", type=int, default=4, help="flights per point, at least 2 (%(default)s)")
-    parser.add_argument("--held-out", type=int, default=30, help="laboratories of the judgement (%(default)s)")
+    parser.add_argument("--held-out", type=int, default=30, help="laboratories of the final evaluation (%(default)s)")
     parser.add_argument("--jobs", type=int, default=2, help="processes (%(default)s)")
-    parser.add_argument("--seed", type=int, default=1, help="of the search (%(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the search (%(default)s)")
     parser.add_argument(
-        "--state", type=Path, help="file of the search's progress; if it exists the search goes on from there"
+        "--state", type=Path, help="file of the search's progress; if it exists the search continues from it"
     )
     parser.add_argument("--minutes", type=float, default=1e6, help="stop after the generation in which they pass")
     parser.add_argument("--out", type=Path, help="controller file to write; absent: standard output")

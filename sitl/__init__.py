@@ -2,5 +2,5 @@
 
 import os
 
-# The world draws nothing; without GLFW it starts a twelfth faster.
+# The world has no display; without GLFW it starts a twelfth faster.
 os.environ.setdefault("MUJOCO_GL", "disable")

@@ -27,14 +27,12 @@ from sitl.server import Ports, Sitl, start_of
 _STANDARD = Ports(autopilot_local=14580, autopilot_remote=14540, mocap_command=1510, mocap_data=1511, multicast=True)
 
 TRUTH_FILE = "world.json"
-"""Written beside the configuration after a flight with faults or several throws: the true course, modes and frames."""
+"""File with true course, modes and frames, written beside the configuration after a flight with faults or several throws."""
 
 
 def _send(message: dict[str, Any]) -> None:
     with contextlib.suppress(OSError):  # the launcher is gone; standard input ends too
-        os.write(
-            1, json.dumps(message).encode() + b"\n"
-        )  # unbuffered: nothing is left to be flushed into a closed pipe
+        os.write(1, json.dumps(message).encode() + b"\n")  # unbuffered, so that nothing is flushed into a closed pipe
 
 
 async def _serve(config: SitlConfig, for_launcher: bool, truth_file: Path, px4_folder: Path | None) -> None:
@@ -68,7 +66,7 @@ async def _serve(config: SitlConfig, for_launcher: bool, truth_file: Path, px4_f
 
 def _send_final(sitl: Sitl, truth_file: Path | None) -> None:
     if truth_file is not None:
-        with contextlib.suppress(OSError):  # the flight's folder may be gone, or full
+        with contextlib.suppress(OSError):  # the flight's folder may be missing or the disk full
             truth_file.write_text(json.dumps(sitl.ground_truth()), encoding="utf-8")
     _send({"type": "final", "world": sitl.final()})
 

@@ -1,6 +1,6 @@
 """An emulated Robotous RFT60-HA01 force-torque sensor on a pty.
 
-It answers as the sensor does (see `companion.io.force_torque.rft`): commands 1, 2, 3, 10, 11, 12, 15, 16 and 17. While it streams it
+It answers like the sensor (see `companion.io.force_torque.rft`): commands 1, 2, 3, 10, 11, 12, 15, 16 and 17. While it streams it
 executes only STOP and SET_BIAS, which have no answer. Readings are quantised to 1/50 N and 1/2000 N m. The caller adds noise and
 latency.
 """
@@ -46,9 +46,9 @@ class ForceTorqueServer:
         firmware: answer to FIRMWARE_VERSION.
 
     Attributes:
-        silent: fault: the sensor neither answers nor streams, as with a cut cable.
-        stuck: fault: it repeats its last reading for ever.
-        dropped: number of packets that were dropped because nobody reads the pty.
+        silent: fault in which the sensor neither answers nor streams, as with a cut cable.
+        stuck: fault in which it repeats its last reading.
+        dropped: number of packets that were dropped because the pty is not read.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class ForceTorqueServer:
             self._send_reading(Command.START)
 
     def inject(self, noise: bytes) -> None:
-        """Put bytes on the line as they are, such as noise or half a packet."""
+        """Put bytes on the line unchanged, such as noise or half a packet."""
         self._write(noise)
 
     def _measure(self) -> Wrench:

@@ -1,7 +1,7 @@
 """An emulated NatNet server (Motive): multicast and unicast, bitstream 3.0 and 4.1.
 
 Layouts as in the NatNet SDK (`NatNetTypes.h`, packet client). It shares only the message ids with the companion's parser, so that an
-error in one of the two shows. The caller adds latency and noise.
+error in one of the two is visible. The caller adds latency and noise.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from companion.model.types import Quat, Vec3
 
 CLOCK_FREQUENCY_HZ: Final = 10_000_000
 """Windows' performance counter, as Motive reports it."""
-_CLOCK_ORIGIN_S: Final = 1000.0  # the server machine was on for a while; tick 0 means "no stamp"
+_CLOCK_ORIGIN_S: Final = 1000.0  # the server has been running; tick 0 means "no stamp"
 _VERSION_BYTES: Final[dict[str, bytes]] = {"3.0": bytes((3, 0, 0, 0)), "4.1": bytes((4, 1, 0, 0))}
 _APPLICATION = b"Motive"
 _APPLICATION_VERSION: Final[dict[str, bytes]] = {"3.0": bytes((2, 0, 0, 0)), "4.1": bytes((3, 0, 0, 0))}
@@ -30,12 +30,12 @@ _MARKERS_BODY_M: Final[tuple[Vec3, ...]] = (
     (-0.12, -0.12, 0.05),
     (0.0, 0.05, 0.11),
 )
-_STRAY_MARKER_M: Final[Vec3] = (2.5, -2.0, 0.03)  # a reflection on the floor, as every lab has one
+_STRAY_MARKER_M: Final[Vec3] = (2.5, -2.0, 0.03)  # a reflection on the floor
 LOOPBACK, LOOPBACK_BROADCAST = "127.0.0.1", "127.255.255.255"
 """A socket on the loopback address receives no broadcasts, so a second socket listens for them."""
 OTHER_BODY: Final = "wand"
 OTHER_PLACE_M: Final[Vec3] = (1.9, -1.5, 0.04)
-"""Position of another rigid body, left on the floor."""
+"""Position of another rigid body on the floor."""
 _MARKER_SIZE_M: Final = 0.014
 _MARKER_OCCLUDED = 0x01
 _MARKER_POINT_CLOUD_SOLVED = 0x02
@@ -123,7 +123,7 @@ class NatNetServer:
         """Open both sockets.
 
         Raises:
-            OSError: a port is in use or the interface is not of this machine; the text says which.
+            OSError: a port is in use or the interface does not belong to this machine; the text names the cause.
         """
         try:
             self._command = self._bind(self._ports[0])

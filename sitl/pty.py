@@ -1,4 +1,4 @@
-"""A pseudo-terminal that the companion opens as a serial port: the device's end of the line."""
+"""The device's end of a pseudo-terminal that the companion opens as a serial port."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class PtyLine:
         self._on_bytes = on_bytes
         self._device_fd = -1
         self._companion_fd = -1
-        """Kept open here as well, so that a companion that closes the port does not hang up the line."""
+        """The companion's end, kept open so that a companion that closes the port does not hang up the line."""
 
     def open(self) -> None:
         """Create the pseudo-terminal in raw mode and start to listen.
@@ -41,7 +41,7 @@ class PtyLine:
             raise
 
     def close(self) -> None:
-        """Close both ends; a companion that still holds the port sees the line hang up."""
+        """Close both ends; the line then hangs up for a companion that still holds the port."""
         if self._device_fd < 0:
             return
         asyncio.get_running_loop().remove_reader(self._device_fd)
@@ -53,7 +53,7 @@ class PtyLine:
         """Send bytes to the companion without blocking; nothing is sent on a closed line.
 
         Returns:
-            How many bytes were dropped because nobody reads the line.
+            The number of bytes dropped because the line is not read.
         """
         if self._device_fd < 0:
             return 0

@@ -36,7 +36,7 @@ from sitl.world.world import PHYSICS_DT_S
 _CATCH_UP_S = 0.03
 COURSE_PERIOD_S, FRAMES_PERIOD_S = 0.01, 0.5
 INJECT_RETRY_S = 0.2
-"""Time between two searches for the process that a fault is meant for."""
+"""Time between two searches for the target process of a fault."""
 OTHER_PROCESS_FAULTS: tuple[FaultKind, ...] = ("kill_recorder", "kill_guardian", "disk_full")
 _LEAVE_S = 30.0
 
@@ -49,7 +49,7 @@ class Ports:
 
     autopilot_local: int = 0
     autopilot_remote: int = 0
-    """Port that PX4 sends to from the start; with 0 it waits until a partner sends something."""
+    """Port that PX4 sends to from the start; with 0 it waits for the first message of a partner."""
     mocap_command: int = 0
     mocap_data: int = 0
     multicast: bool = False
@@ -123,7 +123,7 @@ class Sitl:
         self._origin_s = 0.0
         """World time 0 on the event loop's clock."""
         self._next_frame: asyncio.TimerHandle | None = None
-        """Sends a frame that leaves between two steps."""
+        """Timer that sends a frame between two steps."""
         self._at_rest = False
         self._leaving = False
         self._end_s = math.inf
@@ -311,7 +311,7 @@ class Sitl:
         self.course.append(sample(plant.world, self._vehicle.tether.anchor_world_m))
 
     def ground_truth(self) -> dict[str, Any]:
-        """Return what really happened in a flight with faults, for the table of a campaign (`world.json`)."""
+        """Return the true course of a flight with faults, for the table of a campaign (`world.json`)."""
         return {
             **self.final(),
             "armed": self.autopilot.armed,
@@ -322,7 +322,7 @@ class Sitl:
         }
 
     def final(self) -> dict[str, Any]:
-        """Return what the world reports at the end of a flight, for `summary.json`."""
+        """Return the world's report at the end of a flight, for `summary.json`."""
         world, armed = self.plant.world, self.plant.armed_t_s
         caught = world.payload.caught_t_s
 

@@ -1,4 +1,4 @@
-"""A UDP socket on the event loop, shared by every link of the simulated world that speaks MAVLink."""
+"""A UDP socket on the event loop, used by every MAVLink link of the simulated world."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ CLOSE_DEADLINE_S = 1.0
 
 
 class UdpEndpoint(asyncio.DatagramProtocol):
-    """One socket; `loop.create_datagram_endpoint` opens it. A subclass handles what arrives in `datagram_received`."""
+    """One socket; `loop.create_datagram_endpoint` opens it. A subclass handles datagrams in `datagram_received`."""
 
     def __init__(self) -> None:
         self._transport: asyncio.DatagramTransport | None = None
         self._closed = asyncio.Event()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """The socket is bound."""
+        """Store the bound socket."""
         # Python 3.11's selector transport is a datagram transport in all but its base classes.
         self._transport = cast(asyncio.DatagramTransport, transport)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The socket is closed."""
+        """Note that the socket is closed."""
         self._transport = None
         self._closed.set()
 
     def error_received(self, exc: Exception) -> None:
-        """Ignore an ICMP error: nobody listens at the other end yet."""
+        """Ignore an ICMP error, because the other end does not listen yet."""
 
     @property
     def port(self) -> int:

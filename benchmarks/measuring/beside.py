@@ -1,6 +1,6 @@
 """Loops that run beside a flight, each in a separate process.
 
-python -m benchmarks.measuring.beside empty FILE          # ticks for nothing until SIGTERM; start and lateness of each, s, as .npy
+python -m benchmarks.measuring.beside empty FILE          # empty ticks until SIGTERM; start and lateness of each, s, as .npy
 python -m benchmarks.measuring.beside plain FILE          # the same on asyncio's own event loop
 python -m benchmarks.measuring.beside bare FILE FRAMES    # receives and sends on native MAVSDK; its latency as JSON
 """
@@ -21,9 +21,9 @@ from benchmarks.soaking.lateness import run_idle_ticks
 
 
 def empty(path: Path, *, plain: bool) -> None:
-    """Run an empty loop, with `plain` on asyncio's own event loop.
+    """Run an empty loop; with `plain`, on asyncio's own event loop.
 
-    Rows of the array: `time.monotonic` at the start of each tick, and how late it was."""
+    Rows of the array: `time.monotonic` at the start of each tick, and its lateness."""
     starts_s, lateness_s = array("d"), array("d")
 
     def take(start_s: float, late_s: float) -> None:

@@ -85,9 +85,9 @@ def bare_dynamixel_in_world(cycles: int, mission: Path, folder: Path) -> BusCycl
     """Measure against the servo bus of a simulated world, as a flight uses it.
 
     Args:
-        cycles: how many.
-        mission: where the machine stands.
-        folder: for what the world writes.
+        cycles: number of cycles.
+        mission: mission with the start position.
+        folder: folder for the world's files.
 
     Raises:
         LaunchError: the world did not start.
@@ -111,7 +111,7 @@ def _bus_cycles(path: str, cycles: int) -> BusCycles:
         for servo_id in _SERVO_IDS:
             packet.write1ByteTxRx(
                 port, servo_id, _RETURN_DELAY_ADDRESS, 0
-            )  # 0.5 ms each by default; the companion does so, too
+            )  # 0.5 ms each by default; the companion does the same
         read = GroupSyncRead(port, packet, _PRESENT_ADDRESS, _PRESENT_BYTES)
         write = GroupSyncWrite(port, packet, _GOAL_CURRENT_ADDRESS, _GOAL_CURRENT_BYTES)
         for servo_id in _SERVO_IDS:

@@ -24,7 +24,7 @@ from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
 
 
 async def loop(port: int, mocap: socket.socket, frames: int) -> list[float]:
-    """Do as `receive_and_send`, with asyncio, as MAVSDK 3 requires."""
+    """Run the loop of `receive_and_send` with asyncio, as MAVSDK 3 requires."""
     from mavsdk import System
     from mavsdk.offboard import Attitude
 
@@ -59,7 +59,7 @@ async def loop(port: int, mocap: socket.socket, frames: int) -> list[float]:
 
 
 def _claim_for(server_pid: int) -> None:
-    """Claim the same priority for MAVSDK's server, where that is permitted."""
+    """Claim the same priority for MAVSDK's server if permitted."""
     with contextlib.suppress(OSError):
         for thread in map(int, os.listdir(f"/proc/{server_pid}/task")):
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(FLIGHT_PRIORITY))

@@ -66,12 +66,12 @@ def measure(folder: Path, hover_s: float, say: Callable[[str], None]) -> Figures
     """Fly, watch, and read the log.
 
     Args:
-        folder: for logs; must exist and be empty.
-        hover_s: how long it hovers.
-        say: told of the progress, a line at a time.
+        folder: folder for logs; must exist and be empty.
+        hover_s: duration of the hover.
+        say: called with each line about the progress.
 
     Raises:
-        PartError: there is no broker, or nothing hovered.
+        PartError: there is no broker, or the vehicle did not hover.
     """
     if shutil.which("mosquitto") is None and shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin") is None:
         raise PartError("no broker: apt install mosquitto")
@@ -237,11 +237,11 @@ def _judge(
 
 
 def late_alone(start_s: Array, late_s: Array, beside_start_s: Array, beside_late_s: Array) -> list[float]:
-    """Ticks that began later than two periods while no tick of the loop beside was later than one: a moment at which the computer
-    stands still meets the two at different places of their periods.
+    """Return the lateness of ticks that began later than two periods while no tick of the loop beside was later than one, because a
+    stall of the computer meets the two loops at different points of their periods.
 
     Returns:
-        How late each of them was, s.
+        Lateness of each of these ticks, s.
     """
     late = {float(t): float(by) for t, by in zip(start_s, late_s, strict=True) if by > 2.0 * TICK_PERIOD_S}
     beside = [float(t) for t, by in zip(beside_start_s, beside_late_s, strict=True) if by > TICK_PERIOD_S]
@@ -276,7 +276,7 @@ def _bare(folder: Path) -> Figures:
         found: Figures = json.loads((folder / "bare.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         said = (folder / "bare.txt").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return {"not_measured": said[-1] if said else "it had not ended when the flight had"}
+        return {"not_measured": said[-1] if said else "it had not ended at the end of the flight"}
     return found
 
 

@@ -37,12 +37,12 @@ def read_hover(path: Path, phase: str, settle_s: float) -> HoverLog:
     """Read a log.
 
     Args:
-        path: of flight.mcap, closed by its recorder.
+        path: path of flight.mcap, closed by its recorder.
         phase: name of the phase.
-        settle_s: so much of its beginning is left out.
+        settle_s: time at its beginning that is left out.
 
     Raises:
-        ValueError: it has no such phase, or none that lasts longer than that.
+        ValueError: the log has no such phase, or a shorter one.
     """
     stopwatch = Stopwatch()
     start_s, setpoint_s = array("d"), array("d")

@@ -27,8 +27,9 @@ LIMITS: dict[str, object] = {
     "vehicle.safety.vehicle_timeout_s": 0.6,
     "vehicle.devices.arm.watchdog_ms": 400,
 }
-"""Wider than the vehicle file's, those of docs/soak.md: a shared machine is held up as a whole now and then. How well the flight gets
-over that is not what is measured here; how late it was is."""
+"""Limits of docs/soak.md, wider than the vehicle file's, because a shared machine stalls now and then. The lateness is measured, not
+the reaction of the flight to it.
+"""
 
 
 class NoFlight(Exception):
@@ -61,10 +62,10 @@ def output_path(folder: Path) -> Path:
 
 
 def await_hover(flight: subprocess.Popen[bytes], folder: Path) -> None:
-    """Wait until it hovers.
+    """Wait until the flight hovers.
 
     Raises:
-        NoFlight: it has ended, or takes too long.
+        NoFlight: the flight has ended, or the deadline has passed.
     """
     deadline_s = time.monotonic() + START_TIMEOUT_S
     while f"  {HOVER}" not in (said := output_path(folder).read_text(encoding="utf-8", errors="replace")):

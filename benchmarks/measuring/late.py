@@ -1,4 +1,4 @@
-"""Separates ticks that were late by themselves from those that an empty loop beside them shared."""
+"""Separates ticks that were late alone from ticks that were late together with an empty loop."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ def alone_late(late_s: Sequence[float], beside_late_s: Sequence[float], within_s
     """Return the times of late ticks without a late tick of the loop beside.
 
     Args:
-        late_s: when late ticks began.
-        beside_late_s: the same of the loop beside, by the same clock, in order.
-        within_s: how far apart they may lie.
+        late_s: start times of late ticks.
+        beside_late_s: start times of late ticks of the loop beside, on the same clock, in order.
+        within_s: largest time between two ticks that count as late together.
     """
     found = []
     for time_s in late_s:

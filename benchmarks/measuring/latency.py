@@ -28,11 +28,11 @@ class Latency:
         """Return the percentiles of samples in s.
 
         Raises:
-            ValueError: no samples.
+            ValueError: there are no samples.
         """
         ordered = sorted(seconds)
         if not ordered:
-            raise ValueError("no samples: nothing came back over the wire")
+            raise ValueError("no samples: no answer arrived over the wire")
         last = len(ordered) - 1
         p50, p99, p999, worst = (float(1e3 * ordered[round(part * last)]) for part in (0.5, 0.99, 0.999, 1.0))
         return cls(p50=p50, p99=p99, max=worst, samples=len(ordered), p999=p999)

@@ -21,8 +21,8 @@ def markdown(results: Mapping[str, Any], sections: Sequence[Section]) -> str:
     """Return the page as Markdown.
 
     Args:
-        results: as written by `benchmarks/__main__.py`.
-        sections: its tables.
+        results: results written by `benchmarks/__main__.py`.
+        sections: tables of the page.
     """
     blocks = [HEAD, *_about(results)]
     for section in sections:

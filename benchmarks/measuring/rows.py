@@ -18,7 +18,7 @@ BARE_BUS = "bare dynamixel-sdk, the world's bus"
 
 
 class Found(NamedTuple):
-    """Figures by statistic, and why they were not measured."""
+    """Figures by statistic, or the reason why they were not measured."""
 
     figures: Mapping[str, float]
     why_not: str = ""
@@ -31,7 +31,7 @@ def sections(parts: Mapping[str, Figures]) -> list[Section]:
     """Return all tables.
 
     Args:
-        parts: figures by part, as the parts return them; `{"not_measured": why}` of one that failed, missing: not run.
+        parts: figures by part; `{"not_measured": why}` for a failed part; a part that was not run is missing.
     """
 
     def find(*path: str, as_figures: Callable[[Any], Mapping[str, float]] = _spread) -> Found:

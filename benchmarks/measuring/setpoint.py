@@ -76,7 +76,7 @@ def mavsdk_grpc(frames: int) -> tuple[Latency, Latency]:
     """Receive, then call Offboard.set_attitude of MAVSDK 3.
 
     Raises:
-        NotMeasured: it cannot be installed here.
+        NotMeasured: MAVSDK 3 cannot be installed here.
     """
     python = grpc_environment()
 

@@ -1,6 +1,6 @@
-"""Someone who watches a flight: `companion monitor` with its page in a browser, else with one WebSocket.
+"""A viewer of a flight: `companion monitor` with its page in a browser, or with one WebSocket without a browser.
 
-python -m benchmarks.measuring.viewer URL                 # prints which, and what it showed; until SIGTERM
+python -m benchmarks.measuring.viewer URL                 # prints the kind of viewer and its display, until SIGTERM
 
 The process is niced, because a viewer runs on another computer.
 """

@@ -84,8 +84,9 @@ def free_udp_port() -> int:
 
 
 def receive_and_send(mocap: socket.socket, frames: int, send: Callable[[float], object]) -> list[float]:
-    """The bare loop: one datagram in, one setpoint out. Seconds from arrival of the datagram, as the kernel notes it for the flight,
-    too, to return of the send. Claims the flight's priority first: what it sends by has its threads by now."""
+    """Run the bare loop, one datagram in and one setpoint out. Return the times from the kernel's arrival stamp of each datagram, as
+    used in flight, to the return of the send, s. It first claims the flight's priority for all threads that exist by then.
+    """
     stamp_arrivals(mocap)
     claim_realtime(FLIGHT_PRIORITY)
     taken_s = []
@@ -166,7 +167,7 @@ def autopilot_edge(frames: int) -> tuple[Latency, Latency]:
                     autopilot.send_attitude(AttitudeSetpoint(IDENTITY_QUAT, thrust))
 
                 go()
-                # In a thread as it is blocking; it is the only work of this process.
+                # In a thread because it blocks; it is the only work of this process.
                 return await asyncio.to_thread(receive_and_send, mocap, frames, send)
 
         return asyncio.run(loop())

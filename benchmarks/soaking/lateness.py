@@ -1,4 +1,4 @@
-"""Lateness of ticks, minute by minute: of a flight from its log, and of an empty loop beside it."""
+"""Lateness of ticks for each minute of a flight, from its log, and of an empty loop beside it."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Minutes:
         """Number of ticks that began later than a whole period."""
 
     def take(self, start_s: float, lateness_s: float) -> None:
-        """Take a tick that began at `start_s`."""
+        """Add a tick that began at `start_s`."""
         if self._begin_s is None:
             self._begin_s = start_s
         while start_s >= self._begin_s + MINUTE_S:
@@ -101,15 +101,14 @@ def ticks_of_log(path: Path) -> Ticks:
 
 
 def run_idle_ticks(take: Callable[[float, float], None], *, plain: bool = False) -> int:
-    """Tick as a flight does, with its event loop, ticker and priority, and do nothing else, until SIGTERM or until the process that
-    started this one is gone.
+    """Run empty ticks with a flight's event loop, ticker and priority until SIGTERM or the end of the parent process.
 
     Args:
         take: called with every tick's start (`time.monotonic`) and lateness, s.
-        plain: on asyncio's own event loop instead.
+        plain: use asyncio's own event loop instead.
 
     Returns:
-        Deadlines that passed without a tick.
+        The number of deadlines without a tick.
     """
     return (asyncio.run if plain else run)(_run_idle_ticks(take))
 

@@ -14,7 +14,7 @@ ROLES = {
     "sitl": "world",
 }
 LAUNCHER = "launcher"
-"""The process that was started and starts the others."""
+"""Role of the process that starts all others."""
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 _CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
 

@@ -49,7 +49,9 @@ class Growth:
 
 
 def airborne(samples: Sequence[Sample]) -> list[Sample]:
-    """Return the samples in which every process runs; the recorder starts last, and the launcher goes on to grade the log."""
+    """Return the samples in which every process runs; the recorder starts last, and the launcher continues with the grading of the
+    log.
+    """
     return [sample for sample in samples if all(role in sample.rss_mb for role in ROLES)]
 
 
@@ -95,7 +97,7 @@ def _cpu_percent(part: Sequence[Sample], role: str) -> float:
 
 
 def thirds(minutes: Sequence[Minute], value: str) -> tuple[float, float] | None:
-    """Median over the minutes of the first and of the last third of a percentile (`p50`, `p99`, `max`), ms; None: too short."""
+    """Return a percentile's (`p50`, `p99`, `max`) median over the minutes of the first and last third, ms, or None if too short."""
     count = len(minutes) // 3
     if count == 0:
         return None
@@ -110,7 +112,7 @@ def lateness_problems(flight: Sequence[Minute], empty: Sequence[Minute]) -> list
     for value in ("p50", "p99"):
         of_flight, of_empty = thirds(flight, value), thirds(empty, value)
         if of_flight is None:
-            found.append("too short to tell whether lateness grows")
+            found.append("too short to show growth of lateness")
             break
         grown = of_flight[1] / of_flight[0]
         allowed = LATENESS_GROWTH_MAX * (max(1.0, of_empty[1] / of_empty[0]) if of_empty is not None else 1.0)

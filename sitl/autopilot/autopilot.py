@@ -102,7 +102,7 @@ class Px4Stub:
         estimator: substitute for EKF2.
         cascade: attitude loop, rate loop and mixer.
         setpoint_delay_s: delay from the arrival of a setpoint to its effect in the attitude loop.
-        learned: biases that PX4 knows from the time before the world begins; None for an IMU without bias.
+        learned: biases that PX4 learned before the world begins; None for an IMU without bias.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class Px4Stub:
         """STATUSTEXTs that wait to be sent; the oldest are dropped if the queue is full."""
         self.t_s = 0.0
         self.imu: ImuSample | None = None
-        """The newest sample, without the learned biases, as in HIGHRES_IMU."""
+        """Newest sample, without the learned biases, as in HIGHRES_IMU."""
         self.estimate: Estimate | None = None
         self.target = AttitudeTarget((1.0, 0.0, 0.0, 0.0), 0.0)
         """Setpoint of the attitude loop (ATTITUDE_TARGET)."""
@@ -141,9 +141,9 @@ class Px4Stub:
         self.refuses_arming = False
         """Fault: PX4 refuses to arm."""
         self.booted_at_s = 0.0
-        """World time of the last boot: zero of PX4's own clock; before it nothing runs."""
+        """World time of the last boot: zero of PX4's own clock; PX4 does not run before it."""
         self.clock_ahead_s = 0.0
-        """Sum of the pauses of the world, during which PX4's own clock goes on."""
+        """Sum of the pauses of the world, during which PX4's own clock continues."""
         self.since_sample_s = 0.0
         """Time from the last IMU sample to the message that is being answered, for PX4's clock; set by the links."""
         self._queue: deque[tuple[float, OffboardTarget]] = deque()
@@ -223,17 +223,17 @@ class Px4Stub:
         return self.rotors
 
     def on_setpoint(self, t_s: float, target: OffboardTarget) -> None:
-        """Take an offboard setpoint that arrived at world time `t_s`."""
+        """Process an offboard setpoint that arrived at world time `t_s`."""
         self._setpoint_at_s = t_s
         self._setpoint_kind = target.kind if isinstance(target, PositionTarget) else OffboardKind.ATTITUDE
         self._queue.append((t_s + self._setpoint_delay_s, target))
 
     def on_attitude_target(self, t_s: float, target: AttitudeTarget) -> None:
-        """Take SET_ATTITUDE_TARGET that arrived at world time `t_s`."""
+        """Process SET_ATTITUDE_TARGET that arrived at world time `t_s`."""
         self.on_setpoint(t_s, target)
 
     def on_vision(self, t_s: float, position_ned_m: Vec3, attitude_ned_frd: Quat) -> bool:
-        """Take a vision pose that arrived at world time `t_s`; return whether EKF2_EV_CTRL admits it."""
+        """Process a vision pose that arrived at world time `t_s`; return whether EKF2_EV_CTRL admits it."""
         self.vision_received += 1
         if self.params.integer("EKF2_EV_CTRL") & _EV_POSITION_AND_YAW != _EV_POSITION_AND_YAW:
             return False
@@ -266,7 +266,7 @@ class Px4Stub:
         return None
 
     def reboot(self, for_s: float) -> None:
-        """Restart: everything but the parameters is lost, and PX4 runs again `for_s` later."""
+        """Restart with the loss of everything but the parameters; PX4 runs again `for_s` later."""
         self.booted_at_s = self.t_s + for_s
         self.commander, self.navigator = Commander(self.params), Navigator(self.params)
         self.land, self._estimator = LandDetector(self.params), Estimator()
@@ -400,7 +400,7 @@ class Px4Stub:
 
     @property
     def heading_rad(self) -> float:
-        """Estimated yaw, rad."""
+        """Return the estimated yaw, rad."""
         return heading_rad(self.estimate.attitude_ned_frd) if self.estimate is not None else 0.0
 
 

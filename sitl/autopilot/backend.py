@@ -1,4 +1,4 @@
-"""The interface between the simulated world and its autopilot, and the stub behind it. A real PX4 is in `sitl.px4.backend`."""
+"""Interface between the simulated world and its autopilot, and its implementation by the stub; `sitl.px4.backend` has a real PX4."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sitl.faults.injector import Autopilot as FaultyAutopilot
 from sitl.world.world import World
 
 STUB_VERSION = "1.16"
-"""PX4's version that the stub behaves like."""
+"""PX4 version that the stub imitates."""
 
 
 class Observation(NamedTuple):
@@ -43,7 +43,7 @@ class AutopilotBackend(Protocol):
 
     @property
     def armed(self) -> bool:
-        """Rotors may turn."""
+        """Whether the rotors may turn."""
 
     @property
     def fault_target(self) -> FaultyAutopilot:
@@ -88,11 +88,11 @@ class AutopilotBackend(Protocol):
 
 
 def stub_of(config: WorldConfig, link_delay_s: float = 0.0) -> Px4Stub:
-    """Return the stub with the parameters of this world, gains included; its hover thrust is set by `set_hover_thrust`.
+    """Return the stub with the parameters of this world, gains included; `set_hover_thrust` sets its hover thrust.
 
     Args:
         config: `setpoint_delay_s`, `px4_params` and the biases of `imu`.
-        link_delay_s: added to the setpoint delay, for a loop without a wire that takes this time.
+        link_delay_s: added to the setpoint delay, for a loop without a wire.
     """
     params = Params()
     params.set("THR_MDL_FAC", config.thr_mdl_fac)
@@ -104,11 +104,11 @@ def stub_of(config: WorldConfig, link_delay_s: float = 0.0) -> Px4Stub:
 
 
 def _learned(imu: Imu) -> LearnedBias | None:
-    """Return what EKF2 learns of the biases while the vehicle stands on the floor, at most EKF2_GYR_B_LIM and EKF2_ABL_LIM.
+    """Return the biases that EKF2 learns while the vehicle stands on the floor, limited by EKF2_GYR_B_LIM and EKF2_ABL_LIM.
 
-    The world begins seconds before take-off; PX4 has run for longer. At rest it sees the bias of the gyroscopes directly
-    (ZeroGyroUpdate, and the module gyro_calibration), and that of the vertical accelerometer by the height. It does not see the
-    bias of a horizontal accelerometer: this and a tilt are one and the same to position, at rest and in every flight at constant
+    The world begins seconds before take-off; PX4 has run for longer. At rest it observes the bias of the gyroscopes directly
+    (ZeroGyroUpdate, and the module gyro_calibration), and that of the vertical accelerometer by the height. It does not observe the
+    bias of a horizontal accelerometer, which position cannot distinguish from a tilt, at rest and in every flight at constant
     yaw. EKF2 starts with a tilt from the accelerometers, which is wrong by bias / g, and no innovation corrects it. In flight its
     gains would learn little (Kalman filter with EKF2's parameters and vision at 125 Hz: 0.01 m/s^2 per s and m of innovation,
     against 1.7 rad/s per m on the tilt). Measured on 1.16.1: a bias of 0.1 and 0.08 m/s^2 (0.58 and 0.47 deg) tilts it by 0.60 to
@@ -145,7 +145,7 @@ class StubBackend:
 
     @property
     def armed(self) -> bool:
-        """Rotors may turn."""
+        """Whether the rotors may turn."""
         return self.px4.commander.armed
 
     @property

@@ -104,7 +104,7 @@ class Commander:
             case Command.RUN_PREARM_CHECKS:
                 return Result.ACCEPTED
             case Command.PREFLIGHT_REBOOT_SHUTDOWN:
-                return Result.DENIED  # armed: never; disarmed: a stub does not restart its process
+                return Result.DENIED  # armed: never; disarmed: the stub does not restart its process
             case _:
                 return Result.UNSUPPORTED
 

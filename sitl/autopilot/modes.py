@@ -26,7 +26,7 @@ class NavState(Enum):
 
     @property
     def custom_mode(self) -> int:
-        """HEARTBEAT.custom_mode."""
+        """Return HEARTBEAT.custom_mode."""
         numbers: tuple[int, ...] = self.value
         return numbers[0] << 16 | numbers[1] << 24
 

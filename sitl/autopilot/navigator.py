@@ -28,7 +28,7 @@ _LEVEL_IDLE = PositionTarget(velocity_ned_m_s=(0.0, 0.0, 0.0))
 
 
 class Phase(Enum):
-    """mc_pos_control's take-off state."""
+    """Take-off state of mc_pos_control."""
 
     GROUND = auto()  # idle thrust
     RAMPUP = auto()
@@ -117,7 +117,7 @@ class Navigator:
             offboard: position setpoint in OFFBOARD, or None.
             armed_s: time since arming.
             landed: whether the land detector reports landed.
-            touching: whether it reports ground contact.
+            touching: whether the land detector reports ground contact.
         """
         self.target = target = self._mode_target(dt_s, estimate, home_ned_m, offboard)
         self._advance(t_s, estimate, target, armed_s, landed)

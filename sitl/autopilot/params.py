@@ -41,7 +41,7 @@ class Params:
             ValueError: if an override is not finite, or not whole where PX4 has an INT32.
         """
         self.revision = 0
-        """Grows with every change, so that a cache of values can compare it."""
+        """Counter that grows with every change, for comparison by a cache."""
         self._integer = {name: isinstance(default, int) for name, default in PX4_DEFAULTS.items()}
         self._values: dict[str, Value] = {name: PX4_DEFAULTS[name] for name in sorted(PX4_DEFAULTS)}
         self._names = tuple(self._values)

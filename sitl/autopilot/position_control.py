@@ -178,7 +178,7 @@ def attitude_from_up(thrust_direction_ned: Vec3, yaw_rad: float) -> Quat:
     norm = math.sqrt(xx * xx + xy * xy + xz * xz)
     xx, xy, xz = xx / norm, xy / norm, xz / norm
     yx, yy, yz = zy * xz - zz * xy, zz * xx - zx * xz, zx * xy - zy * xx
-    # Columns of the rotation are x, y, z; the tilt stays below 90 deg, so w is never small for headings taken care of below.
+    # Columns of the rotation are x, y, z; the tilt stays below 90 deg, so w is never small for the headings handled below.
     trace = xx + yy + zz
     if trace > -0.5:
         w = math.sqrt(max(0.0, 1.0 + trace)) / 2.0

@@ -133,7 +133,7 @@ class Receiver:
         self._command(link, message, (params[0], params[1], params[2], params[3], params[4], params[5], params[6]))
 
     def _command_int(self, link: Reply, message: Message) -> None:
-        # PX4 scales x and y of every COMMAND_INT that carries a place; INT32_MAX says "not set".
+        # PX4 scales x and y of every COMMAND_INT with a location; INT32_MAX means "not set".
         x, y = (math.nan if value == 2**31 - 1 else value * 1e-7 for value in (message.x, message.y))
         m = message
         self._command(link, message, (m.param1, m.param2, m.param3, m.param4, x, y, m.z))
@@ -149,7 +149,7 @@ class Receiver:
         )
 
     def _link_command(self, link: Reply, command: int, params: Command7) -> Result | None:
-        """Handle a command that PX4's mavlink module answers itself; return None if the commander handles it."""
+        """Handle a command that PX4's mavlink module answers itself. Return None if the commander handles it."""
         number = int(params[0]) if math.isfinite(params[0]) else -1
         match command:
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
@@ -208,7 +208,7 @@ class Receiver:
         self._vision((m.x, m.y, m.z), quat_from_euler_zyx(m.roll, m.pitch, m.yaw))
 
     def _odometry(self, _link: Reply, message: Message) -> None:
-        """Take ODOMETRY only if it is external vision; PX4 silently does not fuse MOCAP_NED, unset and naive estimators."""
+        """Accept ODOMETRY only if it is external vision; PX4 silently does not fuse MOCAP_NED, unset and naive estimators."""
         m = message
         if m.estimator_type in _FUSED_ESTIMATORS and m.frame_id in _FUSED_FRAMES:
             self._vision((m.x, m.y, m.z), (m.q[0], m.q[1], m.q[2], m.q[3]))

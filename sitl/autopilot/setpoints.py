@@ -43,7 +43,7 @@ class PositionTarget:
 
     @property
     def empty(self) -> bool:
-        """Whether it commands nothing."""
+        """Whether it commands no axis."""
         axes = (*self.position_ned_m, *self.velocity_ned_m_s, *self.acceleration_ned_m_s2)
         return all(value is None for value in axes)
 

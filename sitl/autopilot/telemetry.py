@@ -136,7 +136,7 @@ def local_position_ned(stub: Px4Stub) -> Message | None:
 
 
 def odometry(stub: Px4Stub) -> Message | None:
-    """ODOMETRY; on 1.16 the velocity is NED, and child_frame_id says so."""
+    """ODOMETRY; on 1.16 the velocity is NED, as child_frame_id states."""
     estimate = _attitude(stub)
     if estimate is None:
         return None
@@ -179,8 +179,8 @@ def scaled_imu(stub: Px4Stub) -> Message | None:
 
 
 def estimator_status(stub: Px4Stub) -> Message | None:
-    """ESTIMATOR_STATUS as EKF2 1.16 sends it: a ratio is NaN while nothing of its kind is fused, the absolute position needs an origin,
-    and the flag for constant position is also set at rest.
+    """ESTIMATOR_STATUS as EKF2 1.16 sends it: a ratio is NaN while no measurement of its kind is fused, the absolute position needs an
+    origin, and the flag for constant position is also set at rest.
     """
     estimate = stub.estimate
     if estimate is None:

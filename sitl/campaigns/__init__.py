@@ -1,4 +1,4 @@
-"""The flying side of campaigns, in the fast loop. `companion compare`, `robustness` and `faults` start `python -m sitl.campaigns`.
+"""Flights of campaigns, in the fast loop. `companion compare`, `robustness` and `faults` start `python -m sitl.campaigns`.
 
 Standard input holds one line of JSON, the job, and stays open: when it closes, the campaign ends.
     campaign      compare, robustness or faults
@@ -7,7 +7,7 @@ Standard input holds one line of JSON, the job, and stays open: when it closes, 
     jobs          number of processes; null for one per core
     scheduler     address of a Dask scheduler to fly on its workers; null for this machine
 Standard output has a line of JSON for each flight that ends, {"type": "flight", "index", "row", "series", "wall_s"}, or
-{"type": "error", "text", "bad_input"} and exit code 1 if the campaign cannot go on.
+{"type": "error", "text", "bad_input"} and exit code 1 if the campaign cannot continue.
 
-The row of a flight depends on its configuration alone, wherever and beside whatever it is flown.
+The row of a flight depends only on its configuration, not on the machine or on other flights.
 """

@@ -1,4 +1,4 @@
-"""Flights of `companion compare`: {controller, preset, payload_kg, seed, model_error, series}; `series` asks for a time series."""
+"""Flights of `companion compare`: {controller, preset, payload_kg, seed, model_error, series}; `series` requests a time series."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def fly(config: SitlConfig, flight: Data) -> Data:
 
 
 def series_of(log: FlightLog) -> Data:
-    """Return errors and joint angles in flight over the mission clock, for plots; None where a value is not known."""
+    """Return errors and joint angles in flight over the mission clock, for plots; None where a value is unknown."""
     pre, post = metrics.flight_masks(log)
     used = np.flatnonzero(pre | post)[::SERIES_EVERY]
     columns = log.columns

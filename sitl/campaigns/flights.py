@@ -1,4 +1,4 @@
-"""Fast flights of campaigns: flown, turned into a log, graded."""
+"""Fast flights of campaigns: fly, convert to a log, grade."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from sitl.fast.loop import FastFlight, FastResult
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """A fast flight that has ended, also by an exception."""
+    """A fast flight that has ended, perhaps by an exception."""
 
     config: SitlConfig
-    """The configuration that was flown."""
+    """Configuration of the flight."""
     fast: FastFlight | None
-    """None if an exception ended it."""
+    """Result of the flight; None if an exception ended it."""
     result: FastResult
     error: str | None
     """The exception that ended the flight, if any."""
@@ -43,8 +43,8 @@ def with_world(config: SitlConfig, changes: Data) -> SitlConfig:
     """Return the configuration with keys of its world changed; another seed draws another laboratory.
 
     Args:
-        config: of a flight.
-        changes: plain data by key of the world. A key that is given is not drawn.
+        config: configuration of a flight.
+        changes: plain data by key of the world. A given key is not drawn.
     """
     laboratory = config.laboratory.without(list(changes))
     data = config.world.model_dump(mode="json") | changes
@@ -53,7 +53,7 @@ def with_world(config: SitlConfig, changes: Data) -> SitlConfig:
 
 
 def laboratory_of(config: SitlConfig) -> Data:
-    """Return what a row says about the world of its flight."""
+    """Return the entries of a row about the flight's world."""
     return {"world_seed": config.world.seed, "model_error": config.world.model_error}
 
 
@@ -71,11 +71,11 @@ def fly_to_end(config: SitlConfig, limit_s: float = 90.0) -> Flown:
 def row_of(
     config: FlightConfig, result: FastResult, caught_t_s: float | None, error: str | None = None
 ) -> tuple[Data, FlightLog]:
-    """Grade a flight: return its row (see `companion.campaigns.compare.aggregate`) without what names it, and its log.
+    """Grade a flight: return its row (see `companion.campaigns.compare.aggregate`) without the flight's identification, and its log.
 
     Args:
-        config: of the flight.
-        result: of the flight.
+        config: configuration of the flight.
+        result: result of the flight.
         caught_t_s: world time of the true catch; None if the payload was not caught.
         error: the exception that ended the flight, if any.
     """
@@ -128,7 +128,9 @@ def log_of(config: FlightConfig, result: FastResult, caught_t_s: float | None) -
 
 
 def _with_catch(result: FastResult, caught_t_s: float | None) -> tuple[Outputs, ...]:
-    """Return the outputs with a catch event, at the true catch if the core did not detect it: errors before and after must not mix."""
+    """Return the outputs with a catch event, at the true catch if the core did not detect it, so that errors before and after are not
+    mixed.
+    """
     outputs = list(result.outputs)
     seen = any(event.id == "catch" for output in outputs for event in output.events)
     if caught_t_s is not None and not seen:

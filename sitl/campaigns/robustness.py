@@ -28,15 +28,15 @@ from sitl.world.payload import THROW_LEAD_S
 
 PAYLOAD_KG = (0.05, 0.4)
 THROW_SPEED_M_S = (0.5, 4.0)
-"""Horizontal speed at the catch, from any side; the descent adds to it."""
+"""Range of the horizontal speed at the catch, from any side; the descent is added."""
 DESCENT_MAX_M_S = 2.5
 
 ALONG_MIN_M_S = 0.08
-"""Least speed of the vehicle in the direction of +x at a catch point."""
+"""Smallest speed of the vehicle in the direction of +x at a catch point."""
 END_MARGIN_M = 0.08
 """Distance of the catch points from the ends of the line: a vehicle displaced by the wind may not pass a point closer to them."""
 HAND_HEIGHT_M = 0.1
-"""Least height above the floor at which the payload leaves the hand."""
+"""Smallest height above the floor at which the payload leaves the hand."""
 ROTORS_ABOVE_BODY_M = 0.03
 FELT_S = 0.05
 """Time after the catch by which the force sensor must have sent a sample taken after it."""
@@ -49,7 +49,7 @@ class Throw:
 
     at_m: tuple[float, float]
     descent_m_s: tuple[float, float]
-    """Slowest: thrown from `HAND_HEIGHT_M`. Fastest: the payload reaches the net without passing through the rotors."""
+    """Slowest and fastest descent: thrown from `HAND_HEIGHT_M`; reaching the net without passing through the rotors."""
 
 
 def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
@@ -86,19 +86,19 @@ def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
         found.append(Throw((x_m, later.position_world_m[1]), (slowest, fastest)))
     if not found:
         raise CampaignError(
-            f"mission '{mission.name}' never flies in the direction of +x, so that nothing can be thrown at it",
+            f"mission '{mission.name}' never flies in the direction of +x, so that no payload can be thrown at it",
             bad_input=True,
         )
     return found
 
 
 def draw(seed: int, number: int, places: list[Throw]) -> Data:
-    """Draw payload, throw, catch point and the seed of the world, which draws the rest; return these keys of the world, rounded.
+    """Draw payload, throw, catch point and the world's seed, which draws the rest. Return these keys of the world, rounded.
 
     Args:
-        seed: of the whole campaign.
-        number: of the draw.
-        places: as from `throws`.
+        seed: seed of the campaign.
+        number: number of the draw.
+        places: catch points from `throws`.
     """
     rng = np.random.default_rng([seed, number])
 
@@ -123,7 +123,7 @@ def prepare(job: Data, configs: Sequence[SitlConfig]) -> list[Data]:
     """Return the flights of the job, each with the keys of its world that differ from the configuration.
 
     Raises:
-        CampaignError: nothing can be thrown at the vehicle in this mission.
+        CampaignError: no payload can be thrown at the vehicle in this mission.
     """
     (config,), flights = configs, job["flights"]
     draws = any(flight["world"] is None for flight in flights)
@@ -177,7 +177,7 @@ def _graded(flown: Flown) -> Data:
     graded, log = row_of(flown.config.flight, flown.result, flown.caught_t_s, flown.error)
     events = [event for outputs in flown.result.outputs for event in outputs.events]
     gave_up = [event for event in events if event.action.rank >= SafetyAction.HOLD.rank]
-    # The event that made it land says more than an earlier one that made it hold.
+    # The event that caused a landing is more informative than an earlier one that caused a hold.
     gave_up.sort(key=lambda event: event.action.rank < SafetyAction.LAND.rank)
     ended = gave_up[0] if gave_up and graded["outcome"] != Outcome.COMPLETED.value else None
     noticed = next((event.t_s for event in events if event.id == "catch"), None)
@@ -200,7 +200,7 @@ def _graded(flown: Flown) -> Data:
 
 
 def _extremes(log: FlightLog) -> Data:
-    """Return how close to its limits a flight came."""
+    """Return the extremes of a flight relative to its limits."""
     nothing = {"tilt_max_deg": None, "slack_min_m": None, "home_m": None}
     if not log.inputs:
         return nothing

@@ -19,7 +19,7 @@ Fly = Callable[[SitlConfig, Data], Data]
 
 
 class CampaignError(Exception):
-    """The campaign cannot go on. The text is one line for the user."""
+    """The campaign cannot continue. The text is one line for the user."""
 
     def __init__(self, text: str, *, bad_input: bool = False) -> None:
         super().__init__(text)
@@ -89,7 +89,7 @@ def _over_machines(tasks: Sequence[tuple[Fly, int, str, Data]], scheduler: str) 
             for _, result in as_completed(futures, with_results=True):
                 yield result
         except KilledWorker:
-            raise CampaignError(f"--scheduler {scheduler}: its workers die again and again; see their logs") from None
+            raise CampaignError(f"--scheduler {scheduler}: its workers die repeatedly; see their logs") from None
         except ImportError as error:
             raise CampaignError(
                 f"--scheduler {scheduler}: a worker lacks the program ({error}); install companion[sitl,cluster] there"

@@ -19,11 +19,11 @@ def scales_of(vehicle: Vehicle, servos: Sequence[ServoModel]) -> tuple[JointScal
     """Return the scale of each joint, or None where the companion's set-up of the bus fails.
 
     Args:
-        vehicle: the ids, the baud rate and the torques that the companion believes.
-        servos: all servos whose plug is in the bus.
+        vehicle: vehicle file with the assumed ids, baud rate and torques.
+        servos: all servos that are connected to the bus.
 
     Returns:
-        None if a servo does not answer alone at the vehicle file's id and baud rate, or if its current limit is below
+        None if a servo is not the only one to answer at the vehicle file's id and baud rate, or if its current limit is below
         what `torque_max_nm` needs.
     """
     line, arm = ServoLine(servos), vehicle.arm

@@ -82,7 +82,7 @@ class MemoryWire:
 
 
 class _StubEnd:
-    """Where the stub's receiver sends its answers."""
+    """Receiver of the stub's answers."""
 
     def __init__(self, wire: MemoryWire) -> None:
         self._wire = wire
@@ -122,8 +122,8 @@ class FastGuardian:
         self.events: list[Event] = []
         self.alive = True
 
-    def beat(self, inputs: Inputs, outputs: Outputs) -> None:
-        """Take the heartbeat of one control tick of the flight process."""
+    def heartbeat(self, inputs: Inputs, outputs: Outputs) -> None:
+        """Process the heartbeat of one control tick of the flight process."""
         self._beat = self._heartbeats.of(inputs, outputs)
 
     def decides_to_take_over(self, t_s: float, heard: bool, dead: bool) -> bool:
@@ -172,7 +172,7 @@ class Landing:
 
     @property
     def landed(self) -> bool | None:
-        """As `TakeoverLanding.landed`."""
+        """Result of the landing, as in `TakeoverLanding.landed`."""
         return self._landing.landed
 
     def step(self, t_s: float, poses: list[MocapPose]) -> None:

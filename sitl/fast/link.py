@@ -30,11 +30,11 @@ class FastLink:
         self._faults, self._world, self._px4, self._tick_s = faults, world, px4, tick_s
         self._in_flight: deque[tuple[float, Callable[[], None]]] = deque()
         self._received: deque[tuple[VehicleState | None, AutopilotStatus]] = deque(maxlen=MEMORY)
-        """What PX4 sent in the last ticks, newest first."""
+        """States that PX4 sent in the last ticks, newest first."""
 
     @property
     def alive(self) -> bool:
-        """Whether messages arrive at all."""
+        """Whether messages arrive."""
         return "link_loss" not in self._faults.active and self._world.t_s >= self._px4.booted_at_s
 
     def send(self, deliver: Callable[[], None]) -> None:
@@ -58,7 +58,7 @@ class FastLink:
     def receive(
         self, state: VehicleState | None, status: AutopilotStatus
     ) -> tuple[VehicleState | None, AutopilotStatus]:
-        """Return the state that the core receives in this tick: delayed if the link is slow, the last one if the link is lost."""
+        """Return the state that the core receives in this tick: delayed if the link is slow, the last state if the link is lost."""
         received = self._received
         if not self.alive and received:
             return received[0]
@@ -69,7 +69,7 @@ class FastLink:
         if not delay_s:
             return state, status
         state, status = received[min(len(received) - 1, round(delay_s / self._tick_s))]
-        if state is not None:  # stamps are of the arrival
+        if state is not None:  # stamps are arrival times
             state = replace(
                 state,
                 position_stamp_s=state.position_stamp_s + delay_s,

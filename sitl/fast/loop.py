@@ -1,6 +1,6 @@
 """The fast closed loop: flight core, PX4 stub, servos and world on simulated time, without sockets.
 
-It keeps the sensor rates, quantisation, noise and delays of the wires, and leaves out only their bytes.
+It keeps the sensor rates, quantisation, noise and delays of the wires and leaves out only their bytes.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ _NO_REQUEST = AutopilotRequest.NONE
 _HEALTHY = (0, 0)
 _COOL = (COOL_C, COOL_C)
 SETTLE_S = 30.0
-"""Longest time for which the world goes on after a flight that ends armed."""
+"""Longest time for which the world continues after a flight that ends armed."""
 FLIGHT_PROCESS_FAULTS: frozenset[FaultKind] = frozenset({"stall_loop", "hold_gil", "stop_flight", "kill_flight"})
 """Faults that stop the flight process."""
 _MODES = {NavState.OFFBOARD: FlightMode.OFFBOARD, NavState.LAND: FlightMode.LAND, NavState.LOITER: FlightMode.HOLD}
@@ -93,7 +93,7 @@ class FastResult:
     after: list[Snapshot] = field(default_factory=list)
     """State of the world after the last tick, every 5 ms, while the guardian or PX4 lands."""
     guardian_events: list[Event] = field(default_factory=list)
-    """The guardian's events; empty if it did not act."""
+    """Events of the guardian; empty if it did not act."""
     guardian_landed: bool | None = None
     """Whether the guardian landed the vehicle; None if it did not act or has not finished."""
     armed: bool = False
@@ -217,7 +217,7 @@ class FastFlight:
             self._trusted = outputs.mocap_trusted
             self._carry_out(outputs)
             if guardian is not None:
-                guardian.beat(inputs, outputs)
+                guardian.heartbeat(inputs, outputs)
                 guardian.decides_to_take_over(world.t_s, True, False)
             result.inputs.append(inputs)
             result.outputs.append(outputs)
@@ -242,10 +242,10 @@ class FastFlight:
                 result.after.append(world.snapshot())
 
     def _flight_process_stalled(self, guardian: FastGuardian) -> bool:
-        """Return whether a fault keeps the flight process from its tick, and do what its bus thread still does."""
+        """Return whether a fault keeps the flight process from its tick, and perform the actions of its bus thread."""
         active, t_s = self.faults.active, self.plant.world.t_s
         guardian.alive = "kill_guardian" not in active
-        if "stall_loop" in active:  # the bus thread runs on: it feeds the watchdogs and withdraws stale currents
+        if "stall_loop" in active:  # the bus thread continues: it feeds the watchdogs and withdraws stale currents
             for drive in self._drives:
                 drive.heard_instruction()
                 if t_s - self._goal_s > self._watchdog_s:

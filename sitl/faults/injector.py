@@ -1,7 +1,7 @@
-"""Faults of the simulated world: which are active, and what they do to physics, sensors and PX4.
+"""Faults of the simulated world: schedule, and effect on physics, sensors and PX4.
 
-The plant calls `Faults.step` in every step. Faults of the link, the servo bus and the processes are in `active`, where the wires and
-the fast closed loop look them up.
+The plant calls `Faults.step` in every step. The wires and the fast closed loop read faults of the
+link, the servo bus and the processes from `active`.
 """
 
 from __future__ import annotations
@@ -259,7 +259,7 @@ class Faults:
         return t_s + self.size("clock_step") if t_s >= self._stepped_s else t_s
 
     def wrench(self, force_n: Vec3, torque_nm: Vec3) -> tuple[Vec3, Vec3]:
-        """Return what the force sensor measures instead of the true wrench."""
+        """Return the force sensor's measurement in place of the true wrench."""
         bias_n = self.size("force_bias")
         if bias_n:
             x, y, z = force_n

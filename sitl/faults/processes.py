@@ -1,4 +1,4 @@
-"""Faults of the flight, recorder and guardian processes, injected from outside, and what PX4 observes after them."""
+"""Faults of the flight, recorder and guardian processes, injected from outside, and their effect on PX4."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SIGNALS: dict[FlightFaultKind, signal.Signals] = {
     "stall_loop": signal.SIGUSR2,
 }
 STALL_VARIABLE = "COMPANION_SITL_STALL_S"
-"""Environment variable for sitl/faults/hang: how long the event loop stalls."""
+"""Environment variable for sitl/faults/hang: duration of the event loop's stall."""
 _VISION_WINDOW_S = 2.0
 _SAMPLE_S = 0.01
 
@@ -34,7 +34,7 @@ def environment(kinds: set[str], stall_s: float | None = None) -> dict[str, str]
 
     Args:
         kinds: fault kinds.
-        stall_s: how long the event loop stalls; None means for ever.
+        stall_s: duration of the event loop's stall; None for no end.
     """
     if not kinds & {"hold_gil", "stall_loop"}:
         return {}
@@ -80,11 +80,11 @@ def _command(pid: int) -> list[str]:
 
 
 class ProcessFaults:
-    """Injects one fault of the flight process, then records what still reaches PX4 and how the vehicle moves."""
+    """Injects one fault of the flight process, then records PX4's inputs and the vehicle's motion."""
 
     def __init__(self) -> None:
         self.pid: int | None = None
-        """Pid of the flight process, as the launcher reported it, or None."""
+        """Pid of the flight process from the launcher, or None."""
         self.kind: FlightFaultKind | None = None
         """Kind of the fault that was injected, or None."""
         self._t_s = 0.0

@@ -1,4 +1,4 @@
-"""When faults act: a fault that names a phase of the flight gets the time at which this mission reaches that phase."""
+"""Times of faults: a fault with a phase gets the time at which this mission reaches that phase."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from companion.sitl_config.loader import SitlConfig
 AFTER_CATCH_S = 0.1
 """Start of a fault in phase "catch", after the catch."""
 REBOOT_ON_GROUND_S = 1.3
-"""Start of a PX4 restart in phase "ground": before it PX4 has not booted."""
+"""Start of a PX4 restart in phase "ground", after PX4's first boot."""
 _ALONG_M = 0.3
 _EARLY_IN_LINE, _MIDDLE = 0.35, 0.5
 _FROM_START: frozenset[FaultKind] = frozenset({"payload_missed", "payload_heavy"})

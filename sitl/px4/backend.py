@@ -1,4 +1,4 @@
-"""A real PX4 as the autopilot of the simulated world: started, configured over MAVLink, restarted once, flown in lockstep, ended."""
+"""A real PX4 as the autopilot of the simulated world: start, configuration over MAVLink, restart, lockstep flight, end."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ _LINK_FAULTS: frozenset[FaultKind] = frozenset({"link_loss", "link_delay"})
 Progress = Callable[[str], None]
 
 
-def refuse_what_needs_the_stub(config: WorldConfig) -> None:
+def refuse_stub_only_settings(config: WorldConfig) -> None:
     """Reject a world that only the stub can simulate, before a real PX4 is started.
 
     Raises:
-        Px4Error: the world has such a fault, or without the effect `battery` one that does not start full.
+        Px4Error: the world has such a fault, or a battery that does not start full without the effect `battery`.
     """
     for fault in config.faults:
         if fault.kind in STUB_ONLY_FAULTS and not (fault.kind == "battery_sag" and config.battery.on):
@@ -75,13 +75,13 @@ class RealPx4:
         progress: called with one line for the user.
 
     Raises:
-        Px4Error: the world needs the stub, PX4_SITL names no program, or no instance number is free.
+        Px4Error: the world needs the stub, PX4_SITL does not name a program, or no instance number is free.
     """
 
     lockstep = True
 
     def __init__(self, airframe: Airframe, config: WorldConfig, folder: Path, progress: Progress) -> None:
-        refuse_what_needs_the_stub(config)
+        refuse_stub_only_settings(config)
         self._airframe = airframe
         self._config = config
         self._folder = folder
@@ -201,7 +201,7 @@ class RealPx4:
         absent = [name for name in wanted if name not in have and name not in VERSION_DEPENDENT]
         if absent:
             raise Px4Error(
-                f"PX4 {self._version}: expected the parameter {absent[0]}, found that it has none of this name"
+                f"PX4 {self._version}: expected the parameter {absent[0]}, found no parameter of this name"
                 + (f" (nor {', '.join(absent[1:])})" if absent[1:] else "")
             )
         typed = {name: _as_type_of(have[name], value) for name, value in wanted.items() if name in have}
@@ -215,8 +215,8 @@ class RealPx4:
         """Restart PX4 in the same folder, or ask the user to restart it."""
         if self._process is None:
             self._progress(
-                "the vehicle's parameters are set; PX4 must start again for them: end it and start it once more, in the same folder, "
-                "where it keeps them"
+                "the vehicle's parameters are set and need a restart of PX4: end it and start it again in the same folder, "
+                "where it stores them"
             )
             if not await self._link.await_disconnect(USER_DEADLINE_S):
                 raise Px4Error(f"PX4: expected it to be restarted within {USER_DEADLINE_S:g} s, found it still running")
@@ -231,7 +231,7 @@ class RealPx4:
         await self._boot(BOOT_DEADLINE_S if self._process is not None else USER_DEADLINE_S)
 
     def sense(self, imu: ImuSample) -> None:
-        """Send HIL_SENSOR, with the true height and attitude of this moment."""
+        """Send HIL_SENSOR, with the present true height and attitude."""
         self._imu = imu
         q = self._world.q
         self._link.send(imu, q[2], (q[3], q[4], q[5], q[6]))
@@ -273,7 +273,7 @@ class RealPx4:
         """Do nothing: PX4's only clock is the world's, and a gap in its samples would disturb its estimate."""
 
     def observe(self) -> Observation:
-        """Return the mode; only PX4's own log shows what arrives there."""
+        """Return the mode; only PX4's own log shows its inputs."""
         return Observation(None, None, self._control.nav_state)
 
     def about(self) -> dict[str, Any]:
@@ -318,7 +318,7 @@ class _Faulty:
         self._control = control
 
     def reboot(self, for_s: float) -> None:
-        """Reject the fault; `refuse_what_needs_the_stub` has done so before the flight.
+        """Reject the fault; `refuse_stub_only_settings` has done so before the flight.
 
         Raises:
             Px4Error: always.

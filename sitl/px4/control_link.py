@@ -1,4 +1,4 @@
-"""The simulated world's own MAVLink link to a real PX4, beside the companion's: parameters, version, mode.
+"""The simulated world's own MAVLink link to a real PX4, in addition to the companion's: parameters, version, mode.
 
 It uses PX4's camera link (UDP 14280 plus instance) and leaves the onboard link alone, because PX4 keeps sending to the first partner
 that contacts it.
@@ -86,7 +86,7 @@ class ControlLink(UdpEndpoint):
         """Wait for PX4's heartbeat.
 
         Raises:
-            Px4Error: none came within HEARTBEAT_DEADLINE_S.
+            Px4Error: no heartbeat arrived within HEARTBEAT_DEADLINE_S.
         """
         self.nav_state = None
         heard = await self._ask(
@@ -97,7 +97,7 @@ class ControlLink(UdpEndpoint):
         if heard is None:
             raise Px4Error(
                 f"PX4: expected a heartbeat on UDP {self._instance.control.getsockname()[1]} within "
-                f"{HEARTBEAT_DEADLINE_S:g} s, found none; is it PX4 SITL with its standard links?"
+                f"{HEARTBEAT_DEADLINE_S:g} s, found none; check that it is PX4 SITL with its standard links"
             )
 
     async def version(self) -> Version:
@@ -131,7 +131,7 @@ class ControlLink(UdpEndpoint):
             for i in range(0, len(missing), _AT_ONCE):
                 found |= await self._read_some(missing[i : i + _AT_ONCE])
         if wanted and not found:
-            raise Px4Error(f"PX4: expected values of {len(wanted)} parameters, found no answer at all")
+            raise Px4Error(f"PX4: expected values of {len(wanted)} parameters, found no answer")
         return found
 
     async def _read_some(self, names: list[str]) -> dict[str, Value]:
@@ -187,7 +187,7 @@ class ControlLink(UdpEndpoint):
             )
 
     async def save(self) -> None:
-        """Have PX4 store its parameters now instead of some seconds later.
+        """Make PX4 store its parameters now instead of some seconds later.
 
         Raises:
             Px4Error: PX4 refused or did not answer.
@@ -210,7 +210,7 @@ class ControlLink(UdpEndpoint):
         self._command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, main, sub)
 
     def force_disarm(self) -> None:
-        """Stop the rotors, wherever the vehicle is."""
+        """Stop the rotors, even in the air."""
         self._command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, _FORCE_DISARM)
 
     def send_battery(self, battery: Battery) -> None:

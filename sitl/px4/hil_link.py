@@ -23,7 +23,7 @@ CLOCK_ORIGIN_S = 1.0
 """PX4's clock at its first sample, at any world time. It must not start at zero; if it starts at some minutes, EKF2's first estimate is
 late (PX4 1.16.1: by about 10 s at 300 s, by more than the preflight waits at 1000 s)."""
 ANSWER_PATIENCE_S = 2.0
-"""Time to wait for the answer to one sample; then the next one is sent."""
+"""Timeout of the answer to one sample, after which the next one is sent."""
 ANSWER_DEADLINE_S = 10.0
 """Time without any answer after which PX4 counts as hung."""
 FIELD_EVERY, BARO_OFFSET = 5, 2
@@ -158,11 +158,11 @@ class SimulatorLink:
         return self._peer is not None and self.answers > 0
 
     async def await_lockstep(self, deadline_s: float) -> bool:
-        """Wait for PX4's first answer while samples go on; return False if none came in time."""
+        """Wait for PX4's first answer while samples continue. Return False at the timeout."""
         return await self._until(lambda: self.in_step, deadline_s)
 
     async def await_disconnect(self, deadline_s: float) -> bool:
-        """Wait until PX4 has disconnected; return False if it has not in time."""
+        """Wait until PX4 has disconnected. Return False at the timeout."""
         return await self._until(lambda: not self.connected, deadline_s)
 
     async def _until(self, reached: Any, deadline_s: float) -> bool:
@@ -195,7 +195,7 @@ class SimulatorLink:
         armed is not waited for again until it answers.
 
         Raises:
-            Px4Error: an armed PX4 has answered nothing for `ANSWER_DEADLINE_S`.
+            Px4Error: an armed PX4 has not answered for `ANSWER_DEADLINE_S`.
         """
         while self._awaited_us is not None:
             self._answer.clear()
@@ -210,7 +210,7 @@ class SimulatorLink:
                 if self._silent_s >= ANSWER_DEADLINE_S:
                     raise Px4Error(
                         f"PX4: expected an answer to every HIL_SENSOR (lockstep), found none for {ANSWER_DEADLINE_S:g} s; "
-                        "PX4 hangs, or the machine is far too slow for it"
+                        "PX4 hangs, or the machine is too slow for it"
                     ) from None
 
     # -- called by the peer --------------------------------------------------------------------------------------
@@ -229,7 +229,7 @@ class SimulatorLink:
         return True
 
     def detach(self, peer: _Peer) -> None:
-        """Forget a PX4 that disconnected, and stop its rotors."""
+        """Handle the disconnection of PX4, and stop its rotors."""
         if self._peer is not peer:
             return
         self._peer = None

@@ -23,7 +23,7 @@ _DOUBLE, _INT32, _END = 0x01, 0x10, 0x00
 def decode(data: bytes) -> dict[str, Value] | None:
     """Return the parameters of a BSON document of doubles and 32-bit integers, or None if it is incomplete.
 
-    Layout (bsonspec.org): int32 length of everything, then per element a type, a name that ends with 0 and the value, then 0.
+    Layout (bsonspec.org): int32 length of everything, then per element a type, a zero-terminated name and the value, then 0.
     """
     if len(data) < 5 or struct.unpack_from("<i", data)[0] != len(data):
         return None
@@ -63,7 +63,7 @@ async def stored(folder: Path, values: Mapping[str, Value]) -> bytes:
 
 
 def restore(folder: Path, data: bytes) -> None:
-    """Write the file again as it was when it was complete; call it after PX4 has ended."""
+    """Restore the last complete content of the file; call it after PX4 has ended."""
     file = folder / NAME
     if file.read_bytes() != data:
         file.write_bytes(data)

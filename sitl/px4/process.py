@@ -1,4 +1,4 @@
-"""A real `px4` (SITL) as a child process: finding it, claiming a free instance number, starting it in its own folder, ending it.
+"""A real `px4` (SITL) as a child process: finds it, claims a free instance number, starts it in its own folder and ends it.
 
 PX4 writes its parameters, its logs (`log/*.ulg`) and its output (`px4.log`) to that folder. Outside of it, it writes only
 `/tmp/px4_lock-N` and `/tmp/px4-sock-N`.
@@ -26,7 +26,7 @@ from sitl.px4.hil_link import Px4Error
 VARIABLE = "PX4_SITL"
 """Environment variable that names the px4 binary or its build folder (build/px4_sitl_default)."""
 MODEL = "none_iris"
-"""A quad-x with an external simulator; parameters set everything that matters."""
+"""Model: a quad-x with an external simulator, configured by parameters."""
 INSTANCES = range(10)
 """Usable instance numbers; from 10 on every PX4 sends to the same port, UDP 14549."""
 HOST = "127.0.0.1"
@@ -98,7 +98,7 @@ class Instance:
         self.simulator = simulator
         """Listening TCP socket that PX4 connects to."""
         self.control = control
-        """UDP socket that receives what PX4 sends on its camera link."""
+        """UDP socket that receives PX4's camera link."""
 
     @property
     def onboard_port(self) -> int:
@@ -225,7 +225,7 @@ class Px4Process:
         return f"PX4: px4 -i {self._number} {how}{self._last_error_line()}; see {self.log}"
 
     async def await_end(self, deadline_s: float) -> bool:
-        """Wait until PX4 has ended; return False if it has not in time."""
+        """Wait until PX4 has ended. Return False at the timeout."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             await asyncio.to_thread(self._process.wait, deadline_s)
         return not self.running
@@ -253,7 +253,7 @@ class Px4Process:
 
 
 def _before_exec() -> None:
-    """Runs in the child: end with the parent, as PX4 would wait for a simulator for ever, and drop real-time priority."""
+    """Prepare the child: end with the parent, because PX4 would wait for a simulator for ever, and drop real-time priority."""
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 

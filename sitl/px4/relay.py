@@ -51,7 +51,7 @@ class _Side(UdpEndpoint):
         self._relay = relay
         self._fixed = peer is not None
         self._peer = peer
-        """Where this side sends; without a fixed peer, the newest sender."""
+        """Destination of this side; without a fixed peer, the newest sender."""
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
         self._relay.datagrams += 1

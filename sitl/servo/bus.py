@@ -52,16 +52,16 @@ class ServoLine:
         self._parser.drop_partial()
 
     def feed(self, data: bytes, baud_bps: int | None = None) -> bytes:
-        """Take bytes from the master, return the bytes that the servos answer. Never raises.
+        """Process bytes from the master and return the servos' answer. Never raises.
 
         Args:
             data: any bytes.
-            baud_bps: baud rate at which they were sent; with None every servo hears them.
+            baud_bps: baud rate of the bytes; with None every servo receives them.
         """
         return self.exchange(data, baud_bps)[0]
 
     def exchange(self, data: bytes, baud_bps: int | None = None) -> tuple[bytes, float]:
-        """Do as `feed`, and also return the sum of the servos' return delay times in s."""
+        """Process bytes like `feed`, and also return the sum of the servos' return delay times in s."""
         self._delay_s = 0.0
         packets = self._parser.feed(data)
         if not packets:
@@ -173,7 +173,7 @@ class ServoLine:
         for servo_id, address, length in items:
             having = self._having(servo_id)
             if not having or having[0].status_return_level == 0:
-                break  # each servo waits for the status packet of the one before it
+                break  # each servo waits for the status packet of the previous one
             out += _together([self._status(servo, *_try_read(servo, address, length)) for servo in having])
         return bytes(out)
 
@@ -227,7 +227,7 @@ class ServoLine:
 
 
 def _together(answers: list[bytes]) -> bytes:
-    """Combine answers that overlap on the line: each starts a byte after the one before it, and a 0 bit wins."""
+    """Combine answers that overlap on the line: each starts one byte after the previous one, and a 0 bit wins."""
     line = answers[0] if answers else b""
     for late in answers[1:]:
         late = b"\xff" + late
@@ -267,7 +267,7 @@ class ServoBus:
     Args:
         servos: the servos on the wire.
         wire_time: delay every answer by the time of its bytes at the line's baud rate and by the return delays. The event
-            loop's granularity of 1 ms stands for the latency timer of the USB adapter.
+            loop's granularity of 1 ms represents the latency timer of the USB adapter.
 
     The companion's baud rate is read from the pty's line settings; servos at another baud rate stay silent, as on a real wire.
     """
@@ -275,7 +275,7 @@ class ServoBus:
     def __init__(self, servos: Iterable[ServoModel], *, wire_time: bool = True) -> None:
         self.line = ServoLine(servos)
         self.dropped_bytes = 0
-        """Bytes of answers that were dropped because nobody read the line."""
+        """Bytes of answers that were dropped because the line was not read."""
         self.damaged: Callable[[], bool] = lambda: False
         """Fault: called at every instruction; returns whether noise damages it."""
         self._wire_time = wire_time
@@ -305,7 +305,7 @@ class ServoBus:
         if self.line.packet_pending and now_s - self._last_byte_s > _PARTIAL_TIMEOUT_S:
             self.line.drop_partial()
         self._last_byte_s = now_s
-        # A speed without a name in termios is none that a servo has.
+        # No servo supports a speed without a name in termios.
         baud_bps = _BAUD_OF_SPEED.get(self._pty.speed(), 0)
         answer, delay_s = self.answer_to(data, baud_bps)
         if not answer:
@@ -319,11 +319,11 @@ class ServoBus:
         self._timers.add(loop.call_at(self._line_free_s, self._send, answer))
 
     def inject(self, noise: bytes) -> None:
-        """Put bytes on the line as they are, as noise would."""
+        """Put bytes on the line unchanged, such as noise."""
         self._pty.write(noise)
 
     def answer_to(self, data: bytes, baud_bps: int) -> tuple[bytes, float]:
-        """Return what the servos answer to bytes sent at a baud rate, and their return delay in s; noise may damage the bytes."""
+        """Return the servos' answer to bytes sent at a baud rate, and their return delay in s; noise may damage the bytes."""
         if self.damaged():
             middle = len(data) // 2
             data = data[:middle] + bytes((data[middle] ^ 0x5A,)) + data[middle + 1 :]

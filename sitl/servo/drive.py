@@ -57,7 +57,7 @@ class ServoDrive:
         self.angle_rad = shaft_angle_rad
         self.velocity_rad_s = 0.0
         self.slip_counts = 0
-        """Fault: the horn has slipped, and the encoder reads this much more."""
+        """Fault: offset of the encoder by a slipped horn."""
         self.turn_counts = 0
         """Whole turns that the encoder has lost, see `forget_turns`."""
         self._goal_current_counts = 0
@@ -71,7 +71,7 @@ class ServoDrive:
         self.forget_turns()
 
     def update(self, t_s: float, shaft_angle_rad: float, shaft_velocity_rad_s: float) -> float:
-        """Take the shaft's state and return the motor current.
+        """Process the shaft's state and return the motor current.
 
         Args:
             t_s: world time; must not run backwards.

@@ -80,7 +80,7 @@ class ServoModel:
         self.drive = ServoDrive(shaft_angle_rad)
         """The motor."""
         self.lights = 0
-        """How often its LED was switched on."""
+        """Number of times that the LED was switched on."""
         self._shutdown = False
         self._silent = False
         self._registered: tuple[int, bytes] | None = None
@@ -89,7 +89,7 @@ class ServoModel:
     # --- side of the world -------------------------------------------------------------------------------------------
 
     def update(self, t_s: float, shaft_angle_rad: float, shaft_velocity_rad_s: float) -> float:
-        """Take the shaft's state and return the motor current.
+        """Process the shaft's state and return the motor current.
 
         Args:
             t_s: world time; must not run backwards.
@@ -117,7 +117,7 @@ class ServoModel:
         self.drive.goal_delay_s = delay_s
 
     def fail_silent(self, silent: bool) -> None:
-        """Break or restore the data wire: the servo receives and answers nothing, and its motor goes on until its watchdog trips."""
+        """Break or restore the data wire: the servo receives and answers nothing, and its motor continues until its watchdog trips."""
         self._silent = silent
 
     def trip_overload(self) -> None:
@@ -214,7 +214,7 @@ class ServoModel:
         """Store a write for `action`.
 
         Raises:
-            ServoRefusal: as `write`.
+            ServoRefusal: as for `write`.
         """
         self._checked(address, data)
         self._registered = (address, data)
@@ -224,7 +224,7 @@ class ServoModel:
         """Carry out the registered write.
 
         Raises:
-            ServoRefusal: INSTRUCTION if there is none, else as `write`.
+            ServoRefusal: INSTRUCTION without a registered write, else as for `write`.
         """
         if self._registered is None:
             raise ServoRefusal(StatusError.INSTRUCTION)

@@ -12,7 +12,7 @@ HEADER = b"\xff\xff\xfd\x00"
 BROADCAST_ID = 0xFE
 MAX_ID = 252
 MAX_LENGTH = 1024
-"""Largest valid length field; a larger one is noise that looks like a header."""
+"""Largest valid length field; a larger one is noise that resembles a header."""
 _PREFIX = 7  # header, id, length
 
 
@@ -140,7 +140,7 @@ class PacketParser:
         self._buffer.clear()
 
     def feed(self, data: bytes) -> list[Packet]:
-        """Take bytes from the line and return the packets that they complete."""
+        """Process bytes from the line and return the completed packets."""
         buffer = self._buffer
         buffer += data
         packets: list[Packet] = []
@@ -171,7 +171,7 @@ class PacketParser:
 
 
 def _header_prefix_size(buffer: bytearray) -> int:
-    """Return how many bytes at the end of the buffer may begin a header."""
+    """Return the number of bytes at the end of the buffer that may begin a header."""
     for size in (3, 2, 1):
         if buffer.endswith(HEADER[:size]):
             return size

@@ -10,7 +10,7 @@ from companion.model.types import Vec2
 
 MOVE_S: Final = 2.0
 FORGET_S: Final = 1.5
-"""Time without LED after which the next LED starts again with the first pose."""
+"""Time without a lit LED after which the next LED starts with the first pose again."""
 
 
 class ArmHandling:
@@ -36,7 +36,7 @@ class ArmHandling:
             t_s: world time.
             limp: whether torque is off on both servos.
             angle_rad: joint angles.
-            lights: how often an LED was switched on so far; each time the arm moves to the next pose.
+            lights: number of times that an LED was switched on; each time the arm moves to the next pose.
             lit: whether an LED is on.
         """
         if limp and not self._limp:

@@ -1,7 +1,7 @@
-"""Handling of the vehicle on the ground: carrying it through the guided frame test, tapping it, hanging a weight on its net.
+"""Handling of the vehicle on the ground: carrying it through the guided hand test, tapping it, hanging a weight on its net.
 
-The hand is a spring and a damper on the base. It repeats one round (lift, forward, turn left, back) with a rest in between, or it lifts
-and holds the vehicle while another hand taps it. It sways. It acts only while the vehicle is disarmed.
+The operator's hand is a spring and a damper on the base, and sways. It repeats one round (lift, forward, turn left, back) with a rest
+in between, or lifts and holds the vehicle while a second hand taps it. It acts only while the vehicle is disarmed.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ _TAPS_WORLD: Final[tuple[Vec3, ...]] = (
     (0.0, -0.8, 0.6),
     (-0.6, -0.6, 0.5),
 )
-"""Directions of the taps, in turn."""
+"""Directions of successive taps."""
 
 
 class Wrench(NamedTuple):
@@ -95,7 +95,7 @@ class Handling:
         self._phases: list[float] = np.random.default_rng((config.seed, 17)).uniform(0.0, 2.0 * math.pi, 5).tolist()
 
     def wrench(self, t_s: float, q: list[float], v: list[float]) -> Wrench | None:
-        """Return force and torque of the hand now, or None while it does not hold the vehicle.
+        """Return the present force and torque of the hand, or None while it does not hold the vehicle.
 
         Args:
             t_s: world time.
@@ -141,7 +141,7 @@ class Handling:
     def _tap(self, t_s: float) -> Vec3:
         """Return the force of a tap, world frame."""
         count, since_s = divmod(t_s - _HELD_S - 0.5 * TAP_EVERY_S, TAP_EVERY_S)
-        # A person's taps are irregular.
+        # Taps by hand are irregular.
         since_s -= 0.13 * (1.0 + math.sin(5.1 * count + self._phases[0]))
         if not 0.0 <= count < self._taps or not 0.0 <= since_s < TAP_S:
             return (0.0, 0.0, 0.0)

@@ -15,7 +15,7 @@ class Loads:
     """External forces and torques on bodies; each acts until its cause sets it again.
 
     Args:
-        data: MuJoCo's data; its `xfrc_applied` is written by nothing else.
+        data: MuJoCo's data, whose `xfrc_applied` is written only here.
     """
 
     def __init__(self, data: mujoco.MjData) -> None:
@@ -29,7 +29,7 @@ class Loads:
         self._changed.add(body)
 
     def write(self) -> None:
-        """Give MuJoCo the sums on the bodies whose loads have changed."""
+        """Write the sums on the bodies whose loads have changed to MuJoCo."""
         for body in self._changed:
             fx = fy = fz = tx = ty = tz = 0.0
             for (ax, ay, az), (bx, by, bz) in self._loads[body].values():

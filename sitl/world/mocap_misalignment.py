@@ -1,4 +1,4 @@
-"""Poses as a wrongly configured motion-capture server streams them.
+"""Poses of a wrongly configured motion-capture server.
 
 A rigid body's rotation is zero in the attitude that the vehicle had when the body was created, and it is streamed in the axes of the
 stream. It is assumed that the nose pointed along the stream's x axis then, if that axis is level, else along the true x axis.

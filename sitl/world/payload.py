@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 THROW_LEAD_S = 0.45
 """Time from the throw to the catch."""
 _THROW_BESIDE_M = 0.5
-"""Nothing is thrown if the vehicle passes `catch_at_m` farther to the side than this."""
+"""Largest lateral distance at which the vehicle passes `catch_at_m` and a payload is thrown."""
 
 
 class Ball(NamedTuple):
-    """Indices of a ball: body, first place in qpos and in qvel, and the constraint that holds it in the net."""
+    """Indices of a ball: body, first index in qpos and in qvel, and the constraint that holds it in the net."""
 
     body: int
     q: int
@@ -63,9 +63,9 @@ class Payload:
         self.throws = self.catches = 0
         """Number of throws and of catches so far."""
         self._flies_since_s: float | None = None
-        """Time of the throw that is in flight; a throw that missed the net may still be caught."""
+        """Time of the present throw; a throw that missed the net may still be caught."""
         self._kept_since_s: float | None = None
-        """Time of the catch of the payload that is in the net."""
+        """Time of the catch of the payload in the net."""
         self._missed = False
         """Whether the throw in flight has missed the net."""
         self._last_x = 0.0
@@ -129,11 +129,11 @@ class Payload:
         self._world.report("taken")
 
     def await_pass(self) -> None:
-        """Wait with the next throw until the vehicle passes `catch_at_m` again."""
+        """Delay the next throw until the vehicle passes `catch_at_m` again."""
         self._last_x = self._world.q[0] + self._world.v[0] * THROW_LEAD_S
 
     def throw(self, ball: Ball, aside_m: float = 0.0) -> None:
-        """Launch a ball so that it meets a point `aside_m` to the left (world y) of the net; a person misses that point."""
+        """Launch a ball at a point `aside_m` to the left (world y) of the net, with the errors of the thrower."""
         d, thrower = self._data, self._thrower
         lead_s = THROW_LEAD_S if thrower is None else THROW_LEAD_S + thrower.prediction_error_s()
         target = d.xpos[self._net] + d.qvel[0:3] * lead_s + np.array([0.0, aside_m, 0.0])
@@ -152,7 +152,7 @@ class Payload:
             self.bag.watch(ball.body, ball.q, ball.v)
 
     def catch(self, ball: Ball) -> bool:
-        """Return whether the ball is caught: it touches the net, which then holds it, or it has settled in the bag."""
+        """Return whether the ball is caught: it touches the net, which then holds it, or has settled in the bag."""
         return self._caught_s(ball) is not None
 
     def _caught_s(self, ball: Ball) -> float | None:
@@ -174,7 +174,7 @@ class Payload:
         return True
 
     def drop(self) -> None:
-        """Let the payload fall out of the net, if it is in there."""
+        """Let the payload fall out of the net if it is in the net."""
         if self.ball is not None and self._kept_since_s is not None:
             self._data.eq_active[self.ball.catch] = 0
             if self.bag is not None:

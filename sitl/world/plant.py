@@ -39,7 +39,7 @@ class Px4(Protocol):
     """An autopilot that is stepped with IMU samples."""
 
     def step(self, imu: ImuSample) -> Vec4:
-        """Take one IMU sample and return normalised rotor commands."""
+        """Process one IMU sample and return normalised rotor commands."""
 
 
 class JointDrive(Protocol):
@@ -85,7 +85,7 @@ class Plant:
         px4: the autopilot.
         drives: motors of both joints.
         start: position, yaw and joint angles, m and rad.
-        between_steps: cameras expose at the exact time, not at the end of the physics step.
+        between_steps: the cameras expose at the exact time and not at the end of the physics step.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class Plant:
         self._mocap_errors = MocapErrors.of(config.mocap, config.seed)
         self._seed_noise()
         self._mocap_noise_rad = math.radians(config.mocap_noise_deg)
-        self._spoiled = MocapMisalignment.of(config)
+        self._misalignment = MocapMisalignment.of(config)
         self._handling = Handling(config, self.world.weight_n) if config.hand else None
         self._weight = HungWeight(config) if config.net_weight_kg > 0.0 else None
         self.force_is_read = True
@@ -142,8 +142,8 @@ class Plant:
         """Faults of this world; None if there are none."""
 
     def _seed_noise(self) -> None:
-        """Start one noise sequence per sensor. It restarts at arming, so that the noise in flight depends only on the seed: not on the
-        time before arming, nor on how often another sensor is read."""
+        """Start one noise sequence per sensor. It restarts at arming, so that the noise in flight depends only on the seed, not on the
+        time before arming or the reads of another sensor."""
         self._mocap_noise, self._imu_noise, self._force_noise = (
             noise(self._config.seed, sensor) for sensor in (_MOCAP, _IMU, _FORCE)
         )
@@ -226,7 +226,7 @@ class Plant:
         return self._tick % IMU_EVERY == 0
 
     def sample_imu(self) -> ImuSample:
-        """Return that sample before the step, for an autopilot that needs time to answer."""
+        """Return the IMU sample before the step, for an autopilot that needs time to answer."""
         if self._imu_sample is None:
             self._imu_sample = self._imu()
         return self._imu_sample
@@ -270,8 +270,8 @@ class Plant:
         if faults is not None:
             position, attitude, visible = faults.pose(position, attitude)
             valid = valid and visible
-        if self._spoiled is not None:
-            position, attitude = self._spoiled.pose(position, attitude)
+        if self._misalignment is not None:
+            position, attitude = self._misalignment.pose(position, attitude)
         sent_s = t_s + latency_s
         if self._mocap_errors is not None:
             sent_s = self._mocap_errors.sent_s(sent_s)
@@ -303,7 +303,7 @@ class Plant:
         return [] if self.fault("mocap_loss") else frames
 
     def battery(self) -> Battery:
-        """Return what the power module measures. Without the battery effect the charge falls with the time since arming."""
+        """Return the measurement of the power module. Without the battery effect the charge falls with the time since arming."""
         pack, sag_v = self.world.battery, 0.0 if self.faults is None else self.faults.sag_v
         if pack is not None:
             return Battery(pack.voltage_v - sag_v, pack.current_a, pack.remaining, pack.drawn_as / 3.6)

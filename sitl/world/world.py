@@ -94,7 +94,7 @@ class WorldEvent:
 
     t_s: float
     kind: str
-    """thrown, caught, taken (out of the net), missed, bounced_out (of the bag) or crashed."""
+    """Kind: thrown, caught, taken (out of the net), missed, bounced_out (of the bag) or crashed."""
 
 
 class Effect(Protocol):
@@ -152,7 +152,7 @@ class World:
         self.loads = Loads(d)
         self.payload = Payload(self, vehicle, config)
         self.effects = self._effects_on()
-        """Effects that load bodies and are on."""
+        """Active effects that load bodies."""
         self._step = 0
         """Steps since the noise of the effects began."""
         self.t_s = 0.0
@@ -165,7 +165,7 @@ class World:
         self._place(start_position_m, start_yaw_rad, arm_rad)
 
     def _effects_on(self) -> tuple[Effect, ...]:
-        """Return the effects that are on."""
+        """Return the active effects."""
         config, vehicle = self._config, self._vehicle
         effects: tuple[Effect | None, ...] = (
             Air.of(config.air, config.seed, self._base, self.weight_n),
@@ -196,7 +196,7 @@ class World:
         self.loads.set(self._net, "push", force_world_n)
 
     def hold(self, wrench: Wrench | None) -> None:
-        """Set force and torque of a hand on the base; None releases it."""
+        """Set force and torque of a hand on the base; None releases the base."""
         self.loads.set(self._base, "hold", *(wrench or (ZERO, ZERO)))
 
     def restart_noise(self) -> None:

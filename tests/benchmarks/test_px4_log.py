@@ -58,7 +58,7 @@ def test_modes_are_those_that_flew() -> None:
 
 
 def test_no_log_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(Px4Error, match="expected a log of PX4 in px4/log, found none; was it flown with --sitl=px4"):
+    with pytest.raises(Px4Error, match="expected a log of PX4 in px4/log, found none; fly it with --sitl=px4"):
         newest(tmp_path)
 
 

@@ -175,7 +175,7 @@ def test_a_part_that_fails_ends_no_other(
     assert command.main(["--out", str(out), "--only", "joints", "--only", "setpoint", "--only", "core"]) == 1
     found = json.loads((out / "results.json").read_text())
     assert found["parts"]["joints"]["failed"] == "the bus did not start"
-    assert found["parts"]["setpoint"]["failed"].startswith("it ended with exit code")
+    assert found["parts"]["setpoint"]["failed"].startswith("the part ended with exit code")
     assert found["parts"]["core"]["figures"] == {"law_us": 7.5}
     assert {row["what"]: row["figures"] for row in found["rows"]}["the law alone, us"] == {"p50": 7.5}
     assert "joints was not measured: the bus did not start" in (out / "results.md").read_text()

@@ -97,7 +97,7 @@ def test_lateness_that_grows_is_told_unless_the_machine_grew_as_late() -> None:
     assert lateness_problems(growing, growing) == []
     spike = minutes([1.0] * 55 + [30.0] + [1.0] * 4)
     assert lateness_problems(spike, flat) == [], "one bad minute is no growth"
-    assert lateness_problems(minutes([1.0, 1.0]), flat) == ["too short to tell whether lateness grows"]
+    assert lateness_problems(minutes([1.0, 1.0]), flat) == ["too short to show growth of lateness"]
 
 
 def test_minutes_are_cut_at_sixty_seconds() -> None:

@@ -319,7 +319,7 @@ def test_a_px4_started_by_hand_that_comes_late_flies(tmp_path: Path, autopilot: 
         with sandbox.start("fly", HOVER, f"--sitl={autopilot}", "--out", "out") as running:
             running.wait_for(f"by hand, on TCP 456{number}")
             with px4_by_hand(number, tmp_path / "rootfs") as px4:
-                running.wait_for("start it once more, in the same folder")
+                running.wait_for("start it again in the same folder")
                 px4.terminate()
                 px4.wait(DEADLINE_S)
             with px4_by_hand(number, tmp_path / "rootfs"):

@@ -18,7 +18,7 @@ from companion.sitl_config.world import World
 from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
-from sitl.px4.backend import STUB_ONLY_FAULTS, refuse_what_needs_the_stub
+from sitl.px4.backend import STUB_ONLY_FAULTS, refuse_stub_only_settings
 from sitl.px4.control_link import ControlLink, same
 from sitl.px4.hil_link import Px4Error
 from sitl.px4.parameters import parameters, rotor_geometry
@@ -119,15 +119,15 @@ def test_the_hover_thrust_is_wrong_by_what_the_world_says() -> None:
 def test_a_fault_that_needs_the_stub_is_refused_in_one_line(kind: str) -> None:
     world = World(faults=(Fault.model_validate({"kind": kind, "t_s": 1.0}),))
     with pytest.raises(Px4Error, match=f"world.faults: {kind} .* which only the stub can simulate; run with --sitl"):
-        refuse_what_needs_the_stub(world)
+        refuse_stub_only_settings(world)
 
 
 def test_every_other_fault_is_flown() -> None:
-    refuse_what_needs_the_stub(World(faults=(Fault(kind="link_delay", t_s=1.0), Fault(kind="kill_flight", t_s=1.0))))
+    refuse_stub_only_settings(World(faults=(Fault(kind="link_delay", t_s=1.0), Fault(kind="kill_flight", t_s=1.0))))
     with pytest.raises(Px4Error, match="battery_start"):
-        refuse_what_needs_the_stub(World(battery_start=0.5))
+        refuse_stub_only_settings(World(battery_start=0.5))
     sag = Fault(kind="battery_sag", t_s=1.0)
-    refuse_what_needs_the_stub(World(battery_start=0.5, battery=BatteryConfig(on=True), faults=(sag,)))
+    refuse_stub_only_settings(World(battery_start=0.5, battery=BatteryConfig(on=True), faults=(sag,)))
 
 
 def test_a_battery_of_the_world_takes_the_place_of_px4s_own() -> None:

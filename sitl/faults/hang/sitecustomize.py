@@ -10,14 +10,14 @@ import time
 
 
 def _hold_gil(*_: object) -> None:
-    """Block while holding the interpreter lock, as a faulty extension module does: no Python thread runs any more."""
+    """Block while holding the interpreter lock, as a faulty extension module does; no Python thread runs."""
     libc = ctypes.PyDLL(None)
     while True:
         libc.sleep(3600)
 
 
 def _stall_loop(*_: object) -> None:
-    """Block the event loop: other threads go on, but no tick runs."""
+    """Block the event loop: other threads continue, but no tick runs."""
     # The signal handler runs in the thread of the event loop.
     until_s = time.monotonic() + float(os.environ.get("COMPANION_SITL_STALL_S", "inf"))
     while (left_s := until_s - time.monotonic()) > 0.0:

@@ -16,11 +16,11 @@ _NOISE = 13
 
 
 class Air:
-    """The gusts.
+    """Gusts on the base.
 
     Args:
         config: section `air`.
-        seed: of the world.
+        seed: seed of the world.
         base: MuJoCo's index of the base.
         weight_n: weight of the vehicle, its thrust in hover.
     """
@@ -50,8 +50,8 @@ class Air:
         """Return the gusts' strength relative to hover far from the floor.
 
         Args:
-            thrust_n: of all rotors.
-            height_m: of the base above the floor.
+            thrust_n: thrust of all rotors.
+            height_m: height of the base above the floor.
         """
         near = max(0.0, 1.0 - height_m / self._config.floor_range_m)
         return thrust_n / self._weight_n * (1.0 + self._config.floor_increase * near)

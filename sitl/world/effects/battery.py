@@ -27,7 +27,7 @@ class BatteryPack:
     Args:
         config: section `battery`.
         start: state of charge at arming, 0 to 1.
-        life_s: time in which hovering would empty a full battery.
+        life_s: hover time of a full battery.
         weight_n: weight of the vehicle, for the hover current.
     """
 
@@ -67,7 +67,7 @@ class BatteryPack:
         return max(0.0, self._start - self.drawn_as / self.capacity_as)
 
     def thrust_ratio(self, voltage_v: float) -> float:
-        """Return the thrust at this voltage over the thrust that the vehicle file states, at the same motor signal."""
+        """Return the ratio of the thrust at this voltage to the vehicle file's thrust at the same motor signal."""
         ratio = voltage_v / self._full_thrust_v
         return ratio * ratio
 

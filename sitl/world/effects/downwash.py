@@ -4,8 +4,8 @@ A wake develops and contracts as momentum theory gives it: at a depth of z rotor
 velocity in hover sqrt(T / (2 rho A)) times 1 + z / sqrt(1 + z^2), and the area shrinks by continuity. Turbulence smears its edge and
 keeps its momentum; the momenta of the four wakes add (Reichardt's hypothesis for free turbulence). The cross-section is taken as a
 square of the same area, of which the smeared profile is a product of error functions. All dynamic pressures are proportional to
-thrust, and the density of the air cancels. The flow turns aside above the floor. A link feels the flow across its axis (cross-flow
-principle, Hoerner 1965), acting at its middle; net and payload feel all of it, at their centres of mass.
+thrust, and the density of the air cancels. The flow turns aside above the floor. The flow across its axis loads a link (cross-flow
+principle, Hoerner 1965) at its middle; the whole flow loads net and payload at their centres of mass.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Wakes:
 
     Args:
         rotor_offset_m: distance of the rotors from the x-z plane and the y-z plane of the body.
-        radius_m: of a rotor.
+        radius_m: radius of a rotor.
         spread: see section `downwash`.
     """
 
@@ -43,8 +43,8 @@ class Wakes:
         """Return the mean dynamic pressure.
 
         Args:
-            thrust_n: of each rotor, in PX4's quad-x order.
-            point_m: relative to the centre of the four rotors, body FLU.
+            thrust_n: thrust of each rotor, in PX4's quad-x order.
+            point_m: position relative to the centre of the four rotors, body FLU.
             blur_m: standard deviation along x and y of the area over which the pressure is averaged.
         """
         x, y, z = point_m
@@ -65,7 +65,7 @@ class Wakes:
 
 
 def _smeared(x_m: float, half_m: float, per_m: float) -> float:
-    """Return the share, 0 to 1, that a smeared strip from -`half_m` to `half_m` has at `x_m`."""
+    """Return the profile, 0 to 1, of a smeared strip from -`half_m` to `half_m` at `x_m`."""
     return 0.5 * (math.erf((x_m + half_m) * per_m) - math.erf((x_m - half_m) * per_m))
 
 
@@ -77,7 +77,7 @@ class Downwash:
         rotor_radius_m: radius of a rotor.
         vehicle: vehicle file.
         world: the world whose bodies it loads.
-        seed: of the world.
+        seed: seed of the world.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
-"""Errors of the autopilot's IMU: bias, drift, mounting, and the rotors' vibration as the mean over a sample has it.
+"""Errors of the autopilot's IMU: bias, drift, mounting, and the rotors' vibration averaged over a sample.
 
 A sample of PX4 is the mean of raw samples since the last one (vehicle_imu's delta velocity and delta angle). The mean of a vibration is
-integrated exactly; what the mean leaves, and what it aliases, is in the sample. An unbalanced rotor shakes the body in the rotor's
+integrated exactly; its remainder and its alias are in the sample. An unbalanced rotor shakes the body in the rotor's
 plane with its own frequency and a force proportional to the square of its speed, hence to its thrust. A rotor of two blades shakes the
 body along its axis with twice its frequency, and therefore also turns it.
 """
@@ -25,7 +25,7 @@ _APART = (-1.0, 1.0 / 3.0, -1.0 / 3.0, 1.0)
 
 
 class ImuErrors:
-    """Turns true samples into measured ones.
+    """Converts true samples to measured ones.
 
     Args:
         config: the section.

@@ -1,4 +1,4 @@
-"""The machine as it is built, which differs from its vehicle file."""
+"""The built machine, which differs from its vehicle file."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def shoulder_ypr_rad(machine: Machine) -> Vec3:
     return (math.radians(yaw), math.radians(pitch), math.radians(roll))
 
 
-def _inertia_kg_m2(believed: Vec3, machine: Machine) -> Vec3:
-    """Return the true moments of inertia; each is limited to the sum of the other two, as of every body."""
-    x, y, z = (moment * (1.0 + error) for moment, error in zip(believed, machine.inertia_error, strict=True))
+def _inertia_kg_m2(nominal: Vec3, machine: Machine) -> Vec3:
+    """Return the true moments of inertia; each is limited to the sum of the other two, as for every rigid body."""
+    x, y, z = (moment * (1.0 + error) for moment, error in zip(nominal, machine.inertia_error, strict=True))
     return (min(x, y + z), min(y, x + z), min(z, x + y))

@@ -1,4 +1,4 @@
-"""Errors of motion capture: the pivot beside the body's origin, hidden markers, lost frames, uneven delivery.
+"""Errors of motion capture: offset of the pivot, hidden markers, lost frames, uneven delivery.
 
 Yaw and tilt of the rigid body are in `sitl.world.mocap_misalignment`.
 """
@@ -18,7 +18,7 @@ _STREAM = 12
 
 
 class MocapErrors:
-    """Turns true poses into tracked ones.
+    """Converts true poses to tracked ones.
 
     Args:
         config: the section.
@@ -45,7 +45,7 @@ class MocapErrors:
         self._lost = False
         self._loss_changes_s = t_s + self._after(self._tracked_s)
         self._hidden_s = t_s + self._after(self._config.wobble_every_s)
-        """When markers are hidden, or will be."""
+        """Times at which markers are hidden next."""
         self._draw_wobble()
 
     def _after(self, mean_s: float) -> float:
@@ -57,7 +57,7 @@ class MocapErrors:
         self._wobble = ((m * x, m * y, m * z), (rad * roll, rad * pitch, rad * yaw))
 
     def pose(self, t_s: float, position_world_m: Vec3, attitude_wxyz: Quat) -> tuple[Vec3, Quat, bool]:
-        """Return the pose that the cameras see at `t_s`, and whether they track the body."""
+        """Return the measured pose at `t_s`, and whether the body is tracked."""
         config = self._config
         x, y, z = quat_rotate(attitude_wxyz, config.pivot_offset_m)
         x, y, z = position_world_m[0] + x, position_world_m[1] + y, position_world_m[2] + z
@@ -75,7 +75,7 @@ class MocapErrors:
         return (x, y, z), attitude_wxyz, not self._lost
 
     def sent_s(self, due_s: float) -> float:
-        """Return when the next frame leaves that would leave at `due_s` without jitter."""
+        """Return the transmission time of the next frame, which is `due_s` without jitter."""
         late_s = due_s + float(self._rng.standard_exponential()) * self._config.delivery_jitter_s
         self._sent_s = late_s if late_s > self._sent_s else self._sent_s
         return self._sent_s

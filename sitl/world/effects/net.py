@@ -43,11 +43,11 @@ class Bag:
         self.pivot_m = (0.0, 0.0)
         """x and y of the point about which the payload swings."""
         self.entered_s: float | None = None
-        """Time at which the payload came into the bag; None if it is not in there."""
+        """Time at which the payload came into the bag; None if it is not in the bag."""
         self.touched_s: float | None = None
         """Time of the first contact with hoop or mesh since the throw or since it bounced out."""
         self.bounced = False
-        """Whether the payload has just left the bag after it touched the mesh, without having been caught."""
+        """Whether the payload has just left the bag after it touched the mesh, without a catch."""
         self._above = True
 
     def caught_s(self, t_s: float) -> float | None:
@@ -60,8 +60,8 @@ class Bag:
         """Return the force on the payload, or None without contact.
 
         Args:
-            position: of the payload's centre from the centre of the hoop.
-            velocity: of the payload against the point of the net's frame at its centre.
+            position: position of the payload's centre relative to the centre of the hoop.
+            velocity: velocity of the payload relative to the point of the net's frame at its centre.
             t_s: world time.
         """
         x, y, z = position
@@ -166,12 +166,12 @@ class Net:
         return cls(config, model, data, loads, hoop_radius_m, payload_radius_m) if config.on else None
 
     def watch(self, body: int, q: int, v: int) -> None:
-        """Let the net act on a payload that is thrown: its body and its first places in qpos and qvel."""
+        """Let the net act on a thrown payload, given its body and its first indices in qpos and qvel."""
         self.let_go(body)
         self._bags[body] = (Bag(self._config, *self._radii_m), q, v)
 
     def let_go(self, body: int) -> None:
-        """Let the net no longer act on a payload."""
+        """Stop the net's action on a payload."""
         self._bags.pop(body, None)
         self._release(body)
 
@@ -197,7 +197,7 @@ class Net:
             self._loads.write()
             mujoco.mj_step(self._model, self._data)
             return False
-        # The first half brings the net's pose and velocity up to date: forces of the step before would add energy.
+        # The first half brings the net's pose and velocity up to date: forces of the previous step would add energy.
         mujoco.mj_step1(self._model, self._data)
         for body, (bag, at_q, at_v) in near:
             self._press(body, bag, q[at_q : at_q + 3], v[at_v : at_v + 3], t_s)

@@ -1,4 +1,4 @@
-"""Ornstein-Uhlenbeck processes: noise with unit RMS that forgets exponentially."""
+"""Ornstein-Uhlenbeck processes: noise with unit RMS and exponential autocorrelation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class OrnsteinUhlenbeck:
         count: number of triples.
         correlation_time_s: time after which the autocorrelation has fallen to 1/e.
         period_s: time between two samples.
-        seed: of the world.
+        seed: seed of the world.
         source: number of the noise sequence.
     """
 

@@ -64,7 +64,7 @@ class Rotors:
 
     Args:
         config: section `rotors`.
-        rotor_arm_m: from the centre to each rotor.
+        rotor_arm_m: distance from the centre to each rotor.
         dt_s: physics step.
     """
 
@@ -129,7 +129,7 @@ class Rotors:
         """Return the drag of all rotors, N, world frame: against the airspeed across the rotor axis.
 
         Args:
-            thrust_n: of all rotors.
+            thrust_n: thrust of all rotors.
             airspeed_m_s: velocity of the air relative to the vehicle, world frame.
             q: position and attitude of the base, as MuJoCo's qpos.
         """

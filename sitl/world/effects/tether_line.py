@@ -1,6 +1,6 @@
 """Pull of the slack tether on the vehicle: the weight of the hanging part, a catenary when little slack is left, friction on the floor.
 
-The taut line stays MuJoCo's tendon limit, and `Truth.tether_tension_n` is the limit's tension alone: it does not contain this pull. The
+The taut line remains MuJoCo's tendon limit, and `Truth.tether_tension_n` is only the limit's tension, without this pull. The
 catenary's tension grows without bound towards no slack, so it is computed with at least `SLACK_MIN_SHARE` of the distance as slack.
 Air drag of the line is left out: at 0.5 m/s a hanging metre of 5 mm rope has less than 1 mN.
 """
@@ -64,7 +64,7 @@ def hanging(level_m: float, height_m: float, length_m: float, weight_n_m: float)
 
 
 def _length_m(level_m: float, height_m: float, a_m: float) -> float:
-    """Return the length of a catenary, with a rest on the floor if it touches, whose horizontal tension is the weight of `a_m`."""
+    """Return the length of a catenary, including a part on the floor, whose horizontal tension is the weight of `a_m` of line."""
     reach_m = a_m * math.acosh(1.0 + height_m / a_m)
     if reach_m <= level_m:
         return math.sqrt(height_m * (height_m + 2.0 * a_m)) + level_m - reach_m

@@ -3,7 +3,7 @@
 The angle of the joint in MuJoCo is the true angle of the link. The rotor is integrated here, one degree of freedom per joint:
 the motor's torque and the friction act on it, and a spring with backlash connects it to the link. The stiffness of that spring is the
 series of gear and mount (or link), whose masses between are negligible. Springs and rotors inside MuJoCo would need bodies for these
-masses, whose frequencies of several hundred hertz a step of 2 ms does not represent.
+masses, and a step of 2 ms does not represent their frequencies of several hundred hertz.
 
 Friction: Duclusaud et al., "Extended Friction Models for the Physics Simulation of Servo Actuators", ICRA 2025 (arXiv 2410.08650),
 model M4, with their update: friction is the torque that would stop the rotor within the step, limited to
@@ -100,7 +100,7 @@ class Transmission:
         stretch, torque_nm = self._stretch_rad, 0.0
         if stretch != 0.0:
             torque_nm = self._stiffness_nm * stretch + self._damping_nms * self._stretch_rad_s
-            if torque_nm * stretch < 0.0:  # the tooth lifts off, it does not pull
+            if torque_nm * stretch < 0.0:  # the tooth lifts off instead of pulling
                 torque_nm = 0.0
         dt_s, inertia, velocity = self._dt_s, self._armature_kg_m2, self._rotor_rad_s
         net_nm = motor_nm - torque_nm
