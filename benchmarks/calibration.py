@@ -25,6 +25,8 @@ from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import fly_to_end, log_of, with_world
 
 MISSION = Path(__file__).parents[1] / "configs" / "missions" / "catch.yaml"
+FLIGHT_S = 11.0
+"""End of each flight, from power-on; the catch is at about 10 s."""
 SOFT_CSC = (
     "controller.inertia_md=[3, 3, 3, 1, 1, 1, 0.0742098, 0.0742098]",
     "controller.damping_kd=[5.5, 5.5, 6, 20, 20, 4, 0.7, 0.7]",
@@ -49,7 +51,7 @@ def errors(name: str, world: str, seed: int) -> tuple[float, float, float]:
     """Fly one laboratory; return before the catch RMS ||e_p|| in mm, ||e_q|| and the attitude from level in deg. NaN is unknown."""
     law, preset, overrides, _, _ = LAWS[name]
     config = load_sitl(MISSION, None, law, preset, overrides, world=world)
-    flown = fly_to_end(with_world(config, {"seed": seed}))
+    flown = fly_to_end(with_world(config, {"seed": seed}), FLIGHT_S)
     log = log_of(flown.config.flight, flown.result, flown.caught_t_s)
     before, _ = metrics.flight_masks(log)
     rms = metrics.tracking_rms(log, before)
