@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from companion.mission.plan import STOP_MIN_S, Plan
+from companion.mission.plan import Plan
+from companion.mission.plan_builder import STOP_MIN_S
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED, slow_down, speed_up
 from companion.mission.segments import Segment
 from companion.model.types import Reference

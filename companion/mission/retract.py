@@ -5,13 +5,8 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Room, Vehicle
-from companion.mission.plan import (
-    FOLD_MIN_S,
-    FOLD_SPEED_RAD_S,
-    Plan,
-    PlanBuilder,
-    stopping,
-)
+from companion.mission.plan import FOLD_MIN_S, FOLD_SPEED_RAD_S, Plan
+from companion.mission.plan_builder import PlanBuilder, stopping
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED
 from companion.mission.segments import Segment
 from companion.model.types import PhaseKind, Vec2, Vec3
@@ -86,7 +81,7 @@ def retract_from(
         Segment(name="return", kind=PhaseKind.FLIGHT, start_s=segments[0].end_s, end_s=builder.t_s, index=-1)
     )
     builder.segments += segments
-    return builder.plan("retract")
+    return Plan.of("retract", builder)
 
 
 def _never_outward(velocity_m_s: Vec3, duration_s: float, position_m: Vec3, anchor_m: Vec3) -> Vec3:

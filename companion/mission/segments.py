@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from companion.config.mission import Mission
+from companion.config.mission import ArmMove, Line, Mission, Path, Phase
 from companion.model.types import PhaseKind
 
 
@@ -80,3 +80,19 @@ def repeats_of(mission: Mission, segments: Sequence[Segment], names: tuple[str, 
 def counted(name: str, repetition: int, count: int) -> str:
     """Return the name of a phase for display."""
     return f"{name} ({repetition} of {count})" if repetition else name
+
+
+_PLAIN_NAMES = {"takeoff": "take-off", "hold": "hold", "land": "land"}
+
+
+def phase_name(phase: Phase) -> str:
+    """Return the name of a phase: its own, or what it does."""
+    if phase.name:
+        return phase.name
+    if isinstance(phase, Line):
+        return f"line to ({', '.join(f'{value:g}' for value in phase.to_m)}) m"
+    if isinstance(phase, Path):
+        return f"path to ({', '.join(f'{value:g}' for value in phase.through_m[-1])}) m"
+    if isinstance(phase, ArmMove):
+        return f"arm to ({', '.join(f'{value:g}' for value in phase.arm_deg)}) deg"
+    return _PLAIN_NAMES[phase.type]

@@ -1,16 +1,23 @@
-"""The servo bus of the fast closed loop: the outcome of the companion's bus set-up, computed without a pty."""
+"""The servo bus of the fast closed loop, without a pty: the outcome of the companion's bus set-up, reads and writes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+from msgspec.structs import replace
+
 from companion.config.vehicle import Joint, Vehicle
-from companion.io.dynamixel.registers import JointScale, joint_scale
+from companion.io.dynamixel.registers import WATCHDOG_ERROR, JointScale, joint_scale
+from companion.model.types import ArmState, Vec2
+from sitl.faults.injector import COOL_C, Faults
 from sitl.servo import registers as reg
 from sitl.servo.bus import ServoLine
+from sitl.servo.drive import MODE_CURRENT, ServoDrive
 from sitl.servo.model import ServoModel
 from sitl.servo.protocol import Instruction, packet, status
 
+_HEALTHY = (0, 0)
+_COOL = (COOL_C, COOL_C)
 _LIMIT = reg.CURRENT_LIMIT
 _READ_LIMIT = bytes((Instruction.READ, *_LIMIT.address.to_bytes(2, "little"), *_LIMIT.size.to_bytes(2, "little")))
 
@@ -46,3 +53,104 @@ def _current_limit_counts(line: ServoLine, joint: Joint, baud_bps: int) -> int |
         return None
     data = own[0].read(_LIMIT.address, _LIMIT.size)
     return _LIMIT.decode(data) if answer == status(joint.servo_id, 0, data) else None
+
+
+class FastBus:
+    """The companion's cycle on the bus of two servos.
+
+    Args:
+        drives: motors of the servos, in current mode from now on.
+        scales: scale of each joint; None if the set-up of the bus failed, and then the arm never answers.
+        watchdog_s: timeout of the servos' bus watchdog.
+        faults: of the world; None if it has none.
+    """
+
+    def __init__(
+        self,
+        drives: Sequence[ServoDrive],
+        scales: tuple[JointScale, JointScale] | None,
+        watchdog_s: float,
+        faults: Faults | None,
+    ) -> None:
+        self._drives, self._scales, self._watchdog_s, self._faults = drives, scales, watchdog_s, faults
+        self._goal_s = 0.0
+        self._arm: ArmState | None = None
+        for drive in drives:
+            drive.mode, drive.torque_on = MODE_CURRENT, True
+            drive.set_goal_current(0, at_once=True)
+            drive.start_watchdog(watchdog_s)
+
+    def read(self, t_s: float) -> ArmState | None:
+        """Return the joint state of this tick, or the last one with one more failure."""
+        if self._arm is None or self._faults is None or not self._read_fails(self._faults):
+            self._arm = self._state(t_s)
+        else:
+            self._arm = replace(self._arm, read_failures=self._arm.read_failures + 1)
+        return self._arm
+
+    def keep_alive(self, t_s: float) -> None:
+        """Do what the bus thread does while the flight process stalls: feed the watchdogs, withdraw stale currents."""
+        for drive in self._drives:
+            drive.heard_instruction()
+            if t_s - self._goal_s > self._watchdog_s:
+                drive.set_goal_current(0)
+
+    def write(self, t_s: float, torque_nm: Vec2 | None) -> None:
+        """Write the currents of these torques; None to write none, and then stale currents are withdrawn."""
+        faults = self._faults
+        if torque_nm is not None and self._scales is not None:
+            self._goal_s = t_s
+            (drive1, drive2), (scale1, scale2) = self._drives, self._scales
+            counts = (scale1.current_counts(torque_nm[0]), scale2.current_counts(torque_nm[1]))
+            if faults is None:
+                drive1.set_goal_current(counts[0])
+                drive2.set_goal_current(counts[1])
+            elif not faults.packet_lost():
+                self._set(faults, counts)
+        elif faults is not None and t_s - self._goal_s > self._watchdog_s and not faults.packet_lost():
+            # As the bus thread does with a stale goal; a servo that is lost has its own watchdog.
+            self._set(faults, (0, 0))
+
+    def _set(self, faults: Faults, counts: tuple[int, int]) -> None:
+        lost = faults.active.get("servo_loss")
+        for number, (drive, goal) in enumerate(zip(self._drives, counts, strict=True), start=1):
+            if lost is None or lost.servo != number:
+                drive.set_goal_current(goal)
+
+    def _read_fails(self, faults: Faults) -> bool:
+        """Return whether this read fails. Servos that are not lost still receive the instruction, unless noise damaged it."""
+        lost = faults.active.get("servo_loss")
+        damaged = faults.packet_lost()
+        if lost is None:
+            return damaged
+        if not damaged:
+            self._drives[2 - lost.servo].heard_instruction()
+        return True
+
+    def _state(self, t_s: float) -> ArmState | None:
+        if self._scales is None:
+            return None
+        (drive1, drive2), (scale1, scale2) = self._drives, self._scales
+        current1, speed1, position1 = drive1.present()
+        current2, speed2, position2 = drive2.present()
+        errors, temperatures_c = _HEALTHY, _COOL
+        if self._faults is not None:
+            (e1, e2), (c1, c2) = self._faults.errors, self._faults.temperatures_c
+            errors, temperatures_c = (e1, e2), (c1, c2)
+        if drive1.watchdog_tripped or drive2.watchdog_tripped:
+            # As the driver does: reported in one state, then restarted with zero current.
+            tripped = (drive1.watchdog_tripped * WATCHDOG_ERROR, drive2.watchdog_tripped * WATCHDOG_ERROR)
+            errors = (errors[0] | tripped[0], errors[1] | tripped[1])
+            drive1.start_watchdog(self._watchdog_s)
+            drive2.start_watchdog(self._watchdog_s)
+        drive1.heard_instruction()
+        drive2.heard_instruction()
+        return ArmState(
+            stamp_s=t_s,
+            angle_rad=(scale1.angle_rad(position1), scale2.angle_rad(position2)),
+            velocity_rad_s=(scale1.velocity_rad_s(speed1), scale2.velocity_rad_s(speed2)),
+            torque_nm=(scale1.torque_nm(current1), scale2.torque_nm(current2)),
+            hardware_error=errors,
+            temperature_c=temperatures_c,
+            read_failures=0,
+        )

@@ -11,10 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from msgspec.structs import replace
-
 from companion.core.flight_core import FlightCore
-from companion.io.dynamixel.registers import WATCHDOG_ERROR
 from companion.io.px4.delta_velocity import DeltaVelocity
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.frames import (
@@ -25,7 +22,6 @@ from companion.model.frames import (
     ned_from_enu,
 )
 from companion.model.types import (
-    ArmState,
     AutopilotRequest,
     AutopilotStatus,
     Event,
@@ -49,14 +45,13 @@ from sitl.autopilot.commander import FORCE_MAGIC, Command
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.telemetry import system_status
 from sitl.autopilot.types import AttitudeTarget, ImuSample
-from sitl.fast.bus import scales_of
+from sitl.fast.bus import FastBus, scales_of
 from sitl.fast.guardian import TAKE_OVER_S, FastGuardian, Landing
 from sitl.fast.link import FastLink
-from sitl.faults.injector import COOL_C, Faults
+from sitl.faults.injector import Faults
 from sitl.faults.timing import with_fault_times
 from sitl.force_torque import overloaded, quantised
 from sitl.server import start_of
-from sitl.servo.drive import MODE_CURRENT
 from sitl.servo.from_config import plugged_in, servos_of
 from sitl.world.plant import MocapFrame, Plant
 from sitl.world.world import Layout, Snapshot, Truth
@@ -68,8 +63,6 @@ POSITION_PERIOD_S = 1.0 / 124.0
 _NO_COMMAND, _LAND = OperatorCommand.NONE, OperatorCommand.LAND
 _ON_GROUND, _IN_AIR = LandedState.ON_GROUND, LandedState.IN_AIR
 _NO_REQUEST = AutopilotRequest.NONE
-_HEALTHY = (0, 0)
-_COOL = (COOL_C, COOL_C)
 SETTLE_S = 30.0
 """Longest time for which the world continues after a flight that ends armed."""
 FLIGHT_PROCESS_FAULTS: frozenset[FaultKind] = frozenset({"stall_loop", "hold_gil", "stop_flight", "kill_flight"})
@@ -151,16 +144,15 @@ class FastFlight:
         self._land_at_s = land_at_s
         self.px4 = stub_of(world, LINK_DELAY_S)
         servos = servos_of(vehicle, world)
-        self._drives = [servo.drive for servo in servos]
+        drives = [servo.drive for servo in servos]
         pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
         self._imu = _RecordedImu(self.px4)
-        self.plant = Plant(vehicle, world, self._imu, self._drives, (pose.position_m, pose.yaw_rad, pose.arm_rad))
-        self.faults = Faults(world, self.plant.world, self.px4, self._drives, vehicle.tether.anchor_world_m)
+        self.plant = Plant(vehicle, world, self._imu, drives, (pose.position_m, pose.yaw_rad, pose.arm_rad))
+        self.faults = Faults(world, self.plant.world, self.px4, drives, vehicle.tether.anchor_world_m)
         if world.faults:
             self.plant.faults = self.faults
         self._guardian = FastGuardian(vehicle, self.px4) if world.faults else None
         self._link = FastLink(self.faults, self.plant.world, self.px4, TICK_PERIOD_S)
-        self._goal_s = 0.0
         hover = set_hover_thrust(self.px4, world, self.plant.world)
         if vehicle.airframe.hover_thrust is None:
             airframe = vehicle.airframe.model_copy(update={"hover_thrust": hover})
@@ -168,16 +160,12 @@ class FastFlight:
             config = config.model_copy(update={"vehicle": vehicle})
         self.config = config
         self.core = FlightCore(config.flight)
-        self._watchdog_s = vehicle.devices.arm.watchdog_ms * 1e-3
-        for drive in self._drives:
-            drive.mode, drive.torque_on = MODE_CURRENT, True
-            drive.set_goal_current(0, at_once=True)
-            drive.start_watchdog(self._watchdog_s)
-        self._scales = scales_of(vehicle, plugged_in(servos, world))
-        """Scale of each joint; None if the set-up of the servo bus failed, and then the arm never answers."""
+        scales = scales_of(vehicle, plugged_in(servos, world))
+        self._bus = FastBus(
+            drives, scales, vehicle.devices.arm.watchdog_ms * 1e-3, self.faults if world.faults else None
+        )
         self._mocap: MocapPose | None = None
         self._force: ForceSample | None = None
-        self._arm: ArmState | None = None
         self._position = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
         self._trusted = True
         """Whether the core trusts motion capture; only trusted poses are forwarded to PX4."""
@@ -245,11 +233,8 @@ class FastFlight:
         """Return whether a fault keeps the flight process from its tick, and perform the actions of its bus thread."""
         active, t_s = self.faults.active, self.plant.world.t_s
         guardian.alive = "kill_guardian" not in active
-        if "stall_loop" in active:  # the bus thread continues: it feeds the watchdogs and withdraws stale currents
-            for drive in self._drives:
-                drive.heard_instruction()
-                if t_s - self._goal_s > self._watchdog_s:
-                    drive.set_goal_current(0)
+        if "stall_loop" in active:
+            self._bus.keep_alive(t_s)
         return not active.keys().isdisjoint(FLIGHT_PROCESS_FAULTS)
 
     def _guardian_lands(self, guardian: FastGuardian, result: FastResult, limit_s: float) -> None:
@@ -319,10 +304,6 @@ class FastFlight:
             self._force = ForceSample(
                 stamp_s=t_s, force_sensor_n=force, torque_sensor_nm=torque, overload=overloaded(*load)
             )
-        if self._arm is None or plant.faults is None or not self._bus_fails():
-            self._arm = self._read_arm(t_s)
-        else:
-            self._arm = replace(self._arm, read_failures=self._arm.read_failures + 1)
         land = self._land_at_s is not None and t_s >= self._land_at_s
         return Inputs(
             tick=tick,
@@ -330,22 +311,12 @@ class FastFlight:
             vehicle=vehicle,
             status=status,
             mocap=self._mocap,
-            arm=self._arm,
+            arm=self._bus.read(t_s),
             force=self._force,
             command=_LAND if land else _NO_COMMAND,
             recorder_dropped=dropped,
             guardian_ready=guardian_ready,
         )
-
-    def _bus_fails(self) -> bool:
-        """Return whether this read fails. Servos that are not lost still receive the instruction, unless noise damaged it."""
-        lost = self.faults.active.get("servo_loss")
-        damaged = self.faults.packet_lost()
-        if lost is None:
-            return damaged
-        if not damaged:
-            self._drives[2 - lost.servo].heard_instruction()
-        return True
 
     def _vehicle(self, t_s: float) -> VehicleState | None:
         estimate = self.px4.estimate
@@ -381,36 +352,8 @@ class FastFlight:
             system_status=system_status(self.px4),
         )
 
-    def _read_arm(self, t_s: float) -> ArmState | None:
-        if self._scales is None:
-            return None
-        (drive1, drive2), (scale1, scale2) = self._drives, self._scales
-        current1, speed1, position1 = drive1.present()
-        current2, speed2, position2 = drive2.present()
-        errors, temperatures_c = _HEALTHY, _COOL
-        if self.plant.faults is not None:
-            (e1, e2), (c1, c2) = self.faults.errors, self.faults.temperatures_c
-            errors, temperatures_c = (e1, e2), (c1, c2)
-        if drive1.watchdog_tripped or drive2.watchdog_tripped:
-            # As the driver does: reported in one state, then restarted with zero current.
-            tripped = (drive1.watchdog_tripped * WATCHDOG_ERROR, drive2.watchdog_tripped * WATCHDOG_ERROR)
-            errors = (errors[0] | tripped[0], errors[1] | tripped[1])
-            drive1.start_watchdog(self._watchdog_s)
-            drive2.start_watchdog(self._watchdog_s)
-        drive1.heard_instruction()
-        drive2.heard_instruction()
-        return ArmState(
-            stamp_s=t_s,
-            angle_rad=(scale1.angle_rad(position1), scale2.angle_rad(position2)),
-            velocity_rad_s=(scale1.velocity_rad_s(speed1), scale2.velocity_rad_s(speed2)),
-            torque_nm=(scale1.torque_nm(current1), scale2.torque_nm(current2)),
-            hardware_error=errors,
-            temperature_c=temperatures_c,
-            read_failures=0,
-        )
-
     def _carry_out(self, outputs: Outputs) -> None:
-        torque_nm, setpoint, request = outputs.arm_torque_nm, outputs.attitude, outputs.request
+        setpoint, request = outputs.attitude, outputs.request
         with_faults = self.plant.faults is not None
         if setpoint is not None:
             target = AttitudeTarget(attitude_ned_frd_from_enu_flu(setpoint.attitude_wxyz), setpoint.thrust)
@@ -418,24 +361,7 @@ class FastFlight:
                 self._link.send(lambda: self.px4.on_setpoint(self.plant.world.t_s, target))
             else:
                 self.px4.on_setpoint(self.plant.world.t_s, target)
-        if torque_nm is not None and self._scales is not None:
-            self._goal_s = self.plant.world.t_s
-            (drive1, drive2), (scale1, scale2) = self._drives, self._scales
-            counts = (scale1.current_counts(torque_nm[0]), scale2.current_counts(torque_nm[1]))
-            if not with_faults:
-                drive1.set_goal_current(counts[0])
-                drive2.set_goal_current(counts[1])
-            elif not self.faults.packet_lost():
-                lost = self.faults.active.get("servo_loss")
-                for number, (drive, goal) in enumerate(zip(self._drives, counts, strict=True), start=1):
-                    if lost is None or lost.servo != number:
-                        drive.set_goal_current(goal)
-        elif with_faults and self.plant.world.t_s - self._goal_s > self._watchdog_s and not self.faults.packet_lost():
-            # As the bus thread does with a stale goal; a servo that is lost has its own watchdog.
-            lost = self.faults.active.get("servo_loss")
-            for number, drive in enumerate(self._drives, start=1):
-                if lost is None or lost.servo != number:
-                    drive.set_goal_current(0)
+        self._bus.write(self.plant.world.t_s, outputs.arm_torque_nm)
         if request is not _NO_REQUEST:
             if with_faults:
                 self._link.send(lambda: self._request(request))

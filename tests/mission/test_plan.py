@@ -14,7 +14,8 @@ from pydantic import ValidationError
 from companion.config.loader import load_flight
 from companion.config.mission import Mission
 from companion.mission import minsnap
-from companion.mission.plan import BELOW_GROUND_M, STOP_SPEED_MAX_M_S, Plan, landing_from
+from companion.mission.plan import BELOW_GROUND_M, Plan, landing_from
+from companion.mission.plan_builder import STOP_SPEED_MAX_M_S
 from companion.mission.reference import (
     Move,
     Profile,

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.config.loader import load_vehicle
-from companion.mission.plan import STOP_SPEED_MAX_M_S
+from companion.mission.plan_builder import STOP_SPEED_MAX_M_S
 from companion.mission.retract import BESIDE_ANCHOR_M, inward_only, retract_from
 from companion.model.types import Vec2, Vec3
 

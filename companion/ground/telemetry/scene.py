@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from companion.config.loader import FlightConfig
 from companion.ground.protocol.messages import VERSION, Scene
-from companion.mission.plan import _name as phase_name
+from companion.mission.segments import phase_name
 from companion.model.types import Vec2, Vec3
 
 PATH_POINTS_MAX = 300
