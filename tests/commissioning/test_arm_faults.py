@@ -24,6 +24,7 @@ OUT_OF_THE_BOX = {
     f"arm.scan.joint{n}.{name}" for n in (1, 2) for name in ("return_delay_time", "operating_mode")
 }  # fmt: skip
 RIGHT_ZERO_COUNT = round(1024 + 12 / 360 * 4096)
+EVERY = arm_scan.SEARCHED
 SET_UP = "return_delay_us: 0, operating_mode: 0"
 """Knobs of a servo that needs no setup."""
 
@@ -81,7 +82,7 @@ def test_a_wrong_id_is_found_and_the_servo_gives_way(tmp_path: Path) -> None:
 def test_a_wrong_baud_rate_is_found_and_set_last(tmp_path: Path, searched: Callable[..., None]) -> None:
     searched(1_000_000, 57_600)
     with bench(tmp_path, "[{baud: 57600, id: 4}, {baud: 1000000}]") as one:
-        code, found = one.json("scan", process=True)
+        code, found = one.json("scan")
         assert code == EXIT_REFUSED
         assert {(servo["id"], servo["baud"], servo["joint"]) for servo in found["servos"]} == {
             (4, 57600, 1),
@@ -191,6 +192,10 @@ def test_a_port_that_is_not_there_is_one_line(tmp_path: Path, tool: str, capsys:
     )
     err = capsys.readouterr().err.splitlines()
     assert code == EXIT_REFUSED and len(err) == 1 and f"{tmp_path}/none: no such port" in err[0]
+
+
+def test_a_full_scan_tries_every_baud_rate_the_fastest_first() -> None:
+    assert EVERY == (4_000_000, 3_000_000, 2_000_000, 1_000_000, 115_200, 57_600, 9_600)
 
 
 def test_a_baud_rate_that_the_servos_do_not_have_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:

@@ -57,14 +57,17 @@ def test_bias_turn_and_scale_are_found_without_the_arm_and_the_turn_is_written(s
     assert "--arm-pose A1,A2" in without_arm.out
 
 
-def test_tare_shows_the_drift_and_writes_to_the_sensor_only_when_asked(sandbox: Sandbox) -> None:
+def test_tare_shows_the_drift_and_writes_to_the_sensor_only_when_asked(
+    sandbox: Sandbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.cli.ft.number", lambda *_: float)  # five seconds are the least that it takes
     with World(sandbox, overrides=["world.force_bias_n=[30,0,0]"]) as world:
-        words = ["ft", "tare", "--seconds", 5, "--json", "--vehicle", VEHICLE, *world.addresses()]
+        words = ["ft", "tare", "--seconds", 1, "--json", "--vehicle", VEHICLE, *world.addresses()]
         unasked = run_here(*words, "--sensor")
         zeroed = json.loads(run_here(*words, "--sensor", "--yes").out)
         cleared = json.loads(run_here(*words, "--clear", "--yes").out)
     assert unasked.code == EXIT_ABORTED
-    assert "say --yes" in unasked.err
+    assert "add --yes" in unasked.err
     assert [axis["axis"] for axis in zeroed["drift"]] == ["x", "y", "z"]
     assert zeroed["tare"]["bias_n"] == pytest.approx([30.0, 0.0, 0.0], abs=0.1), "watched before it was set: nobody had"
     assert [row["ok"] for row in zeroed["rows"] if row["id"] == "ft.bias_set"] == [True]
