@@ -264,7 +264,7 @@ def test_loop_and_latency_count_what_they_should() -> None:
     assert summary["latency_ms"]["mocap_to_setpoint"]["max"] == pytest.approx(3.0)
 
 
-def test_every_stage_of_a_tick_is_told_by_its_own_stamps() -> None:
+def test_every_stage_of_a_tick_is_reported_by_its_own_stamps() -> None:
     def staged(i: Inputs, o: Outputs, s: Sent) -> Row:
         assert i.arm is not None
         # The bus thread writes the currents of a tick 1.2 ms after its start, and begins the read for the next 1.5 ms before that one.
@@ -298,7 +298,7 @@ def test_every_stage_of_a_tick_is_told_by_its_own_stamps() -> None:
     assert len(log.timing.bus_read_s) == sum(i.tick % 4 != 3 for i in log.inputs)
 
 
-def test_a_log_from_before_reads_were_stamped_tells_the_other_stages(flight: FlightLog) -> None:
+def test_a_log_from_before_reads_were_stamped_shows_the_other_stages(flight: FlightLog) -> None:
     stages = summarise(flight, outcome="completed", controller="adaptive", preset="paper")["stages_ms"]
     assert stages["bus_read"] == stages["bus_cycle"] == {"p50": None, "p99": None, "max": None}
     assert stages["whole"]["max"] >= stages["core"]["max"] > 0.0
@@ -483,12 +483,12 @@ def test_the_report_of_a_flight_that_hardly_began_is_written_all_the_same(tmp_pa
 class Recited:
     """A core that gives back what was flown, but for one field of one tick."""
 
-    def __init__(self, outputs: tuple[Outputs, ...], spoil: Callable[[Outputs], Outputs] = lambda o: o) -> None:
+    def __init__(self, outputs: tuple[Outputs, ...], corrupt: Callable[[Outputs], Outputs] = lambda o: o) -> None:
         self._outputs = iter(outputs)
-        self._spoil = spoil
+        self._corrupt = corrupt
 
     def step(self, inputs: Inputs) -> Outputs:
-        return self._spoil(next(self._outputs))
+        return self._corrupt(next(self._outputs))
 
 
 def test_replay_compares_every_tick_and_names_the_first_bit_that_differs(flight: FlightLog) -> None:
@@ -502,13 +502,13 @@ def test_replay_compares_every_tick_and_names_the_first_bit_that_differs(flight:
     assert (result.ticks, result.first_difference) == (len(flight.inputs), None)
     assert json.loads(configs[0]) == CONFIG
 
-    def spoil(o: Outputs) -> Outputs:
+    def corrupt(o: Outputs) -> Outputs:
         if o.tick < 1500 or o.control is None:
             return o
         h = o.control.h_hat
         return replace(o, control=replace(o.control, h_hat=(h[0], h[1], math.nextafter(h[2], 1.0), h[3])))
 
-    result = replay(flight, lambda _: Recited(flight.outputs, spoil))
+    result = replay(flight, lambda _: Recited(flight.outputs, corrupt))
     difference = result.first_difference
     assert difference is not None
     assert (difference.tick, difference.field) == (1500, "control.h_hat[2]")

@@ -30,7 +30,7 @@ LAND = Change(20.14, "LAND", armed=True, failsafe=False)
 DISARMED = Change(23.5, "OFFBOARD", armed=False, failsafe=False)
 
 
-def test_a_takeover_is_told_in_seconds_since_the_fault() -> None:
+def test_a_takeover_is_reported_in_seconds_since_the_fault() -> None:
     vision = (*np.arange(19.0, 20.0, 0.005), *np.arange(20.1, 23.0, 0.005))
     setpoints = (*np.arange(19.0, 20.002, 0.005), *np.arange(20.144, 23.0, 0.004))
     found = log(HOLD, OFFBOARD, LAND, DISARMED, vision_s=vision, setpoint_s=setpoints).after(FAULT_S)
@@ -42,7 +42,7 @@ def test_a_takeover_is_told_in_seconds_since_the_fault() -> None:
     assert found.disarmed_s == pytest.approx(3.5)
 
 
-def test_px4s_own_failsafe_is_told_from_a_command() -> None:
+def test_px4s_own_failsafe_is_distinguished_from_a_command() -> None:
     failsafe = Change(20.6, "LAND", armed=True, failsafe=True)
     assert log(OFFBOARD, failsafe).after(FAULT_S).failsafe_s == pytest.approx(0.6)
 

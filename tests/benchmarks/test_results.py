@@ -227,7 +227,7 @@ def test_no_results_no_page(tmp_path: Path) -> None:
     assert ended.value.code == 2
 
 
-def test_an_environment_that_cannot_be_made_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_environment_that_cannot_be_made_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/bin/false")
     with pytest.raises(setpoint.NotMeasured, match="could not be installed"):
         setpoint.grpc_environment(tmp_path / "none")

@@ -88,7 +88,7 @@ def test_what_was_missed_is_a_problem() -> None:
     assert problems_of(GOOD, growth, ticks, flat) == []
 
 
-def test_lateness_that_grows_is_told_unless_the_machine_grew_as_late() -> None:
+def test_lateness_that_grows_is_reported_unless_the_machine_grew_as_late() -> None:
     growing, flat = minutes([1.0] * 20 + [1.2] * 20 + [1.5] * 20), minutes([1.0] * 60)
     assert thirds(growing, "p99") == (1.0, 1.5)
     assert lateness_problems(flat, flat) == []

@@ -135,7 +135,7 @@ def test_a_crash_counts_as_worse_than_every_other_flight() -> None:
     assert all_crashed.spread("rms.post.e_p_m") is None
 
 
-def test_a_payload_that_was_not_caught_is_told() -> None:
+def test_a_payload_that_was_not_caught_is_reported() -> None:
     missed = row(1, 0.1, catch_t_s=None)
     missed["rms"] = {**missed["rms"], "post": {"e_p_m": None, "e_q_deg": None, "e_alpha_deg": None}}
     (group,) = aggregate([missed, row(2, 0.2)])

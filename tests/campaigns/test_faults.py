@@ -160,7 +160,7 @@ def test_a_tether_that_was_made_taut_may_be_so_but_not_be_followed_outward() -> 
     assert row["problems"] == ["outward on a taut tether"]
 
 
-def test_what_is_told_after_the_landing_is_no_answer() -> None:
+def test_what_is_reported_after_the_landing_is_no_answer() -> None:
     made = flight(outcome="completed", events=(event(16.5, "force_lost", SafetyAction.LAND),))
     ticks = [Tick(t.t_s, t.kind if t.t_s < 16.0 else PhaseKind.DONE, SafetyAction.NOMINAL, None) for t in made.ticks]
     row = row_of(

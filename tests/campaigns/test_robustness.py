@@ -83,7 +83,7 @@ def test_a_file_of_cases_takes_any_name_of_a_mission(tmp_path: Path) -> None:
         ("seed: 12", "seed: twelve", r"cases.yaml:\d+:13: cases\[0\].world.seed"),
     ],
 )
-def test_a_mistake_in_a_file_of_cases_is_told_with_its_place(tmp_path: Path, old: str, new: str, why: str) -> None:
+def test_a_mistake_in_a_file_of_cases_is_reported_with_its_place(tmp_path: Path, old: str, new: str, why: str) -> None:
     path = tmp_path / "cases.yaml"
     cases = Cases(mission="a.yaml", controller="adaptive", preset="paper", cases=as_cases([row(0, 0.04)]))
     write_cases(cases, path, "")
@@ -133,7 +133,7 @@ def test_thirds_are_of_payload_and_grade_only_what_was_caught_and_completed() ->
     assert third.e_p_m == pytest.approx({"p50": 0.06, "p95": 0.069, "max": 0.07})
 
 
-def test_flights_are_told_apart_by_what_the_force_sensor_was_like() -> None:
+def test_flights_are_distinguished_by_what_the_force_sensor_was_like() -> None:
     silent = {**row(0, 0.02), "events": ["takeoff", "catch", "force_lost", "touchdown"]}
     assert sensor_of(silent) == "lost after the catch"
     assert sensor_of({**silent, "felt": False}) == "missing at the catch"

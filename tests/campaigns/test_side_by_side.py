@@ -217,7 +217,7 @@ def test_a_value_that_turns_from_true_to_one_differs() -> None:
     assert keys(compare([one, other])) == {"controller.flag"}
 
 
-def test_addresses_of_the_simulated_world_are_told_apart_from_settings_but_not_those_of_a_vehicle() -> None:
+def test_addresses_of_the_simulated_world_are_distinguished_from_settings_but_not_those_of_a_vehicle() -> None:
     def arm_on(port: str) -> dict[str, Any]:
         return configured(vehicle__devices={"arm": {"port": port}, "mocap": {"rate_hz": 200.0}})
 
@@ -327,7 +327,7 @@ def test_the_user_may_choose_another_moment() -> None:
 # The pictures
 
 
-def test_six_flights_are_told_apart_by_colour_and_in_black_and_white() -> None:
+def test_six_flights_are_distinguished_by_colour_and_in_black_and_white() -> None:
     assert len({line.colour for line in LINES}) == len({line.dashes for line in LINES}) == FLIGHTS_MAX
 
 
@@ -395,7 +395,7 @@ def test_whatever_a_log_holds_is_text_on_the_page(tmp_path: Path) -> None:
     assert not re.search(r"""(?:src|href)=['"](?!data:)""", page)
 
 
-def test_the_page_tells_the_figures_the_settings_and_the_events(tmp_path: Path) -> None:
+def test_the_page_shows_the_figures_the_settings_and_the_events(tmp_path: Path) -> None:
     other = made("B", change=further_off(3.0), config=configured(controller__rho_max=7.25))
     comparison = compare([made("A"), other])
     write_html(comparison, write_pictures(comparison, tmp_path), tmp_path / "page.html")
@@ -547,7 +547,7 @@ def test_a_log_without_a_catch_beside_one_with_a_catch_works_and_says_so(
     assert "No catch in B." in (flights / "x/side_by_side.html").read_text(encoding="utf-8")
 
 
-def test_a_summary_beside_the_log_that_is_of_another_flight_is_not_believed(
+def test_a_summary_beside_the_log_that_is_of_another_flight_is_rejected(
     flights: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Logs that were copied into one folder: its one summary is that of one flight, if of any."""

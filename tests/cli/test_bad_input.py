@@ -21,7 +21,7 @@ FLY = ("fly", "mission.yaml", "--sitl", "--out", "out")
 
 @pytest.fixture
 def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
-    """The catch and its vehicle as files that a test may spoil."""
+    """The catch and its vehicle as files that a test may change."""
     with sandbox_in(tmp_path) as sandbox:
         mission = CATCH.read_text(encoding="utf-8").replace("../vehicles/tarot650_2r.yaml", "vehicle.yaml")
         (sandbox.cwd / "mission.yaml").write_text(mission, encoding="utf-8")

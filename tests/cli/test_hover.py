@@ -109,7 +109,7 @@ def test_a_log_that_never_hovered_and_a_file_that_is_no_log_are_refused_in_one_l
         assert told.err.count("\n") == 1
 
 
-def test_a_slope_is_told_with_the_voltage_that_the_value_holds_for() -> None:
+def test_a_slope_is_reported_with_the_voltage_that_the_value_holds_for() -> None:
     fit = HoverFit(
         hover_thrust=0.4912,
         standard_error=0.0003,

@@ -75,7 +75,7 @@ def both(found: FrictionFit) -> list[JointFit]:
 
 
 @pytest.mark.parametrize("off_deg", [0.0, 1.5])
-def test_what_was_put_in_is_told_within_the_errors_claimed(vehicle: Vehicle, off_deg: float) -> None:
+def test_what_was_put_in_is_reported_within_the_errors_claimed(vehicle: Vehicle, off_deg: float) -> None:
     beyond = 0
     for seed in range(8):
         found = fit(swept(vehicle, seed, k=(1.15, 1.15), dry_nm=0.08, viscous_nms=0.05, off_deg=off_deg), vehicle)
@@ -87,7 +87,7 @@ def test_what_was_put_in_is_told_within_the_errors_claimed(vehicle: Vehicle, off
                 beyond += abs(estimate.value - truth) > 2.0 * estimate.standard_error
         changes = found.changes(vehicle)
         assert changes.keys() == {("arm", "torque_per_amp_nm_a"), ("arm", "joint_friction_nm")}
-    assert beyond <= 0.15 * 48, "two standard errors hold 95 % of what is told; the noise wanders"
+    assert beyond <= 0.15 * 48, "two standard errors hold 95 % of what is reported; the noise wanders"
 
 
 def test_an_arm_as_the_file_says_is_left_alone(vehicle: Vehicle) -> None:
@@ -96,20 +96,20 @@ def test_an_arm_as_the_file_says_is_left_alone(vehicle: Vehicle) -> None:
         assert found.changes(vehicle) == {} and found.notes == ()
 
 
-def test_a_sweep_that_gravity_does_not_change_along_cannot_tell_the_constant(vehicle: Vehicle) -> None:
+def test_a_sweep_without_change_of_gravity_does_not_determine_the_constant(vehicle: Vehicle) -> None:
     found = fit(swept(vehicle, reach=0.1, noise_a=0.03), vehicle)
     assert found.torque_per_amp_nm_a is None
     assert ("arm", "torque_per_amp_nm_a") not in found.changes(vehicle)
     assert any("do not determine the torque constant" in note for note in found.notes)
 
 
-def test_noise_that_hides_the_friction_is_told(vehicle: Vehicle) -> None:
+def test_noise_that_hides_the_friction_is_reported(vehicle: Vehicle) -> None:
     found = fit(swept(vehicle, noise_a=0.3), vehicle)
     assert found.joint_friction_nm is None and found.changes(vehicle) == {}
     assert sum("do not determine the dry friction" in note for note in found.notes) == 2
 
 
-def test_too_few_samples_tell_nothing(vehicle: Vehicle) -> None:
+def test_too_few_samples_determine_nothing(vehicle: Vehicle) -> None:
     found = fit(swept(vehicle)[:50], vehicle)
     assert found.joints == (None, None)
     assert (found.torque_per_amp_nm_a, found.joint_friction_nm) == (None, None)
@@ -127,6 +127,6 @@ def test_a_constant_of_no_such_servo_is_not_proposed(vehicle: Vehicle) -> None:
     assert any("implausible for an XM430-W210" in note for note in found.notes)
 
 
-def test_a_machine_that_is_not_level_is_told(vehicle: Vehicle) -> None:
+def test_a_machine_that_is_not_level_is_reported(vehicle: Vehicle) -> None:
     found = fit(swept(vehicle, off_deg=6.0, noise_a=0.003), vehicle)
     assert any("gravity pulls as if the arm were turned" in note for note in found.notes)

@@ -1,4 +1,4 @@
-"""The guide: what a hand does is understood, what is done otherwise than asked is told, and the numbers are those of the arm."""
+"""The guide: what a hand does is understood, what is done otherwise than asked is reported, and the numbers are those of the arm."""
 
 from __future__ import annotations
 
@@ -77,7 +77,9 @@ class Bench:
         (((60.0, 175.0), (-10.0, 150.0)), ((-20.0, 175.0), (-150.0, 150.0)), ((70.0, 130.0), (-140.0, 40.0)))
     ),
 )
-def test_every_sign_zero_and_plug_is_told(signs: Vec2, zeros: Vec2, swapped: bool, limits: tuple[Vec2, Vec2]) -> None:
+def test_every_sign_zero_and_plug_is_reported(
+    signs: Vec2, zeros: Vec2, swapped: bool, limits: tuple[Vec2, Vec2]
+) -> None:
     arm = arm_with(limits)
     bench = Bench(arm, [int(s) for s in signs], [int(z) for z in zeros], (1, 0) if swapped else (0, 1))
     result = bench.through().result
@@ -112,7 +114,7 @@ def test_nothing_counts_before_the_arm_was_moved_unless_somebody_says_so() -> No
     assert view.number == 2
 
 
-def test_both_joints_at_once_are_told_and_put_right() -> None:
+def test_both_joints_at_once_are_reported_and_put_right() -> None:
     bench = Bench(arm_with(), (1, -1), (1024, 3072))
     bench.move(bench.guide.steps[0].pose_deg)
     assert bench.hold().number == 2
@@ -122,7 +124,7 @@ def test_both_joints_at_once_are_told_and_put_right() -> None:
     assert bench.hold().number == 3
 
 
-def test_half_a_turn_is_told() -> None:
+def test_half_a_turn_is_reported() -> None:
     bench = Bench(arm_with(), (1, -1), (1024, 3072))
     bench.move(bench.guide.steps[0].pose_deg)
     bench.hold()
@@ -130,7 +132,7 @@ def test_half_a_turn_is_told() -> None:
     assert bench.hold().number == 2
 
 
-def test_the_same_joint_twice_is_told() -> None:
+def test_the_same_joint_twice_is_reported() -> None:
     bench = Bench(arm_with(), (1, -1), (1024, 3072))
     for pose in ((90.0, 0.0), (90.0, 90.0), (90.0, 45.0)):
         bench.move(pose)
@@ -138,7 +140,7 @@ def test_the_same_joint_twice_is_told() -> None:
     assert view.result is None and "turned in both steps" in view.failed
 
 
-def test_poses_that_disagree_are_told() -> None:
+def test_poses_that_disagree_are_reported() -> None:
     bench = Bench(arm_with(), (1, -1), (1024, 3072))
     for pose in ((90.0, 0.0), (90.0, 105.0), (135.0, 105.0)):
         bench.move(pose)

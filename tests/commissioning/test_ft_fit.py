@@ -79,7 +79,7 @@ def test_a_turned_sensor_is_a_patch_and_a_right_one_none() -> None:
     assert all(row.ok for row in ft_fit.rows(right))
 
 
-def test_straight_down_nobody_can_tell_and_it_says_so() -> None:
+def test_straight_down_the_turn_is_undetermined_and_reported_so() -> None:
     """A turn about the link is invisible there: the configured one is kept, with a warning."""
     seen = fitted(quat_of((90.0, 0.0, 0.0)), arm_rad=HANGING)
     assert len(seen.others) == 3
@@ -90,7 +90,7 @@ def test_straight_down_nobody_can_tell_and_it_says_so() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.9, 2.0])
-def test_a_wrong_scale_is_told_and_no_turn_of_the_sensor(scale: float) -> None:
+def test_a_wrong_scale_is_reported_and_no_turn_of_the_sensor(scale: float) -> None:
     fit = fitted(quat_of((0.0, 0.0, 0.0)), scale=scale)
     assert fit.scale == pytest.approx(scale)
     assert [row.id for row in ft_fit.rows(fit) if not row.ok] == ["ft.scale"]
@@ -115,7 +115,7 @@ def stream(force_n: np.ndarray, rate_hz: float = 200.0) -> list[ForceSample]:
     ]
 
 
-def test_drift_is_told_with_its_error() -> None:
+def test_drift_is_reported_with_its_error() -> None:
     rng = np.random.default_rng(4)
     t = np.arange(0.0, 60.0, 0.005)
     force = rng.normal(0.0, 0.05, (len(t), 3)) + np.outer(t, (0.5 / 60.0, 0.0, -1.0 / 60.0))

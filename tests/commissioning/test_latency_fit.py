@@ -86,7 +86,7 @@ def test_taps_are_found_and_sway_is_not() -> None:
     assert find_taps(tapped(0.005, strength_m_s2=0.0)[0]) == []
 
 
-def test_noise_of_motion_capture_is_told() -> None:
+def test_noise_of_motion_capture_is_reported() -> None:
     _, poses = tapped(0.005)
     position_m, rotation_rad = mocap_noise(poses)
     assert position_m == pytest.approx(0.0002, rel=0.15)
@@ -103,7 +103,7 @@ def test_a_delay_is_found_finer_than_the_samples(delay_s: float) -> None:
     assert result.error_s < 0.001
 
 
-def test_a_quiet_imu_and_sharp_cameras_tell_it_to_a_fraction_of_a_millisecond() -> None:
+def test_a_quiet_imu_and_sharp_cameras_show_it_to_a_fraction_of_a_millisecond() -> None:
     result = combine(measured(*tapped(0.0123, accel_noise=0.03, mocap_noise_m=0.00005)))
     assert not isinstance(result, str), result
     assert result.delay_s == pytest.approx(0.0123, abs=0.0003)
@@ -119,13 +119,13 @@ def test_each_taps_error_is_what_it_scatters_by() -> None:
     assert 0.4 < ratio < 2.5
 
 
-def test_weak_taps_are_not_believed() -> None:
+def test_weak_taps_are_rejected() -> None:
     imu, poses = tapped(0.005, strength_m_s2=3.0, accel_noise=0.2, mocap_noise_m=0.004)
     assert all(tap.problem.startswith("too weak") or "no similar motion" in tap.problem for tap in measured(imu, poses))
     assert isinstance(combine(measured(imu, poses)), str)
 
 
-def test_a_stream_that_shows_something_else_is_not_believed() -> None:
+def test_a_stream_that_shows_something_else_is_rejected() -> None:
     imu, _ = tapped(0.005)
     _, others = tapped(0.005, strength_m_s2=0.0, seed=9)
     result = combine(measured(imu, others))

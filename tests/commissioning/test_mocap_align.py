@@ -85,7 +85,7 @@ def test_a_turned_world_is_no_turned_body() -> None:
     assert row is not None and not row.ok and "ground plane" in row.fix
 
 
-def test_a_mirrored_stream_is_told() -> None:
+def test_a_mirrored_stream_is_reported() -> None:
     a = found('mocap_axes=["x","-y","z"]')
     assert a.mirrored
     assert a.axes.names == ("x", "-y", "z")

@@ -100,7 +100,7 @@ def test_lost_frames_are_counted_by_their_numbers() -> None:
     assert t.rate_hz == pytest.approx(180.0, rel=0.01)
 
 
-def test_jitter_is_told_and_drawn() -> None:
+def test_jitter_is_reported_and_drawn() -> None:
     seen = frames(late_s=lambda number: 0.004 if number % 20 == 0 else 0.0)
     t = timing_of(seen)
     assert t.percentile_off_s(0.5) == pytest.approx(0.0, abs=2e-4)
@@ -111,7 +111,7 @@ def test_jitter_is_told_and_drawn() -> None:
     assert "mocap.steady" in bad(judged(seen))
 
 
-def test_a_camera_at_half_the_rate_is_told_from_frames_that_are_lost() -> None:
+def test_a_camera_at_half_the_rate_is_reported_from_frames_that_are_lost() -> None:
     slow, holes = judged(frames(rate_hz=100.0)), judged(frames(lost=lambda number: number % 2 == 1))
     assert slow[1] == {("devices", "mocap", "rate_hz"): 100.0}
     assert "mocap.rate" in bad(slow) and "mocap.lost" not in bad(slow)
@@ -119,7 +119,7 @@ def test_a_camera_at_half_the_rate_is_told_from_frames_that_are_lost() -> None:
     assert holes[1] == {}
 
 
-def test_more_latency_than_px4_is_told_of() -> None:
+def test_more_latency_than_px4_has_configured_is_reported() -> None:
     assert "mocap.delay" in bad(judged(frames(latency_s=0.035)))
     assert "mocap.delay" not in bad(judged(frames(latency_s=0.006)))
     assert "mocap.latency" in bad(judged(frames(latency_s=None)))
@@ -145,7 +145,7 @@ def test_the_body_that_moves_is_the_vehicle(
     assert found[1].get(("devices", "mocap", "rigid_body_id")) == proposed
 
 
-def test_wifi_is_told() -> None:
+def test_wifi_is_reported() -> None:
     assert "mocap.network" in bad(judged(frames(), route=Route("unicast", "10.0.0.2", "wlan0", True)))
 
 

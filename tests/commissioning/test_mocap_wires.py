@@ -47,7 +47,7 @@ def addresses(world: World, *left_out: str) -> list[str]:
 
 
 def wait_for_error(running: Running, text: str) -> None:
-    """Until standard error has shown it: there people are told what to do."""
+    """Until standard error has shown it: there people are reported what to do."""
     deadline_s = time.monotonic() + DEADLINE_S
     while text not in running._text("err"):
         assert running._pump(deadline_s), (text, running._text("out"), running._text("err"))

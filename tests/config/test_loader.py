@@ -242,7 +242,7 @@ def test_bad_override(project: Path, option: str, line: str) -> None:
     assert lines_of(lambda: load_sitl(CATCH, preset="paper", overrides=[option])) == [line]
 
 
-def test_problems_of_all_files_are_told_together(project: Path) -> None:
+def test_problems_of_all_files_are_reported_together(project: Path) -> None:
     overrides = ["mission.phases[2].duration_s=0", "vehicle.airframe.mass_kg=0", "controller.nu=1", "world.seed=-1"]
     lines = lines_of(lambda: load_sitl(CATCH, overrides=overrides))
     assert [line.split(":")[0] for line in lines] == [

@@ -69,7 +69,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("text", "lines"), BAD, ids=range(len(BAD)))
-def test_refused_text_is_told_in_one_line_per_problem(tmp_path: Path, text: str, lines: list[str] | None) -> None:
+def test_refused_text_is_reported_in_one_line_per_problem(tmp_path: Path, text: str, lines: list[str] | None) -> None:
     path = tmp_path / "f.yaml"
     path.write_text(text, encoding="utf-8")
     try:
@@ -83,7 +83,7 @@ def test_refused_text_is_told_in_one_line_per_problem(tmp_path: Path, text: str,
     assert lines is None or found == lines
 
 
-def test_every_duplicate_is_told(tmp_path: Path) -> None:
+def test_every_duplicate_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "f.yaml"
     path.write_text("a: 1\na: 2\nb:\n  c: 1\n  c: 2\n")
     assert [str(problem.origin) for problem in read_document(path, "f.yaml").problems] == ["f.yaml:2:1", "f.yaml:5:3"]

@@ -147,7 +147,7 @@ def test_the_observer_finds_a_steady_force_whatever_is_asked_for() -> None:
     assert observer.force_n == ZERO
 
 
-def test_the_observer_is_bounded_and_stands_still_when_told() -> None:
+def test_the_observer_is_bounded_and_freezes_on_request() -> None:
     observer = DisturbanceObserver(3.0, (0.1, 0.1, 0.1), 0.0, 2.0)
     for _ in range(500):
         observer.step(0.005, ZERO, (10.0, -10.0, 0.1), learn=True)

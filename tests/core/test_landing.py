@@ -1,4 +1,4 @@
-"""Touch-down with one source spoiled: no rotor stops in the air, none turns on the floor for ever."""
+"""Touch-down with one wrong source: no rotor stops in the air, none turns on the floor for ever."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def configured(mission: Path) -> SitlConfig:
 
 
 class Spoiled(FastFlight):
-    """Motion capture that has the floor elsewhere, and what else the companion is told wrong."""
+    """Motion capture that has the floor elsewhere, and what else the companion is reported wrong."""
 
     def __init__(self, config: SitlConfig, change: Change, lift_m: float) -> None:
         super().__init__(config)
         self._change, self._lift_m = change, lift_m
 
     def _pose(self, frame: object) -> MocapPose:
-        """The error comes in slowly, as a shifting volume would bring it; PX4 is told the same."""
+        """The error comes in slowly, as a shifting volume would bring it; PX4 is reported the same."""
         pose = super()._pose(frame)  # type: ignore[arg-type]
         share = min(1.0, max(0.0, (pose.stamp_s - 11.0) / 8.0))
         x, y, z = pose.position_world_m
@@ -217,7 +217,7 @@ def test_hanging_on_the_tether_is_no_touchdown() -> None:
         assert detector.relief == 1.0
 
 
-def test_a_touchdown_in_order_is_told_before_px4_would_say_so() -> None:
+def test_a_touchdown_in_order_is_reported_before_px4_would_say_so() -> None:
     _, result = ordinary()
     inputs, outputs = result.inputs, result.outputs
     told = next(o for o in outputs if any(event.id == "touchdown" for event in o.events))

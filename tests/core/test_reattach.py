@@ -125,7 +125,7 @@ def stepped_on(core: FlightCore, i: Inputs, *, armed: bool) -> Outputs:
     return o
 
 
-def test_one_that_stands_and_does_not_disarm_is_told() -> None:
+def test_one_that_stands_and_does_not_disarm_is_reported() -> None:
     outputs = stepped([found(FlightMode.OFFBOARD, LandedState.ON_GROUND, STANDING, tick) for tick in range(1700)])
     assert outputs[-1].outcome is Outcome.REFUSED
     assert "disarm_refused" in ids(outputs)

@@ -33,7 +33,7 @@ PAGES = sorted([ROOT / "README.md", ROOT / "benchmarks/README.md", *(ROOT / "doc
 COMMANDS, SAFETY, SITL = ROOT / "docs/commands.md", ROOT / "docs/safety.md", ROOT / "docs/sitl.md"
 FAULTS, LABORATORY = ROOT / "docs/faults.md", ROOT / "docs/world.md"
 LOG, LAW = ROOT / "docs/log.md", ROOT / "docs/control-law.md"
-# What a flight writes, or what a user is told to make: no files of the repository.
+# What a flight writes, or what a user is reported to make: no files of the repository.
 MADE_LATER = {
     "flight.mcap", "flight.log", "flight.pid", "guardian.log", "guardian.pid", "summary.json", "report.html", "config.json",
     "sitl_config.json", "sitl.log", "world.json", "preflight.json", "mine.yaml", "my_vehicle.yaml", "flights/",

@@ -132,7 +132,7 @@ def test_every_key_of_every_section_is_in_it(kind: str) -> None:
         ("s", ""),
     ],
 )
-def test_units_are_told_by_the_name(key: str, expected: str) -> None:
+def test_units_are_reported_by_the_name(key: str, expected: str) -> None:
     assert unit(key) == expected
 
 

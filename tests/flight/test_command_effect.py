@@ -276,14 +276,14 @@ def test_it_waits_for_start_with_nothing_sent_and_then_flies() -> None:
 
 
 @pytest.mark.parametrize("command", [LAND, ABORT])
-def test_it_waits_for_start_and_stands_down_when_it_is_told_to(command: OperatorCommand) -> None:
+def test_it_waits_for_start_and_stands_down_on_command(command: OperatorCommand) -> None:
     flown = commanded((5.0, command), sets=WAITS)
     assert flown.effects == [(True, "not taking off: standing down")]
     assert flown.outcome is Outcome.ABORTED
     assert flown.outputs[-1].t_s < 5.1
 
 
-def test_what_is_lost_while_it_waits_is_told_and_may_come_back_at_any_time() -> None:
+def test_what_is_lost_while_it_waits_is_reported_and_may_come_back_at_any_time() -> None:
     """It is carried half a metre away and back."""
     flown = commanded((6.0, START), (11.0, START), change=off_its_way(4.0, 8.0, 0.5), sets=(*WAITS, *FORGIVING, *LOW))
     assert flown.effects[0][0] is False
@@ -297,7 +297,7 @@ def test_what_is_lost_while_it_waits_is_told_and_may_come_back_at_any_time() -> 
     assert flown.outcome is Outcome.COMPLETED
 
 
-def test_an_estimate_that_wanders_off_while_it_waits_is_told() -> None:
+def test_an_estimate_that_wanders_off_while_it_waits_is_reported() -> None:
     def change(i: Inputs) -> Inputs:
         if i.vehicle is None or not 5.0 <= i.t_s < 8.0:
             return i

@@ -124,7 +124,7 @@ def test_whatever_arrives_ticks_stay_about_a_period_apart(frames_s: list[float],
 
 
 @pytest.mark.parametrize("frames", [True, False])
-def test_a_stall_is_told_and_not_made_up_for(frames: bool) -> None:
+def test_a_stall_is_reported_and_not_made_up_for(frames: bool) -> None:
     def stall(tick: int, time: SimulatedTime) -> None:
         if tick == 150:
             time.now_s += 0.0223

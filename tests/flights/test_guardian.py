@@ -75,7 +75,7 @@ def unguarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, 
 
 @pytest.mark.flight
 @UNGUARDED
-def test_a_guardian_that_dies_in_the_air_is_told_and_the_flight_goes_on(unguarded: tuple[Path, Ended]) -> None:
+def test_a_guardian_that_dies_in_the_air_is_reported_and_the_flight_goes_on(unguarded: tuple[Path, Ended]) -> None:
     folder, ended = unguarded
     assert ended.code == EXIT_OK
     assert ended.err_lines == ["guardian: the guardian process was ended by SIGKILL; see out/guardian.log"]

@@ -257,7 +257,7 @@ def test_a_px4_that_dies_in_the_air_is_one_clear_line(sandbox: Sandbox, autopilo
 
 
 @pytest.mark.waits
-def test_without_a_px4_the_flight_is_refused_within_seconds_and_told_how_to_get_one(tmp_path: Path) -> None:
+def test_without_a_px4_the_flight_is_refused_within_seconds_with_how_to_get_one(tmp_path: Path) -> None:
     nowhere = {VARIABLE: "", "PATH": str(tmp_path)}
     with sandbox_in(tmp_path / "sandbox", nowhere) as sandbox:
         ended = sandbox.run("fly", HOVER, "--sitl=px4", "--out", "out")

@@ -80,7 +80,7 @@ class Page:
         assert self.tab.evaluate("window.violations") == []
         assert [text for text in self.complaints if not may or may not in text] == []
 
-    def tell(self, *messages: Message) -> None:
+    def show(self, *messages: Message) -> None:
         """Send messages through the stub and wait until the page has displayed them."""
         mark = f"mark {next(_marks)}"
         known = Preflight(VERSION, SESSION, (PreflightRow("mark", "ok", mark),))

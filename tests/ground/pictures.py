@@ -39,7 +39,7 @@ def _fly(page: Page, until_s: float, **changes: object) -> None:
     lines = [line for line in flown().events.lines if line.t_s <= past[-1].t_s]
     messages = [relayed(stream) for stream in past]
     messages[-1]["data"] |= changes
-    page.tell(*messages, events_of(*lines))
+    page.show(*messages, events_of(*lines))
     page.run(0.2)
 
 
@@ -48,10 +48,10 @@ def _flying(page: Page, stub: MonitorStub) -> None:
 
 
 def _holding(page: Page, stub: MonitorStub) -> None:
-    page.tell(relayed(flown().streams[0]))
+    page.show(relayed(flown().streams[0]))
     page.press("hold")
     stub.wait_received("command", 1)
-    page.tell(
+    page.show(
         {"kind": "sent", "vehicle": page.shown, "command": "hold", "nonce": NONCE},
         relayed(ack("hold", NONCE, "stops on the planned path and holds")),
     )
@@ -59,7 +59,7 @@ def _holding(page: Page, stub: MonitorStub) -> None:
     _fly(page, 8.5, action="hold")
     lines = [line for line in flown().events.lines if line.id in ("takeoff", "catch")]
     asked = event(0, "operator anna asks for a hold", id_="operator_hold")
-    page.tell(events_of(*lines, asked))
+    page.show(events_of(*lines, asked))
 
 
 def _stale(page: Page, stub: MonitorStub) -> None:

@@ -55,7 +55,9 @@ async def test_what_was_done_is_printed(broker: Broker, keys: str, capsys: pytes
 
 
 @played
-async def test_a_refusal_is_told_with_its_reason(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_a_refusal_is_reported_with_its_reason(
+    broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     async with played_vehicle(broker.port, OPERATORS) as vehicle:
         vehicle.accepts = lambda heard: (False, "start refused: PX4 is not ready")
         ended = await command(capsys, "start", broker, keys)
@@ -71,7 +73,7 @@ async def test_a_refusal_is_told_with_its_reason(broker: Broker, keys: str, caps
 
 
 @played
-async def test_a_stranger_is_told_that_the_vehicle_does_not_have_the_key(
+async def test_an_unknown_operator_is_informed_that_the_vehicle_does_not_have_the_key(
     broker: Broker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With another key under the same name no message is proven, so no command can be dated."""
@@ -115,7 +117,7 @@ async def test_nobody_there(
 
 
 @played
-async def test_several_vehicles_have_to_be_told_apart(
+async def test_several_vehicles_have_to_be_distinguished(
     broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     async with (

@@ -193,7 +193,7 @@ def places(data: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | 
         yield from places(value, (*path, key))
 
 
-def spoiled(data: Any, path: tuple[str | int, ...], raw: str) -> bytes:
+def corrupted(data: Any, path: tuple[str | int, ...], raw: str) -> bytes:
     """Return the message with a JSON text at one path."""
     if not path:
         return raw.encode()
@@ -209,7 +209,7 @@ def everything_hostile() -> Iterator[tuple[Topic, bytes]]:
     for topic, data in genuine().items():
         for path in places(data):
             for raw in HOSTILE:
-                yield topic, spoiled(data, path, raw)
+                yield topic, corrupted(data, path, raw)
         payload = json.dumps(data).encode()
         for other in (
             payload[:-1],

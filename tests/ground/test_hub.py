@@ -151,7 +151,7 @@ def test_a_few_huge_messages_are_too_many_too() -> None:
     assert outbox.close_reason is TOO_SLOW
 
 
-def test_who_comes_late_is_told_what_is_known_but_no_old_stream() -> None:
+def test_a_late_viewer_gets_the_known_state_but_no_old_stream() -> None:
     watch = VehicleTracker()
     hub = Hub(watch, "no broker yet")
     watch.receive("companion/rig/state", encode(state_of("rig", SESSION)), True, 0.0)

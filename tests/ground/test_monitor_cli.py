@@ -86,7 +86,9 @@ async def test_it_prints_an_address_to_open_and_ends_in_order(broker: Broker, sa
     sandbox.assert_nobody_left()
 
 
-def test_a_broker_that_does_not_want_us_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_broker_that_does_not_want_us_is_reported_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with loopback_broker(tmp_path) as broker:
         broker.stop()
         config = tmp_path / "loopback.conf"

@@ -161,20 +161,20 @@ BAD_NUMBERS = [math.nan, math.inf, -math.inf, 1e308]
 
 @pytest.mark.parametrize("bad", BAD_NUMBERS)
 def test_numbers_that_are_none_make_a_message_that_every_parser_reads(bad: float) -> None:
-    def spoilt(value: Any) -> Any:
+    def corrupted(value: Any) -> Any:
         if isinstance(value, float):
             return bad
         if isinstance(value, tuple):
-            return tuple(map(spoilt, value))
+            return tuple(map(corrupted, value))
         if isinstance(value, Record):
-            return type(value)(**{name: spoilt(getattr(value, name)) for name in value.__struct_fields__})
+            return type(value)(**{name: corrupted(getattr(value, name)) for name in value.__struct_fields__})
         return value
 
     event = Event(t_s=1.0, id="e", severity=Severity.INFO, action=SafetyAction.NOMINAL, text="text")
     row = changed(IN_FLIGHT, outputs__events=(event,), **tether())
     maker = StreamBuilder(CONFIG, "s")
     maker.add_tick(*IN_FLIGHT)
-    maker.add_tick(*(spoilt(record) for record in row))
+    maker.add_tick(*(corrupted(record) for record in row))
 
     def no_constants(text: str) -> Any:
         raise AssertionError(text)

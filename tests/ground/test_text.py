@@ -113,7 +113,7 @@ def test_a_taut_tether_is_loud() -> None:
     assert "TETHER TAUT" in drawn(known(tether=TetherView(**tether)))  # type: ignore[arg-type]
 
 
-def test_who_may_not_command_is_told_why_and_shown_no_keys() -> None:
+def test_a_viewer_without_permission_gets_the_reason_and_no_keys() -> None:
     text = plain(
         drawn(
             known(),

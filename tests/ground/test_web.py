@@ -43,7 +43,7 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
 
 
 @played
-async def test_a_viewer_is_greeted_and_told_what_is_known_and_then_sees_it_live(broker: Broker) -> None:
+async def test_a_viewer_receives_hello_and_the_known_state_and_then_live_data(broker: Broker) -> None:
     async with played_vehicle(broker.port, OPERATORS), monitor_at(broker.url) as monitor, viewer_of(monitor) as viewer:
         hello = await viewer.next()
         assert hello["kind"] == "hello" and hello["can_command"] is True and hello["why_not"] is None

@@ -157,7 +157,7 @@ async def test_who_has_no_token_or_another_one_sees_everything_and_commands_noth
 
 
 @played
-async def test_a_command_that_the_broker_does_not_let_pass_is_told_as_that(tmp_path: Path) -> None:
+async def test_a_command_that_the_broker_does_not_let_pass_is_reported_as_that(tmp_path: Path) -> None:
     with loopback_broker(tmp_path) as broker:
         broker.stop()
         (tmp_path / "acl").write_text("topic read companion/#\nuser vehicle\ntopic readwrite companion/#\n")

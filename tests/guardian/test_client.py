@@ -67,7 +67,7 @@ def test_ready_is_a_word_of_the_last_second(pair: Pair, clock: Clock) -> None:
     assert not client.ready
 
 
-def test_a_problem_ends_readiness_and_is_told(pair: Pair) -> None:
+def test_a_problem_ends_readiness_and_is_reported(pair: Pair) -> None:
     client, guardian = pair
     guardian.send(heartbeat.READY)
     guardian.send(heartbeat.PROBLEM + "mocap: ärger".encode())
@@ -180,7 +180,7 @@ def test_when_the_rotors_may_turn(
     assert (beat.pose_stamp_s, beat.position_world_m) == (4.9, (1.0, 2.0, 3.0))
 
 
-def test_a_pilot_stays_one_and_a_pose_that_is_not_believed_is_not_passed_on(pair: Pair, waiting: Outputs) -> None:
+def test_a_pilot_stays_one_and_a_rejected_pose_is_not_passed_on(pair: Pair, waiting: Outputs) -> None:
     client, guardian = pair
     guard = FlightGuard(client, LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0)
     event = Event(
@@ -209,7 +209,7 @@ def test_while_px4_is_armed_no_goodbye_is_said_to_the_guardian(pair: Pair, waiti
 
 
 @pytest.mark.parametrize("event_id", ["mocap_dragged", "mocap_two_streams", "mocap_swapped", "mocap_frozen"])
-def test_motion_capture_is_refused_from_the_landing_for_it_until_it_is_believed_again(
+def test_motion_capture_is_refused_from_the_landing_for_it_until_it_is_trusted_again(
     waiting: Outputs, event_id: str
 ) -> None:
     heartbeats = Heartbeats(LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0)

@@ -94,7 +94,7 @@ def test_what_the_guardian_slept_through_proves_nothing() -> None:
     assert any(verdicts), "but silence while it is awake counts on"
 
 
-def test_a_pose_that_cannot_be_true_is_not_believed() -> None:
+def test_an_impossible_pose_is_rejected() -> None:
     plausible = PoseFilter(10.0, (1.0, 2.0, 1.5))
     assert plausible.check(10.005, (1.01, 2.0, 1.5))
     assert not plausible.check(10.010, (1.01 + JUMP_M + 0.1, 2.0, 1.5))
@@ -104,7 +104,7 @@ def test_a_pose_that_cannot_be_true_is_not_believed() -> None:
     assert plausible.check(late_s, (1.02 + SPEED_MAX_M_S, 2.0, 1.5)), "after a gap more is possible"
 
 
-def test_the_first_pose_is_believed_if_there_was_none() -> None:
+def test_the_first_pose_is_accepted_if_there_was_none() -> None:
     assert PoseFilter(-math.inf, (0.0, 0.0, 0.0)).check(3.0, (5.0, -7.0, 2.0))
 
 

@@ -298,7 +298,7 @@ if "companion.guardian" in sys.orig_argv:
     ],
     ids=["once", "always", "messages", "poses"],
 )
-def test_an_error_of_its_own_is_told_and_the_landing_goes_on(
+def test_an_error_of_its_own_is_reported_and_the_landing_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str, method: str, when: str, where: str
 ) -> None:
     hooks = tmp_path / "hooks"

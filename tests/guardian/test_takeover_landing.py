@@ -92,9 +92,9 @@ class Landing:
         height_m: float = STANDING_M,
         messages: tuple[str, ...] = ("position", "attitude", "imu"),
         mocap: bool = True,
-        spoil: Callable[[Any], None] = lambda message: None,
+        corrupt: Callable[[Any], None] = lambda message: None,
     ) -> None:
-        """Run with PX4 in LAND, armed, at rest at a height, without its land detector; `spoil` changes each state message."""
+        """Run with PX4 in LAND, armed, at rest at a height, without its land detector; `corrupt` changes each state message."""
         q = attitude_ned_frd_from_enu_flu(attitude)
         for _ in range(round(duration_s / STEP_S)):
             self.t_s += STEP_S
@@ -105,7 +105,7 @@ class Landing:
             }
             said = [state[name] for name in messages]
             for message in said:
-                spoil(message)
+                corrupt(message)
             heartbeat = mavlink.MAVLink_heartbeat_message(2, 12, ARMED, LAND_MODE, 4, 3)
             if mocap:
                 number = round(self.t_s / STEP_S)
@@ -141,13 +141,13 @@ def nan_position(message: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("messages", "spoil"),
+    ("messages", "corrupt"),
     [(("attitude",), lambda _: None), (("attitude", "imu"), lambda _: None), (("position", "attitude"), nan_position)],
     ids=["attitude alone", "no position", "a position that is no number"],
 )
-def test_px4s_attitude_is_enough_for_a_flip(messages: tuple[str, ...], spoil: Callable[[Any], None]) -> None:
+def test_px4s_attitude_is_enough_for_a_flip(messages: tuple[str, ...], corrupt: Callable[[Any], None]) -> None:
     landing = Landing(beat())
-    landing.run(1.0, attitude=ON_ITS_BACK, height_m=1.0, messages=messages, spoil=spoil)
+    landing.run(1.0, attitude=ON_ITS_BACK, height_m=1.0, messages=messages, corrupt=corrupt)
     assert landing.forced
 
 
@@ -169,7 +169,7 @@ def test_tipped_over_on_the_floor_it_is_disarmed_by_force() -> None:
     assert "tipped over on the floor: FORCE_DISARM is requested at once" in [notice.text for notice in landing.notices]
 
 
-def test_poses_that_the_flight_process_did_not_believe_are_neither_passed_on_nor_judged_by() -> None:
+def test_poses_that_the_flight_process_rejected_are_neither_passed_on_nor_evaluated() -> None:
     """The flight process landed because of dragged poses and died; the guardian sent them to PX4 and used them."""
     landing = Landing(beat(mocap_refused=True, pose_stamp_s=START_S - 5.0))
     landing.run(10.0, attitude=ON_ITS_ROTORS)

@@ -120,7 +120,7 @@ def plug(sysfs: Path, tty: str, product: str, serial: str, vendor: str = "0403")
     (sysfs / "class/tty" / tty).symlink_to(port)
 
 
-def test_adapters_are_found_and_told_apart(tmp_path: Path) -> None:
+def test_adapters_are_found_and_distinguished(tmp_path: Path) -> None:
     plug(tmp_path, "ttyUSB0", "6001", "A10M")
     plug(tmp_path, "ttyUSB1", "6014", "FT4THVLI")
     plug(tmp_path, "ttyACM0", "0032", "0", vendor="26ac")  # an autopilot
@@ -132,7 +132,7 @@ def test_adapters_are_found_and_told_apart(tmp_path: Path) -> None:
     assert "not plugged in" in choose_adapters(found, "X", None)[2][0]
 
 
-def test_adapters_that_cannot_be_told_apart_are_not_guessed(tmp_path: Path) -> None:
+def test_adapters_that_cannot_be_distinguished_are_not_guessed(tmp_path: Path) -> None:
     plug(tmp_path, "ttyUSB0", "6014", "FT1")
     plug(tmp_path, "ttyUSB1", "6014", "FT2")
     arm, force, (about_arm, about_force) = choose_adapters(adapters(tmp_path), None, None)

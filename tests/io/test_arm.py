@@ -575,7 +575,7 @@ def test_the_time_of_a_read_is_learnt() -> None:
     fly(scenario)
 
 
-def test_the_edge_tells_both_servos_as_it_left_them() -> None:
+def test_the_edge_shows_both_servos_as_it_left_them() -> None:
     async def main() -> None:
         servos = new_servos()
         servos[0].set_voltage_v(11.8)

@@ -48,7 +48,7 @@ def test_what_was_not_measured_adds_nothing(jump_s: float) -> None:
     assert total.sum_m_s == pytest.approx((INTERVAL_S, 0.0, 0.0))
 
 
-def test_a_sample_that_is_not_finite_does_not_spoil_the_sum() -> None:
+def test_a_sample_that_is_not_finite_does_not_corrupt_the_sum() -> None:
     total = DeltaVelocity()
     for k, force in enumerate((1.0, 1.0, math.nan, math.inf, 1.0)):
         total.add(k * INTERVAL_S, (force, 0.0, 0.0))

@@ -318,7 +318,7 @@ def test_a_request_to_stop_the_rotors_is_never_repeated_by_the_link(request_: Au
     asyncio.run(fly())
 
 
-def test_a_repeated_request_is_one_command_and_its_refusals_are_told_once_in_words() -> None:
+def test_a_repeated_request_is_one_command_and_its_refusals_are_reported_once_in_words() -> None:
     async def fly() -> None:
         port = free_udp_port()
         with Px4Peer(port) as peer:
@@ -368,7 +368,7 @@ def test_land_goes_out_while_arm_and_offboard_hang() -> None:
     asyncio.run(fly())
 
 
-def test_a_command_that_nobody_answers_is_told() -> None:
+def test_a_command_that_nobody_answers_is_reported() -> None:
     async def fly() -> None:
         port = free_udp_port()
         with Px4Peer(port) as peer:
@@ -385,7 +385,7 @@ def test_a_command_that_nobody_answers_is_told() -> None:
     asyncio.run(fly())
 
 
-def test_statustexts_become_lines_each_told_once() -> None:
+def test_statustexts_become_lines_each_reported_once() -> None:
     async def fly() -> None:
         port = free_udp_port()
         with Px4Peer(port) as peer:
@@ -520,7 +520,7 @@ def test_an_origin_that_px4_has_is_left_alone() -> None:
     asyncio.run(fly())
 
 
-def test_estimator_status_is_asked_for_and_told() -> None:
+def test_estimator_status_is_asked_for_and_reported() -> None:
     async def fly() -> None:
         port = free_udp_port()
         with Px4Peer(port) as peer:

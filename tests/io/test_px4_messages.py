@@ -93,7 +93,7 @@ def test_a_refused_request_waits_half_a_second_from_command_to_command() -> None
     assert requests.claim(ARM, RETRY_S)
 
 
-def test_the_same_refusal_is_told_again_only_after_a_while() -> None:
+def test_the_same_refusal_is_reported_again_only_after_a_while() -> None:
     requests = RequestQueue()
     for t_s in (0.0, 1.0, SAME_TEXT_S):
         assert requests.claim(ARM, t_s)
@@ -134,7 +134,7 @@ def test_the_newest_messages_are_kept_when_nobody_takes_them() -> None:
     assert requests.take_messages(0.0) == [f"critical: {number}" for number in range(300, 500)]
 
 
-def test_a_text_that_may_go_on_is_told_when_messages_are_taken_later() -> None:
+def test_a_text_that_may_go_on_is_reported_when_messages_are_taken_later() -> None:
     requests = RequestQueue()
     requests.hear({"severity": 2, "text": "x" * 50, "id": 1, "chunk_seq": 0}, 0.0)
     assert requests.take_messages(0.1) == []

@@ -165,7 +165,7 @@ def test_parameters_of_the_stub_at_once_and_one_written() -> None:
     asyncio.run(fly())
 
 
-def test_the_estimator_tells_when_vision_is_fused_and_how_well() -> None:
+def test_the_estimator_shows_when_vision_is_fused_and_how_well() -> None:
     async def fly() -> None:
         port = free_udp_port()
         device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)

@@ -16,7 +16,7 @@ def said(text: str, identity: int = 0, chunk: int = 0, severity: int = CRITICAL)
     return {"severity": severity, "text": text, "id": identity, "chunk_seq": chunk}
 
 
-def test_a_short_text_is_told_at_once_and_without_its_tab() -> None:
+def test_a_short_text_is_reported_at_once_and_without_its_tab() -> None:
     assert Texts().take(said("Preflight Fail: no heading reference\t"), 0.0) == [
         "critical: Preflight Fail: no heading reference"
     ]
@@ -30,7 +30,7 @@ def test_chunks_are_one_line(identity: int) -> None:
     assert texts.overdue(10.0) == []
 
 
-def test_a_text_of_exactly_one_chunk_is_told_after_a_while() -> None:
+def test_a_text_of_exactly_one_chunk_is_reported_after_a_while() -> None:
     texts = Texts()
     assert texts.take(said(LONG[:50], 3), 1.0) == []
     assert texts.overdue(1.0 + CHUNK_PATIENCE_S - 0.01) == []
@@ -50,7 +50,7 @@ def test_a_chunk_that_does_not_follow_is_no_part_of_the_text() -> None:
     assert texts.take(said("third", 3, 2), 0.1) == [f"critical: {LONG[:50]}", "critical: third"]
 
 
-def test_the_same_text_is_told_again_only_after_a_while() -> None:
+def test_the_same_text_is_reported_again_only_after_a_while() -> None:
     texts = Texts()
     assert len(texts.take(said("again\t"), 0.0)) == 1
     assert [texts.take(said("again"), t_s) for t_s in (0.5, 5.0, SAME_TEXT_S - 0.01)] == [[]] * 3
@@ -58,7 +58,7 @@ def test_the_same_text_is_told_again_only_after_a_while() -> None:
     assert texts.take(said("again\t"), SAME_TEXT_S) == ["critical: again"]
 
 
-def test_information_is_not_told_and_whatever_is_in_a_text_it_is_one_line() -> None:
+def test_information_is_not_reported_and_whatever_is_in_a_text_it_is_one_line() -> None:
     texts = Texts()
     assert texts.take(said("Takeoff detected\t", severity=INFO), 0.0) == []
     assert texts.take(said("no MAV_SEVERITY", severity=200), 0.0) == []

@@ -320,7 +320,7 @@ def test_a_flood_is_cut_down_and_setpoints_pass() -> None:
     asyncio.run(fly())
 
 
-def test_a_ground_station_that_is_not_there_yet_is_told_the_phase_when_it_comes() -> None:
+def test_a_ground_station_that_connects_late_receives_the_phase() -> None:
     async def fly() -> None:
         port, ground = free_udp_port(), GroundPeer(beating=False)
         with ground, Px4Peer(port):
@@ -439,7 +439,7 @@ def test_whatever_the_relay_sends_costs_the_flight_a_line_at_most(packet: bytes)
 
 
 @pytest.mark.parametrize(("bye", "texts"), [(False, 1), (True, 0)])
-def test_when_the_flight_process_dies_the_ground_is_told_and_the_relay_ends(bye: bool, texts: int) -> None:
+def test_when_the_flight_process_dies_the_ground_is_informed_and_the_relay_ends(bye: bool, texts: int) -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with GroundPeer() as ground, ours:
         with theirs:
@@ -505,6 +505,6 @@ def test_a_host_that_cannot_be_spoken_to_is_one_line_and_leaves_nothing_open(add
 
 
 @pytest.mark.parametrize("address", ["udp://127.0.0.1:14550", "udpout://127.0.0.1", "udpout://127.0.0.1:0"])
-def test_an_address_that_is_none_is_told_before_any_device_is_opened(address: str) -> None:
+def test_an_address_that_is_none_is_reported_before_any_device_is_opened(address: str) -> None:
     with pytest.raises(ConfigError, match=r"vehicle\.ground\.qgroundcontrol: expected udpout://HOST:PORT"):
         load_flight(CATCH, overrides=[f"vehicle.ground.qgroundcontrol={address}"])

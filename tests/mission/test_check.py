@@ -206,7 +206,7 @@ def test_a_path_that_overshoots_the_room_is_refused() -> None:
     assert problems(swing, "mission.catch.expected_at_m=[1.2, 0]") == []
 
 
-def test_progress_of_the_planning_is_told() -> None:
+def test_progress_of_the_planning_is_reported() -> None:
     told: list[float] = []
     config = load(mission="circuit")
     assert check_mission(config.mission, config.vehicle, progress=told.append) == []

@@ -141,7 +141,7 @@ def test_a_thousand_repetitions_are_checked_as_two(monkeypatch: pytest.MonkeyPat
     assert counts[0] == counts[1]
 
 
-def test_what_is_wrong_only_from_the_second_repetition_on_is_told() -> None:
+def test_what_is_wrong_only_from_the_second_repetition_on_is_reported() -> None:
     """The line to (-1, 0) is short from the start, and too long in its time from where the repetition ends."""
     phases = (
         "mission.phases=[{type: takeoff, height_m: 1, duration_s: 3}, {type: line, name: to, to_m: [-0.9, 0, 1], duration_s: 2}, "
@@ -153,7 +153,7 @@ def test_what_is_wrong_only_from_the_second_repetition_on_is_told() -> None:
     assert not any("(1 of 3)" in problem for problem in found)
 
 
-def test_what_is_wrong_in_every_repetition_is_told_once() -> None:
+def test_what_is_wrong_in_every_repetition_is_reported_once() -> None:
     told = problems("catch", "mission.repeat=9", "mission.phases[2].to_m=[1.9, 0, 1]")
     assert len(told) == len(problems("catch", "mission.phases[2].to_m=[1.9, 0, 1]"))
     [room] = [line for line in told if "leaves the room" in line]

@@ -162,7 +162,7 @@ def test_only_what_may_be_none_has_a_default(cls: type[Record]) -> None:
     assert all(field.default in (None, msgspec.NODEFAULT) for field in msgspec.structs.fields(cls))
 
 
-def test_differences_tells_the_field_and_sees_the_last_bit() -> None:
+def test_differences_shows_the_field_and_sees_the_last_bit() -> None:
     value = 0.3
     next_value = struct.unpack("<d", struct.pack("<q", struct.unpack("<q", struct.pack("<d", value))[0] + 1))[0]
     one = types.AttitudeSetpoint((1.0, 0.0, 0.0, value), 0.5)

@@ -1,4 +1,4 @@
-"""`companion check` and the preflight of `companion fly` over real wires: a sound world passes; what is spoiled in it is told by the
+"""`companion check` and the preflight of `companion fly` over real wires: a sound world passes; what is wrong in it is reported by the
 right rows, and refuses.
 """
 
@@ -48,7 +48,7 @@ def refusing(rows: dict[str, dict[str, Any]]) -> set[str]:
 
 
 @pytest.mark.flight
-def test_a_sound_world_may_fly_and_every_row_is_told(sandbox: Sandbox) -> None:
+def test_a_sound_world_may_fly_and_every_row_is_reported(sandbox: Sandbox) -> None:
     ended = sandbox.run("check", CATCH, "--sitl", "--json")
     sandbox.assert_nobody_left()
     assert (ended.code, ended.err) == (EXIT_OK, ""), ended
@@ -61,15 +61,15 @@ def test_a_sound_world_may_fly_and_every_row_is_told(sandbox: Sandbox) -> None:
 
 
 @pytest.mark.flight
-def test_what_is_spoiled_refuses_the_check_and_the_flight(sandbox: Sandbox, tmp_path: Path) -> None:
+def test_a_wrong_setting_refuses_the_check_and_the_flight(sandbox: Sandbox, tmp_path: Path) -> None:
     """Wrong joint angle, force bias and one parameter of PX4, in the world alone: the companion believes its files."""
-    spoiled = (
+    wrong = (
         "mission.start.arm_deg=[140, 120]",
         "world.force_bias_n=[30, 0, 0]",
         "world.px4_params={COM_OBL_RC_ACT: 0}",
     )
     expected = {"mission.arm", "force.tare", "px4.param.COM_OBL_RC_ACT"}
-    with sandbox_in(tmp_path / "world") as around, World(around, CATCH, spoiled) as world:
+    with sandbox_in(tmp_path / "world") as around, World(around, CATCH, wrong) as world:
         shown = sandbox.run("check", CATCH, *world.addresses())
         assert (shown.code, shown.err) == (EXIT_REFUSED, ""), shown
         assert "3 of " in shown.out and "the machine may not fly." in shown.out

@@ -1,4 +1,4 @@
-"""What a machine at rest tells of wrong axes: every spoiled frame that shows at rest is refused and named, the sound one passes."""
+"""What a machine at rest tells of wrong axes: every wrong frame that shows at rest is refused and named, the sound one passes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_sound_set_up_passes_whatever_the_noise(seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoiled", "row", "words"),
+    ("wrong", "row", "words"),
     [
         # The whole world in other axes, the body made in them: z up turned about x, y and z, exchanged, mirrored.
         ('mocap_axes=["x","z","-y"]', "frames.height", "the stream looks y-up: set devices.mocap.up_axis: y"),
@@ -68,12 +68,12 @@ def test_a_sound_set_up_passes_whatever_the_noise(seed: int) -> None:
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_spoiled_frame_is_refused_and_named(spoiled: str, row: str, words: str, seed: int) -> None:
-    rows = watched(spoiled, f"seed={seed}")
+def test_a_wrong_frame_is_refused_and_named(wrong: str, row: str, words: str, seed: int) -> None:
+    rows = watched(wrong, f"seed={seed}")
     assert row in {bad.id for bad in rows if bad.refuses}
     assert words in failed(rows)[row]
     # On an axis of the world some of them look alike, and none of them looks right.
-    assert row in {bad.id for bad in watched(spoiled, f"seed={seed}", y_m=0.0) if bad.refuses}
+    assert row in {bad.id for bad in watched(wrong, f"seed={seed}", y_m=0.0) if bad.refuses}
 
 
 def test_a_y_up_stream_of_a_machine_that_looks_to_the_left_shows_in_its_tilt_too() -> None:
@@ -108,7 +108,7 @@ def test_a_machine_that_only_stands_elsewhere_is_not_explained_away() -> None:
     assert failed(rows) == {"frames.place": "carry it there or change the mission's start.position_m"}
 
 
-def test_a_little_too_high_is_told_but_does_not_refuse() -> None:
+def test_a_little_too_high_is_reported_but_does_not_refuse() -> None:
     wanted = Wanted((-1.0, 0.3, 0.3), 0.0, 0.15, 15.0)
     rows = list(standing(Pose((-1.0, 0.3, 0.36), (1.0, 0.0, 0.0, 0.0)), G, wanted, "z"))
     assert list(failed(rows)) == ["frames.height"]
@@ -129,7 +129,7 @@ def test_too_few_samples_are_not_judged() -> None:
     assert "0 tracked poses" in row.read
 
 
-def test_noise_and_jumps_are_told_by_how_bad_they_are() -> None:
+def test_noise_and_jumps_are_reported_by_how_bad_they_are() -> None:
     noisy = {row.id: row for row in watched("mocap_noise_m=0.003", "mocap_noise_deg=0.4")}
     for name in ("frames.noise_position", "frames.noise_attitude"):
         assert not noisy[name].ok
@@ -143,7 +143,7 @@ def test_noise_and_jumps_are_told_by_how_bad_they_are() -> None:
     assert refused == ["frames.noise_attitude"]
 
 
-def test_px4_that_does_not_take_the_yaw_is_told() -> None:
+def test_px4_that_does_not_take_the_yaw_is_reported() -> None:
     config = world()
     seen = observed(Standing(config), WATCH_S)
     turned = quat_from_euler_zyx(0.0, 0.0, math.radians(60.0))
@@ -156,7 +156,7 @@ def test_px4_that_does_not_take_the_yaw_is_told() -> None:
     assert [row.id for row in rows if row.refuses] == ["frames.px4_tilt"]
 
 
-def test_an_accelerometer_that_reads_wrong_is_told() -> None:
+def test_an_accelerometer_that_reads_wrong_is_reported() -> None:
     config = world()
     seen = observed(Standing(config), WATCH_S)
     states = tuple(replace(s, specific_force_body_m_s2=(0.0, 0.0, 8.9)) for s in seen.vehicle)
@@ -165,7 +165,7 @@ def test_an_accelerometer_that_reads_wrong_is_told() -> None:
     assert not any(row.refuses for row in rows)
 
 
-def test_the_hand_test_on_record_is_told_on_hardware_only() -> None:
+def test_the_hand_test_on_record_is_reported_on_hardware_only() -> None:
     config = world()
     seen = observed(Standing(config), WATCH_S)
 

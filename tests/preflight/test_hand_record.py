@@ -50,7 +50,7 @@ def test_a_passed_test_counts_for_its_own_set_up() -> None:
         ({"natnet_version": "3.0"}, "natnet_version was 4.1, is 3.0"),
     ],
 )
-def test_what_has_changed_since_then_is_told(change: dict[str, Any], told: str) -> None:
+def test_what_has_changed_since_then_is_reported(change: dict[str, Any], told: str) -> None:
     passed, changed = on_record(replace(SETUP, **change), one())
     assert not passed
     assert changed == f"passed on 2026-03-04T05:06:07+00:00, but since then {told}"

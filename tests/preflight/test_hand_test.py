@@ -1,4 +1,4 @@
-"""The guided hand test on the simulated machine that a hand carries: sound set-ups pass, every spoiled one is refused and named."""
+"""The guided hand test on the simulated machine that a hand carries: sound set-ups pass, every wrong one is refused and named."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_a_biased_imu_and_slow_motion_capture_pass() -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoiled", "row", "words"),
+    ("wrong", "row", "words"),
     [
         ('mocap_axes=["x","z","-y"]', "hand.lift", "the stream looks y-up: set devices.mocap.up_axis: y"),
         (
@@ -123,13 +123,13 @@ def test_a_biased_imu_and_slow_motion_capture_pass() -> None:
         ("mocap_body_tilt_deg=[0,12]", "hand.level", "the rigid body's zero was set while the machine was tilted"),
     ],
 )
-def test_a_spoiled_frame_is_refused_and_named(spoiled: str, row: str, words: str) -> None:
-    refused = failed(hand_test_evaluation.rows(result(samples(spoiled)), "z"))
+def test_a_wrong_frame_is_refused_and_named(wrong: str, row: str, words: str) -> None:
+    refused = failed(hand_test_evaluation.rows(result(samples(wrong)), "z"))
     assert row in refused
     assert words in refused[row]
 
 
-def test_a_body_that_is_turned_is_told_with_its_angle() -> None:
+def test_a_body_that_is_turned_is_reported_with_its_angle() -> None:
     for off_deg in (-90, 20, 90):
         measured = result(samples(f"mocap_body_yaw_deg={off_deg}"))
         assert hand_test_evaluation.yaw_offset_deg(measured.forward) == pytest.approx(off_deg, abs=5.0)
@@ -141,7 +141,7 @@ def test_a_z_up_stream_that_is_taken_for_y_up_is_named() -> None:
 
 
 @pytest.mark.parametrize("axes", ALL, ids=lambda axes: ",".join(axes.names))
-def test_each_of_the_48_body_frames_is_told_from_the_others(axes: AxisMap) -> None:
+def test_each_of_the_48_body_frames_is_distinguished_from_the_others(axes: AxisMap) -> None:
     """Without the rule of how people make a rigid body: every exchange of its axes."""
     measured = result(
         dataclasses.replace(sample, pose=exchanged(sample.pose, axes)) if sample.pose is not None else sample
@@ -169,7 +169,7 @@ def test_axis_maps_are_what_they_say() -> None:
     assert AxisMap.of(("x", "-y", "z")).rotation(q) == (q[0], 0.0, 0.0, -q[3])
 
 
-def test_px4_mounted_the_wrong_way_round_is_told_from_wrong_motion_capture() -> None:
+def test_px4_mounted_the_wrong_way_round_is_distinguished_from_wrong_motion_capture() -> None:
     course = felt_otherwise(samples(), lambda v: (v[1], -v[0], v[2]))
     refused = failed(hand_test_evaluation.rows(result(course), "z"))
     assert "hand.told" in refused
@@ -181,7 +181,7 @@ def doubled(pose: MocapPose) -> MocapPose:
     return replace(pose, position_world_m=(2.0 * x, 2.0 * y, 2.0 * z))
 
 
-def test_wrong_distances_are_told() -> None:
+def test_wrong_distances_are_reported() -> None:
     course = [dataclasses.replace(s, pose=doubled(s.pose)) if s.pose is not None else s for s in samples()]
     assert set(failed(hand_test_evaluation.rows(result(course), "z"))) == {"hand.scale"}
 
@@ -214,7 +214,7 @@ def test_a_test_without_a_result_names_the_command_to_do_again() -> None:
         assert (row.refuses, row.read, row.fix) == (True, "nobody lifted it", f"repeat the test: {again}")
 
 
-def test_a_machine_that_nobody_lifts_is_told_after_the_time_limit() -> None:
+def test_a_machine_that_nobody_lifts_is_reported_after_the_time_limit() -> None:
     view = ran(standing())
     assert view.ended.startswith(f"not within {STEP_TIMEOUT_S:g} s: take it by its legs")
     assert "moved by 0 cm" in view.ended
@@ -257,6 +257,6 @@ def test_a_pause_in_the_middle_of_the_round_is_not_taken_for_the_floor() -> None
     assert not failed(hand_test_evaluation.rows(view.result, "z"))
 
 
-def test_the_docs_tell_every_row() -> None:
+def test_the_docs_list_every_row() -> None:
     page = (ROOT / "docs/hand-test.md").read_text(encoding="utf-8")
     assert written(page, {"hand": checks_table(hand_test_evaluation.CHECKS)}) == page

@@ -1,4 +1,6 @@
-"""Every row of the preflight by records: a sound machine passes, and whatever can be wrong is told by its own row, with what to do."""
+"""Every row of the preflight by records: a sound machine passes, and whatever can be wrong is reported by its own row, with what to
+do.
+"""
 
 from __future__ import annotations
 
@@ -236,7 +238,7 @@ def test_a_sound_machine_passes_every_row() -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_what_is_wrong_is_told_by_its_row(name: str) -> None:
+def test_what_is_wrong_is_reported_by_its_row(name: str) -> None:
     case = CASES[name]
     rows = judged(case)
     row = rows[case.row]
@@ -255,7 +257,7 @@ def test_every_row_can_fail() -> None:
     assert {row for row in told if not row.startswith(px4.PARAM_ID)} == (here - NEVER_BAD) | {px4.FIRMWARE_ID}
 
 
-# What is wrong in one place is told in one place.
+# What is wrong in one place is reported in one place.
 LONELY = ("old heartbeat", "armed", "slow state", "flat battery", "hover thrust doubtful",
           "a parameter", "lost frames", "another body", "another mode",
           "servo error", "loose cable", "leaning hard", "overloaded", "weak tether", "arm elsewhere", "full disk", "no recorder",
@@ -323,7 +325,7 @@ def test_observations_of_nothing_refuse_and_do_not_fall_over() -> None:
     assert {"px4.heartbeat", "px4.vision", "mocap.device", "force.device"} <= {row.id for row in rows if row.refuses}
 
 
-def test_the_docs_tell_every_row() -> None:
+def test_the_docs_list_every_row() -> None:
     """Made by `python -m tools.docs.preflight docs/preflight.md`."""
     page = (ROOT / "docs/preflight.md").read_text(encoding="utf-8")
     assert written(page, tables()) == page

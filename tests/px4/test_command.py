@@ -110,7 +110,7 @@ def test_a_name_that_px4_does_not_have_is_not_all_written(tmp_path: Path, capsys
         assert peer.params["COM_RC_IN_MODE"] == 3
 
 
-def test_another_type_than_px4s_is_told_and_not_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_type_than_px4s_is_reported_and_not_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "mine.params"
     path.write_text(params_file.text({"MPC_THR_HOVER": 1}), encoding="utf-8")
     port = free_udp_port()
@@ -127,7 +127,9 @@ def test_a_bad_address_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert "a port from 1 to 65535" in said
 
 
-def test_a_damaged_file_is_told_before_anything_is_opened(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_damaged_file_is_reported_before_anything_is_opened(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "mine.params"
     path.write_text("1\t1\tA\tx\t6\n", encoding="utf-8")
     assert params(1, "--diff", str(path)) == EXIT_BAD_INPUT

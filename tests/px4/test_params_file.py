@@ -65,7 +65,7 @@ def test_a_file_of_qgroundcontrol_is_read() -> None:
         ("1\t1\tA\t1\t6", "A is a duplicate of line 2"),
     ],
 )
-def test_a_mistake_is_told_with_its_line(line: str, said: str) -> None:
+def test_a_mistake_is_reported_with_its_line(line: str, said: str) -> None:
     with pytest.raises(ConfigError) as caught:
         params_file.parse(f"# mine\n1\t1\tA\t0\t6\n{line}\n", "mine.params")
     assert len(caught.value.lines) == 1
@@ -73,7 +73,7 @@ def test_a_mistake_is_told_with_its_line(line: str, said: str) -> None:
     assert said in caught.value.lines[0]
 
 
-def test_every_mistake_is_told_at_once(tmp_path: Path) -> None:
+def test_every_mistake_is_reported_at_once(tmp_path: Path) -> None:
     path = tmp_path / "two.params"
     path.write_text("1\t1\tA\tx\t6\n1\t1\tB\t1\t6\n1\t1\tC\ty\t9\n", encoding="utf-8")
     with pytest.raises(ConfigError) as caught:

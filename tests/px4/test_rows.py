@@ -1,4 +1,4 @@
-"""The preflight's rows of firmware and parameters: what is spoiled is named, with the fix; what is fine is not."""
+"""The preflight's rows of firmware and parameters: what is wrong is named, with the fix; what is fine is not."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ VEHICLE_FILE = Path(__file__).parents[2] / "configs/vehicles/tarot650_2r.yaml"
 FIRMWARE = "PX4 1.16.1 release (git 94cb20127)"
 UDP = "vehicle.devices.autopilot.address=udpin://127.0.0.1:14540"
 
-# Name, spoiled value, whether the machine stays on the ground, and a part of the fix.
+# Name, wrong value, whether the machine stays on the ground, and a part of the fix.
 SPOILED = [
     ("EKF2_EV_CTRL", 0, True, "set EKF2_EV_CTRL to 11"),
     ("EKF2_HGT_REF", 1, True, "set EKF2_HGT_REF to 3 (companion px4 params --write), then reboot PX4"),
@@ -66,7 +66,7 @@ def test_what_this_project_sets_is_fine() -> None:
 
 
 @pytest.mark.parametrize(("name", "value", "refuses", "fix"), SPOILED)
-def test_a_spoiled_parameter_is_named_with_its_fix(name: str, value: float, refuses: bool, fix: str) -> None:
+def test_a_wrong_parameter_is_named_with_its_fix(name: str, value: float, refuses: bool, fix: str) -> None:
     (row,) = wrong({**good(), name: value})
     assert row.id == f"px4.param.{name}"
     assert row.title == name
@@ -96,7 +96,7 @@ def test_limits_follow_the_vehicle_file() -> None:
     assert [row.title for row in wrong(good(), strong)] == [HOVER]
 
 
-def test_a_parameter_that_px4_does_not_have_is_told() -> None:
+def test_a_parameter_that_px4_does_not_have_is_reported() -> None:
     params = good()
     del params["EKF2_EV_QMIN"]
     (row,) = wrong(params)
@@ -163,9 +163,9 @@ def test_types_and_names_are_those_of_px4() -> None:
     }
 
 
-def test_spoiled_over_real_mavlink_the_row_is_there() -> None:
-    spoiled = {"EKF2_EV_CTRL": 3.0, "COM_OBL_RC_ACT": 6.0, "COM_OF_LOSS_T": 5.0}
-    world, _ = load_world([f"world.px4_params={spoiled}".replace("'", "")])
+def test_a_wrong_parameter_over_real_mavlink_gives_its_row() -> None:
+    wrong = {"EKF2_EV_CTRL": 3.0, "COM_OBL_RC_ACT": 6.0, "COM_OF_LOSS_T": 5.0}
+    world, _ = load_world([f"world.px4_params={wrong}".replace("'", "")])
 
     async def read() -> list[Row]:
         port = free_udp_port()
@@ -176,7 +176,7 @@ def test_spoiled_over_real_mavlink_the_row_is_there() -> None:
         ):
             return rows(await autopilot.firmware(), await autopilot.read_params(names()), vehicle())
 
-    assert {row.title for row in asyncio.run(read()) if not row.ok} == set(spoiled)
+    assert {row.title for row in asyncio.run(read()) if not row.ok} == set(wrong)
 
 
 @pytest.mark.parametrize(
@@ -187,13 +187,13 @@ def test_spoiled_over_real_mavlink_the_row_is_there() -> None:
         ("{EKF2_EVP_NOISE: 1.0e+39}", "EKF2_EVP_NOISE cannot hold 1e+39"),
     ],
 )
-def test_a_spoiled_parameter_that_px4_cannot_have_is_refused(override: str, said: str) -> None:
+def test_a_wrong_parameter_that_px4_cannot_have_is_refused(override: str, said: str) -> None:
     with pytest.raises(ConfigError) as caught:
         load_world([f"world.px4_params={override}"])
     assert said in caught.value.lines[0]
 
 
-def test_spoiled_parameters_come_in_px4s_types() -> None:
+def test_wrong_parameters_come_in_px4s_types() -> None:
     world = World(px4_params={"EKF2_EV_CTRL": 3.0, "COM_OF_LOSS_T": 1.0})
     assert world.overridden_px4_params() == {"EKF2_EV_CTRL": 3, "COM_OF_LOSS_T": 1.0}
     assert [type(value) for value in world.overridden_px4_params().values()] == [int, float]

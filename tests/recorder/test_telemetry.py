@@ -127,7 +127,7 @@ def test_a_flight_process_that_dies_is_silent_first_and_lost_with_its_channel(tm
     assert len(FlightLog.read(flight.path).inputs) == 400
 
 
-def test_a_broker_that_dies_and_comes_back_costs_no_sample_and_is_told_everything_again(
+def test_a_broker_that_dies_and_comes_back_costs_no_sample_and_is_reported_everything_again(
     tmp_path: Path, broker: Broker
 ) -> None:
     with flight_with(tmp_path, broker.url) as flight:
@@ -178,7 +178,7 @@ def test_a_broker_that_takes_nothing_costs_no_sample_and_holds_nobody(tmp_path: 
     assert len(FlightLog.read(flight.path).inputs) == len(ROWS)
 
 
-def test_no_broker_at_all_is_told_once_and_costs_no_sample(tmp_path: Path) -> None:
+def test_no_broker_at_all_is_reported_once_and_costs_no_sample(tmp_path: Path) -> None:
     url = f"mqtt://127.0.0.1:{free_port()}"
     with flight_with(tmp_path, url) as flight:
         flight.wait(lambda: flight.recorder.client.telemetry_status is not None, "the flight is not told")

@@ -222,7 +222,7 @@ def test_no_command_is_heard_over_a_plain_way_to_another_computer(tmp_path: Path
 
 
 @pytest.mark.parametrize("fault", ["open to others", "absent", "no yaml"])
-def test_a_login_that_cannot_be_used_is_told_in_one_line_and_the_log_is_written(
+def test_a_login_that_cannot_be_used_is_reported_in_one_line_and_the_log_is_written(
     tmp_path: Path, broker: Broker, fault: str
 ) -> None:
     login = tmp_path / "login.yaml"
@@ -247,7 +247,7 @@ log_dest stderr
 """
 
 
-def test_a_broker_that_does_not_let_the_vehicle_speak_is_told(tmp_path: Path) -> None:
+def test_a_broker_that_does_not_let_the_vehicle_speak_is_reported(tmp_path: Path) -> None:
     acl, config, port = tmp_path / "acl", tmp_path / "mosquitto.conf", free_port()
     acl.write_text(f"topic write companion/{VEHICLE}/stream\n", encoding="utf-8")
     acl.chmod(0o600)
@@ -318,7 +318,7 @@ def test_over_tls_with_its_login_a_vehicle_is_seen_and_commanded(tmp_path: Path,
         ("plain to the TLS port", "no broker at"),
     ],
 )
-def test_what_is_wrong_with_login_or_certificate_is_told_and_the_log_is_written(
+def test_what_is_wrong_with_login_or_certificate_is_reported_and_the_log_is_written(
     tmp_path: Path, site: Site, fault: str, told: str
 ) -> None:
     settings: dict[str, Any] = secure(site)

@@ -293,23 +293,23 @@ def test_without_a_pose_of_motion_capture_px4_s_is_shown(tmp_path: Path, changes
 def sick(rows: list[Row], chance: random.Random) -> Row:
     """Yield ticks in which any field is absent or not finite, at every depth."""
 
-    def spoil(record: Any) -> Any:
+    def corrupt(record: Any) -> Any:
         if isinstance(record, float):
             return chance.choice([record, record, NAN, math.inf, -math.inf, 1e308, -0.0])
         if isinstance(record, tuple):
-            return tuple(spoil(item) for item in record)
+            return tuple(corrupt(item) for item in record)
         if isinstance(record, Record):
             changed = {}
             for field in fields(record):
                 absent = field.default is None and chance.random() < 0.2
-                changed[field.name] = None if absent else spoil(getattr(record, field.name))
+                changed[field.name] = None if absent else corrupt(getattr(record, field.name))
             return replace(record, **changed)
         if isinstance(record, str):
             return chance.choice([record, "", "\x00", "ä" * 300])
         return record
 
     inputs, outputs, sent = chance.choice(rows)
-    return spoil(inputs), spoil(outputs), spoil(sent)
+    return corrupt(inputs), corrupt(outputs), corrupt(sent)
 
 
 def test_no_sick_tick_is_lost_or_stops_the_viewers(tmp_path: Path) -> None:
@@ -334,7 +334,7 @@ def test_no_sick_tick_is_lost_or_stops_the_viewers(tmp_path: Path) -> None:
             assert all(map(math.isfinite, floats(message.data))), message
 
 
-def test_a_tick_that_cannot_be_drawn_is_recorded_and_told_once(tmp_path: Path) -> None:
+def test_a_tick_that_cannot_be_drawn_is_recorded_and_reported_once(tmp_path: Path) -> None:
     log_file = LogFile(tmp_path / "flight.mcap")
     writer = LogWriter(log_file, EPOCH_NS, chunk_bytes=2**19)
     rows = still(12)

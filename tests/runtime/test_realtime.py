@@ -125,7 +125,7 @@ def test_a_limit_on_locked_memory_is_no_trap_in_flight() -> None:
     assert told["permitted"] == told["refused"]
 
 
-def test_cores_that_are_not_there_are_told() -> None:
+def test_cores_that_are_not_there_are_reported() -> None:
     told = in_a_process_of_its_own(
         "got = claim_realtime(1, cpus={1000}, lock_memory=False)",
         "print(json.dumps({'cpus': got.cpus, 'line': str(got), 'locked': got.memory_locked}))",

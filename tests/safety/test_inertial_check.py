@@ -82,7 +82,7 @@ def test_a_drag_that_begins_slowly_is_not_found() -> None:
     assert found_s(growing_m_s2=0.7) is not None
 
 
-def test_a_lasting_shift_of_one_centimetre_is_believed_and_one_of_five_is_not() -> None:
+def test_a_lasting_shift_of_one_centimetre_is_accepted_and_one_of_five_is_not() -> None:
     assert found_s(step_m=0.01) is None
     after_s = found_s(step_m=0.05)
     assert after_s is not None and after_s < 0.1

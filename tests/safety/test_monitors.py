@@ -240,7 +240,7 @@ def test_every_rule_has_its_fault() -> None:
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
-def test_each_fault_is_told_once_by_name_and_asks_for_its_rung(rule: Rule) -> None:
+def test_each_fault_is_reported_once_by_name_and_requests_its_action(rule: Rule) -> None:
     fault = FAULTS[rule.id]
     events = watched(VEHICLE, stream(rule.id), fault.situation())
     assert {event.id for event in events} == {rule.id, *fault.also}
@@ -254,7 +254,7 @@ IN_THE_AIR = {rule.id for rule in RULES if rule.ground is None}
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
-def test_on_the_ground_only_what_matters_there_is_told(rule: Rule) -> None:
+def test_on_the_ground_only_what_matters_there_is_reported(rule: Rule) -> None:
     fault = FAULTS[rule.id]
     situation = standing(
         offboard_expected=rule.id in ("pilot_took_over", "offboard_left"),
@@ -299,7 +299,7 @@ def broken_fields() -> list[tuple[str, str, int | None]]:
 
 @pytest.mark.parametrize("bad", [NAN, math.inf, -math.inf, 1e300])
 @pytest.mark.parametrize(("part", "name", "index"), broken_fields())
-def test_a_value_that_is_no_number_is_told_and_its_record_counts_as_missing(
+def test_a_value_that_is_no_number_is_reported_and_its_record_counts_as_missing(
     part: str, name: str, index: int | None, bad: float
 ) -> None:
     monitors = Monitors(VEHICLE)
@@ -317,7 +317,7 @@ def test_a_value_that_is_no_number_is_told_and_its_record_counts_as_missing(
 # -- motion capture --------------------------------------------------------------------------------------------------
 
 
-def test_a_pose_that_is_not_believed_is_passed_on_to_nobody() -> None:
+def test_a_rejected_pose_is_not_passed_on() -> None:
     monitors = Monitors(VEHICLE)
     watched(VEHICLE, [healthy(k) for k in range(3)], flying(), monitors)
     monitors.check(moved("mocap", (0.0, 0.3, 0.0))(healthy(3)), flying())
@@ -403,21 +403,21 @@ def test_a_mocap_that_stays_away_after_a_hold_up_is_lost() -> None:
 # -- what comes and goes ---------------------------------------------------------------------------------------------
 
 
-def test_what_flickers_is_not_told_in_every_tick() -> None:
+def test_what_flickers_is_not_reported_in_every_tick() -> None:
     def now_and_then(i: Inputs) -> Inputs:
         return put("arm", read_failures=6)(i) if i.tick % 20 == 5 else i
 
     assert len(watched(VEHICLE, after_a_moment(now_and_then), flying())) == 1
 
 
-def test_what_comes_back_after_a_while_is_told_again() -> None:
+def test_what_comes_back_after_a_while_is_reported_again() -> None:
     def twice(i: Inputs) -> Inputs:
         return put("arm", read_failures=6)(i) if i.tick in (100, 500) else i
 
     assert len(watched(VEHICLE, after_a_moment(twice), flying())) == 2
 
 
-def test_what_is_still_there_after_a_hold_was_taken_back_is_told_again() -> None:
+def test_what_is_still_there_after_a_hold_was_taken_back_is_reported_again() -> None:
     monitors = Monitors(VEHICLE)
     inputs = after_a_moment(at(1.6, 0.0, 1.0, vx=0.8), sound=0)
     before = watched(VEHICLE, inputs[:100], flying(), monitors)
@@ -472,7 +472,7 @@ def test_while_inputs_are_missing_only_people_and_broken_values_are_heard() -> N
 # -- words -----------------------------------------------------------------------------------------------------------
 
 
-def test_hardware_errors_are_told_by_name() -> None:
+def test_hardware_errors_are_reported_by_name() -> None:
     assert error_text((0, 0b100100)) == "servo 2: overheating, overload"
     assert error_text((0b1, 0b1000000)) == "servo 1: input voltage; servo 2: bit 6"
 

@@ -76,7 +76,7 @@ def test_the_arm_delay_delays_the_currents_and_nothing_else() -> None:
     assert [late.inputs[k] for k in before] == [prompt.inputs[k] for k in before]
 
 
-def test_a_silent_servo_lets_go_and_that_is_told_when_it_answers_again() -> None:
+def test_a_silent_servo_lets_go_and_that_is_reported_when_it_answers_again() -> None:
     """As over the wire: the watchdog trips, and the driver restarts it and reports it in one state."""
     result = flown("world.faults=[{kind: servo_loss, t_s: 4.0, duration_s: 0.12}]")
     armed_s = next(i.t_s for i in result.inputs if i.status is not None and i.status.armed)

@@ -60,7 +60,7 @@ def test_a_phase_is_a_time_of_the_plan() -> None:
         assert plan.segment(fault.t_s - SPOOL_S).name == name, phase
 
 
-def test_the_catch_is_the_world_s_to_tell_unless_nothing_is_thrown() -> None:
+def test_the_world_reports_the_catch_unless_nothing_is_thrown() -> None:
     (fault,) = with_fault_times(with_faults({"kind": "mocap_loss", "phase": "catch"})).world.faults
     assert fault.after == "catch"
     (fault,) = with_fault_times(
@@ -161,7 +161,7 @@ def test_a_clock_that_steps_makes_the_frames_late_that_were_on_their_way() -> No
 
 
 def test_without_faults_the_flight_is_the_same_to_the_last_bit() -> None:
-    """A fault that never comes changes nothing but that the guardian is told of."""
+    """A fault that never comes changes nothing but that the guardian is reported of."""
     late = FastFlight(with_faults({"kind": "mocap_loss", "t_s": 1000.0})).run(3.0)
     never = FastFlight(CONFIG).run(3.0)
     assert [o.attitude for o in late.outputs] == [o.attitude for o in never.outputs]
@@ -194,7 +194,7 @@ def test_without_faults_the_flight_is_the_same_to_the_last_bit() -> None:
         ("pilot_takeover", "landing", 1.0, None, "landed", "pilot_took_over", "autopilot_land"),
     ],
 )  # fmt: skip
-def test_it_ends_well_and_is_told(
+def test_it_ends_well_and_is_reported(
     kind: FaultKind,
     phase: FlightPhase,
     size: float | None,
@@ -299,7 +299,7 @@ def test_a_restart_of_px4_in_the_air_is_a_fall_and_is_called_so() -> None:
 # -- processes ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_flight_process_is_told_for_how_long_it_stalls() -> None:
+def test_the_flight_process_receives_the_duration_of_its_stall() -> None:
     assert environment({"mocap_loss"}, 0.2) == {}
     assert environment({"stall_loop"}, 0.2)["COMPANION_SITL_STALL_S"] == "0.2"
     assert "COMPANION_SITL_STALL_S" not in environment({"stall_loop"})

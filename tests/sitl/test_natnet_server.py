@@ -113,7 +113,7 @@ def test_every_section_is_skipped(version: NatNetVersion) -> None:
     assert frame.body.position_m == (10.0, 2.0, 3.0)
 
 
-def test_frame_of_the_other_version_is_not_believed() -> None:
+def test_frame_of_the_other_version_is_rejected() -> None:
     for actual, assumed in (("3.0", "4.1"), ("4.1", "3.0")):
         result = parse(frame_of(actual), assumed)  # type: ignore[arg-type]
         assert isinstance(result, Malformed) or result.body is None

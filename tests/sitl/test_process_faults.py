@@ -122,7 +122,7 @@ def injected() -> Iterator[ProcessFaults]:
         process.kill()
 
 
-def test_the_report_tells_late_setpoints_a_gap_in_vision_and_drift(injected: ProcessFaults) -> None:
+def test_the_report_shows_late_setpoints_a_gap_in_vision_and_drift(injected: ProcessFaults) -> None:
     poses = 100
     for k in range(1, 2001):
         t_s = 5.0 + 0.002 * k

@@ -36,7 +36,7 @@ def test_it_reads_what_was_written(values: dict[str, Value]) -> None:
 
 
 @given(st.dictionaries(NAMES, VALUES, min_size=1), st.data())
-def test_a_file_that_is_not_whole_is_not_believed(values: dict[str, Value], data: st.DataObject) -> None:
+def test_a_file_that_is_not_whole_is_rejected(values: dict[str, Value], data: st.DataObject) -> None:
     whole = document(values)
     assert decode(whole[: data.draw(st.integers(0, len(whole) - 1))]) is None
 

@@ -99,7 +99,7 @@ def test_it_runs_in_its_folder_and_ends_when_asked(tmp_path: Path) -> None:
     asyncio.run(scenario())
 
 
-def test_one_that_dies_is_told_with_its_last_complaint(tmp_path: Path) -> None:
+def test_one_that_dies_is_reported_with_its_last_complaint(tmp_path: Path) -> None:
     build = installed(tmp_path / "build", "#!/bin/sh\necho 'ERROR [init] Unknown model'\nexit 7\n")
     installation = find({"PX4_SITL": str(build)})
     assert installation is not None

@@ -78,7 +78,7 @@ def test_a_type_that_disagrees_changes_nothing() -> None:
     assert params["EKF2_EV_CTRL"] == 11
 
 
-def test_the_hash_and_the_revision_tell_of_every_change() -> None:
+def test_the_hash_and_the_revision_show_of_every_change() -> None:
     params = Params()
     hash_before, revision = params.hash_check(), params.revision
     params.set("MPC_THR_HOVER", 0.6)

@@ -183,7 +183,7 @@ def test_statustext_needs_a_ground_station_on_the_link(kind: int, texts: bool) -
     asyncio.run(scenario())
 
 
-def test_what_was_said_a_moment_ago_is_told_to_a_ground_station_that_comes() -> None:
+def test_a_new_ground_station_receives_recent_texts() -> None:
     async def scenario() -> None:
         rig = Rig()
 

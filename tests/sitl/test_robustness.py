@@ -151,14 +151,14 @@ def test_a_row_is_what_the_flight_was(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("lost_s", "felt"), [(2.0, False), (5.0, True)])
-def test_a_catch_is_felt_if_the_force_sensor_lives_to_tell(lost_s: float, felt: bool) -> None:
+def test_a_catch_is_felt_if_the_force_sensor_still_works(lost_s: float, felt: bool) -> None:
     world = {"payload_kg": 0.2, "faults": [{"kind": "force_loss", "t_s": lost_s}]}
     found = robustness.fly(SHORT, {"name": "a", "number": None, "world": world})["row"]
     assert found["caught"] and found["felt"] is felt
     assert (found["noticed_s"] is not None) is felt
 
 
-def test_what_ended_a_mission_early_is_told() -> None:
+def test_what_ended_a_mission_early_is_reported() -> None:
     world = {"faults": [{"kind": "battery_sag", "phase": "line", "size": 4.0}]}
     found = robustness.fly(SHORT, {"name": "draw 0", "number": 0, "world": world})["row"]
     assert found["outcome"] == "aborted"

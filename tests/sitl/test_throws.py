@@ -125,7 +125,7 @@ def test_the_committed_soak_mission_catches_in_the_fast_loop() -> None:
     assert (world.payload.throws, world.payload.catches) == (1, 1)
 
 
-def test_the_battery_lives_as_long_as_it_is_told() -> None:
+def test_the_battery_lasts_as_long_as_configured() -> None:
     config = configured("world.battery_life_s=50", "world.battery_start=0.9")
     flight = FastFlight(config)
     plant: Plant = flight.plant

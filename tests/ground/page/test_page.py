@@ -67,7 +67,7 @@ def test_the_page_says_its_token_first_and_hides_it(stub: MonitorStub, page: Pag
 def test_values_are_those_of_the_newest_record(page: Page) -> None:
     for mission_t_s in (1.5, 8.5, 14.0):
         stream = flown().at(mission_t_s)
-        page.tell(relayed(stream))
+        page.show(relayed(stream))
         assert stream.tether is not None and stream.position_world_m is not None and stream.e_p_m is not None
         assert page.figure("tether") == f"{stream.tether.slack_m:.2f}"
         assert page.figure("height") == f"{stream.position_world_m[2]:.2f}"
@@ -79,7 +79,7 @@ def test_values_are_those_of_the_newest_record(page: Page) -> None:
 
 
 def test_every_light_of_the_vehicle_is_shown_with_its_state(watched: Page, newest: Callable[[Stream], Message]) -> None:
-    watched.tell(newest(in_flight()))
+    watched.show(newest(in_flight()))
     rows = watched.tab.locator("#light-list li")
     shown = [(rows.nth(k).get_attribute("data-light"), rows.nth(k).locator(".text").inner_text()) for k in range(10)]
     assert shown == [(light.light.value, light.text) for light in in_flight().lights]
@@ -93,20 +93,20 @@ def test_pictures_change_with_the_flight(page: Page) -> None:
         found: list[str] = page.tab.evaluate("[...document.querySelectorAll('canvas')].map((c) => c.toDataURL())")
         return found
 
-    page.tell(*[relayed(stream) for stream in flown().streams if stream.mission_t_s < 2.0])
+    page.show(*[relayed(stream) for stream in flown().streams if stream.mission_t_s < 2.0])
     before = pictures()
-    page.tell(*[relayed(stream) for stream in flown().streams if 2.0 < stream.mission_t_s < 8.0])
+    page.show(*[relayed(stream) for stream in flown().streams if 2.0 < stream.mission_t_s < 8.0])
     after = pictures()
     assert len(before) == 8 and all(one != other for one, other in zip(before, after, strict=True))
 
 
 def test_stale_shows_within_half_a_second_of_the_last_message(page: Page) -> None:
     news = playing(in_flight())
-    page.tell(news())
+    page.show(news())
     for _ in range(3):
         page.run(0.3)
         assert page.body("stale") == "false"
-        page.tell(news())
+        page.show(news())
     page.run(0.3)
     assert (page.body("stale"), page.tab.is_visible("#stale")) == ("false", False)
     page.run(0.2)
@@ -116,7 +116,7 @@ def test_stale_shows_within_half_a_second_of_the_last_message(page: Page) -> Non
     assert page.body("frame") == "bad"
     page.run(3.0)
     assert page.text("#stale").startswith("STALE 3.5 s")
-    page.tell(news())
+    page.show(news())
     assert (page.body("stale"), page.tab.is_visible("#stale"), page.tab.is_visible("#edge")) == ("false", False, False)
 
 
@@ -129,37 +129,37 @@ def test_figures_look_dead_when_they_are_old(page: Page, how: str) -> None:
         )
         return found
 
-    page.tell(relayed(in_flight()))
+    page.show(relayed(in_flight()))
     alive = look()
     if how == "stale":
         page.run(1.0)
     else:
-        page.tell(relayed(state(Presence.ENDED, outcome="completed")))
+        page.show(relayed(state(Presence.ENDED, outcome="completed")))
     assert all(one != other for one, other in zip(alive, look(), strict=True))
 
 
 def test_a_record_that_was_long_on_its_way_is_old_when_it_comes(
     watched: Page, newest: Callable[[Stream], Message]
 ) -> None:
-    watched.tell(newest(in_flight()) | {"age_s": 0.9})
+    watched.show(newest(in_flight()) | {"age_s": 0.9})
     assert watched.body("stale") == "true" and float(watched.tab.get_attribute("#age", "data-age")) >= 0.9
-    watched.tell(newest(in_flight()) | {"age_s": 0.01})
+    watched.show(newest(in_flight()) | {"age_s": 0.01})
     assert watched.body("stale") == "false"
 
 
 def test_a_backlog_does_not_look_alive(page: Page) -> None:
     """Records arrive at the vehicle's own rate, but all of them two seconds late."""
     first = in_flight()
-    page.tell(relayed(first))
+    page.show(relayed(first))
     page.run(2.1)
-    page.tell(relayed(replace(first, t_s=first.t_s + 0.1)))
+    page.show(relayed(replace(first, t_s=first.t_s + 0.1)))
     assert page.body("stale") == "true"
     assert float(page.tab.get_attribute("#age", "data-age")) == pytest.approx(2.0, abs=0.01)
 
 
 def test_no_broker_is_stale_at_once(page: Page) -> None:
-    page.tell(relayed(in_flight()))
-    page.tell({**BROKER, "connected": False, "text": "no broker at mqtt://127.0.0.1:1883, trying"})
+    page.show(relayed(in_flight()))
+    page.show({**BROKER, "connected": False, "text": "no broker at mqtt://127.0.0.1:1883, trying"})
     assert page.body("frame") == "bad"
     assert page.text("#stale").startswith("NO BROKER") and "mqtt://127.0.0.1:1883, trying" in page.text("#stale")
     assert page.enabled() == SAFE
@@ -173,8 +173,8 @@ def test_no_broker_is_stale_at_once(page: Page) -> None:
         (state(Presence.ENDED, outcome="crashed"), "ENDED crashed", "bad"),
     ],
 )
-def test_an_end_is_told_calmly(page: Page, known: Any, word: str, level: str) -> None:
-    page.tell(relayed(in_flight()), relayed(known))
+def test_an_end_is_reported_calmly(page: Page, known: Any, word: str, level: str) -> None:
+    page.show(relayed(in_flight()), relayed(known))
     page.run(5.0)
     assert f"{page.text('#word')} {page.text('#why')}".startswith(word)
     assert (page.body("level"), page.body("stale"), page.body("old")) == (level, "false", "true")
@@ -183,14 +183,14 @@ def test_an_end_is_told_calmly(page: Page, known: Any, word: str, level: str) ->
 
 @pytest.mark.parametrize("presence", [Presence.LOST, Presence.SILENT])
 def test_a_vehicle_that_is_gone_is_framed_in_red_and_can_still_be_commanded(page: Page, presence: Presence) -> None:
-    page.tell(relayed(in_flight()), relayed(state(presence, text="the guardian may be landing it")))
+    page.show(relayed(in_flight()), relayed(state(presence, text="the guardian may be landing it")))
     assert page.text("#stale").startswith(presence.value.upper())
     assert "the guardian may be landing it" in page.text("#stale")
     assert (page.body("frame"), page.enabled()) == ("bad", SAFE)
 
 
 def test_the_last_will_of_an_older_session_does_not_hide_a_flight(page: Page) -> None:
-    page.tell(relayed(in_flight()), relayed(state(Presence.LOST, session="older")))
+    page.show(relayed(in_flight()), relayed(state(Presence.LOST, session="older")))
     assert (page.text("#word"), page.body("stale")) == ("FLYING", "false")
 
 
@@ -211,7 +211,7 @@ def test_the_last_will_of_an_older_session_does_not_hide_a_flight(page: Page) ->
 def test_the_word_says_what_it_does_and_how_grave_that_is(
     watched: Page, newest: Callable[[Stream], Message], changes: dict[str, Any], word: str, level: str
 ) -> None:
-    watched.tell(newest(in_flight(**changes)))
+    watched.show(newest(in_flight(**changes)))
     assert (watched.text("#word"), watched.body("level")) == (word, level)
 
 
@@ -225,25 +225,25 @@ def test_tether_slack_shows_in_its_colour(
     tether = in_flight().tether
     assert tether is not None
     view = replace(tether, slack_m=slack_m, stop_slack_m=slack_m, taut=taut, snagged=snagged)
-    watched.tell(newest(in_flight(tether=view)))
+    watched.show(newest(in_flight(tether=view)))
     assert watched.figure("tether") == f"{slack_m:.2f}"
     assert watched.tab.get_attribute(".tile:first-child", "data-level") == level
     assert watched.body("level") == level
 
 
 def test_the_catch_appears_among_the_events_and_is_read_out(page: Page) -> None:
-    page.tell(relayed(in_flight()))
+    page.show(relayed(in_flight()))
     assert page.tab.locator("#event-list li").count() == 0
-    page.tell(relayed(flown().events))
+    page.show(relayed(flown().events))
     assert "payload caught" in page.text("[data-event='catch']")
     assert page.tab.locator("#event-list li").first.get_attribute("data-event") == "touchdown"
     assert "payload caught" in page.tab.locator("#announce").text_content()
-    page.tell(relayed(flown().events))
+    page.show(relayed(flown().events))
     assert page.tab.locator("#event-list li").count() == len(flown().events.lines)
 
 
 def test_events_can_be_filtered(page: Page) -> None:
-    page.tell(events_of(event(1, "a", severity="info"), event(2, "b"), event(3, "c", severity="critical")))
+    page.show(events_of(event(1, "a", severity="info"), event(2, "b"), event(3, "c", severity="critical")))
     visible = page.tab.locator("#event-list li:visible")
     for filtered, expected in (("warning", ["critical", "warning"]), ("critical", ["critical"])):
         page.tab.click(f"[data-filter='{filtered}']")
@@ -255,21 +255,21 @@ def test_events_can_be_filtered(page: Page) -> None:
 def test_a_filter_that_leaves_nothing_says_so(page: Page) -> None:
     page.tab.click("[data-filter='critical']")
     assert page.text("#event-none") == "No events yet."
-    page.tell(relayed(flown().events))
+    page.show(relayed(flown().events))
     assert page.tab.locator("#event-list li:visible").count() == 0
     assert page.text("#event-none") == "No events of this severity."
 
 
 def test_a_new_session_begins_with_nothing_of_the_old_one(page: Page) -> None:
-    page.tell(relayed(in_flight()), relayed(flown().events))
+    page.show(relayed(in_flight()), relayed(flown().events))
     assert page.tab.locator("#event-list li").count() > 0
-    page.tell(relayed(state(session="new")), relayed(replace(flown().at(1.0), session="new", t_s=1.0)))
+    page.show(relayed(state(session="new")), relayed(replace(flown().at(1.0), session="new", t_s=1.0)))
     assert page.tab.locator("#event-list li").count() == 0 and page.body("stale") == "false"
 
 
 def test_what_comes_from_outside_is_text(stub: MonitorStub, page: Page) -> None:
     light = replace(in_flight().lights[0], text=HOSTILE, name=HOSTILE)
-    page.tell(
+    page.show(
         relayed(state(mission=HOSTILE, text=HOSTILE)),
         relayed(in_flight(phase=HOSTILE, lights=(light,), limited_by=(HOSTILE,), mode=HOSTILE)),
         events_of(event(1, HOSTILE, id_=HOSTILE, action=HOSTILE)),
@@ -287,16 +287,16 @@ def test_what_comes_from_outside_is_text(stub: MonitorStub, page: Page) -> None:
 
 
 def test_several_vehicles(stub: MonitorStub, page: Page) -> None:
-    page.tell(relayed(in_flight()))
+    page.show(relayed(in_flight()))
     assert not page.tab.is_visible("#vehicle-select")
-    page.tell(*retained("second"), relayed(in_flight(position_world_m=(0.0, 0.0, 1.77)), "second"))
+    page.show(*retained("second"), relayed(in_flight(position_world_m=(0.0, 0.0, 1.77)), "second"))
     options = page.tab.locator("#vehicle-select option")
     assert [options.nth(k).text_content() for k in range(2)] == [f"{NAME} · FLYING", "second · FLYING"]
     assert page.figure("height") == "1.00"
     page.tab.select_option("#vehicle-select", "second")
     page.shown = "second"
     assert page.figure("height") == "1.77"
-    page.tell(relayed(state(Presence.LOST)))
+    page.show(relayed(state(Presence.LOST)))
     assert options.nth(0).text_content() == f"⚠ {NAME} · LOST"
     assert page.text("#word") == "FLYING" and page.text("#notice").startswith(f"{NAME}: LOST")
     page.press("hold")
@@ -305,20 +305,20 @@ def test_several_vehicles(stub: MonitorStub, page: Page) -> None:
 
 def test_a_restarted_monitor_is_found_again(browser: Any, own_stub: MonitorStub) -> None:
     with watching(browser, own_stub, may="WebSocket connection to") as page:
-        page.tell(relayed(in_flight()))
+        page.show(relayed(in_flight()))
         own_stub.stop()
         page.until_text("#stale", "NO CONNECTION")
         assert page.body("frame") == "bad" and page.enabled() <= SAFE
         own_stub.start()
         page.tab.clock.resume()
         own_stub.wait_received("token", 2)
-        page.tell(relayed(in_flight(t_s=5000.0, position_world_m=(0.0, 0.0, 1.55))))
+        page.show(relayed(in_flight(t_s=5000.0, position_world_m=(0.0, 0.0, 1.55))))
         page.until_text("[data-figure='height']", "1.55")
 
 
 def test_without_a_connection_a_press_says_that_nothing_was_sent(browser: Any, own_stub: MonitorStub) -> None:
     with watching(browser, own_stub, may="WebSocket connection to") as page:
-        page.tell(relayed(in_flight()))
+        page.show(relayed(in_flight()))
         own_stub.stop()
         page.until_text("#stale", "NO CONNECTION")
         page.press("hold")
@@ -328,11 +328,11 @@ def test_without_a_connection_a_press_says_that_nothing_was_sent(browser: Any, o
 def test_a_page_that_may_only_watch_says_why(stub: MonitorStub, shared: Page) -> None:
     stub.greeting[0] = hello(can_command=False, operator=None, why_not="this monitor was started with --view-only")
     shared.open_anew(stub)
-    shared.tell(relayed(in_flight()))
+    shared.show(relayed(in_flight()))
     assert shared.enabled() == set()
     assert shared.text("#commands-why") == "this monitor was started with --view-only"
     assert shared.tab.is_visible("#badge-view")
     shared.tab.keyboard.press("Shift+H")
-    shared.tell(hello())
+    shared.show(hello())
     shared.press("abort")
     assert [message["command"] for message in stub.wait_received("command", 1)] == ["abort"]

@@ -27,7 +27,7 @@ NO_ANSWER = "no answer from the vehicle within 1.5 s: use Ctrl-C or the pilot's 
 @pytest.fixture
 def page(page: Page) -> Page:
     """The page during a flight."""
-    page.tell(relayed(flown().at(8.5)))
+    page.show(relayed(flown().at(8.5)))
     return page
 
 
@@ -55,30 +55,30 @@ def test_hold_then_land_arrive_and_their_answers_show(stub: MonitorStub, page: P
     page.press("hold")
     assert asked(stub, 1) == ["hold"]
     assert answer(page, "hold") == ("wait", "sending …")
-    page.tell(sent("hold"))
+    page.show(sent("hold"))
     assert answer(page, "hold") == ("wait", "sent, waiting for the vehicle …")
-    page.tell(relayed(ack("hold", NONCE, "holding at (1.00, 0.00, 1.00) m")))
+    page.show(relayed(ack("hold", NONCE, "holding at (1.00, 0.00, 1.00) m")))
     assert answer(page, "hold") == ("done", "✓ holding at (1.00, 0.00, 1.00) m")
     page.press("land")
     assert asked(stub, 2) == ["hold", "land"]
-    page.tell(sent("land", "b" * 32), relayed(ack("land", "b" * 32, "landing")))
+    page.show(sent("land", "b" * 32), relayed(ack("land", "b" * 32, "landing")))
     assert answer(page, "land") == ("done", "✓ landing")
     assert answer(page, "hold")[0] == "done"
 
 
 def test_what_the_vehicle_refuses_is_red(page: Page) -> None:
     page.press("abort")
-    page.tell(sent("abort"), relayed(ack("abort", NONCE, "nothing to abort: on the ground", accepted=False)))
+    page.show(sent("abort"), relayed(ack("abort", NONCE, "nothing to abort: on the ground", accepted=False)))
     assert answer(page, "abort") == ("no", "✗ nothing to abort: on the ground")
 
 
 def test_no_answer_is_red_until_a_late_one_comes(page: Page) -> None:
     page.press("land")
-    page.tell(sent("land"), refused("land", NO_ANSWER))
+    page.show(sent("land"), refused("land", NO_ANSWER))
     assert answer(page, "land") == ("no", NO_ANSWER)
-    page.tell(sent("land", "c" * 32))
+    page.show(sent("land", "c" * 32))
     assert answer(page, "land")[0] == "no" and "sent again (2)" in answer(page, "land")[1]
-    page.tell(relayed(ack("land", NONCE, "landing")))
+    page.show(relayed(ack("land", NONCE, "landing")))
     assert answer(page, "land") == ("done", "✓ landing")
 
 
@@ -91,7 +91,7 @@ def test_a_monitor_that_says_nothing_is_no_answer_either(page: Page) -> None:
 
 
 def test_what_others_command_is_shown_with_their_name(page: Page) -> None:
-    page.tell(relayed(ack("hold", "d" * 32, "holding", operator="bert")))
+    page.show(relayed(ack("hold", "d" * 32, "holding", operator="bert")))
     assert answer(page, "hold") == ("done", "✓ bert: holding")
 
 
@@ -114,7 +114,7 @@ def test_a_state_that_the_stream_contradicts_keeps_nobody_from_landing_it(
     stub: MonitorStub, page: Page, lie: Any
 ) -> None:
     """The stream is proven, the state is not."""
-    page.tell(relayed(replace(flown().at(8.55), proofs=("0" * 32,))), relayed(lie))
+    page.show(relayed(replace(flown().at(8.55), proofs=("0" * 32,))), relayed(lie))
     assert page.enabled() == {"hold", "land", "abort"}
     page.press("land")
     assert asked(stub, 1) == ["land"]
@@ -140,7 +140,7 @@ def test_keys_command_too(stub: MonitorStub, page: Page) -> None:
 def test_start_needs_a_vehicle_that_waits_and_a_long_press(stub: MonitorStub, page: Page) -> None:
     assert "start" not in page.enabled() and "only while waiting" in page.text("[data-command='start']")
     news = playing(flown().streams[0], waits_for_start=True)
-    page.tell(news())
+    page.show(news())
     assert "start" in page.enabled() and "resume" not in page.enabled()
     _hold_down(page, "start", 0.7, news)
     _hold_down(page, "start", 0.9, news)
@@ -150,13 +150,13 @@ def test_start_needs_a_vehicle_that_waits_and_a_long_press(stub: MonitorStub, pa
 
 def test_resume_needs_a_hold_and_works_by_keyboard(stub: MonitorStub, page: Page) -> None:
     news = playing(flown().at(8.5), action="hold")
-    page.tell(news())
+    page.show(news())
     assert "resume" in page.enabled()
     page.tab.focus("[data-command='resume']")
     page.tab.keyboard.down("Enter")
     for _ in range(3):
         page.run(0.3)
-        page.tell(news())
+        page.show(news())
     page.tab.keyboard.up("Enter")
     assert asked(stub, 1) == ["resume"]
     page.run(1.0)
@@ -170,7 +170,7 @@ def test_a_press_is_for_what_was_shown_when_the_button_went_down(stub: MonitorSt
     after = changes.get(change, {})
     held = replace(flown().at(8.5), action="hold", hold=1)
     news = playing(held)
-    page.tell(news(), *retained("second"), {**news(), "vehicle": "second"})
+    page.show(news(), *retained("second"), {**news(), "vehicle": "second"})
     page.tab.hover("[data-command='resume']")
     page.tab.mouse.down()
     for k in range(9):
@@ -181,7 +181,7 @@ def test_a_press_is_for_what_was_shown_when_the_button_went_down(stub: MonitorSt
         if k == 4 and change == "another vehicle":
             page.tab.evaluate(CHOOSE, "second")
             page.shown = "second"
-        page.tell(said, {**said, "vehicle": "second"})
+        page.show(said, {**said, "vehicle": "second"})
         assert "resume" in page.enabled()
     page.tab.mouse.up()
     page.press("land")
@@ -190,7 +190,7 @@ def test_a_press_is_for_what_was_shown_when_the_button_went_down(stub: MonitorSt
 
 def test_a_long_press_ends_with_the_permission(stub: MonitorStub, page: Page) -> None:
     """The press begins while the vehicle waits for START, and the data becomes stale during it."""
-    page.tell(playing(flown().streams[0], waits_for_start=True)())
+    page.show(playing(flown().streams[0], waits_for_start=True)())
     page.tab.hover("[data-command='start']")
     page.tab.mouse.down()
     page.run(2.0)
@@ -200,7 +200,7 @@ def test_a_long_press_ends_with_the_permission(stub: MonitorStub, page: Page) ->
 
 
 def test_a_vehicle_that_hears_no_commands_says_so(page: Page) -> None:
-    page.tell(relayed(state(commands=False, text="commands are disabled in the vehicle file")))
+    page.show(relayed(state(commands=False, text="commands are disabled in the vehicle file")))
     assert page.enabled() == set()
     assert page.text("#commands-why") == "commands are disabled in the vehicle file"
 
@@ -211,5 +211,5 @@ def _hold_down(page: Page, command: str, seconds: float, news: Callable[[], Mess
     page.tab.mouse.down()
     for _ in range(round(seconds / 0.1)):
         page.run(0.1)
-        page.tell(news())
+        page.show(news())
     page.tab.mouse.up()

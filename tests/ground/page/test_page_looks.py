@@ -49,7 +49,7 @@ def geometry(opened: tuple[Page, MonitorStub]) -> Page:
 def test_nothing_scrolls_sideways_and_safety_is_always_in_reach(touched: tuple[Page, MonitorStub], size: str) -> None:
     page, stub = touched
     page.open_anew(stub, size=size)
-    page.tell(relayed(flown().at(8.5)), relayed(flown().events))
+    page.show(relayed(flown().at(8.5)), relayed(flown().events))
     for down_px in (0, 100_000):
         page.tab.evaluate("y => window.scrollTo(0, y)", down_px)
         wide, shown = page.tab.evaluate("[document.documentElement.scrollWidth, innerWidth]")
@@ -71,8 +71,8 @@ def _assert_in_reach(page: Page, command: str) -> None:
 def test_every_control_of_a_tablet_is_large_enough(touched: tuple[Page, MonitorStub]) -> None:
     page, stub = touched
     page.open_anew(stub, size="tablet")
-    page.tell(*retained("second"))
-    page.tell(relayed(flown().at(8.5)))
+    page.show(*retained("second"))
+    page.show(relayed(flown().at(8.5)))
     for control in page.tab.locator("button:visible, select:visible, summary:visible").all():
         box = control.bounding_box()
         assert box["height"] >= TOUCH_PX and box["width"] >= TOUCH_PX, control.inner_text()
@@ -83,7 +83,7 @@ def test_every_plots_values_stand_beside_its_title(shared: Page, stub: MonitorSt
     """The header has room for one line; a second one is cut off."""
     late = msgspec.structs.replace(flown().at(8.5).timing, lateness_ms=12.3, mocap_age_ms=16.5, whole_ms=10.4)
     shared.open_anew(stub, size=size)
-    shared.tell(relayed(msgspec.structs.replace(flown().at(8.5), timing=late)))
+    shared.show(relayed(msgspec.structs.replace(flown().at(8.5), timing=late)))
     cut = shared.tab.evaluate(
         "[...document.querySelectorAll('.plot header')].filter((h) => h.scrollHeight > h.clientHeight).map((h) => h.innerText)"
     )
@@ -95,7 +95,7 @@ def test_buttons_stay_where_they_are_when_things_go_wrong(shared: Page, stub: Mo
     """A finger may already be moving to a button."""
     for size in SIZES:
         shared.open_anew(stub, size=size)
-        shared.tell(relayed(flown().at(8.5)))
+        shared.show(relayed(flown().at(8.5)))
 
         def boxes() -> list[Any]:
             commands = ("hold", "land", "abort")
@@ -104,12 +104,12 @@ def test_buttons_stay_where_they_are_when_things_go_wrong(shared: Page, stub: Mo
         before = boxes()
         for command in ("hold", "land"):
             text = "no answer from the vehicle within 1.5 s: use Ctrl-C or the pilot's switch (sent again, 2 of 3)"
-            shared.tell({"kind": "refused", "vehicle": shared.shown, "command": command, "text": text})
+            shared.show({"kind": "refused", "vehicle": shared.shown, "command": command, "text": text})
         shared.run(5.0)
         assert shared.tab.is_visible("#stale") and boxes() == before
-        shared.tell({**BROKER, "rejected": 7, "rejected_text": "no JSON"})
+        shared.show({**BROKER, "rejected": 7, "rejected_text": "no JSON"})
         assert shared.tab.is_visible("#notice") and boxes() == before
-        shared.tell(hello(can_command=False, why_not="this monitor was started with --view-only"))
+        shared.show(hello(can_command=False, why_not="this monitor was started with --view-only"))
         assert shared.tab.is_visible("#commands-why") and boxes() == before
 
 
@@ -117,8 +117,8 @@ def test_buttons_stay_where_they_are_when_things_go_wrong(shared: Page, stub: Mo
 def test_text_has_enough_contrast(shared: Page, stub: MonitorStub, scheme: str, stale: bool) -> None:
     shared.open_anew(stub, scheme=scheme)
     lines = [event(1, "a", severity="info"), event(2, "b"), event(3, "c", severity="critical")]
-    shared.tell(relayed(flown().at(8.5)), events_of(*lines))
-    shared.tell({"kind": "refused", "vehicle": shared.shown, "command": "land", "text": "no answer"})
+    shared.show(relayed(flown().at(8.5)), events_of(*lines))
+    shared.show({"kind": "refused", "vehicle": shared.shown, "command": "land", "text": "no answer"})
     shared.tab.click("#control summary")
     shared.tab.click("#preflight summary")
     if stale:
@@ -158,7 +158,7 @@ _CONTRAST = """([large, largeBold]) => {
 
 
 def test_everything_can_be_reached_by_keyboard_and_the_commands_first(page: Page) -> None:
-    page.tell(relayed(flown().at(8.5)))
+    page.show(relayed(flown().at(8.5)))
     page.tab.keyboard.press("Tab")
     page.tab.keyboard.press("Enter")
     order = []
@@ -169,7 +169,7 @@ def test_everything_can_be_reached_by_keyboard_and_the_commands_first(page: Page
 
 
 def test_the_camera_moves_by_mouse_wheel_and_keys(page: Page) -> None:
-    page.tell(relayed(flown().at(8.5)))
+    page.show(relayed(flown().at(8.5)))
 
     def picture() -> str:
         page.run(0.5)
