@@ -38,7 +38,6 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 RelativeError = Annotated[float, Field(ge=-0.5, le=0.5)]
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
-Vector4 = tuple[float, float, float, float]
 Positive2 = tuple[Positive, Positive]
 Positive3 = tuple[Positive, Positive, Positive]
 

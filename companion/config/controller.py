@@ -12,7 +12,6 @@ Positive8 = tuple[Positive, Positive, Positive, Positive, Positive, Positive, Po
 NonNegative8 = tuple[
     NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
 ]
-NonNegative2 = tuple[NonNegative, NonNegative]
 NonNegative3 = tuple[NonNegative, NonNegative, NonNegative]
 Positive4 = tuple[Positive, Positive, Positive, Positive]
 

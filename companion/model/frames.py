@@ -124,11 +124,6 @@ def enu_from_ned(v: Vec3) -> Vec3:
     return (v[1], v[0], -v[2])
 
 
-def frd_from_flu(v: Vec3) -> Vec3:
-    """Body vector, FLU -> FRD."""
-    return (v[0], -v[1], -v[2])
-
-
 def flu_from_frd(v: Vec3) -> Vec3:
     """Body vector, FRD -> FLU (its own inverse)."""
     return (v[0], -v[1], -v[2])

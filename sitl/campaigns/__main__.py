@@ -9,9 +9,10 @@ import sys
 import threading
 from contextlib import closing
 
+from companion.campaigns.process import CampaignError
 from companion.sitl_config.loader import SitlConfig
 from sitl.campaigns import compare, faults, robustness
-from sitl.campaigns.runner import CampaignError, Data, fly_all
+from sitl.campaigns.runner import Data, fly_all
 
 _CAMPAIGNS = {
     "compare": (compare.prepare, compare.fly),

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 
 from companion.campaigns.faults.judge import FaultFlight, Point, row_of, ticks_of
 from companion.campaigns.faults.variants import Variant
+from companion.campaigns.process import CampaignError
 from companion.model.frames import quat_rotate, tilt_rad
 from companion.model.types import Outcome
 from companion.safety.touchdown import HEIGHT_MARGIN_M
 from companion.sitl_config.loader import SitlConfig
 from sitl.campaigns.flights import Flown, fly_to_end, laboratory_of, with_world
-from sitl.campaigns.runner import CampaignError, Data
+from sitl.campaigns.runner import Data
 from sitl.fast.loop import FastResult
 from sitl.faults.timing import FaultError, with_fault_times
 from sitl.world.world import Snapshot

@@ -14,6 +14,7 @@ import numpy as np
 
 from companion.analysis import metrics
 from companion.analysis.log import FlightLog
+from companion.campaigns.process import CampaignError
 from companion.campaigns.robustness.draws import DRAWN
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
@@ -23,7 +24,7 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Outcome, PhaseKind, SafetyAction
 from companion.sitl_config.loader import SitlConfig
 from sitl.campaigns.flights import Flown, fly_to_end, laboratory_of, row_of, with_world
-from sitl.campaigns.runner import CampaignError, Data
+from sitl.campaigns.runner import Data
 from sitl.world.payload import THROW_LEAD_S
 
 PAYLOAD_KG = (0.05, 0.4)

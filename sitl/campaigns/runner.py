@@ -8,6 +8,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from typing import Any
 
+from companion.campaigns.process import CampaignError
 from companion.sitl_config.loader import SitlConfig
 
 SCHEDULER_TIMEOUT_S = 10.0
@@ -16,15 +17,6 @@ WORKERS_TIMEOUT_S = 30.0
 Data = dict[str, Any]
 Fly = Callable[[SitlConfig, Data], Data]
 """Flies one flight of a job and returns its `row`, and a `series` if it has one; a function of a module, so that workers find it."""
-
-
-class CampaignError(Exception):
-    """The campaign cannot continue. The text is one line for the user."""
-
-    def __init__(self, text: str, *, bad_input: bool = False) -> None:
-        super().__init__(text)
-        self.bad_input = bad_input
-        """Whether the user's input is the cause; then nothing was flown."""
 
 
 def fly_all(

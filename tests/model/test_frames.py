@@ -57,7 +57,7 @@ def test_attitude_conversion_commutes_with_vectors(roll: float, pitch: float, ya
     """Turning a body vector into the world gives the same arrow in either pair of frames."""
     q = frames.quat_from_euler_zyx(roll, pitch, yaw)
     enu = frames.quat_rotate(q, body)
-    ned = frames.quat_rotate(frames.attitude_ned_frd_from_enu_flu(q), frames.frd_from_flu(body))
+    ned = frames.quat_rotate(frames.attitude_ned_frd_from_enu_flu(q), frames.flu_from_frd(body))
     assert same(frames.ned_from_enu(enu), ned, 1e-9)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from companion.campaigns.faults.judge import good
+from companion.campaigns.process import CampaignError
 from companion.campaigns.runner import Row
 from companion.mission.plan import Plan
 from companion.model.exit_codes import EXIT_BAD_INPUT
@@ -19,7 +20,6 @@ from companion.sitl_config.faults import KINDS, FaultKind, FlightPhase
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.faults import fly, prepare
 from sitl.campaigns.robustness import draw, throws
-from sitl.campaigns.runner import CampaignError
 from sitl.fast.loop import FastFlight, FastResult
 from sitl.faults.processes import environment
 from sitl.faults.timing import FaultError, with_fault_times

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from companion.campaigns.process import CampaignError
 from companion.control.manipulator import Manipulator
 from companion.mission.plan import Plan
 from companion.model.types import PhaseKind
@@ -17,7 +18,6 @@ from companion.sitl_config.loader import SitlConfig, load_sitl
 from companion.sitl_config.world import World
 from sitl.campaigns import flights, robustness
 from sitl.campaigns.flights import Flown
-from sitl.campaigns.runner import CampaignError
 from sitl.world.model import link_masses_kg
 from sitl.world.world import World as SimulatedWorld
 from tests.support import CATCH, HOVER, SHORT_CATCH, position_error_m
