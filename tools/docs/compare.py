@@ -31,6 +31,12 @@ IN_PAPER = {"adaptive/paper": "proposed", "psc/tuned": "PSC", "csc/tuned": "CSC"
 """Variants with figures in the paper, by the paper's name of the law."""
 ABLATION_KG = 0.2
 """Payload of the table of ablations."""
+PICTURES = {
+    "errors": ("extras", "Position error of every flight before and after the catch, by payload and law"),
+    "model_error": ("model error", "Position error after the catch against model error, one panel per law"),
+    "adaptation": ("adaptation", "Position error with the adaptation on against the same flight with it off"),
+}
+"""Of the plots that the page shows: the table below which it stands, and its alternative text."""
 _E_P = "rms.{}.e_p_m"
 _FIGURES = (
     ("e_p before, m", _E_P.format("pre"), 3),
@@ -269,7 +275,7 @@ def tables(files: Sequence[Results]) -> dict[str, str]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Write the tables into a page, and the plots that it shows into `pictures/` beside it."""
+    """Write the tables into a page, and its plots into `pictures/` beside it."""
     parser = argparse.ArgumentParser(prog="tools.docs.compare")
     parser.add_argument("page", type=Path)
     parser.add_argument("results", type=Path, nargs="+", help="compare.json of companion compare")
@@ -281,12 +287,14 @@ def main(argv: list[str] | None = None) -> int:
         reason = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
         print(f"{', '.join(map(str, arguments.results))}: {reason}", file=sys.stderr)
         return 2
-    code = write_page(arguments.page, found)
-    for name, _, _, figure in distributions(aggregate(rows)) if code == 0 else []:
-        picture = f"pictures/compare_{name}.svg"
-        if picture in arguments.page.read_text(encoding="utf-8"):
+    for name, _, _, figure in distributions(aggregate(rows)):
+        if name in PICTURES:
+            table, alt = PICTURES[name]
+            picture = Path("pictures") / f"compare_{name}.svg"
+            found[table] += f"\n\n![{alt}]({picture})"
+            (arguments.page.parent / picture).parent.mkdir(exist_ok=True)
             write_svg(figure, arguments.page.parent / picture)
-    return code
+    return write_page(arguments.page, found)
 
 
 if __name__ == "__main__":
