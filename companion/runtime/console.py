@@ -215,6 +215,9 @@ def print_result(console: Console, summary: dict[str, Any], out: Path, report: P
     style = _OUTCOME_STYLE.get(outcome, "bold red")
     facts.add_row("outcome", f"[{style}]{outcome}[/]")
     facts.add_row("controller", f"{summary['controller']} ({summary['preset']})")
+    world = summary.get("world")
+    if world is not None:
+        facts.add_row("world", f"{world['name']}, seed {world['seed']}")
     if summary.get("payload_kg") is not None:
         facts.add_row("payload", f"{summary['payload_kg']:g} kg (known to the simulated world only)")
     catch = summary.get("catch_t_s")
