@@ -36,6 +36,7 @@ from companion.preflight.hand_test.record import record_path
 from companion.preflight.px4 import PARAM_ID
 from companion.recorder.client import RecorderProcess
 from companion.runtime.clock import flight_clock
+from companion.runtime.compiled import COMPILED
 from companion.runtime.console import console_on, print_error
 from companion.runtime.event_loop import run_until_interrupted
 from companion.runtime.subprocesses import LaunchError
@@ -191,7 +192,9 @@ class _Line:
 def show(console: Console, rows: list[Row], task: Task) -> None:
     """Print one table per device, what to do below each row that fails, and the verdict."""
     where = " (SITL)" if task.sitl is not None else ""
-    console.print(Text(f"{task.config.vehicle.name}{where}, mission '{task.config.mission.name}'", style="bold"))
+    build = ", compiled build" if COMPILED else ""
+    title = f"{task.config.vehicle.name}{where}, mission '{task.config.mission.name}'{build}"
+    console.print(Text(title, style="bold"))
     for prefix, heading in GROUPS.items():
         group = [row for row in rows if row.id.partition(".")[0] == prefix]
         if not group:

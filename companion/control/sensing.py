@@ -113,7 +113,8 @@ class CatchDetector:
     """Time for which the force must stay below that share. A bump from below unloads the net for a shorter time."""
     FALLING_SHARE = 0.6
     """Share of gravity. With less specific force the whole machine falls, and the force of a payload in the net is small as well."""
-    LOWPASS_S, WEIGHT_S = 0.05, 1.0
+    LOWPASS_S = 0.05
+    WEIGHT_S = 1.0
 
     def __init__(self) -> None:
         self._blow_s: float | None = None

@@ -17,6 +17,7 @@ from companion.preflight import evaluation
 from companion.preflight.hand_test import record as hand_record
 from companion.preflight.observe import Progress, observe
 from companion.runtime.clock import Clock
+from companion.runtime.compiled import COMPILED
 from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
 
 SCHEMA_VERSION = 1
@@ -68,7 +69,12 @@ def _hand_test(config: FlightConfig, natnet_version: str) -> tuple[str, str]:
 
 def as_json(rows: Sequence[Row]) -> dict[str, Any]:
     """Return the JSON of `companion check --json` and of `preflight.json`."""
-    return {"schema_version": SCHEMA_VERSION, "ok": not refusals(rows), "rows": [row.as_json() for row in rows]}
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "ok": not refusals(rows),
+        "compiled": COMPILED,
+        "rows": [row.as_json() for row in rows],
+    }
 
 
 def write(rows: Sequence[Row], out: Path) -> None:

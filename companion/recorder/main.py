@@ -32,6 +32,7 @@ from companion.recorder.log_file import LogFile
 from companion.recorder.log_writer import LogWriter
 from companion.recorder.telemetry import TelemetryThread, broker_configured
 from companion.recorder.versions import versions
+from companion.runtime.compiled import COMPILED
 from companion.runtime.cores import keep_off
 
 LOG_FORMAT = "1"
@@ -192,6 +193,7 @@ def main(argv: list[str] | None = None) -> int:
         "log_format": LOG_FORMAT,
         "records": fingerprint(Inputs, Outputs, Sent),
         "epoch_offset_ns": str(arguments.epoch_offset_ns),
+        "compiled": json.dumps(COMPILED),
     }
     writer.metadata("companion", {**about, **{f"version_{name}": text for name, text in versions().items()}})
     writer.metadata("config", {"json": config_json})

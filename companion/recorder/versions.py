@@ -22,6 +22,8 @@ _PACKAGES = (
     "mcap",
     "mujoco",
 )
+REVISION_FILE = "revision"
+"""Beside the packages of a compiled build: the commit that it was made of."""
 
 
 def versions() -> dict[str, str]:
@@ -35,8 +37,12 @@ def versions() -> dict[str, str]:
 
 
 def _git_revision() -> str | None:
-    """Return the commit of this module's working copy, with `-dirty` if it was changed; None outside of one."""
+    """Return the commit of this module's working copy, with `-dirty` if it was changed, or the commit that the compiled build was
+    made of; None outside of both.
+    """
     root = Path(__file__).resolve().parents[2]
+    if (root / REVISION_FILE).exists():
+        return (root / REVISION_FILE).read_text(encoding="utf-8") or None
     if not (root / ".git").exists():
         return None
     try:

@@ -123,7 +123,7 @@ class Estimator:
     ) -> None:
         """Fuse a vision pose of world time `t_s` (arrival minus EKF2_EV_DELAY); `noise_m` is EKF2_EVP_NOISE."""
         # A sum is finite only if every term is.
-        if self._t_s is None or not math.isfinite(sum(position_ned_m) + sum(attitude_ned_frd)):
+        if self._t_s is None or not math.isfinite(sum((*position_ned_m, *attitude_ned_frd))):
             return
         gap = self._t_s - self._arrived_t_s if self._arrived_t_s is not None else 1.0
         self._arrived_t_s = self._t_s

@@ -9,7 +9,6 @@ import contextlib
 import gc
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
 
 from companion.core.flight_core import FlightCore
 from companion.io.px4.delta_velocity import DeltaVelocity
@@ -91,12 +90,15 @@ class FastResult:
     """Whether the guardian landed the vehicle; None if it did not act or has not finished."""
     armed: bool = False
     """Whether the vehicle is still armed at the end."""
+    _truth: list[Truth] | None = field(default=None, init=False, repr=False)
 
-    @cached_property
+    @property
     def truth(self) -> list[Truth]:
         """True state after each tick; computed at the first access."""
-        layout = self.layout
-        return [] if layout is None else [layout.truth(snapshot) for snapshot in self.snapshots]
+        if self._truth is None:
+            layout = self.layout
+            self._truth = [] if layout is None else [layout.truth(snapshot) for snapshot in self.snapshots]
+        return self._truth
 
 
 @contextlib.contextmanager

@@ -145,7 +145,9 @@ class Payload:
         if thrower is None:
             d.qpos[q : q + 3], d.qvel[v : v + 3] = point, velocity
         else:
-            d.qpos[q : q + 3], d.qvel[v : v + 3] = thrower.release(point.tolist(), velocity.tolist(), THROW_LEAD_S)
+            d.qpos[q : q + 3], d.qvel[v : v + 3] = thrower.release(
+                tuple(point.tolist()), tuple(velocity.tolist()), THROW_LEAD_S
+            )
         d.qpos[q + 3 : q + 7] = (1, 0, 0, 0)
         d.qvel[v + 3 : v + 6] = 0.0
         if self.bag is not None:

@@ -1,0 +1,8 @@
+"""Which build of the computing modules this process runs: plain Python, or compiled by `make compile`. Both compute the same bits."""
+
+from __future__ import annotations
+
+from companion.model import frames
+
+COMPILED = not frames.__file__.endswith(".py")
+"""True in the compiled build."""
