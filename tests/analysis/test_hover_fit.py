@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable
+from functools import cache
 
 import msgspec
 import pytest
@@ -16,8 +17,9 @@ from sitl.campaigns.flights import log_of
 from tests.control.test_hover import configured, flown, true_hover_thrust
 
 
+@cache
 def logged(error: float, adapt: bool = True) -> FlightLog:
-    config = configured(error, adapt, "recommended")
+    config = configured(error, adapt)
     airframe = config.vehicle.airframe.model_copy(update={"hover_thrust": true_hover_thrust() * (1.0 + error)})
     vehicle = config.vehicle.model_copy(update={"airframe": airframe})
     return log_of(config.model_copy(update={"vehicle": vehicle}), flown(error, adapt), None)
