@@ -29,6 +29,8 @@ OVERLOAD, OVERHEATING = 0x20, 0x04
 """Bits of register 70."""
 COOL_C = 35.0
 _FOREVER_M = 1000.0
+LATE_S = 0.01
+"""A fault that is due for longer than this when its origin becomes known begins at that moment."""
 _OTHER_BODY_Z_M = 0.05
 _OTHER_BODY_YAW_RAD = math.radians(120.0)
 _BESIDE = (0.6, 0.8)
@@ -80,6 +82,7 @@ class Faults:
     ) -> None:
         self._faults = config.faults
         self._on = [False] * len(config.faults)
+        self._begins_s: list[float | None] = [None] * len(config.faults)
         self._world, self._px4, self._drives, self._servos = world, px4, drives, servos
         self._anchor_m = anchor_world_m
         self._wind_m_s = world.wind_m_s
@@ -116,9 +119,12 @@ class Faults:
         for index, fault in enumerate(self._faults):
             origin_s = origins[fault.after]
             assert fault.t_s is not None
-            since_s = -1.0 if origin_s is None else t_s - origin_s
-            end_s = math.inf if fault.duration_s is None else fault.t_s + fault.duration_s
-            on = fault.t_s <= since_s < end_s
+            if origin_s is not None and self._begins_s[index] is None and t_s - origin_s >= fault.t_s:
+                # A catch is known only when the payload has come to rest: the fault then begins late and lasts as long as it should.
+                due_s = origin_s + fault.t_s
+                self._begins_s[index] = due_s if t_s - due_s < LATE_S else t_s
+            begins_s = self._begins_s[index]
+            on = begins_s is not None and (fault.duration_s is None or t_s - begins_s < fault.duration_s)
             if on is not self._on[index]:
                 self._on[index] = on
                 self._switch(fault, on, t_s)

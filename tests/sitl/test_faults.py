@@ -149,6 +149,18 @@ def test_of_two_of_a_kind_the_other_one_goes_on() -> None:
     assert {size for t_s, size in sizes if t_s > 0.41} == {0.0}
 
 
+def test_a_short_fault_whose_catch_is_known_late_lasts_as_long_as_it_should() -> None:
+    flight = FastFlight(with_faults({"kind": "mocap_loss", "after": "catch", "t_s": 0.05, "duration_s": 0.1}))
+    acts = []
+    while flight.plant.t_s < 0.5:
+        flight.plant.step(False)
+        if flight.plant.t_s > 0.3:
+            flight.plant.world.payload.caught_t_s = 0.0
+        acts.append((flight.plant.t_s, "mocap_loss" in flight.faults.active))
+    assert {on for t_s, on in acts if 0.31 < t_s < 0.39} == {True}
+    assert {on for t_s, on in acts if t_s < 0.3 or t_s > 0.41} == {False}
+
+
 def test_a_clock_that_steps_makes_the_frames_late_that_were_on_their_way() -> None:
     """Exposed by the old clock, sent by the new one; those after them are as they were."""
     config = with_faults({"kind": "clock_step", "after": "start", "t_s": 0.503, "size": 5.0})
