@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-LEFT = ("", "condition", "fault", "loop", "outcome", "process", "target")
+LEFT = ("loop", "process")
 """Columns of words; all others hold figures."""
 
 
