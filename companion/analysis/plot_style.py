@@ -17,10 +17,15 @@ WIDTH_IN = 9.0
 INK = "#22303c"
 SOFT = "#8b98a5"
 CATCH = "#c2255c"
+REFERENCE = "#55626e"
+SERIES = ("#1f6fb4", "#e07b22", "#2e9d6b", "#8a5cc2")
+"""Colours of the lines in a flight's report."""
+SERIES_DARK = ("#0b365c", "#7d3d05")
+"""Colours of a reference drawn over its own measurement."""
 DASHED = (0, (4, 2))
 """Line style of a reference; the flown motion is solid."""
 COLOURS = ("#0072b2", "#d55e00", "#000000", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a5cc2", "#6b705c", "#a3b18a")
-"""Colours of the plot lines. The first six are by Okabe and Ito, "Color Universal Design", for readers with any colour blindness."""
+"""Colours of flights and laws in comparisons; the first six by Okabe and Ito, "Color Universal Design", for any colour vision."""
 
 
 def new_figure(height_in: float) -> Figure:

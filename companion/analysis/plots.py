@@ -15,15 +15,23 @@ from matplotlib.figure import Figure
 
 from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
-from companion.analysis.plot_style import CATCH, DASHED, INK, dress, mark_catch, new_figure, write_png
+from companion.analysis.plot_style import (
+    CATCH,
+    DASHED,
+    INK,
+    REFERENCE,
+    SERIES,
+    SERIES_DARK,
+    dress,
+    mark_catch,
+    new_figure,
+    write_png,
+)
 from companion.analysis.timing import end_s
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import tilt_rad
 from companion.model.types import Outputs, PhaseKind
 
-_REFERENCE = "#55626e"
-_SERIES = ("#1f6fb4", "#e07b22", "#2e9d6b", "#8a5cc2")
-_SERIES_DARK = ("#0b365c", "#7d3d05")  # a reference drawn over its own measurement
 _PHASES_NAMED_MAX = 40
 """Number of phases above which only their kinds are distinguished."""
 _PHASES = {
@@ -77,12 +85,10 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
 
 def _tracking(log: FlightLog) -> Figure | None:
     figure, axes, t = _stack(log, "Tracking errors and arm", (1.0, 1.0, 1.25))
-    _line(axes[0], t, _norm(metrics.position_error_m(log)), r"$\|e_p\|$", _SERIES[0])
-    _line(
-        axes[0], t, log.column(lambda i, o, s: o.mocap_innovation_m or None), "motion capture against IMU", _SERIES[1]
-    )
+    _line(axes[0], t, _norm(metrics.position_error_m(log)), r"$\|e_p\|$", SERIES[0])
+    _line(axes[0], t, log.column(lambda i, o, s: o.mocap_innovation_m or None), "motion capture against IMU", SERIES[1])
     _legend(axes[0], columns=2)
-    _line(axes[1], t, np.degrees(_norm(metrics.attitude_error_rad(log))), r"$\|e_q\|$", _SERIES[0])
+    _line(axes[1], t, np.degrees(_norm(metrics.attitude_error_rad(log))), r"$\|e_q\|$", SERIES[0])
     axes[0].set_ylabel("position error [m]")
     axes[1].set_ylabel("attitude error [deg]")
     pre, post = metrics.flight_masks(log)
@@ -96,8 +102,8 @@ def _tracking(log: FlightLog) -> Figure | None:
             ax.set_ylim(0.0, 1.15 * max(float(seen.max()), 1e-3))
     angles, wanted = np.degrees(log.columns.arm_rad), np.degrees(log.columns.arm_reference_rad)
     for j in range(2):
-        _line(axes[2], t, angles[:, j], rf"$\alpha_{j + 1}$", _SERIES[j])
-        _line(axes[2], t, wanted[:, j], rf"$\alpha_{j + 1}$ reference", _SERIES_DARK[j], reference=True)
+        _line(axes[2], t, angles[:, j], rf"$\alpha_{j + 1}$", SERIES[j])
+        _line(axes[2], t, wanted[:, j], rf"$\alpha_{j + 1}$ reference", SERIES_DARK[j], reference=True)
     axes[2].set_ylabel("arm angle [deg]")
     _legend(axes[2], columns=4)
     return figure
@@ -107,22 +113,22 @@ def _actuation(log: FlightLog) -> Figure | None:
     figure, axes, t = _stack(log, "Actuation", (1.0, 1.0, 1.25))
     thrust = log.column(lambda i, o, s: o.attitude.thrust if o.attitude else None)
     hover = log.column(lambda i, o, s: o.control.hover_thrust if o.control else None)
-    _line(axes[0], t, 100 * thrust, "collective", _SERIES[0])
-    _line(axes[0], t, 100 * hover, "hover", _REFERENCE, reference=True)
+    _line(axes[0], t, 100 * thrust, "collective", SERIES[0])
+    _line(axes[0], t, 100 * hover, "hover", REFERENCE, reference=True)
     axes[0].set_ylabel("thrust [%]")
     _legend(axes[0])
     asked = log.column(lambda i, o, s: tilt_rad(o.attitude.attitude_wxyz) if o.attitude else None)
     flown = log.column(lambda i, o, s: tilt_rad(i.mocap.attitude_wxyz) if i.mocap and i.mocap.tracking_valid else None)
-    _line(axes[1], t, np.degrees(flown), "flown", _SERIES[0])
-    _line(axes[1], t, np.degrees(asked), "commanded", _REFERENCE, reference=True)
+    _line(axes[1], t, np.degrees(flown), "flown", SERIES[0])
+    _line(axes[1], t, np.degrees(asked), "commanded", REFERENCE, reference=True)
     axes[1].set_ylabel("tilt [deg]")
     _legend(axes[1])
     commanded = log.column(lambda i, o, s: o.arm_torque_nm, 2)
     sent = log.column(lambda i, o, s: s.arm_torque_sent_nm, 2)
     for j in range(2):
         # Below what was sent, which is noisy and mostly the same: only a difference is to show.
-        axes[2].plot(t, commanded[:, j], color=_SERIES_DARK[j], lw=1.2, label=f"joint {j + 1} commanded")
-        _line(axes[2], t, sent[:, j], f"joint {j + 1} sent", _SERIES[j])
+        axes[2].plot(t, commanded[:, j], color=SERIES_DARK[j], lw=1.2, label=f"joint {j + 1} commanded")
+        _line(axes[2], t, sent[:, j], f"joint {j + 1} sent", SERIES[j])
     axes[2].set_ylabel("joint torque [N m]")
     _legend(axes[2], columns=4)
     return figure
@@ -133,14 +139,14 @@ def _adaptation(log: FlightLog) -> Figure | None:
     if not np.isfinite(rho).any():
         return None
     figure, axes, t = _stack(log, "Adaptation", (1.0, 1.25, 0.8))
-    _line(axes[0], t, rho, r"$\rho$", _SERIES[0])
+    _line(axes[0], t, rho, r"$\rho$", SERIES[0])
     axes[0].set_ylabel(r"switching gain $\rho$")
     h_hat = log.column(lambda i, o, s: o.control.h_hat if o.control else None, 4)
     for j in range(4):
-        _line(axes[1], t, h_hat[:, j], rf"$\hat{{H}}_{j}$", _SERIES[j])
+        _line(axes[1], t, h_hat[:, j], rf"$\hat{{H}}_{j}$", SERIES[j])
     axes[1].set_ylabel(r"$\hat{H}_0 \ldots \hat{H}_3$")
     _legend(axes[1], columns=4)
-    _line(axes[2], t, log.column(lambda i, o, s: o.control.zeta if o.control else None), r"$\zeta$", _SERIES[0])
+    _line(axes[2], t, log.column(lambda i, o, s: o.control.zeta if o.control else None), r"$\zeta$", SERIES[0])
     axes[2].set_ylabel(r"$\zeta$")
     for ax in axes:
         ax.set_ylim(bottom=0.0)
@@ -155,10 +161,10 @@ def _load(log: FlightLog) -> Figure | None:
     moments = log.column(lambda i, o, s: o.control.moment_estimate_kg_m if o.control else None, 2)
     friction = log.column(lambda i, o, s: o.control.friction_estimate_nm if o.control else None, 2)
     for j, name in enumerate("xyz"):
-        _line(axes[0], t, force[:, j], f"${name}$", _SERIES[j])
+        _line(axes[0], t, force[:, j], f"${name}$", SERIES[j])
     for j in range(2):
-        _line(axes[1], t, moments[:, j], f"link {j + 1}", _SERIES[j])
-        _line(axes[2], t, friction[:, j], f"joint {j + 1}", _SERIES[j])
+        _line(axes[1], t, moments[:, j], f"link {j + 1}", SERIES[j])
+        _line(axes[2], t, friction[:, j], f"joint {j + 1}", SERIES[j])
     for ax, label in zip(axes, ("load [N]", "first moment [kg m]", "friction [N m]"), strict=True):
         ax.set_ylabel(label)
         _legend(ax, columns=3)
@@ -171,11 +177,11 @@ def _force(log: FlightLog) -> Figure | None:
         return None
     figure, axes, t = _stack(log, "Contact force, world frame", (1.0,), height_in=3.2)
     for j, name in enumerate("xyz"):
-        _line(axes[0], t, force[:, j], f"$F_{name}$", _SERIES[j])
+        _line(axes[0], t, force[:, j], f"$F_{name}$", SERIES[j])
     payload_kg = log.column(lambda i, o, s: o.control.payload_estimate_kg if o.control else None)
     if np.isfinite(payload_kg).any():
         weight_n = GRAVITY_M_S2 * payload_kg
-        _line(axes[0], t, -weight_n, "weight of the estimated payload", _REFERENCE, reference=True)
+        _line(axes[0], t, -weight_n, "weight of the estimated payload", REFERENCE, reference=True)
     axes[0].set_ylabel("force [N]")
     _legend(axes[0], columns=4)
     return figure
@@ -190,8 +196,8 @@ def _path(log: FlightLog) -> Figure | None:
     caught = metrics.catch_index(log)
     for ax, row, name in ((axes[0], 1, "y"), (axes[1], 2, "z")):
         dress(ax)
-        ax.plot(wanted[:, 0], wanted[:, row], color=_REFERENCE, lw=1.2, ls=DASHED, label="reference", zorder=3.5)
-        ax.plot(flown[:, 0], flown[:, row], color=_SERIES[0], lw=1.5, label="flown", zorder=3)
+        ax.plot(wanted[:, 0], wanted[:, row], color=REFERENCE, lw=1.2, ls=DASHED, label="reference", zorder=3.5)
+        ax.plot(flown[:, 0], flown[:, row], color=SERIES[0], lw=1.5, label="flown", zorder=3)
         if caught is not None:
             ax.plot(*flown[caught, [0, row]], "o", ms=7, mfc="white", mec=CATCH, mew=1.8, label="catch", zorder=4)
         ax.set_ylabel(f"{name} [m]")
@@ -217,9 +223,9 @@ def _timing(log: FlightLog) -> Figure | None:
         lambda i, o, s: i.arm.stamp_s - i.arm.asked_s if i.arm and i.arm.asked_s is not None else None
     )
     for values_ms, label, colour in (
-        (whole_ms, "whole tick", _SERIES[1]),
-        (read_ms, "servo bus read", _SERIES[2]),
-        (late_ms, "tick lateness", _SERIES[0]),
+        (whole_ms, "whole tick", SERIES[1]),
+        (read_ms, "servo bus read", SERIES[2]),
+        (late_ms, "tick lateness", SERIES[0]),
     ):
         if np.isfinite(values_ms).any():
             panes["time"].plot(log.columns.t_s, values_ms, color=colour, lw=0.6, label=label)
@@ -239,10 +245,10 @@ def _timing(log: FlightLog) -> Figure | None:
         ax.set_xlabel("[ms]")
         spread = metrics.percentiles(values_s)
         if spread is None:
-            ax.text(0.5, 0.5, "not measured", ha="center", va="center", color=_REFERENCE, transform=ax.transAxes)
+            ax.text(0.5, 0.5, "not measured", ha="center", va="center", color=REFERENCE, transform=ax.transAxes)
             continue
         end_ms = max(1.3 * spread.p99_ms, 0.1)
-        ax.hist(np.minimum(1e3 * values_s, end_ms), bins=40, range=(0.0, end_ms), color=_SERIES[0], alpha=0.85)
+        ax.hist(np.minimum(1e3 * values_s, end_ms), bins=40, range=(0.0, end_ms), color=SERIES[0], alpha=0.85)
         for value_ms, label, dash in ((spread.p50_ms, "p50", "-"), (spread.p99_ms, "p99", "--")):
             ax.axvline(value_ms, color=CATCH, lw=1.2, ls=dash, label=f"{label} {value_ms:.2f} ms")
         ax.plot([], [], " ", label=f"max {spread.max_ms:.2f} ms")

@@ -190,7 +190,7 @@ class _Line:
 
 
 def show(console: Console, rows: list[Row], task: Task) -> None:
-    """Print one table per device, what to do below each row that fails, and the verdict."""
+    """Print one table per device, the remedy below each failed row, and the verdict."""
     where = " (SITL)" if task.sitl is not None else ""
     build = ", compiled build" if COMPILED else ""
     title = f"{task.config.vehicle.name}{where}, mission '{task.config.mission.name}'{build}"

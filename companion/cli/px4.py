@@ -114,7 +114,7 @@ async def _armed(autopilot: MavsdkAutopilot) -> bool:
 
 
 def _back_up(path: Path, differences: Sequence[Difference], firmware: str, source: str) -> str | None:
-    """Save the old values; returns None, or why nothing may be written."""
+    """Save the old values. Return None, or the reason why nothing may be written."""
     heading = [f"Values of {firmware} before {source} was written.", ""]
     text = params_file.text({difference.name: difference.px4 for difference in differences}, heading)
     try:

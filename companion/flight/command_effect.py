@@ -91,7 +91,7 @@ def _start(before: Outputs | None, after: Outputs) -> Effect:
 
 
 def _instead(after: Outputs) -> str:
-    """Return what the flight does instead of holding."""
+    """Return the activity of a flight that does not hold."""
     if after.phase_kind is PhaseKind.GROUND:
         return "on the ground"
     if after.action is SafetyAction.RETRACT:

@@ -196,7 +196,7 @@ class SerialWire(_ChannelWire):
         super().__init__(self._port)
 
     def send(self, data: bytes) -> None:
-        """Write what the port takes."""
+        """Write as many bytes as the port accepts."""
         with contextlib.suppress(OSError):
             self._port.write(data)
 

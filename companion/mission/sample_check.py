@@ -124,7 +124,7 @@ class SampleCheck:
         yield from self._thrust(reference)
 
     def _off_m(self, t_s: float, position: Vec3, kind: PhaseKind) -> float:
-        """Return how far from the plan the vehicle may be at this instant, m."""
+        """Return the largest expected distance from the plan at this instant, m."""
         if self._catch is not None and kind is PhaseKind.FLIGHT and not 0.0 < self._blow_until_s <= t_s:
             if math.dist(position[:2], self._catch.expected_at_m) <= CATCH_NEAR_M:
                 self._blow_until_s = t_s + CATCH_S
@@ -188,7 +188,7 @@ class SampleCheck:
                     limit=f"{STOP}{limit}",
                     excess=beyond_m,
                     what=f"could not stop within the {what}",
-                    detail=f"{speed:.2f} m/s take {speed * stop_s:.2f} m to stop, {beyond_m:.2f} m too far{with_m}",
+                    detail=f"{speed:.2f} m/s needs {speed * stop_s:.2f} m to stop, {beyond_m:.2f} m too far{with_m}",
                     advice="fly slower towards its edge or turn round earlier",
                 )
 

@@ -48,7 +48,7 @@ class Repeats:
         return self.begin_s + self.period_s + self.left_out_s
 
     def before(self, t_s: float) -> int:
-        """Return how many of the represented repetitions are complete at a time."""
+        """Return the number of represented repetitions that are complete at a time."""
         whole = int((t_s - self.begin_s) / self.period_s)
         return 0 if whole < 1 else min(whole, self.count - 2)
 
@@ -86,7 +86,7 @@ _PLAIN_NAMES = {"takeoff": "take-off", "hold": "hold", "land": "land"}
 
 
 def phase_name(phase: Phase) -> str:
-    """Return the name of a phase: its own, or what it does."""
+    """Return the name of a phase: the configured one, or a description."""
     if phase.name:
         return phase.name
     if isinstance(phase, Line):

@@ -1,4 +1,4 @@
-"""The stages of a flight, their times, and what PX4's status says about the pilot. `companion.core.sequence` executes the stages.
+"""The stages of a flight, their times, and the pilot's state by PX4's status. `companion.core.sequence` executes the stages.
 
 WAIT -> OFFBOARD -> ARM -> SPOOL -> PLAN -> TOUCHDOWN -> DISARM -> DONE
 WAIT <-> READY -> OFFBOARD, if the operator starts the take-off

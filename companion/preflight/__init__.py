@@ -1,3 +1,3 @@
-"""Preflight: observe the open devices for a few seconds, evaluate what they delivered with pure functions, and report one row per
+"""Preflight: observe the open devices for a few seconds, evaluate their data with pure functions, and report one row per
 check.
 """

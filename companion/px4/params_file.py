@@ -17,7 +17,7 @@ from pathlib import Path
 from companion.config.document import ConfigError
 
 PACKAGED = Path(__file__).parent / "indoor_mocap.params"
-"""Package data, so that it is found wherever the package is installed; configs/px4/ holds the same file."""
+"""The project's parameter file as package data, so that an installation finds it; configs/px4/ holds the same file."""
 INT32, REAL32 = 6, 9
 COLUMNS = "# Vehicle-Id\tComponent-Id\tName\tValue\tType"
 VEHICLE_ID = COMPONENT_ID = 1

@@ -48,7 +48,7 @@ class Channel:
             yield packet
 
     def stop(self) -> None:
-        """Read what the socket still holds, then end."""
+        """Read the remaining packets of the socket, then end."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RD)
 

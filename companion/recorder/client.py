@@ -3,7 +3,7 @@
 The recorder answers on the same channel: a full disk, commands from the ground, the state of its telemetry.
 
 The channel is a Unix SOCK_SEQPACKET pair; its packets are `companion.model.packets`. If the channel is
-full the packet is dropped and counted. If the recorder is dead every packet is counted as dropped and the flight goes on. If the
+full the packet is dropped and counted. If the recorder is dead every packet is counted as dropped and the flight continues. If the
 flight process is killed, its packets are still in the socket: the recorder writes them, closes the log and exits.
 """
 

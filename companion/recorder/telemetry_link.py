@@ -19,7 +19,8 @@ from companion.ground.protocol.access import KEYS, BrokerAccess, broker_access
 from companion.ground.protocol.commands import Verifier
 from companion.ground.protocol.connection import Connection, error_text
 from companion.ground.protocol.keys import load_operators
-from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, RETAINED, STREAM_PERIOD_S, Command, Topic
+from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, RETAINED, Command, Topic
+from companion.ground.telemetry.stream import STREAM_PERIOD_S
 from companion.model.codec import to_packet
 from companion.model.packets import LogLine
 from companion.model.types import Severity
@@ -75,7 +76,7 @@ class RecorderSide:
     state: Callable[[], tuple[int, str | None]]
     """Returns the number of lost records, and why recording stopped."""
     ending: Callable[[], bool | None]
-    """Returns None while the flight goes on, else whether it ended normally."""
+    """Returns None during the flight, then whether it ended normally."""
     counts: Counts
     """Updated while the session runs."""
 
@@ -334,7 +335,7 @@ def run(config_json: str, session: str, simulated: bool, recorder: RecorderSide)
 
 
 def _verifier(config: FlightConfig, mqtt: Mqtt, session: str) -> tuple[Verifier | None, str | None]:
-    """Return the command verifier, or why commands are not accepted."""
+    """Return the command verifier, or the reason why commands are not accepted."""
     if not mqtt.commands:
         return None, "commands are disabled in the vehicle file (ground.mqtt.commands)"
     address = mqtt.address

@@ -29,7 +29,7 @@ def use_default_signals() -> None:
     """Restore signals that the parent process left ignored or blocked, so that Ctrl-C and `kill -INT` always work.
 
     A shell without job control starts `companion ... &` with SIGINT ignored, and children inherit that. With SIGCHLD ignored, the
-    exit code of a child is lost. SIGHUP is left as it is, because `nohup` relies on it. Does nothing outside of the main thread,
+    exit code of a child is lost. SIGHUP is left unchanged, because `nohup` relies on it. Does nothing outside of the main thread,
     which alone can set handlers.
     """
     if threading.current_thread() is not threading.main_thread():

@@ -66,7 +66,7 @@ RULES: tuple[Rule, ...] = (
     _operator(OperatorCommand.RESUME, "RESUME was commanded", None, _NOMINAL, "resume commanded"),
     _operator(OperatorCommand.START, "START was commanded", _NOMINAL, _NOMINAL, "take-off commanded"),
     _operator(
-        OperatorCommand.LAND, "LAND was commanded, by Ctrl-C as well; or the launcher has ended", _LAND, _LAND,
+        OperatorCommand.LAND, "LAND was commanded (also by Ctrl-C), or the launcher has ended", _LAND, _LAND,
         "landing commanded",
     ),
     _operator(OperatorCommand.ABORT, "ABORT was commanded", _LAND, _LAND, "abort commanded"),

@@ -67,7 +67,7 @@ class FlightTracker:
         return self._inputs is not None and seems_flipped(self._inputs)
 
     def stop_s(self, vehicle: VehicleState) -> float:
-        """Velocity times this is the displacement to where the vehicle would come to rest after a fault."""
+        """Return the stopping time: times the velocity it is the displacement to the predicted stop after a fault."""
         vx, vy, vz = vehicle.velocity_world_m_s
         return self._stop.time_s(math.sqrt(vx * vx + vy * vy + vz * vz))
 
@@ -122,7 +122,7 @@ def geofence_left(f: FlightTracker, tolerance_m: float) -> Values | None:
 
 
 def geofence_near(f: FlightTracker, tolerance_m: float) -> Values | None:
-    """The rotors would be outside the room by more than the tolerance where the vehicle would come to rest after a fault."""
+    """At the predicted stop after a fault the rotors would be outside the room by more than the tolerance."""
     if f.vehicle is None:
         return None
     (x, y, z), (vx, vy, vz), stop_s = f.vehicle.position_world_m, f.vehicle.velocity_world_m_s, f.stop_s(f.vehicle)
@@ -151,7 +151,7 @@ def thrust_saturated(f: FlightTracker, saturated_max_s: float) -> Values | None:
 
 
 def tether_short(f: FlightTracker, slack_min_m: float) -> Values | None:
-    """Less tether than the threshold would be left where the vehicle would come to rest after a fault."""
+    """At the predicted stop after a fault less tether than the threshold would be left."""
     t = f.tether
     return (t.stop_slack_m, slack_min_m) if t is not None and t.stop_slack_m < slack_min_m else None
 

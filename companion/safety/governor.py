@@ -24,7 +24,7 @@ from companion.safety.stop import StopModel
 BODY_TOP_M = 0.15
 """Height of rotors and markers above the body's origin."""
 BELOW_STANDING_M = 0.75
-"""The set reaches this far below standing height: a landing's reference goes on below the floor until touchdown is detected, and its
+"""The set reaches this far below standing height: a landing's reference continues below the floor until touchdown is detected, and its
 predicted stop lies lower still."""
 JUMP_M = 0.002
 """A reference continues the previous one if its position is within this distance of the extrapolated one."""

@@ -48,7 +48,7 @@ def update(
         state: state before the tick.
         events: events of this tick.
         t_s: flight clock.
-        times: how long a HOLD and a RETRACT may last.
+        times: max duration of a HOLD and of a RETRACT.
         standing: message of the active rule that requires a HOLD; None if there is none, so that the operator may end a HOLD.
     """
     held = state.action is SafetyAction.HOLD  # a RESUME does not end a HOLD that begins in the same tick

@@ -160,7 +160,7 @@ class World(Model):
     hand_tap_n: Positive = 30.0
     """Peak force of a tap."""
     px4_params: Px4Params = Field(default={})
-    """PX4 parameters by name that override those of a set-up vehicle."""
+    """PX4 parameters by name; they override those of the configured vehicle."""
     faults: tuple[Fault, ...] = ()
     air: Air = Air()
     downwash: Downwash = Downwash()

@@ -78,7 +78,7 @@ class Params:
         return int(self._values[name])
 
     def set(self, name: str, value: Value) -> Value:
-        """Store a value and return what was stored.
+        """Store a value and return the stored value.
 
         Raises:
             KeyError: unknown name.

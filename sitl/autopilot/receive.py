@@ -26,7 +26,7 @@ _FUSED_FRAMES = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_FRD)
 
 
 class Reply(Protocol):
-    """The link that a message came from."""
+    """Link from which a message arrived."""
 
     schedule: Schedule
 

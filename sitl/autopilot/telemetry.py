@@ -22,7 +22,7 @@ _NAN = math.nan
 _NO_COVARIANCE = [_NAN] * 21
 _PRESSURE_HPA, _TEMPERATURE_C = 1013.25, 25.0
 _VERSION = 1 << 24 | 16 << 16 | 1 << 8 | 255
-"""1.16.1, release."""
+"""Encoded version: 1.16.1, release."""
 
 
 def _ms(stub: Px4Stub) -> int:

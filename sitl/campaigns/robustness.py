@@ -50,7 +50,7 @@ class Throw:
 
     at_m: tuple[float, float]
     descent_m_s: tuple[float, float]
-    """Slowest and fastest descent: thrown from `HAND_HEIGHT_M`; reaching the net without passing through the rotors."""
+    """Range of the descent speed: a throw from `HAND_HEIGHT_M` is the slowest; the fastest still passes clear of the rotors."""
 
 
 def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:

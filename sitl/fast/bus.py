@@ -89,7 +89,7 @@ class FastBus:
         return self._arm
 
     def keep_alive(self, t_s: float) -> None:
-        """Do what the bus thread does while the flight process stalls: feed the watchdogs, withdraw stale currents."""
+        """Perform the actions of the bus thread while the flight process stalls: feed the watchdogs, withdraw stale currents."""
         for drive in self._drives:
             drive.heard_instruction()
             if t_s - self._goal_s > self._watchdog_s:

@@ -86,7 +86,7 @@ def test_a_file_that_is_no_flight_log_is_refused_in_one_line(flight: FlightLog, 
     for path, reason in (
         (tmp_path / "absent", "No such file"),
         (tmp_path, "directory"),
-        (text, "no MCAP file"),
+        (text, "not an MCAP file"),
         (empty, "is empty"),
         (foreign, "not a flight log"),
         (damaged, "damaged"),

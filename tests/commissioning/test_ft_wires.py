@@ -50,7 +50,7 @@ def test_bias_turn_and_scale_are_found_without_the_arm_and_the_turn_is_written(s
     fixes = bad(found)
     assert set(fixes) - {"force.rate"} == {"force.tare", "ft.direction", "ft.scale"}
     assert "companion ft tare --sensor" in fixes["force.tare"]
-    assert "2.00 times the truth" in fixes["ft.scale"]
+    assert "2.00 times the true force" in fixes["ft.scale"]
     assert changes(found) == {"tool.sensor_rpy_deg": [0.0, 0.0, 90.0]}
     assert load_vehicle(vehicle).tool.sensor_rpy_deg == (0.0, 0.0, 90.0)
     assert without_arm.code == EXIT_REFUSED
@@ -103,7 +103,7 @@ def test_ctrl_c_ends_the_check(sandbox: Sandbox) -> None:
     with World(sandbox) as world:
         running = sandbox.start("ft", "check", "--weight", 1, "--vehicle", VEHICLE, *world.addresses())
         with running:
-            wait_for_error(running, "hands off")
+            wait_for_error(running, "nothing touches it")
             running.signal(signal.SIGINT)
             ended = running.end()
     assert ended.code == EXIT_ABORTED

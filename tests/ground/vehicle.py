@@ -16,7 +16,6 @@ from companion.config.loader import FlightConfig, load_flight
 from companion.ground.protocol.commands import Accepted, Refused, Verifier
 from companion.ground.protocol.keys import Operators
 from companion.ground.protocol.messages import (
-    STREAM_PERIOD_S,
     VERSION,
     Ack,
     Command,
@@ -33,7 +32,7 @@ from companion.ground.protocol.messages import (
 )
 from companion.ground.protocol.proof import with_proof, with_proofs
 from companion.ground.telemetry.scene import scene_of
-from companion.ground.telemetry.stream import replay
+from companion.ground.telemetry.stream import STREAM_PERIOD_S, replay
 from tests.analysis.synthetic_flight import synthetic_flight
 from tests.support import CATCH
 

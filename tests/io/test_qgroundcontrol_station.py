@@ -156,7 +156,7 @@ def test_qgroundcontrol_sees_the_stub_reads_a_parameter_and_hears_our_words() ->
                 await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191, name="progress", value=0.25)
                 # The companion's own part of the talk with PX4 (component 195) is nobody else's business.
                 assert ground.senders() == {(1, 1), (1, 191)}
-                assert station.take_messages() == [f"ground station 127.0.0.1:{ground.port} is there"]
+                assert station.take_messages() == [f"ground station 127.0.0.1:{ground.port} is connected"]
 
     asyncio.run(fly())
 

@@ -17,7 +17,7 @@ from tests.support import HOVER, run_here, sandbox_in, set_options
     [
         ({"vehicle.ground.mqtt": None}, r"vehicle\.ground\.mqtt is null$"),
         ({"vehicle.ground.mqtt.commands": False}, r"vehicle\.ground\.mqtt\.commands is false$"),
-        ({"vehicle.ground.mqtt.url": "mqtt://192.0.2.7:1883"}, r"mqtt://192\.0\.2\.7:1883, .* plain connection"),
+        ({"vehicle.ground.mqtt.url": "mqtt://192.0.2.7:1883"}, r"mqtt://192\.0\.2\.7:1883, .* unencrypted connection"),
     ],
     ids=["no broker", "no commands", "plain and remote"],
 )

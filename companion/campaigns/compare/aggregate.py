@@ -1,4 +1,5 @@
-"""Distributions of a comparison's figures over the seeds, and the paired comparison of two variants.
+"""Distributions of a comparison's figures over the seeds, and the paired comparison of two variants. `campaign` has the columns of its
+tables.
 
 A *row* holds the results of one flight as plain data: controller, preset, payload_kg, seed, world_seed, model_error, outcome, error,
 catch_t_s, rms {pre|post: e_p_m, e_q_deg, e_alpha_deg}, impedance_error {position_n, arm_nm}, final_e_z_m, peak_e_p_m,

@@ -65,7 +65,7 @@ class ByKeys:
         return state.stamp_s > self._ends_s
 
     def status(self) -> str:
-        """Return which joint the keys move, or why it must not move further."""
+        """Return the joint that the keys move, or the reason why it must not move further."""
         return self._refusal or f"keys move joint {self._joint + 1}"
 
     def _go(self, motion: Motion, way: float, state: ArmState) -> None:

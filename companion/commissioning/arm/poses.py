@@ -41,7 +41,7 @@ class Step:
 
     @property
     def hand_rad(self) -> Vec2:
-        """Both joints at the end."""
+        """Return the angles of both joints at the end of the step."""
         return (math.radians(self.pose_deg[0]), math.radians(self.pose_deg[1]))
 
 

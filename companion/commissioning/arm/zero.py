@@ -27,7 +27,7 @@ ALONE_SHARE: Final = 0.35
 HAND_DEG: Final = 2.0
 """Accuracy of a link held level or plumb; a zero of the vehicle file within this is kept."""
 DISAGREE_DEG: Final = 8.0
-"""Difference of the zeros of two poses beyond which a pose was not held as requested, or the arm slips."""
+"""Largest difference between the zeros of two poses; a larger one means a pose that was not held, or a slipping arm."""
 _DEG_PER_COUNT: Final = 360.0 / COUNTS_PER_TURN
 
 Counts = tuple[int, int]

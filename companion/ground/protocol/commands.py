@@ -168,7 +168,7 @@ def _mac(command: Command, key: bytes) -> str:
 
 
 def _field_problem(command: Command) -> str | None:
-    """Return what is wrong with a field of the signed text, or None."""
+    """Return the problem of a field of the signed text, or None."""
     if VEHICLE_NAME.fullmatch(command.vehicle) is None:
         return f"vehicle: {command.vehicle!r:.60} is not a vehicle name"
     if _SESSION.fullmatch(command.session) is None:
@@ -265,7 +265,7 @@ class Verifier:
         Args:
             payload: received bytes.
             retained: the broker had kept the message: its age is unknown, and later subscribers would receive it again.
-            now_t_s: flight clock, s; None before it starts. The time never goes back: of two calls the later time counts.
+            now_t_s: flight clock, s; None before it starts. The time never goes back: the latest time of all calls counts.
         """
         if len(payload) > COMMAND_MAX_BYTES:
             return Refused(Reason.OVERSIZED, f"{len(payload)} bytes, at most {COMMAND_MAX_BYTES} expected")

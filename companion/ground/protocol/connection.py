@@ -96,7 +96,7 @@ class Connection(aiomqtt.Client):
             raise
 
     async def subscribe_topic(self, topic: str, qos: int) -> str | None:
-        """Subscribe; return None, or why the broker refuses.
+        """Subscribe. Return None, or the reason of the broker's refusal.
 
         Raises:
             aiomqtt.MqttError: no answer.

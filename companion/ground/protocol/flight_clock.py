@@ -34,5 +34,5 @@ class FlightClock:
             samples.popleft()
 
     def now_ms(self, monotonic_s: float) -> int | None:
-        """Return the flight clock now, ms; None before the first message. The clock goes on while the vehicle is silent."""
+        """Return the flight clock now, ms; None before the first message. The clock continues while the vehicle is silent."""
         return None if not self._samples else int((monotonic_s + self._samples[0][1]) * 1000.0)

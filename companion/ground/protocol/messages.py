@@ -29,7 +29,6 @@ from companion.model.types import Quat, Vec2, Vec3, Vec4
 
 VERSION = 2
 ROOT = "companion"
-STREAM_PERIOD_S = 0.05
 MESSAGE_MAX_BYTES = 200_000
 """Largest message on any topic; a receiver drops larger ones unread."""
 COMMAND_MAX_BYTES = 1024

@@ -31,6 +31,8 @@ from companion.model.constants import GRADED_POSE_MAX_AGE_S, TICK_PERIOD_S
 from companion.model.flight_stage import Stage
 from companion.model.types import ControlLog, Inputs, Outputs, Quat, Reference, SafetyAction, Sent, TetherState, Vec3
 
+STREAM_PERIOD_S = 0.05
+"""Period of the stream messages over MQTT."""
 _TOUCHDOWN = Stage.TOUCHDOWN.value
 """Phases on the ground, where the reference below the floor is not a tracking error."""
 WAITS_FOR_START = Stage.READY.value

@@ -1,6 +1,6 @@
 """XM430-W210-T: control table, units, and the SDK's serial port adapted to a control loop. The SDK implements the protocol.
 
-Source: ROBOTIS e-manual, XM430-W210 control table.
+Source: ROBOTIS e-manual, XM430-W210 control table. The supported baud rates are those of `companion.config.vehicle.ArmDevice.baud`.
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ class ServoPort(PortHandler):  # type: ignore[misc]
 
 
 def _open_failure(port: str, error: Exception) -> str:
-    """Return why a port did not open and what to do, in one line."""
+    """Return the reason why a port did not open, and the remedy, in one line."""
     number = getattr(error, "errno", None)
     if number == errno.ENOENT or not Path(port).exists():
         found = sorted(p.device for p in list_ports.comports())

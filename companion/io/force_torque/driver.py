@@ -289,7 +289,7 @@ class RobotousForceTorque:
 
 
 class _Collector:
-    """Collector of a number of samples."""
+    """Collects a given number of samples."""
 
     def __init__(self, count: int) -> None:
         self._count = count

@@ -353,7 +353,7 @@ class MavsdkAutopilot:
             self._loop.call_soon_threadsafe(self._show_ground_station)
 
     def _show_ground_station(self) -> None:
-        """Answer the heartbeat of a disarmed PX4 with a ground station's: PX4 reports the reasons of a refusal only if it sees one.
+        """Answer the heartbeat of a disarmed PX4 with a ground station's: PX4 reports the reasons of a refusal only to one.
 
         While PX4 is armed nothing is sent, because PX4 must notice the loss of the real ground station, whatever NAV_DLL_ACT
         is set to.

@@ -22,7 +22,7 @@ makes must not stop rotors. The core repeats the request in every tick for as lo
 RETRY_S = 0.5
 """Min time between two commands of one kind."""
 SETTLE_S = 1.5
-"""Pause after an accepted command: the heartbeat that shows it done comes once a second."""
+"""Pause after an accepted command, because the heartbeat that shows its effect is sent once per second."""
 ANSWER_DEADLINE_S = 3.0
 """MAVSDK gives a command up after about 2 s; after this time its answer is lost and the request may be repeated."""
 _MESSAGES_KEPT = 200

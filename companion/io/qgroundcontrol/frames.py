@@ -94,7 +94,7 @@ class TokenBucket:
         self._seen_s: float | None = None
 
     def take(self, now_s: float) -> bool:
-        """Return whether one more is allowed."""
+        """Return whether one more message is allowed, and count it."""
         if self._seen_s is not None:
             self._left = min(self._burst, self._left + (now_s - self._seen_s) * self._rate_hz)
         self._seen_s = now_s
@@ -242,7 +242,7 @@ class DownlinkFilter:
         self._extras: dict[int, int | None] = dict(_CRC_EXTRA)
 
     def pick(self, datagram: bytes, now_s: float) -> list[bytes]:
-        """Return what to send of a datagram that MAVSDK forwarded."""
+        """Return the frames to send from a datagram that MAVSDK forwarded."""
         picked = []
         for frame in frames(datagram):
             if frame is None or (frame.system, frame.component) == self._own or not self._due(frame, now_s):

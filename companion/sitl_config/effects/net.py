@@ -22,7 +22,7 @@ class Net(Model):
     restitution: Fraction = 0.3
     """Speed at which the mesh and the hoop return a payload over the speed at which it arrived (e)."""
     pocket: Fraction = 0.5
-    """Share of the payload's distance from the centre, where it enters, that remains when it has settled: 0 if it slides to the
-    middle of the bag, 1 if the mesh forms a pocket at the point of entry (e)."""
+    """Distance of the settled payload from the centre over its distance at entry: 0 if it slides to the middle of the bag, 1 if the
+    mesh forms a pocket at the point of entry (e)."""
     swing_damping_ratio: Positive = 0.15
     """Damping ratio of the settled payload's swing (e)."""

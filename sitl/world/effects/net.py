@@ -43,7 +43,7 @@ class Bag:
         self.pivot_m = (0.0, 0.0)
         """x and y of the point about which the payload swings."""
         self.entered_s: float | None = None
-        """Time at which the payload came into the bag; None if it is not in the bag."""
+        """Time at which the payload entered the bag; None if it is not in the bag."""
         self.touched_s: float | None = None
         """Time of the first contact with hoop or mesh since the throw or since it bounced out."""
         self.bounced = False
