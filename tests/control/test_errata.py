@@ -31,9 +31,17 @@ POSE = (1.7, 1.0)
 HOVER = 0.49
 
 
-@pytest.fixture(scope="module", params=["paper", "recommended"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        ("paper", ()),
+        ("recommended", ("controller.disturbance_time_xyz_s=[0.65, 0.65, 0.8]", "controller.arm_friction_share=0.75")),
+    ],
+    ids=["paper", "recommended with every option"],
+)
 def config(request: pytest.FixtureRequest) -> FlightConfig:
-    return load_flight("configs/missions/catch.yaml", preset=request.param)
+    preset, overrides = request.param
+    return load_flight("configs/missions/catch.yaml", preset=preset, overrides=overrides)
 
 
 @pytest.fixture(scope="module")
@@ -127,6 +135,9 @@ OPTIONS_OFF = {
     "feedforward_lead_s": 0.0,
     "arm_inertia_nominal": False,
     "arm_friction_share": 0.0,
+    "load_rate_xyz": (0.0, 0.0, 0.0),
+    "moment_rate": 0.0,
+    "friction_rate": 0.0,
 }
 
 

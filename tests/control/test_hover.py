@@ -120,9 +120,9 @@ def flown(error: float, adapt: bool = True, faults: str = "[]") -> FastResult:
 
 
 def configured(error: float, adapt: bool, faults: str = "[]") -> SitlConfig:
-    """Without the law's own disturbance observer, which would make good for a wrong hover thrust by itself."""
+    """Without the law's own adaptive force, which would make good for a wrong hover thrust by itself."""
     overrides = (
-        "controller.disturbance_time_xyz_s=[0, 0, 0]",
+        "controller.load_rate_xyz=[0, 0, 0]",
         f"world.hover_thrust_error={error}",
         f"vehicle.airframe.hover_thrust_adapt={str(adapt).lower()}",
         f"world.faults={faults}",

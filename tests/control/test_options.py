@@ -162,7 +162,9 @@ def test_a_force_that_the_base_gives_way_to_is_not_observed_away(config: FlightC
     assert isinstance(config.controller, AdaptiveConfig)
     found = []
     for compliance in ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)):
-        law = config.controller.model_copy(update={"base_compliance_xyz": compliance})
+        law = config.controller.model_copy(
+            update={"base_compliance_xyz": compliance, "disturbance_time_xyz_s": (0.65, 0.65, 0.8)}
+        )
         controller = AdaptiveController(law, config.vehicle, 0.49)
         for _ in range(400):
             state = PlantState(

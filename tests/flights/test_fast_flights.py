@@ -7,6 +7,7 @@ from functools import cache
 
 import pytest
 
+from companion.control.hover_thrust import AIRBORNE_M
 from companion.model.frames import tilt_rad
 from companion.model.types import Outcome, PhaseKind
 from companion.sitl_config.loader import SitlConfig, load_sitl
@@ -56,6 +57,20 @@ def test_the_payload_is_caught_and_carried_home(preset: str, payload_kg: float, 
     x, y, _ = result.truth[-1].position_world_m
     assert math.hypot(x + 1.0, y) < 0.1, "it did not come home"
     assert max(tilt_rad(truth.attitude_wxyz) for truth in result.truth) < math.radians(15)
+
+
+def test_adaptive_loads_do_not_wind_up_while_the_ground_carries_the_vehicle() -> None:
+    result = flown(0.2, "recommended")
+    low_m = configured().vehicle.airframe.ground_clearance_m + AIRBORNE_M
+    low = [
+        outputs.control.load_estimate_n
+        for inputs, outputs in zip(result.inputs, result.outputs, strict=True)
+        if outputs.control and inputs.vehicle and inputs.vehicle.position_world_m[2] <= low_m
+    ]
+    before_lift, landed = low[0], low[-1]
+    assert before_lift == (0.0, 0.0, 0.0) != landed
+    assert len(low) > 100
+    assert set(low) == {before_lift, landed}
 
 
 def test_the_catch_is_where_and_when_the_paper_has_it() -> None:

@@ -26,7 +26,8 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     # The base does not comply with a force that it compensates by feed-forward.
     "base rows on": ("controller.base_compliance_xyz=[1, 1, 1]", "controller.force_feedforward_xyz=[0, 0, 0]"),
     "F_d off": ("controller.desired_force_time_s=null",),
-    "disturbance observer off": ("controller.disturbance_time_xyz_s=[0, 0, 0]",),
+    "adaptive force off": ("controller.load_rate_xyz=[0, 0, 0]",),
+    "adaptive moments and friction off": ("controller.moment_rate=0", "controller.friction_rate=0"),
     "lead off": ("controller.feedforward_lead_s=0",),
     "arm inertia and friction off": ("controller.arm_inertia_nominal=false", "controller.arm_friction_share=0"),
 }
