@@ -107,6 +107,7 @@ def test_the_page_says_how_the_laboratory_differs_from_the_paper() -> None:
     assert "* CSC (csc/tuned) after the catch: failed at 0.2 kg (printed: 0.293)." in made["differences"]
     assert "at 0.2 kg: PSC, proposed, CSC (printed: proposed, PSC, CSC)" in made["differences"]
     assert "| csc/tuned | 0 of 6 (6 crashed) | 0.010 (0.010) | – |" in made["published"]
+    assert "| 1.0 / 3.0 | 0.091 / 0.165 |" in made["published"], "attitude, then the printed position errors"
     assert "6 laboratories (seeds 1 to 6), 18 flights" in made["published"]
     assert made["published"].count("Flown by") == 2
     assert "| adaptive/paper | 0.2 kg | 0 % | 0.400 | 0.200 | -50 % | 6 of 6 | 0.03 |" in made["adaptation"]

@@ -70,9 +70,10 @@ def merged(files: Sequence[Results]) -> list[Row]:
 
 def laws_markdown(groups: Sequence[Group]) -> str:
     """Return one line per payload and preset, with the paper's figures where it prints any."""
-    head = ["payload", "law/preset", "completed", *(title for title, _, _ in _FIGURES)]
+    head = ["payload", "law/preset", "completed", *(title for title, _, _ in _FIGURES), "e_q, deg"]
     rows = [
-        [f"{group.payload_kg:g} kg", group.label, _completed(group), *_spreads(group, _FIGURES)] for group in groups
+        [f"{group.payload_kg:g} kg", group.label, _completed(group), *_spreads(group, _FIGURES), _attitude(group)]
+        for group in groups
     ]
     if any(map(_paper, groups)):
         head.append("printed e_p, m")
