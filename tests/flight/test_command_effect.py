@@ -208,7 +208,7 @@ def test_nothing_is_done_against_a_pilot() -> None:
 
 
 def test_commands_while_px4_lands_on_its_own() -> None:
-    blind = ("world.faults=[{kind: mocap_loss, t_s: 6.0}]",)
+    blind = ("world.faults=[{kind: mocap_loss, t_s: 5.7}]",)
     flown = commanded((8.0, LAND), (8.1, ABORT), (8.2, HOLD), (8.3, RESUME), (8.4, START), sets=blind, until_s=9.0)
     assert flown.effects[:2] == [(True, "recorded; PX4's own landing continues")] * 2
     assert [accepted for accepted, _ in flown.effects[2:]] == [False, False, False]

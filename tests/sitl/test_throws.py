@@ -18,12 +18,13 @@ from sitl.world.world import World
 from tests.support import SHORT_CATCH
 
 ROOT = Path(__file__).parents[2]
-CATCH_S, PERIOD_S, KEEP_S = 2.45, 5.0, 1.0
+CATCH_S, PERIOD_S, KEEP_S = 2.45, 6.0, 1.0
 """Time of the first catch of `TO_AND_FRO`, time between two catches, and time in the net."""
 TO_AND_FRO = (
     'mission.phases=[{"type": "takeoff", "height_m": 0.5, "duration_s": 1.5},'
     ' {"type": "line", "name": "catch", "to_m": [0.4, 0, 0.5], "duration_s": 2}, {"type": "hold", "duration_s": 1},'
-    ' {"type": "line", "to_m": [-0.2, 0, 0.5], "duration_s": 2}, {"type": "land", "speed_m_s": 0.35}]',
+    ' {"type": "line", "to_m": [-0.2, 0, 0.5], "duration_s": 2}, {"type": "hold", "duration_s": 1},'
+    ' {"type": "land", "speed_m_s": 0.35}]',
     f"world.keep_s={KEEP_S}",
 )
 """The short catch, flown there and back: it may be repeated."""
