@@ -24,6 +24,8 @@ from sitl.world.payload import Payload
 
 PHYSICS_DT_S = 0.002
 DRAG_N_PER_M_S = 0.25
+FALL_M_S = 2.5
+"""Speed at which the legs break on the floor: a fall from 0.3 m. PX4 descends at 0.7 m/s at most."""
 _EFFECT_STEPS = round(EFFECT_PERIOD_S / PHYSICS_DT_S)
 SNAG_STIFFNESS_N_M, SNAG_DAMPING_NS_M = 400.0, 30.0
 """Stiffness and damping of a snagged tether."""
@@ -135,7 +137,7 @@ class World:
         ) or LinearRotors(config.rotor_lag_s, PHYSICS_DT_S)
         self.battery = BatteryPack.of(config.battery, config.battery_start, config.battery_life_s, self.weight_n)
         """The battery, or None if its effect is off."""
-        self._crash_m = 0.6 * vehicle.airframe.ground_clearance_m
+        self._standing_m = vehicle.airframe.ground_clearance_m
         self.wind_m_s = config.wind_m_s
         self.rotor_share: Vec4 | None = None
         """Share of each rotor's thrust that a fault leaves; None without a fault."""
@@ -319,13 +321,14 @@ class World:
         return (pull_n * x, pull_n * y, pull_n * z)
 
     def _watch_crash(self) -> None:
-        """Detect a crash: the vehicle is far below its standing height or upside down."""
+        """Detect a crash: the vehicle is far below its standing height, upside down, or reaches the floor in a fall."""
         if self.crashed:
             return
         q = self.q
         z, x, y = q[2], q[4], q[5]
         up = 1.0 - 2.0 * (x * x + y * y)
-        if z < self._crash_m or up < 0.3 or not math.isfinite(z):
+        fell = z < self._standing_m and self.v[2] < -FALL_M_S
+        if fell or z < 0.6 * self._standing_m or up < 0.3 or not math.isfinite(z):
             self.crashed = True
             self.report("crashed")
 

@@ -302,7 +302,7 @@ def _load_n(result: FastResult, t_s: float) -> float:
 
 
 def test_a_restart_of_px4_in_the_air_is_a_fall_and_is_called_so() -> None:
-    row = flown("autopilot_reboot", "line", 2.0)
+    row = flown("autopilot_reboot", "line", 2.0, config=CONFIG)
     assert row["outcome"] == "crashed"
     assert row["problems"] == ["crashed"]
     assert row["event"] == "vehicle_state_lost"
