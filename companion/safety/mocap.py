@@ -151,6 +151,8 @@ class MocapTracker:
     def _judge(self, pose: MocapPose, vehicle: VehicleState | None, awake_s: float) -> None:
         """Evaluate a new frame."""
         before, accepted = self.frame, self._trusted_pose
+        if before is None:
+            self._trusted_awake_s = awake_s  # a stream may begin within a burst of lost frames
         gone_s = awake_s - self._frame_awake_s
         self.frame, self._frame_awake_s = pose, awake_s
         self._window_frames += 1
