@@ -452,7 +452,7 @@ def test_hardware_error_at_start_is_named_and_not_rebooted() -> None:
 
 def test_joint_outside_its_walls_is_refused() -> None:
     text = refused(new_servos(start_deg=(165.0, 170.0)))
-    assert "servo 12 (joint 2): stands at 170.0 deg" in text
+    assert "servo 12 (joint 2): is at 170.0 deg" in text
     assert "outside its limits -150 to 150 deg" in text
 
 

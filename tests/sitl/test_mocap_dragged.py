@@ -49,7 +49,7 @@ def test_vibration_is_neither_drag_nor_snag(amplitude_m_s2: float, hz: float) ->
     assert max(judged) < LIMIT_M / 3.0
 
 
-@pytest.mark.parametrize(("speed_m_s", "within_s"), [(0.4, 0.2), (1.0, 0.15)])
+@pytest.mark.parametrize(("speed_m_s", "within_s"), [(0.6, 0.2), (1.0, 0.15)])
 def test_a_drag_is_found_through_vibration(speed_m_s: float, within_s: float) -> None:
     _, flight, result = flown(10.0, 149.7, f"{{kind: mocap_drag, phase: line, size: {speed_m_s}}}")
     begun_s = flight.faults.begun_s
