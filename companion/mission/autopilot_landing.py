@@ -39,6 +39,8 @@ BEGUN_S = 1.0
 DESCENT_M_S = 0.25
 """PX4 descends when its estimate sinks faster; a third of MPC_LAND_SPEED."""
 DESCENT_HOLD_S = 0.3
+DESCENT_COUNTED_M_S = 0.7
+"""MPC_LAND_SPEED. A faster descent counts as this one: PX4 brakes a vehicle that falls to this speed, in the air."""
 ARRESTED_SHARE = 0.5
 """Share of the fastest descent. PX4 controls its estimated speed, so in the air the estimate does not slow down to less: the floor
 stops it."""
@@ -75,7 +77,7 @@ class Arrest:
 
     descends_since_s: float | None = None
     fastest_m_s: float = 0.0
-    """Fastest descent that lasted for `DESCENT_HOLD_S`; 0 before there was one."""
+    """Fastest descent that lasted for `DESCENT_HOLD_S`, `DESCENT_COUNTED_M_S` at most; 0 before there was one."""
     arrested_since_s: float | None = None
 
     def update(self, t_s: float, up_m_s: float) -> Arrest:
@@ -83,7 +85,7 @@ class Arrest:
         descends = up_m_s < -max(DESCENT_M_S, ARRESTED_SHARE * self.fastest_m_s)
         since_s = (t_s if self.descends_since_s is None else self.descends_since_s) if descends else None
         lasting = since_s is not None and t_s - since_s >= DESCENT_HOLD_S
-        fastest_m_s = max(self.fastest_m_s, -up_m_s) if lasting else self.fastest_m_s
+        fastest_m_s = max(self.fastest_m_s, min(-up_m_s, DESCENT_COUNTED_M_S)) if lasting else self.fastest_m_s
         arrested = fastest_m_s > 0.0 and up_m_s > -ARRESTED_SHARE * fastest_m_s
         arrested_since_s = (t_s if self.arrested_since_s is None else self.arrested_since_s) if arrested else None
         return Arrest(since_s, fastest_m_s, arrested_since_s)

@@ -150,6 +150,7 @@ def test_a_descent_that_the_floor_stops_is_a_touchdown_although_the_estimate_dri
         lambda t_s: -0.7,
         lambda t_s: -0.7 if t_s < 1.5 else -0.4,  # PX4 descends more slowly near the floor
         lambda t_s: -0.7 if t_s < 1.5 or t_s > 1.7 else 0.0,  # a gust
+        lambda t_s: -1.8 if t_s < 1.0 else -0.6,  # it falls when the landing begins, and PX4 brakes it
     ],
 )
 def test_a_descent_that_goes_on_is_no_touchdown(up_m_s: Callable[[float], float]) -> None:
