@@ -11,7 +11,7 @@ from pydantic.json_schema import GenerateJsonSchema
 from companion.config.controller import ControllerConfig
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
-from companion.sitl_config.laboratory import Normal, Uniform
+from companion.sitl_config.distributions import Normal, Uniform
 from companion.sitl_config.world import World
 
 KINDS: dict[str, TypeAdapter[Any]] = {

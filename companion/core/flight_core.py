@@ -16,16 +16,16 @@ from companion.core.sequence import missing_inputs
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters, event_of
 from companion.mission.plan import Plan
-from companion.mission.reattach import found_armed
 from companion.model import flight_stage as seq
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.flight_stage import Stage
 from companion.model.types import ControlLog, Event, Inputs, Outputs, PhaseKind, Reference
 from companion.safety import notices
-from companion.safety.events import OPERATOR_RESUME
 from companion.safety.gate import ARM_FRESH_S, Gate, Refusal
 from companion.safety.governor import Governor
 from companion.safety.monitors import Monitors
+from companion.safety.reattach import found_armed
+from companion.safety.rules import OPERATOR_RESUME
 from companion.safety.situation import Situation
 from companion.safety.tether import TetherWatch
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from companion.mission.active_plan import Course
-from companion.mission.autopilot_landing import AutopilotLanding
 from companion.mission.plan import Plan
 from companion.mission.settled import SettledEstimate
 from companion.model import flight_stage as seq
 from companion.model.codec import Record
 from companion.model.flight_stage import Stage
 from companion.model.types import AutopilotRequest, Event, Inputs, Outcome, PhaseKind, Reference, TetherState
+from companion.safety.autopilot_landing import AutopilotLanding
 from companion.safety.rotor_stop import RotorStop
 from companion.safety.supervisor import SupervisorState
 from companion.safety.touchdown import Touchdown

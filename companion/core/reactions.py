@@ -9,7 +9,7 @@ from companion.model import flight_stage as seq
 from companion.model.flight_stage import Stage
 from companion.model.types import OperatorCommand, Outcome, PhaseKind, Reference, SafetyAction, Vec3
 from companion.safety import notices
-from companion.safety.events import OPERATOR_ABORT, OPERATOR_LAND, OPERATOR_RESUME, PILOT_TOOK_OVER
+from companion.safety.rules import OPERATOR_ABORT, OPERATOR_LAND, OPERATOR_RESUME, PILOT_TOOK_OVER
 from companion.safety.supervisor import update
 
 HOLD_ABOVE_M = 0.3

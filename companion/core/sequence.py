@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from companion.core.flight_state import Tare
 from companion.core.transition import Transition
 from companion.mission.active_plan import Course
-from companion.mission.autopilot_landing import FLIPPED, TIPPED
 from companion.mission.check import check_start
 from companion.mission.plan import Plan
 from companion.mission.settled import SettledEstimate
@@ -16,9 +15,10 @@ from companion.model.flight_stage import Stage
 from companion.model.frames import euler_zyx_from_quat
 from companion.model.types import AutopilotRequest, Inputs, Outcome, PhaseKind, SafetyAction, Severity
 from companion.safety import notices
-from companion.safety.events import CRASHED, PILOT_TOOK_OVER
+from companion.safety.autopilot_landing import FLIPPED, TIPPED
 from companion.safety.mocap import unfused
 from companion.safety.notices import Notice
+from companion.safety.rules import CRASHED, PILOT_TOOK_OVER
 
 ARMED_SHOWN_S = 1.5
 """PX4's HEARTBEAT reports once a second whether it is armed: after a request to arm, an older "not armed" proves nothing."""

@@ -11,7 +11,7 @@ from companion.core.reactions import supervise
 from companion.core.sequence import advance
 from companion.core.transition import Parameters, Transition
 from companion.model.types import Event
-from companion.safety.events import OPERATOR_START
+from companion.safety.rules import OPERATOR_START
 
 
 def transition(

@@ -10,12 +10,12 @@ from companion.config.loader import FlightConfig
 from companion.config.vehicle import Vehicle
 from companion.core.flight_state import FlightState, Observation, Tare
 from companion.mission.active_plan import Course
-from companion.mission.autopilot_landing import AutopilotLanding
 from companion.mission.plan import Plan
 from companion.model import flight_stage as seq
 from companion.model.flight_stage import Stage
 from companion.model.negative_zero import without_negative_zero
 from companion.model.types import Event, Outcome, SafetyAction, Severity, Vec2
+from companion.safety.autopilot_landing import AutopilotLanding
 from companion.safety.notices import Notice
 from companion.safety.rotor_stop import RotorStop
 from companion.safety.supervisor import LadderTimes

@@ -49,7 +49,7 @@ from companion.runtime import ipc
 from companion.runtime.clock import Clock, flight_clock
 from companion.runtime.event_loop import run
 from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
-from companion.safety.events import REATTACHED
+from companion.safety.rules import REATTACHED
 
 STATUS_EVERY = 20
 JOINT_READ_TIMEOUT_S = 0.002

@@ -1,6 +1,6 @@
 """The landing after a takeover: motion capture keeps flowing to PX4, PX4 lands, the guardian disarms if PX4 cannot.
 
-The rules are those of the companion's own landing on PX4 (`companion.mission.autopilot_landing`). Pure except for the link that it
+The rules are those of the companion's own landing on PX4 (`companion.safety.autopilot_landing`). Pure except for the link that it
 sends on; time is an argument.
 """
 
@@ -16,7 +16,6 @@ from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
 from companion.guardian.monitors import PoseFilter
 from companion.guardian.px4 import Px4State
-from companion.mission.autopilot_landing import TIMEOUT_S, AutopilotLanding, LandingStep
 from companion.model.types import (
     AutopilotRequest,
     AutopilotStatus,
@@ -27,6 +26,7 @@ from companion.model.types import (
     SafetyAction,
     Severity,
 )
+from companion.safety.autopilot_landing import TIMEOUT_S, AutopilotLanding, LandingStep
 
 HEARTBEAT_PERIOD_S = 1.0
 ASK_PERIOD_S = 0.1

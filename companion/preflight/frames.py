@@ -1,7 +1,7 @@
 """Checks at rest that motion capture, PX4 and the mission use the same axes. Pure.
 
 PX4 fuses motion capture, so a wrong yaw is invisible to EKF2. Gravity by the accelerometer reveals a tilted frame; the mission's start
-position and yaw reveal a rotated one; the hand test reveals the rest (`companion.preflight.hand_test.run`).
+position and yaw reveal a rotated one; the hand test reveals the rest (`companion.preflight.hand_test.steps`).
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ from typing import Any
 from companion.config.vehicle import Vehicle
 from companion.model.negative_zero import without_negative_zero
 from companion.model.types import Event, SafetyAction
-from companion.safety.events import RULES
 from companion.safety.rule import Repeat, Rule, Subject, hold_time_s, thresholds_of
+from companion.safety.rules import RULES
 from companion.safety.situation import Values
 
 QUIET_S = 1.0

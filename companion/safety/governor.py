@@ -28,10 +28,10 @@ BELOW_STANDING_M = 0.75
 predicted stop lies lower still."""
 JUMP_M = 0.002
 """A reference continues the previous one if its position is within this distance of the extrapolated one."""
-CATCH_UP_PER_S = 2.5
+RETURN_PER_S = 2.5
 """Rate at which a constrained reference returns to the input reference. Its velocity follows four times as fast, so that it does not
 overshoot."""
-SPEED_PER_S = 4.0 * CATCH_UP_PER_S
+SPEED_PER_S = 4.0 * RETURN_PER_S
 INSIDE_M = 0.001
 """A target outside the set is replaced by the nearest point this far inside it."""
 _TOLERANCE = 1e-9
@@ -310,7 +310,7 @@ class Governor:
         away = math.sqrt(ex * ex + ey * ey + ez * ez)
         rate = 0.0
         if away > 0.0:
-            rate = min(CATCH_UP_PER_S, math.sqrt(self.stop_deceleration_m_s2 / away))
+            rate = min(RETURN_PER_S, math.sqrt(self.stop_deceleration_m_s2 / away))
         wx, wy, wz = _limited((follow[0] + rate * ex, follow[1] + rate * ey, follow[2] + rate * ez), self.speed_max_m_s)
         gain = min(SPEED_PER_S, 1.0 / dt_s)
         ax, ay, az = _limited(

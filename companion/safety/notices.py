@@ -1,4 +1,4 @@
-"""Events that the state machine and the core report themselves, without a rule in `companion.safety.events`.
+"""Events that the state machine and the core report themselves, without a rule in `companion.safety.rules`.
 
 One row each; docs/safety.md is made from them. Ids are stable: logs, summaries and outside scripts name them.
 """

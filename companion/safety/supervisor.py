@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 from companion.config.vehicle import Safety
 from companion.model.types import Event, SafetyAction
-from companion.safety.events import OPERATOR_RESUME
 from companion.safety.notices import HOLD_EXPIRED, RETRACT_EXPIRED
+from companion.safety.rules import OPERATOR_RESUME
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from companion.config.explain import nearest
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.overrides import apply_overrides, parse_overrides
 from companion.config.yaml_strict import read_document
-from companion.sitl_config.laboratory import Laboratory, check_world, take_ranges
+from companion.sitl_config.distributions import Laboratory, check_world, take_ranges
 from companion.sitl_config.world import World
 
 WORLD_DIRECTORY = Path(__file__).parent / "worlds"

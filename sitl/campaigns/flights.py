@@ -14,7 +14,7 @@ from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
 from companion.config.loader import FlightConfig
 from companion.model.types import Event, Inputs, Outcome, Outputs, SafetyAction, Sent, Severity
-from companion.sitl_config.laboratory import draw
+from companion.sitl_config.distributions import draw
 from companion.sitl_config.loader import SitlConfig
 from companion.sitl_config.world import World
 from sitl.campaigns.runner import Data

@@ -13,8 +13,8 @@ from typing import NamedTuple, Protocol
 from companion.config.vehicle import Joint, Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_normalize
 from companion.model.types import Quat, Vec2, Vec3, Vec4
+from companion.sitl_config.distributions import with_model_error
 from companion.sitl_config.faults import Fault, FaultKind
-from companion.sitl_config.laboratory import with_model_error
 from companion.sitl_config.world import Push, Servo
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery

@@ -27,7 +27,7 @@ from companion.model.types import (
     Severity,
     Vec3,
 )
-from companion.safety.events import RULES
+from companion.safety.rules import RULES
 from companion.sitl_config.faults import IN_FLIGHT, KINDS, PHASES, FaultKind
 from companion.sitl_config.loader import load_sitl
 from tests.campaigns.made_up import fault_row

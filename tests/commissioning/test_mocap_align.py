@@ -12,7 +12,7 @@ from companion.io.mocap.natnet import z_up_from_y_up
 from companion.model.observations import Observations
 from companion.model.types import MocapPose
 from companion.preflight import frames
-from companion.preflight.hand_test.run import HandResult, HandTest
+from companion.preflight.hand_test.steps import HandResult, HandTest
 from tests.preflight.hand_rig import Standing, world
 
 

@@ -13,8 +13,8 @@ import pytest
 
 from companion.cli.schema import KINDS
 from companion.model.types import SafetyAction
-from companion.safety.events import RULES
 from companion.safety.rule import Rule
+from companion.safety.rules import RULES
 from tests.support import DEADLINE_S
 from tools.docs.reference import main, page, unit
 

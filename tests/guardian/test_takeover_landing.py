@@ -13,9 +13,9 @@ from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
 from companion.guardian.px4 import Px4State
 from companion.guardian.takeover_landing import Notice, TakeoverLanding
-from companion.mission.autopilot_landing import TIMEOUT_S
 from companion.model.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
 from companion.model.types import MocapPose, Quat, Vec3
+from companion.safety.autopilot_landing import TIMEOUT_S
 
 STANDING_M, TILT_MAX_RAD = 0.3, math.radians(40.0)
 START_S, STEP_S = 20.0, 0.01

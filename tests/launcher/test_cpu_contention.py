@@ -18,7 +18,7 @@ from companion.launcher.cpu_contention import (
     read_core_waits,
 )
 from companion.preflight.evaluation import CHECKS
-from companion.safety.events import RULES
+from companion.safety.rules import RULES
 from tests.support import wait_until
 
 

@@ -13,9 +13,9 @@ from msgspec.structs import replace
 from companion.config.loader import FlightConfig, load_flight
 from companion.mission.check import check_mission
 from companion.mission.plan import Plan
-from companion.safety.events import RULES
 from companion.safety.flight import FlightTracker
 from companion.safety.rule import thresholds_of
+from companion.safety.rules import RULES
 from companion.safety.tether import TetherWatch, allowed_m, attachment_world_m, distance_m, slack_m
 from tests.safety.healthy import flying, healthy
 

@@ -12,7 +12,7 @@ from companion.model.frames import (
     ned_from_enu,
 )
 from companion.model.types import MocapPose, VehicleState
-from companion.preflight.hand_test.run import HandSample
+from companion.preflight.hand_test.steps import HandSample
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.autopilot.autopilot import Px4Stub, gains_from_params
 from sitl.autopilot.cascade import Cascade

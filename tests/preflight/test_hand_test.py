@@ -15,7 +15,7 @@ from companion.model.frames import quat_rotate
 from companion.model.types import MocapPose, Quat, Vec3
 from companion.preflight.axes import ALL, IDENTITY, MIRRORINGS, ROTATIONS, AxisMap
 from companion.preflight.hand_test import evaluation as hand_test_evaluation
-from companion.preflight.hand_test.run import (
+from companion.preflight.hand_test.steps import (
     SILENCE_MAX_S,
     STEP_TIMEOUT_S,
     HandResult,

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.model.types import Event, SafetyAction, Severity
-from companion.safety.events import OPERATOR_RESUME as RESUME
-from companion.safety.events import RULES
 from companion.safety.notices import HOLD_EXPIRED, RETRACT_EXPIRED
+from companion.safety.rules import OPERATOR_RESUME as RESUME
+from companion.safety.rules import RULES
 from companion.safety.supervisor import (
     LadderTimes,
     SupervisorState,

@@ -15,10 +15,10 @@ from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.types import Event, FlightMode, Inputs, OperatorCommand, SafetyAction
 from companion.safety.arm import error_text
-from companion.safety.events import RULES
 from companion.safety.mocap import unfused
 from companion.safety.monitors import Monitors
 from companion.safety.rule import Rule
+from companion.safety.rules import RULES
 from companion.safety.situation import Situation
 from tests.safety.healthy import (
     SLOW,

@@ -12,9 +12,9 @@ from pydantic import BaseModel
 
 from companion.config.vehicle import ForceDevice, Safety, Tether
 from companion.model.types import Event, SafetyAction, Severity
-from companion.safety.events import RULES
 from companion.safety.notices import HOLD_EXPIRED, NO_ROOM_TO_STAY, NOTICES, RETRACT_DONE, RETRACT_EXPIRED
 from companion.safety.rule import Repeat, Rule, Subject
+from companion.safety.rules import RULES
 from companion.safety.supervisor import LadderTimes, SupervisorState, update
 from tools.docs.tables import write_page
 

@@ -15,7 +15,7 @@ from companion.preflight.axes import IDENTITY, Y_UP, AxisMap
 from companion.preflight.checks import Check
 from companion.preflight.hand_test.evaluation import LEVEL_MAX_DEG, YAW_MAX_DEG, best_axes, yaw_offset_deg
 from companion.preflight.hand_test.motion import angle_rad
-from companion.preflight.hand_test.run import HandResult
+from companion.preflight.hand_test.steps import HandResult
 
 WORLD_YAW = Check("align.world_yaw", "world's yaw", why="room, tether and mission are given in these axes")
 _UP: Final[Vec3] = (0.0, 0.0, 1.0)

@@ -23,7 +23,7 @@ from companion.io.mocap.natnet import ServerInfo
 from companion.io.protocols import DeviceError
 from companion.model.check_row import refusals
 from companion.preflight.hand_test import evaluation as hand_evaluation
-from companion.preflight.hand_test.run import HandResult
+from companion.preflight.hand_test.steps import HandResult
 from companion.runtime.clock import flight_clock
 
 if TYPE_CHECKING:

@@ -1,6 +1,6 @@
 """Health of each device by the limits of the vehicle file, with the value measured. Pure.
 
-The limits are those of the safety monitors (`companion.safety.events`): a value that lands the vehicle or disables a device is BAD,
+The limits are those of the safety monitors (`companion.safety.rules`): a value that lands the vehicle or disables a device is BAD,
 one that causes a warning is WARN. The health is for display only; the monitors act on their own.
 """
 

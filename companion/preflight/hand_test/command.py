@@ -22,7 +22,7 @@ from companion.model.types import AutopilotStatus, MocapPose, VehicleState
 from companion.preflight.checks import Check
 from companion.preflight.hand_test import evaluation as hand_test_evaluation
 from companion.preflight.hand_test import record as hand_record
-from companion.preflight.hand_test.run import INSTRUCTIONS, HandResult, HandSample, HandTest, HandView, Step
+from companion.preflight.hand_test.steps import INSTRUCTIONS, HandResult, HandSample, HandTest, HandView, Step
 from companion.runtime.terminal import Bars, pressed, raw_keys
 
 LOOK_PERIOD_S: Final = 0.004

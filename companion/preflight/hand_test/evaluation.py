@@ -15,7 +15,7 @@ from companion.model.types import Vec3
 from companion.preflight.axes import ALL, IDENTITY, Y_UP, AxisMap
 from companion.preflight.checks import Check
 from companion.preflight.hand_test.motion import Motion, angle_rad, norm
-from companion.preflight.hand_test.run import HandResult
+from companion.preflight.hand_test.steps import HandResult
 
 _ASTRAY = "the controller would push in wrong directions"
 DONE = Check("hand.done", "hand test", "every step is recognised", "the axes are not known")

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from companion.model.types import Vec3
 from companion.sitl_config.effects.air import Air as AirConfig
-from sitl.world.effects.ornstein_uhlenbeck import OrnsteinUhlenbeck
 from sitl.world.loads import EFFECT_PERIOD_S
+from sitl.world.ornstein_uhlenbeck import OrnsteinUhlenbeck
 
 if TYPE_CHECKING:
     from sitl.world.world import World

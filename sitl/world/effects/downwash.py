@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 from companion.config.vehicle import Vehicle
 from companion.model.types import Vec3, Vec4
 from companion.sitl_config.effects.downwash import Downwash as DownwashConfig
-from sitl.world.effects.ornstein_uhlenbeck import OrnsteinUhlenbeck
 from sitl.world.loads import EFFECT_PERIOD_S
 from sitl.world.model import PAYLOAD_RADIUS_M, ROTOR_HEIGHT_M, rotor_offset_m
+from sitl.world.ornstein_uhlenbeck import OrnsteinUhlenbeck
 
 if TYPE_CHECKING:
     from sitl.world.world import World

@@ -11,7 +11,7 @@ from companion.sitl_config.effects.air import Air as AirConfig
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.air import Air
-from sitl.world.effects.ornstein_uhlenbeck import OrnsteinUhlenbeck
+from sitl.world.ornstein_uhlenbeck import OrnsteinUhlenbeck
 from sitl.world.world import PHYSICS_DT_S, World
 from tests.support import CATCH
 

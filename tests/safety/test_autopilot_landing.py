@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import pytest
 
-from companion.mission.autopilot_landing import TIMEOUT_S, AutopilotLanding, LandingStep
 from companion.model.types import (
     AutopilotRequest,
     AutopilotStatus,
@@ -18,6 +17,7 @@ from companion.model.types import (
     OperatorCommand,
     VehicleState,
 )
+from companion.safety.autopilot_landing import TIMEOUT_S, AutopilotLanding, LandingStep
 from companion.safety.touchdown import HEIGHT_HOLD_S, HEIGHT_MARGIN_M
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)

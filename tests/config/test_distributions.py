@@ -16,8 +16,8 @@ from companion.cli.schema import schema_json
 from companion.config.document import ConfigError
 from companion.config.yaml_strict import read_document
 from companion.model.constants import GRAVITY_M_S2
+from companion.sitl_config.distributions import Normal, Range, Uniform, with_model_error
 from companion.sitl_config.effects.machine import Machine
-from companion.sitl_config.laboratory import Normal, Range, Uniform, with_model_error
 from companion.sitl_config.loader import WORLDS, SitlConfig, load_sitl, load_world
 from companion.sitl_config.world import World
 from sitl.campaigns.flights import with_world
