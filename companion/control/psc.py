@@ -17,43 +17,12 @@ from companion.config.controller import PscConfig
 from companion.config.vehicle import Vehicle
 from companion.control.common import tracking_errors
 from companion.control.model_based import ModelBasedLaw
+from companion.control.payload_mass import PayloadEstimator
 from companion.control.thrust import collective_n
 from companion.control.types import PlantState, Wrench
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import body_x_z_axes_world
 from companion.model.types import Reference, Vec2, Vec3, Vec8
-
-
-class PayloadEstimator:
-    """Estimate of the payload's mass: thrust / specific force along body z, low-passed, less the machine's own mass.
-
-    In the air the rotors' thrust is the only force that an accelerometer on the machine measures (drag aside), so their ratio is the
-    total mass, whatever the motion. The thrust is the commanded one, delayed as the rotors delay it.
-    """
-
-    _LIFTING_SHARE = 0.7
-    """Share of the machine's weight below which the ground may carry a part of it."""
-
-    def __init__(self, config: PscConfig, mass_kg: float) -> None:
-        self._mass_kg = mass_kg
-        self._time_s = config.payload_time_s
-        self._max_kg = config.payload_max_kg
-        self._lag_s = config.thrust_lag_s
-        self._thrust_n: float | None = None
-        self.payload_kg = 0.0
-
-    def step(self, dt_s: float, commanded_n: float, specific_force_z_m_s2: float, airborne: bool) -> float:
-        """Run one tick with the thrust commanded in the last one and return the estimate, kg, within [0, payload_max_kg]."""
-        if self._thrust_n is None:
-            self._thrust_n = commanded_n
-        k = 1.0 - math.exp(-dt_s / self._lag_s) if self._lag_s > 0 else 1.0
-        self._thrust_n += k * (commanded_n - self._thrust_n)
-        least_n = self._LIFTING_SHARE * self._mass_kg * GRAVITY_M_S2
-        if airborne and self._thrust_n > least_n and specific_force_z_m_s2 > self._LIFTING_SHARE * GRAVITY_M_S2:
-            sample_kg = self._thrust_n / specific_force_z_m_s2 - self._mass_kg
-            self.payload_kg += (1.0 - math.exp(-dt_s / self._time_s)) * (sample_kg - self.payload_kg)
-            self.payload_kg = max(0.0, min(self._max_kg, self.payload_kg))
-        return self.payload_kg
 
 
 class PscController(ModelBasedLaw):

@@ -10,9 +10,9 @@ import pytest
 from rich.console import Console
 
 from companion.campaigns.compare.aggregate import Spread, adaptation_pairs, aggregate
-from companion.campaigns.compare.campaign import print_tables
 from companion.campaigns.compare.grid import ABLATED, ABLATIONS, flights_of, variants_of
 from companion.campaigns.compare.paper_results import TABLE, printed
+from companion.campaigns.compare.tables import print_tables
 from companion.campaigns.runner import Row
 from companion.sitl_config.loader import load_sitl
 from tests.campaigns.made_up import compare_row

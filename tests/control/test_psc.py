@@ -14,7 +14,8 @@ from companion.analysis.replay import flight_core, replay
 from companion.config.controller import PscConfig
 from companion.control.dynamics import Dynamics
 from companion.control.manipulator import Manipulator
-from companion.control.psc import PayloadEstimator, PscController
+from companion.control.payload_mass import PayloadEstimator
+from companion.control.psc import PscController
 from companion.control.types import PlantState, Wrench
 from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind, Reference
 from companion.sitl_config.loader import SitlConfig, load_sitl

@@ -12,10 +12,10 @@ from typing import Any
 
 from companion.analysis.plot_style import write_svg
 from companion.campaigns.compare.aggregate import Group, adaptation_pairs, aggregate
-from companion.campaigns.compare.campaign import by_payload, spread_text
 from companion.campaigns.compare.grid import ABLATED, ADAPTATION_OFF, LESS, is_ablation
 from companion.campaigns.compare.paper_results import Printed
 from companion.campaigns.compare.plots import distributions
+from companion.campaigns.compare.tables import by_payload, spread_text
 from companion.campaigns.runner import Row
 from companion.config.controller import PRESETS, AdaptiveConfig, ControllerConfig, CscConfig, PscConfig
 from companion.config.loader import load_flight

@@ -1,4 +1,4 @@
-"""Distributions of a comparison's figures over the seeds, and the paired comparison of two variants. `campaign` has the columns of its
+"""Distributions of a comparison's figures over the seeds, and the paired comparison of two variants. `tables` has the columns of its
 tables.
 
 A *row* holds the results of one flight as plain data: controller, preset, payload_kg, seed, world_seed, model_error, outcome, error,
