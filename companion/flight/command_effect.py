@@ -1,4 +1,4 @@
-"""Effect of an operator's command as text. Pure: derived from the outputs of the tick with the command and the tick before."""
+"""Describes the effect of an operator's command, derived from the outputs of its tick and of the tick before. Pure."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from companion.model.flight_stage import PILOT_FLIES, Stage
 from companion.model.types import OperatorCommand, Outputs, PhaseKind, SafetyAction
 
 Effect = tuple[bool, str]
-"""Whether the command was accepted (executed, or fulfilled before), and a text with the action or the reason of the refusal."""
+"""Whether the command was accepted (executed, or already in effect), and a text: the action, or the reason for the refusal."""
 
 _RISING = frozenset({Stage.OFFBOARD.value, Stage.ARM.value, Stage.SPOOL.value})
-"""Phases between the start command and the take-off."""
+"""Phases between the start command and take-off."""
 
 
 def effect_of(command: OperatorCommand, before: Outputs | None, after: Outputs) -> Effect:
@@ -91,7 +91,7 @@ def _start(before: Outputs | None, after: Outputs) -> Effect:
 
 
 def _instead(after: Outputs) -> str:
-    """Return the activity of a flight that does not hold."""
+    """Return what a vehicle that is not holding is doing."""
     if after.phase_kind is PhaseKind.GROUND:
         return "on the ground"
     if after.action is SafetyAction.RETRACT:

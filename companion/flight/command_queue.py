@@ -13,7 +13,7 @@ from companion.model.types import GroundCommand, OperatorCommand, Outputs, Safet
 from companion.runtime import ipc
 
 WAITING_MAX = 32
-"""Largest number of queued commands. Beyond it the least severe are refused."""
+"""Maximum number of queued commands. If there are more, the least severe are refused."""
 _GRAVEST_FIRST = {
     command: rank
     for rank, command in enumerate(
@@ -32,7 +32,7 @@ _T = TypeVar("_T")
 
 
 class Dropped(NamedTuple):
-    """A command that is dropped before its tick."""
+    """A command that is dropped before it is executed."""
 
     asked: GroundCommand
     why: str
@@ -40,14 +40,14 @@ class Dropped(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """Commands of one tick."""
+    """The command of one tick."""
 
     command: OperatorCommand
     """Command for the core."""
     asked: GroundCommand | None
-    """The ground station's command that is answered after the tick."""
+    """The ground station's command that this tick executes and answers."""
     refused: str | None = None
-    """Reason for a refusal without asking the core; None if the answer is the command's effect."""
+    """Why the command is refused before it reaches the core; None if the core decides."""
 
 
 class GivenUp(Exception):
@@ -55,7 +55,7 @@ class GivenUp(Exception):
 
 
 class Operator:
-    """Commands from the launcher's messages, from signals to this process, and from the ground station.
+    """Collects commands from the launcher's messages, signals to this process, and the ground station.
 
     Args:
         channel: channel to the launcher.
@@ -68,12 +68,11 @@ class Operator:
         self._given = OperatorCommand.NONE
         self._holds = 0
         self.hold: int | None = None
-        """Number of the active hold, as `Sent.hold`; None without a hold."""
+        """Number of the active hold, as in `Sent.hold`; None if the vehicle does not hold."""
 
     def ask(self, commands: Iterable[GroundCommand]) -> list[Dropped]:
-        """Queue commands from the ground station in their order of arrival: each has its tick, the most severe first.
-
-        A hold, landing or abort drops every queued RESUME and START, because those were given before it. Returns the dropped commands.
+        """Queue commands from the ground station and return those that are dropped. Each queued command gets its own tick, the most
+        severe first. A hold, landing or abort drops every RESUME and START that was queued before it.
         """
         dropped = []
         for asked in commands:
@@ -90,9 +89,9 @@ class Operator:
     def next(self) -> Turn:
         """Return the commands of this tick.
 
-        A landing requested by the launcher or a signal stays requested. A command from the ground station lasts one tick, and a
-        repeated one waits another tick, because the core counts rising edges. A RESUME that names another hold than the active one is
-        refused.
+        A landing requested by the launcher or a signal stays requested. A command from the ground station lasts one tick. A
+        repeated one is delayed by a tick, because the core counts rising edges. A RESUME that names a hold other than the active
+        one is refused.
         """
         waiting = self._waiting
         if self._land.is_set():
@@ -104,14 +103,13 @@ class Operator:
         if asked.command is OperatorCommand.RESUME and self.hold is not None and asked.hold != self.hold:
             self._given = OperatorCommand.NONE
             meant = f"hold {asked.hold}" if asked.hold else "no hold"
-            text = f"resume refused: it names {meant}, now hold {self.hold} is active; check the situation, then command it again"
+            text = f"resume refused: it names {meant}, but hold {self.hold} is active; check the situation, then command it again"
             return Turn(OperatorCommand.NONE, asked, text)
         self._given = asked.command
         return Turn(asked.command, asked)
 
     def judged(self, command: OperatorCommand, outputs: Outputs) -> int | None:
-        """Number the holds and return `hold`. A new one begins with `SafetyAction.HOLD`, and with every hold command while it is
-        active.
+        """Number the holds and return `hold`. A new hold begins with `SafetyAction.HOLD`, and with every hold command during it.
 
         Args:
             command: command of the tick.

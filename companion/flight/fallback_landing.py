@@ -16,9 +16,9 @@ from companion.runtime.clock import Clock
 
 LANDING_TIMEOUT_S = 30.0
 STATUS_MIN_AGE_S = 1.5
-"""PX4 reports once a second whether it is armed; an older report does not count."""
+"""PX4 reports once a second whether it is armed; an older report is ignored."""
 UNFLOWN_HOVER_THRUST = 0.5
-"""Hover thrust for a vehicle that was found in the air: the core requires one, and its law never runs there."""
+"""Hover thrust for a vehicle that was found in the air: the core requires a value, but its controller never runs."""
 
 
 class Lander(Protocol):

@@ -16,11 +16,11 @@ _REFUSALS = frozenset({MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STR
 
 
 class Heartbeats:
-    """The heartbeats of one flight. Pure.
+    """Builds the heartbeats of one flight. Pure.
 
     Args:
         identity: identity of the MAVLink link that the guardian would take over.
-        origin_s: `time.monotonic` at zero of the flight clock.
+        origin_s: `time.monotonic` when the flight clock was zero.
     """
 
     def __init__(self, identity: LinkIdentity, origin_s: float) -> None:
@@ -28,7 +28,7 @@ class Heartbeats:
         self._origin_s = origin_s
         self._pilot = False
         self._lands_without_mocap = False
-        """Whether one of `_REFUSALS` has happened. From then on a rejected pose is more than a single invalid one."""
+        """Whether an event of `_REFUSALS` has occurred. From then on, rejected poses are more than a single invalid one."""
         self._pose_stamp_s = float("-inf")
         self._position_world_m = (0.0, 0.0, 0.0)
 
@@ -41,7 +41,7 @@ class Heartbeats:
         if mocap is not None and mocap.tracking_valid and outputs.mocap_trusted:
             self._pose_stamp_s, self._position_world_m = mocap.stamp_s, mocap.position_world_m
         armed = inputs.status is not None and inputs.status.armed
-        # PX4 reports once a second that it is armed: from the request on it may be.
+        # PX4 reports once a second that it is armed: it may be as soon as arming is requested.
         may_lift = armed or outputs.request is AutopilotRequest.ARM or outputs.phase_kind in _IN_THE_AIR
         link = self._identity
         return Heartbeat(
@@ -69,7 +69,7 @@ class FlightGuard:
     Args:
         client: connection to the guardian.
         identity: identity of the MAVLink link that the guardian would take over.
-        origin_s: `time.monotonic` at zero of the flight clock.
+        origin_s: `time.monotonic` when the flight clock was zero.
     """
 
     def __init__(self, client: GuardianClient, identity: LinkIdentity, origin_s: float) -> None:
@@ -94,12 +94,13 @@ class FlightGuard:
         self._client.send_heartbeat(self._last)
 
     def still_here(self) -> None:
-        """Send a heartbeat after the last tick while this process performs a landing itself."""
+        """Send a heartbeat after the last tick, while this process lands the vehicle itself."""
         if self._last is not None:
             self._client.send_heartbeat(self._last)
 
     def goodbye(self, now: AutopilotStatus | None) -> None:
-        """Sign off from the guardian. While PX4 is armed nothing is sent: the guardian takes over once this process has ended.
+        """Send the guardian the last heartbeat. Send nothing while PX4 is armed: the guardian then takes over once this process has
+        ended.
 
         Args:
             now: PX4's newest status; None if none was received.

@@ -53,7 +53,7 @@ from companion.safety.rules import REATTACHED
 
 STATUS_EVERY = 20
 JOINT_READ_TIMEOUT_S = 0.002
-"""Timeout from the start of the tick. The read was started before that."""
+"""Timeout of the joint read, from the start of the tick; the read begins before that."""
 JOINT_LEAD_MAX_S = 0.003
 JOINT_MARGIN_S = 0.0001
 """The joint read is timed so that its answer arrives this long before the tick, neither late nor stale."""
@@ -177,12 +177,12 @@ class Flight:
         ipc.send(self._channel, {"type": "command", "t_s": after.mission_t_s, **message})
 
     def _goes_on(self, outputs: Outputs) -> bool:
-        """Return whether a PX4 that was found armed is still armed. If not, there is nothing to land and no mission to fly."""
+        """Return whether a PX4 that was found armed is still armed. If it is not, the flight ends."""
         goes_on = any(event.id == REATTACHED for event in outputs.events)
-        lines = [f"landing without it: {line}" for line in self._devices.failures]
+        lines = [f"landing without this device: {line}" for line in self._devices.failures]
         if not goes_on:
             lines = [
-                "PX4 was armed when the companion started and has disarmed since; no take-off happened: start again to fly"
+                "PX4 was armed when the companion started and has disarmed since; the vehicle did not take off. To fly, start again"
             ]
         for text in lines:
             self._tell(

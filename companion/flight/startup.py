@@ -1,4 +1,4 @@
-"""The flight process between open devices and the first tick: preflight, and the parameters read from PX4."""
+"""What the flight process does between opening the devices and the first tick: run the preflight and read PX4 parameters."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _HOVER_PARAM = "MPC_THR_HOVER"
 
 
 class Refused(Exception):
-    """The preflight refuses; `lines` are the reasons, one each."""
+    """The preflight refuses the flight; each of `lines` is a reason."""
 
     def __init__(self, lines: list[str]) -> None:
         super().__init__("; ".join(lines))
@@ -34,7 +34,7 @@ class Refused(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """Results of the preflight for the flight."""
+    """Results of the preflight that the flight uses."""
 
     plan: Plan
     """Plan from the mission's start pose."""

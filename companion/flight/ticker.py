@@ -13,9 +13,9 @@ EARLY_S, LATE_S = 0.0015, 0.001
 window's end.
 """
 MATCH = 0.02
-"""Largest relative difference between frame rate and tick rate for synchronisation."""
+"""Largest relative difference between frame rate and tick rate at which ticks follow the frames."""
 _GAIN, _SLEW_S = 0.1, 0.00025
-"""Share of a frame's timing error by which the next deadline moves, and the largest such step."""
+"""Fraction of a frame's timing error by which the next deadline moves, and the largest such step."""
 _PATIENCE = 3.0
 """Number of periods without a frame in its window after which ticks no longer wait for frames."""
 
@@ -26,15 +26,15 @@ class TickTime:
 
     start_s: float
     lateness_s: float
-    """Delay after the frame that started it, or else after its deadline."""
+    """Delay of the tick after the frame that started it, or after its deadline if no frame did."""
 
 
 class Ticker:
-    """Absolute deadlines: a late tick does not move the next one. Deadlines in the past are skipped.
+    """Times the ticks by absolute deadlines: a late tick does not move the next one. Deadlines in the past are skipped.
 
-    Frames that arrive at the tick rate move the deadlines, by at most `_SLEW_S` per tick, and each tick begins when its frame arrives.
-    A tick does not wait longer than `LATE_S` for its frame, and a frame outside of its window starts no tick: whatever arrives, ticks
-    are about half to one and a half periods apart.
+    Frames that arrive at the tick rate move the deadlines, by at most `_SLEW_S` per tick, and each tick begins when its frame
+    arrives. A tick does not wait longer than `LATE_S` for its frame, and a frame outside its window starts no tick. Ticks are
+    therefore always about half to one and a half periods apart.
 
     Args:
         period_s: period of the ticks.

@@ -13,7 +13,7 @@ from companion.runtime.clock import Clock
 
 READY_TIMEOUT_S = 10.0
 SILENT_S = 1.0
-"""Silence after which the guardian counts as gone."""
+"""Silence after which the guardian is treated as dead."""
 _LISTEN_PERIOD_S = 0.02
 
 

@@ -27,15 +27,15 @@ _Ipv4 = Annotated[str, Meta(pattern=r"^\d{1,3}(\.\d{1,3}){3}$")]
 
 
 class Heartbeat(Record, frozen=True, kw_only=True):
-    """State of one control tick that the guardian needs to take over."""
+    """State that the guardian needs to take over, sent in each control tick."""
 
     tick: int
     t_s: float
     """Flight clock."""
     origin_s: float
-    """`time.monotonic` at zero of the flight clock: the time base of the poses sent to PX4."""
+    """`time.monotonic` when the flight clock was zero: the time base of the poses sent to PX4."""
     mission_t_s: float
-    """Time since take-off was commanded, 0 before."""
+    """Time since take-off was commanded; 0 before that."""
     lifting: bool
     """The rotors turn, or may be about to."""
     pilot: bool
@@ -43,7 +43,7 @@ class Heartbeat(Record, frozen=True, kw_only=True):
     goodbye: bool
     """This is the last heartbeat: the flight ends normally."""
     mocap_refused: bool
-    """The flight process rejects motion capture and lands without it: its poses must neither go to PX4 nor judge the landing."""
+    """The flight process rejects motion capture and lands without it: poses must neither be sent to PX4 nor confirm the landing."""
     autopilot_system: _Byte
     """MAVLink system id of PX4."""
     own_system: _Byte
@@ -65,7 +65,7 @@ def pack(heartbeat: Heartbeat) -> bytes:
 
 
 def unpack(datagram: bytes) -> Heartbeat | None:
-    """Decode a heartbeat; None if the datagram is another one, is damaged, or holds a value that is out of range or not finite."""
+    """Decode a heartbeat; None if the datagram is not a heartbeat, is malformed, or holds a value out of range or not finite."""
     if datagram[:1] != HEARTBEAT:
         return None
     try:

@@ -40,7 +40,7 @@ class Wire(Protocol):
 
     @property
     def lost(self) -> bool:
-        """Whether the connection has ended. A lost wire wakes every wait and carries nothing."""
+        """Whether the connection has ended. A lost wire ends every wait on it and transfers no data."""
 
     def fileno(self) -> int:
         """Return the descriptor to wait on."""
@@ -75,18 +75,17 @@ class _ChannelWire:
 
 
 class UdpWire(_ChannelWire):
-    """UDP transport, bound where PX4 sends to (`udpin`) or sending to PX4 (`udpout`) from the port that the flight process used.
-
-    PX4 keeps the first partner of a UDP link, so the port must stay the same. Once PX4's address is known the socket is connected to
-    it and the kernel drops datagrams of all other senders. After REPIN_SILENCE_S without a datagram the socket is disconnected, then
-    connected to the next sender of a HEARTBEAT of PX4's system id at the same IPv4 address: a router that restarts sends from
-    another port.
+    """UDP transport: bound to the port that PX4 sends to (`udpin`), or sending to PX4 from the flight process's port (`udpout`).
+    PX4 only talks to the first partner of a UDP link, so the port must stay the same. Once PX4's address is known the socket is
+    connected to it and the kernel drops datagrams of all other senders. After REPIN_SILENCE_S without a datagram the socket is
+    disconnected, then connected to the next sender at the same IPv4 address of a HEARTBEAT with PX4's system id: a restarted router
+    sends from a new port.
 
     Args:
         local: address to bind; None for any.
-        remote: PX4's address; None to take the sender of the first valid HEARTBEAT of an autopilot.
-        beside: the killed flight process still holds the port. It reads no more: among sockets connected to PX4 the kernel delivers
-            datagrams to the newest (measured, Linux 6.18).
+        remote: PX4's address; None to use the sender of the first valid HEARTBEAT of an autopilot.
+        beside: the killed flight process still holds the port, but reads nothing: of several sockets connected to PX4, the newest
+            receives the datagrams (measured, Linux 6.18).
     """
 
     def __init__(self, local: tuple[str, int] | None, remote: tuple[str, int] | None, *, beside: bool = False) -> None:
@@ -119,7 +118,7 @@ class UdpWire(_ChannelWire):
                 self._socket.sendto(data, self._remote)
 
     def receive(self) -> list[bytes]:
-        """Return datagrams from PX4's address; before it is known, only the HEARTBEAT that identifies it."""
+        """Return datagrams from PX4's address; while that is unknown, only the HEARTBEAT that reveals it."""
         # Disconnecting would take an unbound socket's port away from it.
         if self._connected and self._bound and time.monotonic() - self._heard_s > REPIN_SILENCE_S:
             disconnect_udp(self._socket)
@@ -201,7 +200,7 @@ class SerialWire(_ChannelWire):
             self._port.write(data)
 
     def receive(self) -> list[bytes]:
-        """Return the data that has arrived. A port that is readable without data (unplugged, hung up) is lost."""
+        """Return the data that has arrived. A port that is readable but has no data (unplugged, hung up) is lost."""
         try:
             data = self._port.read(_MAX_BYTES)
         except OSError:  # serial.SerialException is one
@@ -211,7 +210,7 @@ class SerialWire(_ChannelWire):
 
 
 def address_problem(address: str) -> str | None:
-    """Return why the guardian cannot take over this link, or None if it can. Checked before take-off."""
+    """Return why the guardian cannot take over this link, or None if it can; called before take-off."""
     if _NET.fullmatch(address) or _SERIAL.fullmatch(address):
         return None
     return f"autopilot {address}: the guardian cannot take over this link; expected udpin, udpout, tcpout or serial"
@@ -328,7 +327,7 @@ class Link:
         self._send_command(*messages.command(request))
 
     def request_message(self, message_id: int) -> None:
-        """Send MAV_CMD_REQUEST_MESSAGE: PX4 sends the message once, at once."""
+        """Send MAV_CMD_REQUEST_MESSAGE: PX4 sends the message immediately, once."""
         self._send_command(mavlink.MAV_CMD_REQUEST_MESSAGE, float(message_id), 0.0)
 
     def request_rate(self, message_id: int, rate_hz: float) -> None:
@@ -336,7 +335,7 @@ class Link:
         self._send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate_hz)
 
     def send_zero_thrust(self, t_s: float, yaw_rad: float) -> None:
-        """Send SET_ATTITUDE_TARGET: level at `yaw_rad` (world ENU) without thrust. Only for a vehicle on the ground."""
+        """Send SET_ATTITUDE_TARGET: level, at `yaw_rad` (world ENU), with zero thrust. Only for a vehicle on the ground."""
         q = attitude_ned_frd_from_enu_flu(quat_from_euler_zyx(0.0, 0.0, yaw_rad))
         target, component = self._autopilot_system, messages.MAV_COMP_ID_AUTOPILOT1
         self.send(

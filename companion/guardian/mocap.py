@@ -1,4 +1,4 @@
-"""The guardian's motion capture: the NatNet client of the flight (`companion.io.mocap.client`) on plain sockets.
+"""The guardian's motion-capture client: the flight's NatNet client (`companion.io.mocap.client`) on plain sockets.
 
 In standby it keeps its connection to the server and reads only the newest frame. After a takeover it reads every frame.
 """
@@ -47,7 +47,7 @@ class MocapClient:
         except OSError as error:
             for opened in self.sockets:
                 opened.close()
-            raise MocapProblem(f"{where}: cannot listen beside the flight process: {error.strerror}") from None
+            raise MocapProblem(f"{where}: cannot share the port with the flight process: {error.strerror}") from None
         self._client = NatNetClient(
             settings.rigid_body_id, settings.up_axis, settings.transport, application="companion guardian"
         )
@@ -57,7 +57,7 @@ class MocapClient:
 
     @property
     def problem(self) -> str | None:
-        """Why the newest invalid datagram was rejected; None if none was."""
+        """Why the newest rejected datagram was invalid; None if none was rejected."""
         return self._client.problem
 
     def keep_connected(self, now_s: float) -> None:

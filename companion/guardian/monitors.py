@@ -1,4 +1,4 @@
-"""Detection of a stalled flight process, and of implausible poses. Pure; time is an argument."""
+"""Detects a stalled flight process, and implausible poses. Pure; time is an argument."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from companion.model.types import Vec3
 
 AWAKE_STEP_MAX_S = 0.02
-"""Longest silence that one round of the guardian's loop (10 ms) adds: a time in which it was not scheduled is no evidence."""
+"""Most silence that one pass of the guardian's loop (10 ms) may add: time in which the guardian was not scheduled proves nothing."""
 JUMP_M = 0.5
 SPEED_MAX_M_S = 4.0
 
@@ -25,7 +25,7 @@ class StallWatch:
         self.silent_s = 0.0
 
     def update(self, now_s: float, heard: bool) -> bool:
-        """Update after one round of the loop; return whether the flight process hangs."""
+        """Update after one pass of the loop; return whether the flight process hangs."""
         step_s = 0.0 if self._last_s is None else min(now_s - self._last_s, AWAKE_STEP_MAX_S)
         self._last_s = now_s
         self.silent_s = 0.0 if heard else self.silent_s + step_s

@@ -36,9 +36,9 @@ MOCAP_FRESH_S = 0.5
 KILL_TIMEOUT_S = 0.5
 """A killed process ends within milliseconds unless a thread is in uninterruptible sleep (state D)."""
 LINK_TIMEOUT_S = 30.0
-"""A link that cannot be opened for this long is given up, and the vehicle is lost."""
+"""Time after which the guardian gives up opening the link; the vehicle is then lost."""
 REOPEN_PERIOD_S = 0.5
-"""Pause before a lost link (TCP closed, serial port unplugged) is opened again."""
+"""Pause before a lost link (TCP closed, serial port unplugged) is reopened."""
 STATUS_PERIOD_S = 0.5
 ERROR_CHARS, ERRORS_REPORTED_MAX = 300, 20
 _MAX_DATAGRAMS = 512
@@ -53,7 +53,7 @@ class FlightProcess:
         self._poll.register(pidfd, select.POLLIN)
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait up to `timeout_s`; return whether the process is dead. The sockets of a dead process are closed."""
+        """Wait up to `timeout_s`; return whether the process is dead. The kernel has then closed its sockets."""
         return bool(self._poll.poll(max(0, round(timeout_s * 1e3))))
 
     def kill(self) -> None:
@@ -70,7 +70,7 @@ class HeartbeatReceiver:
         self._channel = channel
         self.last: Heartbeat | None = None
         self.count = self.missed = 0
-        """Heartbeats received, and ticks of the flight between them that were missed."""
+        """Heartbeats received, and ticks for which the heartbeat is missing."""
         self.recorder: socket.socket | None = None
         """The recorder's channel, once the flight process has shared it."""
 
@@ -122,7 +122,7 @@ class Guardian:
         self._link_reported = False
         """Whether the closed link has been reported."""
         self._reopen_s = float("-inf")
-        """Earliest `time.monotonic` at which a lost link is opened again."""
+        """Earliest `time.monotonic` at which a lost link is reopened."""
         self._silent_s = 0.0
         """Longest silence while the rotors might turn."""
 
@@ -188,7 +188,8 @@ class Guardian:
             return None
         mocap = self._settings.mocap
         wrong = f" ({self._mocap.problem})" if self._mocap.problem else ""
-        return f"mocap {mocap.server}:{mocap.command_port}: the guardian's client tracks no rigid body {mocap.rigid_body_id}{wrong}"
+        where = f"mocap {mocap.server}:{mocap.command_port}"
+        return f"{where}: the guardian's client does not track rigid body {mocap.rigid_body_id}{wrong}"
 
     # -- take-over -------------------------------------------------------------------------------------------------
 
@@ -225,8 +226,8 @@ class Guardian:
     def _try_wire(self, last: Heartbeat) -> Wire | None:
         """Open the wire, or return None and report the first failure.
 
-        A killed flight process that has not ended runs none of its code: it neither sends nor reads, so a UDP link is opened
-        although it is still bound. A serial port is not: two readers would share its bytes if the process came back. Neither is TCP.
+        A killed flight process that has not ended runs no code: it neither sends nor reads, so a UDP port is opened although it is
+        still bound. A serial port is not: if the process resumed, two readers would share the bytes. Nor is a TCP link.
         """
         address = self._settings.autopilot_address
         try:
@@ -248,7 +249,7 @@ class Guardian:
             self._publish(last, Notice(now_s, "guardian_no_link", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
 
     def _restore_link(self, last: Heartbeat, link: Link, landing: TakeoverLanding, waiting: select.poll) -> None:
-        """Close a lost link, so that it wakes no wait, and try to open it again every REOPEN_PERIOD_S."""
+        """Close a lost link, so that it ends no further waits, and try to reopen it every REOPEN_PERIOD_S."""
         now_s = time.monotonic()
         if not link.wire.lost or now_s < self._reopen_s:
             return
@@ -357,7 +358,7 @@ class Guardian:
 
 
 def _log_line(text: str) -> None:
-    """Write one line to guardian.log; if the disk is full the line is lost and the landing continues."""
+    """Write one line to guardian.log. If the disk is full, the line is lost and the landing continues."""
     with contextlib.suppress(OSError):
         os.write(2, text.encode() + b"\n")  # unbuffered, so that a failed write is not tried again at exit
 
@@ -375,7 +376,7 @@ def main(argv: list[str] | None = None) -> int:
     for number in (
         signal.SIGINT,
         signal.SIGHUP,
-    ):  # the flight handles them by landing; the guardian ends after the flight
+    ):  # the flight lands on these signals; the guardian ends after the flight
         signal.signal(number, signal.SIG_IGN)
     settings = read_settings(arguments.config)
     with socket.socket(fileno=arguments.heartbeats) as heartbeats, socket.socket(fileno=arguments.channel) as channel:

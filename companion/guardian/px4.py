@@ -1,4 +1,4 @@
-"""PX4's messages as the companion's records. Pure."""
+"""Converts PX4's messages to the companion's records. Pure."""
 
 from __future__ import annotations
 
@@ -60,10 +60,8 @@ class Px4State:
         )
 
     def vehicle(self) -> VehicleState | None:
-        """Return the vehicle's state, or None before the first attitude.
-
-        Attitude alone shows whether the vehicle is flipped, so no other message is awaited: a position or IMU sample that never
-        arrived has the stamp -inf.
+        """Return the vehicle's state, or None before the first attitude. Attitude alone shows whether the vehicle is flipped, so
+        the others are not awaited: a position or IMU sample that has not arrived has the stamp -inf.
         """
         if self._attitude is None:
             return None
@@ -71,7 +69,7 @@ class Px4State:
 
     @property
     def pilot(self) -> bool:
-        """Whether PX4 is armed in a mode that a pilot selects."""
+        """Whether PX4 is armed and in a mode that only a pilot selects."""
         return flown_by_pilot(self.status())
 
     def yaw_rad(self) -> float | None:

@@ -1,7 +1,7 @@
-"""The landing after a takeover: motion capture keeps flowing to PX4, PX4 lands, the guardian disarms if PX4 cannot.
+"""The landing after a takeover: the guardian keeps sending motion capture to PX4, PX4 lands, and the guardian disarms if PX4 does not.
 
-The rules are those of the companion's own landing on PX4 (`companion.safety.autopilot_landing`). Pure except for the link that it
-sends on; time is an argument.
+The rules are those of the companion's own landing on PX4 (`companion.safety.autopilot_landing`). Pure except for the link; time is
+an argument.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ ASK_PERIOD_S = 0.1
 LINK_TIMEOUT_S = 1.0
 """On a `udpin` link PX4's address is unknown before its first message; after this timeout the landing starts without it."""
 MODE_TIMEOUT_S = 0.15
-"""PX4's mode is requested first, because a pilot may fly; without an answer for this long PX4 is commanded to land."""
+"""PX4's mode is requested first, because a pilot may be flying. After this long without an answer PX4 is commanded to land."""
 REPEAT_S = 0.25
-"""A command is repeated at this period until the status shows its effect."""
+"""Period at which a command is repeated until the status shows its effect."""
 ZERO_THRUST_PERIOD_S = 0.02
 LINK_FRESH_S = 2.5
 TOUCH_DOWN = "touchdown"
@@ -44,7 +44,7 @@ TOUCH_DOWN = "touchdown"
 DISARMED_AFTER_S = 1.5
 """PX4 reports once a second whether it is armed; a status from before the takeover is ignored for this long."""
 ATTEMPTS_MAX = 4
-"""Landing attempts of 30 s each, while PX4 sends messages, before the vehicle counts as lost."""
+"""Number of landing attempts of 30 s each, while PX4 sends messages, after which the vehicle counts as lost."""
 _STREAMS = (
     (mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 50.0),
     (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, 50.0),
@@ -72,10 +72,10 @@ class TakeoverLanding:
 
     Args:
         last_heartbeat: newest heartbeat of the flight process.
-        clearance_m: height of the body's origin when the vehicle stands on the ground.
+        clearance_m: height of the body's origin when the vehicle rests on the ground.
         tilt_max_rad: `safety.tilt_abort_deg`.
         link: an open link.
-        t_s: flight clock now.
+        t_s: current flight clock.
         notify: called with each notice.
     """
 
@@ -105,7 +105,7 @@ class TakeoverLanding:
         self.overturned = False
         """Whether the rotors were commanded to stop because the vehicle was flipped or tipped over."""
         self.landed: bool | None = None
-        """None while the landing runs. True: on the ground and disarmed (or PX4 does not answer). False: no landing was confirmed."""
+        """None during the landing; True if on the ground and disarmed (or PX4 does not answer); False if no landing was confirmed."""
 
     @property
     def pose(self) -> MocapPose | None:
@@ -122,7 +122,7 @@ class TakeoverLanding:
             if not pose.tracking_valid:
                 continue
             if self._mocap_refused:
-                text = "the flight process rejected motion capture; no pose is sent to PX4, which lands on its own estimate"
+                text = "the flight process rejected motion capture; no poses are sent to PX4, which lands on its own estimate"
                 self._notify_once(pose.stamp_s, "guardian_mocap", Severity.WARNING, text)
                 continue
             if not self._pose_filter.check(pose.stamp_s, pose.position_world_m):
@@ -130,7 +130,7 @@ class TakeoverLanding:
                     pose.stamp_s,
                     "guardian_mocap",
                     Severity.WARNING,
-                    "motion capture jumps; the pose is not sent to PX4",
+                    "the motion-capture pose jumped; it is not sent to PX4",
                 )
                 continue
             self._link.send_vision(pose)
@@ -175,7 +175,7 @@ class TakeoverLanding:
         self._apply(t_s, status, step)
 
     def restart(self, t_s: float) -> None:
-        """Start a new landing after an internal error. If no landing has begun by itself, PX4 is still commanded to land."""
+        """Start a new landing after an internal error. PX4 is commanded to land even if no landing had begun."""
         self._landing = None
         status = self._px4.status()
         if not self._pilot and status is not None and status.mode is not FlightMode.LAND and status.armed:
@@ -189,7 +189,7 @@ class TakeoverLanding:
             self._pilot = True
             self._landing = None
         if self._pilot:
-            text = "a pilot flies: only motion capture is sent to PX4"
+            text = "a pilot is flying: only motion capture is sent to PX4"
             self._notify_once(t_s, "guardian_pilot", Severity.WARNING, text)
 
     def _apply(self, t_s: float, status: AutopilotStatus | None, step: LandingStep) -> None:

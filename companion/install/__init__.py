@@ -1,4 +1,4 @@
-"""`companion install`: changes to the vehicle's computer, and their removal.
+"""`companion install`: set up the vehicle's computer, and undo that.
 
 templates.py  contents of the installed files
 adapters.py   USB serial adapters that are plugged in, from /sys

@@ -8,7 +8,7 @@ from pathlib import Path
 
 FTDI = "0403"
 U2D2 = "6014"
-"""Product id of the FT232H in a U2D2 (ROBOTIS). The force sensor's USB-RS485 adapter has another one (6001 FT232R, 6015 FT-X)."""
+"""Product id of the FT232H in a U2D2 (ROBOTIS). The force sensor's USB-RS485 adapter has a different one (6001 FT232R, 6015 FT-X)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,9 @@ class Adapter:
     """Product name that the chip reports."""
 
     def __str__(self) -> str:
-        return f"/dev/{self.tty} ({self.vendor}:{self.product} {self.name or 'without a name'}, serial {self.serial or 'none'})"
+        return (
+            f"/dev/{self.tty} ({self.vendor}:{self.product} {self.name or 'unnamed'}, serial {self.serial or 'none'})"
+        )
 
 
 def adapters(sysfs: Path = Path("/sys")) -> tuple[Adapter, ...]:
@@ -47,8 +49,8 @@ def choose_adapters(
 ) -> tuple[str | None, str | None, tuple[str, ...]]:
     """Return the serial numbers of the arm's and the force sensor's adapter, and one line of explanation for each.
 
-    A given serial number is used unchanged. Otherwise the only remaining FTDI adapter of the right kind is chosen: a U2D2
-    for the arm, another one for the force sensor. The result is None if no adapter or several fit.
+    A given serial number is used unchanged. Otherwise the only remaining FTDI adapter of the right kind is chosen: a U2D2 for the
+    arm, any other for the force sensor. The serial number is None if no adapter or more than one fits.
     """
     reasons = []
     chosen: dict[str, str | None] = {"arm": arm_serial, "force": force_serial}

@@ -1,7 +1,7 @@
-"""Install and undo: change files below a root folder, and run commands only if that root is the running system's.
+"""Install and undo: change files below a root folder; run commands only if that folder is the root of the running system.
 
-Every change is recorded before it is made. A failed installation is rolled back at once, and `undo` also reverts one that a loss of
-power interrupted.
+Every change is recorded before it is made. A failed installation is rolled back at once, and `undo` also reverts one that was
+interrupted by a power loss.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """Changes that an installation would make, or made."""
+    """Changes that an installation makes."""
 
     entries: Mapping[str, Entry]
     """All entries of the record, by path."""
@@ -43,15 +43,14 @@ class Changes:
 
     @property
     def to_do(self) -> tuple[str, ...]:
-        """Paths whose content differs from the wanted one."""
+        """Paths whose content differs from the planned one."""
         return tuple(path for path, entry in self.entries.items() if not self.now[path].matches(entry.after))
 
 
 def pending_changes(root: Path, plan: Plan, record: Record | None) -> Changes:
     """Compare the plan with the file system; changes nothing.
 
-    Raises:
-        InstallError: a path is blocked, or a file was changed since its installation.
+    Raises: InstallError: a path is blocked, or a file has been modified since it was installed.
     """
     old = record or Record()
     entries, now = {}, {}
@@ -88,8 +87,8 @@ def _before(path: str, found: PathState, old: Record) -> PathState:
 
 
 def changed_by_others(path: str) -> str:
-    """Return the message for a file that was changed after the installation."""
-    return f"{path}: was changed after its installation; restore it or move the file away, then try again"
+    """Return the error message for a file that was modified after the installation."""
+    return f"{path}: was modified after it was installed; restore it or move it away, then try again"
 
 
 def install(root: Path, plan: Plan, user: str, report: Report) -> bool:
@@ -171,7 +170,7 @@ def undo(root: Path, report: Report) -> bool:
     """Revert the installation; return False if nothing is installed.
 
     Raises:
-        InstallError: a file was changed after the installation or the service runs, and nothing was reverted; or the undo was
+        InstallError: a file was modified after the installation or the service is running, and nothing was reverted; or the undo was
             interrupted and can be run again.
     """
     record = load(root)
@@ -187,7 +186,7 @@ def undo(root: Path, report: Report) -> bool:
             back.append(path)
     if live:
         if _service_active(SERVICE):
-            raise InstallError(f"{SERVICE} is running; first: systemctl stop companion (in the air it lands)")
+            raise InstallError(f"{SERVICE} is running; first run: systemctl stop companion (a flying vehicle lands)")
         if PERFORMANCE in " ".join(back):
             _run(Command(("systemctl", "stop", PERFORMANCE), "restores the clock"), report)
     try:
@@ -210,13 +209,13 @@ def undo(root: Path, report: Report) -> bool:
 
 
 def _take_ownership(root: Path, record: Record, report: Report) -> None:
-    """Leave no file to the id of a deleted user: the system may assign that id to another user.
+    """Delete or reassign the files of deleted users: the system may assign a deleted user's id to another user.
 
-    The service's keys are deleted; its logs are given to the user who runs the undo (root). The home of a user who is kept is not
+    The service's keys are deleted; its logs go to the user who runs the undo (root). The home of a user who is not deleted is not
     touched.
 
     Raises:
-        OSError: a file cannot be deleted or given to another owner.
+        OSError: a file cannot be deleted or its owner cannot be changed.
     """
     home = under_root(root, HOME)
     if not record.users or home.is_symlink() or not home.is_dir():

@@ -1,4 +1,4 @@
-"""Extras of the package that a command needs and a flight-only installation lacks."""
+"""Optional packages (extras) that some commands need and a flight-only installation lacks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 _WORLD = ("mujoco", "sitl")
 _NEEDS = {"sitl": _WORLD, "compare": _WORLD, "robustness": _WORLD, "faults": _WORLD}
-"""By command: the package, and the extra that installs it. `monitor` and `broker init` check their own."""
+"""The package that a command needs and the extra that installs it, by command. `monitor` and `broker init` check their own."""
 
 
 def _installed(package: str) -> bool:

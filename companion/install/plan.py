@@ -1,4 +1,4 @@
-"""Plan of an installation: settings in, files and commands out. Pure."""
+"""Plan of an installation: derives files and commands from the settings. Pure."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Settings:
     mission: str
     vehicle: str | None
     arm_serial: str | None
-    """Serial number of the arm's USB adapter; None for no stable device name."""
+    """Serial number of the arm's USB adapter; None to install no stable device name."""
     force_serial: str | None
     at_boot: bool
     """Whether the service starts at boot."""
@@ -49,7 +49,7 @@ class Command:
     argv: tuple[str, ...]
     why: str
     needed: bool = False
-    """Whether a failure of the command rolls the installation back. Otherwise the next boot has the same effect as the command."""
+    """Whether a failure of the command rolls the installation back. If not, the next boot has the same effect as the command."""
 
     def __str__(self) -> str:
         return " ".join(self.argv)
@@ -64,17 +64,17 @@ class Plan:
 
 
 def plan(settings: Settings) -> Plan:
-    """Return the plan: files in this order, then commands."""
+    """Return the files to install, in order, and the commands to run after them."""
     unit = templates.service(settings.user, settings.program, settings.mission, settings.vehicle)
     rules = templates.udev_rules(settings.arm_serial, settings.force_serial)
     items = [
-        Item(_SYSUSERS, "user of the service, without a login, in dialout", templates.sysusers(settings.user)),
-        Item("/etc/modules-load.d/companion.conf", "drivers of USB serial ports, from boot on", templates.modules()),
+        Item(_SYSUSERS, "service user, without login, member of dialout", templates.sysusers(settings.user)),
+        Item("/etc/modules-load.d/companion.conf", "USB serial drivers, loaded at boot", templates.modules()),
         Item("/etc/udev/rules.d/99-companion.rules", "latency timer 1 ms, stable names", rules),
         Item("/etc/security/limits.d/companion.conf", "real-time limits for the group dialout", templates.limits()),
         Item(f"{_UNITS}/{PERFORMANCE}", "full clock", templates.performance_service()),
-        Item(f"{_UNITS}/{SERVICE}", "the flight; it waits for an operator's START", unit),
-        Item(f"{_AT_BOOT}/{PERFORMANCE}", "full clock from boot on", link=f"{_UNITS}/{PERFORMANCE}"),
+        Item(f"{_UNITS}/{SERVICE}", "the flight service; it waits for an operator's START", unit),
+        Item(f"{_AT_BOOT}/{PERFORMANCE}", "full CPU clock from boot", link=f"{_UNITS}/{PERFORMANCE}"),
     ]
     if settings.at_boot:
         items.append(Item(f"{_AT_BOOT}/{SERVICE}", "starts the service at boot", link=f"{_UNITS}/{SERVICE}"))
@@ -89,7 +89,7 @@ def plan(settings: Settings) -> Plan:
                 "applies them to connected adapters",
             ),
             Command(("systemctl", "daemon-reload"), "reloads the units"),
-            Command(("systemctl", "restart", PERFORMANCE), "full clock now"),
+            Command(("systemctl", "restart", PERFORMANCE), "full CPU clock now"),
         ),
     )
 

@@ -29,7 +29,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One installation, including later changes to it."""
+    """An installation, including later changes to it."""
 
     entries: Mapping[str, Entry] = field(default_factory=dict)
     """Entries by path on the vehicle's computer."""
@@ -43,12 +43,12 @@ class Record:
 
 
 def under_root(root: Path, path: str) -> Path:
-    """Return the location of a path of the vehicle's computer below `root`."""
+    """Return where a path of the vehicle's computer lies below `root`."""
     return root / path.lstrip("/")
 
 
 def load(root: Path) -> Record | None:
-    """Read the record, or return None if nothing is installed.
+    """Read the record; None if nothing is installed.
 
     Raises:
         InstallError: the file is not a valid record, or users other than root can change it.
@@ -72,9 +72,9 @@ def load(root: Path) -> Record | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise InstallError(f"{path}: cannot be read: {error.strerror}; is this root?") from None
+        raise InstallError(f"{path}: cannot be read: {error.strerror}; run this command as root") from None
     except (ValueError, KeyError, TypeError, AttributeError):
-        raise InstallError(f"{path}: is not a valid record of an installation; it was changed by hand") from None
+        raise InstallError(f"{path}: not a valid record of an installation; it has been edited by hand") from None
 
 
 def save(root: Path, record: Record) -> None:

@@ -14,7 +14,7 @@ from companion.runtime.files import write_whole
 
 
 class InstallError(Exception):
-    """The installation failed; one line. Changes have been rolled back unless the line says otherwise."""
+    """The installation failed. The text is one line; changes were rolled back unless it says otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class PathState:
     mode: int = 0
     """Permission bits of a file."""
     owner: tuple[int, int] | None = None
-    """User and group id of a file that existed before; None for the user who installs."""
+    """User and group id of a file that existed before; None for the user who runs the installation."""
 
     @property
     def absent(self) -> bool:
@@ -34,7 +34,7 @@ class PathState:
         return self.content is None and self.link is None
 
     def matches(self, other: PathState) -> bool:
-        """Whether both are equal; an unknown owner equals any."""
+        """Whether both are equal; an unknown owner matches any owner."""
         owners = self.owner is None or other.owner is None or self.owner == other.owner
         return owners and (self.content, self.link, self.mode) == (other.content, other.link, other.mode)
 
@@ -90,7 +90,7 @@ def read_state(path: Path) -> PathState:
 
 
 def write_state(path: Path, state: PathState) -> None:
-    """Write, replace or remove a path atomically, even across a loss of power.
+    """Write, replace or remove a path atomically, even if power is lost.
 
     Raises:
         OSError: the change failed; the path is unchanged.

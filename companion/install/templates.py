@@ -7,11 +7,11 @@ udev(7), limits.conf(5).
 from __future__ import annotations
 
 STOP_TIMEOUT_S = 180
-"""Time for a landing: return along the tether, PX4's landing and its confirmation take one minute at most; tripled for margin."""
+"""Time for a landing: return along the tether, PX4's landing and its confirmation take one minute at most, tripled as a margin."""
 RTPRIO = 60
 """Real-time priority limit: that of the guardian; the flight process uses less."""
 STATE_DIRECTORY = "companion/fly"
-"""Below /var/lib. Its parent folder holds the record that `--undo` trusts, so that folder belongs to root."""
+"""Folder below /var/lib. Its parent holds the record that `--undo` trusts and therefore belongs to root."""
 _GOVERNORS = "/sys/devices/system/cpu/cpufreq/policy*/scaling_governor"
 _HEAD = "# Written by companion install; companion install --undo removes it."
 

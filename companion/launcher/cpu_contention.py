@@ -1,6 +1,6 @@
-"""Detection of a computer that is too busy for a flight, by the time that its processes wait for a core.
+"""Detects a computer that is too busy for a flight from the time that the flight's processes wait for a core.
 
-A computer whose cores are taken by other programs looks like failing devices: answers arrive late or not at all. The scheduler's
+When other programs occupy the cores, the symptoms resemble failing devices: answers arrive late or not at all. The scheduler's
 statistics show the cause.
 """
 
@@ -17,7 +17,7 @@ from companion.model.check_row import Level
 from companion.model.types import SafetyAction, Severity
 
 WAIT_MAX = 0.15
-"""Share of the time that a process may wait for a core before it responds too late."""
+"""Fraction of the time that a process may wait for a core before it responds too late."""
 WAIT_LATE_MAX, LATE_S = 0.05, 0.005
 """The same limit when ticks are late by `LATE_S` or more."""
 WINDOW_S, SAMPLE_S = 3.0, 0.5
@@ -36,19 +36,19 @@ CoreWaits = Mapping[int, float]
 
 @dataclass(frozen=True, slots=True)
 class ProcessWait:
-    """How long one process waited for a core."""
+    """How long a process waited for a core."""
 
     process: str
     """Name of the process, for the message."""
     share: float
-    """Waiting time of the thread that waited longest, as a share of the time, 0 to 1."""
+    """Waiting time of the thread that waited longest, as a fraction of the elapsed time, 0 to 1."""
 
 
 def contention_message(waits: Sequence[ProcessWait], late_s: float) -> str | None:
     """Return one line for the operator if the computer is too busy, else None.
 
     Args:
-        waits: waits of each process.
+        waits: one entry per process.
         late_s: 99th percentile of the ticks' lateness; 0 before the first tick.
     """
     worst = max((wait.share for wait in waits), default=0.0)
@@ -77,10 +77,10 @@ def read_core_waits(pid: int) -> CoreWaits:
 
 
 class CpuContention:
-    """Samples the waits of a flight's processes and evaluates them when an event occurs that lateness may have caused.
+    """Samples the scheduling delays of a flight's processes and evaluates them when an event occurs that lateness may have caused.
 
     Args:
-        pids: process ids by the process's name.
+        pids: process ids keyed by process name.
         read: returns the waits of one process's threads.
     """
 

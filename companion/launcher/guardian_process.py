@@ -16,7 +16,7 @@ from companion.runtime import ipc
 from companion.runtime.subprocesses import holds_traceback, how_it_ended, last_line, remove_file, terminate, write_text
 
 SILENT_S = 5.0
-"""Silence after which the guardian counts as hung; after a takeover it reports twice per second."""
+"""Silence after which the launcher treats the guardian as hung. After a takeover it reports twice a second."""
 
 
 class GuardianProcess:

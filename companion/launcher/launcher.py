@@ -42,13 +42,13 @@ from companion.runtime.subprocesses import (
 from companion.sitl_config.loader import SitlConfig
 
 SITL_SETTLE_TIMEOUT_S = 40.0
-"""Time for the simulated world to come to rest after the flight process is gone."""
+"""Timeout for the simulated world to come to rest after the flight process has ended."""
 FLIGHT_SILENT_TIMEOUT_S = 5.0
-"""Silence after which the flight process counts as hung without an action of the guardian, which does not act on the ground and may
+"""Silence after which the launcher treats the flight process as hung. The guardian does not act on the ground and may
 be dead. Once the flight process is killed, PX4 lands by its own offboard-loss failsafe.
 """
 GUARDIAN_EXIT_TIMEOUT_S = 5.0
-"""Time for a guardian that is not needed to exit after the flight process is gone."""
+"""Timeout for a guardian that is not needed to exit after the flight process has ended."""
 RECORDER_CLOSE_TIMEOUT_S = 10.0
 
 OnMessage = Callable[[ipc.Message], None]
@@ -109,7 +109,7 @@ class Launcher:
         self._result: dict[str, Any] | None = None
         self._refused: list[str] | None = None
         self._critical_events: list[tuple[int, str]] = []
-        """Tick and text of events that end a flight; those of the first tick are the cause, later ones its consequences."""
+        """Tick and text of the events that end a flight; those of the first tick are the cause, later ones its consequences."""
         self._events: list[dict[str, Any]] = []
         self._px4_texts: list[str] = []
         """Texts of PX4 since the flight began."""
@@ -221,7 +221,7 @@ class Launcher:
         return self._determine_outcome(process.returncode, log_path, sitl)
 
     def _determine_outcome(self, code: int, log_path: Path, sitl: SitlProcess | None) -> Outcome:
-        """Return the outcome after the flight process is gone, from its messages and its exit code."""
+        """Determine the outcome from the messages and the exit code of the flight process, which has ended."""
         guardian = self._guardian
         expected: int | None
         if self._refused is not None:
@@ -257,7 +257,7 @@ class Launcher:
 
     @staticmethod
     def _takeover_summary(guardian: GuardianProcess, code: int, log_path: Path) -> str:
-        """Return one line on the end of the flight process and of the vehicle's flight."""
+        """Return one line on how the flight process and the flight ended."""
         vehicle = {
             Outcome.ABORTED: "the guardian landed the vehicle",
             Outcome.CRASHED: "the vehicle was flipped or tipped over, and the guardian stopped its rotors",
@@ -318,7 +318,7 @@ class Launcher:
                 flight_open_s = now_s
             alone_s = now_s - flight_open_s
             if guardian.hangs() or (not guardian.took_over and alone_s > GUARDIAN_EXIT_TIMEOUT_S):
-                self._failures.append("guardian: the guardian process hangs and was killed")
+                self._failures.append("guardian: the guardian process hung and was killed")
                 guardian.kill()
                 return
 
@@ -354,7 +354,7 @@ class Launcher:
         self._check_cpu_contention(message)
 
     def _check_cpu_contention(self, message: ipc.Message) -> None:
-        """Report a busy computer beside an event that lateness may have caused."""
+        """Report a busy computer together with an event that lateness may have caused."""
         text = self._cpu_contention.on_message(message, time.monotonic())
         if text is None:
             return
@@ -364,7 +364,7 @@ class Launcher:
         self._events.append({**stamps, **about, "text": text})
 
     def _await_recorder(self) -> None:
-        """Wait for the recorder to close the log of a killed flight process; it is no child of this process, so poll its pidfd."""
+        """Wait for the recorder to close the log of a killed flight process; it is not a child of this process, so poll its pidfd."""
         if self._recorder_pid is None or self._result is not None:
             return
         try:

@@ -17,7 +17,7 @@ from companion.runtime.subprocesses import LaunchError
 from companion.sitl_config.loader import SitlConfig
 
 TICKS_MAX = 60_000
-"""Max number of evaluated ticks. A flight over 5 minutes is thinned, because one hour at 200 Hz would need 6 GB."""
+"""Max number of evaluated ticks. A flight of more than 5 minutes is thinned, because one hour at 200 Hz would need 6 GB."""
 
 
 def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Console, report: bool = True) -> int:
@@ -61,7 +61,7 @@ def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Con
 
 
 def _summary(config: SitlConfig, result: FlightResult, out: Path) -> tuple[FlightLog | None, dict[str, Any]]:
-    """Read the log, if there is one, and write summary.json."""
+    """Read the log if it exists, and write summary.json."""
     log = None
     path = out / "flight.mcap"
     if path.exists():

@@ -17,13 +17,13 @@ from companion.sitl_config.loader import SitlConfig
 
 SITL_READY_TIMEOUT_S = 30.0
 PX4_READY_TIMEOUT_S = 700.0
-"""Timeout with a real PX4. The world has its own deadlines for PX4's boot and for a user who starts PX4 by hand."""
+"""Timeout with a real PX4. The world has its own timeouts for PX4's boot and for a user who starts PX4 manually."""
 PX4_FOLDER = "px4"
 """Folder of a real PX4's files, below the flight's folder."""
 SITL_EXIT_TIMEOUT_S = 5.0
-"""The world exits by itself once the launcher has closed its input and its rotors stand still."""
+"""Timeout for the world to exit once the launcher has closed its input and the rotors have stopped."""
 SITL_TERMINATE_TIMEOUT_S = 10.0
-"""Time to exit after SIGTERM; a real PX4 needs some seconds."""
+"""Timeout for the exit after SIGTERM; a real PX4 needs a few seconds."""
 
 
 class SitlProcess:
@@ -113,7 +113,7 @@ class SitlProcess:
 
     @property
     def ended(self) -> bool:
-        """Whether the world has closed its end of the pipe, because it has exited or is about to."""
+        """Whether the world has closed its end of the pipe; it has then exited or is about to."""
         return self._lines.ended
 
     def _update(self, message: dict[str, Any]) -> None:
@@ -131,7 +131,7 @@ class SitlProcess:
             os.write(self.process.stdin.fileno(), json.dumps({"type": "flight", "pid": pid}).encode() + b"\n")
 
     def wait_at_rest(self, deadline_s: float) -> None:
-        """Wait until the world's rotors stand still, or the deadline."""
+        """Wait until the world's rotors have stopped, at most until the deadline."""
         for _ in self.messages(0.0):
             pass
         while not self.at_rest and time.monotonic() < deadline_s and not self.ended:

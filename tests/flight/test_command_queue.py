@@ -98,7 +98,7 @@ def test_a_resume_ends_the_hold_that_it_names_and_no_other(
         assert (turn.command, turn.asked) == (NONE, resume(named))
         assert (
             turn.refused
-            == f"resume refused: it names {meant}, now hold 2 is active; check the situation, then command it again"
+            == f"resume refused: it names {meant}, but hold 2 is active; check the situation, then command it again"
         )
     operator.ask([resume(2)])
     assert operator.next() == Turn(RESUME, resume(2))

@@ -90,7 +90,7 @@ def test_started_again_in_the_air_it_lands_what_it_finds(sandbox: Sandbox, arm_o
         assert not asked & {AutopilotRequest.ARM} and AutopilotRequest.LAND in asked
         assert all(o.attitude is None or o.attitude.thrust == 0.0 for o in log.outputs)
         assert any(o.arm_torque_nm is not None for o in log.outputs) is arm_opens
-        assert ("landing without it: arm bus" in ended.out) is not arm_opens
+        assert ("landing without this device: arm bus" in ended.out) is not arm_opens
         assert any(i.mocap is not None for i in log.inputs) and all(o.mocap_trusted for o in log.outputs)
         assert world.armings == 1 and not world.crashes
         wait_until(lambda: at_rest(world), lambda: str(world.messages[-3:]))

@@ -241,7 +241,7 @@ def test_it_is_not_ready_without_a_body_of_its_own(tmp_path: Path) -> None:
                 said.append(rig.beats.recv(1024))
             except BlockingIOError:
                 return False
-            return b"tracks no rigid body" in said[-1]
+            return b"does not track rigid body" in said[-1]
 
         wait_until(blind, lambda: f"{said} {rig.log.read_text()}")
 

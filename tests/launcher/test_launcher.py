@@ -244,5 +244,5 @@ def test_a_flight_process_that_hangs_in_the_air_is_ended_without_a_guardian(sand
     sandbox.assert_nobody_left()
     assert ended.code == EXIT_LOST
     assert "flight: the flight process sent nothing for 5 s and was killed" in ended.err
-    assert "guardian: the guardian process hangs and was killed" in ended.err
+    assert "guardian: the guardian process hung and was killed" in ended.err
     assert read_summary(sandbox.cwd / "out")["outcome"] == "lost"
