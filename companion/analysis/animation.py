@@ -1,6 +1,6 @@
-"""Animation of a flight: the vehicle in 3D, position and arm error beside it; as a GIF, or as a player in an HTML page.
+"""Animation of a flight: the vehicle in 3D with plots of position and arm error, as a GIF or as a player in an HTML page.
 
-No sensor measures the payload before the catch. It is drawn from the throw of the simulated world; for a real flight it is not drawn.
+No sensor measures the payload before the catch: it is drawn from the simulated world's throw, and not at all for a real flight.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ _SOFT, _AXIS, _GRID = "#5b6b79", "#aab4bd", "#e6eaee"
 _FLYING = (PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING)
 _GRAVITY_WORLD_M_S2 = np.array([0.0, 0.0, -GRAVITY_M_S2])
 _TARGET_M = np.array([0.1, 0.0, -0.16])
-"""The camera looks at this point beside the vehicle, world axes."""
+"""Point that the camera looks at, relative to the vehicle, world axes."""
 _THROWN_S = 0.45
-"""The payload is drawn for this time before the catch."""
+"""Time before the catch for which the payload is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class Frame:
 
     shapes: list[Shape]
     curves_to_px: float
-    """The curves are drawn up to this column."""
+    """Column up to which the curves are drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +132,7 @@ def _times(first_s: float, last_s: float, catch_s: float | None) -> Iterator[tup
 
 
 class _Track:
-    """Poses of vehicle, arm and payload. A missing measurement is replaced by the previous one."""
+    """Poses of vehicle, arm and payload; the previous measurement replaces a missing one."""
 
     def __init__(self, log: FlightLog, scene: Scene, caught: int | None, throw_velocity_m_s: Array | None) -> None:
         columns = log.columns

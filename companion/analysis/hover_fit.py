@@ -1,5 +1,5 @@
-"""Fit of the hover thrust without payload to the calm parts of a flight's log: least squares over the balance of
-`companion.control.hover_thrust`, thrust = h . load, and over the battery voltage if it changed enough.
+"""Fit of the hover thrust without payload to the steady parts of a flight's log: least squares on the balance of
+`companion.control.hover_thrust`, thrust = h . load, and on the battery voltage if it changed enough.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from companion.model.types import PhaseKind
 
 FIT_MIN_S = 2.0
 PIECE_S = 1.0
-"""Length of an independent piece of data: the vertical loop correlates neighbouring ticks, but not pieces of seconds."""
+"""Length of the pieces of data that are treated as independent: the vertical loop correlates neighbouring ticks, but not these."""
 SLOPE_MIN_V = 0.3
 """Smallest change of the voltage for which a slope is fitted."""
 
@@ -30,7 +30,7 @@ class VoltageSlope:
     """Change of the hover thrust with the battery voltage."""
 
     per_v: float
-    """Normalised thrust per volt; negative, because an empty battery needs more."""
+    """Normalised thrust per volt; negative, because a lower voltage needs more."""
     standard_error_per_v: float
 
 
@@ -43,7 +43,7 @@ class HoverFit:
     standard_error: float
     """Standard error from noise alone; it does not contain an error of the configured mass."""
     used_s: float
-    """Duration of the calm flight that was used, s."""
+    """Duration of the steady flight that was used, s."""
     configured: float | None
     """Hover thrust at the start of the flight."""
     last_estimate: float | None
@@ -60,7 +60,7 @@ def fit_hover_thrust(log: FlightLog) -> HoverFit:
     """Fit the hover thrust to a log.
 
     Raises:
-        HoverFitError: less than `FIT_MIN_S` of calm flight under the law, or no mass in the log's configuration.
+        HoverFitError: less than `FIT_MIN_S` of steady flight under the control law, or no mass in the log's configuration.
     """
     airframe = (log.config.get("vehicle") or {}).get("airframe") or {}
     samples = _calm(log)
@@ -68,7 +68,7 @@ def fit_hover_thrust(log: FlightLog) -> HoverFit:
     used_s = float(dt_s.sum())
     if used_s < FIT_MIN_S:
         raise HoverFitError(
-            f"{log.path}: {used_s:.1f} s of calm flight, expected {FIT_MIN_S:g} s or more; fly a hover of some seconds"
+            f"{log.path}: {used_s:.1f} s of steady flight, expected {FIT_MIN_S:g} s or more; hover for a few seconds"
         )
     pieces = np.floor(np.cumsum(dt_s) / PIECE_S)
     values, errors = _least_squares(dt_s, load[:, None], thrust, pieces)
@@ -93,7 +93,7 @@ def fit_hover_thrust(log: FlightLog) -> HoverFit:
 
 
 def _calm(log: FlightLog) -> Array:
-    """Return the valid ticks: duration s, thrust, load as a share of the weight, battery V (NaN if unknown)."""
+    """Return the valid ticks: duration s, thrust, load as a fraction of the weight, battery V (NaN if unknown)."""
     vehicle = log.config.get("vehicle") or {}
     mass_kg = (vehicle.get("airframe") or {}).get("mass_kg")
     force_timeout_s = (vehicle.get("safety") or {}).get("force_timeout_s", 0.25)

@@ -28,11 +28,11 @@ _RECORDS: dict[str, type] = {"/inputs": Inputs, "/outputs": Outputs, "/sent": Se
 _TOPICS = tuple(_RECORDS)
 """Topics in the order of a tick's records in the file."""
 _FORMER_KEY, _KEY = b'"bent_by"', b'"limited_by"'
-"""A key of /outputs in logs of the previous release, and its present name."""
+"""A key of /outputs in logs of the previous release, and its current name."""
 
 
 class LogError(Exception):
-    """The file is not a flight log, or not usable for the purpose. The text is one line for the user."""
+    """The file is not a flight log, or cannot be used as requested. The text is one line for the user."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class FlightLog:
     closed: bool
     """Whether the recorder closed the file."""
     stride: int = 1
-    """Every `stride`-th tick is kept, and those with events; 1 keeps all."""
+    """Every `stride`-th tick and every tick with events is kept; 1 keeps all."""
     measured: Timing | None = None
-    """Timing of all ticks, if not all are kept."""
+    """Timing of all ticks; None if all ticks are kept."""
 
     @staticmethod
     def read(path: Path, *, ticks_max: int | None = None) -> FlightLog:
@@ -58,12 +58,12 @@ class FlightLog:
 
         Args:
             path: path of the file.
-            ticks_max: keep about this many ticks, evenly spread (`stride`), and those with events; a tick takes some 8 kB of memory.
+            ticks_max: keep about this many ticks, evenly spread (`stride`), and those with events; a tick takes about 8 kB of memory.
                 None keeps all, which a replay needs.
 
         Raises:
-            LogError: the file does not exist, is not MCAP, was not written by the recorder, is damaged, or has records with other
-                fields. A field that may be None and is missing in an older version is read as None.
+            LogError: the file does not exist, is not MCAP, was not written by the recorder, is damaged, or has records with
+                different fields. An optional field that an older version lacks is read as None.
         """
         rows = _Rows(ticks_max)
         metadata: dict[str, dict[str, str]] = {}
@@ -83,7 +83,7 @@ class FlightLog:
                     closed = True
         except RecordError as error:
             raise LogError(
-                f"{path}: records with other fields ({error}); it was written by {writer(metadata)}, open it with that version"
+                f"{path}: its records have different fields ({error}); it was written by {writer(metadata)}: open it with that version"
             ) from None
         except (McapError, ZstdError, RuntimeError, MemoryError, struct.error, ValueError, KeyError) as error:
             raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
@@ -126,7 +126,7 @@ class FlightLog:
 
     @cached_property
     def timing(self) -> Timing:
-        """Return the timing of every recorded tick, kept or not."""
+        """Return the timing of every recorded tick, whether kept or not."""
         return self.measured or timing_of(self.rows())
 
     def rows(self) -> Iterator[tuple[Inputs, Outputs, Sent]]:
@@ -146,9 +146,8 @@ class FlightLog:
 
 
 class _Rows:
-    """Assembler of the three records of each tick. It thins the kept ticks when there are too many.
-
-    Chunks hold whole ticks, so anything else means that the file was not written by the recorder.
+    """Assembles the three records of each tick, and thins the ticks when there are too many. Chunks hold whole ticks; a file with
+    incomplete ones was not written by the recorder.
     """
 
     def __init__(self, ticks_max: int | None) -> None:

@@ -19,10 +19,10 @@ Mask = npt.NDArray[np.bool_]
 SLIDING_LOWPASS_HZ = 10.0
 FINAL_WINDOW_S = 0.5
 TARGET = tuple(np.array(row) for row in ([1.0] * 3 + [0.1] * 2, [40.0] * 3 + [0.7] * 2, [144.0] * 3 + [1.225] * 2))
-"""M_d, K_d and K_p of x, y, z and both joints that every law is graded against: the paper's (tab:control_parameters)."""
+"""The impedance (M_d, K_d, K_p of x, y, z and both joints) that every law is graded against: the paper's (tab:control_parameters)."""
 _TARGET_ROWS = [0, 1, 2, 6, 7]
 DESIRED_FORCE_TIME_S = 0.5
-"""Time constant of the desired force of that target: a lasting payload is carried instead of yielded to."""
+"""Time constant of that target's desired force, with which a lasting load is carried instead of yielded to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class TrackingRms:
 def catch_index(log: FlightLog) -> int | None:
     """Return the tick (position in the log) of the catch, at the time of the first event "catch".
 
-    The detector confirms a catch after some time and dates its event back to the contact, so that the impact counts as after the catch.
+    The detector confirms a catch with a delay and dates its event back to the contact, so that the impact counts as after the catch.
     Without such an event it is the tick of an unconfirmed catch (`unconfirmed_catch_index`). None if no contact was measured.
     """
     confirmed = _confirmed_catch_index(log)
@@ -54,9 +54,8 @@ def catch_index(log: FlightLog) -> int | None:
 
 
 def unconfirmed_catch_index(log: FlightLog) -> int | None:
-    """Return the tick of an impact with a force after it that was not confirmed before the flight was killed or left its plan.
-
-    The logged forces pass through the flight's own detector again. None if a catch was confirmed, or no contact was measured.
+    """Return the tick of an impact that the detector did not confirm before the flight was killed or left its plan. The flight's
+    own detector is run on the logged forces again. None if a catch was confirmed, or no contact was measured.
     """
     if _confirmed_catch_index(log) is not None:
         return None
@@ -96,7 +95,7 @@ def position_error_m(log: FlightLog) -> Array:
 
 
 def attitude_error_rad(log: FlightLog) -> Array:
-    """Return roll, pitch, yaw by motion capture minus the law's desired attitude, wrapped, (ticks, 3)."""
+    """Return roll, pitch, yaw measured by motion capture minus the law's desired attitude, wrapped, (ticks, 3)."""
     return _wrapped(log.columns.mocap_attitude_rad - log.columns.attitude_desired_rad)
 
 
@@ -136,11 +135,11 @@ def final_e_z_m(log: FlightLog) -> float | None:
 
 def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:
     """Return the RMS after the catch of ||dI|| on the position rows (N) and on the joint rows (N m), against one target for every law.
-    None if a part of it was not logged, and for a log with ticks left out.
+    None if a part of it was not logged or the log is thinned.
 
-    dI = M_d e'' + K_d e' + K_p e - e_tau with `TARGET`, the paper's table, whatever the law's own gains: measured by its own gains, a
-    stiff law would look worse by definition. On the joints e_tau is J'(F - F_d), where F_d is F low-passed by `DESIRED_FORCE_TIME_S`;
-    it is 0 on the base. Derivatives are central differences, low-passed at 10 Hz without phase shift.
+    dI = M_d e'' + K_d e' + K_p e - e_tau with `TARGET`, the paper's table, for every law: graded against its own gains, a stiff law
+    would look worse by definition. On the joints e_tau is J'(F - F_d), where F_d is F low-passed by `DESIRED_FORCE_TIME_S`; it is 0
+    on the base. Derivatives are central differences, low-passed at 10 Hz without phase shift.
     """
     if log.stride > 1:
         return None, None  # derivatives need every tick
@@ -229,7 +228,7 @@ def lateness(log: FlightLog) -> Percentiles | None:
 
 
 def percentiles(durations_s: Array) -> Percentiles | None:
-    """Return p50, p99 and maximum in ms, or None for no values."""
+    """Return p50, p99 and maximum in ms; None if there are no values."""
     known = durations_s[np.isfinite(durations_s)]
     if not len(known):
         return None
@@ -238,9 +237,8 @@ def percentiles(durations_s: Array) -> Percentiles | None:
 
 
 def slack_m(log: FlightLog) -> Array:
-    """Return the tether length minus the distance from the anchor to the attachment point, by motion capture, for each tick.
-
-    NaN on the ground and where it is unknown.
+    """Return the tether length minus the distance from anchor to attachment point, measured by motion capture, for each tick; NaN
+    on the ground and where unknown.
     """
     slack = np.full(len(log.inputs), np.nan)
     tether = (log.config.get("vehicle") or {}).get("tether")

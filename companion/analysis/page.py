@@ -1,4 +1,4 @@
-"""Builds self-contained HTML pages: one file with embedded pictures, suitable for printing."""
+"""Writes self-contained HTML pages: one file with embedded pictures, suitable for printing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of a page below a heading; empty parts are left out."""
+    """A heading and what is below it; empty parts are left out."""
 
     title: str
     lead: str = ""
@@ -54,7 +54,7 @@ class Page:
     good: bool = True
     """Whether the verdict is good."""
     notes: Sequence[str] = ()
-    """Notes to read before the figures."""
+    """Notes to read before the values."""
     badge: str = ""
     """The outcome, beside the title."""
     player_html: str = ""

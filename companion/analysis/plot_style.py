@@ -1,4 +1,4 @@
-"""Common style of all plots: size, colours, axes, the mark of the catch. Needs matplotlib (extra `analysis`)."""
+"""Common style of all plots: size, colours, axes, the line at the catch. Needs matplotlib (extra `analysis`)."""
 
 from __future__ import annotations
 

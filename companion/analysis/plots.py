@@ -33,7 +33,7 @@ from companion.model.frames import tilt_rad
 from companion.model.types import Outputs, PhaseKind
 
 _PHASES_NAMED_MAX = 40
-"""Number of phases above which only their kinds are distinguished."""
+"""Number of phases above which only kinds of phases are distinguished."""
 _PHASES = {
     PhaseKind.TAKEOFF: "#eaf3fb",
     PhaseKind.FLIGHT: "#ffffff",
@@ -55,17 +55,17 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
     if not log.inputs:
         return []
     makers: tuple[tuple[str, str, str, Callable[[FlightLog], Figure | None]], ...] = (
-        ("tracking", "Tracking", "Position and attitude by motion capture against the reference.", _tracking),
-        ("actuation", "Actuation", "Commands of the law and the values sent.", _actuation),
+        ("tracking", "Tracking", "Position and attitude measured by motion capture, and the reference.", _tracking),
+        ("actuation", "Actuation", "Commands of the control law and the values sent.", _actuation),
         ("adaptation", "Adaptation", "Switching gain and its adapted parameters.", _adaptation),
         (
             "load",
             "Adaptive load",
-            "Loads that the law has adapted to: force on the base, first moments of the links, joint friction.",
+            "Loads estimated by the adaptation: force on the base, first moments of the links, joint friction.",
             _load,
         ),
         ("force", "Contact force", "Tared force on the net in the world frame, its weight removed.", _force),
-        ("path", "Path", "By motion capture, seen from above and from the side.", _path),
+        ("path", "Path", "Measured by motion capture, seen from above and from the side.", _path),
         (
             "timing",
             "Timing",
@@ -126,7 +126,7 @@ def _actuation(log: FlightLog) -> Figure | None:
     commanded = log.column(lambda i, o, s: o.arm_torque_nm, 2)
     sent = log.column(lambda i, o, s: s.arm_torque_sent_nm, 2)
     for j in range(2):
-        # Below what was sent, which is noisy and mostly the same: only a difference is to show.
+        # Drawn below the values sent, which are noisy and mostly the same: only a difference shall show.
         axes[2].plot(t, commanded[:, j], color=SERIES_DARK[j], lw=1.2, label=f"joint {j + 1} commanded")
         _line(axes[2], t, sent[:, j], f"joint {j + 1} sent", SERIES[j])
     axes[2].set_ylabel("joint torque [N m]")

@@ -51,7 +51,7 @@ def replay(log: FlightLog, make_core: Callable[[str], Core]) -> ReplayResult:
         make_core: makes the core from the recorded configuration (JSON).
 
     Raises:
-        LogError: no configuration, another version, an empty log, or missing ticks.
+        LogError: no configuration, a different version, an empty log, or missing ticks.
     """
     config_json = check_replayable(log)
     try:
@@ -86,14 +86,14 @@ def check_replayable(log: FlightLog) -> str:
         )
     if about.get("records") != fingerprint(Inputs, Outputs, Sent):
         raise LogError(
-            f"{log.path}: its records have other fields than this version's; it was written by "
+            f"{log.path}: its records have different fields from this version's; it was written by "
             f"{writer(log.metadata)}, replay it with that version"
         )
     config_json = log.config_json
     if config_json is None:
-        raise LogError(f"{log.path}: holds no configuration (metadata record 'config'); it cannot be replayed")
+        raise LogError(f"{log.path}: has no configuration (metadata record 'config'); it cannot be replayed")
     if not log.inputs:
-        raise LogError(f"{log.path}: holds no ticks")
+        raise LogError(f"{log.path}: has no ticks")
     first, missing = log.inputs[0].tick, log.missing_ticks()
     if first != 0 or missing:
         what = (

@@ -59,11 +59,11 @@ def write_report(log: FlightLog, summary: dict[str, Any], out_dir: Path) -> Path
 
 
 def _why_ended(summary: dict[str, Any]) -> str:
-    """Return the text of the event that ended the mission early; empty if the mission was completed or no event did."""
+    """Return the text of the event that ended the mission early; empty if the mission was completed or no event ended it."""
     if summary["outcome"] == Outcome.COMPLETED.value:
         return ""
     ranked = [(SafetyAction(event["action"]).rank, str(event["text"])) for event in summary["events"]]
-    # The first landing says more than an earlier hold.
+    # The first landing explains more than an earlier hold.
     for least in (SafetyAction.LAND, SafetyAction.HOLD):
         for rank, text in ranked:
             if rank >= least.rank:
@@ -86,12 +86,12 @@ def _results(summary: dict[str, Any], stride: int) -> list[Table]:
         ("final height error", _number(summary["final_e_z_m"], 3, " m")),
         ("impedance error, position", _number(summary["impedance_error"]["position_n"], 2, " N")),
         ("impedance error, arm", _number(summary["impedance_error"]["arm_nm"], 3, " N m")),
-        ("least tether slack", _number(summary["tether"]["min_slack_m"], 2, " m")),
+        ("minimum tether slack", _number(summary["tether"]["min_slack_m"], 2, " m")),
     ]
     if summary.get("catch_confirmed") is False:
         flight.insert(1, ("catch confirmed", "no, the flight ended too soon after the impact"))
     if stride > 1:
-        flight.append(("long flight: graded and drawn", f"every {stride}th tick"))
+        flight.append(("long flight: evaluated and drawn", f"every {stride}th tick"))
     timing = [
         (name, *(_number(figures[key], 2) for key in ("p50", "p99", "max")))
         for name, figures in (
@@ -100,10 +100,10 @@ def _results(summary: dict[str, Any], stride: int) -> list[Table]:
             ("mocap datagram → setpoint", latency["mocap_to_setpoint"]),
             ("whole tick", stages["whole"]),
             ("· wait for the joints", stages["wait_for_joints"]),
-            ("· core: inputs → decision", stages["core"]),
+            ("· core: inputs → outputs", stages["core"]),
             ("· setpoint and currents sent", stages["send"]),
             ("servo bus: read", stages["bus_read"]),
-            ("servo bus: read → write, whole", stages["bus_cycle"]),
+            ("servo bus: read → write, total", stages["bus_cycle"]),
         )
     ]
     processes = [

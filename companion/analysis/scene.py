@@ -126,7 +126,7 @@ class Scene:
 
     @property
     def standing_height_m(self) -> float:
-        """Height of the body's origin while the vehicle stands, world z."""
+        """Height of the body's origin while the vehicle rests on the ground, world z."""
         return float(self._low[2] + self._foot_m)
 
     def net_world_m(self, pose: Pose) -> Array:

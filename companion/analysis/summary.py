@@ -118,10 +118,10 @@ def effective_config(log: FlightLog, summary: dict[str, Any]) -> dict[str, Any]:
 
 
 def world_text(world: dict[str, Any] | None) -> str:
-    """Return name, seed and model error of a simulated world on one line; empty for a flight on the vehicle.
+    """Return name, seed and model error of a simulated world on one line; empty for a flight on hardware.
 
     Args:
-        world: world of a summary or an effective configuration; older ones have no name.
+        world: world of a summary or of an effective configuration; old ones have no name.
     """
     if not world:
         return ""

@@ -1,4 +1,4 @@
-"""A table as data: columns format an item, and the terminal and an HTML page (`page.html`) show the same cells."""
+"""A table as data: columns format the items; the terminal and an HTML page (`page.html`) show the same cells."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Line:
 
     colour: str
     dashes: tuple[float, ...] = ()
-    """Ink and gap in turn, in units of the line width; empty for a solid line."""
+    """Lengths of dashes and gaps in turn, in units of the line width; empty for a solid line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of cells below their columns."""
+    """Rows of cells with their columns."""
 
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]

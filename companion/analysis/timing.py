@@ -1,4 +1,4 @@
-"""Timing of every tick of a flight. It is small enough to be kept for all ticks even if only some of the ticks are kept."""
+"""Timing of every tick of a flight. It is small enough to be kept for every tick of a log that is thinned otherwise."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Timing:
     span_s: float
     """Time from the start of the first tick to the start of the last."""
     period_s: float
-    """Nominal period of the loop: the median of the ticks' intervals; NaN for less than two ticks."""
+    """Nominal period of the loop: the median interval between ticks; NaN for fewer than two ticks."""
     lateness_s: Array
     """Delay of the tick's start after its deadline."""
     joint_read_to_write_s: Array
@@ -48,7 +48,7 @@ class Timing:
 
 
 class Stopwatch:
-    """Collector of the timing, 80 bytes per tick."""
+    """Collects the timing, 80 bytes per tick."""
 
     def __init__(self) -> None:
         self._t_s, self._lateness_s = array("d"), array("d")

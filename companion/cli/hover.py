@@ -69,7 +69,7 @@ def lines(fit: HoverFit, vehicle_file: str) -> list[str]:
     at = f" at {fit.voltage_mean_v:.2f} V" if fit.slope else ""
     compared = [
         f"hover thrust      {fit.hover_thrust:.{_DIGITS}f} ± {fit.standard_error:.{_DIGITS}f} (standard error){at}, "
-        f"from {fit.used_s:.1f} s of calm flight"
+        f"from {fit.used_s:.1f} s of steady flight"
     ]
     for name, value in (("flight began with", fit.configured), ("flight ended with", fit.last_estimate)):
         relative = _relative(value, fit)

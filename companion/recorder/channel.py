@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 FLUSH_PERIOD_S = 0.4
-"""Period at which a chunk is closed; the data since then is lost if the recorder itself is killed. A shorter period is costly: the
+"""Period at which a chunk is closed; newer data is lost if the recorder itself is killed. A shorter period is costly: the
 index at the end of the file takes 180 bytes per chunk, and with chunks of 16 kB it grew by 30 MB in an hour.
 """
 _QUEUE_PACKETS = 8192
@@ -22,7 +22,7 @@ class Channel:
     """Reads the flight's packets in its own thread, so that a slow disk does not fill the socket.
 
     Attributes:
-        copy_to: called with every packet as soon as it is read, if set; must neither wait nor raise.
+        copy_to: if set, called with every packet as soon as it is read; must neither wait nor raise.
     """
 
     def __init__(self, channel: socket.socket) -> None:
@@ -48,7 +48,7 @@ class Channel:
             yield packet
 
     def stop(self) -> None:
-        """Read the remaining packets of the socket, then end."""
+        """Read the packets that remain in the socket, then end."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RD)
 
@@ -61,7 +61,7 @@ class Channel:
         return True
 
     def inject(self, packet: bytes) -> bool:
-        """Queue a packet of this process as if the flight had sent it; never waits. Return False if the queue is full."""
+        """Queue a packet as if the flight process had sent it; never waits. Return False if the queue is full."""
         try:
             self._packets.put_nowait(packet)
         except queue.Full:

@@ -30,7 +30,7 @@ from companion.runtime.subprocesses import JsonLines
 _BUFFER_BYTES = 8 * 2**20
 _MESSAGE_MAX_BYTES = 4096
 _MESSAGES_PER_TICK = 16
-"""Further messages are read in the next tick."""
+"""Maximum number of messages read in a tick; the rest are read in the next one."""
 _COMMANDS = {command.value: command for command in OperatorCommand if command is not OperatorCommand.NONE}
 _SO_SNDBUFFORCE = 32
 
@@ -119,7 +119,7 @@ class RecorderClient:
         return self._send(LogLine(number=self._offered, t_s=t_s, severity=severity, source=source, text=text))
 
     def metadata(self, name: str, values: Mapping[str, str]) -> bool:
-        """Write a metadata record that becomes known only during the flight (autopilot version, parameters, ...)."""
+        """Write a metadata record whose values become known only during the flight (autopilot version, parameters, ...)."""
         return self._send(Metadata(self._offered, name, dict(values)))
 
     def fileno(self) -> int:
@@ -146,12 +146,12 @@ class RecorderClient:
             except OSError as error:
                 if isinstance(error, (BrokenPipeError, ConnectionError)):
                     self._dead = True
-                    self.error = self.error or "recorder: the recorder process has ended; nothing more is recorded"
+                    self.error = self.error or "recorder: the recorder process has ended; recording has stopped"
         self.dropped += 1
         return False
 
     def _read_messages(self, data: bytes) -> None:
-        """Handle a message and those that follow at once; empty bytes mean the end of the channel."""
+        """Handle a message and those waiting behind it; empty bytes mean the end of the channel."""
         left = _MESSAGES_PER_TICK
         with contextlib.suppress(OSError):
             while data:
@@ -184,7 +184,7 @@ class RecorderReport:
     samples: int
     """Ticks in the log."""
     dropped: int
-    """Packets that were sent and are not in the log."""
+    """Packets that were sent but are not in the log."""
     error: str | None
 
 
@@ -194,7 +194,7 @@ class RecorderProcess:
     Args of `start`:
         path: the log to write; must not exist.
         config_json: effective configuration, stored unchanged.
-        epoch_offset_ns: wall clock (ns since 1970) at zero of the flight clock; see `epoch_offset_ns`.
+        epoch_offset_ns: wall clock (ns since 1970) when the flight clock was zero; see `epoch_offset_ns`.
         metadata: further key-value pairs of the log's `flight` metadata record (controller, mission, ...).
         simulated: the devices are those of the simulated world; ground stations show that.
     """
@@ -218,7 +218,7 @@ class RecorderProcess:
         simulated: bool = False,
         deadline_s: float = 15.0,
     ) -> RecorderProcess:
-        """Start the process and wait until the log is open. Blocks for about 0.3 s: not for the control tick.
+        """Start the process and wait until the log is open. Blocks for about 0.3 s; do not call it in a control tick.
 
         Raises:
             DeviceError: the log cannot be opened, or the process is not ready within the deadline.
@@ -239,7 +239,7 @@ class RecorderProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 pass_fds=(theirs.fileno(), config_fd),
-                # Ctrl-C on the terminal is for the flight process only; the recorder ends when the flight ends.
+                # Ctrl-C in the terminal is meant for the flight process only; the recorder ends when the flight ends.
                 process_group=0,
             )
         except BaseException:
@@ -299,7 +299,7 @@ def epoch_offset_ns(flight_clock_s: float) -> int:
 
 
 def _enlarge(channel: socket.socket) -> None:
-    """Request a send buffer for some seconds of ticks; the kernel limits it for users without CAP_NET_ADMIN."""
+    """Request a send buffer for a few seconds of ticks; the kernel limits it for users without CAP_NET_ADMIN."""
     try:
         channel.setsockopt(socket.SOL_SOCKET, _SO_SNDBUFFORCE, _BUFFER_BYTES)
     except OSError:

@@ -1,4 +1,4 @@
-"""The log file below the MCAP writer."""
+"""The file that the MCAP writer writes to."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 class LogFile:
-    """File object for the MCAP writer: appends whole pieces, and discards everything after the first failure.
+    """File object for the MCAP writer: appends complete writes, and discards everything after the first failure.
 
     On a failure the file is truncated to the last complete log (`commit`), so that it stays readable.
     """

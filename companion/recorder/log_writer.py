@@ -61,7 +61,7 @@ class LogWriter:
         for channel, text in zip((self._inputs, self._outputs, self._sent), texts, strict=True):
             channel.log(text, log_time=stamp_ns)
             self._unflushed_bytes += len(text)
-        # The tick is recorded; an error in its viewer messages must not count it as lost.
+        # The tick is recorded: an error in its viewer messages must not count as a lost tick.
         try:
             for event in outputs.events:
                 self._event(stamp_ns, outputs.mission_t_s, event)

@@ -1,4 +1,4 @@
-"""The recorder process: reads ticks from the flight's channel and writes an MCAP log; outlives the flight process to close the log.
+"""The recorder process: reads ticks from the flight's channel and writes an MCAP log; it outlives the flight process to close the log.
 
 If the vehicle file names a broker the recorder also holds the telemetry session: telemetry out, signed commands in
 (`companion.recorder.telemetry`).
@@ -38,11 +38,11 @@ from companion.runtime.cores import keep_off
 LOG_FORMAT = "1"
 SYNC_PERIOD_S = 1.0
 TELEMETRY_END_TIMEOUT_S = 1.5
-"""Time for the last telemetry messages after the log is closed."""
+"""Timeout for sending the last telemetry messages after the log is closed."""
 
 
 class Recorder:
-    """The main loop: writes packets, flushes chunks, counts losses."""
+    """Runs the main loop: writes packets, flushes chunks, counts losses."""
 
     def __init__(self, channel: Channel, writer: LogWriter, log_file: LogFile) -> None:
         self._channel = channel
@@ -140,7 +140,7 @@ def _read_config(source: str) -> str:
 
 
 def _lower_priority(config_json: str) -> None:
-    """Give the control tick precedence: leave its cores and its real-time priority."""
+    """Give the control tick precedence: leave its cores, and drop its real-time priority."""
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     with contextlib.suppress(OSError):
@@ -160,7 +160,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--fd", type=int, required=True, help="the flight's channel: an open SOCK_SEQPACKET socket")
     parser.add_argument("--out", type=Path, required=True, help="log to write; must not exist")
     parser.add_argument("--config", required=True, help="effective configuration (JSON): a file or an open descriptor")
-    parser.add_argument("--epoch-offset-ns", type=int, required=True, help="wall clock at zero of the flight clock")
+    parser.add_argument("--epoch-offset-ns", type=int, required=True, help="wall clock when the flight clock was zero")
     parser.add_argument(
         "--metadata", type=json.loads, default={}, help="metadata record `flight`: a JSON object of strings"
     )

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from companion.recorder.telemetry_link import Counts, FlightSide
 
 PACKETS_MAX = 8192
-"""Packets that wait for the thread: 40 s of flight. Further packets are counted and skipped; the log has them all the same."""
+"""Maximum number of packets that wait for the thread: 40 s of flight. Further ones are counted and skipped; the log still has them."""
 
 
 def broker_configured(config_json: str) -> bool:
@@ -53,7 +53,7 @@ class TelemetryThread:
         recorder_state: Callable[[], tuple[int, str | None]],
     ) -> None:
         self.session = secrets.token_hex(8)
-        """Session id of this flight, which commands name."""
+        """Session id of this flight, which commands must name."""
         self.dropped = 0
         """Packets that the queue had no room for."""
         self._config_json = config_json
@@ -108,7 +108,7 @@ class TelemetryThread:
         }
 
     def _run(self) -> None:
-        """Run the event loop. The log does not depend on anything that happens here."""
+        """Run the event loop. No failure here affects the log."""
         try:
             from companion.config.document import ConfigError
             from companion.recorder import telemetry_link
@@ -126,7 +126,7 @@ class TelemetryThread:
             except ConfigError as error:
                 self._report(f"no telemetry: {error.lines[0]}")
         except Exception as error:
-            self._report(f"telemetry has failed: {type(error).__name__}: {error}")
+            self._report(f"telemetry failed: {type(error).__name__}: {error}")
             if not isinstance(error, ImportError):
                 sys.excepthook(type(error), error, error.__traceback__)
         finally:

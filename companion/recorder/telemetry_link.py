@@ -1,4 +1,6 @@
-"""The event loop of the telemetry: turns packets into MQTT messages, whatever the broker does. Runs in the telemetry thread only."""
+"""The event loop of the telemetry: turns packets into MQTT messages, with or without a connection to the broker. Runs in the
+telemetry thread only.
+"""
 
 from __future__ import annotations
 
@@ -30,15 +32,15 @@ from companion.runtime.tasks import until_first
 ANSWER_S = 4.0
 """Timeout for each answer of the broker."""
 COMMAND_PACKET_MAX_BYTES = 16_384
-"""Maximum Packet Size for the broker: sixteen times a command, so that a somewhat oversized one is received and reported."""
+"""Maximum Packet Size given to the broker: sixteen times a command, so that a somewhat oversized command is received and reported."""
 SEND_BUFFER_BYTES = 65_536
-"""About one second of the stream; data that a slow broker takes later than that is stale."""
+"""Maximum number of unsent stream messages, about one second; if a slow broker takes longer, the data is stale."""
 PAUSE_MIN_S, PAUSE_MAX_S = 0.2, 2.0
 """Pause between two connection attempts."""
 END_TIMEOUT_S = 1.0
-"""Time for the last messages of the session, if a broker is connected."""
+"""Timeout for the last messages of the session, if a broker is connected."""
 FLOOD_PER_S = 1500
-"""Refused messages per second that are processed at full speed; beyond that `FLOOD_STEP / FLOOD_PAUSE_S` a second."""
+"""Refused messages per second that are processed at full speed; further ones at `FLOOD_STEP / FLOOD_PAUSE_S` a second."""
 FLOOD_STEP, FLOOD_PAUSE_S = 30, 0.02
 _ACKS_MAX = 200
 
@@ -60,7 +62,7 @@ class Counts:
     connections: int = 0
     stream_sent: int = 0
     stream_dropped: int = 0
-    """Stream messages that a connected broker did not take in time."""
+    """Stream messages that a connected broker did not accept in time."""
     commands: int = 0
     """Commands forwarded to the flight process."""
     refused: int = 0
@@ -97,7 +99,7 @@ class Outbox:
         """Set when no message with QoS 1 is left to send."""
 
     def put(self, out: Outgoing) -> None:
-        """Add new messages; drop a message that is too large for receivers."""
+        """Add new messages; drop one that is too large for the receivers."""
         for topic, payload in out.retained.items():
             if len(payload) <= MESSAGE_MAX_BYTES:
                 self.kept[topic] = payload
@@ -117,12 +119,12 @@ class Outbox:
 
 
 class Uplink:
-    """Connects one telemetry session to its broker.
+    """Connects a telemetry session to its broker.
 
     Args:
         session: builds the messages and verifies the commands.
-        access: the broker.
-        recorder: the rest of the recorder.
+        access: settings of the broker.
+        recorder: interface to the rest of the recorder.
     """
 
     def __init__(self, session: TelemetrySession, access: BrokerAccess, recorder: RecorderSide) -> None:
@@ -138,7 +140,7 @@ class Uplink:
         self._command_topic = Topic.COMMAND.of(session.vehicle)
 
     async def run(self) -> None:
-        """Run until the flight has ended and that is published, or no broker is connected."""
+        """Run until the end of the flight is published, or has come while no broker is connected."""
         async with asyncio.TaskGroup() as group:
             staying = group.create_task(self._stay_connected())
             await self._pump()
@@ -265,7 +267,7 @@ class Uplink:
         elif topic not in self._refused_topics:
             text = f"the broker does not let this vehicle publish its {topic.value}: {refusal}"
             self._session.notify(time.monotonic(), WARNING, text)
-            if not self._refused_topics:  # a wrong login affects all topics; report one
+            if not self._refused_topics:  # a wrong login affects all topics; report only one
                 self._recorder.flight.send({"ground": text})
             self._refused_topics.add(topic)
 
@@ -280,7 +282,7 @@ class Uplink:
             self._slow_down(now_s)
 
     def _slow_down(self, now_s: float) -> None:
-        """Limit the processor time that a flood of invalid commands costs the flight: unread messages wait at the broker."""
+        """Limit the CPU time that a flood of invalid commands takes from the flight: unread messages wait at the broker."""
         if now_s - self._flood_began_s >= 1.0:
             self._flood_began_s, self._flood_before = now_s, self._session.refused
         many = self._session.refused - self._flood_before
@@ -302,7 +304,7 @@ class Uplink:
         self._session.notify(now_s, WARNING, f"{command.command.value} of {command.operator}: {text}")
 
     def _report_change(self, severity: str, text: str) -> None:
-        """Report a change of the connection once; while the broker is away only the first reason is reported."""
+        """Report a change of the connection once; while the broker is unreachable, only the first reason is reported."""
         kind = text.split(", ")[0]
         if kind == self._last_reported:
             return

@@ -36,17 +36,17 @@ from companion.model.types import Outcome
 SILENT_S = 0.5
 """Time without a tick after which the vehicle is reported as silent."""
 STATE_PERIOD_S = 2.0
-"""Period of the retained state, which replaces what another client or an old last will published."""
+"""Period at which the retained state is published again, which replaces any state from another client or an old last will."""
 REFUSAL_PERIOD_S = 1.0
-"""Refused commands of one reason are reported once in this time."""
+"""Period in which refused commands with the same reason are reported only once."""
 WARNING, INFO = "warning", "info"
-_SILENT = "the flight process sends nothing; in the air the guardian lands the vehicle"
-_LOST = "the flight process or its recorder ended without notice; in the air the guardian lands the vehicle"
+_SILENT = "the flight process sends nothing; if the vehicle is in the air, the guardian lands it"
+_LOST = "the flight process or its recorder ended without notice; if the vehicle is in the air, the guardian lands it"
 
 
 @dataclass(slots=True)
 class _Refusals:
-    """Refused commands of one reason."""
+    """Refused commands with the same reason."""
 
     count: int = 0
     """Refusals that have not been reported."""
@@ -91,14 +91,14 @@ class TelemetrySession:
         self._verifier = verifier
         self._stream = StreamBuilder(config, session)
         self._clock_s = math.inf
-        """CLOCK_MONOTONIC minus flight clock: the smallest difference seen, from the packet with the least delay."""
+        """CLOCK_MONOTONIC minus flight clock: the smallest difference seen, from the packet with the shortest delay."""
         self._tick_s: float | None = None
         """CLOCK_MONOTONIC of the newest tick."""
         self._new_ticks = False
         self._outcome: Outcome | None = None
         self._over = False
         self._packet_error: str | None = None
-        """Error of the first malformed packet (a defect of the program); empty once it has been reported."""
+        """Error of the first malformed packet (a bug); empty once it has been reported."""
         self._refusals: dict[str, _Refusals] = {}
         self._acks: deque[Ack] = deque(maxlen=200)
         self._log: deque[tuple[float, str, str]] = deque(maxlen=200)
@@ -310,7 +310,7 @@ class TelemetrySession:
         if self._over:
             return
         if self._tick_s is None:
-            self._tick_s = now_s  # first call: a tick is expected from now on
+            self._tick_s = now_s  # first call: ticks are expected from now on
         silent = now_s - self._tick_s > SILENT_S
         text = _SILENT if silent else self._no_commands
         self._set_state(presence=Presence.SILENT if silent else Presence.FLYING, text=text)

@@ -23,7 +23,7 @@ _PACKAGES = (
     "mujoco",
 )
 REVISION_FILE = "revision"
-"""Beside the packages of a compiled build: the commit that it was made of."""
+"""File beside the packages of a compiled build: the commit that it was built from."""
 
 
 def versions() -> dict[str, str]:
@@ -38,7 +38,7 @@ def versions() -> dict[str, str]:
 
 def _git_revision() -> str | None:
     """Return the commit of this module's working copy, with `-dirty` if it was changed, or the commit that the compiled build was
-    made of; None outside of both.
+    built from; None if neither is known.
     """
     root = Path(__file__).resolve().parents[2]
     if (root / REVISION_FILE).exists():

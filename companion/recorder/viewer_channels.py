@@ -10,9 +10,9 @@
 ``/scene_static`` foxglove.SceneUpdate        room, anchor, planned path, vehicle, arm, net: once, and when the plan is known
 ================  ==========================  =========================================================================
 
-A viewer that jumps in time asks only for the newest message of each topic; so data with different rates, and data sent once, have
-topics of their own. Vehicle, arm and net are drawn once and locked to their frames; the frames move. A message with a value that is
-not finite is left out.
+A viewer that jumps in time requests only the newest message of each topic. Data with different rates, and data sent once, therefore
+have topics of their own. Vehicle, arm and net are drawn once and locked to their frames; the frames move. A message with a value
+that is not finite is left out.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ PERIOD_S = 0.02
 SCENE_PERIOD_S = 0.05
 PATH_PERIOD_S = 2.0
 _EARLY_S = 0.0025
-"""A message that is due within half a tick is sent in this tick."""
+"""A message may be sent this much (half a tick) before it is due."""
 _LIFETIME = Duration(0, 500_000_000)
 """Lifetime of moving entities: they disappear half a second after their last update."""
 _FRESH_S = 0.1
-"""An older motion-capture pose is stale."""
+"""Max age of a motion-capture pose; an older one is stale."""
 _FLOWN = Color(r=0.12, g=0.44, b=0.71, a=1.0)
 _REFERENCE = Color(r=0.88, g=0.48, b=0.13, a=0.9)
 _TRAIL_POINTS = 256

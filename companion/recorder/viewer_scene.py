@@ -1,4 +1,4 @@
-"""Scene of a 3D viewer: geometry from the configuration, shapes of the machine and its room, the slack tether. No I/O.
+"""Scene of a 3D viewer: geometry from the configuration, shapes of the vehicle and its room, the slack tether. No I/O.
 
 World ENU, body FLU, metres. The arm's frames are those of `companion.control.manipulator`: x of ``link1`` points from the shoulder
 to the elbow, x of ``link2`` from the elbow to the net's centre, y of both is the body's.
@@ -66,7 +66,7 @@ class TetherShape:
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Geometry of the machine; None where the configuration has no valid value."""
+    """Geometry of the vehicle; None where the configuration has no valid value."""
 
     arm: ArmShape | None
     tether: TetherShape | None
@@ -114,7 +114,7 @@ def machine_of(config: Any) -> Machine:
 
 
 def path_of(data: Any, most: int = 1000) -> tuple[Vec3, ...]:
-    """Return the points of a path [[x, y, z], ...]; empty if the data is anything else."""
+    """Return the points of a path [[x, y, z], ...]; empty if the data is not a path."""
     if not isinstance(data, list) or len(data) > most:
         return ()
     points = [_numbers(point, 3) for point in data]

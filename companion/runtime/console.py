@@ -239,7 +239,7 @@ def print_result(console: Console, summary: dict[str, Any], out: Path, report: P
         facts.add_row("recorder", f"{recorder['samples']} ticks, {recorder['dropped']} dropped")
     slack = (summary.get("tether") or {}).get("min_slack_m")
     if slack is not None:
-        facts.add_row("tether", f"least slack {slack:.2f} m")
+        facts.add_row("tether", f"minimum slack {slack:.2f} m")
     every = summary.get("graded_every", 1)
     if every > 1:
         facts.add_row("graded", f"every {every}th tick of a long flight; loop and latencies: every tick")

@@ -429,7 +429,7 @@ def test_a_log_from_before_a_field_that_may_be_none_opens_but_is_not_replayed(
     log = FlightLog.read(rewritten(flight.path, tmp_path / "older.mcap", same, "0" * 16))
     assert log.outputs == flight.outputs
     with pytest.raises(
-        LogError, match=r"^[^\n]*records have other fields than this version[^\n]*replay it with that version$"
+        LogError, match=r"^[^\n]*records have different fields from this version[^\n]*replay it with that version$"
     ):
         replay(log, lambda _: Recited(log.outputs))
 
@@ -449,7 +449,7 @@ def test_a_log_with_records_of_another_shape_is_refused_in_one_line(
     path = rewritten(flight.path, tmp_path / "other.mcap", change, "0" * 16)
     with pytest.raises(LogError) as refusal:
         FlightLog.read(path)
-    assert str(refusal.value).startswith(f"{path}: records with other fields (Outputs: ")
+    assert str(refusal.value).startswith(f"{path}: its records have different fields (Outputs: ")
     assert "at `$.control`" in str(refusal.value)
     assert reason in str(refusal.value)
     assert "written by companion " in str(refusal.value)
@@ -537,8 +537,8 @@ def test_a_log_that_cannot_be_replayed_says_why_in_one_line(flight: FlightLog) -
         (gap, refuse, "3 of 4401 ticks are missing"),
         (late, refuse, "begins at tick 5"),
         (older, refuse, "recorded by companion 0.0.1"),
-        (bare, refuse, "holds no configuration"),
-        (empty, refuse, "holds no ticks"),
+        (bare, refuse, "has no configuration"),
+        (empty, refuse, "has no ticks"),
         (flight, refuse, "field x is unknown"),
     ):
         with pytest.raises(LogError) as refusal:

@@ -99,7 +99,9 @@ def test_less_flight_is_less_certain() -> None:
 def test_a_log_without_hovering_is_refused_in_one_line() -> None:
     log = logged(0.0)
     short = dataclasses.replace(log, inputs=log.inputs[:900], outputs=log.outputs[:900], sent=log.sent[:900])
-    with pytest.raises(HoverFitError, match=rf"^fast: 0\.\d s of calm flight, expected {FIT_MIN_S:g} s or more[^\n]*$"):
+    with pytest.raises(
+        HoverFitError, match=rf"^fast: 0\.\d s of steady flight, expected {FIT_MIN_S:g} s or more[^\n]*$"
+    ):
         fit_hover_thrust(short)
     bare = dataclasses.replace(log, metadata={"config": {"json": json.dumps({})}})
     with pytest.raises(HoverFitError, match=r"^fast: no vehicle\.airframe\.mass_kg[^\n]*$"):

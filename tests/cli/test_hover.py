@@ -97,7 +97,7 @@ def test_a_log_that_never_hovered_and_a_file_that_is_no_log_are_refused_in_one_l
     text = tmp_path / "notes.txt"
     text.write_text("thirty characters and then some", encoding="utf-8")
     for path, reason in (
-        (record(short, tmp_path / "short.mcap"), "0.0 s of calm flight, expected 2 s or more"),
+        (record(short, tmp_path / "short.mcap"), "0.0 s of steady flight, expected 2 s or more"),
         (text, "not an MCAP file"),
         (tmp_path / "absent.mcap", "No such file"),
     ):
@@ -121,7 +121,7 @@ def test_a_slope_is_reported_with_the_voltage_that_the_value_holds_for() -> None
         slope=VoltageSlope(-0.021, 0.0008),
     )
     told = lines(fit, "my_vehicle.yaml")
-    assert told[0] == "hover thrust      0.4912 ± 0.0003 (standard error) at 15.62 V, from 31.2 s of calm flight"
+    assert told[0] == "hover thrust      0.4912 ± 0.0003 (standard error) at 15.62 V, from 31.2 s of steady flight"
     assert told[1] == "flight began with 0.5000, +1.79 % of the fitted value"
     assert told[3].endswith("15.62 V on average, changed by 1.40 V; slope -0.0210 ± 0.0008 per V")
     assert told[-3:] == ["# my_vehicle.yaml", "airframe:", "  hover_thrust: 0.4912"]

@@ -73,7 +73,7 @@ _KNOWN: tuple[tuple[str, str, int, str], ...] = (
     ("final_e_z_m", "height error at the end [m]", 4, ""),
     ("impedance_error.position_n", "impedance error, position [N]", 3, ""),
     ("impedance_error.arm_nm", "impedance error, arm [N m]", 4, ""),
-    ("tether.min_slack_m", "least tether slack [m]", 3, ""),
+    ("tether.min_slack_m", "minimum tether slack [m]", 3, ""),
     ("loop.rate_hz", "control loop [Hz]", 2, ""),
     ("loop.ticks", "ticks", 0, ""),
     ("loop.missed", "ticks a period late", 0, "machine"),
