@@ -175,11 +175,16 @@ class MocapDevice(Model):
     """Expected frame rate."""
 
 
+ServoBaud = Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000]
+"""Baud rates of the arm's servos, in the order of register 8. The tools and the simulated servos have the same and those too slow or
+too fast for a flight."""
+
+
 class ArmDevice(Model):
     """The Dynamixel bus behind a U2D2."""
 
     port: str
-    baud: Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000] = 3000000
+    baud: ServoBaud = 3000000
     watchdog_ms: Annotated[int, Field(ge=20, le=2540)] = 100
     """Bus watchdog (register 98), a multiple of 20 ms; the servos release torque after this time without an instruction."""
 

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field
 
 from companion.config.base import Fraction, Model, NonNegative, Positive, RelativeError, Vector2, Vector3
 from companion.config.explain import nearest
+from companion.config.vehicle import ServoBaud
 from companion.px4.defaults import PX4_DEFAULTS
 from companion.sitl_config.effects.air import Air
 from companion.sitl_config.effects.battery import Battery
@@ -66,7 +67,7 @@ class Servo(Model):
 
     id: Annotated[int, Field(ge=0, le=252)] | None = None
     """Register 7; null for the id of the vehicle file. The answers of two servos with the same id collide."""
-    baud: Literal[9600, 57600, 115200, 1000000, 2000000, 3000000, 4000000] | None = None
+    baud: Literal[9600, ServoBaud] | None = None
     """Register 8; null for the baud rate of the vehicle file."""
     firmware: Annotated[int, Field(ge=0, le=255)] = 48
     return_delay_us: Annotated[int, Field(ge=0, le=508, multiple_of=2)] = 500

@@ -6,9 +6,12 @@ Source: ROBOTIS e-manual, XM430-W210, "Control Table of EEPROM Area" and "Contro
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import get_args
+
+from companion.config.vehicle import ServoBaud
 
 MODEL = 1030
-BAUDS = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
+BAUDS: tuple[int, ...] = (9600, *get_args(ServoBaud), 4_500_000)
 """Baud rate by value of register 8."""
 TABLE_SIZE = 662
 EEPROM_END = 64

@@ -9,18 +9,18 @@ import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Final, Self
+from typing import Final, Self, get_args
 
 from dynamixel_sdk import COMM_SUCCESS, PacketHandler
 
+from companion.config.vehicle import ServoBaud
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.registers import Register
 from companion.io.protocols import DeviceError
 
-BAUDS: Final = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
-"""Baud rates that the tools try (a flight's: `devices.arm.baud`, `companion.config.vehicle`), by value of register 8; 4.5 Mbps, the
-eighth, has no name in termios and dynamixel-sdk does not know it.
-"""
+BAUDS: Final[tuple[int, ...]] = (9600, *get_args(ServoBaud))
+"""Baud rates that the tools try, by value of register 8: those of a flight and 9600. 4.5 Mbps, the eighth, has no name in
+termios, and dynamixel-sdk does not know it."""
 FACTORY_BAUD: Final = 57600
 
 ID = Register(7, 1, "id")
