@@ -9,12 +9,13 @@ from companion.model import flight_stage as seq
 from companion.model.flight_stage import Stage
 from companion.model.types import OperatorCommand, Outcome, PhaseKind, Reference, SafetyAction, Vec3
 from companion.safety import notices
-from companion.safety.rules import OPERATOR_ABORT, OPERATOR_LAND, OPERATOR_RESUME, PILOT_TOOK_OVER
+from companion.safety.rules import OPERATOR_ABORT, OPERATOR_LAND, OPERATOR_RESUME, RULES
 from companion.safety.supervisor import update
 
 HOLD_ABOVE_M = 0.3
 """Margin over standing height below which the vehicle lands instead of holding."""
 _BY_OPERATOR = (OPERATOR_LAND, OPERATOR_ABORT, notices.CALLED_OFF.id)
+_PILOT_FLIES = frozenset(rule.id for rule in RULES if rule.pilot_flies)
 _EXPIRED = {
     notices.HOLD_EXPIRED.id: (notices.HOLD_EXPIRED, "no command ended the hold in time; landing"),
     notices.RETRACT_EXPIRED.id: (notices.RETRACT_EXPIRED, "the retract took too long; landing here"),
@@ -75,7 +76,7 @@ def _react(t: Transition) -> None:
     elif action is SafetyAction.AUTOPILOT_LAND:
         if state.stage in seq.LIFTING:
             t.finish(Outcome.ABORTED)
-            t.enter(Stage.AUTOPILOT_LAND, pilot_flies=state.supervisor.cause == PILOT_TOOK_OVER)
+            t.enter(Stage.AUTOPILOT_LAND, pilot_flies=state.supervisor.cause in _PILOT_FLIES)
     elif state.stage is Stage.SPOOL:
         t.finish(Outcome.ABORTED)
         t.enter(Stage.TOUCHDOWN)

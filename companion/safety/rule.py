@@ -60,6 +60,9 @@ class Rule:
     """Text of the event, with braces for the predicate's values."""
     severity: Severity | None = None
     """Severity; if None, CRITICAL for RETRACT and more severe actions in the air, else WARNING."""
+    pilot_flies: bool = False
+    """Whether a pilot has the vehicle from this event on: with AUTOPILOT_LAND the companion sends PX4 no command and only
+    monitors the landing."""
     repeat: Repeat = Repeat.AFTER_QUIET
     while_waiting: bool = False
     """Evaluated also while inputs are still missing on the ground."""

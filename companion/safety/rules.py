@@ -172,7 +172,8 @@ RULES: tuple[Rule, ...] = (
     Rule(
         id=PILOT_TOOK_OVER, subject=Subject.PX4,
         what="PX4 left OFFBOARD for a mode that only a pilot chooses (manual, hold, return or take-off), and not by its failsafe",
-        predicate=px4.pilot_took_over, ground=_PX4_LANDS, air=_PX4_LANDS, message="PX4 left OFFBOARD for {}{}",
+        predicate=px4.pilot_took_over, ground=_PX4_LANDS, air=_PX4_LANDS, pilot_flies=True,
+        message="PX4 left OFFBOARD for {}{}",
     ),
     Rule(
         id="offboard_left", subject=Subject.PX4, what="PX4 left OFFBOARD for another mode (its own failsafe)",

@@ -59,7 +59,8 @@ def monitors_table() -> str:
                     ", ".join(map(_default, rule.thresholds + rule.tracked_by)),
                     _hold_time(rule),
                     _action(rule.ground),
-                    _action(rule.air),
+                    _action(rule.air)
+                    + (", only monitored: the pilot flies, PX4 gets no command" if rule.pilot_flies else ""),
                     _message(rule),
                 )
                 rows.append(f"| {' | '.join(cells)} |")
