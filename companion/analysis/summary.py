@@ -48,6 +48,7 @@ def empty_summary(
         "tether": {"min_slack_m": None},
         "graded_every": 1,
         "world": None,
+        "autopilot": None,
     }
 
 
@@ -65,7 +66,7 @@ def summarise(
     Args:
         log: the flight.
         outcome: completed, refused, aborted, crashed or lost, as determined by the launcher.
-        controller: adaptive, csc or psc.
+        controller: control law.
         preset: built-in preset or name of a user's preset.
         payload_kg: true mass in SITL; None on hardware.
         recorder: the recorder's own report (samples, dropped, error); None to count from the log.
