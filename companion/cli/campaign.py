@@ -13,7 +13,7 @@ from typing import Any
 from rich.console import Console
 
 from companion.campaigns.runner import Campaign, run
-from companion.cli.world_options import add_world
+from companion.cli.options import add_law, add_world
 from companion.config.document import ConfigError
 from companion.mission.check import check_mission
 from companion.runtime.console import terminal_console
@@ -35,8 +35,7 @@ def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | 
     """
     parser.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
     if one_law:
-        parser.add_argument("--controller", metavar="LAW", help="control law: adaptive, csc or psc")
-        parser.add_argument("--preset", metavar="NAME", help="gains: paper or recommended (adaptive), tuned (csc, psc)")
+        add_law(parser)
     parser.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="override for every flight"
     )

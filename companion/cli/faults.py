@@ -11,7 +11,7 @@ from companion.analysis.table import for_terminal
 from companion.campaigns.faults.campaign import Faults, kinds_list, kinds_table
 from companion.campaigns.faults.variants import WIRES, planned
 from companion.cli.campaign import DEFAULT_MISSION, add_options, checked, common, fly, names, wide_console
-from companion.cli.world_options import add_seed
+from companion.cli.options import add_seed
 from companion.config.document import ConfigError
 from companion.config.explain import nearest
 from companion.model.exit_codes import EXIT_OK

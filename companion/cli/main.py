@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from companion.cli.options import add_law, add_seed, add_world
 from companion.cli.planning_progress import PlanningProgress
 from companion.cli.schema import schema_json
-from companion.cli.world_options import add_seed, add_world
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig
 from companion.install.extras import missing_extra
@@ -181,8 +181,7 @@ def _add_flight_options(parser: argparse.ArgumentParser, mission_default: bool =
     else:
         parser.add_argument("mission", help="mission file, YAML")
     parser.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
-    parser.add_argument("--controller", metavar="LAW", help="control law: adaptive, csc or psc")
-    parser.add_argument("--preset", metavar="NAME", help="gains: paper or recommended (adaptive), tuned (csc, psc)")
+    add_law(parser)
     parser.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="e.g. world.payload_kg=0.3"
     )

@@ -1,10 +1,18 @@
-"""Options for the simulated world, shared by all commands that use it."""
+"""Options that several commands share: the control law and the simulated world."""
 
 from __future__ import annotations
 
 import argparse
 
+from companion.config.controller import PRESETS
 from companion.sitl_config.loader import DEFAULT_WORLD, WORLDS
+
+
+def add_law(parser: argparse.ArgumentParser) -> None:
+    """Add `--controller` and `--preset`."""
+    parser.add_argument("--controller", metavar="LAW", help=f"control law: {', '.join(PRESETS)}")
+    gains = "; ".join(f"{law}: {', '.join(reversed(presets))}" for law, presets in PRESETS.items())
+    parser.add_argument("--preset", metavar="NAME", help=f"gains, the default first ({gains})")
 
 
 def add_world(parser: argparse.ArgumentParser, default: str | None = DEFAULT_WORLD) -> None:
