@@ -23,11 +23,10 @@ Rows = tuple[float, float, float, float, float]
 
 
 class LoadAdaptation:
-    """Load on the rows x, y, z (N) and on both joints (N m), integrated with an exact zero-order hold.
+    """Load on the rows x, y, z (N) and on both joints (N m), integrated from zero with an exact zero-order hold.
 
     Args:
         config: rates, leakage and bounds.
-        moments_kg_m: first moments of link 1 and link 2 about their joints at the start; 0 if they are not known.
     """
 
     def __init__(self, config: AdaptiveConfig) -> None:
