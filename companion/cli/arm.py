@@ -17,33 +17,35 @@ def add_parser(commands: Any) -> None:
     scan = add_tool(
         parts, "scan", _TOOLS, yes=False,
         help="find every servo on the bus",
-        description="Find every servo at every baud rate and compare it with the vehicle file. Nothing is written to the servos, no "
-        "torque. Exit 0: everything matches the vehicle file; 3: something differs.",
+        description="Find every servo at every baud rate and compare it with the vehicle file. Nothing is written to "
+        "the servos; torque stays off. Exit 0: everything matches the vehicle file; 3: something "
+        "differs.",
     )  # fmt: skip
     scan.add_argument(
-        "--baud", type=int, metavar="RATE", help="try only this baud rate, which takes one second (default: all)"
+        "--baud", type=int, metavar="RATE", help="try only this baud rate; takes one second (default: all)"
     )
     setup = add_tool(
         parts, "setup", _TOOLS,
-        help="set the servos up: id, baud rate, return delay, mode, limits",
-        description="Write the required settings to each servo. Torque is off; the values are shown, confirmed, written and read "
-        "back. Exit 0: all is set up; 3: not.",
+        help="set up the servos: id, baud rate, return delay, mode, limits",
+        description="Write the required settings to each servo. Torque is off; you see and confirm the values, which "
+        "are then written and read back. Exit 0: all servos are set up; 3: they are not.",
     )  # fmt: skip
     setup.add_argument("--joint", type=_joint, metavar="N", help="the only connected servo belongs to joint 1 or 2")
     add_tool(
         parts, "zero", _TOOLS, yes=False,
         help="find zeros and directions: hold the arm by hand in three poses",
-        description="No torque. Hold the arm by hand in three poses; finds zero_count and sign of both joints, and servos in each "
-        "other's joint. A pose counts when it is held still for 2 s, or at Enter.",
+        description="Torque is off. Hold the arm by hand in three poses, to find zero_count and sign of both joints "
+        "and whether the servos are interchanged. A pose is accepted when it is held still for 2 s, or "
+        "on Enter.",
     )  # fmt: skip
     jog = add_tool(
         parts, "jog", _TOOLS, write="",
-        help="move one joint, slowly, by keys",
-        description="Move one joint at a time, at most 20 deg/s, within the joint limits. It stops when the key is released, and "
-        "at an obstacle. Afterwards the arm is limp: hold it.",
+        help="move one joint slowly with keys",
+        description="Move one joint at a time, at most 20 deg/s, within the joint limits. It stops when you release "
+        "the key, and at an obstacle. Afterwards the arm is limp: hold it.",
     )  # fmt: skip
     jog.add_argument("--joint", type=_joint, metavar="N", help="with --to: joint 1 or 2")
-    jog.add_argument("--to", type=float, metavar="DEG", help="target angle of a motion without keys")
+    jog.add_argument("--to", type=float, metavar="DEG", help="move to this angle instead of using keys")
     add_tool(
         parts, "friction", _TOOLS,
         help="measure torque constant and friction of both joints",

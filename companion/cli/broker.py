@@ -1,4 +1,4 @@
-"""`companion broker`: create a broker's users and certificates, and show a login's permissions at a broker."""
+"""`companion broker`: create a broker's users and certificates, and show what a login may do at a broker."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def add_parser(commands: Any) -> None:
     init.add_argument(
         "--host", **several, help="names and addresses of the broker's computer (default: the name of this computer)"
     )
-    init.add_argument("--operator", **several, help="names of operators, who may command (default: you)")
+    init.add_argument("--operator", **several, help="names of operators, who may send commands (default: you)")
     init.add_argument("--viewer", **several, help="names of viewers, who may only watch (default: viewer)")
     init.add_argument("--vehicle", **several, help=f"names of vehicles in topics (default: {VEHICLE})")
     init.add_argument(
@@ -51,15 +51,17 @@ def add_parser(commands: Any) -> None:
 
     check = parts.add_parser(
         "check",
-        help="show a login's permissions at a broker",
+        help="show what a login may read and write at a broker",
         description="Connect, subscribe and publish an empty message on every topic. Exit 0: connected; 2: wrong input; 3: no "
         "connection.",
     )
     check.add_argument("url", metavar="URL", help="mqtt://HOST:PORT, or mqtts://HOST:PORT with TLS")
     check.add_argument("--login", metavar="FILE", help="YAML file with username and password")
-    check.add_argument("--ca", metavar="FILE", help="certificate of the authority that signed the broker's")
+    check.add_argument("--ca", metavar="FILE", help="CA certificate (PEM) to verify the broker's certificate")
     check.add_argument(
-        "--vehicle", metavar="NAME", help="vehicle whose topics to write to, with its own login (default: none)"
+        "--vehicle",
+        metavar="NAME",
+        help="vehicle whose topics are tested for writing, with its own login (default: none)",
     )
     check.set_defaults(run=_check)
 
@@ -95,7 +97,7 @@ def _init(arguments: argparse.Namespace) -> int:
         print(
             f"{folder}/server.pem, server.key: for {', '.join(hosts)}, until {broker_setup.certificate_expiry(folder)}"
         )
-        print("Restart the broker, which reads them when it starts. No other computer needs a new file.")
+        print("Restart the broker so that it reads them. No other computer needs a new file.")
         return EXIT_OK
     users = broker_setup.BrokerUsers(
         hosts=tuple(arguments.host) or broker_setup.this_host(),
@@ -131,7 +133,7 @@ def _instructions(folder: Path, users: BrokerUsers, ends: str) -> list[str]:
     for name in users.vehicles:
         lines += [
             f"Vehicle {name}: copy {folder}/vehicles/{name} to its computer, for example to /etc/companion, "
-            "owned by the user that flies.",
+            "owned by the user who runs companion.",
             "Vehicle file:",
             "  ground:",
             f"    topic: {name}",
@@ -156,7 +158,7 @@ def _instructions(folder: Path, users: BrokerUsers, ends: str) -> list[str]:
         ]
     return [
         *lines,
-        "Each folder contains the credentials of its name: copy each only to its computer (scp -rp), and keep ca.key here.",
+        "Each folder holds credentials: copy it only to the computer that it is named for (scp -rp), and keep ca.key here.",
     ]
 
 

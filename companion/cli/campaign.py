@@ -1,4 +1,4 @@
-"""Shared parts of the campaign commands: options, checked configuration, folder of the results."""
+"""Shared parts of the campaign commands: options, checked configuration, results folder."""
 
 from __future__ import annotations
 
@@ -37,15 +37,23 @@ def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | 
     if one_law:
         add_law(parser)
     parser.add_argument(
-        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="override for every flight"
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="override a setting for every flight",
     )
     add_world(parser, world)
     parser.add_argument(
-        "--jobs", type=count, metavar="N", help="number of flights at the same time (default: by the number of cores)"
+        "--jobs",
+        type=count,
+        metavar="N",
+        help="number of simultaneous flights (default: depends on the number of cores)",
     )
     parser.add_argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, to fly on its workers")
-    parser.add_argument("--out", metavar="DIR", help="folder for the results (default: a new one, named by the time)")
-    parser.add_argument("--json", action="store_true", help="print rows and their summary as JSON and nothing else")
+    parser.add_argument("--out", metavar="DIR", help="folder for the results (default: a new one named after the time)")
+    parser.add_argument("--json", action="store_true", help="print only JSON: the rows and their summary")
 
 
 def common(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -66,10 +74,10 @@ def count(text: str) -> int:
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Return the names that an argument lists with commas, for argparse."""
+    """Return the names in a comma-separated argument, for argparse."""
     found = tuple(name.strip() for name in text.split(","))
     if not all(found):
-        raise argparse.ArgumentTypeError(f"expected names with commas between them, got '{text}'")
+        raise argparse.ArgumentTypeError(f"expected comma-separated names, got '{text}'")
     return found
 
 
@@ -109,7 +117,7 @@ def fly(campaign: Campaign, arguments: argparse.Namespace, parent: str) -> int:
     try:
         return run(campaign, folder, None if arguments.json else wide_console(CAMPAIGN_WIDTH))
     finally:
-        # Only empty folders can be removed: those of a campaign in which no flight ended.
+        # Removes empty folders only: those of a campaign in which no flight ended.
         with contextlib.suppress(OSError):
             folder.rmdir()
             if arguments.out is None:
@@ -129,16 +137,16 @@ def why_unusable(folder: Path, result: str) -> str | None:
 
     Args:
         folder: may exist.
-        result: file that a folder with earlier results holds.
+        result: name of the file by which earlier results are recognised.
     """
     try:
         if folder.exists() and not folder.is_dir():
             return "is a file; choose a folder"
         if (folder / result).exists():
-            return f"contains a {result} already; choose another folder"
+            return f"already contains {result}; choose another folder"
         folder.mkdir(parents=True, exist_ok=True)
-        # Permissions are no evidence: root ignores them, and a read-only file system overrides them.
+        # Permission bits prove nothing: root ignores them, and a read-only file system overrides them.
         with tempfile.TemporaryFile(dir=folder):
             return None
     except OSError as error:
-        return f"{error.strerror}; choose a folder that can be written to"
+        return f"{error.strerror}; choose a writable folder"

@@ -1,4 +1,4 @@
-"""`companion check`: run every check that a flight runs before it arms. Nothing moves, nothing is armed."""
+"""`companion check`: run every check that a flight runs before it arms. Nothing moves or is armed."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ GROUPS = {
     "mission": "Mission",
     "machine": "Computer",
 }
-"""Headings by the first part of a row's id."""
+"""Table heading for each first part of a row's id."""
 _MARK_WIDTH, _TITLE_WIDTH, _WIDTH_MAX, _GAP = 4, 34, 160, 2
 _STYLES = {"ok": "green", "WARN": "yellow", "FAIL": "bold red"}
 
@@ -120,7 +120,7 @@ def _rows(task: Task, plan: tuple[str, ...], scratch: Path, people: Console) -> 
     with contextlib.ExitStack() as stack:
         line = stack.enter_context(_Line(people))
         if task.sitl is not None:
-            line("the simulated world starts")
+            line("starting the simulated world")
             world = SitlProcess(task.config, scratch, px4=task.sitl == "px4")
             stack.callback(world.stop)
             config = replace_device_settings(config, world.devices(line.world))
@@ -159,7 +159,7 @@ def _recorder(config: FlightConfig, scratch: Path) -> str:
 
 
 class _Line:
-    """Progress display: one line with the current subject in a terminal, nothing elsewhere."""
+    """Shows the current check on one line of a terminal; shows nothing elsewhere."""
 
     def __init__(self, people: Console) -> None:
         self._status = people.status("companion check") if people.is_terminal else None
@@ -190,7 +190,7 @@ class _Line:
 
 
 def show(console: Console, rows: list[Row], task: Task) -> None:
-    """Print one table per device, the remedy below each failed row, and the verdict."""
+    """Print one table per device with a remedy below each failed row, then the verdict."""
     where = " (SITL)" if task.sitl is not None else ""
     build = ", compiled build" if COMPILED else ""
     title = f"{task.config.vehicle.name}{where}, mission '{task.config.mission.name}'{build}"
@@ -219,16 +219,16 @@ def show(console: Console, rows: list[Row], task: Task) -> None:
     console.print()
     verdict = Text()
     if refused:
-        verdict.append(f"{len(refused)} of {len(rows)} checks refuse: the machine may not fly.", style="bold red")
+        verdict.append(f"{len(refused)} of {len(rows)} checks failed: the vehicle may not fly.", style="bold red")
     else:
-        verdict.append(f"{len(rows)} checks: the machine may fly.", style="bold green")
+        verdict.append(f"{len(rows)} checks: the vehicle may fly.", style="bold green")
     if warned:
         verdict.append(f" {len(warned)} warnings.", style="yellow")
     console.print(verdict, soft_wrap=True)
 
 
 def _line(console: Console, mark: str, title: str, read: str, wanted: str, *, header: bool = False) -> Table:
-    """Return one row of the table. The measured value also uses the column of a missing expected value."""
+    """Return one row of the table. If there is no expected value, the measured value also uses its column."""
     width = min(console.width, _WIDTH_MAX)
     title_width = min(_TITLE_WIDTH, width // 3)
     left = max(20, width - _MARK_WIDTH - title_width - 4 * _GAP)
@@ -246,7 +246,7 @@ def _line(console: Console, mark: str, title: str, read: str, wanted: str, *, he
 
 
 def _under(row: Row) -> Padding:
-    """Return remedy and reason for a row that does not pass."""
+    """Return the remedy and the reason for a row that does not pass."""
     table = Table.grid(padding=(0, 1, 0, 0))
     if row.fix:
         table.add_row("->", Text(row.fix, style="bold"))

@@ -22,11 +22,11 @@ from companion.runtime.console import print_error
 from companion.runtime.tasks import until_first
 
 FOUND_S = 5.0
-"""Timeout for the broker and the first message of the vehicle."""
+"""Timeout for connecting to the broker and for the vehicle's first message."""
 _HELP = {
     CommandName.HOLD: "stop and hold position",
     CommandName.LAND: "land",
-    CommandName.ABORT: "abort the mission and land at once",
+    CommandName.ABORT: "abort the mission and land immediately",
     CommandName.RESUME: "continue after a hold, if the supervisor allows it",
     CommandName.START: "take off; for flights that wait for START",
 }
@@ -46,7 +46,7 @@ def add_parser(commands: Any) -> None:
         "--hold",
         type=int,
         metavar="N",
-        help="resume: number of the hold to end, as in the telemetry (default: the current hold)",
+        help="resume: with resume: number of the hold to end, as in the telemetry (default: the current hold)",
     )
     add_broker_options(command)
     command.set_defaults(run=run)
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     station = Station(
         access,
         signer,
-        None,  # all vehicles, so that a misspelt name can be reported with the others
+        None,  # all vehicles, so that the report of a misspelt name can list them
         lambda heard: commander.changed.set(),
         lambda connected, text: commander.changed.set(),
         topics=(Topic.STATE, Topic.ACK, Topic.STREAM),
@@ -111,8 +111,8 @@ class _Commander:
     async def _found(self, station: Station) -> str | None:
         """Return the vehicle to command; None if several are possible, which has been reported.
 
-        Retained messages arrive before the link reports that it is connected (`Station`, in_order): until then no vehicle counts as
-        missing.
+        Retained messages arrive before the link reports that it is connected (`Station`, in_order): until then no vehicle is
+        reported as missing.
         """
         connected_s: float | None = None
         while True:
@@ -120,16 +120,16 @@ class _Commander:
             known = station.tracker.vehicles
             if station.link.connected:
                 connected_s = connected_s or time.monotonic()
-                # A flying vehicle has sent a proven message by then, regardless of its state message.
+                # A flying vehicle has sent an authenticated message by then, whatever its state message says.
                 waited = time.monotonic() - connected_s > LIVE_S
                 names = [self._only] if self._only is not None else station.tracker.present(time.monotonic())
                 if len(names) > 1 and self._command in SAFER_COMMANDS:
                     if not waited:
-                        names = []  # a retained state is no proof of a flight
+                        names = []  # a retained state does not prove a flight
                     elif len(proven := station.tracker.proven(time.monotonic())) == 1:
                         others = ", ".join(name for name in names if name not in proven)
                         print_error(
-                            f"companion command: sent to {proven[0]}; no proven messages from: {others}; "
+                            f"companion command: sent to {proven[0]}; no authenticated messages from: {others}; "
                             "to command another: --vehicle NAME"
                         )
                         return proven[0]

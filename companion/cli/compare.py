@@ -1,4 +1,4 @@
-"""`companion compare`: controllers, presets, payloads and seeds in the fast loop, in the paper's table."""
+"""`companion compare`: compare controllers, presets, payloads and seeds in the fast loop, in the paper's table."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from companion.config.document import ConfigError
 from companion.sitl_config.loader import SitlConfig, load_sitl
 
 _OPTIONS = {"world.payload_kg": "--payloads", "world.seed": "--seeds", "world.model_error": "--model-error"}
-"""Options that replace overrides of keys that the grid sets."""
+"""Options to use instead of overriding the keys that the grid sets."""
 
 
 def add_parser(commands: Any) -> None:
@@ -22,8 +22,8 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "compare",
         help="compare controllers in the fast closed loop",
-        description="Fly a grid of controllers, presets, payloads and seeds in the fast closed loop and print the paper's table "
-        "with the printed values beside the results. A crash is a result, not an error.",
+        description="Fly a grid of controllers, presets, payloads and seeds in the fast closed loop and print the "
+        "results beside the values of the paper's table. A crash is a result, not an error.",
     )
     parser.add_argument(
         "--payloads", type=_payloads, default=(0.1, 0.2, 0.3), metavar="KG,...", help="default: 0.1,0.2,0.3"
@@ -38,8 +38,8 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--first-seed", type=count, default=1, metavar="N", help="first seed (default: 1)")
     parser.add_argument(
         "--model-error", type=_model_errors, metavar="SHARE,...",
-        help="shares by which masses, inertia and torque constants differ from the vehicle file, 0 to 0.3, e.g. 0,0.1,0.2,0.3 "
-        "(default: that of the world)",
+        help="fractions by which masses, inertia and torque constants differ from the vehicle file, 0 to 0.3, e.g. 0,0.1,0.2,0.3 "
+        "(default: the world's)",
     )  # fmt: skip
     parser.add_argument(
         "--adaptation", type=_adaptation, default=ADAPTATION[:1], metavar="on,off",
@@ -58,7 +58,7 @@ def _payloads(text: str) -> tuple[float, ...]:
 
 
 def _model_errors(text: str) -> tuple[float, ...]:
-    return _numbers(text, 0.3, "shares from 0 to 0.3")
+    return _numbers(text, 0.3, "fractions from 0 to 0.3")
 
 
 def _adaptation(text: str) -> tuple[str, ...]:
@@ -73,7 +73,7 @@ def _numbers(text: str, most: float, what: str) -> tuple[float, ...]:
     except ValueError:
         values = (math.nan,)
     if not all(0 <= value <= most for value in values):
-        raise argparse.ArgumentTypeError(f"expected {what} with commas between them, got '{text}'")
+        raise argparse.ArgumentTypeError(f"expected comma-separated {what}, got '{text}'")
     return tuple(dict.fromkeys(values))
 
 
@@ -114,7 +114,7 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
                 )
             )
         except ConfigError as error:
-            # A problem of the first variant usually affects all; a problem of a later one is its own.
+            # A problem of the first variant usually affects all; a problem of a later one affects only that one.
             raise ConfigError([f"{variant.label}: {line}" if configs else line for line in error.lines]) from None
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     model_errors = arguments.model_error or (configs[0].world.model_error,)

@@ -1,4 +1,4 @@
-"""`companion faults`: each fault in every phase of a mission, and the outcome of each flight."""
+"""`companion faults`: fly each fault in every phase of a mission and judge the flights."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "faults",
         help="fly a mission with every fault of the simulated world",
-        description="Fly a mission in the fast closed loop, or with --wires over real wires, with one fault per flight in every phase. "
-        "Exit code 0 only if every flight was completed or landed, no tether was pulled taut by the machine's own motion and nothing "
-        "left the room; otherwise 5.",
+        description="Fly a mission in the fast closed loop, or with --wires over the real protocols, with one fault "
+        "per flight, in every phase. Exit code 0 only if every flight was completed or landed, no "
+        "vehicle pulled its tether taut by its own motion and none left the room; otherwise 5.",
     )
     parser.add_argument(
         "mission", nargs="?", default=DEFAULT_MISSION, help=f"mission file, YAML (default: {DEFAULT_MISSION})"
     )
     parser.add_argument(
-        "--list", action="store_true", help="print the kinds of faults and the meaning of their sizes, without a flight"
+        "--list", action="store_true", help="print the kinds of faults and the meaning of their sizes; fly nothing"
     )
     kinds = _known(tuple(KINDS), "kind of fault")
     parser.add_argument("--kinds", type=kinds, default=(), metavar="KIND,...", help="default: all; see --list")
@@ -42,7 +42,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--wires",
         action="store_true",
-        help=f"fly {len(WIRES)} chosen faults with `companion fly --sitl`, a minute each",
+        help=f"fly {len(WIRES)} selected faults with `companion fly --sitl`, one minute each",
     )
     add_options(parser, one_law=True)
     add_seed(parser)
@@ -77,7 +77,7 @@ def _campaign(arguments: argparse.Namespace) -> Faults:
     """Check everything before the first flight.
 
     Raises:
-        ConfigError: one line per problem, or no fault is left to fly.
+        ConfigError: one line per problem; also if no fault is left to fly.
     """
     flights = planned(arguments.kinds, arguments.phases, wires=arguments.wires)
     if not flights:

@@ -13,21 +13,20 @@ from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.runtime.console import print_error
 
 _DIGITS = 4
-"""Digits of a printed or written hover thrust: 0.01 % of full thrust."""
+"""Decimal places of a printed or written hover thrust: 0.01 % of full thrust."""
 
 
 def add_parser(commands: Any) -> None:
     """Add `hover` to the sub-parsers of `companion`."""
-    hover = commands.add_parser("hover", help="hover thrust: fit it from a flight's log")
+    hover = commands.add_parser("hover", help="fit the hover thrust to a flight's log")
     parts = hover.add_subparsers(dest="part", required=True, metavar="PART")
     fit = parts.add_parser(
         "fit",
         help="fit the hover thrust to a log",
-        description="Fit the hover thrust of the machine without payload from the calm parts of a flight, and print the lines for "
-        "the vehicle file.",
+        description="Fit the hover thrust without payload to the steady parts of a flight, and print the lines for the vehicle file.",
     )
     fit.add_argument("log", type=Path, help="flight.mcap")
-    fit.add_argument("--json", action="store_true", help="print the result as JSON and nothing else")
+    fit.add_argument("--json", action="store_true", help="print only JSON: the result")
     fit.set_defaults(run=run)
 
 
@@ -71,7 +70,10 @@ def lines(fit: HoverFit, vehicle_file: str) -> list[str]:
         f"hover thrust      {fit.hover_thrust:.{_DIGITS}f} ± {fit.standard_error:.{_DIGITS}f} (standard error){at}, "
         f"from {fit.used_s:.1f} s of steady flight"
     ]
-    for name, value in (("flight began with", fit.configured), ("flight ended with", fit.last_estimate)):
+    for name, value in (
+        ("value at the start", fit.configured),
+        ("value at the end  ", fit.last_estimate),
+    ):
         relative = _relative(value, fit)
         if value is not None and relative is not None:
             compared.append(f"{name} {value:.{_DIGITS}f}, {100 * relative:+.2f} % of the fitted value")
@@ -87,7 +89,7 @@ def lines(fit: HoverFit, vehicle_file: str) -> list[str]:
 
 def _battery(fit: HoverFit) -> str:
     if fit.voltage_mean_v is None or fit.voltage_span_v is None:
-        return "voltage not always known, no slope fitted"
+        return "voltage not always known; no slope was fitted"
     about = f"{fit.voltage_mean_v:.2f} V on average, changed by {fit.voltage_span_v:.2f} V"
     if fit.slope is None:
         return f"{about}; {SLOPE_MIN_V:g} V or more are needed for a slope"
@@ -96,7 +98,7 @@ def _battery(fit: HoverFit) -> str:
 
 
 def _relative(value: float | None, fit: HoverFit) -> float | None:
-    """Return the relative difference of a value to the fitted one; positive if it is larger."""
+    """Return the relative difference between a value and the fitted one; positive if the value is larger."""
     return None if value is None else value / fit.hover_thrust - 1.0
 
 

@@ -1,4 +1,4 @@
-"""`companion install`: prepare the vehicle's computer for flights, show the changes, and revert them."""
+"""`companion install`: prepare the vehicle's computer for flights, preview the changes, and revert them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PROGRAM = "/opt/companion/.venv/bin/companion"
 _NAME = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
 _SERIAL = re.compile(r"[A-Za-z0-9._:+-]{1,64}")
 _HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
-"""Folders that the service cannot see (ProtectHome, PrivateTmp)."""
+"""Folders that are hidden from the service (ProtectHome, PrivateTmp)."""
 
 
 def add_parser(commands: Any) -> None:
@@ -41,13 +41,15 @@ def add_parser(commands: Any) -> None:
         "install",
         help="set up the vehicle's computer: service, adapter names and latency, limits, full clock; or undo it",
         description="Install companion as a systemd service that waits on the ground for an operator's START, with the settings that "
-        "its timing needs; show what is changed, and undo it exactly. Exit 0: done, or nothing to do; 2: wrong input; 3: failed, "
+        "its timing needs; show the changes, and undo them exactly. Exit 0: done, or nothing to do; 2: wrong input; 3: failed, "
         "nothing was changed; 4: cancelled.",
     )
     what = install.add_mutually_exclusive_group(required=True)
     what.add_argument("--systemd", action="store_true", help="install")
-    what.add_argument("--undo", action="store_true", help="restore the state before the first --systemd")
-    install.add_argument("--dry-run", action="store_true", help="only show the changes, with the content of every file")
+    what.add_argument("--undo", action="store_true", help="restore the state from before the first --systemd")
+    install.add_argument(
+        "--dry-run", action="store_true", help="only show the changes, with the contents of every file"
+    )
     install.add_argument("--yes", action="store_true", help="do not ask for confirmation")
     install.add_argument("--json", action="store_true", help="print only JSON; needs --yes or --dry-run")
     install.add_argument(
@@ -61,12 +63,14 @@ def add_parser(commands: Any) -> None:
     )
     install.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
     install.add_argument(
-        "--arm-serial", metavar="SERIAL", help="serial number of the arm's U2D2 (default: the one that is plugged in)"
+        "--arm-serial",
+        metavar="SERIAL",
+        help="serial number of the arm's U2D2 (default: of the one that is plugged in)",
     )
     install.add_argument(
         "--force-serial",
         metavar="SERIAL",
-        help="serial number of the force sensor's USB adapter (default: the one that is plugged in)",
+        help="serial number of the force sensor's USB adapter (default: of the one that is plugged in)",
     )
     install.add_argument("--at-boot", action="store_true", help="start the service at boot; it waits on the ground")
     install.add_argument("--program", metavar="FILE", help="companion executable of the service (default: this one)")
@@ -75,7 +79,7 @@ def add_parser(commands: Any) -> None:
         type=Path,
         default=Path("/"),
         metavar="DIR",
-        help="change the files of a system below DIR only, and run no command",
+        help="only change the files of a system below DIR, and run no commands",
     )
     install.set_defaults(run=run)
 
@@ -91,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
         return EXIT_BAD_INPUT
     if root == Path("/") and os.geteuid() != 0 and not arguments.dry_run:
         print_error(
-            f"companion install: needs root: sudo {os.path.abspath(sys.argv[0])} install ...; --dry-run does not"
+            f"companion install: needs root: sudo {os.path.abspath(sys.argv[0])} install ...; only --dry-run works without"
         )
         return EXIT_REFUSED
     try:
@@ -146,7 +150,7 @@ def _undo(arguments: argparse.Namespace, root: Path) -> int:
             for user in record.users:
                 print(f"removes the user {user}")
         return EXIT_OK
-    if not arguments.yes and not _agreed(f"Restore {len(paths)} files as they were?"):
+    if not arguments.yes and not _agreed(f"Restore {len(paths)} files to their previous contents?"):
         print_error("companion install: cancelled; nothing was changed")
         return EXIT_ABORTED
     apply.undo(root, (lambda _: None) if arguments.json else print)
@@ -246,7 +250,7 @@ def _summary(wanted: Plan, found: Changes, live: bool) -> Iterator[tuple[str, st
 
 
 def _shown(wanted: Plan, found: Changes, live: bool) -> Iterator[str]:
-    """Yield the summary with the content of every file."""
+    """Yield the summary with the contents of every file."""
     content = {item.path: item.content if item.link is None else f"-> {item.link}" for item in wanted.items}
     for path, line in _summary(wanted, found, live):
         yield line
@@ -267,7 +271,7 @@ def _afterwards(settings: Settings, live: bool) -> Iterator[str]:
         yield "Log in again before you fly from a shell: limits and groups are set at login."
     boot = ", and at boot" if settings.at_boot else ""
     yield f"It starts with: systemctl start companion{boot}. Then it waits for an operator's START."
-    yield "It stops with: systemctl stop companion; in the air it lands first. To undo everything: companion install --undo"
+    yield "It stops with: systemctl stop companion; a flying vehicle lands first. To undo everything: companion install --undo"
 
 
 def _as_json(wanted: Plan, found: Changes, live: bool, *, done: bool) -> dict[str, Any]:
@@ -291,7 +295,7 @@ def _agreed(question: str) -> bool:
 
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
-    """Context in which SIGTERM and SIGHUP act as Ctrl-C, so that unfinished changes are rolled back."""
+    """Context in which SIGTERM and SIGHUP act like Ctrl-C, so that unfinished changes are rolled back."""
 
     def stop(*_: object) -> None:
         raise KeyboardInterrupt

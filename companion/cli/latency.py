@@ -1,4 +1,4 @@
-"""`companion latency`: delay of motion capture to PX4, measured by taps on the airframe."""
+"""`companion latency`: measure the delay of motion capture to PX4 by tapping the airframe."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ def add_parser(commands: Any) -> None:
     """Add `latency` to the sub-parsers of `companion`."""
     latency = add_tool(
         commands, "latency", "companion.commissioning.latency.tools",
-        help="measure the delay of motion capture by taps on the airframe: EKF2_EV_DELAY",
-        description="Hold the machine up, disarmed, propellers off; a second person taps its frame. IMU and motion capture are "
-        "compared. Exit 0: EKF2_EV_DELAY is right; 3: it is not, or cannot be measured.",
+        help="measure the delay of motion capture (EKF2_EV_DELAY) by tapping the airframe",
+        description="Hold the vehicle up, disarmed, propellers off, while a second person taps its frame. IMU and "
+        "motion capture are compared. Exit 0: EKF2_EV_DELAY is right; 3: it is wrong or could not be "
+        "measured.",
         write="write EKF2_EV_DELAY to PX4, which must then be restarted",
     )  # fmt: skip
     latency.add_argument(
@@ -24,5 +25,5 @@ def add_parser(commands: Any) -> None:
         type=number(5.0, 600.0, " s"),
         default=90.0,
         metavar="N",
-        help="time to wait for the taps (default: 90)",
+        help="timeout for the taps (default: 90)",
     )

@@ -41,7 +41,7 @@ _WITH_MODULES = (
     ),
     *("broker", "report"),
 )
-"""Commands with a parser of their own, in `companion.cli.NAME`."""
+"""Commands whose parser is in `companion.cli.NAME`."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -105,9 +105,7 @@ def _normalised(argv: list[str]) -> list[str]:
 
 
 def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
-    """Return the parser of all commands, or of the one named by the first word of a command line, because loading all takes half a
-    second.
-    """
+    """Return the parser of the command that a command line names first, else of all commands, which take half a second to load."""
     parser = _Parser(
         prog="companion", description="Flies an aerial manipulator on PX4 with adaptive impedance control."
     )
@@ -118,9 +116,9 @@ def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
     fly.add_argument(
         "--sitl", metavar="stub|px4", help="fly in the simulated world: with the PX4 stub, or with a real PX4 (SITL)"
     )
-    fly.add_argument("--out", metavar="DIR", help="folder of log and report (default: flights/TIME-MISSION)")
+    fly.add_argument("--out", metavar="DIR", help="folder for log and report (default: flights/TIME-MISSION)")
     fly.add_argument(
-        "--no-report", action="store_true", help="write log and summary only; companion report writes the rest"
+        "--no-report", action="store_true", help="write only log and summary; companion report writes the rest"
     )
     fly.add_argument(
         "--mqtt", metavar="URL|off", help="broker for telemetry and commands (default: the vehicle file's)"
@@ -133,13 +131,13 @@ def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
     fly.add_argument(
         "--wait-for-start",
         action="store_true",
-        help="when everything is ready, wait on the ground until an operator commands start",
+        help="when ready, wait on the ground until an operator commands start",
     )
     fly.set_defaults(run=_fly)
 
     check = commands.add_parser(
         "check",
-        help="run all checks before a flight: devices, PX4's parameters, frames, mission; nothing moves",
+        help="run all preflight checks: devices, PX4's parameters, frames, mission; nothing moves",
         description="Run every check that a flight runs before it arms. Exit code 0: the vehicle may fly, 3: it may not.",
     )
     _add_flight_options(check, mission_default=True)
@@ -148,8 +146,8 @@ def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
         metavar="stub|px4",
         help="check the simulated world's devices, with the PX4 stub or a real PX4",
     )
-    check.add_argument("--hand", action="store_true", help="then do the guided hand test, for a new set-up")
-    check.add_argument("--json", action="store_true", help="print the rows as JSON and nothing else")
+    check.add_argument("--hand", action="store_true", help="then run the guided hand test, required for a new set-up")
+    check.add_argument("--json", action="store_true", help="print only JSON: the rows")
     check.add_argument("--plan-only", action="store_true", help="check only the mission, without devices")
     check.set_defaults(run=_check)
 
@@ -157,9 +155,9 @@ def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
     schema.add_argument("kind", choices=("mission", "vehicle", "controller", "world"))
     schema.set_defaults(run=lambda a: print(schema_json(a.kind)) or EXIT_OK)
 
-    sitl = commands.add_parser("sitl", help="run the simulated world alone, for QGroundControl or a user's script")
+    sitl = commands.add_parser("sitl", help="run only the simulated world, for QGroundControl or your own script")
     _add_flight_options(sitl, mission_default=True)
-    sitl.add_argument("--px4", action="store_true", help="with a real PX4 (SITL) instead of the stub")
+    sitl.add_argument("--px4", action="store_true", help="use a real PX4 (SITL) instead of the stub")
     sitl.set_defaults(run=_sitl)
 
     alone = bool(first) and first[0] in {"replay", *commands.choices, *_WITH_MODULES}
@@ -269,7 +267,7 @@ def _start_impossible(config: FlightConfig) -> list[str]:
 
 def _sitl(arguments: argparse.Namespace) -> int:
     config = _load(arguments, hardware=False)
-    # It replaces this process, so that signals reach the world itself and it cannot outlive a parent.
+    # The world replaces this process, so that signals reach it directly and it cannot outlive a parent.
     file = os.memfd_create("sitl-config", 0)
     os.write(file, config.model_dump_json().encode())
     command = [sys.executable, "-m", "sitl", "--config", f"/proc/self/fd/{file}"]

@@ -1,4 +1,4 @@
-"""`companion mocap check|align`: the stream of motion capture and its axes."""
+"""`companion mocap check|align`: check the motion-capture stream and find its axes."""
 
 from __future__ import annotations
 
@@ -23,13 +23,16 @@ def add_parser(commands: Any) -> None:
     check.add_argument(
         "--seconds", type=number(1.0, 600.0, " s"), default=10.0, metavar="N", help="duration (default: 10)"
     )
-    check.add_argument("--move", action="store_true", help="carry the vehicle meanwhile, to find its rigid body")
+    check.add_argument(
+        "--move", action="store_true", help="identify the vehicle's rigid body, while you carry the vehicle"
+    )
     align = add_tool(
         parts, "align", _TOOLS,
-        help="find the axes by hand: lift, forward, turn left",
-        description="The guided hand test, and the setting that explains its result. Battery in, disarmed, propellers off. Exit 0: the "
+        help="find the axes by moving the vehicle: lift, forward, turn left",
+        description="Run the guided hand test and name the setting that explains its result. Battery in, disarmed, "
+        "propellers off. Exit 0: the "
         "axes are right; 3: they are not; 4: cancelled.",
     )  # fmt: skip
     align.add_argument(
-        "mission", nargs="?", default=MISSION, help=f"mission whose start gives the yaw (default: {MISSION})"
+        "mission", nargs="?", default=MISSION, help=f"mission whose start defines the yaw (default: {MISSION})"
     )

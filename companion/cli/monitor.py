@@ -40,7 +40,7 @@ def add_parser(commands: Any) -> None:
     )
     monitor.add_argument("logs", nargs="*", type=Path, metavar="LOG", help="flight.mcap to view; needs no broker")
     add_broker_options(monitor)
-    monitor.add_argument("--view-only", action="store_true", help="allow no commands from this monitor")
+    monitor.add_argument("--view-only", action="store_true", help="do not allow commands from this monitor")
     monitor.add_argument("--text", action="store_true", help="show the vehicle in this terminal instead of a page")
     monitor.add_argument("--port", type=int, default=PORT, help="port of the page (default: %(default)s; 0: any)")
     monitor.add_argument(
@@ -61,10 +61,12 @@ def add_broker_options(parser: argparse.ArgumentParser) -> None:
         "--broker", metavar="URL", default=Mqtt().url, help="mqtt[s]://HOST:PORT (default: %(default)s)"
     )
     parser.add_argument("--login", metavar="FILE", help="YAML file with username and password")
-    parser.add_argument("--ca", metavar="FILE", help="certificates (PEM) of the authority that signed the broker's")
-    parser.add_argument("--operator", metavar="NAME", help="operator who commands (default: the only one in the file)")
+    parser.add_argument("--ca", metavar="FILE", help="CA certificates (PEM) to verify the broker's certificate")
+    parser.add_argument(
+        "--operator", metavar="NAME", help="operator who signs commands (default: the only one in the file)"
+    )
     parser.add_argument("--operators", metavar="FILE", help="file of operator keys (default: this user's own)")
-    parser.add_argument("--vehicle", metavar="NAME", help="only this vehicle")
+    parser.add_argument("--vehicle", metavar="NAME", help="show only this vehicle")
 
 
 def vehicle_option(arguments: argparse.Namespace) -> str | None:
@@ -76,7 +78,7 @@ def vehicle_option(arguments: argparse.Namespace) -> str | None:
     name: str | None = arguments.vehicle
     if name is not None and VEHICLE_NAME.fullmatch(name) is None:
         raise ConfigError(
-            [f"--vehicle {name!r:.60}: expected the vehicle's name in topics: letters, digits, '_', '-' or '.'"]
+            [f"--vehicle {name!r:.60}: expected a vehicle name as used in topics: letters, digits, '_', '-' or '.'"]
         )
     return name
 
@@ -98,7 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _Refusal(Exception):
-    """A package, port or file that is needed is not available; one line for the user."""
+    """A required package, port or file is not available. The text is one line for the user."""
 
 
 async def until_signal(work: Coroutine[Any, Any, Any]) -> None:
@@ -111,14 +113,16 @@ async def until_signal(work: Coroutine[Any, Any, Any]) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """Check the options against each other.
+    """Check that the options are compatible.
 
     Raises:
         ConfigError: one line.
     """
     if arguments.text and arguments.logs:
         raise ConfigError(
-            ["companion monitor: --text shows a running flight only; for logs use the page or companion report"]
+            [
+                "companion monitor: --text shows only live flights; to view logs, leave out --text or use companion report"
+            ]
         )
     if not 0 <= arguments.port <= 65535:
         raise ConfigError([f"companion monitor: --port {arguments.port}: expected 0 to 65535"])
@@ -163,7 +167,7 @@ def _serve(arguments: argparse.Namespace) -> None:
 
 
 def _read(paths: Sequence[Path]) -> list[ReplayLog]:
-    """Read the logs before serving: a log of an hour takes one to two minutes, and Ctrl-C ends it."""
+    """Read the logs before serving the page: a log of an hour takes one to two minutes, and Ctrl-C cancels it."""
     from companion.ground.station.replay_log import read_for_page
 
     logs = []

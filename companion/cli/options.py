@@ -21,7 +21,7 @@ def add_world(parser: argparse.ArgumentParser, default: str | None = DEFAULT_WOR
         "--world",
         default=default,
         metavar=f"{'|'.join(WORLDS)}|FILE",
-        help=f"the simulated world, built in or from a file (default: {default or 'robustness; with --cases: ideal'})",
+        help=f"simulated world: a built-in name or a file (default: {default or 'robustness; with --cases: ideal'})",
     )
 
 
@@ -34,7 +34,7 @@ def add_seed(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=_seed_override,
         metavar="N",
-        help="seed of the simulated world: draws another laboratory and other noise (short for --set world.seed=N)",
+        help="seed of the simulated world: another seed draws another laboratory and other noise (short for --set world.seed=N)",
     )
 
 

@@ -1,4 +1,4 @@
-"""Progress bar while a mission is planned and checked. It appears in a terminal if planning takes long."""
+"""Progress bar while a mission is planned and checked; shown in a terminal if planning takes long."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class PlanningProgress:
             self._progress.stop()
 
     def __call__(self, share: float) -> None:
-        """Show the completed share, 0 to 1."""
+        """Show the completed fraction, 0 to 1."""
         if not self._visible or self._now_s() - self._start_s < SHOW_AFTER_S:
             return
         self._progress.update(self._task, completed=share)

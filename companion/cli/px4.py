@@ -50,7 +50,7 @@ def add_parser(commands: Any) -> None:
     where.add_argument(
         "--vehicle", metavar="FILE", default=VEHICLE, help=f"vehicle file with PX4's address (default: {VEHICLE})"
     )
-    where.add_argument("--address", help="MAVSDK's, e.g. udpin://0.0.0.0:14540")
+    where.add_argument("--address", help="address in MAVSDK's notation, e.g. udpin://0.0.0.0:14540")
     params.add_argument(
         "--backup", type=Path, metavar="FILE", help="file for the old values (default: px4_TIME.params)"
     )
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 async def _run(arguments: argparse.Namespace, wanted: dict[str, Value], device: AutopilotDevice, source: str) -> int:
     from companion.io.px4.driver import (
-        MavsdkAutopilot,  # MAVSDK's library takes a moment to load, so not every command imports it
+        MavsdkAutopilot,  # MAVSDK's library is slow to load, so not every command imports it
     )
 
     async with MavsdkAutopilot(device, flight_clock()) as autopilot:
@@ -114,8 +114,8 @@ async def _armed(autopilot: MavsdkAutopilot) -> bool:
 
 
 def _back_up(path: Path, differences: Sequence[Difference], firmware: str, source: str) -> str | None:
-    """Save the old values. Return None, or the reason why nothing may be written."""
-    heading = [f"Values of {firmware} before {source} was written.", ""]
+    """Save the old values; return why nothing may be written, or None if they are saved."""
+    heading = [f"Values in {firmware} of the parameters that {source} changes, before writing.", ""]
     text = params_file.text({difference.name: difference.px4 for difference in differences}, heading)
     try:
         with path.open("x", encoding="utf-8") as file:
@@ -123,9 +123,7 @@ def _back_up(path: Path, differences: Sequence[Difference], firmware: str, sourc
     except FileExistsError:
         return f"--backup {path}: already exists; choose another name (nothing was written)"
     except OSError as error:
-        return (
-            f"--backup {path}: {error.strerror or error}; choose a place that can be written to (nothing was written)"
-        )
+        return f"--backup {path}: {error.strerror or error}; choose a writable path (nothing was written)"
     return None
 
 
@@ -172,9 +170,9 @@ def lines(comparison: Comparison, result: WriteResult | None) -> list[str]:
     ]
     shown += [f"{name:16}  PX4 does not have it" for name in comparison.absent]
     differ = len(shown)
-    shown += [f"{name:16}  no such serial port in this PX4, left out" for name in comparison.absent_port]
+    shown += [f"{name:16}  this PX4 has no such serial port; skipped" for name in comparison.absent_port]
     shown += [
-        f"{d.name:16}  {value_text(d.px4):>12}, measured on each installation, left unchanged (the file has {value_text(d.file)})"
+        f"{d.name:16}  {value_text(d.px4):>12}, measured for each vehicle and left unchanged (the file has {value_text(d.file)})"
         for d in comparison.measured
     ]
     if result is None:
@@ -187,5 +185,5 @@ def lines(comparison: Comparison, result: WriteResult | None) -> list[str]:
     if reboot:
         shown.append(f"reboot PX4: {', '.join(reboot)}")
     if any(difference.reboot is None for difference in result.written):
-        shown.append("it is unknown whether parameters beyond this project's own need a reboot")
+        shown.append("whether parameters other than this project's need a reboot is unknown")
     return shown

@@ -1,4 +1,4 @@
-"""`companion report`: summary and report of a log; one page side by side for several logs."""
+"""`companion report`: write summary and report of a log, or one side-by-side page for several logs."""
 
 from __future__ import annotations
 
@@ -32,10 +32,12 @@ def add_parser(commands: Any) -> None:
     report = commands.add_parser(
         "report",
         help="write summary and report of a log, or compare several flights side by side",
-        description=f"One log: write its summary and report again. Two to {FLIGHTS_MAX} logs: write one page with what was flown, "
-        "the settings that differ, all figures, and plots of all flights over each other.",
+        description=f"One log: write its summary and report again. Two to {FLIGHTS_MAX} logs: write one page with "
+        "the missions, the settings that differ, all metrics, and plots that overlay all flights.",
     )
-    report.add_argument("log", type=Path, nargs="+", help="flight.mcap; several: side by side, compared with the first")
+    report.add_argument(
+        "log", type=Path, nargs="+", help="flight.mcap; several logs are compared with the first, side by side"
+    )
     report.add_argument(
         "--out",
         metavar="DIR",
@@ -44,7 +46,7 @@ def add_parser(commands: Any) -> None:
     report.add_argument(
         "--align",
         choices=("catch", "takeoff", "start"),
-        help="several logs: zero of the common time axis (default: the catch if all have one, else the take-off)",
+        help="several logs: zero of the common time axis (default: the catch if all flights have one, else take-off)",
     )
     report.add_argument(
         "--gif",
@@ -55,22 +57,22 @@ def add_parser(commands: Any) -> None:
     report.add_argument(
         "--json",
         action="store_true",
-        help="print the summary or comparison as JSON and nothing else; write files only with --out",
+        help="print only JSON: the summary or comparison; write files only with --out",
     )
     report.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read and grade the logs and write the report; return the exit code.
+    """Read and evaluate the logs, and write the report; return the exit code.
 
     Raises:
-        ConfigError: one line on what the user must change.
+        ConfigError: one line that says what the user must change.
     """
     logs: list[Path] = arguments.log
     if arguments.out is not None and not arguments.out.strip():
         raise _refusal("--out: expected the name of a folder, got an empty one")
     if len(logs) > FLIGHTS_MAX:
-        raise _refusal(f"{len(logs)} logs: expected at most {FLIGHTS_MAX}, more cannot be distinguished in one plot")
+        raise _refusal(f"{len(logs)} logs: expected at most {FLIGHTS_MAX}: more cannot be distinguished in one plot")
     if arguments.align is not None and len(logs) == 1:
         raise _refusal("--align: expected two or more logs, got one")
     if arguments.gif is not None and len(logs) > 1:
@@ -99,7 +101,7 @@ class Graded:
 
 
 def graded(path: Path) -> Graded:
-    """Read a log and grade it. Facts that only the flight's launcher knew come from the summary beside the log.
+    """Read and evaluate a log. What only the flight's launcher knew comes from the summary beside the log.
 
     Raises:
         LogError: the file is not a log.
@@ -119,30 +121,26 @@ def graded(path: Path) -> Graded:
         "world": known.get("world"),
         "autopilot": known.get("autopilot") or autopilot_of(log, {}),
     }
-    # The guardian acts after the last tick: its events are not in the outputs of the core.
+    # The guardian acts after the last tick, so its events are not in the core's outputs.
     recorded_ids = {event["id"] for event in summary["events"]}
     summary["events"] = summary["events"] + [e for e in known.get("events", ()) if e["id"] not in recorded_ids]
     return Graded(log, summary, note)
 
 
 def _known(path: Path, own: dict[str, Any]) -> tuple[dict[str, Any], str | None]:
-    """Return the summary beside the log, and a note if it cannot be used: a copied log may lie beside another flight's summary."""
+    """Return the summary beside the log, and a note if it is not used: beside a copied log there may be another flight's summary."""
     try:
         known = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return {}, None
     except (OSError, ValueError) as error:
-        return {}, f"{path}: cannot be read ({error}); outcome and payload are not taken from it"
+        return {}, f"{path}: cannot be read ({error}); outcome and payload are unknown"
     try:
         times = {event["t_s"] for event in known["events"]}
         same = known["loop"]["ticks"] == own["loop"]["ticks"] and times >= {event["t_s"] for event in own["events"]}
     except (KeyError, TypeError):
-        return {}, f"{path}: is not a summary of a flight; outcome and payload are not taken from it"
-    return (
-        (known, None)
-        if same
-        else ({}, f"{path}: is the summary of another flight; outcome and payload are not taken from it")
-    )
+        return {}, f"{path}: is not the summary of a flight; outcome and payload are unknown"
+    return (known, None) if same else ({}, f"{path}: is the summary of another flight; outcome and payload are unknown")
 
 
 def _setting(log: FlightLog, name: str) -> str:
@@ -185,7 +183,7 @@ def _write_gif(flight: Graded, path: Path) -> None:
     movie = movie_of(flight.log, flight.summary)
     if movie is None:
         raise _refusal(
-            f"{flight.log.path}: the vehicle did not take off, or the log lacks its geometry; there is no animation"
+            f"{flight.log.path}: the vehicle did not take off, or the log lacks its geometry: no animation was made"
         )
     try:
         write_gif(movie, path)
@@ -249,12 +247,12 @@ def names_of(paths: Sequence[Path]) -> list[str]:
 
 
 def _folder(asked: str | None, flights: Sequence[Flight]) -> Path:
-    """Return the output folder, which must not contain a report of other flights."""
+    """Return the output folder; reject one that contains a report of other flights."""
     digests = [flight.digest for flight in flights]
     if asked is not None:
         folder = Path(asked)
         if _holds_others(folder, digests):
-            raise _refusal(f"--out {folder}: contains a {RESULT} of other flights already; choose another folder")
+            raise _refusal(f"--out {folder}: already contains a {RESULT} of other flights; choose another folder")
         return folder
     name = "-vs-".join(flight.name.replace("/", "-") for flight in flights)
     if len(name.encode()) > _NAME_BYTES_MAX:

@@ -1,4 +1,4 @@
-"""`companion robustness`: one mission in many worlds drawn at random, in the fast loop."""
+"""`companion robustness`: fly a mission in many randomly drawn worlds, in the fast loop."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ def add_parser(commands: Any) -> None:
     """Add `robustness` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "robustness",
-        help="fly a mission in many worlds drawn at random",
-        description="Fly a mission in the fast closed loop in worlds drawn at random: payload, throw and catch point, and everything "
-        "that the world's seed draws. A key of world. that --set sets is not drawn. Exit code 5 if any flight crashed or was lost.",
+        help="fly a mission in many randomly drawn worlds",
+        description="Fly a mission in the fast closed loop in randomly drawn worlds: payload, throw, catch point, "
+        "and everything that the world's seed determines. A key of the section world that --set sets is "
+        "not drawn. Exit code 5 if any flight crashed or was lost.",
     )
     parser.add_argument("mission", nargs="?", help=f"mission file, YAML (default: {DEFAULT_MISSION})")
     parser.add_argument("--draws", type=count, default=500, metavar="N", help="number of flights (default: 500)")
@@ -31,13 +32,13 @@ def add_parser(commands: Any) -> None:
         default=[],
         type=_model_error_override,
         metavar="SHARE",
-        help="share by which masses, inertia and torque constants differ from the vehicle file, 0 to 0.3 "
-        "(short for --set world.model_error=SHARE)",
+        help="fraction by which masses, inertia and torque constants differ from the vehicle file, 0 to 0.3 (short "
+        "for --set world.model_error=FRACTION)",
     )
     parser.add_argument("--cases", metavar="FILE", help="fly the cases of this file instead of draws")
     parser.add_argument("--case", action="append", default=[], metavar="NAME", help="only this case of --cases")
     parser.add_argument(
-        "--keep", metavar="FILE", help="write the ten worst draws, or the flown cases, and their results to FILE"
+        "--keep", metavar="FILE", help="write the ten worst draws, or the flown cases, with their results to FILE"
     )
     add_options(parser, one_law=True, world=None)
     parser.set_defaults(run=run)
@@ -45,7 +46,7 @@ def add_parser(commands: Any) -> None:
 
 def _number(text: str) -> int:
     if not text.isdecimal() or len(text) > 9:
-        raise argparse.ArgumentTypeError(f"expected a number of 0 or more, got '{text}'")
+        raise argparse.ArgumentTypeError(f"expected a whole number, 0 or greater, got '{text}'")
     return int(text)
 
 
@@ -74,7 +75,7 @@ def _campaign(arguments: argparse.Namespace) -> Robustness:
         if not cases:
             raise ConfigError([f"{arguments.cases}: cases: expected at least one case, found none"])
     mission = arguments.mission or (kept.mission if kept is not None else DEFAULT_MISSION)
-    # The preset of the file belongs to its law.
+    # The file's preset belongs to the file's control law.
     preset = arguments.preset or (kept.preset if kept is not None and arguments.controller is None else None)
     law = arguments.controller or (kept.controller if kept is not None else None)
     # A case contains its whole world.

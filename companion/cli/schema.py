@@ -23,10 +23,10 @@ KINDS: dict[str, TypeAdapter[Any]] = {
 
 
 class _Brief(GenerateJsonSchema):
-    """Leaves out the titles of fields, which repeat their keys, and writes the schema of a vector's elements once."""
+    """Generates schemas without titles of fields, which repeat the keys, and with the schema of a vector's elements only once."""
 
     def field_title_should_be_set(self, schema: Any) -> bool:
-        """Return False."""
+        """Return False: fields get no title."""
         return False
 
     def tuple_schema(self, schema: Any) -> dict[str, Any]:

@@ -216,7 +216,7 @@ CASES = "mission: a.yaml\ncontroller: adaptive\npreset: paper\ncases: []\n"
         (("compare", "--set", "controller.rho_maxx=2"), r"^--set controller\.rho_maxx: unknown key"),
         (("compare", "--mission", "nofile.yaml"), r"^nofile\.yaml: no such file$"),
         (("compare", "--out", ""), r"^companion compare: --out .*empty"),
-        (("compare", "--out", "taken"), r"^companion compare: --out taken: contains a compare\.json already"),
+        (("compare", "--out", "taken"), r"^companion compare: --out taken: already contains compare\.json"),
         (("faults", "--kinds", "mocap_los"), r"there is no kind of fault 'mocap_los'; did you mean 'mocap_loss'\?"),
         (("faults", "--phases", "lunch"), r"there is no phase 'lunch'"),
         (("faults", "--set", "world.faults=[]"), r"the campaign sets it; use --kinds and --phases"),

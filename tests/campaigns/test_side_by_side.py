@@ -476,7 +476,7 @@ def test_a_comparison_of_other_flights_is_never_overwritten(flights: Path, capsy
     capsys.readouterr()
     assert main(["report", WHOLE, SHORT, "--out", "x"]) == EXIT_BAD_INPUT
     assert capsys.readouterr().err == (
-        "companion report: --out x: contains a side_by_side.json of other flights already; choose another folder\n"
+        "companion report: --out x: already contains a side_by_side.json of other flights; choose another folder\n"
     )
     assert contents(flights / "x") == held
     assert main(["report", WHOLE, GAINS, "--out", "x"]) == EXIT_OK
@@ -512,7 +512,7 @@ def test_json_is_printed_alone_and_nothing_is_written(flights: Path, capsys: pyt
         (("flights/whole/summary.json", WHOLE), r"flights/whole/summary\.json: is not an MCAP file; .*"),
         ((WHOLE, "damaged.mcap"), r"damaged\.mcap: damaged: .*"),
         ((WHOLE, "flights"), r"flights: cannot be read: Is a directory"),
-        ((WHOLE,) * 7, r"companion report: 7 logs: expected at most 6, .*"),
+        ((WHOLE,) * 7, r"companion report: 7 logs: expected at most 6: .*"),
         ((WHOLE, SHORT, "--align", "catch"), rf"{SHORT}: --align catch: there is no catch in this flight"),
         ((WHOLE, "--align", "catch"), r"companion report: --align: expected two or more logs, got one"),
         ((WHOLE, GAINS, "--out", ""), r"companion report: --out: expected the name of a folder, got an empty one"),
@@ -561,7 +561,7 @@ def test_a_summary_beside_the_log_that_is_of_another_flight_is_rejected(
     one, other = (flight["summary"] for flight in json.loads(out)["flights"])
     assert (one["outcome"], one["payload_kg"]) == ("crashed", 0.25)
     assert (other["outcome"], other["payload_kg"]) == ("lost", None)
-    assert err == "summary.json: is the summary of another flight; outcome and payload are not taken from it\n"
+    assert err == "summary.json: is the summary of another flight; outcome and payload are unknown\n"
 
 
 @pytest.mark.parametrize("text", ["{", '{"loop": 3, "events": []}'])
@@ -572,7 +572,7 @@ def test_a_damaged_summary_beside_the_log_costs_one_line_and_no_more(
     capsys.readouterr()
     assert main(["report", WHOLE, GAINS, "--json"]) == EXIT_OK
     out, err = capsys.readouterr()
-    assert re.fullmatch(r"flights/whole/summary\.json: .*; outcome and payload are not taken from it\n", err)
+    assert re.fullmatch(r"flights/whole/summary\.json: .*; outcome and payload are unknown\n", err)
     assert (
         json.loads(out)["flights"][0]["summary"]["loop"]["ticks"]
         == json.loads(out)["flights"][1]["summary"]["loop"]["ticks"]

@@ -105,7 +105,7 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "model error that is too large": (
         ("compare", "--model-error", "0,0.4"),
-        (r"--model-error: expected shares from 0 to 0\.3",),
+        (r"--model-error: expected comma-separated fractions from 0 to 0\.3",),
     ),
     "model error of draws that is too large": (
         ("robustness", "mission.yaml", "--model-error", "0.4"),
@@ -149,12 +149,12 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "out is a file": (("fly", "mission.yaml", "--sitl", "--out", "vehicle.yaml"), (r"--out vehicle\.yaml: is a file",)),
     "out is below a file": (
         ("fly", "mission.yaml", "--sitl", "--out", "vehicle.yaml/a"),
-        (r"--out vehicle\.yaml/a: Not a directory; choose a folder",),
+        (r"--out vehicle\.yaml/a: Not a directory; choose a writable folder",),
     ),
     # The one folder that neither root nor anybody else can write to.
     "out cannot be written": (
         ("fly", "mission.yaml", "--sitl", "--out", "/proc"),
-        (r"--out /proc: .*; choose a fold",),
+        (r"--out /proc: .*; choose a writable fold",),
     ),
     "replay of nothing": (("replay", "nofile.mcap"), (r"^nofile\.mcap: cannot be read: No such file",)),
     "replay of no log": (("replay", "mission.yaml"), (r"^mission\.yaml: ",)),
@@ -264,7 +264,7 @@ def test_bad_file(sandbox: Sandbox, companion: Command, case: str, command: str)
 def test_a_folder_that_holds_a_flight_is_not_touched(sandbox: Sandbox, companion: Command) -> None:
     (sandbox.cwd / "out").mkdir()
     (sandbox.cwd / "out/flight.mcap").write_bytes(b"an earlier flight")
-    assert_refused(sandbox, companion, FLY, (r"--out out: contains a flight\.mcap already; choose another folder",))
+    assert_refused(sandbox, companion, FLY, (r"--out out: already contains flight\.mcap; choose another folder",))
 
 
 def test_the_good_files_that_the_bad_ones_are_made_of_pass(sandbox: Sandbox) -> None:

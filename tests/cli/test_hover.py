@@ -46,7 +46,7 @@ def test_it_prints_the_truth_and_what_to_write_into_the_vehicle_file(
     assert float(value[1]) == pytest.approx(flown[1], rel=0.005)
     assert 0.0 < float(value[2]) < 0.002
     assert float(value[3]) > 10.0
-    began = re.search(r"^flight began with 0\.\d{4}, \+(\d\.\d\d) % of the fitted value$", out, re.M)
+    began = re.search(r"^value at the start 0\.\d{4}, \+(\d\.\d\d) % of the fitted value$", out, re.M)
     assert began is not None, out
     assert float(began[1]) == pytest.approx(100 * ERROR, abs=0.5)
     assert "V or more are needed for a slope" in out
@@ -122,7 +122,7 @@ def test_a_slope_is_reported_with_the_voltage_that_the_value_holds_for() -> None
     )
     told = lines(fit, "my_vehicle.yaml")
     assert told[0] == "hover thrust      0.4912 ± 0.0003 (standard error) at 15.62 V, from 31.2 s of steady flight"
-    assert told[1] == "flight began with 0.5000, +1.79 % of the fitted value"
+    assert told[1] == "value at the start 0.5000, +1.79 % of the fitted value"
     assert told[3].endswith("15.62 V on average, changed by 1.40 V; slope -0.0210 ± 0.0008 per V")
     assert told[-3:] == ["# my_vehicle.yaml", "airframe:", "  hover_thrust: 0.4912"]
     assert jsonable(fit)["slope_per_v"] == -0.021

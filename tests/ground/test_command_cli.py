@@ -160,7 +160,7 @@ async def test_a_state_that_was_left_behind_keeps_nobody_from_making_it_safer(
         ended = await command(capsys, name, broker, keys)
         assert (ended.code, ended.out) == (EXIT_OK, f"rig: {name}: {name}: done\n")
         assert ended.err_lines == [
-            "companion command: sent to rig; no proven messages from: quiet-49; to command another: --vehicle NAME"
+            "companion command: sent to rig; no authenticated messages from: quiet-49; to command another: --vehicle NAME"
         ]
         assert [heard.command.value for heard in vehicle.accepted] == [name]
 
@@ -181,7 +181,7 @@ async def leave_states(broker: Broker) -> None:
     [
         (["jump"], "invalid choice: 'jump'"),
         (["hold", "--broker", "http://x"], "--broker: expected mqtt://"),
-        (["hold", "--vehicle", "a/b"], "--vehicle 'a/b': expected the vehicle's name"),
+        (["hold", "--vehicle", "a/b"], "--vehicle 'a/b': expected a vehicle name"),
         (["hold", "--operators", "nofile.yaml"], "nofile.yaml: no such file"),
         (["hold", "--broker", "mqtt://192.0.2.1"], "is not encrypted"),
         (["hold", "--login", "nofile.yaml"], "nofile.yaml: no such file"),

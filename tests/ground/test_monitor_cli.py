@@ -129,7 +129,7 @@ def test_mistakes(tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str])
         ([str(foreign)], f"{foreign}: is not an MCAP file"),
         ([str(empty)], f"{empty}: is empty"),
         ([str(log), str(foreign)], f"{foreign}: is not an MCAP file"),
-        ([str(log), "--text"], "--text shows a running flight"),
+        ([str(log), "--text"], "--text shows only live flights"),
         (["--port", "70000"], "--port 70000: expected 0 to 65535"),
         (["--cert", str(cert)], "--cert and --key must be given together"),
         (["--cert", str(cert), "--key", "nofile.pem"], "--key nofile.pem: cannot be read"),

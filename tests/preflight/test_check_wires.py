@@ -72,7 +72,7 @@ def test_a_wrong_setting_refuses_the_check_and_the_flight(sandbox: Sandbox, tmp_
     with sandbox_in(tmp_path / "world") as around, World(around, CATCH, wrong) as world:
         shown = sandbox.run("check", CATCH, *world.addresses())
         assert (shown.code, shown.err) == (EXIT_REFUSED, ""), shown
-        assert "3 of " in shown.out and "the machine may not fly." in shown.out
+        assert "3 of " in shown.out and "the vehicle may not fly." in shown.out
         assert "-> set COM_OBL_RC_ACT to 4" in shown.out
 
         flown = sandbox.run("fly", CATCH, "--out", "out", *world.addresses())
