@@ -1,6 +1,7 @@
 """All monitors of one flight: trackers take each tick's inputs, then the loop evaluates the event table. Pure.
 
-A new monitor is a row in `companion.safety.rules` and a predicate in the module of its subject (`arm`, `px4`, `mocap`, `flight`)."""
+`companion.safety` says where a new rule begins.
+"""
 
 from __future__ import annotations
 

@@ -108,6 +108,15 @@ def test_links_and_file_names_exist(page: Path) -> None:
     assert wrong == []
 
 
+def test_files_to_begin_in_exist_and_hold_the_names_in_brackets() -> None:
+    for cells in table(ROOT / "docs/architecture.md", "to change"):
+        for path, name in re.findall(r"`(\w+/[^`]+)`(?: \(`(\w+)`\))?", " ".join(cells)):
+            assert (ROOT / path).exists() and (not name or re.search(rf"\b{name}\b", text_of(ROOT / path))), (
+                path,
+                name,
+            )
+
+
 def test_pictures_are_small() -> None:
     pictures = list((ROOT / "docs/pictures").glob("*"))
     assert pictures

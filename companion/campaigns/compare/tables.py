@@ -1,7 +1,4 @@
-"""The tables of `companion compare`, on the terminal and as a page, and their columns.
-
-A new figure is measured in `sitl.campaigns.flights`, summarised by `companion.campaigns.compare.aggregate.FIGURES`, and shown here.
-"""
+"""The tables of `companion compare`, on the terminal and as a page, and their columns."""
 
 from __future__ import annotations
 
