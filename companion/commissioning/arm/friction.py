@@ -26,6 +26,8 @@ BIN_S: Final = 0.25
 """Samples are averaged over this time, because those of neighbouring control ticks are not independent."""
 BINS_MIN: Final = 12
 LEVEL_DEG: Final = 2.0
+HUBER: Final = 2.0
+"""Residual, in standard deviations by the median, from which a bin loses weight."""
 CONSTANT_ERROR_MAX: Final = 0.05
 """Relative standard error beyond which a torque constant is unknown."""
 FRICTION_ERROR_MAX_NM: Final = 0.015
@@ -146,18 +148,27 @@ def fit_joint(samples: Sequence[Sample], vehicle: Vehicle, joint: int) -> JointF
     rows, currents, chains = _binned(samples, vehicle, joint)
     if len(currents) < BINS_MIN:
         return None
-    # Repeated, because the weight of the prior depends on the scatter of the currents.
-    scatter, theta, covariance = 0.01, np.zeros(4), np.eye(4)
-    for _ in range(3):
+    # Repeated, because the weights and that of the prior depend on the scatter of the currents.
+    scatter, theta, covariance, weights = 0.01, np.zeros(4), np.eye(4), np.ones(len(currents))
+    for _ in range(8):
         prior = np.array([[0.0, 0.0, 0.0, scatter / math.radians(LEVEL_DEG) * vehicle.arm.torque_per_amp_nm_a]])
-        design, wanted = np.vstack([rows, prior]), np.append(currents, 0.0)
+        root = np.sqrt(weights)
+        design, wanted = np.vstack([rows * root[:, None], prior]), np.append(currents * root, 0.0)
         inverse = np.linalg.pinv(design.T @ design)
         theta = inverse @ design.T @ wanted
         residual = currents - rows @ theta
-        freedom = max(1, len(currents) - 3)
-        scatter = max(1e-4, math.sqrt(float(residual @ residual) / freedom))
-        covariance = scatter**2 * _inflation(residual, chains) * inverse
+        weights = _huber(residual)
+        clipped = weights * residual
+        freedom = max(1.0, (len(currents) - 3) * float(np.mean(weights == 1.0)) ** 2)
+        scatter = max(1e-4, math.sqrt(float(clipped @ clipped) / freedom))
+        covariance = scatter**2 * _inflation(clipped, chains) * inverse
     return _as_joint_fit(theta, covariance, rows, scatter)
+
+
+def _huber(residual: _Array) -> _Array:
+    """Return Huber's weights: a touched arm or a computer that was held up for a moment must not decide the fit."""
+    spread = 1.4826 * float(np.median(np.abs(residual)))
+    return np.minimum(1.0, HUBER * spread / np.maximum(np.abs(residual), 1e-9))
 
 
 def _binned(samples: Sequence[Sample], vehicle: Vehicle, joint: int) -> tuple[_Array, _Array, list[int]]:

@@ -19,6 +19,8 @@ REACH_DEG: Final = ((-30.0, 30.0), (-5.0, 70.0))
 REACH_MIN_DEG: Final = 20.0
 SETTLED_S: Final = 0.4
 """Time at constant speed before a sample counts."""
+HELD_UP_S: Final = 0.1
+"""After a longer gap between two samples the joint has to settle again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +96,7 @@ class Sweeper:
         self.samples: list[Sample] = []
         self._leg = -1
         self._steady_since_s: float | None = None
+        self._stamp_s = 0.0
 
     def begin(self, state: ArmState) -> list[Vec2]:
         """Return every pose from here to the end of the last leg."""
@@ -129,8 +132,9 @@ class Sweeper:
         if not leg.counts or abs(abs(rate) - math.radians(leg.speed_deg_s)) > 1e-9:
             self._steady_since_s = None
             return
-        if self._steady_since_s is None:
+        if self._steady_since_s is None or state.stamp_s - self._stamp_s > HELD_UP_S:
             self._steady_since_s = state.stamp_s
+        self._stamp_s = state.stamp_s
         if state.stamp_s - self._steady_since_s < SETTLED_S:
             return
         if self.samples and self.samples[-1].t_s == state.stamp_s:
