@@ -83,6 +83,17 @@ SUMMARY_KEYS: dict[str, Any] = {
 """Keys of summary.json that outside scripts rely on."""
 
 
+SIMULATED = ("fly", "check", "sitl", "compare", "faults")
+"""Commands that fly the laboratory by default."""
+
+
+def in_a_world(arguments: tuple[object, ...]) -> tuple[object, ...]:
+    """Add `--world ideal` to a command that names no world."""
+    if arguments[:1] and arguments[0] in SIMULATED and "--world" not in arguments:
+        return (*arguments, "--world", "ideal")
+    return arguments
+
+
 @dataclass(frozen=True)
 class Ended:
     """A program that ran to its end."""
@@ -124,6 +135,7 @@ class Sandbox:
             usual = {PREFLIGHT: PATIENT[PREFLIGHT]}
         more = {key: value for key, value in usual.items() if key not in given}
         no_report = ["--no-report"] if arguments[:1] == ("fly",) and not report else []
+        arguments = in_a_world(arguments)
         return Running(self, (*arguments, *no_report, *set_options(**more)), IN_BACKGROUND if background else ())
 
     def run(self, *arguments: object, report: bool = False) -> Ended:
@@ -251,7 +263,7 @@ def run_here(*arguments: object) -> Ended:
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            code = main([str(word) for word in arguments])
+            code = main([str(word) for word in in_a_world(arguments)])
         except SystemExit as end:
             code = int(end.code or 0)
     return Ended(code, out.getvalue(), err.getvalue())

@@ -17,7 +17,7 @@ from companion.cli.options import add_law, add_world
 from companion.config.document import ConfigError
 from companion.mission.check import check_mission
 from companion.runtime.console import terminal_console
-from companion.sitl_config.loader import DEFAULT_WORLD, SitlConfig, load_sitl
+from companion.sitl_config.loader import COMMAND_LINE_WORLD, SitlConfig, load_sitl
 
 DEFAULT_MISSION = "configs/missions/catch.yaml"
 PIPED_WIDTH = 132
@@ -25,7 +25,7 @@ PIPED_WIDTH = 132
 CAMPAIGN_WIDTH = 168
 
 
-def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | None = DEFAULT_WORLD) -> None:
+def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | None = COMMAND_LINE_WORLD) -> None:
     """Add the options that all campaigns share.
 
     Args:

@@ -22,7 +22,7 @@ from companion.mission.check import check_mission
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import print_error, terminal_console
 from companion.runtime.subprocesses import use_default_signals
-from companion.sitl_config.loader import SitlConfig, load_sitl
+from companion.sitl_config.loader import COMMAND_LINE_WORLD, DEFAULT_WORLD, SitlConfig, load_sitl
 
 _WITH_MODULES = (
     *(
@@ -198,7 +198,8 @@ def _load(arguments: argparse.Namespace, *, hardware: bool) -> SitlConfig:
         arguments.preset,
         arguments.overrides,
         hardware=hardware,
-        world=arguments.world,
+        # Nothing of a world is read on hardware, and drawing one takes NumPy.
+        world=DEFAULT_WORLD if hardware and arguments.world == COMMAND_LINE_WORLD else arguments.world,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from companion.config.controller import PRESETS
-from companion.sitl_config.loader import DEFAULT_WORLD, WORLDS
+from companion.sitl_config.loader import COMMAND_LINE_WORLD, WORLDS
 
 
 def add_law(parser: argparse.ArgumentParser) -> None:
@@ -15,7 +15,7 @@ def add_law(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", metavar="NAME", help=f"gains, the default first ({gains})")
 
 
-def add_world(parser: argparse.ArgumentParser, default: str | None = DEFAULT_WORLD) -> None:
+def add_world(parser: argparse.ArgumentParser, default: str | None = COMMAND_LINE_WORLD) -> None:
     """Add `--world`; only `companion robustness` has no default."""
     parser.add_argument(
         "--world",

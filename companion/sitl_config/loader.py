@@ -18,7 +18,9 @@ WORLD_DIRECTORY = Path(__file__).parent / "worlds"
 WORLDS = tuple(sorted(path.stem for path in WORLD_DIRECTORY.glob("*.yaml")))
 """Names of the built-in worlds."""
 DEFAULT_WORLD = "ideal"
-"""Default world of a simulated flight or campaign."""
+"""The world of a configuration for which none is named."""
+COMMAND_LINE_WORLD = "lab"
+"""The world of a simulated flight or campaign whose command names none."""
 
 
 class SitlConfig(FlightConfig):

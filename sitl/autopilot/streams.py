@@ -33,7 +33,7 @@ STREAMS: dict[int, Stream] = {
         build=telemetry.attitude_quaternion, onboard_hz=50.0, ground_hz=10.0, ceiling_hz=212.0
     ),
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: Stream(
-        build=telemetry.highres_imu, onboard_hz=50.0, ground_hz=0.0, ceiling_hz=226.0
+        build=telemetry.highres_imu, onboard_hz=50.0, ground_hz=0.0, ceiling_hz=241.0
     ),
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: Stream(
         build=telemetry.local_position_ned, onboard_hz=30.0, ground_hz=1.0, ceiling_hz=124.0

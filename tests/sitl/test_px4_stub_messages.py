@@ -249,7 +249,7 @@ def test_ping_timesync_and_file_requests_are_answered() -> None:
         (mavlink.MAVLINK_MSG_ID_ODOMETRY, 200.0, 124.0),
         (mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 200.0, 124.0),
         (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, 250.0, 212.0),
-        (mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, 250.0, 226.0),
+        (mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, 250.0, 241.0),
         (mavlink.MAVLINK_MSG_ID_HEARTBEAT, 50.0, 1.0),
         (mavlink.MAVLINK_MSG_ID_ODOMETRY, 40.0, 40.0),
     ],
