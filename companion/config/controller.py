@@ -1,4 +1,4 @@
-"""The controller file: one of three laws with its gains."""
+"""The controller file: a control law and its gains. The laws, and the estimates that they start with, are in `companion.control`."""
 
 from __future__ import annotations
 
@@ -166,6 +166,8 @@ class PscConfig(_LawConfig):
 
 ControllerConfig: TypeAlias = Annotated[AdaptiveConfig | CscConfig | PscConfig, Field(discriminator="law")]
 """Any law's configuration."""
+LawName = Literal["adaptive", "csc", "psc"]
+PresetName = Literal["paper", "paper_slow_leakage", "model_free", "recommended", "tuned_extras", "tuned"]
 LAWS: dict[str, type[AdaptiveConfig] | type[CscConfig] | type[PscConfig]] = {
     "adaptive": AdaptiveConfig,
     "csc": CscConfig,

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from companion.config.base import Location, Model, NonNegative, Positive, Vector2, Vector3, refuse
-from companion.config.controller import PRESETS
+from companion.config.controller import PRESETS, LawName, PresetName
 
 Duration = Annotated[float, Field(gt=0, le=600)]
 Delay = Annotated[float, Field(ge=0, le=600)]
@@ -143,8 +143,8 @@ class Catch(Model):
 class ControllerChoice(Model):
     """A controller file, or a law and one of its presets."""
 
-    law: Literal["adaptive", "csc", "psc"] = "adaptive"
-    preset: Literal["paper", "paper_slow_leakage", "model_free", "recommended", "tuned_extras", "tuned"] | None = None
+    law: LawName = "adaptive"
+    preset: PresetName | None = None
     """If neither preset nor file is given, the law's default: recommended or tuned."""
     file: str | None = None
     """Path of a controller file, relative to the mission file."""

@@ -1,4 +1,4 @@
-"""Build the configured control law."""
+"""Build the configured control law. `companion.control` says where a new law begins."""
 
 from __future__ import annotations
 

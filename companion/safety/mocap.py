@@ -2,7 +2,8 @@
 
 A pose is trusted if it is near the one that PX4's velocity and rates predict. A pose that is not trusted counts as
 not received and is not passed on to PX4: an estimator that has fused another body's pose is useless in a landing.
-Thresholds are keys of `safety:` in the vehicle file (`companion.config.vehicle.Safety`); `companion.safety.rules` names them per rule.
+Thresholds are keys of `safety:` in the vehicle file (`companion.config.vehicle.Safety`); `companion.safety.rules` names them per rule
+and has the texts for the operator.
 """
 
 from __future__ import annotations

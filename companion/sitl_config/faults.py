@@ -1,6 +1,7 @@
 """Faults of the simulated world: their kinds, the meaning of their size, and one injected fault.
 
 One table: the world injects from it, `companion faults --list` prints it, docs/faults.md shows it.
+The effect of a kind is in `sitl.faults`; `companion.campaigns.faults.variants` lists what a campaign flies.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The faults that a campaign injects, one per flight."""
+"""The faults that a campaign injects, one per flight. A new kind begins in `companion.sitl_config.faults`."""
 
 from __future__ import annotations
 
