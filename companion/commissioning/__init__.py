@@ -1,1 +1,1 @@
-"""Tools that commission a new machine: each measures, proposes a change of the vehicle file, and writes it only when asked."""
+"""Tools that commission a new vehicle: each measures, proposes a change to the vehicle file, and writes it only on request."""

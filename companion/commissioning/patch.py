@@ -1,4 +1,4 @@
-"""A proposed change of the vehicle file: printed for users and scripts, written only with `--write`."""
+"""A proposed change to the vehicle file: printed for users and scripts, written only with `--write`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BOM = "\ufeff"
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One value that changes."""
+    """A value that changes."""
 
     location: Location
     old: Data
@@ -50,7 +50,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """Changes of a vehicle file; false if the file has all these values already."""
+    """Changes to a vehicle file; false if the file already has all of these values."""
 
     path: Path
     shown: str
@@ -84,12 +84,14 @@ class Patch:
         """Write the file and keep the old one beside it; return the path of that backup.
 
         Raises:
-            ConfigError: the file has changed meanwhile or cannot be written; it is left unchanged.
+            ConfigError: the file has changed since it was read or cannot be written; it is left unchanged.
         """
         path = self.path.resolve()
         try:
             if path.read_bytes() != self.before:
-                raise ConfigError([f"{self.shown}: has changed meanwhile; nothing was written, run the tool again"])
+                raise ConfigError(
+                    [f"{self.shown}: has changed since it was read; nothing was written, run the tool again"]
+                )
             backup = _back_up(path, self.before)
             write_whole(path, self.after, mode=stat.S_IMODE(path.stat().st_mode), durable=True)
         except OSError as error:
@@ -100,12 +102,12 @@ class Patch:
 
 
 def propose(vehicle_path: str | Path, changes: Mapping[Location, Data]) -> Patch:
-    """Return the patch that brings values into the vehicle file. Nothing is written.
+    """Return the patch that sets values in the vehicle file. Nothing is written.
 
     Args:
         vehicle_path: vehicle file.
-        changes: new values by location, in the file's units: `{("arm", "joints", 0, "sign"): -1}`. Values that it has
-            already are left out, missing keys are added. Values are written as given: round them before.
+        changes: new values by location, in the file's units: `{("arm", "joints", 0, "sign"): -1}`. Values that the file already has
+            are left out; missing keys are added. Round the values first: they are written as given.
 
     Raises:
         ConfigError: the file cannot be read, or would become invalid; one line per problem.

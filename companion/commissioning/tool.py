@@ -1,6 +1,6 @@
-"""Common sequence of the commissioning tools: collect with open devices, fit, propose a change of the vehicle file, show.
+"""Common sequence of the commissioning tools: collect data from the devices, fit, propose a change to the vehicle file, report.
 
-Its instances are the `TOOLS` of `companion.commissioning.arm`, `.force_torque`, `.latency` and `.mocap`.
+The tools are the `TOOLS` of `companion.commissioning.arm`, `.force_torque`, `.latency` and `.mocap`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class GivenUp(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """Behaviour of a command's tools towards the user and the vehicle file."""
+    """How a group of tools treats the user and the vehicle file."""
 
     guides_on_stderr: bool
     """Whether instructions go to standard error even without `--json`."""
@@ -60,7 +60,7 @@ class Report:
 
     rows: Sequence[Row] = ()
     data: Mapping[str, Any] = field(default_factory=dict)
-    """JSON values beside the rows, with units in their keys."""
+    """JSON values in addition to the rows, with units in their keys."""
     text: Sequence[str] = ()
     """Lines printed above the rows."""
     changes: Mapping[Location, Data] = field(default_factory=dict)
@@ -68,7 +68,7 @@ class Report:
     advice: Sequence[str] = ()
     """Lines printed below the rows."""
     ok: bool | None = None
-    """Whether everything but `changes` is right; None if the rows decide."""
+    """Whether everything except `changes` is right; None if the rows decide."""
     brief: Mapping[str, str] = field(default_factory=dict)
     """Titles by id prefix: rows with this prefix that are ok are printed as one line."""
 
@@ -99,7 +99,7 @@ class Session:
         self.console.print(Text(text, style=style), soft_wrap=True)
 
     def ask(self, question: str) -> bool | None:
-        """Ask a yes-or-no question, which `--yes` answers with yes. Return None without a terminal."""
+        """Ask a yes-or-no question, which `--yes` answers with yes; return None if there is no terminal."""
         if getattr(self.arguments, "yes", False):
             return True
         if sys.stdin is None or not sys.stdin.isatty():
@@ -108,7 +108,7 @@ class Session:
         return sys.stdin.readline().strip().lower() in ("y", "yes")
 
     def confirm(self, question: str) -> bool:
-        """Return whether the user agrees; without a terminal print that nothing was done."""
+        """Return whether the user agrees; if there is no terminal, print that nothing was done."""
         answer = self.ask(question)
         if answer is None:
             self.say(f"{question} not done: there is no terminal to ask; add --yes")
@@ -127,7 +127,7 @@ class Tool(Generic[_T]):
     fit: Callable[[_T, Vehicle], Report]
     """Evaluates the measurements. Pure."""
     device: Check | None = None
-    """The row for a device that does not open or stops answering; None if it is reported as one line on standard error."""
+    """Row for a device that does not open or stops answering; None to report it as one line on standard error."""
     no_data: Mapping[str, Any] = field(default_factory=dict)
     """`Report.data` when a device fails."""
 
@@ -222,7 +222,7 @@ def _patch_lines(patch: Patch | None, written: str | None) -> list[str]:
         "",
         patch.text,
         "",
-        f"written; the old file: {written}" if written else "not written; add --write to write it",
+        f"written; the old file is kept as {written}" if written else "not written; add --write to write it",
     ]
 
 
@@ -246,9 +246,7 @@ def add_tool(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
         help="override a value, e.g. vehicle.devices.arm.port=/dev/ttyUSB0",
     )  # fmt: skip
-    parser.add_argument(
-        "--json", action="store_true", help="print one JSON document and nothing else on standard output"
-    )
+    parser.add_argument("--json", action="store_true", help="print only one JSON document on standard output")
     if write:
         parser.add_argument("--write", action="store_true", help=write)
     if yes:

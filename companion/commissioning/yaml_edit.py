@@ -15,11 +15,11 @@ from companion.config.yaml_text import flow_text
 
 
 class EditError(Exception):
-    """The text cannot be edited at this location; the message is one line without the file's name."""
+    """The text cannot be edited at this location. The message is one line without the file's name."""
 
 
 class Edit(NamedTuple):
-    """Replace the characters from `begin` to `end` by `text`."""
+    """Replace the characters from `begin` to `end` with `text`."""
 
     begin: int
     end: int
@@ -121,7 +121,7 @@ def _added(text: str, parent: yaml.MappingNode, steps: Location, value: Data) ->
 
 
 def _last_line_of_plain_values(parent: yaml.MappingNode) -> int:
-    """Return the index of a character on the line after which a new key is added: that of the last value that is not a block."""
+    """Return the index of a character on the line after which a new key is added: the line of the last value that is not a block."""
     plain = [value for _, value in parent.value if _is_flow(value)]
     last: yaml.Node = (plain or [parent.value[-1][1]])[-1]
     while not _is_flow(last):
@@ -131,7 +131,7 @@ def _last_line_of_plain_values(parent: yaml.MappingNode) -> int:
 
 
 def _is_flow(node: yaml.Node) -> bool:
-    """Return whether the node's end mark is its end; that of a block is after the comments that follow."""
+    """Return whether the node's end mark is its end; the end mark of a block comes after the comments that follow it."""
     return isinstance(node, yaml.ScalarNode) or (isinstance(node, yaml.CollectionNode) and bool(node.flow_style))
 
 

@@ -16,19 +16,22 @@ DEVICE = Check(
     "arm.device", "arm bus", "the port opens, both servos answer and accept their settings", "the flight needs the arm"
 )
 MODEL = Check(
-    "arm.model", "servos", "XM430-W210 (model 1030)", "other models have another torque constant and other registers"
+    "arm.model",
+    "servos",
+    "XM430-W210 (model 1030)",
+    "other models have a different torque constant and different registers",
 )
 FIRMWARE = Check(
     "arm.firmware",
     "servo firmware",
     "38 or newer, the same on both",
-    "older firmware has no bus watchdog: the arm would keep its torque after the companion has died",
+    "older firmware has no bus watchdog: the arm would keep its torque if the companion died",
 )
 MODE = Check(
     "arm.mode",
     "operating mode",
     "current control (register 11 is 0)",
-    "in another mode a torque command has another meaning",
+    "in any other mode a torque command has a different meaning",
 )
 RETURN_DELAY = Check(
     "arm.return_delay",
@@ -46,18 +49,18 @@ CURRENT_LIMIT = Check(
     "arm.current_limit",
     "current limit",
     "at least the current for `torque_max_nm` (register 38)",
-    "the arm would be weaker than the law assumes",
+    "the arm would be weaker than the controller assumes",
 )
 VOLTAGE = Check(
     "arm.voltage",
     "servo supply",
     "10.0 to 14.8 V",
-    "outside of it the servos switch their torque off with an input voltage error",
+    "outside this range the servos report an input voltage error and switch their torque off",
 )
 TEMPERATURE = Check(
     "arm.temperature",
     "servo temperature",
-    "`safety.servo_warn_c`; from `safety.servo_max_c` on refused",
+    "below `safety.servo_warn_c`; refused at `safety.servo_max_c` or above",
     "at 80 degC a servo switches its torque off",
 )
 ERROR = Check(
@@ -70,20 +73,20 @@ ANGLES = Check(
     "arm.angles",
     "joint angles",
     "within the limits of both joints",
-    "beyond a limit links touch the airframe, or zero_count and sign are wrong",
+    "beyond a limit the links touch the airframe, or zero_count or sign is wrong",
 )
 STILL = Check("arm.still", "arm at rest", "moves less than 3 deg", "motion of the arm falsifies the tare")
 READS = Check(
     "arm.reads",
     "bus cycles without an answer",
-    "0.1 %; above 10 % refused",
-    "`safety.arm_read_failures_max` of them in a row end the flight",
+    "0.1 %; refused above 10 %",
+    "`safety.arm_read_failures_max` in a row end the flight",
 )
 USB = Check(
     "arm.usb_latency",
     "arm's USB latency timer",
     "1 ms, or no FTDI adapter",
-    "more delays control ticks; from 5 ms on the driver refuses the bus",
+    "a longer time delays control ticks; at 5 ms or more the driver refuses the bus",
     warns=True,
 )
 CHECKS = (
@@ -129,7 +132,11 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
     yield firmware(FIRMWARE, [servo.firmware for servo in servos])
     modes = [servo.operating_mode for servo in servos]
     yield _equal(
-        MODE, modes, MODE_CURRENT, _mode, "another program has changed it: close that program, cycle the servos' power"
+        MODE,
+        modes,
+        MODE_CURRENT,
+        _mode,
+        "another program has changed it: close that program, then cycle the servos' power",
     )
     delays_us = [servo.return_delay_us for servo in servos]
     yield _equal(
@@ -137,7 +144,7 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
     )
     watchdogs_ms = [servo.watchdog_ms for servo in servos]
     wanted_ms = vehicle.devices.arm.watchdog_ms
-    yield _equal(WATCHDOG, watchdogs_ms, wanted_ms, "{} ms".format, "cycle the servos' power; look for a loose supply")
+    yield _equal(WATCHDOG, watchdogs_ms, wanted_ms, "{} ms".format, "cycle the servos' power; check for a loose supply")
     yield _current_limit(servos, vehicle)
     yield supply(VOLTAGE, [servo.voltage_v for servo in servos])
 
@@ -179,13 +186,13 @@ def _states(states: Sequence[ArmState], vehicle: Vehicle) -> Iterator[Row]:
         yield TEMPERATURE.good(read, wanted)
     else:
         row = TEMPERATURE.doubtful if hottest_c < safety.servo_max_c else TEMPERATURE.bad
-        yield row(read, wanted, "let the arm cool down; look for a jammed joint or an arm under load")
+        yield row(read, wanted, "let the arm cool down; check for a jammed joint or a load on the arm")
     errors = (_or(state.hardware_error[0] for state in states), _or(state.hardware_error[1] for state in states))
     named = error_text(errors)
     if named:
         yield ERROR.bad(named, "none", "remove the cause, then cycle the servos' power")
     elif (errors[0] | errors[1]) & WATCHDOG_BIT:
-        fix = "look for a loose cable or supply, and for a computer that stalls"
+        fix = "check for a loose cable or supply, and for a computer that stalls"
         yield ERROR.doubtful("a bus watchdog tripped", "none", fix)
     else:
         yield ERROR.good("none", "none")
@@ -197,7 +204,7 @@ def _states(states: Sequence[ArmState], vehicle: Vehicle) -> Iterator[Row]:
     if moved_rad <= STILL_RAD:
         yield STILL.good(read, wanted)
     else:
-        yield STILL.bad(read, wanted, "fold the arm so that it rests by itself, and do not touch it")
+        yield STILL.bad(read, wanted, "fold the arm so that it rests on its own, and do not touch it")
 
 
 def _angles(last: ArmState, vehicle: Vehicle) -> Row:
@@ -215,12 +222,12 @@ def _reads(cycles: int, missed: int) -> Row:
     read, wanted = f"{missed} of {cycles}", f"{MISSED_GOOD:.1%}"
     if cycles and share <= MISSED_GOOD:
         return READS.good(read, wanted)
-    fix = "look for a loose cable, a bad ground or interference on the servo bus"
+    fix = "check for a loose cable, a bad ground or interference on the servo bus"
     return (READS.doubtful if cycles and share <= MISSED_MAX else READS.bad)(read, wanted, fix)
 
 
 def usb_latency(check: Check, latency_ms: int | None) -> Row:
-    """Return the row of a USB adapter's latency timer. The force sensor's port uses it as well."""
+    """Return the row of a USB adapter's latency timer; also used for the force sensor's port."""
     wanted = f"{LATENCY_GOOD_MS} ms"
     if latency_ms is None:
         return check.good("not an FTDI adapter", wanted)

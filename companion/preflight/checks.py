@@ -1,4 +1,4 @@
-"""A check has a fixed identity and produces rows. Each module lists its checks, so that all of them can be documented."""
+"""A check: its identity and texts, from which it makes rows. Each module lists its checks, so that all of them can be documented."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class Check:
     title: str
     """Title of its row."""
     wanted: str = ""
-    """Expected result in general terms, for the table of the preflight's checks. The row states it with figures."""
+    """Expected result in general terms, for the table of checks in the docs. The row states the actual limits."""
     why: str = ""
     """Consequence if the check fails."""
     warns: bool = False
     """Whether a failure only warns."""
     settles: bool = False
-    """Whether the check may pass after some time, on a PX4 that has just started."""
+    """Whether the check may pass later, on a PX4 that has just started."""
 
     def good(self, read: str, wanted: str = "") -> Row:
         """Return a row that passes."""

@@ -1,8 +1,6 @@
-"""Checks of PX4 by its telemetry: alive, disarmed, fusing motion capture, battery charged. `preflight.px4` checks firmware and
-parameters.
-
-Pure. PX4 accepts poses that it does not fuse without any notice. Only the estimator's own status and
-position over the whole observation prove fusion.
+"""Checks of PX4's telemetry: alive, disarmed, fusing motion capture, battery charged. `preflight.px4` checks firmware and
+parameters. Pure. PX4 accepts poses without fusing them and does not say so. Only the estimator's own status and position over the
+whole observation prove fusion.
 """
 
 from __future__ import annotations
@@ -25,19 +23,19 @@ HEARTBEAT = Check(
     "px4.heartbeat",
     "PX4 heartbeat",
     "newer than `safety.heartbeat_timeout_s`",
-    "a link that loses heartbeats loses setpoints, too, and the flight ends in PX4's failsafe",
+    "a link that loses heartbeats also loses setpoints, and the flight ends in PX4's failsafe",
 )
 DISARMED = Check("px4.disarmed", "PX4 is disarmed", "disarmed", "an armed vehicle must be landed, not checked")
 RATES = Check(
     "px4.rates",
     "PX4 state rates",
-    "position, attitude and IMU at 80 Hz or more; below 40 Hz refused",
-    "the law uses this state at 200 Hz; with stale data the vehicle oscillates",
+    "position, attitude and IMU at 80 Hz or more; refused below 40 Hz",
+    "the controller uses this state at 200 Hz; if it is stale, the vehicle oscillates",
 )
 LAG = Check(
     "px4.lag",
     "PX4 link lag",
-    "at most `safety.link_lag_max_s` above the least delay",
+    "at most `safety.link_lag_max_s` above the shortest delay",
     "a delayed state makes the control unstable",
     warns=True,
 )
@@ -52,13 +50,13 @@ AGREES = Check(
     "px4.agrees",
     "PX4 against motion capture",
     "0.10 m, 8 deg of yaw",
-    "PX4 would hold another position or heading than the mission's",
+    "PX4 would hold a different position or heading from the mission's",
     settles=True,
 )
 STEADY = Check(
     "px4.steady",
     "PX4's estimate at rest",
-    "varies by less than 0.04 m and 3 deg against motion capture",
+    "varies by less than 0.04 m and 3 deg relative to motion capture",
     "the vehicle follows a drifting estimate at take-off",
     settles=True,
 )
@@ -71,20 +69,20 @@ BATTERY = Check(
 HOVER = Check(
     "px4.hover_thrust",
     "hover thrust",
-    "within 15 % of weight over `airframe.thrust_max_n`; beyond 35 % refused (PX4's own value has its own row)",
-    "it sets the thrust in the first second: too high and the vehicle jumps, too low and it does not take off",
+    "within 15 % of weight over `airframe.thrust_max_n`; refused beyond 35 % (a value from PX4 has its own row)",
+    "it determines the thrust in the first second: if too high, the vehicle jumps; if too low, it does not take off",
 )
 CHECKS = (DEVICE, HEARTBEAT, DISARMED, RATES, LAG, VISION, AGREES, STEADY, BATTERY, HOVER)
 
 RATE_GOOD_HZ, RATE_MIN_HZ = 80.0, 40.0
 ACCURACY_MAX_M = 0.1
 COVER_S = 0.6
-"""A stream that is present from the start begins within this time."""
+"""Time within which a stream that is present from the start begins."""
 PAIR_S = 0.1
 STEADY_M, STEADY_RAD = 0.04, math.radians(3.0)
 HOVER_GOOD, HOVER_MAX = 0.15, 0.35
-# ESTIMATOR_STATUS_FLAGS. PX4 sets the absolute horizontal one only once it knows a global origin, which nothing here needs, and the
-# one of constant position whenever the machine stands.
+# ESTIMATOR_STATUS_FLAGS. PX4 sets the absolute horizontal one only once it knows a global origin, which is not needed here, and the
+# one of constant position whenever the vehicle is at rest.
 FLAGS = {1: "attitude", 2: "horizontal velocity", 4: "vertical velocity", 8: "horizontal position", 32: "height"}
 
 
@@ -145,7 +143,7 @@ def _rates(o: Observations) -> Row:
 
 
 def _lag(o: Observations, vehicle: Vehicle) -> Row:
-    """Return the delays over the whole observation: arrival minus PX4's own clock, relative to the least."""
+    """Return the row on delays over the whole observation: arrival minus PX4's own clock, relative to the shortest."""
     offsets_s = sorted(state.attitude_stamp_s - state.boot_s for state in o.vehicle if state.boot_s is not None)
     late_s = offsets_s[int(0.99 * (len(offsets_s) - 1))] - offsets_s[0]
     limit_s = vehicle.safety.link_lag_max_s
@@ -205,7 +203,7 @@ def _ratios(report: EstimatorReport) -> tuple[float, float, float]:
 
 
 def _finite(ratio: float) -> float:
-    """Return the finite values. A test ratio of a source that is not fused may be NaN."""
+    """Return the ratio, or 0 if it is not finite: the test ratio of a source that is not fused may be NaN."""
     return ratio if math.isfinite(ratio) else 0.0
 
 

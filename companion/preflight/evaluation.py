@@ -1,4 +1,4 @@
-"""All rows of a preflight in their order of display. Pure."""
+"""All rows of a preflight in display order. Pure."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ CHECKS: tuple[Check, ...] = (
 )
 """All checks except those of `companion.preflight.px4`: one row for PX4's firmware and one for each parameter."""
 SETTLE_S = 30.0
-"""Longest time until the estimate of a PX4 that has just started is steady."""
+"""Longest time that the estimate of a PX4 that has just started takes to become steady."""
 BEGIN_S = 2.0
-"""Longest time until PX4 fuses poses that have just begun to arrive."""
+"""Longest time that PX4 takes to fuse poses that have just begun to arrive."""
 _SETTLES = {check.id: check.title for check in CHECKS if check.settles}
 
 
 def rows(o: Observations, config: FlightConfig) -> list[Row]:
-    """Return one row for every check. A check of a missing device has none."""
+    """Return one row for every check, except for those of a missing device."""
     vehicle = config.vehicle
     link, *state = estimator.rows(o, vehicle)
     return [
@@ -46,9 +46,8 @@ def rows(o: Observations, config: FlightConfig) -> list[Row]:
 
 
 def unsettled(o: Observations, config: FlightConfig) -> Waiting | None:
-    """Return the condition that may pass after more time, or None if waiting is useless.
-
-    If a row fails permanently, wait only until the observation of the other rows excludes the start of motion capture.
+    """Return the condition that may pass later, or None if waiting is useless. If a row fails permanently, wait only until the data
+    of the other rows no longer includes the start of motion capture.
     """
     refusing = refusals(rows(o, config))
     settling = [_SETTLES[row.id] for row in refusing if row.id in _SETTLES]

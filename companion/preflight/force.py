@@ -1,4 +1,4 @@
-"""Checks of the force-torque sensor at rest: rate, noise, overload, and a tare that matches an empty net. Pure."""
+"""Checks of the force-torque sensor at rest: rate, noise, overload, and whether the tare fits an empty net. Pure."""
 
 from __future__ import annotations
 
@@ -16,34 +16,37 @@ from companion.preflight.arm import usb_latency
 from companion.preflight.checks import Check
 
 DEVICE = Check(
-    "force.device", "force sensor", "the port opens, an RFT60 answers and streams", "the law needs the payload's force"
+    "force.device",
+    "force sensor",
+    "the port opens, an RFT60 answers and streams",
+    "the controller needs the payload's force",
 )
 RATE = Check(
     "force.rate",
     "force sensor rate",
-    "90 % of `devices.force.rate_hz`; below half refused",
+    "90 % of `devices.force.rate_hz`; refused below half",
     "a catch is detected late, or not at all",
 )
 CHECKSUMS = Check(
     "force.checksums",
     "force sensor packets",
     "none with an invalid checksum",
-    "interference loses samples, more so in flight",
+    "interference causes losses of samples, and of more in flight",
     warns=True,
 )
 NOISE = Check(
     "force.noise",
     "force sensor noise",
-    "0.3 N; above 1.5 N refused",
-    "the law responds to every measured force, so noise becomes motion",
+    "0.3 N; refused above 1.5 N",
+    "the controller responds to every measured force, so noise becomes motion",
 )
 OVERLOAD = Check(
-    "force.overload", "force sensor overload", "none", "an overloaded sensor saturates, and may be damaged for good"
+    "force.overload", "force sensor overload", "none", "an overloaded sensor saturates, and may be permanently damaged"
 )
 TARE = Check(
     "force.tare",
     "force sensor tare",
-    "bias below 5 % of `devices.force.force_max_n`; above 10 % refused",
+    "bias below 5 % of `devices.force.force_max_n`; refused above 10 %",
     "the tare removes every force at rest except the empty net's weight, so a load on the net would be missing in flight",
 )
 STILL = Check(
@@ -88,13 +91,13 @@ def stream_rows(
     vehicle: Vehicle,
     pose: tuple[Quat, Vec2] | None,
 ) -> Iterator[Row]:
-    """Return the rows of a sensor that was watched at rest.
+    """Return the rows of a sensor that was recorded at rest.
 
     Args:
         stream: counters.
         samples: in order of time.
         duration_s: duration of the observation.
-        vehicle: limits, and the tool whose weight is tared.
+        vehicle: limits, and the tool whose weight the tare accounts for.
         pose: attitude of the body and joint angles, rad; None if unknown; the row of the tare is then left out.
     """
     if stream.lost is not None:
@@ -122,7 +125,7 @@ def _rate(rate_hz: float, vehicle: Vehicle) -> Row:
 
 
 def _noise(samples: Sequence[ForceSample]) -> Row:
-    """Return the row on the difference between consecutive samples. Drift has a row of its own."""
+    """Return the row on the differences between consecutive samples. Drift has its own row."""
     squares = [0.0, 0.0, 0.0]
     for before, now in itertools.pairwise(samples):
         for axis in range(3):
@@ -147,7 +150,7 @@ def _overload(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
 def _tare(bias_n: Vec3, vehicle: Vehicle) -> Row:
     size_n, full_n = math.hypot(*bias_n), vehicle.devices.force.force_max_n
     x, y, z = bias_n
-    read = f"({x:.1f}, {y:.1f}, {z:.1f}) N beside the net's {vehicle.tool.net_mass_kg:g} kg"
+    read = f"({x:.1f}, {y:.1f}, {z:.1f}) N beyond the net's {vehicle.tool.net_mass_kg:g} kg"
     wanted = f"{TARE_GOOD * full_n:g} N"
     if size_n <= TARE_GOOD * full_n:
         return TARE.good(read, wanted)
@@ -156,7 +159,7 @@ def _tare(bias_n: Vec3, vehicle: Vehicle) -> Row:
 
 
 def tare_bias_n(samples: Sequence[ForceSample], vehicle: Vehicle, attitude: Quat, arm_rad: Vec2) -> Vec3:
-    """Return the bias that a flight's tare would find: the mean reading less the weight of the net, in the sensor frame."""
+    """Return the bias that a flight's tare would find: the mean reading minus the weight of the net, in the sensor frame."""
     sensing = ForceSensing(vehicle.tool, Manipulator(vehicle.arm, vehicle.tool))
     for sample in samples:
         sensing.collect(sample, attitude, arm_rad)
@@ -174,7 +177,7 @@ def _still(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
     read, wanted = f"drifts by {drift_n:.2f} N", f"{limit_n:g} N"
     if drift_n <= limit_n:
         return STILL.good(read, wanted)
-    return STILL.bad(read, wanted, "do not touch the net; let the sensor warm up for some minutes")
+    return STILL.bad(read, wanted, "do not touch the net; let the sensor warm up for a few minutes")
 
 
 def mean_force_n(samples: Sequence[ForceSample]) -> Vec3:

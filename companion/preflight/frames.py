@@ -1,7 +1,6 @@
-"""Checks at rest that motion capture, PX4 and the mission use the same axes. Pure.
-
-PX4 fuses motion capture, so a wrong yaw is invisible to EKF2. Gravity by the accelerometer reveals a tilted frame; the mission's start
-position and yaw reveal a rotated one; the hand test reveals the rest (`companion.preflight.hand_test.steps`).
+"""Checks that motion capture, PX4 and the mission use the same axes, from data at rest. Pure. PX4 fuses motion capture, so a wrong
+yaw is invisible to EKF2. Gravity measured by the accelerometer reveals a tilted frame; the mission's start position and yaw reveal
+a rotated one; the hand test reveals the rest (`companion.preflight.hand_test.steps`).
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ HAND_TEST = Check(
     "PX4 fuses motion capture and cannot detect wrong axes; not all of them show at rest",
     warns=True,
 )
-REST = Check("frames.rest", "at rest", "no motion during the observation", "gravity can be measured at rest only")
+REST = Check("frames.rest", "at rest", "no motion during the observation", "gravity can only be measured at rest")
 GRAVITY = Check(
     "frames.gravity",
     "gravity in motion capture's axes",
@@ -39,7 +38,7 @@ GRAVITY = Check(
 HEIGHT = Check(
     "frames.height",
     "height at rest",
-    "`airframe.ground_clearance_m` within 3 cm; beyond the mission's `start.tolerance_m` refused",
+    "`airframe.ground_clearance_m` ± 3 cm; refused beyond the mission's `start.tolerance_m`",
     "heights are wrong by the difference, and touchdown is detected early or late",
 )
 PLACE = Check(
@@ -57,19 +56,19 @@ YAW = Check(
 NOISE_POSITION = Check(
     "frames.noise_position",
     "noise of the position at rest",
-    "2 mm, and no frame 30 mm off; above 10 mm refused",
+    "2 mm, and no frame 30 mm off; refused above 10 mm",
     "the vehicle would shake, or lose its estimate",
 )
 NOISE_ATTITUDE = Check(
     "frames.noise_attitude",
     "noise of the attitude at rest",
-    "0.3 deg, and no frame 10 deg off; above 2 deg refused",
-    "a jumping yaw means that markers are confused; PX4 follows it",
+    "0.3 deg, and no frame 10 deg off; refused above 2 deg",
+    "yaw jumps when Motive mixes up markers, and PX4 follows the jumps",
 )
 ACCELEROMETER = Check(
     "frames.accelerometer",
-    "gravity by the accelerometer",
-    "9.81 m/s2 within 0.5",
+    "gravity measured by the accelerometer",
+    "9.81 ± 0.5 m/s2",
     "PX4's height and tilt depend on it",
     warns=True,
 )
@@ -105,11 +104,11 @@ RATE_MAX_DEG_S: Final = 3.0
 """Largest mean of the gyro at rest."""
 _EXPLAINED_DEG: Final = 10.0
 _UP: Vec3 = (0.0, 0.0, 1.0)
-_RESET = "set the machine level with its nose along the stream's +x and reset the rigid body's orientation in Motive"
+_RESET = "place the vehicle level with its nose along the stream's +x and reset the rigid body's orientation in Motive"
 
 
 class Pose(NamedTuple):
-    """Pose of the machine by motion capture, in the mission's world if the stream's axes are right."""
+    """Pose of the vehicle measured by motion capture, in the mission's world if the stream's axes are right."""
 
     position_m: Vec3
     attitude: Quat
@@ -133,7 +132,7 @@ class Wanted:
 
 
 def rows(observations: Observations, mission: Mission, vehicle: Vehicle) -> Iterator[Row]:
-    """Return the rows that can be evaluated at rest; only the first ones if the data is insufficient or the machine moved."""
+    """Return the rows that can be evaluated at rest; only the first ones if the data is insufficient or the vehicle moved."""
     if observations.hand_test is not None:
         yield _hand_test(observations.hand_test, observations.hand_test_changed)
     poses = [pose for pose in observations.mocap if pose.tracking_valid]
@@ -155,11 +154,11 @@ def rows(observations: Observations, mission: Mission, vehicle: Vehicle) -> Iter
 
 
 def standing(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> Iterator[Row]:
-    """Return the rows on gravity, height, position and yaw of a machine at rest.
+    """Return the rows on gravity, height, position and yaw of a vehicle at rest.
 
     Args:
-        at: pose by motion capture, as configured.
-        force_m_s2: specific force by the accelerometer, body FLU.
+        at: pose measured by motion capture, as configured.
+        force_m_s2: specific force measured by the accelerometer, body FLU.
         wanted: start pose of the mission.
         up_axis: devices.mocap.up_axis, "y" or "z".
     """
@@ -177,7 +176,7 @@ def standing(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> Iterat
         yield GRAVITY.bad(read, text, fix or f"the rigid body's zero was set while it was tilted: {_RESET}")
     else:
         level = "calibration square level on the floor"
-        yield GRAVITY.bad(read, text, fix or f"set the ground plane anew in Motive ({level}), then {_RESET}")
+        yield GRAVITY.bad(read, text, fix or f"set the ground plane again in Motive ({level}), then {_RESET}")
 
     read, text = f"z = {z:.3f} m", f"{wz:.2f} m (airframe.ground_clearance_m) within {HEIGHT_GOOD_M:g} m"
     pivot = (
@@ -203,15 +202,15 @@ def standing(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> Iterat
         yield YAW.good(read, text)
     else:
         turned = (
-            f"if the nose truly points {abs(yaw_off_deg):.0f} deg off, turn the machine or change the mission's start.yaw_deg; "
+            f"if the nose really points {abs(yaw_off_deg):.0f} deg off, turn the vehicle or change the mission's start.yaw_deg; "
             f"if not, the rigid body's zero is turned by {yaw_off_deg:+.0f} deg: {_RESET}"
         )
         yield YAW.bad(read, text, fix or turned)
 
 
 def explanation(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> str:
-    """Return one line on the axis permutation that explains every wrong value at rest and its remedy, or an empty text if none does or
-    nothing is wrong. Likelier permutations are tried first; the hand test distinguishes those that look alike at rest.
+    """Return one line with the axis permutation that explains every wrong value at rest, and its remedy; empty if none does or
+    nothing is wrong. Likelier permutations are tried first; only the hand test distinguishes those that look alike at rest.
     """
 
     def fits(position_m: Vec3, attitude: Quat) -> bool:
@@ -234,14 +233,14 @@ def explanation(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> str
         if fits(axes.inverse.vector(p), quat_multiply(quat_conjugate(axes.quat), q)):
             return f"the world looks turned {_turn(axes)}: {_plane(axes)}{_or_so(axes)}"
     for axes in (*others, *MIRRORINGS):
-        # An operator who created the body in wrong axes still turned its nose along the stream's x.
+        # An operator who created the body in the wrong axes still pointed its nose along the stream's x.
         nose = _nose(axes)
         upright = quat_multiply(axes.inverse.rotation(q), nose)
         if fits(axes.inverse.vector(p), upright):
             if axes.determinant < 0:
                 return (
-                    f"the stream looks left-handed (its x, y, z are the true {', '.join(axes.names)}): take Motive's right-handed "
-                    "axes, without axis conversion"
+                    f"the stream looks left-handed (its x, y, z are the true {', '.join(axes.names)}): use Motive's "
+                    "right-handed axes, without axis conversion"
                 )
             return (
                 f"the stream's axes look exchanged (its x, y, z are the true {', '.join(axes.names)}): {_plane(axes)}"
@@ -273,8 +272,8 @@ def _turn(axes: AxisMap) -> str:
 
 
 def _or_so(axes: AxisMap) -> str:
-    """Return the note that the machine itself may be turned about the vertical."""
-    return "; if the machine itself is turned, place it as the mission requires" if axes.vector(_UP) == _UP else ""
+    """Return the note that the vehicle itself may be turned about the vertical."""
+    return "; if the vehicle itself is turned, place it as the mission requires" if axes.vector(_UP) == _UP else ""
 
 
 def _plane(axes: AxisMap) -> str:
@@ -288,11 +287,13 @@ def _plane(axes: AxisMap) -> str:
 def _hand_test(passed: str, changed: str) -> Row:
     if passed:
         return HAND_TEST.good(passed, "passed with this set-up")
-    return HAND_TEST.bad(changed or "never passed", "passed with this set-up", "companion check --hand takes a minute")
+    return HAND_TEST.bad(
+        changed or "never passed", "passed with this set-up", "run companion check --hand (one minute)"
+    )
 
 
 def _rest(poses: list[MocapPose], states: tuple[VehicleState, ...]) -> Row:
-    """Return the row on whether the machine was at rest, on which all other rows depend."""
+    """Return the row on whether the vehicle was at rest, on which all other rows depend."""
     quarter = len(poses) // 4
     first, last = poses[:quarter], poses[-quarter:]
     moved_m = math.dist(
@@ -340,7 +341,7 @@ def _accelerometer(force_m_s2: Vec3) -> Row:
 
 
 def _px4(at: Pose, states: tuple[VehicleState, ...], vehicle: Vehicle) -> Iterator[Row]:
-    """Return the row on PX4's attitude against motion capture, from the newest half because its filter may have just started."""
+    """Return the rows on PX4's attitude compared with motion capture, from the newest half because its filter may have just started."""
     estimate = mean_attitude([state.attitude_wxyz for state in states[len(states) // 2 :]])
     tilt_deg = math.degrees(angle_rad(quat_rotate(estimate, _UP), quat_rotate(at.attitude, _UP)))
     read, wanted = f"{tilt_deg:.1f} deg apart", f"within {TILT_MAX_DEG:g} deg"

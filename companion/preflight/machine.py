@@ -15,13 +15,13 @@ DISK = Check(
     "machine.disk",
     "disk space",
     "the log of the mission and of twice its length",
-    "an incomplete log explains nothing; a full disk slows down the whole computer",
+    "an incomplete log cannot explain the flight, and a full disk slows down the whole computer",
 )
 GOVERNOR = Check(
     "machine.governor",
     "processor",
     "governor `performance` on every core, where it is reported",
-    "a reduced clock frequency makes ticks late",
+    "at a reduced clock frequency ticks are late",
     warns=True,
 )
 REALTIME = Check(
@@ -35,13 +35,13 @@ MEMORY_LOCK = Check(
     "machine.memory_lock",
     "memory lock",
     "RLIMIT_MEMLOCK unlimited, unless `computer.lock_memory` is false",
-    "swapped-out pages are read from the card in flight, which takes tens of milliseconds",
+    "reading swapped-out pages from the card in flight takes tens of milliseconds",
     warns=True,
 )
 CPUS = Check(
     "machine.cpus",
     "cores of the flight",
-    "this computer has every core of `computer.cpus`, and one more",
+    "this computer has every core of `computer.cpus`, and at least one more",
     "the flight would share its cores with all other processes",
 )
 RECORDER = Check(
@@ -68,9 +68,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
             yield _disk(machine.disk_free_bytes, o.mission_s if o.mission_s is not None else DEFAULT_MISSION_S)
         others = sorted({governor for governor in machine.governors if governor != "performance"})
         if others:
-            fix = (
-                "run sudo companion install --systemd; only until the next boot: cpupower frequency-set -g performance"
-            )
+            fix = "run sudo companion install --systemd; for this session only: cpupower frequency-set -g performance"
             yield GOVERNOR.bad(", ".join(others), "performance", fix)
         else:
             yield GOVERNOR.good("performance" if machine.governors else "no governor is reported", "performance")
@@ -90,7 +88,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
 
 
 _PERMIT = (
-    "sudo companion install --systemd permits it to the service and to users in the group dialout; by hand, `{}` in "
+    "sudo companion install --systemd permits it for the service and for users in the group dialout; manually, `{}` in "
     "/etc/security/limits.conf; then log in again"
 )
 
@@ -111,10 +109,10 @@ def _cpus(machine: Machine, computer: Computer) -> Row:
         return CPUS.good(f"all: {there}")
     asked = f"computer.cpus {listed(computer.cpus)}"
     if missing := set(computer.cpus) - set(machine.cpus):
-        fix = f"take {listed(missing)} out of computer.cpus; on another computer add --set 'vehicle.computer.cpus=[]'"
+        fix = f"remove {listed(missing)} from computer.cpus; on another computer add --set 'vehicle.computer.cpus=[]'"
         return CPUS.bad(there, asked, fix)
     if not set(machine.cpus) - set(computer.cpus):
-        fix = "leave a core out of computer.cpus, or all of them: recorder and guardian share them with the flight"
+        fix = "remove at least one core from computer.cpus; otherwise recorder and guardian share all cores with the flight"
         return CPUS.doubtful(there, f"{asked} and one more", fix)
     return CPUS.good(asked, f"among {there}")
 
@@ -125,5 +123,5 @@ def _disk(free_bytes: int, mission_s: float) -> Row:
     read, wanted = f"{free_bytes / 1e6:.0f} MB free", f"{twice / 1e6:.0f} MB for a mission of {mission_s:.0f} s"
     if free_bytes >= twice:
         return DISK.good(read, wanted)
-    fix = "delete old flights, or name another disk with --out"
+    fix = "delete old flights, or choose another disk with --out"
     return (DISK.doubtful if free_bytes >= once else DISK.bad)(read, wanted, fix)

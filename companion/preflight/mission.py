@@ -1,4 +1,4 @@
-"""Checks of the mission, the arm's start pose, and the machine's position in the room. `frames` checks start position and yaw. Pure."""
+"""Checks of the mission, the arm's start pose, and the vehicle's position in the room. `frames` checks start position and yaw. Pure."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from companion.preflight.checks import Check
 PLAN = Check(
     "mission.plan",
     "mission",
-    "inside room and tether, within all limits; `fly` checks it before it opens a device, exit 2",
+    "inside room and tether, within all limits; `fly` checks it before it opens a device (exit code 2)",
     "the flight would leave the room, load the tether or exceed the vehicle's limits",
 )
 ARM = Check(
     "mission.arm",
     "arm at the start",
     "`start.arm_deg` of the mission within `start.arm_tolerance_deg`",
-    "the arm's first motion is planned from there",
+    "the arm's first motion is planned from this pose",
 )
 ROOM = Check(
     "mission.room",
     "position in the room",
     "body origin and rotors inside `room`",
-    "nothing detects the real walls; only the limits in `room` keep the rotors away from them",
+    "no sensor detects the real walls; only the limits in `room` keep the rotors away from them",
 )
 CHECKS = (PLAN, ARM, ROOM)
 
@@ -59,7 +59,7 @@ def _arm(angle_rad: Vec2, start: Start) -> Row:
     wanted = f"({start.arm_deg[0]:g}, {start.arm_deg[1]:g}) deg within {start.arm_tolerance_deg:g} deg"
     if off_deg <= start.arm_tolerance_deg:
         return ARM.good(read, wanted)
-    return ARM.bad(read, wanted, "move it there by hand, or change start.arm_deg of the mission")
+    return ARM.bad(read, wanted, "move it there by hand, or change the mission's start.arm_deg")
 
 
 def _room(position: Vec3, room: Room, radius_m: float) -> Row:

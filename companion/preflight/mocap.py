@@ -15,7 +15,7 @@ DEVICE = Check("mocap.device", "motion capture", "the server answers and streams
 RATE = Check(
     "mocap.rate",
     "mocap rate",
-    "90 % of `devices.mocap.rate_hz`; below `safety.mocap_rate_min_hz` refused",
+    "90 % of `devices.mocap.rate_hz`; refused below `safety.mocap_rate_min_hz`",
     "PX4's estimate becomes slow and noisy; in flight this is a fault",
 )
 JITTER = Check(
@@ -28,20 +28,20 @@ JITTER = Check(
 LATENCY = Check(
     "mocap.latency",
     "mocap latency",
-    "`safety.mocap_latency_warn_s`, and reported by the server; `safety.mocap_latency_max_s` refuses",
+    "reported by the server and below `safety.mocap_latency_warn_s`; refused above `safety.mocap_latency_max_s`",
     "EKF2_EV_DELAY is 5 ms: older poses are fused as if they were current",
 )
 LOST = Check(
     "mocap.lost",
     "mocap frames lost",
-    "0.5 %; above 5 % refused",
+    "0.5 %; refused above 5 %",
     "a network that loses frames at rest loses more of them in flight",
 )
 TRACKED = Check(
     "mocap.tracked",
     "body tracked",
-    "in every frame; less than 95 % refused",
-    "a body that is lost on the ground is lost in flight: PX4 then drifts",
+    "in every frame; refused below 95 %",
+    "a body that is lost on the ground will be lost in flight: PX4 then drifts",
 )
 BODY = Check(
     "mocap.body",
@@ -59,8 +59,8 @@ ERROR = Check(
 )
 CLOCK = Check(
     "mocap.clock",
-    "mocap clock against the companion's",
-    "frames arrive steadily by their numbers: rate within 1 %, jitter below 20 ms",
+    "mocap clock compared with the companion's",
+    "frames arrive regularly for their frame numbers: rate within 1 %, jitter below 20 ms",
     "diverging clocks, or a server that stalls and catches up, make every age wrong",
     warns=True,
 )
@@ -102,7 +102,7 @@ def _rate(o: Observations, stream: MocapStream, vehicle: Vehicle) -> Row:
     read, wanted = f"{rate_hz:.0f} Hz", f"{expected_hz:g} Hz"
     if rate_hz >= RATE_GOOD * expected_hz:
         return RATE.good(read, wanted)
-    fix = "set the camera rate in Motive or devices.mocap.rate_hz; look for a slow network or a busy computer"
+    fix = "set the camera rate in Motive or devices.mocap.rate_hz; check for a slow network or a busy computer"
     return (RATE.doubtful if rate_hz >= least_hz else RATE.bad)(read, wanted, fix)
 
 
@@ -111,7 +111,7 @@ def _jitter(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
     read, wanted = f"longest gap {gap_s * 1e3:.0f} ms", f"{GAP_GOOD_S * 1e3:.0f} ms"
     if gap_s <= max(GAP_GOOD_S, 2.5 / vehicle.devices.mocap.rate_hz):
         return JITTER.good(read, wanted)
-    fix = "use a cable, not Wi-Fi; turn power saving of the network card off; see processor and real-time permission"
+    fix = "use a cable, not Wi-Fi; disable power saving of the network card; see the rows on processor and real-time permission"
     return JITTER.bad(read, wanted, fix)
 
 
@@ -136,7 +136,7 @@ def _lost(stream: MocapStream) -> Row:
     read, wanted = f"{stream.lost} of {stream.frames + stream.lost} frames, {share:.1%}", f"{LOST_GOOD:.1%}"
     if share <= LOST_GOOD:
         return LOST.good(read, wanted)
-    fix = "use a cable to a network of its own; on Wi-Fi take unicast (devices.mocap.transport)"
+    fix = "use a cable on a separate network; on Wi-Fi use unicast (devices.mocap.transport)"
     return (LOST.doubtful if share <= LOST_MAX else LOST.bad)(read, wanted, fix)
 
 
@@ -164,7 +164,7 @@ def _error(poses: tuple[MocapPose, ...]) -> Row:
     read, wanted = f"{mean_m * 1e3:.1f} mm", f"{ERROR_GOOD_M * 1e3:.0f} mm"
     if mean_m <= ERROR_GOOD_M:
         return ERROR.good(read, wanted)
-    return ERROR.bad(read, wanted, "create the rigid body anew in Motive; fasten its markers; calibrate the volume")
+    return ERROR.bad(read, wanted, "create the rigid body again in Motive; fasten its markers; calibrate the volume")
 
 
 def _clock(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
@@ -181,13 +181,13 @@ def _clock(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
         return CLOCK.bad(
             "the frame number does not advance", wanted, "restart streaming in Motive; it is paused or plays a take"
         )
-    # Late frames are jitter; only the bulk of each tenth of the time counts here.
+    # Late frames are jitter; only the median of each tenth of the time is used here.
     off_s = sorted(_medians([b - mean_t - period_s * (a - mean_n) for a, b in zip(n, t, strict=True)]))
     wander_s = off_s[-1] - off_s[0]
     read = f"{period_s * 1e3:.3f} ms per frame, jitter {wander_s * 1e3:.1f} ms"
     if abs(period_s * expected_hz - 1.0) <= CLOCK_GOOD and wander_s <= WANDER_GOOD_S:
         return CLOCK.good(read, wanted)
-    fix = "set devices.mocap.rate_hz to the camera rate; look for a server that stalls, or time synchronisation that steps"
+    fix = "set devices.mocap.rate_hz to the camera rate; check for a server that stalls, or for steps by time synchronisation"
     return CLOCK.bad(read, wanted, fix)
 
 

@@ -1,4 +1,4 @@
-"""Observe the open devices for some seconds and collect their data. This is the only part of the preflight with I/O."""
+"""Observe the open devices for a few seconds and collect their data: the only part of the preflight with I/O."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ TELL_PERIOD_S = 0.5
 GOVERNORS = Path("/sys/devices/system/cpu")
 
 Progress = Callable[[str, float], None]
-"""Callback for display: the current subject and the elapsed share of the time."""
+"""Callback for display: the current subject and the elapsed fraction of the time."""
 Unsettled = Callable[[Observations], Waiting | None]
 
 _T = TypeVar("_T")
@@ -72,19 +72,19 @@ async def observe(
     progress: Progress,
     known: Observations | None = None,
 ) -> Observations:
-    """Observe all devices for `safety.preflight_s`, and longer while a check may still pass.
-
-    Meanwhile PX4's version and parameters are read, and the servo bus is read as in flight, which keeps its watchdogs from tripping.
+    """Observe all devices for `safety.preflight_s`, and longer while a check may still pass. At the same time read PX4's version
+    and parameters, and read the servo bus as in flight, which keeps its watchdogs from tripping.
 
     Args:
-        devices: open devices; for a device that could not be opened only the failure is reported.
+        devices: open devices; of a device that could not be opened, only the failure is reported.
         config: the effective configuration.
         clock: the flight clock.
         out: folder of the flight's files, for the free disk space.
         param_names: PX4's parameters to read.
-        unsettled: called after the time, with the last `preflight_s`; see `companion.preflight.evaluation.unsettled`.
+        unsettled: called when the time is over, with the data of the last `preflight_s`; see
+            `companion.preflight.evaluation.unsettled`.
         progress: progress callback.
-        known: facts from elsewhere: plan, recorder, mission length, hand test.
+        known: facts that are not observed: plan, recorder, mission length, hand test.
     """
     watcher = _Watcher(devices, config, clock)
     duration_s = config.vehicle.safety.preflight_s
@@ -153,7 +153,7 @@ def _with_answers(seen: Observations, answers: _Answers) -> Observations:
 
 
 class _Watcher:
-    """Collects the data of the devices. Data before the queried interval is dropped."""
+    """Collects the data of the devices; drops data older than the queried interval."""
 
     def __init__(self, devices: Devices | AvailableDevices, config: FlightConfig, clock: Clock) -> None:
         self._devices = devices

@@ -17,7 +17,7 @@ PARAM_ID = "px4.param."
 """Prefix of the row's id, followed by the parameter's name."""
 
 _FIRMWARE = re.compile(r"PX4 (\d+)\.(\d+)\.(\d+) (\w+)")
-_FIRMWARE_WHY = "parameters change their meaning between versions, and EKF2 its behaviour"
+_FIRMWARE_WHY = "the meaning of parameters and the behaviour of EKF2 change between versions"
 _WRITE = "companion px4 params --write"
 
 
@@ -25,7 +25,7 @@ def rows(firmware: str | None, params: Mapping[str, Value], vehicle: Vehicle) ->
     """Return one row for the firmware and one per parameter.
 
     Args:
-        firmware: as returned by `MavsdkAutopilot.firmware`; None for no row.
+        firmware: as returned by `MavsdkAutopilot.firmware`; None to return no row.
         params: PX4's parameters by name; one that PX4 does not have is absent.
         vehicle: limits, room, thrust and the link's address.
     """
@@ -71,9 +71,11 @@ def firmware_row(firmware: str) -> Row:
         return row(False, fix="flash a release of PX4 1.16 or 1.18")
     version, kind = (int(match[1]), int(match[2])), match[4]
     if version < OLDEST:
-        return row(False, Level.REFUSE, "flash a release of PX4 1.16 or 1.18: parameters of this one have other names")
+        return row(
+            False, Level.REFUSE, "flash a release of PX4 1.16 or 1.18: parameters of this version have different names"
+        )
     if version not in KNOWN_GOOD:
-        return row(False, fix="this version was not tested: flash 1.16 or 1.18, or fly with care, tethered")
+        return row(False, fix="this version was not tested: flash 1.16 or 1.18, or fly with care on a tether")
     if kind != "release":
         return row(False, fix=f"this is a {kind} build: flash a release build")
     return row(True)
@@ -90,12 +92,12 @@ def _param_rows(params: Mapping[str, Value], vehicle: Vehicle) -> Iterator[Row]:
         if value is None and wanted.only:
             continue
         if value is None:
-            fix = "check the firmware: PX4 1.16 and 1.18 have it"
+            fix = "check the firmware: PX4 1.16 and 1.18 have this parameter"
             yield Row(
                 id=row_id,
                 title=wanted.name,
                 ok=False,
-                read="PX4 does not have it",
+                read="PX4 does not have this parameter",
                 wanted=text,
                 why=wanted.why,
                 fix=fix,
@@ -125,5 +127,5 @@ def fix_of(wanted: Wanted) -> str:
 
 
 def text_of(value: Value | None) -> str:
-    """Return a value as text: REAL32 with its significant digits."""
+    """Return a value as text, a REAL32 with its significant digits only."""
     return f"{value:.7g}" if isinstance(value, float) else f"{value}"

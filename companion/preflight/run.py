@@ -1,4 +1,4 @@
-"""A preflight from beginning to end: observe, evaluate, write."""
+"""Runs a preflight: observe, evaluate, write."""
 
 from __future__ import annotations
 

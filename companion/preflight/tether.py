@@ -16,19 +16,19 @@ from companion.preflight.checks import Check
 LINE = Check(
     "tether.line",
     "tether as described",
-    "to be compared with the real tether",
+    "shown for comparison with the real tether",
     "every distance to the taut sphere is computed from it",
 )
 STRENGTH = Check(
     "tether.strength",
     "tether strength",
-    "`tether.load_rating_n` covers full thrust",
+    "`tether.load_rating_n` is full thrust or more",
     "the tether must not break",
 )
 SLACK = Check(
     "tether.slack",
     "tether slack at the start",
-    "`tether.margin_m` or more at the machine's position",
+    "`tether.margin_m` or more at the vehicle's position",
     "a taut tether tips the vehicle over at take-off",
 )
 CHECKS = (LINE, STRENGTH, SLACK)
@@ -47,7 +47,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     if tether.load_rating_n >= airframe.thrust_max_n:
         yield STRENGTH.good(read, wanted)
     else:
-        yield STRENGTH.bad(read, wanted, "take a stronger tether, and correct tether.load_rating_n")
+        yield STRENGTH.bad(read, wanted, "use a stronger tether, and correct tether.load_rating_n")
     pose = next((pose for pose in reversed(o.mocap) if pose.tracking_valid), None)
     if pose is None:
         return

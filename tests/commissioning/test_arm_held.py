@@ -55,7 +55,7 @@ def test_jog_stops_when_gravity_does_not_explain_the_load(held: Rig) -> None:
     code, done = held.json("jog", "--joint", "2", "--to", "125", "--yes", *heavy)
     assert code == EXIT_REFUSED
     # Three limits are passed within a few milliseconds; which of them the next read sees first is the computer's.
-    reasons = ("beside gravity; look for an obstacle", "from its reference", "runs away; unless it was pulled")
+    reasons = ("beyond gravity; check for an obstacle", "from its reference", "runs away; unless it was pulled")
     assert any(reason in done["stopped"] for reason in reasons), done["stopped"]
 
 

@@ -143,7 +143,7 @@ def made_up(*delays_ms: float, problem: str = "") -> list[TapDelay]:
 def test_too_few_taps_are_refused() -> None:
     told = combine([*made_up(5.0, 5.1, 4.9, 5.2), *made_up(7.0, problem="too weak: x")])
     assert isinstance(told, str)
-    assert "4 of 5 taps are usable, 5 are needed" in told
+    assert "4 of 5 taps are usable, expected 5" in told
 
 
 def test_one_tap_that_is_far_off_does_not_count() -> None:

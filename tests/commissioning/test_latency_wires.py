@@ -90,7 +90,7 @@ def test_ctrl_c_gives_up(sandbox: Sandbox) -> None:
     with World(sandbox) as world:
         running = sandbox.start("latency", "--vehicle", VEHICLE, *world.addresses())
         with running:
-            wait_for_error(running, "hold the machine up")
+            wait_for_error(running, "hold the vehicle up")
             running.signal(signal.SIGINT)
             ended = running.end()
     assert (ended.code, ended.out) == (EXIT_ABORTED, "")

@@ -92,7 +92,7 @@ def test_a_file_that_was_changed_meanwhile_is_left_alone(mine: Path) -> None:
     patch = propose(mine, {("arm", "joints", 0, "sign"): -1})
     mine.write_bytes(mine.read_bytes() + b"# somebody else\n")
     before = mine.read_bytes()
-    with pytest.raises(ConfigError, match="changed meanwhile"):
+    with pytest.raises(ConfigError, match="has changed since it was read"):
         patch.write()
     assert mine.read_bytes() == before and list(mine.parent.iterdir()) == [mine]
 

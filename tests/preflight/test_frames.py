@@ -62,7 +62,7 @@ def test_a_sound_set_up_passes_whatever_the_noise(seed: int) -> None:
         ("mocap_body_yaw_deg=90", "frames.yaw", "the rigid body's zero was set while it was turned by -90 deg about z"),
         ("mocap_body_yaw_deg=20", "frames.yaw", "the rigid body's zero is turned by +20 deg"),
         ("mocap_body_yaw_deg=-20", "frames.yaw", "the rigid body's zero is turned by -20 deg"),
-        ("mocap_body_tilt_deg=[90,0]", "frames.gravity", "while it was turned by -90 deg about x: set the machine level"),
+        ("mocap_body_tilt_deg=[90,0]", "frames.gravity", "while it was turned by -90 deg about x: place the vehicle level"),
         ("mocap_body_tilt_deg=[0,90]", "frames.gravity", "the rigid body's zero was set while it was turned by -90 deg about y"),
         ("mocap_body_tilt_deg=[0,8]", "frames.gravity", "the rigid body's zero was set while it was tilted"),
     ],

@@ -111,7 +111,7 @@ def test_a_biased_imu_and_slow_motion_capture_pass() -> None:
         (
             'mocap_axes=["x","-z","y"]',
             "hand.lift",
-            "the stream's axes are exchanged (its x, y, z look like the machine's x, -z, y)",
+            "the stream's axes are exchanged (its x, y, z look like the vehicle's x, -z, y)",
         ),
         ('mocap_axes=["x","z","y"]', "hand.lift", "the stream is left-handed (its x, y, z look like the true x, z, y)"),
         ('mocap_axes=["x","-y","z"]', "hand.turn", "the stream is left-handed"),
@@ -120,7 +120,7 @@ def test_a_biased_imu_and_slow_motion_capture_pass() -> None:
         ("mocap_body_yaw_deg=180", "hand.forward", "the rigid body's zero is turned"),
         ("mocap_body_yaw_deg=20", "hand.forward", "the rigid body's zero is turned"),
         ("mocap_body_tilt_deg=[90,0]", "hand.level", "the rigid body's axes are exchanged"),
-        ("mocap_body_tilt_deg=[0,12]", "hand.level", "the rigid body's zero was set while the machine was tilted"),
+        ("mocap_body_tilt_deg=[0,12]", "hand.level", "the rigid body's zero was set while the vehicle was tilted"),
     ],
 )
 def test_a_wrong_frame_is_refused_and_named(wrong: str, row: str, words: str) -> None:
@@ -216,7 +216,7 @@ def test_a_test_without_a_result_names_the_command_to_do_again() -> None:
 
 def test_a_machine_that_nobody_lifts_is_reported_after_the_time_limit() -> None:
     view = ran(standing())
-    assert view.ended.startswith(f"not within {STEP_TIMEOUT_S:g} s: take it by its legs")
+    assert view.ended.startswith(f"not within {STEP_TIMEOUT_S:g} s: hold it by its legs")
     assert "moved by 0 cm" in view.ended
 
 

@@ -196,9 +196,9 @@ CASES = {
         "machine.memory_lock", "memory not locked", "memlock unlimited",
         {"machine": r.machine(memory_lock="memory not locked (8 kB)")}, WARN,
     ),
-    "cores that are not there": Case("machine.cpus", "cores 0-3", "take 4,6 out", {}, vehicle={"computer.cpus": (4, 2, 6)}),
+    "cores that are not there": Case("machine.cpus", "cores 0-3", "remove 4,6", {}, vehicle={"computer.cpus": (4, 2, 6)}),
     "no core beside the flight's": Case(
-        "machine.cpus", "cores 0-3", "leave a core out", {}, WARN, vehicle={"computer.cpus": (0, 1, 2, 3)}
+        "machine.cpus", "cores 0-3", "remove at least one core", {}, WARN, vehicle={"computer.cpus": (0, 1, 2, 3)}
     ),
     "no recorder": Case("machine.recorder", "no space", "names file", {"recorder": "no space"}),
 }  # fmt: skip

@@ -100,7 +100,7 @@ def test_a_parameter_that_px4_does_not_have_is_reported() -> None:
     params = good()
     del params["EKF2_EV_QMIN"]
     (row,) = wrong(params)
-    assert (row.title, row.read, row.level) == ("EKF2_EV_QMIN", "PX4 does not have it", Level.WARN)
+    assert (row.title, row.read, row.level) == ("EKF2_EV_QMIN", "PX4 does not have this parameter", Level.WARN)
 
 
 @pytest.mark.parametrize(

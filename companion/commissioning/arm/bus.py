@@ -38,15 +38,15 @@ LED = Register(65, 1, "LED")
 PING_BYTES: Final = 14
 _WRITE_TIMEOUT_S = 1.0
 _REPLY_TIMEOUT_MS: Final = 100.0
-"""An FTDI adapter with its factory latency timer delays an answer by 16 ms, a busy computer by more."""
+"""Timeout of an answer: an FTDI adapter with its factory latency timer delays it by 16 ms, a busy computer by more."""
 _ERROR_NUMBER: Final = 0x7F
 _CRC_ERROR: Final = 3
 _ATTEMPTS: Final = 10
-"""Attempts of a read or write, because interference damages single packets and a busy computer delays an answer."""
+"""Attempts at a read or write: interference corrupts single packets, and a busy computer delays answers."""
 
 
 class _CountingPort(dxl.ServoPort):
-    """Counts bytes, to separate noise from silence."""
+    """Counts bytes, to distinguish noise from silence."""
 
     came_bytes = 0
 
@@ -63,7 +63,7 @@ class PingAnswers:
     servos: tuple[tuple[int, int, int], ...]
     """Model and firmware of each servo, by id."""
     garbled: bool
-    """Whether unreadable bytes arrived: two servos with one id, or noise."""
+    """Whether unreadable bytes arrived, from two servos with the same id or from noise."""
 
 
 class ServoTalk:
@@ -130,7 +130,7 @@ class ServoTalk:
         return bool(result == COMM_SUCCESS)
 
     def read(self, servo_id: int, register: Register) -> int:
-        """Return a register's value. A lost or damaged packet is repeated.
+        """Return a register's value. A lost or corrupt packet is repeated.
 
         Raises:
             DeviceError: no answer, or a refusal.
@@ -144,7 +144,7 @@ class ServoTalk:
         return int.from_bytes(bytes(data), "little", signed=register.signed)
 
     def write(self, servo_id: int, register: Register, value: int, *, read_back: bool = True) -> None:
-        """Write a register and read it back. A lost or damaged packet is repeated.
+        """Write a register and read it back. A lost or corrupt packet is repeated.
 
         Args:
             servo_id: id of the servo.
@@ -153,7 +153,7 @@ class ServoTalk:
             read_back: False for id and baud rate, because the servo then answers at another id or rate.
 
         Raises:
-            DeviceError: no answer, a refusal, or another value is read afterwards.
+            DeviceError: no answer, a refusal, or a different value is read back.
         """
         data = list(value.to_bytes(register.size, "little", signed=register.signed))
         for _ in range(_ATTEMPTS if read_back else 1):
@@ -167,12 +167,12 @@ class ServoTalk:
         found = self.read(servo_id, register)
         if found != value:
             raise self._error(
-                servo_id, f"{register} reads {found} after {value} was written; another program may be on the bus"
+                servo_id, f"{register} reads {found} after {value} was written; another program may be using the bus"
             )
 
     def _check(self, servo_id: int, doing: str, result: int, error: int) -> None:
         if result != COMM_SUCCESS:
-            raise self._error(servo_id, f"{doing}: no answer at {self.baud} baud; look for a loose cable or supply")
+            raise self._error(servo_id, f"{doing}: no answer at {self.baud} baud; check for a loose cable or supply")
         if error & _ERROR_NUMBER:
             text = self._protocol.getRxPacketError(error & _ERROR_NUMBER).removeprefix("[RxPacketError] ")
             raise self._error(servo_id, f"{doing} was refused: {text}")

@@ -1,4 +1,4 @@
-"""Move the real arm as a leader decides, with the flight's own driver, and make it limp at the end in every case."""
+"""Move the real arm with the flight's own driver as a leader decides, and always make it limp at the end."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Leader(Protocol):
     """Decides the motion of the arm."""
 
     def begin(self, state: ArmState) -> Sequence[Vec2]:
-        """Return every known pose (rad) that the arm will move to."""
+        """Return the poses (rad) that the arm will move to, as far as they are known."""
         ...
 
     def update(self, motion: Motion, moved: Moved | None, state: ArmState) -> bool:
@@ -33,7 +33,7 @@ class Leader(Protocol):
         ...
 
     def status(self) -> str:
-        """Return the present activity for display."""
+        """Return the current activity for display."""
         ...
 
 
@@ -45,7 +45,7 @@ class Driven:
     """Why it ended early, one line; empty if the leader ended it."""
     angle_deg: Vec2
     load_max_nm: Vec2
-    """Largest torque beside gravity of each joint."""
+    """Largest torque of each joint in addition to gravity."""
 
 
 async def drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
@@ -71,9 +71,7 @@ async def drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
                 state = newest
             age_s = clock() - state.stamp_s
             if age_s > vehicle.safety.arm_timeout_s:
-                text = (
-                    f"the arm is lost: no answer for {age_s:.2f} s, {state.read_failures} reads; look for a loose cable"
-                )
+                text = f"the arm is lost: no answer for {age_s:.2f} s, {state.read_failures} reads; check for a loose cable"
                 return _driven(text, motion, state)
             if state.stamp_s > stepped_s:
                 moved = motion.step(state, state.stamp_s - stepped_s)
@@ -97,7 +95,7 @@ def _show(bars: Bars, limits_deg: Sequence[Vec2], state: ArmState, moved: Moved)
     bars.show(
         [(deg - low) / (high - low) for deg, (low, high) in zip(degrees, limits_deg, strict=True)],
         [
-            f"{deg:7.1f} deg  {load:+.2f} N m beside gravity  {hot:.0f} degC"
+            f"{deg:7.1f} deg  {load:+.2f} N m beyond gravity  {hot:.0f} degC"
             for deg, load, hot in zip(degrees, moved.load_nm, state.temperature_c, strict=True)
         ],
     )

@@ -1,4 +1,4 @@
-"""`companion arm jog` without `--to`: motion of a joint by keys. Pure."""
+"""`companion arm jog` without `--to`: move a joint with keys. Pure."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from companion.model.types import ArmState, Vec2
 STEP_DEG: Final = 2.0
 """Motion per key press; a held key repeats before the motion ends."""
 KEY_TIMEOUT_S: Final = 0.5
-"""Without a key for this time the joint stops."""
+"""Time without a key after which the joint stops."""
 IDLE_S: Final = 60.0
-"""Without a key for this time the arm goes limp."""
+"""Time without a key after which the arm goes limp."""
 FORWARD_KEYS: Final = frozenset({"\x1b[C", "\x1b[A", "+", "="})
 BACKWARD_KEYS: Final = frozenset({"\x1b[D", "\x1b[B", "-"})
 END_KEYS: Final = frozenset({"q", "Q", "\x1b", "\x04"})
@@ -43,7 +43,7 @@ class ByKeys:
         self._moving = False
 
     def begin(self, state: ArmState) -> list[Vec2]:
-        """Return the present pose of the arm."""
+        """Return the current pose of the arm."""
         self._ends_s = state.stamp_s + IDLE_S
         return [state.angle_rad]
 
@@ -65,7 +65,7 @@ class ByKeys:
         return state.stamp_s > self._ends_s
 
     def status(self) -> str:
-        """Return the joint that the keys move, or the reason why it must not move further."""
+        """Return the joint that the keys move, or why it must not move further."""
         return self._refusal or f"keys move joint {self._joint + 1}"
 
     def _go(self, motion: Motion, way: float, state: ArmState) -> None:

@@ -1,6 +1,5 @@
-"""Slow, bounded motion of one joint at a time on the ground, and every reason to stop it. Pure: joint states in, torques out.
-
-The law is that of `companion.control.arm_hold` behind a reference of limited speed; a small integral compensates friction and wrong
+"""Slow, bounded motion of one joint at a time on the ground, and the conditions that stop it. Pure: joint states in, torques out.
+The controller is `companion.control.arm_hold` behind a speed-limited reference; a small integral compensates friction and wrong
 masses. Angles are the paper's; the body is assumed to be level.
 """
 
@@ -20,30 +19,30 @@ from companion.model.types import IDENTITY_QUAT, ArmState, Vec2
 SPEED_MAX_DEG_S: Final = 20.0
 ACCELERATION_DEG_S2: Final = 60.0
 TORQUE_SHARE: Final = 0.6
-"""Torque limit of each servo as a share of `torque_max_nm`."""
+"""Torque limit of each servo as a fraction of `torque_max_nm`."""
 LOAD_NM: Final = 0.5
-"""Torque beside gravity that means an obstacle if it lasts for `LOAD_S`."""
+"""Torque beyond gravity that indicates an obstacle if it lasts for `LOAD_S`."""
 LOAD_S: Final = 0.15
 LIMIT_MARGIN_DEG: Final = 3.0
 RUNAWAY_DEG_S: Final = 90.0
-"""A joint turns this fast only if its sign is wrong or it is pulled."""
+"""Speed that a joint reaches only if its sign is wrong or it is pulled."""
 ASTRAY_DEG: Final = 10.0
 """Distance of a joint from its reference at which the motion stops."""
 REACHED_DEG: Final = 0.7
 _INTEGRAL_NM_RAD_S: Final = 12.0
 _INTEGRAL_MAX_NM: Final = 0.25
 _LEAD_RAD: Final = math.radians(5.0)
-"""Lag of a joint beyond which the reference waits."""
+"""Lag of a joint at which the reference stops and waits."""
 
 
 def gentle(arm: Arm, share: float = TORQUE_SHARE) -> Arm:
-    """Return the arm's configuration with this share of the torque; the driver clips every command to it."""
+    """Return the arm's configuration with this fraction of the torque limits, to which the driver clips every command."""
     first, second = (joint.model_copy(update={"torque_max_nm": share * joint.torque_max_nm}) for joint in arm.joints)
     return arm.model_copy(update={"joints": (first, second)})
 
 
 def limits_deg(arm: Arm, joint: int) -> tuple[float, float]:
-    """Return the joint limits less a margin."""
+    """Return the joint limits minus a margin."""
     low, high = arm.joints[joint].angle_deg
     return low + LIMIT_MARGIN_DEG, high - LIMIT_MARGIN_DEG
 
@@ -56,19 +55,18 @@ class Moved:
     reference_rad: Vec2
     reference_rate_rad_s: Vec2
     load_nm: Vec2
-    """Torque beside gravity."""
+    """Torque beyond gravity."""
     reached: bool
     """Whether reference and joint are at the goal."""
     stop: str = ""
-    """Why the motion has to end at once, with a torque of 0; empty if it may continue."""
+    """Why the motion has to end immediately, with zero torque; empty if it may continue."""
 
 
 class Motion:
     """Controls both joints, one of which moves.
 
     Args:
-        vehicle: arm, tool and limits.
-        state: present state of the arm.
+        vehicle: arm, tool and limits. state: current state of the arm.
     """
 
     def __init__(self, vehicle: Vehicle, state: ArmState) -> None:
@@ -83,7 +81,7 @@ class Motion:
         self._loaded_s = 0.0
         self._speed_rad_s = math.radians(SPEED_MAX_DEG_S)
         self.load_max_nm = [0.0, 0.0]
-        """Largest torque beside gravity so far."""
+        """Largest torque beyond gravity so far."""
 
     @property
     def reference_rad(self) -> Vec2:
@@ -91,11 +89,11 @@ class Motion:
         return (self._reference[0], self._reference[1])
 
     def go(self, joint: int, goal_rad: float, speed_rad_s: float) -> None:
-        """Move a joint from now on; the other one stays at its reference.
+        """Start to move a joint; the other one stays at its reference.
 
         Args:
             joint: 0 or 1.
-            goal_rad: clipped to the joint limits less the margin; a joint beyond them may only return.
+            goal_rad: clipped to the joint limits minus the margin; a joint beyond them may only return.
             speed_rad_s: at most `SPEED_MAX_DEG_S`.
         """
         low, high = (math.radians(limit) for limit in limits_deg(self._arm, joint))
@@ -118,7 +116,7 @@ class Motion:
                     where = f"({math.degrees(pose[0]):.0f}, {math.degrees(pose[1]):.0f}) deg"
                     return (
                         f"at {where} joint {joint + 1} carries {abs(gravity[joint]):.2f} N m, more than 90 % of the "
-                        f"{self._limit_nm[joint]:.2f} N m allowed here; choose a pose nearer to hanging"
+                        f"{self._limit_nm[joint]:.2f} N m allowed here; choose a pose closer to hanging"
                     )
         return ""
 
@@ -160,7 +158,7 @@ class Motion:
         )
 
     def _lead(self, joint: int, angle_rad: float, dt_s: float) -> None:
-        """Move the reference towards the goal, within its speed, and not away from a joint that does not follow."""
+        """Move the reference towards the goal within its speed limit, and not away from a joint that does not follow."""
         left = self._goal[joint] - self._reference[joint]
         if left == 0.0:
             self._rate[joint] = 0.0
@@ -197,7 +195,7 @@ class Motion:
                 return f"{name} runs away; unless it was pulled, its sign is wrong: companion arm zero"
             astray_deg = math.degrees(abs(state.angle_rad[joint] - self._reference[joint]))
             if astray_deg > ASTRAY_DEG:
-                return f"{name} is {astray_deg:.0f} deg from its reference; look for an obstacle or for something that pulls it"
+                return f"{name} is {astray_deg:.0f} deg from its reference; check for an obstacle or for something that pulls it"
             low, high = self._arm.joints[joint].angle_deg
             angle_deg = math.degrees(state.angle_rad[joint])
             if not low <= angle_deg <= high:
@@ -205,7 +203,7 @@ class Motion:
         if self._loaded_s > LOAD_S:
             joint = 0 if abs(load[0]) > abs(load[1]) else 1
             return (
-                f"joint {joint + 1}: {load[joint]:+.2f} N m beside gravity; look for an obstacle, and check the masses "
+                f"joint {joint + 1}: {load[joint]:+.2f} N m beyond gravity; check for an obstacle, and check the masses "
                 "and the torque constant in the vehicle file"
             )
         return ""

@@ -1,4 +1,4 @@
-"""The poses in which the user holds the arm, so that its zeros, directions and plugs can be found. Pure.
+"""The poses in which the user holds the arm to determine zeros, directions and swapped plugs. Pure.
 
 Angles are the paper's: joint 1 from body +x, positive turning down; joint 2 turns the lower link the other way, so that it points along
 `alpha_1 - alpha_2`. Only level and plumb directions can be held exactly by hand.
@@ -14,7 +14,7 @@ from companion.config.vehicle import Arm, Joint
 from companion.model.types import Vec2
 
 SWING_DEG, SWING_MIN_DEG = 45.0, 25.0
-"""Swing of a joint whose limits do not allow an exact direction."""
+"""Swing of a joint whose limits exclude a turn to an exact direction."""
 _STRAIGHT_DEG = ((0.0, 0.0), (90.0, 0.0))
 _DIRECTIONS = {
     0: "straight forward (towards the nose), level",
@@ -31,11 +31,11 @@ class Step:
     name: str
     instruction: str
     joint: int | None
-    """The one joint that moves, 0 or 1; None if both may."""
+    """Joint that moves, 0 or 1; None if both may."""
     by_deg: float
     """Angle by which it moves."""
     exact: bool
-    """Whether it ends in a direction that can be held exactly; otherwise only the direction of the motion counts."""
+    """Whether it ends in a direction that can be held exactly; if not, only the direction of the motion is used."""
     pose_deg: Vec2
     """Both joints at the end; approximate if not exact."""
 

@@ -25,8 +25,8 @@ SEARCHED: tuple[int, ...] = tuple(reversed(bus.BAUDS))
 """Baud rates of a full scan, in this order after the vehicle file's."""
 
 IDS = Check("arm.scan.ids", "servo ids", why=preflight.DEVICE.why)
-BAUD = Check("arm.scan.baud", "baud rate", why="servos at another rate receive nothing")
-COLLISION = Check("arm.scan.collision", "one servo per id", why="answers that collide are lost")
+BAUD = Check("arm.scan.baud", "baud rate", why="servos at a different rate receive nothing")
+COLLISION = Check("arm.scan.collision", "one servo per id", why="colliding answers are lost")
 MODEL = Check("arm.scan.model", "servo models", why=preflight.MODEL.why)
 FIRMWARE = Check("arm.scan.firmware", "servo firmware", why=preflight.FIRMWARE.why)
 ERROR = Check("arm.scan.error", "servo hardware error", why=preflight.ERROR.why)
@@ -36,7 +36,7 @@ USB = Check("arm.scan.usb_latency", "USB latency timer", why=preflight.USB.why, 
 WATCHDOG = Check(
     "arm.scan.watchdog",
     "bus watchdog",
-    why="a servo whose watchdog tripped gives no torque until it is cleared; the companion starts it in every flight",
+    why="a servo whose watchdog has tripped produces no torque until it is cleared; the companion arms the watchdog in every flight",
     warns=True,
 )
 _SETUP: Final = "companion arm setup"
@@ -53,18 +53,18 @@ class Judgement:
 
 
 def scan_for(session: Session, only: int | None = None) -> Scan:
-    """Scan the vehicle file's port and show the progress; arguments are those of `scan`."""
+    """Scan the vehicle file's port and show the progress. `only`: as in `scan`."""
     device = session.vehicle.devices.arm
     where = "every baud rate" if only is None else f"{only} baud only"
-    session.say(f"{device.port}: every servo at {where}; nothing is written, no torque")
-    with session.console.status("looking for servos") as status:
-        return scan(device, progress=lambda text: status.update(f"looking for servos at {text}"), only=only)
+    session.say(f"{device.port}: every servo at {where}; nothing is written, torque stays off")
+    with session.console.status("searching for servos") as status:
+        return scan(device, progress=lambda text: status.update(f"searching for servos at {text}"), only=only)
 
 
 def scan(
     device: ArmDevice, *, progress: Callable[[str], None] = lambda _: None, sysfs: Path = SYSFS, only: int | None = None
 ) -> Scan:
-    """Ping at every baud rate and read the registers of every servo that answers. Nothing is written, no torque.
+    """Ping at every baud rate and read the registers of every servo that answers. Nothing is written; torque stays off.
 
     Args:
         device: port, and the baud rate that is tried first.
@@ -96,7 +96,7 @@ def scan(
 
 
 def _read(talk: ServoTalk, servo_id: int, model: int, firmware: int) -> FoundServo:
-    """Read the registers of a servo that answered a ping; none if it is another model or no longer answers."""
+    """Read the registers of a servo that answered a ping; read none if it is a different model or no longer answers."""
     registers: dict[str, int] = {}
     if model == dxl.MODEL_NUMBER_XM430_W210:
         try:
@@ -138,7 +138,7 @@ def _collision(found: Scan) -> Row:
     if not found.garbled_at:
         return COLLISION.good("every answer is readable", "readable answers")
     where = " and ".join(map(str, found.garbled_at))
-    fix = f"two servos may share one id: {_one_at_a_time()}; otherwise look for a bad cable or ground"
+    fix = f"two servos may share one id: {_one_at_a_time()}; otherwise check for a bad cable or ground"
     return COLLISION.bad(f"unreadable answers at {where} baud", "readable answers", fix)
 
 
@@ -167,10 +167,13 @@ def _ids(found: Scan, who: Assignment, arm: Arm) -> Row:
 def _models(found: Scan) -> Iterator[Row]:
     strange = [servo for servo in found.servos if not servo.is_xm430]
     for servo in strange:
-        read, fix = f"id {servo.servo_id}: model {servo.model}", "install an XM430-W210, or take it off this bus"
+        read, fix = (
+            f"id {servo.servo_id}: model {servo.model}",
+            "install an XM430-W210, or remove this servo from the bus",
+        )
         if servo.model == dxl.MODEL_NUMBER_XM430_W210:
             read = f"id {servo.servo_id}: answers a ping, but not all reads"
-            fix = "another program may be on the bus: close it; otherwise cycle the servo's power"
+            fix = "another program may be using the bus: close it; otherwise cycle the servo's power"
         yield MODEL.bad(read, "XM430-W210", fix)
     if found.servos and not strange:
         yield MODEL.good("XM430-W210", "XM430-W210")
@@ -207,14 +210,14 @@ def _states(servos: Sequence[FoundServo], vehicle: Vehicle) -> list[Row]:
             not tripped,
             _each(servos, ["tripped" if servo in tripped else "not tripped" for servo in servos]),
             "not tripped",
-            f"{_SETUP} clears it; a companion that died or a cable pulled under torque caused it",
+            f"{_SETUP} clears it; it tripped because a companion died or a cable was pulled under torque",
         ),
         preflight.supply(VOLTAGE, [servo.value(dxl.PRESENT_VOLTAGE) * dxl.VOLTAGE_UNIT_V for servo in servos]),
         TEMPERATURE.row(
             max(temperatures_c) < warn_c,
             _each(servos, [f"{temperature_c} degC" for temperature_c in temperatures_c]),
             f"below {warn_c:g} degC",
-            "let the arm cool down; look for a jammed joint or an arm under load",
+            "let the arm cool down; check for a jammed joint or a load on the arm",
         ),
     ]
 
@@ -230,7 +233,7 @@ def _settings(index: int, servo: FoundServo, arm: Arm, device: ArmDevice) -> Ite
 
 
 def _each(servos: Sequence[FoundServo], texts: Sequence[str]) -> str:
-    """Return one text if all servos have it, else each with its id."""
+    """Return the common text of all servos, or each servo's text with its id if they differ."""
     if len(set(texts)) == 1:
         return texts[0]
     return ", ".join(f"id {servo.servo_id}: {text}" for servo, text in zip(servos, texts, strict=True))

@@ -19,18 +19,18 @@ SETTINGS: Final = (
     dxl.STATUS_RETURN_LEVEL, dxl.HARDWARE_ERROR, dxl.BUS_WATCHDOG, dxl.PRESENT_POSITION, dxl.PRESENT_VOLTAGE,
     dxl.PRESENT_TEMPERATURE,
 )  # fmt: skip
-"""Registers that are read of every servo."""
+"""Registers that are read from every servo."""
 CURRENT_LIMIT_MAX: Final = 1193
 CURRENT_RESERVE: Final = 1.1
 SHUTDOWN_BITS: Final = 0b00110100
-"""Overheating, electrical shock, overload: the factory's value of register 63."""
+"""Overheating, electrical shock, overload: factory value of register 63."""
 NO_SHADOW: Final = 255
 _DRIVE_REVERSE: Final = 1
 
 
 @dataclass(frozen=True, slots=True)
 class FoundServo:
-    """One servo that answered."""
+    """A servo that answered."""
 
     servo_id: int
     baud: int
@@ -84,13 +84,13 @@ class Scan:
     """Baud rates that were tried."""
     servos: tuple[FoundServo, ...]
     garbled_at: tuple[int, ...]
-    """Baud rates at which unreadable bytes came."""
+    """Baud rates at which unreadable bytes arrived."""
     latency_ms: int | None
     """Latency timer of the adapter; None if it has none."""
 
 
 class Setting(NamedTuple):
-    """Found and required value of one register."""
+    """Found and required value of a register."""
 
     register: Register
     found: int
@@ -106,7 +106,8 @@ class Setting(NamedTuple):
 
 
 def settings(servo: FoundServo, joint: Joint, arm: Arm, device: ArmDevice) -> list[Setting]:
-    """Return every setting that the companion needs, in the order of writing: id and baud rate, which change the address, last.
+    """Return every setting that the companion needs, in the order of writing: id and baud rate come last because they change the
+    address.
 
     Args:
         servo: found servo with its registers.
@@ -126,9 +127,9 @@ def settings(servo: FoundServo, joint: Joint, arm: Arm, device: ArmDevice) -> li
         (bus.SHADOW_ID, NO_SHADOW, lambda v: "none" if v > 252 else str(v), "it would follow another servo's commands"),
         (dxl.CURRENT_LIMIT, wanted_limit, str, f"torque_max_nm {joint.torque_max_nm:g} needs {needed}"),
         (bus.PWM_LIMIT, 885, str, "a lower voltage gives less torque at speed"),
-        (bus.MIN_POSITION_LIMIT, 0, str, "the companion keeps the joint limits itself"),
-        (bus.MAX_POSITION_LIMIT, dxl.COUNTS_PER_TURN - 1, str, "the companion keeps the joint limits itself"),
-        (bus.STARTUP, 0, str, "no torque when the power comes on"),
+        (bus.MIN_POSITION_LIMIT, 0, str, "the companion itself enforces the joint limits"),
+        (bus.MAX_POSITION_LIMIT, dxl.COUNTS_PER_TURN - 1, str, "the companion itself enforces the joint limits"),
+        (bus.STARTUP, 0, str, "no torque at power-on"),
         (bus.SHUTDOWN, SHUTDOWN_BITS, lambda v: f"0x{v:02x}", "overheating, shock and overload switch the torque off"),
         (bus.ID, joint.servo_id, str, "the vehicle file's servo_id"),
         (bus.BAUD, bus.BAUDS.index(device.baud), baud_text, "the vehicle file's devices.arm.baud"),
@@ -144,11 +145,11 @@ class Assignment:
     """Assignment of servos to joints."""
 
     joints: tuple[FoundServo | None, FoundServo | None]
-    """Servo of each joint, by id; a single remaining servo belongs to the missing joint."""
+    """Servo of each joint, by id; a single remaining servo is assigned to the joint without one."""
     renamed: int | None
-    """Joint whose servo has another id than in the vehicle file."""
+    """Joint whose servo id differs from the vehicle file."""
     others: tuple[FoundServo, ...]
-    """Servos that belong to no joint or an unknown one."""
+    """Servos that belong to no joint or to an unknown one."""
 
 
 def assign(servos: Sequence[FoundServo], arm: Arm) -> Assignment:

@@ -1,6 +1,6 @@
 """`companion arm setup`: write the required settings to each servo, with torque off and read back, the baud rate last.
 
-After every step `companion arm scan` finds the servos, so an interrupted setup can be run again.
+`companion arm scan` finds the servos after every step, so an interrupted setup can be repeated.
 """
 
 from __future__ import annotations
@@ -89,13 +89,13 @@ def plan(found: Scan, arm: Arm, device: ArmDevice, joint: int | None = None) -> 
         alone = f"connect only the servo of joint {joint + 1} and run companion arm setup --joint {joint + 1} again"
     if found.garbled_at:
         where = " and ".join(map(str, found.garbled_at))
-        text = f"unreadable answers at {where} baud, probably from two servos with one id; {alone}"
+        text = f"unreadable answers at {where} baud, probably from two servos with the same id; {alone}"
         return SetupPlan(refusal=text, one_at_a_time=True)
     strange = [servo for servo in found.servos if not servo.is_xm430]
     if strange:
         servo = strange[0]
-        text = f"servo {servo.servo_id} at {servo.baud} baud is no XM430-W210 that answers (model {servo.model})"
-        return SetupPlan(refusal=f"{text}; take it off this bus, or cycle its power")
+        text = f"servo {servo.servo_id} at {servo.baud} baud is not an answering XM430-W210 (model {servo.model})"
+        return SetupPlan(refusal=f"{text}; remove it from the bus, or cycle its power")
     if not found.servos:
         return SetupPlan(refusal="no servo answers at any baud rate; check their power and the plugs of the cable")
     if joint is not None:
@@ -117,7 +117,7 @@ def plan(found: Scan, arm: Arm, device: ArmDevice, joint: int | None = None) -> 
 
 
 def carry_out(port: str, plans: Sequence[ServoPlan], report: Callable[[str], None] = lambda _: None) -> None:
-    """Write the settings of the plans, one servo after the other.
+    """Write the planned settings to one servo after the other.
 
     Args:
         port: serial device.
@@ -125,7 +125,7 @@ def carry_out(port: str, plans: Sequence[ServoPlan], report: Callable[[str], Non
         report: called with a line for each value that is written.
 
     Raises:
-        DeviceError: no answer, a refusal, or a value that was not stored; values written before remain.
+        DeviceError: no answer, a refusal, or a value that was not stored; values already written remain.
     """
     with ServoTalk(port) as talk:
         for one in plans:
@@ -157,8 +157,8 @@ def _carry_out(talk: ServoTalk, one: ServoPlan, report: Callable[[str], None]) -
 def _expect(talk: ServoTalk, servo_id: int, now: str, before: str) -> None:
     if not talk.answers(servo_id):
         raise DeviceError(
-            f"servo {servo_id}: does not answer with its new {now} (it had {before}); run companion arm scan, which "
-            "finds it at either value, then companion arm setup again"
+            f"servo {servo_id}: does not answer with its new {now} (it had {before}); run companion arm scan, which finds it "
+            "with either value, then companion arm setup again"
         )
 
 
@@ -175,7 +175,7 @@ class Done:
 
 
 def set_up(session: Session) -> Done:
-    """Scan, show the changes, ask, write, scan again; one servo at a time if they cannot be distinguished.
+    """Scan, show the changes, ask, write and scan again; one servo at a time if they cannot be distinguished.
 
     Raises:
         DeviceError: a servo no longer answers; scan again.
@@ -220,7 +220,7 @@ def _set_up(session: Session, wanted: SetupPlan) -> Done:
         return Done(wanted, "nothing to do", (text,), right=not wanted.absent)
     answer = session.ask(f"write this to {len(needed)} servo{'s' if len(needed) > 1 else ''}?")
     if answer is None:
-        return Done(wanted, "not written", ("nothing was written; --yes writes it without asking",), right=False)
+        return Done(wanted, "not written", ("nothing was written; --yes writes without asking",), right=False)
     if not answer:
         raise GivenUp("nothing was written")
     carry_out(vehicle.devices.arm.port, needed, lambda text: session.say(f"  {text}"))

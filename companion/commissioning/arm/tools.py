@@ -28,14 +28,14 @@ _NAMES = ("joint 1", "joint 2")
 
 
 def _stand_text(vehicle: Vehicle) -> str:
-    """Return how the machine must be set up so that the arm can hang freely."""
+    """Return how to place the vehicle so that the arm can hang freely."""
     arm = vehicle.arm
     below_m = sum(arm.link_lengths_m) + vehicle.tool.net_radius_m - arm.shoulder_body_m[2]
     text = f"the arm reaches {below_m:.2f} m below the body"
     if below_m <= vehicle.airframe.ground_clearance_m:
         return text
-    clearance = f"on its own feet the machine has {vehicle.airframe.ground_clearance_m:.2f} m"
-    return f"{text}, {clearance}: put it on a stand, level, with nothing below the arm"
+    clearance = f"on its landing gear the vehicle has {vehicle.airframe.ground_clearance_m:.2f} m of clearance"
+    return f"{text}, {clearance}: put it on a level stand, with nothing below the arm"
 
 
 def _scan(session: Session) -> Scan:
@@ -65,7 +65,7 @@ def _zero(session: Session) -> ZeroResult:
     session.say("zero: the arm is limp, nothing moves by itself; propellers off", "bold")
     session.say(f"  {_stand_text(session.vehicle)}")
     session.say(
-        "  the servos' lights are on during a step and go off when it is accepted: held still for 2 s, or Enter"
+        "  the servos' LEDs are on during a step and go off when it is accepted: when the arm is held still for 2 s, or on Enter"
     )
     for number, step in enumerate(guide.steps, 1):
         session.say(f"  {number}. {step.instruction}")
@@ -97,7 +97,7 @@ async def _drive(session: Session, leader: Leader, what: str) -> Driven:
     session.say(f"{part}: {what}", "bold")
     session.say(f"  propellers off; {_stand_text(session.vehicle)}")
     bounds = f"at most {SPEED_MAX_DEG_S:g} deg/s and {100 * TORQUE_SHARE:.0f} % of the torque"
-    session.say(f"  {bounds}; the arm stops at {LOAD_NM:g} N m beyond gravity, and immediately at Ctrl-C")
+    session.say(f"  {bounds}; the arm stops at {LOAD_NM:g} N m beyond gravity, and immediately on Ctrl-C")
     session.say("  at the end the arm always goes limp: keep hands and objects out of the space below it")
     answer = session.ask("may the arm move now?")
     if answer is None:
@@ -118,7 +118,7 @@ async def _jog(session: Session) -> Driven:
     if goal_deg is not None:
         low, high = limits_deg(arm, joint)
         if not low <= goal_deg <= high:
-            expected = f"expected {low:g} to {high:g} deg, joint {joint + 1}'s limits less a margin"
+            expected = f"expected {low:g} to {high:g} deg, joint {joint + 1}'s limits minus a margin"
             raise ConfigError([f"companion arm jog: --to {goal_deg:g}: {expected}"])
         leader = Sweeper([Leg(joint, goal_deg, SPEED_MAX_DEG_S)], arm.torque_per_amp_nm_a)
         return await _drive(session, leader, f"joint {joint + 1} moves to {goal_deg:g} deg")
@@ -135,7 +135,7 @@ def _judge_jog(driven: Driven, vehicle: Vehicle) -> Report:
     first, second = driven.angle_deg
     load_nm = max(driven.load_max_nm)
     text = [f"stopped: {driven.stop}"] if driven.stop else []
-    text.append(f"the arm is limp, at ({first:.1f}, {second:.1f}) deg; at most {load_nm:.2f} N m beside gravity")
+    text.append(f"the arm is limp, at ({first:.1f}, {second:.1f}) deg; at most {load_nm:.2f} N m beyond gravity")
     data = {"stopped": driven.stop, "angle_deg": [first, second], "load_max_nm": list(driven.load_max_nm)}
     return Report((), data, text, ok=not driven.stop)
 

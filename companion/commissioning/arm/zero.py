@@ -1,4 +1,4 @@
-"""Zeros, directions and plugs of the arm's servos, from three hand-held poses. Pure."""
+"""Finds zeros, directions and swapped plugs of the arm's servos from three hand-held poses. Pure."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from companion.config.vehicle import Arm
 from companion.io.dynamixel.registers import COUNTS_PER_TURN
 
 HELD_S: Final = 2.0
-"""A pose counts after this time at rest."""
+"""Time at rest after which a pose is accepted."""
 STILL_DEG: Final = 1.5
 """Largest motion of a joint at rest."""
 BEGUN_DEG: Final = 5.0
 """Motion that begins a step."""
 NEAR_SHARE: Final = 0.35
-"""Largest error of an exact turn, as a share of it."""
+"""Largest error of an exact turn, as a fraction of the turn."""
 ALONE_SHARE: Final = 0.35
-"""Largest motion of the other joint, as a share of the turn."""
+"""Largest motion of the other joint, as a fraction of the turn."""
 HAND_DEG: Final = 2.0
-"""Accuracy of a link held level or plumb; a zero of the vehicle file within this is kept."""
+"""Accuracy of a link held level or plumb; a zero in the vehicle file is kept if its error is smaller."""
 DISAGREE_DEG: Final = 8.0
-"""Largest difference between the zeros of two poses; a larger one means a pose that was not held, or a slipping arm."""
+"""Largest difference between the zeros of two poses; a larger one means that a pose was not held, or that the arm slips on a servo."""
 _DEG_PER_COUNT: Final = 360.0 / COUNTS_PER_TURN
 
 Counts = tuple[int, int]
@@ -42,7 +42,7 @@ class ZeroJoint:
     zero_count: int
     """Present position (register 132) at joint angle 0, within one turn unless the joint turns more than once."""
     spread_deg: float | None
-    """Difference between the poses that show the zero; None if only one does."""
+    """Difference between the zeros of two poses; None if only one pose shows it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,22 +82,22 @@ class ZeroView:
     moved_deg: tuple[float, float]
     """Motion since the step began, as each servo counts, in the order of the vehicle file's servos."""
     held: float
-    """Share of `HELD_S` for which the arm has been held, 0 to 1."""
+    """Fraction of `HELD_S` for which the arm has been held, 0 to 1."""
     notice: str
     """Deviation from the requested pose; empty if there is none."""
     result: ZeroResult | None = None
     failed: str = ""
-    """Why the poses contradict each other, which ends the guide."""
+    """Why the poses contradict each other, which ends the test."""
 
 
 class ZeroGuide:
     """Watches the arm, decides when a pose is held, and computes the result at the end.
 
     Args:
-        arm: arm of the vehicle file; its joint limits determine the poses.
+        arm: arm from the vehicle file; its joint limits determine the poses.
 
     Raises:
-        ConfigError: the joint limits leave no such poses.
+        ConfigError: no suitable poses lie within the joint limits.
     """
 
     def __init__(self, arm: Arm) -> None:
@@ -157,9 +157,9 @@ class ZeroGuide:
             return ""
         most, least = max(map(abs, moved)), min(map(abs, moved))
         if least > ALONE_SHARE * max(most, SWING_MIN_DEG):
-            return "both joints have moved; turn only the requested one and return the other"
+            return "both joints have moved; turn only the requested one and move the other one back"
         if step.exact and abs(most - abs(step.by_deg)) > NEAR_SHARE * abs(step.by_deg):
-            return f"{abs(step.by_deg):.0f} deg are requested, it has turned by {most:.0f}"
+            return f"requested {abs(step.by_deg):.0f} deg, it has turned by {most:.0f}"
         if most < SWING_MIN_DEG:
             return f"turn it further, {SWING_MIN_DEG:.0f} deg at least; it has turned by {most:.0f}"
         return ""
@@ -177,7 +177,7 @@ class ZeroGuide:
         for joint, found in enumerate(joints):
             if found.spread_deg is not None and found.spread_deg > DISAGREE_DEG:
                 text = f"joint {joint + 1}: the poses disagree by {found.spread_deg:.1f} deg"
-                return _failed(view, f"{text}; hold them more exactly, and look for a slipping horn")
+                return _failed(view, f"{text}; hold them more precisely, and check for a slipping horn")
         result = ZeroResult((joints[0], joints[1]), elbow == 0)
         return ZeroView(step=None, number=view.number, moved_deg=moved, held=1.0, notice="", result=result)
 

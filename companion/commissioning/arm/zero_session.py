@@ -1,4 +1,4 @@
-"""`companion arm zero`: the user holds the limp arm; the servos' lights show which step is accepted. I/O only."""
+"""`companion arm zero`: the user holds the limp arm; the servos' LEDs go off when a step is accepted. I/O only."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from companion.runtime.terminal import Bars, pressed, raw_keys
 PERIOD_S: Final = 0.02
 STEP_TIMEOUT_S: Final = 180.0
 _FULL_DEG: Final = 90.0
-"""Angle at which a bar is full."""
+"""Angle at which a progress bar is full."""
 
 
 def hold(vehicle: Vehicle, guide: ZeroGuide, console: Console) -> ZeroResult:
-    """Guide the user through the steps without torque; the lights always go off at the end.
+    """Guide the user through the steps without torque; the LEDs always go off at the end.
 
     Raises:
         DeviceError: a servo does not answer or is not set up, a pose was not held in time, or the poses contradict each other.

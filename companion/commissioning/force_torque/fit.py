@@ -1,4 +1,4 @@
-"""Mounting and scale of the force sensor, from a known weight on the net; drift of a sensor at rest. Pure.
+"""Mounting and scale of the force sensor from a known weight on the net, and its drift at rest. Pure.
 
 Frames: link 2 (x outwards along the link, y along the joint axis) and the sensor, rotated against it by `tool.sensor_rpy_deg`. A
 reading is the force of the surroundings on the tool side of the sensor.
@@ -25,9 +25,9 @@ from companion.preflight.hand_test.motion import angle_rad, norm
 
 STUCK = Check("ft.stuck", "force sensor alive", why="a stuck sensor reports plausible values and measures nothing")
 WEIGHT = Check("ft.weight", "known weight", why="scale and direction remain unknown")
-SCALE = Check("ft.scale", "force sensor scale", why="the law would respond to a wrong force")
+SCALE = Check("ft.scale", "force sensor scale", why="the controller would respond to the wrong force")
 DIRECTION = Check(
-    "ft.direction", "force sensor direction", why="the law would respond to every force in a wrong direction"
+    "ft.direction", "force sensor direction", why="the controller would respond to every force in the wrong direction"
 )
 POSE = Check(
     "ft.pose", "pose of the arm", why="a rotation of the sensor about the weight's direction is invisible", warns=True
@@ -36,39 +36,39 @@ POSE = Check(
 SCALE_TOLERANCE: Final = 0.05
 DIRECTION_MAX_DEG: Final = 8.0
 EXPLAINED_MAX_DEG: Final = 20.0
-"""Largest remaining angle at which a right-angle turn explains a direction."""
+"""Largest remaining angle at which a right-angle turn counts as the explanation of a direction."""
 APART_MIN_DEG: Final = 12.0
 """Smallest difference in angle between the best and the next explanation."""
 
 
 @dataclass(frozen=True, slots=True)
 class WeightFit:
-    """Scale and mounting of the sensor by a known weight."""
+    """Scale and mounting of the sensor, measured with a known weight."""
 
     expected_n: float
     measured_n: float
     scale: float
     """Measured over expected weight."""
     off_deg: float
-    """Angle between the measured weight and its direction by the vehicle file."""
+    """Angle between the measured weight and its direction according to the vehicle file."""
     turn: AxisMap
     """Right-angle turn of the sensor, on top of the vehicle file's mounting, that explains the weight best."""
     rest_deg: float
     """Remaining angle after that turn."""
     others: tuple[AxisMap, ...]
-    """Turns that explain it nearly as well."""
+    """Other turns that explain it nearly as well."""
     rpy_deg: Vec3
     """Value of `tool.sensor_rpy_deg` with that turn."""
 
 
 def down_in_link2(arm_rad: Vec2) -> Vec3:
-    """Return gravity's direction in link 2's frame while the machine is level."""
+    """Return gravity's direction in link 2's frame for a level vehicle."""
     half = 0.5 * (arm_rad[0] - arm_rad[1])
     return quat_rotate((math.cos(half), 0.0, -math.sin(half), 0.0), (0.0, 0.0, -1.0))
 
 
 def fit_weight(empty_n: Vec3, loaded_n: Vec3, arm_rad: Vec2, weight_kg: float, sensor_rpy_deg: Vec3) -> WeightFit:
-    """Return the one of the 24 right-angle turns that explains the weight best, preferring the configured mounting.
+    """Return which of the 24 right-angle turns explains the weight best, preferring the configured mounting.
 
     Args:
         empty_n: mean reading with the net empty, sensor frame.
@@ -102,20 +102,20 @@ def rows(fit: WeightFit) -> Iterator[Row]:
     read = f"{fit.measured_n:.2f} N of {fit.expected_n:.2f} N, ratio {fit.scale:.3f}"
     fix = (
         f"the sensor reads {fit.scale:.2f} times the true force: check the weight, and hang it on the net only; if "
-        "that is correct, the sensor is another model (this one has 50 counts per N) or has to be calibrated by its maker"
+        "that is correct, the sensor is a different model (this one has 50 counts per N) or must be calibrated by its manufacturer"
     )
     yield SCALE.row(abs(fit.scale - 1.0) <= SCALE_TOLERANCE, read, f"within {100 * SCALE_TOLERANCE:g} %", fix)
-    read = f"{fit.off_deg:.0f} deg from the direction by tool.sensor_rpy_deg"
+    read = f"{fit.off_deg:.0f} deg from the direction according to tool.sensor_rpy_deg"
     fix = (
-        "hang the weight freely from the net's centre; check the arm's angles (companion arm zero); level the "
-        "machine; raise link 2 to some 30 deg below level, and repeat"
+        "hang the weight freely from the net's centre; check the arm's angles (companion arm zero); level the vehicle; raise "
+        "link 2 to about 30 deg below level, and repeat"
     )
     if changes(fit):
         rpy = ", ".join(f"{angle:g}" for angle in fit.rpy_deg)
-        fix = f"the sensor is turned: set tool.sensor_rpy_deg: [{rpy}], with {fit.rest_deg:.0f} deg remaining"
+        fix = f"the sensor is turned: set tool.sensor_rpy_deg: [{rpy}], which leaves {fit.rest_deg:.0f} deg"
     yield DIRECTION.row(fit.off_deg <= DIRECTION_MAX_DEG, read, f"within {DIRECTION_MAX_DEG:g} deg", fix)
     read = f"{len(fit.others) or 'no'} other right-angle turns explain it as well"
-    yield POSE.row(not fit.others, read, "none", "repeat with link 2 some 20 to 35 deg below level, not straight down")
+    yield POSE.row(not fit.others, read, "none", "repeat with link 2 about 20 to 35 deg below level, not straight down")
 
 
 def changes(fit: WeightFit) -> dict[Location, Data]:
@@ -146,18 +146,18 @@ def stuck_row(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """One axis of a sensor at rest."""
+    """Drift of one axis of a sensor at rest."""
 
     mean_n: float
     noise_n: float
-    """Standard deviation about the drift."""
+    """Standard deviation about the drift line."""
     per_minute_n: float
     standard_error_n: float
     """Standard error of `per_minute_n`, from the scatter of means over a second."""
 
 
 def drift(samples: Sequence[ForceSample]) -> list[Drift]:
-    """Fit a straight line to each axis x, y, z; takes at least 4 s of samples."""
+    """Fit a straight line to each axis x, y, z; requires at least 4 s of samples."""
     return [_drift([(s.stamp_s, s.force_sensor_n[axis]) for s in samples]) for axis in range(3)]
 
 

@@ -1,4 +1,6 @@
-"""`companion ft check`: the force sensor at rest and under a known weight. `companion ft tare`: its drift and its own bias."""
+"""`companion ft check`: measure the force sensor at rest and under a known weight. `companion ft tare`: measure its drift and set
+its own zero.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,7 @@ TARE_S: Final = 1.0
 """Duration of a flight's tare."""
 DRIFT_WARN_N_MIN: Final = 0.3
 ZERO_MAX_N: Final = 0.3
-_EMPTY: Final = "the machine stands level on its legs, the net is empty, nothing touches it"
+_EMPTY: Final = "the vehicle rests level on its landing gear, the net is empty, nothing touches it"
 
 DRIFT = Check(
     "ft.drift",
@@ -44,14 +46,14 @@ BIAS_SET = Check("ft.bias_set", "sensor's own bias", why="the sensor ignored the
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """Measurement of the sensor at rest and, if announced, under a known weight."""
+    """Measurement of the sensor at rest and, if requested, under a known weight."""
 
     empty: Sequence[ForceSample]
     arm_rad: Vec2
     stream: ForceStream
     usb_latency_ms: int | None
     weight_kg: float | None
-    """Announced weight; None if none was announced."""
+    """Known weight given by the user; None if none was given."""
     loaded: Sequence[ForceSample] = ()
     """Samples under the weight; empty if no weight was recognised."""
     loaded_arm_rad: Vec2 = (0.0, 0.0)
@@ -89,14 +91,14 @@ async def watch(session: Session) -> Watched:
             session.say(f"weight detected; do not touch it for {LOADED_S:g} s")
             loaded = await sensor.tare_samples(LOADED_S)
             seen = replace(seen, loaded=loaded, loaded_arm_rad=await angles_rad())
-            session.say("take the weight off")
+            session.say("remove the weight")
         except DeviceError as error:
             return replace(seen, problem=str(error))
         return seen
 
 
 def judge(seen: Watched, vehicle: Vehicle) -> Report:
-    """Return the report on the sensor at rest, and on scale and direction if a weight was announced."""
+    """Return the report on the sensor at rest, and on scale and direction if a weight was given."""
     rows = _rest_rows(seen, vehicle)
     duration_s = seen.empty[-1].stamp_s - seen.empty[0].stamp_s
     rest = {
@@ -134,8 +136,8 @@ def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
     samples = seen.empty
     duration_s = samples[-1].stamp_s - samples[0].stamp_s
     bias_fix = (
-        "free the net; without a load correct tool.net_mass_kg, or loosen the sensor's mount; make the remaining "
-        "force the sensor's own zero with companion ft tare --sensor"
+        "free the net; if it is free, correct tool.net_mass_kg or loosen the sensor's mount; set the sensor's own zero to the "
+        "remaining force with companion ft tare --sensor"
     )
     return [
         *(
@@ -149,22 +151,22 @@ def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
 
 @dataclass(frozen=True, slots=True)
 class Tared:
-    """Measurement of the empty net, and of the sensor after its own zero was set."""
+    """Measurement with an empty net, and after the sensor's own zero was set."""
 
     samples: Sequence[ForceSample]
     first: Sequence[ForceSample]
-    """The first samples, as many as in a flight's tare."""
+    """The first samples, as many as the tare of a flight uses."""
     arm_rad: Vec2
     zeroed: Sequence[ForceSample] = ()
     """Samples after the sensor's own zero was set; empty if it was not."""
 
 
 async def watch_drift(session: Session) -> Tared:
-    """Measure the empty net; set or clear the sensor's own zero on request."""
+    """Measure with an empty net; set or clear the sensor's own zero on request."""
     arguments, vehicle = session.arguments, session.vehicle
     given_rad = pose_rad(arguments.arm_pose, vehicle)
     for wanted, question in (
-        (arguments.sensor, "make the present reading the sensor's own zero?"),
+        (arguments.sensor, "set the sensor's own zero to the present reading?"),
         (arguments.clear, "clear the sensor's own zero?"),
     ):
         if wanted and not session.confirm(question):
@@ -190,13 +192,13 @@ def judge_drift(seen: Tared, vehicle: Vehicle) -> Report:
     rows = []
     if seen.zeroed:
         left_n = math.hypot(*mean_force_n(seen.zeroed))
-        read = f"reads {left_n:.2f} N right after it was set"
+        read = f"reads {left_n:.2f} N just after it was set"
         rows.append(BIAS_SET.row(left_n <= ZERO_MAX_N, read, f"{ZERO_MAX_N:g} N", "power-cycle the sensor and repeat"))
     axes = dict(zip("xyz", ft_fit.drift(seen.samples), strict=True))
     worst_n = max(abs(axis.per_minute_n) for axis in axes.values())
-    fix = "leave it powered for 20 minutes and repeat; keep it away from sunlight and the motors' heat"
-    read = f"{worst_n:.2f}N per minute on the worst axis"
-    rows.append(DRIFT.row(worst_n <= DRIFT_WARN_N_MIN, read, f"{DRIFT_WARN_N_MIN:g}N per minute", fix))
+    fix = "leave it powered for 20 minutes and repeat; keep it away from sunlight and from the heat of the motors"
+    read = f"{worst_n:.2f} N per minute on the worst axis"
+    rows.append(DRIFT.row(worst_n <= DRIFT_WARN_N_MIN, read, f"{DRIFT_WARN_N_MIN:g} N per minute", fix))
     rows.append(ft_fit.stuck_row(seen.samples, vehicle))
     x, y, z = bias_n = tare_bias_n(seen.first, vehicle, IDENTITY_QUAT, seen.arm_rad)
     net_kg = vehicle.tool.net_mass_kg
@@ -208,10 +210,10 @@ def judge_drift(seen: Tared, vehicle: Vehicle) -> Report:
     text = [
         *(
             f"  F{name}  mean {one.mean_n:+7.2f} N   noise {one.noise_n:.3f} N   drift {one.per_minute_n:+.3f} "
-            f"+- {one.standard_error_n:.3f}N per minute"
+            f"+- {one.standard_error_n:.3f} N per minute"
             for name, one in axes.items()
         ),
-        f"  a flight's tare removes ({x:+.2f}, {y:+.2f}, {z:+.2f}) N beside the net's {net_kg:g} kg",
+        f"  a flight's tare would remove ({x:+.2f}, {y:+.2f}, {z:+.2f}) N beyond the net's {net_kg:g} kg",
         "  temperature: the sensor's protocol does not report it",
         "",
     ]

@@ -26,14 +26,14 @@ _STILL_N: Final = 0.3
 """Largest difference between means over `_LOOK_S` once the weight has stopped swinging."""
 _CHANGE_MIN_N: Final = 0.5
 _CHANGE_SHARE: Final = 0.15
-"""Share of the weight from which on it is detected, so that a sensor that reads too little is found as well."""
+"""Fraction of the weight at which it is detected; small enough for a sensor that reads too little."""
 
 
 class FtSensor(RobotousForceTorque):
     """The force sensor's driver with SET_BIAS, which no flight uses."""
 
     async def set_bias(self, on: bool) -> None:
-        """Make the present reading zero (SET_BIAS 1), or undo that (0), and drop the samples in transit.
+        """Set the sensor's zero to the present reading (SET_BIAS 1) or clear it (0), and drop the samples in transit.
 
         The sensor does not acknowledge the command; check its reading.
 
@@ -55,7 +55,7 @@ def pose_rad(text: str | None, vehicle: Vehicle) -> Vec2 | None:
     try:
         first, second = (float(part) for part in text.split(","))
     except ValueError:
-        raise ConfigError([f"--arm-pose {text}: expected two angles in deg, as 165,140"]) from None
+        raise ConfigError([f"--arm-pose {text}: expected two angles in deg, such as 165,140"]) from None
     for angle, joint, number in zip((first, second), vehicle.arm.joints, (1, 2), strict=True):
         low, high = joint.angle_deg
         if not low <= angle <= high:
@@ -67,7 +67,7 @@ def pose_rad(text: str | None, vehicle: Vehicle) -> Vec2 | None:
 async def arm_angles(
     vehicle: Vehicle, clock: Clock, given_rad: Vec2 | None
 ) -> AsyncIterator[Callable[[], Awaitable[Vec2]]]:
-    """Yield a function that returns the given joint angles, or reads them from the servos, which get no current.
+    """Yield a function that returns the given joint angles, or reads them from the servos without torque.
 
     Raises:
         DeviceError: the arm does not open, or stops answering.

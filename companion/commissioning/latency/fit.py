@@ -1,11 +1,11 @@
-"""Delay of motion capture from taps on the airframe, by comparing it with the IMU. Pure.
+"""Measures the delay of motion capture from taps on the airframe, by comparison with the IMU. Pure.
 
-A tap changes the position too little for a second difference of motion capture, whose noise of 0.2 mm gives 20 m/s^2 at 200 Hz.
-Therefore the IMU is integrated. Around each tap the specific force is rotated into the world and integrated twice, the gyro once.
-Position and rotation by motion capture are regressed on the result, shifted by a delay, and on a polynomial for slow changes: initial
-values, gravity, bias, the sway of the hand. The residual is smallest at the delay; a parabola through the minimum resolves it below the
-sample period, and its curvature gives the error. IMU samples are on the companion's clock, poses are stamped on arrival at the
-companion.
+A tap moves the vehicle too little to differentiate motion capture twice: its noise of 0.2 mm gives 20 m/s^2 at 200 Hz. Therefore
+the IMU is integrated. Around each tap the specific force is rotated into the world and integrated twice, the gyro once. Position
+and rotation measured by motion capture are regressed on the result, shifted by a delay, and on a polynomial for slow changes:
+initial values, gravity, bias, the sway of the hand. The residual is smallest at the delay; a parabola through the minimum resolves
+it below the sample period, and its curvature gives the error. IMU samples are on the companion's clock, poses are stamped on
+arrival at the companion.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ Floats = NDArray[np.float64]
 DELAY_SPAN_S: Final = (-0.020, 0.150)
 TAPS_MIN: Final = 5
 STRENGTH_MIN_M_S2: Final = 1.5
-"""Peak of the specific force without its slow part."""
+"""Least peak of the specific force without its slow part."""
 NOISE_FACTOR: Final = 7.0
-"""Ratio of a tap to the IMU's noise."""
+"""Least ratio of a tap to the IMU's noise."""
 CORRELATION_MIN: Final = 0.5
 TAP_ERROR_MAX_S: Final = 0.004
-"""Standard error of one tap's delay."""
+"""Largest standard error of one tap's delay."""
 ERROR_MAX_S: Final = 0.0015
-"""Standard error of the result."""
+"""Largest standard error of the result."""
 BEFORE_S, AFTER_S = 0.08, 0.16
-"""Time around a tap in which motion capture is compared."""
+"""Window around a tap in which motion capture is compared."""
 SETTLE_S: Final = 0.35
 """Time after a tap until all its data have arrived, delay included."""
 APART_S: Final = 0.45
@@ -63,11 +63,11 @@ class TapDelay:
 
     tap: Tap
     delay_s: float
-    """Time from exposure, by PX4's clock, to the arrival of the pose at the companion."""
+    """Time from exposure, according to PX4's clock, to the arrival of the pose at the companion."""
     error_s: float
     """Standard error from the curvature of the residual."""
     correlation: float
-    """Correlation without the slow part: 1 if the shifted IMU explains all of the motion."""
+    """Correlation without the slow part; 1 if the shifted IMU explains all motion."""
     problem: str
     """Why the tap is not used; empty if it is used."""
 
@@ -105,7 +105,7 @@ def find_taps(imu: Sequence[ImuAt]) -> list[Tap]:
 
 
 def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: tuple[float, float]) -> TapDelay:
-    """Measure the delay with one tap.
+    """Measure the delay from one tap.
 
     Args:
         tap: found in `imu`.
@@ -127,7 +127,7 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
         if step_s == _FINE_S:
             first_s, last_s = delay_s - 2.0 * _COARSE_S, delay_s + 2.0 * _COARSE_S
         grid = np.arange(first_s, last_s + 0.5 * step_s, step_s)
-        # The coarse round covers every possible delay, the fine one the neighbourhood of the best.
+        # The coarse search covers every possible delay, the fine one the neighbourhood of the best.
         centre_s = tap.t_s + (delay_s if step_s == _FINE_S else 0.0)
         until_s = centre_s + AFTER_S + (high if step_s == _COARSE_S else 0.0)
         window = [pose for pose in seen if centre_s - BEFORE_S <= pose.t_s <= until_s]
@@ -156,11 +156,9 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
     error_s = math.sqrt(2.0 * scatter / curvature) if curvature > 0.0 else math.inf
     problem = ""
     if correlation < CORRELATION_MIN:
-        problem = (
-            f"too weak: the IMU explains too little of the motion by motion capture (correlation {correlation:.2f})"
-        )
+        problem = f"too weak: the IMU explains too little of the motion that motion capture measured (correlation {correlation:.2f})"
     elif error_s > TAP_ERROR_MAX_S:
-        problem = f"too weak: its time is known only to {1e3 * error_s:.1f} ms"
+        problem = f"too weak: its time is known only to within {1e3 * error_s:.1f} ms"
     return TapDelay(tap=tap, delay_s=delay_s, error_s=error_s, correlation=correlation, problem=problem)
 
 
@@ -180,14 +178,15 @@ def combine(taps: Sequence[TapDelay]) -> Delay | str:
     if len(good) < TAPS_MIN:
         weak = [tap.problem for tap in taps if tap.problem]
         why = f"; {len(weak)} are unusable, the last: {weak[-1]}" if weak else ""
-        return f"{len(good)} of {len(taps)} taps are usable, {TAPS_MIN} are needed{why}"
+        return f"{len(good)} of {len(taps)} taps are usable, expected {TAPS_MIN}{why}"
     values = np.array([tap.delay_s for tap in good])
     spread_s = float(values.std(ddof=1))
     error_s = spread_s / math.sqrt(len(good))
     if error_s > ERROR_MAX_S:
         return (
-            f"the taps differ by {1e3 * spread_s:.1f} ms (standard deviation), the mean is known only to {1e3 * error_s:.1f} ms, "
-            f"{1e3 * ERROR_MAX_S:g} ms are needed"
+            f"the taps differ by {1e3 * spread_s:.1f} ms (standard deviation), the mean is known only to within {1e3 * error_s:.1f} "
+            "ms, "
+            f"expected {1e3 * ERROR_MAX_S:g} ms"
         )
     return Delay(float(values.mean()), error_s, spread_s, tuple(good))
 
@@ -207,7 +206,7 @@ def mocap_noise(poses: Sequence[PoseAt]) -> tuple[float, float]:
 
 
 class _Course:
-    """Position and rotation by integration of the IMU, at any time between its samples."""
+    """Position and rotation integrated from the IMU, at any time between its samples."""
 
     def __init__(self, imu: Sequence[ImuAt], start: Quat) -> None:
         self._start = start
@@ -235,7 +234,7 @@ class _Course:
         self._r, self._w = np.array(turns), np.array([*rates, rates[-1]])
 
     def costs(self, window: Sequence[PoseAt], delays: Floats, noise: tuple[float, float]) -> tuple[Floats, float, int]:
-        """Return the residual of each delay in units of the noise, the residual without an IMU, and the degrees of freedom."""
+        """Return the residual for each delay in units of the noise, the residual without the IMU, and the degrees of freedom."""
         t = np.array([pose.t_s for pose in window])
         s = (t - t[0]) / (t[-1] - t[0])
         place = np.array([pose.position_m for pose in window])
@@ -253,7 +252,7 @@ class _Course:
                 fast = (felt - slow @ (slow.T @ felt)) / sigma
                 power = float((fast**2).sum())
                 share = float((fast * seen).sum()) / power if power > 0.0 else 0.0
-                # The scales may differ slightly, the signs must agree.
+                # The scales may differ slightly; the signs must agree.
                 share = min(1.5, max(0.0, share))
                 cost += float(((seen - share * fast) ** 2).sum())
             costs.append(cost)

@@ -2,7 +2,7 @@
 only.
 
 HIGHRES_IMU carries the time of its sample (`time_usec`), so the latency of the message does not matter. PX4 answers a TIMESYNC request
-(`tc1` = 0) immediately with its time; half of the round-trip time is taken as the delay of the reply.
+(`tc1` = 0) immediately with its time; half the round-trip time is used as the delay of the reply.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _NEAR: Final = 30
 
 @dataclass(frozen=True, slots=True)
 class Sync:
-    """One answer with PX4's clock."""
+    """PX4's answer to one TIMESYNC request."""
 
     t_s: float
     """Midpoint between request and answer, companion's clock."""
@@ -43,7 +43,7 @@ class Sync:
 
 
 class LatencyLink(MavsdkAutopilot):
-    """The autopilot's driver, which also keeps every IMU sample and requests PX4's clock ten times a second."""
+    """The autopilot driver, extended to keep every IMU sample and to request PX4's clock ten times a second."""
 
     def __init__(self, device: AutopilotDevice, clock: Clock) -> None:
         super().__init__(device, clock)

@@ -1,4 +1,4 @@
-"""`companion latency`: delay of motion capture to PX4, measured by taps on the airframe, and the value of EKF2_EV_DELAY."""
+"""`companion latency`: measures the delay of motion capture to PX4 by taps on the airframe, and sets EKF2_EV_DELAY."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ TAPS = Check("latency.taps", "taps", why="the delay remains unknown")
 DELAY = Check(
     "latency.delay",
     "EKF2_EV_DELAY",
-    why="PX4 fuses each pose at the wrong time: the estimate oscillates with the machine",
+    why="PX4 fuses each pose at the wrong time: the estimate oscillates with the vehicle's motion",
 )
 LONG = Check(
     "latency.long",
@@ -67,15 +67,15 @@ class Measured:
     round_trip_s: float
     imu_age_s: float | None
     mocap_latency_s: float | None
-    """Median time from mid-exposure to transmission, by the server's stamps."""
+    """Median time from mid-exposure to transmission, according to the server's stamps."""
     px4_ms: float | None
-    """Present EKF2_EV_DELAY; None if PX4 has no such parameter."""
+    """Current EKF2_EV_DELAY; None if PX4 has no such parameter."""
     written_ms: float | None = None
     """Written EKF2_EV_DELAY; None if it was not written."""
 
     @property
     def total_ms(self) -> float | None:
-        """Time from exposure to arrival in PX4, the meaning of EKF2_EV_DELAY; None without a delay."""
+        """Time from exposure to arrival in PX4, as in EKF2_EV_DELAY; None if the delay is unknown."""
         return None if isinstance(self.delay, str) else 1e3 * (self.delay.delay_s + 0.5 * self.round_trip_s)
 
 
@@ -95,8 +95,8 @@ async def measure(session: Session) -> Measured:
         # As in flight, because a busy computer stamps motion capture late.
         claim_realtime(FLIGHT_PRIORITY, cpus=vehicle.computer.cpus, lock_memory=False)
         session.say(
-            f"hold the machine up by its legs, propellers off, and have a second person tap its frame {arguments.taps} times with the "
-            "flat of the hand, one tap a second, from several sides"
+            f"hold the vehicle up by its legs, propellers off, while a second person taps its frame {arguments.taps} times with "
+            "the flat of the hand, one tap a second, from several sides"
         )
         taps = await _tapped(session, link, clock, poses)
         latencies_s = [pose.latency_s for pose in poses if pose.latency_s is not None]
@@ -112,7 +112,7 @@ async def measure(session: Session) -> Measured:
             return measured
         value, max_ms = round(measured.total_ms, _DIGITS), _max_ms(vehicle)
         if not 0.0 <= measured.total_ms <= max_ms:
-            session.say(f"{PARAMETER} is not written: {measured.total_ms:.1f} ms is outside of 0 to {max_ms:g} ms")
+            session.say(f"{PARAMETER} is not written: {measured.total_ms:.1f} ms is outside 0 to {max_ms:g} ms")
         elif session.confirm(f"write {PARAMETER} = {value:g} ms to PX4?"):
             _refuse_armed(link, devices.autopilot.address)
             measured = replace(measured, written_ms=float(await link.write_param(PARAMETER, value)))
@@ -126,9 +126,8 @@ def _refuse_armed(link: LatencyLink, address: str) -> None:
 
 
 async def _tapped(session: Session, link: LatencyLink, clock: Clock, poses: list[MocapPose]) -> tuple[TapDelay, ...]:
-    """Return every tap so far, once enough are usable or the time is over.
-
-    During the session taps are only counted, because work on the event loop would stamp motion capture late.
+    """Return all taps once enough are usable or the time is over. During the session taps are only counted, because computing on
+    the event loop would delay the time stamps of motion capture.
     """
     end_s, from_s, wanted = clock() + session.arguments.seconds, clock(), session.arguments.taps
     done: list[TapDelay] = []
@@ -150,14 +149,14 @@ async def _tapped(session: Session, link: LatencyLink, clock: Clock, poses: list
         from_s = clock() + _LOOK_S
         if missing > 0:
             problem = next((tap.problem for tap in reversed(done) if tap.problem), "their delays differ")
-            session.say(f"{missing} of {wanted} are missing, the last problem: {problem}; continue tapping")
+            session.say(f"{missing} of {wanted} taps are missing (last problem: {problem}); continue tapping")
     return tuple(done)
 
 
 async def _count(
     session: Session, link: LatencyLink, clock: Clock, from_s: float, end_s: float, wanted: int
 ) -> list[Tap]:
-    """Return the taps since `from_s` once there are `wanted` and the last one is complete; fewer if the time is over."""
+    """Return the taps since `from_s` once there are `wanted` of them and the last is complete; fewer if the time is over."""
     felt: list[Tap] = []
     while clock() < end_s and (len(felt) < wanted or clock() < felt[-1].t_s + SETTLE_S):
         await asyncio.sleep(_LOOK_S)
@@ -187,8 +186,8 @@ def rows(m: Measured, max_ms: float) -> list[Row]:
     """Return the rows; `max_ms` is the largest delay that the preflight accepts."""
     if isinstance(m.delay, str):
         fix = (
-            f"tap harder, with the flat of the hand ({STRENGTH_MIN_M_S2:g} m/s2 and more), the machine held up in the air where it can "
-            "give way, markers in view, one tap a second"
+            f"tap harder, with the flat of the hand ({STRENGTH_MIN_M_S2:g} m/s2 or more), one tap a second; hold the vehicle in "
+            "the air so that it can move, with its markers in view"
         )
         return [TAPS.bad(m.delay, "", fix)]
     assert m.total_ms is not None
@@ -197,7 +196,7 @@ def rows(m: Measured, max_ms: float) -> list[Row]:
     set_it = (
         f"set {PARAMETER} to {round(m.total_ms, _DIGITS):g} (companion latency --write, or QGroundControl), restart PX4"
     )
-    relieve = "reduce Motive's load (no video, fewer bodies), use a cable to a network of its own; then measure again"
+    relieve = "reduce Motive's load (no video, fewer bodies), use a cable on a separate network; then measure again"
     return [
         TAPS.good(f"{len(m.delay.used)} of {len(m.taps)}, {1e3 * m.delay.spread_s:.1f} ms from tap to tap"),
         DELAY.row(
@@ -220,7 +219,7 @@ def text(m: Measured) -> list[str]:
             + (f"  {tap.problem}" if tap.problem else "")
         )
     ages = (
-        ("mocap datagram's age by the server's stamps", m.mocap_latency_s),
+        ("mocap datagram's age (server's stamps)", m.mocap_latency_s),
         ("IMU message's age", m.imu_age_s),
         ("link to PX4 and back", m.round_trip_s),
     )

@@ -23,13 +23,13 @@ _UP: Final[Vec3] = (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Axes of the set-up by the three motions."""
+    """Axes of the set-up, found from the three motions."""
 
     axes: AxisMap
     """The true directions of the rigid body's streamed axes."""
     mirrored: bool
     level: bool
-    """Whether gravity is vertical in the stream. Then either the whole stream has other axes, or nothing has."""
+    """Whether gravity is vertical in the stream. If so, either the axes of the whole stream are wrong, or none are."""
     up_axis: str
     """Proposed `devices.mocap.up_axis`."""
     body_yaw_deg: float
@@ -44,7 +44,7 @@ def alignment(result: HandResult, up_axis: str, start_yaw_rad: float) -> Alignme
     Args:
         result: result of the test.
         up_axis: `devices.mocap.up_axis` during the test.
-        start_yaw_rad: true yaw of the nose during the motion forward, the mission's start yaw.
+        start_yaw_rad: true yaw of the nose during the forward motion: the mission's start yaw.
     """
     axes = best_axes(result)
     level = angle_rad(quat_rotate(result.stood.attitude, result.stood.force_m_s2), _UP) <= math.radians(LEVEL_MAX_DEG)
@@ -81,8 +81,8 @@ def world_row(found: Alignment, tolerance_deg: float) -> Row | None:
     limit_deg = max(tolerance_deg, YAW_MAX_DEG)  # a hand-held direction is not exact to the degree
     read = f"forward is {yaw_deg:+.0f} deg off the mission's start yaw"
     fix = (
-        f"if the machine stood at the mission's start.yaw_deg, Motive's ground plane is turned by {yaw_deg:+.0f} deg: set it anew "
-        "with the calibration square's x along the room's x; if not, turn the machine that way and repeat"
+        f"if the vehicle was placed at the mission's start.yaw_deg, Motive's ground plane is turned by {yaw_deg:+.0f} deg: set "
+        "it again with the calibration square's x along the room's x; if not, place the vehicle at that yaw and repeat"
     )
     return WORLD_YAW.row(abs(yaw_deg) <= limit_deg, read, f"within {limit_deg:g} deg", fix)
 

@@ -1,4 +1,4 @@
-"""Rates, jitter, latency and bodies of a watched stream of motion capture, and the remedies. Pure.
+"""Evaluates rate, jitter, latency and bodies of a recorded motion-capture stream, and names remedies. Pure.
 
 The preflight's rows are used as they are (`companion.preflight.mocap`); the others are for a new set-up.
 """
@@ -39,7 +39,7 @@ MOVED_MIN_M: Final = 0.05
 RATE_TOLERANCE: Final = 0.05
 DELAY_TOLERANCE_S: Final = 0.003
 EV_DELAY_MS: Final = next(float(one.value or 0.0) for one in WANTED if one.name == "EKF2_EV_DELAY")
-"""Value in the project's parameter file."""
+"""EKF2_EV_DELAY in the project's parameter file."""
 _BINS: Final = 9
 _BAR: Final = 40
 
@@ -49,10 +49,10 @@ class FrameSeen:
     """One frame of data with all of its rigid bodies, in the axes that the server streams."""
 
     arrived_s: float
-    """Time on the flight clock when its datagram was read."""
+    """Flight clock when its datagram was read."""
     number: int
     timestamp_s: float
-    """Time on the server's own time base."""
+    """Time stamp on the server's clock."""
     latency_s: float | None
     """Time from mid-exposure to transmission."""
     bodies: tuple[RigidBody, ...]
@@ -71,7 +71,7 @@ class Route:
 
 @dataclass(frozen=True, slots=True)
 class BodyMotion:
-    """One rigid body while it was watched."""
+    """One rigid body during the recording."""
 
     id: int
     name: str
@@ -94,13 +94,13 @@ class Timing:
 
     rate_hz: float
     server_rate_hz: float | None
-    """Rate by frame numbers and the server's own time stamps; None if the server sends no time stamps."""
+    """Rate computed from frame numbers and the server's time stamps; None if the server sends no time stamps."""
     period_s: float
     lost: int
     gap_s: float
     """Longest time between two arrivals."""
     off_s: tuple[float, ...]
-    """Delay of each arrival against an even stream, sorted; the 5th percentile is 0."""
+    """Delay of each arrival relative to a perfectly regular stream, sorted; the 5th percentile is 0."""
     latency_s: tuple[float, ...]
     """Times from mid-exposure to transmission, sorted."""
 
@@ -135,7 +135,7 @@ def timing(frames: Sequence[FrameSeen]) -> Timing | None:
 
 
 def bodies(frames: Sequence[FrameSeen], names: Mapping[int, str]) -> list[BodyMotion]:
-    """Return every rigid body that was streamed or is described, by id."""
+    """Return every rigid body that was streamed or that the server describes, by id."""
     ids = {body.id for frame in frames for body in frame.bodies} | set(names)
     found = []
     for number in sorted(ids):
@@ -160,7 +160,7 @@ def bodies(frames: Sequence[FrameSeen], names: Mapping[int, str]) -> list[BodyMo
 
 
 def histogram(t: Timing) -> list[str]:
-    """Return a histogram of the delays against an even stream; the last bar contains all longer delays."""
+    """Return a histogram of the delays relative to a regular stream; the last bar contains all longer delays."""
     width_s = max(0.0005, _percentile(t.off_s, 0.99) / (_BINS - 1))
     counts = [0] * _BINS
     for off_s in t.off_s:
@@ -186,11 +186,11 @@ class Watched:
     route: Route
     duration_s: float
     moving: bool
-    """Whether the vehicle was moved meanwhile."""
+    """Whether the vehicle was moved during the recording."""
 
 
 def judge(watched: Watched, vehicle: Vehicle) -> tuple[list[Row], dict[Location, Data]]:
-    """Return all rows of a watched stream, and the corrections of the vehicle file."""
+    """Return all rows of a recorded stream, and the corrections to the vehicle file."""
     frames, info, device = watched.frames, watched.info, vehicle.devices.mocap
     changes = dict[Location, Data]()
     version = ".".join(map(str, info.application_version))
@@ -259,7 +259,7 @@ def _own(seen: Sequence[BodyMotion], own_id: int, moving: bool, changes: dict[Lo
         fix = f"it is {moved[0].label}: set devices.mocap.rigid_body_id: {moved[0].id}"
         return OWN.bad(read, f"id {own_id} moves", fix)
     if moving and not moved:
-        return OWN.bad(read, f"id {own_id} moves", "nothing moved: repeat, and carry the vehicle some 30 cm")
+        return OWN.bad(read, f"id {own_id} moves", "nothing moved: repeat, and carry the vehicle about 30 cm")
     if len(moved) > 1 and own_id in [body.id for body in moved]:
         return OWN.bad(read, f"id {own_id} is the only one that moves", "move only the vehicle, and repeat")
     if own_id in streamed:
@@ -271,7 +271,7 @@ def _own(seen: Sequence[BodyMotion], own_id: int, moving: bool, changes: dict[Lo
     elif streamed:
         fix = "find the vehicle's id: companion mocap check --move"
     else:
-        fix = "in Motive create a rigid body of the vehicle's markers and stream rigid bodies"
+        fix = "in Motive, create a rigid body from the vehicle's markers, and stream rigid bodies"
     return OWN.bad(read, f"id {own_id}", fix)
 
 
@@ -281,10 +281,10 @@ def _rate(t: Timing, expected_hz: float, changes: dict[Location, Data]) -> Row:
     read = f"{t.rate_hz:.1f} Hz, the cameras run at {camera_hz:.1f} Hz"
     if abs(t.rate_hz / expected_hz - 1.0) <= RATE_TOLERANCE:
         return preflight.RATE.good(read, wanted)
-    fix = "frames are lost on the network: use a cable, a network of its own, a less busy computer"
+    fix = "frames are lost on the network: use a cable, a separate network or a less busy computer"
     if abs(camera_hz / expected_hz - 1.0) > RATE_TOLERANCE:
         changes["devices", "mocap", "rate_hz"] = float(round(camera_hz))
-        fix = f"set the camera rate to {expected_hz:g} Hz in Motive; or fly with this one, devices.mocap.rate_hz: {round(camera_hz)}"
+        fix = f"set the camera rate to {expected_hz:g} Hz in Motive; or fly at this rate with devices.mocap.rate_hz: {round(camera_hz)}"
     return preflight.RATE.bad(read, wanted, fix)
 
 
@@ -325,7 +325,7 @@ def text(watched: Watched) -> list[str]:
         )
     t = timing(watched.frames)
     if t is not None:
-        lines += ["delay of the frames against an even stream:", *histogram(t)]
+        lines += ["delay of the frames relative to a regular stream:", *histogram(t)]
     return [*lines, ""]
 
 

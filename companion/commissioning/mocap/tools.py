@@ -1,4 +1,4 @@
-"""`companion mocap check` checks the motion-capture stream for the flight, `companion mocap align` its axes."""
+"""`companion mocap check` checks the motion-capture stream; `companion mocap align` finds its axes."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ async def watch(session: Session) -> Watched | NotStreaming:
                 async with asyncio.timeout(_DESCRIPTION_TIMEOUT_S):
                     while not driver.client.names:  # noqa: ASYNC110 - the driver signals nothing
                         await asyncio.sleep(0.02)
-            move = "; carry the vehicle about, some 30 cm and back" if arguments.move else ""
+            move = "; carry the vehicle about 30 cm away and back" if arguments.move else ""
             session.say(f"watching for {arguments.seconds:g} s{move}")
             frames.clear()
             start_s = clock()
@@ -76,12 +76,12 @@ async def watch(session: Session) -> Watched | NotStreaming:
     except DeviceError as error:
         if driver.server_info is not None:
             return NotStreaming(str(error), driver.server_info, {})
-        session.say("no answer; searching the whole segment")
+        session.say("no answer; searching the whole network segment")
         return NotStreaming(str(error), None, await discover(device.interface, device.command_port))
 
 
 def judge(seen: Watched | NotStreaming, vehicle: Vehicle) -> Report:
-    """Return the report on the stream, or a proposal where to find it."""
+    """Return the report on the stream; if there is none, propose where to find it."""
     if isinstance(seen, Watched):
         rows, changes = mocap_judge.judge(seen, vehicle)
         return Report(rows, mocap_judge.as_json(seen), mocap_judge.text(seen), changes)
@@ -138,7 +138,7 @@ async def carry(session: Session) -> Carried:
             opened.autopilot.send_vision(pose)
 
     session.say(
-        "axes of motion capture, by hand: lift, forward, turn left; place the machine at the mission's start position and yaw"
+        "axes of motion capture: lift, forward, turn left; first place the vehicle at the mission's start position and yaw"
     )
     try:
         async with (

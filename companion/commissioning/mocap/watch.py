@@ -24,7 +24,7 @@ _ASK_PERIOD_S: Final = 0.25
 
 
 def watcher(device: MocapDevice, clock: Clock, on_frame: Callable[[FrameSeen], None]) -> NatNetMocap:
-    """Return the motion-capture driver, not yet open, which reports every rigid body of every frame and requires none.
+    """Return an unopened motion-capture driver that reports every rigid body of every frame and requires none.
 
     Args:
         device: addresses, transport, version.
@@ -53,8 +53,8 @@ async def discover(interface: str, command_port: int, within_s: float = 1.0) -> 
     """Return the NatNet servers of the segment by address: a connect request is broadcast and the answers are collected.
 
     Args:
-        interface: address of this computer in that segment; 0.0.0.0: all segments.
-        command_port: NatNet's, 1510 unless it was changed in Motive.
+        interface: address of this computer in that segment; 0.0.0.0 for all segments.
+        command_port: NatNet's command port, 1510 unless changed in Motive.
         within_s: time to wait for answers.
     """
     found: dict[str, ServerInfo] = {}
@@ -74,7 +74,7 @@ async def discover(interface: str, command_port: int, within_s: float = 1.0) -> 
                     with contextlib.suppress(TimeoutError):
                         async with asyncio.timeout(_ASK_PERIOD_S):
                             await _collect(opened, found)
-        for address in found:  # a unicast server took the request for that of a client
+        for address in found:  # a unicast server treated the request as a client's
             with contextlib.suppress(OSError):
                 opened.sendto(natnet.encode_message(Message.DISCONNECT), (address, command_port))
     return found

@@ -51,11 +51,12 @@ async def run_hand_test(
     """Guide the operator through the test and return its rows. Any key or Ctrl-C ends it.
 
     Args:
-        devices: open devices; poses need not be forwarded to PX4. An open arm is read meanwhile to keep its watchdogs from tripping.
+        devices: open devices; poses need not be forwarded to PX4. An open arm is read during the test to keep its watchdogs from
+            tripping.
         config: the effective configuration.
         console: terminal of the operator.
-        json: keep standard output free: everything for the operator goes to standard error.
-        record: where a passed test is recorded (`hand_record.record_path()`); None if it is not recorded, as in SITL.
+        json: keep standard output free: all text for the operator goes to standard error.
+        record: file in which a passed test is recorded (`hand_record.record_path()`); None to record nothing, as in SITL.
     """
     outcome = await perform(devices, config, console, json)
     if isinstance(outcome, str):
@@ -71,9 +72,7 @@ async def run_hand_test(
 async def perform(
     devices: Devices | AvailableDevices, config: FlightConfig, console: Console, json: bool = False
 ) -> HandResult | str:
-    """Guide the operator through the test and return the measurements, or the reason why there are none. Arguments are those of
-    `run_hand_test`.
-    """
+    """Guide the operator through the test and return the measurements, or why there are none. Arguments as in `run_hand_test`."""
     mocap, autopilot, arm = devices.mocap, devices.autopilot, devices.arm
     if mocap is None or autopilot is None:
         missing = "motion capture" if mocap is None else "PX4"
@@ -104,7 +103,7 @@ def _keep(path: Path, setup: hand_record.Setup, rows: list[Row]) -> Row:
     try:
         tests = hand_record.load(path)
     except hand_record.RecordError:
-        tests = []  # an unreadable record is replaced: the test that was just passed must be kept
+        tests = []  # an unreadable record is replaced, so that the test just passed is kept
     try:
         hand_record.save(path, hand_record.with_passed(tests, setup, datetime.now(UTC), rows))
     except hand_record.RecordError as error:
@@ -119,7 +118,7 @@ def _armed(status: AutopilotStatus | None, now_s: float, config: FlightConfig) -
 
 
 class _StampClock:
-    """The flight clock by the devices' stamps: monotonic time from another origin. It continues when all devices are silent."""
+    """The flight clock, derived from the devices' stamps; it continues on monotonic time when all devices are silent."""
 
     def __init__(self) -> None:
         self._ahead_s: float | None = None

@@ -1,7 +1,6 @@
-"""Evaluation of a hand test: rows with the measurements, and which axis is wrong. Pure.
-
-IMU measurements are in the machine's body frame (x forward, y left, z up), motion-capture measurements in the frame of its rigid body.
-On a correct set-up both frames are the same.
+"""Evaluates a hand test: rows with the measurements, and which axis is wrong. Pure. IMU measurements are in the vehicle's body
+frame (x forward, y left, z up), motion-capture measurements in the frame of its rigid body. In a correct set-up both frames are the
+same.
 """
 
 from __future__ import annotations
@@ -17,13 +16,13 @@ from companion.preflight.checks import Check
 from companion.preflight.hand_test.motion import Motion, angle_rad, norm
 from companion.preflight.hand_test.steps import HandResult
 
-_ASTRAY = "the controller would push in wrong directions"
+_ASTRAY = "the controller would push in the wrong directions"
 DONE = Check("hand.done", "hand test", "every step is recognised", "the axes are not known")
 AS_REQUESTED = Check(
     "hand.told",
     "hand test: as instructed",
     "the IMU measured up, forward and a turn to the left",
-    "the vehicle was moved otherwise, or PX4's own axes are wrong",
+    "the vehicle was moved differently, or PX4's own axes are wrong",
 )
 LEVEL = Check("hand.level", "hand test: level", "gravity is vertical in the stream within 5 deg", _ASTRAY)
 LIFT = Check("hand.lift", "hand test: up", "IMU and motion capture agree on the direction within 20 deg", _ASTRAY)
@@ -42,16 +41,16 @@ TURN = Check(
 SCALE = Check(
     "hand.scale",
     "hand test: distance",
-    "0.7 to 1.4 m by motion capture for each metre by the IMU",
-    "every distance would be wrong by that",
+    "motion capture sees 0.7 to 1.4 m for each metre that the IMU measures",
+    "every distance would be wrong by this factor",
 )
 CHECKS = (DONE, AS_REQUESTED, LEVEL, LIFT, FORWARD, TURN, SCALE)
 
 LEVEL_MAX_DEG: Final = 5.0
-"""Largest angle between gravity by the accelerometer, rotated by the streamed attitude, and the world's vertical."""
+"""Largest angle between gravity as measured by the accelerometer, rotated by the streamed attitude, and the world's vertical."""
 AXIS_MAX_DEG: Final = 20.0
 YAW_MAX_DEG: Final = 12.0
-"""Largest angle between the rigid body's forward axis and the machine's."""
+"""Largest angle between the forward axes of the rigid body and of the vehicle."""
 TURN_MAX_DEG: Final = 8.0
 """Largest difference between gyro and motion capture over a turn of about 45 deg."""
 REQUESTED_MAX_DEG: Final = 40.0
@@ -60,8 +59,8 @@ SCALE_SPAN: Final = (0.7, 1.4)
 
 _UP: Vec3 = (0.0, 0.0, 1.0)
 _AHEAD: Vec3 = (1.0, 0.0, 0.0)
-_RESET = "in Motive, with the machine level and its nose along the stream's +x, reset the rigid body's orientation"
-_BOARD = "correct PX4's SENS_BOARD_ROT and calibrate its accelerometer: its axes are not the machine's"
+_RESET = "in Motive, with the vehicle level and its nose along the stream's +x, reset the rigid body's orientation"
+_BOARD = "correct PX4's SENS_BOARD_ROT and calibrate its accelerometer: its axes are not the vehicle's"
 
 
 def rows(result: HandResult, up_axis: str) -> list[Row]:
@@ -86,7 +85,7 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
     def row(check: Check, ok: bool, read: str, wanted: str, wrong: str = fix) -> Row:
         return check.good(read, wanted) if ok else check.bad(read, wanted, wrong)
 
-    far = "calibrate the motion-capture volume anew (wand length), or the accelerometer if it reads wrong at rest"
+    far = "calibrate the motion-capture volume again (wand length), or the accelerometer if it reads wrong at rest"
     return [
         DONE.good("lift, forward and turn were recognised"),
         requested,
@@ -117,7 +116,7 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
         row(
             SCALE,
             all(SCALE_SPAN[0] <= scale <= SCALE_SPAN[1] for scale in scales),
-            f"motion capture saw {scales[0]:.2f} m up and {scales[1]:.2f} m forward for each metre by the IMU",
+            f"motion capture saw {scales[0]:.2f} m up and {scales[1]:.2f} m forward for each metre that the IMU measured",
             f"{SCALE_SPAN[0]:g} to {SCALE_SPAN[1]:g} m",
             far,
         ),
@@ -125,18 +124,18 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
 
 
 def ended(cause: str, again: str = "companion check --hand") -> Row:
-    """Return the row of a test without a result; `again` is the command to repeat."""
+    """Return the row of a test without a result; `again` is the command that repeats it."""
     return DONE.bad(cause, "lift, forward and a turn to the left, each recognised", f"repeat the test: {again}")
 
 
 def yaw_offset_deg(forward: Motion) -> float:
-    """Return the excess of the streamed yaw, in (-180, 180] deg."""
+    """Return by how much the streamed yaw is too large, in (-180, 180] deg."""
     (fx, fy, _), (sx, sy, _) = forward.felt_m, forward.response
     return math.degrees(math.atan2(sx * fy - sy * fx, fx * sx + fy * sy))
 
 
 def _as_requested(lift: Motion, forward: Motion, turn: Motion, up_body: Vec3) -> Row:
-    """Return the row on whether the IMU measured the requested motion. If so, the IMU's own axes are right as well."""
+    """Return the row on whether the IMU measured the requested motion. If it did, the IMU's own axes are right too."""
     up_deg = math.degrees(angle_rad(lift.felt_m, up_body))
     standing_deg = math.degrees(angle_rad(up_body, _UP))
     ahead_deg = math.degrees(angle_rad(forward.felt_m, _AHEAD))
@@ -144,18 +143,20 @@ def _as_requested(lift: Motion, forward: Motion, turn: Motion, up_body: Vec3) ->
     read = f"the IMU measured {_way(lift.felt_m)}, then {_way(forward.felt_m)}, then a turn by {left_deg:+.0f} deg"
     if max(up_deg, standing_deg, ahead_deg) <= REQUESTED_MAX_DEG and left_deg > 0.0:
         return AS_REQUESTED.good(read, "up, forward, left")
-    return AS_REQUESTED.bad(read, "up, forward, left", f"repeat the test; if it was moved as instructed, {_BOARD}")
+    return AS_REQUESTED.bad(
+        read, "up, forward, left", f"repeat the test; if the vehicle was moved as instructed, {_BOARD}"
+    )
 
 
 def _seen_as_requested(result: HandResult) -> bool:
-    """Return whether motion capture alone measured the requested motion: up, forward, left."""
+    """Return whether motion capture, considered alone, measured the requested motion: up, forward, left."""
     most = math.radians(REQUESTED_MAX_DEG)
     straight = angle_rad(result.lift.seen_m, _UP) <= most and angle_rad(result.forward.seen_m, _AHEAD) <= most
     return straight and result.turn.seen_turn_rad[2] > 0.0
 
 
 def best_axes(result: HandResult) -> AxisMap:
-    """Return the one of the 48 axis maps of the rigid body that is nearest to all measurements."""
+    """Return which of the 48 axis maps of the rigid body fits all measurements best."""
     polar = [(m.felt_m, m.response) for m in (result.lift, result.forward)]
     axial = (result.turn.felt_turn_rad, result.turn.seen_turn_rad)
 
@@ -174,10 +175,10 @@ def _explain(result: HandResult, up_axis: str) -> str:
     yaw_deg = yaw_offset_deg(result.forward)
     if axes.determinant < 0:
         return (
-            f"the stream is left-handed (its x, y, z look like the true {', '.join(axes.names)}): "
-            "take Motive's right-handed axes, and no axis conversion on the way"
+            f"the stream is left-handed (its x, y, z look like the true {', '.join(axes.names)}): use Motive's right-handed "
+            "axes, without axis conversion"
         )
-    # A whole stream in other axes is level in itself; a body alone is not.
+    # Gravity is vertical in a stream whose axes are all wrong, but not in one in which only the body's axes are wrong.
     level = angle_rad(quat_rotate(result.stood.attitude, result.stood.force_m_s2), _UP) <= math.radians(LEVEL_MAX_DEG)
     if level and axes == Y_UP and up_axis == "z":
         return "the stream looks y-up: set devices.mocap.up_axis: y"
@@ -187,8 +188,8 @@ def _explain(result: HandResult, up_axis: str) -> str:
         side = "left" if yaw_deg > 0.0 else "right"
         return f"the rigid body's zero is turned: its x axis points {abs(yaw_deg):.0f} deg to the {side} of the nose; {_RESET}"
     if axes == IDENTITY:
-        return f"the rigid body's zero was set while the machine was tilted, or the ground plane is not level; {_RESET}"
-    exchanged = f"axes are exchanged (its x, y, z look like the machine's {', '.join(axes.names)})"
+        return f"the rigid body's zero was set while the vehicle was tilted, or the ground plane is not level; {_RESET}"
+    exchanged = f"axes are exchanged (its x, y, z look like the vehicle's {', '.join(axes.names)})"
     if level:
         return f"the stream's {exchanged}: set devices.mocap.up_axis as Motive streams, and Motive's ground plane with z up"
     return f"the rigid body's {exchanged}; {_RESET}"

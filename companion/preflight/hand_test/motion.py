@@ -1,8 +1,8 @@
-"""Comparison of one carried motion as measured by PX4's IMU and by motion capture. Pure.
+"""Compares one motion of the carried vehicle as measured by PX4's IMU and by motion capture. Pure.
 
-PX4's attitude is derived from motion capture and adds no information; accelerometer and gyro do. Gravity and the accelerometer's bias
-are nearly constant over a motion of two seconds, so both velocities are compared without mean and slope. The rest at both ends need not
-be perfect.
+PX4's attitude is derived from motion capture and adds no information; accelerometer and gyro do. Gravity and the accelerometer's
+bias are nearly constant over a motion of two seconds, so both velocities are compared after their mean and slope are removed. The
+vehicle need not be perfectly at rest at both ends.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 
 GRID_S: Final = 0.02
 GAP_MAX_S: Final = 0.3
-"""A motion with a longer gap between samples is not evaluated."""
+"""Longest gap between samples of a motion that is evaluated."""
 
 
 class PoseAt(NamedTuple):
@@ -48,19 +48,19 @@ class Motion:
 
     duration_s: float
     felt_m: Vec3
-    """Displacement by the IMU, in the body frame at the start."""
+    """Displacement measured by the IMU, in the body frame at the start."""
     seen_m: Vec3
-    """Displacement by motion capture, in the frame of its rigid body at the start."""
+    """Displacement measured by motion capture, in the frame of its rigid body at the start."""
     seen_world_m: Vec3
-    """Displacement by motion capture, in the stream's world."""
+    """Displacement measured by motion capture, in the stream's world."""
     response: Vec3
-    """Motion capture's displacement, in its body frame, per metre of the IMU's along `felt_m`: its length is the ratio of the scales,
-    its direction should be that of `felt_m`.
+    """Displacement measured by motion capture, in its body frame, per metre of the IMU's displacement along `felt_m`: its length is
+    the ratio of the scales, its direction should be that of `felt_m`.
     """
     felt_turn_rad: Vec3
-    """Rotation vector by the gyro, in the body frame at the start."""
+    """Rotation vector measured by the gyro, in the body frame at the start."""
     seen_turn_rad: Vec3
-    """Rotation vector by motion capture, in the frame of its rigid body at the start."""
+    """Rotation vector measured by motion capture, in the frame of its rigid body at the start."""
 
 
 def measure(
@@ -107,7 +107,7 @@ def measure(
 
 
 def _felt(imu: Sequence[ImuAt], times: Sequence[float], bias: Vec3) -> tuple[list[Vec3], Quat]:
-    """Integrate the specific force in the body frame at the start, on the grid; also return the rotation until the end."""
+    """Integrate the specific force in the initial body frame, on the time grid; return the velocity and the total rotation."""
     index = max(0, bisect_left(imu, times[0], key=lambda sample: sample.t_s) - 1)
     now_s, q = times[0], IDENTITY_QUAT
     velocity: list[Vec3] = [(0.0, 0.0, 0.0)]
@@ -154,7 +154,7 @@ def _nearest(poses: Sequence[PoseAt], t_s: float) -> PoseAt:
 
 
 def _travel(velocity: Sequence[Vec3]) -> Vec3:
-    """Return the distance of a velocity that is zero at both ends, with the linear growth of gravity and bias removed."""
+    """Return the displacement of a velocity that is zero at both ends, with the linear growth due to gravity and bias removed."""
     count = len(velocity) - 1
     drift = _scaled(velocity[-1], 1.0 / count)
     total: Vec3 = (0.0, 0.0, 0.0)
@@ -164,7 +164,7 @@ def _travel(velocity: Sequence[Vec3]) -> Vec3:
 
 
 def _detrended(values: Sequence[Vec3]) -> list[Vec3]:
-    """Return the values without mean and slope, each axis by least squares."""
+    """Return the values minus their mean and slope, fitted to each axis by least squares."""
     count = len(values)
     middle = 0.5 * (count - 1)
     spread = sum((k - middle) ** 2 for k in range(count))

@@ -1,4 +1,4 @@
-"""Record of passed hand tests: the motion-capture set-ups that have been compared with an IMU.
+"""Record of passed hand tests: the motion-capture set-ups that an IMU has confirmed.
 
 `$XDG_STATE_HOME/companion/hand-tests.json`, else `~/.local/state/companion/hand-tests.json`.
 """
@@ -65,7 +65,7 @@ class Passed:
 def record_path(environment: Mapping[str, str] = os.environ) -> Path:
     """Return the path of the record."""
     state = environment.get("XDG_STATE_HOME", "")
-    # The XDG specification has a relative path ignored.
+    # The XDG specification requires a relative path to be ignored.
     folder = Path(state) if state and Path(state).is_absolute() else Path.home() / ".local/state"
     return folder / FILE
 
@@ -86,7 +86,7 @@ def on_record(setup: Setup, tests: Sequence[Passed]) -> tuple[str, str]:
 
 
 def with_passed(tests: Sequence[Passed], setup: Setup, at: datetime, rows: Sequence[Row]) -> list[Passed]:
-    """Return the tests with a newly passed one, which replaces an older one of the same set-up."""
+    """Return the tests plus a newly passed one, which replaces an older one of the same set-up."""
     measured = {row.id: row.read for row in rows}
     return [*(test for test in tests if test.setup != setup), Passed(setup, at.isoformat(timespec="seconds"), measured)]
 
@@ -109,7 +109,7 @@ def load(path: Path) -> list[Passed]:
     except OSError as error:
         raise RecordError(f"{path}: cannot be read ({error.strerror}); correct its permissions") from None
     except (ValueError, TypeError, KeyError) as error:
-        raise RecordError(f"{path}: is no record of hand tests ({error!r}); remove the file") from None
+        raise RecordError(f"{path}: is not a record of hand tests ({error!r}); remove the file") from None
 
 
 def save(path: Path, tests: Sequence[Passed]) -> None:

@@ -1,7 +1,7 @@
-"""The guided hand test: the operator carries the machine, rotors off, and every axis of motion capture is compared with the IMU. Pure.
+"""The guided hand test: the operator carries the vehicle, rotors off, and every axis of motion capture is compared with the IMU. Pure.
 
 The steps are: stand still, lift, forward, turn left. Each step is recognised by the distance that motion capture measures, in any
-direction, because the directions are under test. They are evaluated at the end (`companion.preflight.hand_test.evaluation`).
+direction, because the directions are under test. Directions are evaluated at the end (`companion.preflight.hand_test.evaluation`).
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ TURN_WANTED_DEG: Final = 45.0
 TURN_MIN_DEG: Final = 30.0
 STEP_TIMEOUT_S: Final = 60.0
 STAND_S: Final = 2.5
-"""Time on the floor, longer than an accidental pause."""
+"""Time at rest on the floor that begins the test, longer than an accidental pause."""
 STILL_S: Final = 0.6
 STILL_M, STILL_DEG = 0.02, 5.0
-"""Largest deviation from the mean within `STILL_S` of a machine of 3 kg held by hand."""
+"""Largest deviation from the mean within `STILL_S` for a vehicle of 3 kg held by hand."""
 STAND_M, STAND_DEG = 0.004, 1.0
-"""Largest deviation from the mean of a machine on the floor."""
+"""Largest deviation from the mean for a vehicle on the floor."""
 MOVE_MAX_S: Final = 8.0
 """Longest motion that is evaluated, because the IMU's integration drifts."""
 SILENCE_MAX_S: Final = 3.0
@@ -43,7 +43,7 @@ SILENCE_MAX_S: Final = 3.0
 _PERIOD_S: Final = 0.05
 _POSES_MIN: Final = 10
 _SPARSE_S: Final = 0.12
-"""Longest gap between poses during which the machine may count as still."""
+"""Longest gap between poses in which the vehicle may still count as at rest."""
 _KEEP_S: Final = 20.0
 
 
@@ -60,10 +60,10 @@ class Step(Enum):
 _NEXT: Final = {Step.STAND: Step.LIFT, Step.LIFT: Step.FORWARD, Step.FORWARD: Step.TURN, Step.TURN: Step.DONE}
 INSTRUCTIONS: Final = {
     Step.STAND: "place the vehicle on the floor and let go of it",
-    Step.LIFT: "take it by its legs, lift it straight up by 30 cm in about two seconds, hold it still",
+    Step.LIFT: "hold it by its legs, lift it straight up by 30 cm in about two seconds, hold it still",
     Step.FORWARD: "move it 30 cm forward, where its nose points, without turning it; hold it still",
     Step.TURN: "turn it to the left, seen from above, by 45 deg; hold it still",
-    Step.DONE: "done; put it back on its place",
+    Step.DONE: "done; put it back in its place",
 }
 
 
@@ -80,14 +80,14 @@ class HandSample:
 
 @dataclass(frozen=True, slots=True)
 class Stood:
-    """State of the machine on the floor before it was lifted."""
+    """State of the vehicle on the floor before it was lifted."""
 
     position_m: Vec3
     attitude: Quat
-    """Position and attitude by motion capture."""
+    """Position and attitude measured by motion capture."""
     force_m_s2: Vec3
     rate_rad_s: Vec3
-    """Specific force and rate by the IMU, body FLU; the rate is the gyro's bias."""
+    """Specific force and rate measured by the IMU, body FLU; the rate is the gyro's bias."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,7 @@ class HandView:
     progress: float
     """Progress of this step, 0 to 1."""
     seen: str
-    """The motion seen by motion capture, as text."""
+    """Motion measured by motion capture, as text."""
     notice: str
     """Why the last attempt did not count; empty if there was none."""
     ended: str
@@ -208,7 +208,7 @@ class HandTest:
     def _still(
         self, t_s: float, window_s: float = STILL_S, within_m: float = STILL_M, within_deg: float = STILL_DEG
     ) -> _Rest | None:
-        """Return the last `window_s` as a rest, or None if the machine moved or was not tracked."""
+        """Return the mean pose of the last `window_s`, or None if the vehicle moved or was not tracked."""
         recent = self._poses[bisect_left(self._poses, t_s - window_s, key=lambda pose: pose.t_s) :]
         if len(recent) < _POSES_MIN or recent[0].t_s > t_s - window_s + _SPARSE_S or recent[-1].t_s < t_s - _SPARSE_S:
             return None
@@ -227,7 +227,7 @@ class HandTest:
         rest = self._still(t_s, STAND_S, STAND_M, STAND_DEG)
         stood_s = 0.0 if self._still_since_s is None else t_s - max(self._still_since_s, self._step_s)
         self._progress = min(1.0, stood_s / STAND_S)
-        self._seen = "it stands" if self._still_since_s is not None else "the machine moves, or is not tracked"
+        self._seen = "it stands" if self._still_since_s is not None else "the vehicle moves, or is not tracked"
         felt = self._imu[bisect_left(self._imu, t_s - STAND_S, key=lambda sample: sample.t_s) :]
         if rest is None or len(felt) < _POSES_MIN:
             return
@@ -252,7 +252,7 @@ class HandTest:
             return
         share = turned_deg / TURN_MIN_DEG if turning else moved_m / MOVE_MIN_M
         if share < 0.25:
-            self._rest = still  # not begun; a move counts from the last rest before it
+            self._rest = still  # not begun; a move is measured from the last rest before it
         elif share >= 1.0:
             self._take(t_s, before, still)
 
