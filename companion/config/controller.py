@@ -16,7 +16,7 @@ NonNegative3 = tuple[NonNegative, NonNegative, NonNegative]
 Positive4 = tuple[Positive, Positive, Positive, Positive]
 
 
-class _LawConfig(Model):
+class LawConfig(Model):
     """Settings of every law: the measured force, additional compensation, and the limits of its commands."""
 
     force_lowpass_hz: Positive
@@ -40,7 +40,7 @@ class _LawConfig(Model):
     attitude_filter_damping: Annotated[float, Field(ge=0.5, le=2)] = 1.0
 
 
-class AdaptiveConfig(_LawConfig):
+class AdaptiveConfig(LawConfig):
     """Adaptive impedance control (paper, tab:control_parameters).
 
     Rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. All matrices are diagonal.
@@ -115,7 +115,7 @@ class AdaptiveConfig(_LawConfig):
         return self
 
 
-class CscConfig(_LawConfig):
+class CscConfig(LawConfig):
     """Complete-system compliance (after Cataldi et al., IROS 2016): one impedance for vehicle and arm, realised by the nominal model.
 
     Rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. All matrices are diagonal.
@@ -138,7 +138,7 @@ class CscConfig(_LawConfig):
     """Factor on the masses and inertias of the vehicle file, for studies of a wrong model."""
 
 
-class PscConfig(_LawConfig):
+class PscConfig(LawConfig):
     """Partitioned compliance (after Wang et al., RA-L 2024): impedance of the arm alone, position control of the vehicle alone."""
 
     schema_version: Literal[1]

@@ -6,8 +6,8 @@ Everything here runs in the control tick and is therefore written in plain float
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
+from companion.config.controller import LawConfig
 from companion.config.vehicle import Vehicle
 from companion.control.thrust import (
     ForceLimits,
@@ -88,22 +88,6 @@ class DesiredForce:
         self.world_n = (x + k * (fx - x), y + k * (fy - y), z + k * (fz - z))
 
 
-class ActuationConfig(Protocol):
-    """The part of a law's configuration that limits its commands."""
-
-    @property
-    def lateral_force_max_n(self) -> float:
-        """Largest horizontal force, N."""
-
-    @property
-    def attitude_filter_rad_s(self) -> float:
-        """Bandwidth of the filter of desired roll and pitch, rad/s."""
-
-    @property
-    def attitude_filter_damping(self) -> float:
-        """Damping ratio of the filter of desired roll and pitch."""
-
-
 class Actuation:
     """Convert force and joint torques to commands: vertical force first, then lateral force within the tilt limit, filtered roll and
     pitch, joint torques within their limits.
@@ -111,7 +95,7 @@ class Actuation:
     Results of the last tick are attributes, because one more record per tick would cost more than the arithmetic.
     """
 
-    def __init__(self, config: ActuationConfig, vehicle: Vehicle, hover_thrust: float) -> None:
+    def __init__(self, config: LawConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
         self._limits = ForceLimits(
             vertical_min_n=0.3 * weight_n,

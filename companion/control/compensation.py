@@ -6,8 +6,8 @@ All laws share it, so that they can be compared with the same options.
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
+from companion.config.controller import LawConfig
 from companion.config.vehicle import Vehicle
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.types import PlantState
@@ -16,34 +16,6 @@ from companion.model.types import Reference, Vec2, Vec3
 
 FRICTION_RATE_RAD_S = 0.1
 """Joint rate below which the friction fades out, so that a joint at rest is not shaken."""
-
-
-class CompensationConfig(Protocol):
-    """The part of a law's configuration that sets its compensation."""
-
-    @property
-    def force_feedforward_xyz(self) -> Vec3:
-        """Share of the measured force that the base carries directly, per world axis."""
-
-    @property
-    def disturbance_time_xyz_s(self) -> Vec3:
-        """Time constant of the disturbance observer, per world axis."""
-
-    @property
-    def disturbance_lag_s(self) -> float:
-        """Lag from the commanded to the actual force, s."""
-
-    @property
-    def disturbance_max_n(self) -> float:
-        """Bound of the observer's estimate, N."""
-
-    @property
-    def feedforward_lead_s(self) -> float:
-        """Lead of the feedforward of the reference's horizontal acceleration, s."""
-
-    @property
-    def arm_friction_share(self) -> float:
-        """Share of the vehicle file's joint friction that is fed forward."""
 
 
 class Compensation:
@@ -57,7 +29,7 @@ class Compensation:
     """
 
     def __init__(
-        self, config: CompensationConfig, vehicle: Vehicle, answered_xyz: Vec3, inertia_xy_kg: tuple[float, float]
+        self, config: LawConfig, vehicle: Vehicle, answered_xyz: Vec3, inertia_xy_kg: tuple[float, float]
     ) -> None:
         mass_kg = vehicle.airframe.mass_kg
         self._weight_n = mass_kg * GRAVITY_M_S2

@@ -2,28 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
+from companion.config.controller import LawConfig
 from companion.config.vehicle import Vehicle
-from companion.control.common import ZERO8, Actuation, ActuationConfig, DesiredForce, ForceFilter
-from companion.control.compensation import Compensation, CompensationConfig
+from companion.control.common import ZERO8, Actuation, DesiredForce, ForceFilter
+from companion.control.compensation import Compensation
 from companion.control.dynamics import Dynamics
 from companion.control.manipulator import Manipulator
 from companion.control.types import PlantState, Wrench
 from companion.model.frames import body_x_z_axes_world, quat_conjugate, quat_rotate
 from companion.model.types import ControlLog, Reference, Vec2, Vec3, Vec8
-
-
-class ModelBasedConfig(ActuationConfig, CompensationConfig, Protocol):
-    """The part of a model-based law's configuration for the measured force."""
-
-    @property
-    def force_lowpass_hz(self) -> float:
-        """Cutoff frequency of the external force's filter, Hz."""
-
-    @property
-    def desired_force_time_s(self) -> float | None:
-        """Time constant of F_d, s; with None F_d stays 0."""
 
 
 class ModelBasedLaw:
@@ -39,7 +26,7 @@ class ModelBasedLaw:
 
     def __init__(
         self,
-        config: ModelBasedConfig,
+        config: LawConfig,
         vehicle: Vehicle,
         hover_thrust: float,
         answered_xyz: Vec3 = (0.0, 0.0, 0.0),
