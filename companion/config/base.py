@@ -1,4 +1,4 @@
-"""Base of all configuration models: frozen, with unknown keys, NaN and implicit conversions refused."""
+"""Base of all configuration models: frozen; rejects unknown keys, NaN and implicit conversions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 Location = tuple[str | int, ...]
-"""Keys and indices from a model down to a value."""
+"""Keys and indices that lead from a model to a value."""
 
 
 class Model(BaseModel):
@@ -21,7 +21,7 @@ def refuse(title: str, problems: list[tuple[Location, str]]) -> None:
     """Raise the problems that a model validator has found, each at its own location, so that messages name the right line.
 
     Raises:
-        ValidationError: if there is any problem. Pydantic prepends the model's own location in the document.
+        ValidationError: there is any problem. Pydantic prepends the model's own location in the document.
     """
     if not problems:
         return

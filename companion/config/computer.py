@@ -26,4 +26,4 @@ class Computer(Model):
     """Cores reserved for the flight process, numbered from 0; launcher, guardian, recorder and simulated world use the others. If it is
     empty, all processes share all cores."""
     lock_memory: bool = True
-    """Lock the memory of the flight process, where that is permitted. If false, the system may page it out."""
+    """Lock the memory of the flight process if that is permitted. If false, the system may page it out."""

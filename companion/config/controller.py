@@ -1,4 +1,4 @@
-"""The controller file: a control law and its gains. The laws, and the estimates that they start with, are in `companion.control`."""
+"""The controller file: a control law and its gains. `companion.control` implements the laws and the estimates that they start with."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ Positive4 = tuple[Positive, Positive, Positive, Positive]
 
 
 class LawConfig(Model):
-    """Settings of every law: the measured force, additional compensation, and the limits of its commands."""
+    """Settings that every law has: the measured force, additional compensation, and the limits of its commands."""
 
     force_lowpass_hz: Positive
     desired_force_time_s: Positive | None = None
-    """T_d of F_d = lowpass(F_ext) on the joint rows. If it is absent, F_d = 0 and the arm sags under a carried payload."""
+    """T_d of F_d = lowpass(F_ext) on the joint rows. If absent, F_d = 0 and the arm sags under a carried payload."""
     force_feedforward_xyz: NonNegative3 = (0.0, 0.0, 0.0)
-    """Share of the measured F_ext that the base carries directly, per world axis."""
+    """Fraction of the measured F_ext that is fed forward to the base, per world axis."""
     disturbance_time_xyz_s: NonNegative3 = (0.0, 0.0, 0.0)
     """Time constant of the disturbance observer, per world axis. It estimates and compensates the forces on the base that are neither
-    commanded nor fed forward. 0 switches it off, as in the paper."""
+    commanded nor fed forward. 0 switches it off, as in the paper.
+    """
     disturbance_lag_s: NonNegative = 0.1
     """Lag from the commanded to the actual force that the observer assumes."""
     disturbance_max_n: NonNegative = 6.0
@@ -34,7 +35,7 @@ class LawConfig(Model):
     feedforward_lead_s: NonNegative = 0.0
     """Lead of the feedforward of the reference's horizontal acceleration (a + lead times jerk), for the delay of the attitude loop."""
     arm_friction_share: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Share of the vehicle file's `arm.joint_friction_nm` that is fed forward along the reference joint rate."""
+    """Fraction of the vehicle file's `arm.joint_friction_nm` that is fed forward along the wanted joint rate."""
     lateral_force_max_n: Positive = 12.0
     attitude_filter_rad_s: Positive = 30.0
     attitude_filter_damping: Annotated[float, Field(ge=0.5, le=2)] = 1.0
@@ -60,7 +61,7 @@ class AdaptiveConfig(LawConfig):
     stiffness_kp: Positive8
     """K_p; must equal (K_d - M_d Phi) Phi (gain_cond)."""
     row_weights_s: NonNegative8
-    """S: weight of each row in ||s||, ||xi||, ||chi_dd||; 0 masks a row that another loop closes."""
+    """S: weight of each row in ||s||, ||xi||, ||chi_dd||; 0 masks a row that another loop controls."""
     h_initial: Positive4
     """H_0(0) .. H_3(0)."""
     zeta_initial: Positive
@@ -74,7 +75,7 @@ class AdaptiveConfig(LawConfig):
     """Largest ||S chi_dd|| that may enter rho; 0 switches H_3 off."""
     acceleration_lowpass_hz: Positive
     h_max: Positive4 | None = None
-    """Bound of H_0 .. H_3 (projection); null leaves them to the leakage, as in the paper."""
+    """Bound of H_0 .. H_3 (projection); if null, only the leakage bounds them, as in the paper."""
     load_rate_xyz: NonNegative3 = (0.0, 0.0, 0.0)
     """Gamma of the adaptive load on x, y and z, kg/s^2; 0 switches it off, as in the paper."""
     load_leakage: NonNegative = 0.0
@@ -92,9 +93,9 @@ class AdaptiveConfig(LawConfig):
     arm_gravity_nominal: bool = True
     """Feed the arm's gravity torque forward with the vehicle file's masses."""
     base_compliance_xyz: NonNegative3 = (0.0, 0.0, 0.0)
-    """Share of the measured F_ext that enters e_tau on the base rows (0: as in the paper)."""
+    """Fraction of the measured F_ext that enters e_tau on the base rows (0: as in the paper)."""
     arm_inertia_nominal: bool = False
-    """Feed the arm's nominal inertia and Coriolis torque forward in place of M_d. Vehicle and coupling stay unknown."""
+    """Feed the arm's nominal inertia and Coriolis torque forward in place of M_d. The vehicle and the coupling stay unmodelled."""
 
     @model_validator(mode="after")
     def _conditions(self) -> Self:
@@ -131,11 +132,11 @@ class CscConfig(LawConfig):
     stiffness_kp: Positive8
     """K_p. On the attitude rows it describes the stiffness of PX4's attitude loop and has no effect on commands."""
     external_xyz: NonNegative3 = (1.0, 1.0, 1.0)
-    """Share of the measured F_ext, per world axis, that enters the base's impedance and that the model cancels."""
+    """Fraction of the measured F_ext, per world axis, that enters the base's impedance and is cancelled through the model."""
     desired_force_xyz: NonNegative3 = (0.0, 0.0, 0.0)
-    """Share of F_d that the base carries. With 0 the base also yields to a carried payload."""
+    """Fraction of F_d that the base carries. If 0, the base also yields to a carried payload."""
     model_mass_scale: Positive = 1.0
-    """Factor on the masses and inertias of the vehicle file, for studies of a wrong model."""
+    """Factor on the masses and inertias of the vehicle file, for studies of model errors."""
 
 
 class PscConfig(LawConfig):

@@ -98,7 +98,7 @@ class Document:
         return self.keys.get(location) or self.origin(location)
 
     def replace(self, location: Location, value: Data, origin: Origin) -> None:
-        """Set a value from the command line; its parent must exist."""
+        """Set a value given on the command line; its parent must exist."""
         parent: Data = self.data
         for step in location[:-1]:
             parent = _child(parent, step)

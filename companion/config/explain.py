@@ -1,4 +1,4 @@
-"""Pydantic's errors as one message per problem: origin, key, expected and found value, and a suggestion.
+"""Turns Pydantic's errors into one message per problem: origin, key, expected and found value, and a suggestion.
 
 Expectations and known keys are read from the model's own JSON schema, so that they cannot differ from the checks.
 """
@@ -30,14 +30,14 @@ UNITS = {
     "kg": "kg", "g": "g", "lb": "lb", "lbs": "lb", "n": "N", "kn": "kN", "lbf": "lbf", "nm": "N m", "nms": "N m s", "nm_a": "N m/A",
     "hz": "Hz", "khz": "kHz", "a": "A", "ma": "mA", "v": "V", "mv": "mV", "c": "degC", "kgf": "kgf",
 }  # fmt: skip
-"""Units by the suffix of a key, including units that no key uses."""
+"""Units by key suffix, including units that no key uses."""
 MANY_OPTIONS = 12
 """Largest number of options that a message lists."""
 
 
 @functools.cache
 def schema_of(model: type[Model]) -> _Node:
-    """Return the model's JSON Schema; its generation takes longer than all other validation."""
+    """Return the model's JSON Schema; generating it takes longer than all other validation."""
     return model.model_json_schema()
 
 
@@ -141,7 +141,7 @@ def describe(node: _Node | None, schema: _Node) -> str:
             items = [describe(item, schema) for item in node["prefixItems"]]
             alike = len(set(items)) == 1
             return f"a list of {len(items)} {_plural(items[0]) if alike else 'values'}"
-        return f"a list of at least {node['minItems']}" if node.get("minItems") else "a list"
+        return f"a list of at least {node['minItems']} items" if node.get("minItems") else "a list"
     if kind == "object":
         keys = node.get("properties", {})
         return f"a mapping with the keys {', '.join(keys)}" if keys else "a mapping"
@@ -171,7 +171,7 @@ def _plural(item: str) -> str:
 
 
 def _unknown(at: Location, parent: _Node | None, document: Document) -> tuple[str, str | None]:
-    """Return the message about an unknown key, and the known key that was probably meant."""
+    """Return the message about an unknown key and the known key that was probably meant."""
     key = str(at[-1])
     known = list((parent or {}).get("properties", {}))
     stem, unit = split_unit(key)
@@ -243,7 +243,7 @@ def _get(document: Document, at: Location) -> Data:
 
 
 def _resolve(node: _Node, schema: _Node) -> _Node:
-    """Follow references and take the part of an optional value that is not null."""
+    """Follow references, and choose the part of an optional value that is not null."""
     while True:
         if "$ref" in node:
             node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
@@ -262,7 +262,9 @@ def _step(node: _Node, step: str | int) -> _Node | None:
 
 
 def _walk(schema: _Node, loc: tuple[str | int, ...]) -> tuple[Location, _Node | None, _Node | None]:
-    """Convert pydantic's location to the document's, which has no union tags; also return its schema node and its parent's."""
+    """Convert pydantic's location to the document's, which has no union tags; also return the schema nodes of the value and of its
+    parent.
+    """
     node: _Node | None = _resolve(schema, schema)
     parent: _Node | None = None
     at: list[str | int] = []

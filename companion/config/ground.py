@@ -23,7 +23,7 @@ class BrokerAddress(Model):
 
     @property
     def loopback(self) -> bool:
-        """Whether the broker runs on this computer."""
+        """Return whether the broker runs on this computer."""
         return _LOOPBACK.fullmatch(self.host) is not None
 
     def __str__(self) -> str:
@@ -35,7 +35,7 @@ def broker_address(url: str) -> BrokerAddress:
     """Parse a broker's URL.
 
     Raises:
-        ValueError: not a broker's URL.
+        ValueError: the text is not a broker's URL.
     """
     match = _URL.fullmatch(url)
     if match is None:
@@ -70,9 +70,9 @@ class Mqtt(Model):
     login_file: str | None = None
     """YAML file with `username` and `password`, readable only by its owner. If it is absent, no login is used."""
     ca_file: str | None = None
-    """Certificate (PEM) of the authority that signed the broker's certificate. If it is absent, the system's authorities are used."""
+    """CA certificates (PEM) to verify the broker's certificate. If it is absent, the system's CA certificates are used."""
     commands: bool = True
-    """Accept signed commands. Over a connection to another computer without TLS they are never accepted."""
+    """Accept signed commands. They are never accepted over a connection to another computer without TLS."""
     operators_file: str | None = None
     """YAML file of the operators and their keys. If it is absent, the file of this user on this computer is used."""
 
@@ -105,5 +105,5 @@ class Ground(Model):
 
 
 def topic_name(topic: str | None, vehicle_name: str) -> str:
-    """Return the name of a vehicle in topics, with '-' for characters that MQTT does not allow."""
+    """Return the name of a vehicle in topics, with '-' in place of characters that MQTT does not allow."""
     return topic or (re.sub(r"[^A-Za-z0-9_.-]", "-", vehicle_name)[:40] or "vehicle")

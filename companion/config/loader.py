@@ -32,7 +32,7 @@ from companion.config.yaml_strict import read_document
 M = TypeVar("M", bound=Model)
 
 PRESET_DIRECTORY = Path(__file__).parent / "presets"
-"""Built-in controller files are package data, so that they are found wherever the package is installed."""
+"""Folder of the built-in controller files: package data, so that every installation finds them."""
 
 
 class Sources(Model):
@@ -74,7 +74,7 @@ def load_flight(
         preset: built-in preset of that law in place of the mission's.
         overrides: `--set` options, `section.key[index].key=value`, applied before anything is checked. Those of the section `world`
             are not read: they belong to the simulated world (`companion.sitl_config`).
-        hardware: the addresses of the vehicle file are used, not those of SITL; then `devices.mocap.interface` must name one network.
+        hardware: the vehicle file's addresses are used, not those of SITL; then `devices.mocap.interface` must name one network.
 
     Raises:
         ConfigError: one message per problem of all files.
@@ -135,7 +135,7 @@ def load_vehicle(path: str | Path, overrides: Sequence[str] = ()) -> Vehicle:
 
 
 def logged_flight(config_json: str) -> FlightConfig:
-    """Return the configuration that a log holds. Older logs also hold the simulated world's, which is left out.
+    """Return the configuration in a log. Older logs also contain that of the simulated world, which is left out.
 
     Raises:
         ValueError: not JSON, or not a configuration of this version.
@@ -159,7 +159,7 @@ def check_document(
 
 
 def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:
-    """Refuse motion capture on all networks: any sender there could claim Motive's address."""
+    """Reject motion capture on all networks, because any sender there could claim Motive's address."""
     interface = vehicle.devices.mocap.interface
     if interface != ANY_INTERFACE:
         return []
@@ -211,7 +211,7 @@ def _open_named(
     else:
         named = _value(mission_file, location)
         if not isinstance(named, str):
-            return None  # missing or not text: reported by the check of the mission
+            return None  # missing or not text: the check of the mission reports it
         origin = mission_file.origin(location)
         base = Path(mission_file.source).parent if origin.line else Path()
         shown = os.path.normpath(base / named)

@@ -1,6 +1,6 @@
-"""The mission file: start pose of the machine, motion limits, and the phases of the flight.
+"""The mission file: start pose of the vehicle, motion limits, and the phases of the flight.
 
-Positions are of the body's origin in the world frame (z up, 0 on the floor); angles of the arm are the paper's.
+Positions are those of the body's origin in the world frame (z up, 0 on the floor); joint angles are as in the paper.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Line(Model):
     name: Name | None = None
     to_m: Vector3
     duration_s: Duration | None = None
-    """If it is absent, the shortest duration that the limits allow."""
+    """Duration. If it is absent, the shortest one that the limits allow."""
     arm_deg: Vector2 | None = None
     """Final joint angles. If they are absent the arm keeps its pose."""
     arm_delay_s: Delay | None = None
@@ -80,7 +80,7 @@ class Path(Model):
     through_m: Annotated[tuple[Vector3, ...], Field(min_length=1, max_length=30)]
     """Points in order up to the end of the path, without its start."""
     duration_s: Duration | None = None
-    """If it is absent, the shortest duration that the limits allow."""
+    """Duration. If it is absent, the shortest one that the limits allow."""
 
 
 class ArmMove(Model):
@@ -90,7 +90,7 @@ class ArmMove(Model):
     name: Name | None = None
     arm_deg: Vector2
     duration_s: Duration | None = None
-    """If it is absent, the shortest duration that the limits allow."""
+    """Duration. If it is absent, the shortest one that the limits allow."""
 
 
 class Land(Model):
@@ -129,11 +129,11 @@ class Limits(Model):
     arm_acceleration_max_deg_s2: Positive
     arm_jerk_max_deg_s3: Positive = 600.0
     thrust_share_max: Annotated[float, Field(gt=0, le=1)] = 0.8
-    """Largest share of airframe.thrust_max_n that the plan may need with the largest payload."""
+    """Largest fraction of airframe.thrust_max_n that the plan may need with the largest payload."""
 
 
 class Catch(Model):
-    """The expected payload, for checks and reports; the controller does not know it."""
+    """The expected payload. Checks and reports use it; the controller does not know it."""
 
     expected_at_m: Vector2
     """x, y of the vehicle when the payload arrives."""
@@ -145,14 +145,14 @@ class ControllerChoice(Model):
 
     law: LawName = "adaptive"
     preset: PresetName | None = None
-    """If neither preset nor file is given, the law's default: recommended or tuned."""
+    """Built-in preset. If neither preset nor file is given, the law's default: recommended or tuned."""
     file: str | None = None
     """Path of a controller file, relative to the mission file."""
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
         if self.file is not None and self.preset is not None:
-            refuse("controller", [(("preset",), "either a preset or a file, not both")])
+            refuse("controller", [(("preset",), "give either a preset or a file, not both")])
         if self.preset is not None and self.preset not in PRESETS[self.law]:
             text = f"no such preset of '{self.law}', got \"{self.preset}\"; available: {', '.join(PRESETS[self.law])}"
             refuse("controller", [(("preset",), text)])
@@ -194,7 +194,7 @@ class Mission(Model):
     def _paths_go_somewhere(self) -> Self:
         problems: dict[Location, str] = {}
         at_m = (*self.start.position_m, 0.0)
-        # The first phase of a further repetition begins where the last one ended.
+        # The first phase of a later repetition begins where the previous one ended.
         again = range(1, len(self.phases) - 1) if self.repeat > 1 else ()
         for index in (*range(len(self.phases)), *again):
             phase = self.phases[index]

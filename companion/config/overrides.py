@@ -95,7 +95,7 @@ def _parse(text: str) -> Override:
 
 
 def _make_way(document: Document, override: Override) -> None:
-    """Create the parent mappings that the file leaves to their defaults; refuse indices that do not exist."""
+    """Create the parent mappings that the file leaves to their defaults; reject indices that do not exist."""
     value: Data = document.data
     for depth, step in enumerate(override.location):
         last = depth == len(override.location) - 1

@@ -1,4 +1,4 @@
-"""The vehicle file: the machine, its devices, its tether and its room."""
+"""The vehicle file: the vehicle, its devices, its tether and its room."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Airframe(Model):
     """The flying base."""
 
     mass_kg: Positive
-    """Whole machine, arm and net included, ready to fly, without payload."""
+    """Mass of the whole vehicle ready to fly, with arm and net, without payload."""
     inertia_kg_m2: Positive3 = (0.045, 0.045, 0.075)
     """Moments of inertia of the base without arm and tool about the body's x, y, z at its origin; used by the model-based laws and the
     simulated airframe. The default is the Tarot 650's."""
@@ -41,13 +41,13 @@ class Airframe(Model):
     thrust_max_n: Positive
     """Thrust of all rotors at full command with a charged battery."""
     hover_thrust: Fraction | None = None
-    """Normalised thrust that holds `mass_kg`. If it is absent, PX4's MPC_THR_HOVER is used."""
+    """Normalised thrust that carries `mass_kg`. If it is absent, PX4's MPC_THR_HOVER is used."""
     hover_thrust_adapt: bool = True
     """Estimate the hover thrust in flight from the thrust sent, the IMU and the force sensor. If false it stays constant."""
     tilt_max_deg: Annotated[float, Field(gt=0, le=45)] = 20.0
     """Largest tilt of an attitude setpoint."""
     ground_clearance_m: Positive
-    """Height of the body origin above the floor when the vehicle stands on its landing gear."""
+    """Height of the body origin above the floor when the vehicle rests on its landing gear."""
     radius_m: Positive = 0.45
     """Horizontal radius around the body origin, rotor disks included."""
     payload_max_kg: NonNegative = 0.4
@@ -73,9 +73,9 @@ class Arm(Model):
 
     shoulder_body_m: Vector3
     link_lengths_m: Positive2
-    """Shoulder to elbow, and elbow to the centre of the net."""
+    """Lengths from shoulder to elbow, and from elbow to the centre of the net."""
     link_masses_kg: Positive2
-    """Link 1 with the elbow servo, link 2 without sensor and net."""
+    """Masses of link 1 with the elbow servo, and of link 2 without sensor and net."""
     link_com_m: Positive2
     """Distance of each link's centre of mass from its joint."""
     torque_per_amp_nm_a: Positive = 1.3
@@ -119,12 +119,13 @@ class Tether(Model):
     taut_slack_m: NonNegative = 0.05
     """The tether is taut below this slack."""
     pull_min_n: Positive = 3.0
-    """Smallest pull that is detected. Gusts, downwash and a force sensor that has drifted reached 2.8 N for a moment in sound
-    laboratories; a pull of 3 N tilts a vehicle of 3 kg by 6 deg."""
+    """Smallest pull that is detected. Gusts, downwash and a force sensor that has drifted reached 2.8 N for a moment in simulated
+    laboratories without faults; a pull of 3 N tilts a vehicle of 3 kg by 6 deg.
+    """
     pull_filter_s: Positive = 0.1
     """Time constant of the low-pass of the force that rotors, gravity and tool do not explain."""
     pull_time_s: NonNegative = 0.8
-    """Shortest pull that is not treated as a blow."""
+    """Shortest pull that is not treated as an impact."""
     separation_m: Positive = 0.3
     """Distance beyond the length without a pull at which the tether is considered separated."""
     rotor_inner_radius_m: NonNegative = 0.15
@@ -159,7 +160,7 @@ class MocapDevice(Model):
     """OptiTrack Motive over NatNet."""
 
     server: str
-    """Address of the Motive machine."""
+    """Address of the Motive computer."""
     interface: str = ANY_INTERFACE
     """This computer's address on the camera network. `fly` and `check` refuse 0.0.0.0 (all networks) without `--sitl`."""
     transport: Literal["multicast", "unicast"] = "multicast"
@@ -224,9 +225,9 @@ class Safety(Model):
 
     # Motion capture
     mocap_timeout_s: Positive = 0.2
-    """Max age of a mocap pose; beyond it the arm folds and PX4 lands on its own estimate. Until then the vehicle follows PX4's dead
-    reckoning: with an acceleration error of 0.5 m/s^2 it is 10 mm off after 0.2 s and 31 mm after 0.35 s. PX4 gives up fusion after
-    0.55 s. Hidden markers interrupt tracking for up to 0.1 s in a sound laboratory."""
+    """Max age of a mocap pose; beyond it the arm folds and PX4 lands using its own estimate. Until then the vehicle follows PX4's dead
+    reckoning: with an acceleration error of 0.5 m/s^2 it is 10 mm off after 0.2 s and 31 mm after 0.35 s. PX4 stops fusing after 0.55
+        s. Hidden markers interrupt tracking for up to 0.1 s in a simulated laboratory without faults."""
     mocap_rate_min_hz: Positive = 50.0
     """Rate of poses below which a warning is raised."""
     mocap_latency_warn_s: Positive = 0.05
@@ -235,15 +236,16 @@ class Safety(Model):
     """Latency above which PX4 lands: PX4 fuses a pose at its arrival minus EKF2_EV_DELAY, so at 1 m/s a pose that is 0.12 s late is
     0.11 m off, as far as `mocap_jump_m` allows."""
     mocap_jump_m: Positive = 0.10
-    """Largest distance of a pose from the position predicted with PX4's velocity; a pose beyond it is ignored."""
+    """Largest distance between a pose and the position predicted from PX4's velocity; a pose beyond it is ignored."""
     mocap_jump_deg: Positive = 20.0
     """Largest change of a pose's attitude beyond what the angular rates explain."""
     mocap_frozen_s: Positive = 0.10
-    """Time with new frames but an identical pose while the vehicle moves."""
+    """Longest time with new frames but an identical pose while the vehicle moves."""
     mocap_inertial_m: Positive = 0.04
-    """Largest distance between a pose and the position predicted by the IMU; above it PX4 lands without motion capture. With one IMU
-    sample in ten lost it reaches 0.024 at 10 m/s2 of vibration, and in proportion 0.036 at the laboratory's 15 m/s2. 0.015 detects
-    drags that begin at 0.2 m/s or faster, 0.025 at 0.3 m/s, 0.04 at 0.5 m/s; a vehicle that vibrates less should use less."""
+    """Largest distance between a pose and the position predicted from the IMU; above it PX4 lands without motion capture. With one IMU
+    sample in ten lost it reaches 0.024 at 10 m/s2 of vibration, and 0.036 at 15 m/s2. 0.015 detects drags that begin at 0.2 m/s or
+    faster, 0.025 at 0.3 m/s, 0.04 at 0.5 m/s; a vehicle that vibrates less should use a smaller value.
+    """
     mocap_inertial_s: NonNegative = 0.05
     """Hold time of `mocap_inertial_m`."""
     estimate_disagreement_m: Positive = 0.30
@@ -271,22 +273,24 @@ class Safety(Model):
     servo_max_c: Positive = 75.0
     """The servos shut down at 80."""
     servo_overload_s: Positive = 1.0
-    """Longest time of a joint at its torque limit."""
+    """Longest time that a joint may be at its torque limit."""
     joint_jump_deg: Positive = 15.0
     """Largest change between two reads beyond what the joint's largest speed explains."""
     joint_rate_max_deg_s: Positive = 700.0
-    """Joint rate that no servo of this kind reaches, even if an external force drives it."""
+    """Largest plausible joint rate: no servo of this type reaches it, even if an external force drives it."""
     joint_wall_warn_deg: Positive = 3.0
     joint_wall_max_deg: Positive = 10.0
-    """Angle beyond a joint limit."""
+    """Largest angle by which a joint may exceed its limits; beyond it the vehicle lands."""
     servo_current_max_a: Positive = 2.3
     """Largest commanded current: the stall current."""
     force_timeout_s: Positive = 0.25
-    """Max age of a force sample; beyond it the law continues without force and a warning is raised."""
+    """Max age of a force sample; beyond it the controller continues without force and a warning is raised."""
     force_stuck_s: Positive = 0.25
-    """Time with new but identical samples after which the law continues without force."""
+    """Time with new but identical samples after which the controller continues without force."""
     force_drift_n: Positive = 2.0
-    """Largest lasting force on the net before the catch. Drift and the rotors' wake on the net reached 1.5 N in sound laboratories."""
+    """Largest lasting force on the net before the catch. Drift and the rotors' wake on the net reached 1.5 N in simulated laboratories
+    without faults.
+    """
 
     # The flight itself
     loop_late_s: Positive = 0.05
@@ -296,13 +300,13 @@ class Safety(Model):
     command_state_age_max_s: Positive = 0.10
     """Max age of the attitude from which a setpoint was computed; an older one is not sent to PX4."""
     thrust_slew_max_per_s: Positive = 100.0
-    """Largest rate of the normalised thrust, far above that of a catch."""
+    """Largest rate of change of the normalised thrust, far above that of a catch."""
     tilt_abort_deg: Annotated[float, Field(gt=0, le=80)] = 40.0
     tracking_error_warn_m: Positive = 0.45
     tracking_error_hold_m: Positive = 0.6
     tracking_error_abort_m: Positive = 0.8
     thrust_saturated_s: Positive = 1.0
-    """Longest surplus of time at the upper thrust limit over time below it."""
+    """Largest excess of the time at the upper thrust limit over the time below it."""
     speed_max_m_s: Positive = 2.0
     """Largest horizontal speed; a mission's limits must stay below."""
     climb_max_m_s: Positive = 1.5
@@ -314,7 +318,8 @@ class Safety(Model):
 
     # Reactions
     guardian_timeout_s: Positive = 0.1
-    """Time without a heartbeat of the flight process, with turning rotors, after which the guardian kills it, takes over and lands."""
+    """Time without a heartbeat from the flight process, with turning rotors, after which the guardian kills it, takes over and lands.
+    """
     hold_max_s: Positive = 20.0
     """Longest HOLD; then the vehicle lands."""
     retract_max_s: Positive = 12.0
@@ -327,7 +332,7 @@ class Safety(Model):
 
 
 class Vehicle(Model):
-    """One machine with its devices, tether and room."""
+    """One vehicle with its devices, tether and room."""
 
     schema_version: Literal[1]
     name: str
@@ -365,7 +370,7 @@ class Vehicle(Model):
                 problems.append((("airframe", "inertia_kg_m2", axis), text))
         carried_kg = sum(self.arm.link_masses_kg) + self.tool.sensor_mass_kg + self.tool.net_mass_kg
         if carried_kg >= self.airframe.mass_kg:
-            text = f"{self.airframe.mass_kg:g} kg is the whole machine, but arm and tool alone weigh {carried_kg:g} kg"
+            text = f"{self.airframe.mass_kg:g} kg is the whole vehicle, but arm and tool alone weigh {carried_kg:g} kg"
             problems.append((("airframe", "mass_kg"), text))
         if self.airframe.thrust_max_n <= GRAVITY_M_S2 * self.airframe.mass_kg:
             text = f"{self.airframe.thrust_max_n:g} N do not lift {self.airframe.mass_kg:g} kg"

@@ -37,7 +37,7 @@ _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _INFINITE = re.compile(r"[-+]?\.(inf|Inf|INF)")
 _NAN = re.compile(r"\.(nan|NaN|NAN)")
 _HALF_CHARACTER = "an escape (\\uD800 to \\uDFFF) for half a character; write the character itself"
-_DIGITS_MAX = 400  # Python refuses to convert integers of more than 4300 digits with an exception of its own.
+_DIGITS_MAX = 400  # Python refuses to convert integers of more than 4300 digits with a different exception.
 
 
 class StrictLoader(yaml.SafeLoader):
@@ -112,7 +112,7 @@ def read_document(path: str | Path, shown_as: str | None = None) -> Document:
 
 
 def parse_value(text: str, origin: Origin) -> Data:
-    """Parse the value of a command line override by the same rules.
+    """Parse the value of a command-line override by the same rules.
 
     Raises:
         ConfigError: one line per problem.
@@ -168,7 +168,7 @@ class _Builder:
         self._document.problems.append(Problem(rank, self._at(mark), where + text))
 
     def build(self, node: yaml.Node, location: Location) -> Data:
-        """Return the data of a node and its children."""
+        """Return the data of a node and of its children."""
         self._document.values[location] = self._at(node.start_mark)
         if isinstance(node, yaml.MappingNode):
             return self._mapping(node, location)
@@ -253,13 +253,13 @@ def _syntax(error: yaml.MarkedYAMLError) -> str:
     if "'\\t'" in problem:
         return "a tab; indent with spaces"
     if "expected a single document" in (error.context or "") or "but found another document" in problem:
-        return "a second document (---); one per file"
+        return "a second document (---); only one per file is accepted"
     if "mapping values are not allowed here" in problem:
         return "an unexpected ':'; check the line above, the quotes and the indentation"
     if "could not find expected ':'" in problem:
         return "a key without ':'"
     if problem.startswith("expected <block end>"):
-        return "the indentation does not fit the lines above"
+        return "the indentation does not match the lines above"
     if problem.startswith(("aliases", "tags", "nested")):
         return problem
     context = f" {error.context}" if error.context else ""

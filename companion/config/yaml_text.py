@@ -1,4 +1,4 @@
-"""Values as YAML text on one line, for files that a user continues to edit. Pure."""
+"""Writes values as YAML text on one line, for files that a user continues to edit. Pure."""
 
 from __future__ import annotations
 

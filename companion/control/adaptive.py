@@ -5,7 +5,7 @@ every norm and get no torque. The order of the steps is that of docs/control-law
 0 for any input.
 
 Sums over the five active rows are written out, with the row in every name (`s0` to `s2` for x y z, `s6` and `s7` for the joints),
-because plain floats are several times as fast as loops or arrays.
+because this is several times as fast as loops or arrays.
 """
 
 from __future__ import annotations
@@ -81,7 +81,9 @@ class Adaptation:
 
 
 class AccelerationFilter:
-    """Low-pass filter of chi'' of the active rows, exact for a held input: measured for the base, differenced for the joints."""
+    """Low-pass filter of chi'' of the active rows, exact for a held input: measured for the base, differentiated numerically for the
+    joints.
+    """
 
     def __init__(self, cutoff_hz: float) -> None:
         self._w = 2.0 * math.pi * cutoff_hz
@@ -106,7 +108,7 @@ class AccelerationFilter:
 
 
 class AdaptiveController:
-    """The adaptive impedance law for vehicle and arm."""
+    """The adaptive impedance control law for vehicle and arm."""
 
     def __init__(self, config: AdaptiveConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
@@ -137,7 +139,7 @@ class AdaptiveController:
         self._up_m_s2: Vec2 = (0.0, GRAVITY_M_S2)
         self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
         self.hover_thrust = hover_thrust
-        """Normalised hover thrust, for the log. Its estimator sets it before every step."""
+        """Normalised hover thrust, for the log. The hover-thrust estimator sets it before every step."""
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
         """Run one tick of `dt_s`; see `companion.control.types.Controller`."""
@@ -274,8 +276,8 @@ class AdaptiveController:
     ) -> Vec2:
         """Return the joint torques: tau and gravity, plus the configured (M_arm - M_d) alpha''* + C alpha' and friction at alpha'*.
 
-        The star marks the target impedance's present request: alpha''* = alpha''_d - Phi e' + gamma' and alpha'* = alpha'_d - Phi e +
-        gamma = alpha' - s.
+        The star marks what the target impedance requests at this instant: alpha''* = alpha''_d - Phi e' + gamma' and alpha'* = alpha'_d
+        - Phi e + gamma = alpha' - s.
         """
         t6, t7 = tau[3], tau[4]
         rates = state.arm_rate_rad_s

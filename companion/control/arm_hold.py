@@ -1,4 +1,4 @@
-"""PD control of the joints: holds or folds the arm while the impedance law does not run (on the ground, after an abort)."""
+"""PD control of the joints: holds or folds the arm while the control law does not run (on the ground, after an abort)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parts that every law shares: errors, the filtered external force, the desired force, and the saturation of commands.
+"""Parts that every control law shares: errors, the filtered external force, the desired force, and the saturation of commands.
 
 Everything here runs in the control tick and is therefore written in plain floats, axis by axis.
 """
@@ -46,7 +46,7 @@ def tracking_errors(state: PlantState, reference: Reference, yaw_rad: float) -> 
 class ForceFilter:
     """First-order low-pass filter of the external force, exact for a held input.
 
-    It returns zero while there is no valid sample and starts again at the next valid one.
+    It returns zero while there is no valid sample and restarts at the next valid one.
     """
 
     def __init__(self, cutoff_hz: float) -> None:
@@ -67,7 +67,7 @@ class ForceFilter:
 
 
 class DesiredForce:
-    """Desired force F_d. It follows the external force slowly, so that a carried payload stops being a disturbance.
+    """Desired force F_d. It follows the external force slowly, so that a carried payload ceases to be a disturbance.
 
     Args:
         time_s: time constant; with None F_d stays 0.
@@ -89,10 +89,10 @@ class DesiredForce:
 
 
 class Actuation:
-    """Convert force and joint torques to commands: vertical force first, then lateral force within the tilt limit, filtered roll and
+    """Converts force and joint torques to commands: vertical force first, then lateral force within the tilt limit, filtered roll and
     pitch, joint torques within their limits.
 
-    Results of the last tick are attributes, because one more record per tick would cost more than the arithmetic.
+    Results of the last tick are attributes, because a record per tick would cost more than the arithmetic.
     """
 
     def __init__(self, config: LawConfig, vehicle: Vehicle, hover_thrust: float) -> None:

@@ -1,4 +1,4 @@
-"""Optional compensation for every law: measured force, estimated disturbances, delay of the attitude loop, joint friction.
+"""Optional compensation for every control law: measured force, estimated disturbances, delay of the attitude loop, joint friction.
 
 All laws share it, so that they can be compared with the same options.
 """
@@ -15,16 +15,17 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Reference, Vec2, Vec3
 
 FRICTION_RATE_RAD_S = 0.1
-"""Joint rate below which the friction fades out, so that a joint at rest is not shaken."""
+"""Joint rate below which the friction torque fades out, so that a joint at rest does not shake."""
 
 
 class Compensation:
-    """Computes forces and torques in addition to those of a law.
+    """Computes forces and torques in addition to those of a control law.
 
     Args:
         config: configuration of the law.
-        vehicle: nominal machine.
-        answered_xyz: share of the measured force, per world axis, that the law itself compensates; the observer does not estimate it.
+        vehicle: the nominal vehicle.
+        answered_xyz: fraction of the measured force, per world axis, that the law itself compensates; the observer does not estimate
+            it.
         inertia_xy_kg: inertia along x and y that the law imposes on the base, used for the feedforward's lead.
     """
 
@@ -65,9 +66,7 @@ class Compensation:
         return (x, y, z)
 
     def joint_torque_nm(self, torque_nm: Vec2, wanted_rate_rad_s: Vec2) -> Vec2:
-        """Return the torques with friction added along the reference joint rates. Along the measured rates it would
-        shake a joint at rest.
-        """
+        """Return the torques with friction added along the wanted joint rates. Measured rates would shake a joint at rest."""
         if self._friction_nm == 0.0:
             return torque_nm
         (t1, t2), (r1, r2) = torque_nm, wanted_rate_rad_s
@@ -77,6 +76,6 @@ class Compensation:
         )
 
     def remember(self, sent_n: Vec3, force: Vec3) -> None:
-        """Store the known force for the observer. It contains the part of the measured force that is accounted for."""
+        """Store the force that was sent, and the part of the measured force that is accounted for, for the observer."""
         (x, y, z), (f0, f1, f2), (c0, c1, c2) = sent_n, force, self._accounted
         self._known_n = (x + c0 * f0, y + c1 * f1, z + c2 * f2 - self._weight_n)

@@ -48,7 +48,7 @@ class CscController(ModelBasedLaw):
         return self._end(dt_s, error, error_rate, e_tau, force)
 
     def _external(self, state: PlantState, force: Vec3) -> tuple[Vec8, Vec8]:
-        """Return tau_ext and tau_ext - tau_d. The share of the base is configured."""
+        """Return tau_ext and tau_ext - tau_d. The configuration sets which fraction acts on the base."""
         ext, desired = self._joint_torques_nm(state, force)
         x, y, z = (share * f for share, f in zip(self._c.external_xyz, force, strict=True))
         dx, dy, dz = (share * f for share, f in zip(self._c.desired_force_xyz, self._desired.world_n, strict=True))

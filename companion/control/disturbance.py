@@ -1,6 +1,6 @@
 """Disturbance observer: estimates the unknown force on the base from Newton's law, first order.
 
-    d' = (m a - F - d) / T,    F = the known force, lagged as the rotors and the attitude loop lag
+    d' = (m a - F - d) / T, F = the known force, low-passed like the response of rotors and attitude loop
 
 The estimate contains any unknown force: wind, a payload, the arm's reaction, the tether, a wrong hover thrust.
 """
@@ -16,7 +16,7 @@ class DisturbanceObserver:
     """Estimate of the unknown force on the base, world frame, N.
 
     Args:
-        mass_kg: mass of the whole machine.
+        mass_kg: mass of the whole vehicle.
         time_xyz_s: time constant per axis; an axis with 0 stays 0.
         lag_s: time constant from the commanded to the actual force.
         max_n: bound of the estimate per axis.
@@ -38,8 +38,8 @@ class DisturbanceObserver:
         Args:
             dt_s: time since the last tick.
             known_n: sum of all known forces commanded in the last tick, weight included.
-            acceleration_world_m_s2: measured acceleration.
-            learn: if false the estimate does not change (on the ground, or while the actuators are saturated).
+            acceleration_world_m_s2: measured acceleration. learn: if False the estimate does not change (on the ground, or while the
+            actuators are saturated).
         """
         if not self._on:
             return self.force_n

@@ -5,7 +5,7 @@ torques of roll, pitch, yaw, N m; joint torques, N m]. The arm moves in the body
 
 The terms are built in the coordinates (origin velocity in body axes, body rate, joint rates), where the planar arm leaves few terms,
 and then transformed to chi by the Euler-rate matrix W: omega_body = W(roll, pitch) q'. The module uses floats and tuples only: it runs
-in the control tick, and a replay on another machine must not depend on the summation order of a linear-algebra library.
+in the control tick, and a replay on another computer must not depend on the summation order of a linear-algebra library.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _Vec4 = tuple[float, float, float, float]
 
 ROD_AXIAL_SHARE = 0.1
 ROD_AXIAL_KG_M2 = 1e-5
-"""Inertia of a link about its own axis: a share of the transverse inertia plus a constant."""
+"""Inertia of a link about its own axis: a fraction of the transverse inertia plus this constant."""
 TOOL_PART_INERTIA_KG_M2 = 1e-4
 """Inertia of the sensor and of the net about any axis, kg m^2."""
 
 
 @dataclass(frozen=True, slots=True)
 class DynamicsTerms:
-    """The three terms at one state. The rows of `mass` are the rows of M."""
+    """The terms M, C chi' and g of the equation of motion at one state. `mass` is M as a tuple of rows."""
 
     mass: Mat8
     coriolis: Vec8
@@ -41,7 +41,7 @@ class DynamicsTerms:
 
 @dataclass(frozen=True, slots=True)
 class ArmTerms:
-    """The same terms for the arm on a fixed base. Gravity is `Manipulator.gravity_torque_nm`."""
+    """M and C alpha' of the arm on a fixed base, without gravity (see `Manipulator.gravity_torque_nm`)."""
 
     mass: Mat2
     coriolis: Vec2
@@ -107,7 +107,7 @@ class Dynamics:
         """Return M, C chi' and g at a state. They do not depend on the position.
 
         Args:
-            rotation: body to world, the matrix of the three angles.
+            rotation: rotation matrix from body to world of the three angles.
             roll_pitch_yaw_rad: ZYX; |pitch| < 90 deg.
             angle_rad: joint angles.
             chi_rate: chi'; rows 3-5 are the rates of roll, pitch, yaw.
@@ -121,7 +121,7 @@ class Dynamics:
         sy = self._shoulder[1]
         up = (rotation[2][0] * GRAVITY_M_S2, rotation[2][1] * GRAVITY_M_S2, rotation[2][2] * GRAVITY_M_S2)
 
-        # First moment, inertia about the origin, coupling columns; then forces and torques of the held rates.
+        # First moment, inertia about the origin, coupling columns; then forces and torques at constant rates.
         hx = hy = hz = 0.0
         ixx, iyy, izz, ixy, ixz, iyz = bx, by, bz, 0.0, 0.0, 0.0
         px1 = px2 = pz1 = pz2 = 0.0

@@ -1,9 +1,9 @@
-"""Estimator of the hover thrust in flight: the normalised thrust that carries the machine without payload. Pure; time is an argument.
+"""Estimator of the hover thrust in flight: the normalised thrust that carries the vehicle without payload. Pure; time is an argument.
 
-The balance along body z, with the machine as one mass, is (m g / h) u = m f_z - F_z, where u is the thrust that the rotors give now
-(commanded thrust behind delay and rotor lag), h the hover thrust, f_z the specific force along body z (IMU) and F_z the measured force
-on the net. A caught payload acts on the sensor and does not change h. The remaining changes of h come from battery, propellers, air
-density and the true mass.
+The balance along body z, with the vehicle as one mass, is (m g / h) u = m f_z - F_z, where u is the thrust that the rotors produce now
+(the commanded thrust after delay and rotor lag), h the hover thrust, f_z the specific force along body z (IMU) and F_z the measured
+force on the net. A caught payload acts on the sensor and does not change h. The remaining changes of h come from battery, propellers,
+air density and the true mass.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from companion.model.types import Inputs, LandedState, Quat, Vec3
 SHARE_MAX = 0.25
 """Largest relative deviation of the estimate from its start value. It keeps a faulty accelerometer from making the vehicle sink."""
 AIRBORNE_M = 0.10
-"""Height above the standing height from which the ground no longer carries the vehicle, m."""
+"""Height above standing height at which the ground no longer carries the vehicle, m."""
 _LAG_S = 0.05
-"""Lag from command to thrust: transmission and rotors. Its exact value does not matter against the estimator's time constants of
+"""Lag from command to thrust: transmission and rotors. Its exact value does not matter because the estimator's time constants are
 seconds.
 """
 _TIME_MIN_S, _TIME_MAX_S = 1.0, 6.0
@@ -41,9 +41,9 @@ class Balance:
     def step(
         self, dt_s: float, thrust_sent: float, acceleration_world_m_s2: Vec3, force_world_n: Vec3, attitude_wxyz: Quat
     ) -> tuple[float, float] | None:
-        """Return the normalised thrust that the rotors give now and the load as a share of the weight (1 is hover without payload).
+        """Return the normalised thrust that the rotors produce now, and the load divided by the weight (1 in hover without payload).
 
-        Returns None while the vehicle is tilted or accelerates strongly, or the command is at its limits.
+        Return None while the vehicle is tilted or accelerates strongly, or the command is at its limits.
         """
         before = thrust_sent if self._thrust is None else self._thrust
         self._thrust = before + (1.0 - math.exp(-dt_s / _LAG_S)) * (thrust_sent - before)
@@ -65,8 +65,8 @@ class HoverThrust:
     """Estimator of the hover thrust.
 
     Args:
-        start: initial hover thrust (PX4's MPC_THR_HOVER or the vehicle file), 0 to 1.
-        mass_kg: nominal mass of the whole machine, without payload.
+        start: initial hover thrust (PX4's MPC_THR_HOVER or the vehicle file), 0 to 1. mass_kg: nominal mass of the whole vehicle
+        without payload.
     """
 
     def __init__(self, start: float, mass_kg: float) -> None:
@@ -80,9 +80,9 @@ class HoverThrust:
 
         Args:
             dt_s: time since the last step.
-            thrust_sent: normalised thrust sent in the last tick. At its limits the estimate does not change.
+            thrust_sent: normalised thrust sent in the last tick. The estimate does not change while it is at its limits.
             state: state of this tick.
-            airborne: whether only the rotors carry the machine.
+            airborne: whether only the rotors carry the vehicle.
             carrying: whether a payload was caught; without a force sensor the estimate is then frozen.
         """
         force = state.force_ext_world_n
@@ -105,7 +105,7 @@ class HoverThrust:
 
 
 def off_the_ground(inputs: Inputs, ground_clearance_m: float) -> bool:
-    """Return whether only the rotors carry the machine, by PX4's landed state and by height."""
+    """Return whether only the rotors carry the vehicle, according to PX4's landed state and to height."""
     if inputs.vehicle is None or inputs.status is None or inputs.status.landed is not LandedState.IN_AIR:
         return False
     return inputs.vehicle.position_world_m[2] > ground_clearance_m + AIRBORNE_M

@@ -3,11 +3,11 @@
     theta' = Gamma phi' s - nu_theta theta,    each theta_i projected to its bounds
 
 phi holds a constant for each of x, y and z (an unknown force: weight, wind, tilt, rotors that lose thrust), the levers of gravity of
-both links (their first moments, payload included), and the commanded direction of each joint (dry friction). tau contains
-the estimated load. With V_theta = (theta - theta*)' Gamma^-1 (theta - theta*) / 2 added to the paper's Lyapunov function, the term
-s' phi (theta* - theta) of V' cancels for constant theta*; leakage, projection and a load that varies leave a bounded remainder, as the
-leakage of H does (eq. adaptive_law_full). s is integrated and not e: at s = 0 the target impedance holds, so a measured force still
-moves the arm according to K_d and K_p.
+both links (their first moments, payload included), and the commanded direction of motion of each joint (dry friction). tau contains the
+estimated load. With V_theta = (theta - theta*)' Gamma^-1 (theta - theta*) / 2 added to the paper's Lyapunov function, the term s' phi
+(theta* - theta) of V' cancels for constant theta*; leakage, projection and a load that varies leave a bounded remainder, as the leakage
+of H does (eq. adaptive_law_full). s is integrated and not e: at s = 0 the target impedance holds, so a measured force still moves the
+arm according to K_d and K_p.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class LoadAdaptation:
 
         self._held = HoldTable(held)
         self.force_n: Vec3 = (0.0, 0.0, 0.0)
-        """Estimated force that the rotors must give in addition, world frame."""
+        """Estimated force that the rotors must produce in addition, world frame."""
         self.moments_kg_m: Vec2 = (0.0, 0.0)
         """Estimated first moments of the links about their joints, in addition to the nominal ones."""
         self.friction_nm: Vec2 = (0.0, 0.0)
@@ -68,8 +68,8 @@ class LoadAdaptation:
     def advance(self, dt_s: float, s: Rows, learn: bool) -> None:
         """Integrate one step with s held. Without `learn` the estimates do not change: on the ground and in saturation.
 
-        The friction of a joint changes only while the joint turns as it is meant to. At rest static friction takes any value up to its
-        limit, so s tells nothing about that limit, and s phi = -s tanh(s / 0.1) would only raise the estimate.
+        The friction of a joint changes only while the joint turns in the wanted direction. At rest static friction takes any value up
+        to its limit, so s contains no information about that limit, and s phi = -s tanh(s / 0.1) would only raise the estimate.
         """
         if not self.on or not learn:
             return

@@ -1,4 +1,4 @@
-"""Kinematics and nominal gravity of the 2R arm.
+"""Kinematics and nominal gravity torques of the 2R arm.
 
 Angles are those of the paper: alpha_1 is the angle of link 1 from body +x, positive downwards (about body +y); alpha_2 rotates link 2
 in the opposite direction, so that link 2 points along alpha_1 - alpha_2. The arm moves in the body's x-z plane. The module uses floats
@@ -64,7 +64,7 @@ class Manipulator:
         self, angle_rad: Vec2, attitude_wxyz: Quat, specific_force_m_s2: float = GRAVITY_M_S2
     ) -> Vec2:
         """Return the motor torques that hold the arm against gravity at the given attitude, N m, payload excluded."""
-        # "Up" seen from the body: the arm must push that way.
+        # Upward direction in the body frame: the arm must push that way.
         up_x, _, up_z = quat_rotate(
             (attitude_wxyz[0], -attitude_wxyz[1], -attitude_wxyz[2], -attitude_wxyz[3]), (0.0, 0.0, specific_force_m_s2)
         )
@@ -82,7 +82,7 @@ class Manipulator:
 
         Args:
             angle_rad: both joint angles.
-            up_x_m_s2: body x component of the reaction to gravity, 9.81 m/s^2 upwards.
+            up_x_m_s2: body x component of the reaction to gravity, which is 9.81 m/s^2 upwards.
             up_z_m_s2: its body z component.
         """
         a1, a2 = angle_rad
@@ -96,7 +96,7 @@ class Manipulator:
         return -l1 * s1 - s2, s2, -l1 * c1 - c2, c2, about_1 + about_2, -about_2
 
     def gravity_levers_m_s2(self, angle_rad: Vec2, up_x_m_s2: float, up_z_m_s2: float) -> Vec2:
-        """Return the torque that holds each link against gravity for a first moment of 1 kg m, about its own joint; arguments as for
+        """Return, for each link, the torque about its own joint that holds a first moment of 1 kg m against gravity; arguments as for
         `joint_terms`.
         """
         a1, a2 = angle_rad

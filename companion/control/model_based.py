@@ -1,4 +1,4 @@
-"""Parts that the model-based laws share: model, external joint torque, and the end of a tick."""
+"""Parts that the model-based control laws share: model, external joint torque, and the end of a tick."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from companion.model.types import ControlLog, Reference, Vec2, Vec3, Vec8
 
 
 class ModelBasedLaw:
-    """Base class of the model-based laws.
+    """Base class of the model-based control laws.
 
     Args:
         config: configuration of the law.
-        vehicle: the nominal machine, without payload.
+        vehicle: the nominal vehicle without payload.
         hover_thrust: normalised thrust that carries it, 0 to 1.
-        answered_xyz: share of the measured force, per world axis, that the law itself compensates.
+        answered_xyz: fraction of the measured force, per world axis, that the law itself compensates.
         model_mass_scale: ratio of the model's masses to the nominal ones.
     """
 
@@ -40,7 +40,7 @@ class ModelBasedLaw:
         mass_kg = vehicle.airframe.mass_kg
         self._compensation = Compensation(config, vehicle, answered_xyz, (mass_kg, mass_kg))
         self.hover_thrust = hover_thrust
-        """Normalised hover thrust, for the log. Its estimator sets it before every step."""
+        """Normalised hover thrust, for the log. The hover-thrust estimator sets it before every step."""
 
     def _send(
         self,

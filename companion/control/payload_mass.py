@@ -1,4 +1,4 @@
-"""Estimate of the payload's mass, used by the PSC law. It starts at zero; `companion.control.load_adaptation` is the adaptive law's."""
+"""Estimates the payload's mass for the PSC law, starting at zero; the adaptive law uses `companion.control.load_adaptation`."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from companion.model.constants import GRAVITY_M_S2
 
 
 class PayloadEstimator:
-    """Estimate of the payload's mass: thrust / specific force along body z, low-passed, less the machine's own mass.
+    """Estimates the payload's mass: thrust / specific force along body z, low-passed, minus the vehicle's own mass.
 
-    In the air the rotors' thrust is the only force that an accelerometer on the machine measures (drag aside), so their ratio is the
-    total mass, whatever the motion. The thrust is the commanded one, delayed as the rotors delay it.
+    In the air the rotors' thrust is the only force that an accelerometer on the vehicle measures (drag aside), so their ratio is the
+    total mass, whatever the motion. The thrust is the commanded one, delayed like the rotors' response.
     """
 
     _LIFTING_SHARE = 0.7
-    """Share of the machine's weight below which the ground may carry a part of it."""
+    """Fraction of the vehicle's weight; with less thrust than this the ground may carry a part of it."""
 
     def __init__(self, config: PscConfig, mass_kg: float) -> None:
         self._mass_kg = mass_kg
@@ -27,7 +27,7 @@ class PayloadEstimator:
         self.payload_kg = 0.0
 
     def step(self, dt_s: float, commanded_n: float, specific_force_z_m_s2: float, airborne: bool) -> float:
-        """Run one tick with the thrust commanded in the last one and return the estimate, kg, within [0, payload_max_kg]."""
+        """Run one tick with the thrust commanded in the previous one and return the estimate, kg, within [0, payload_max_kg]."""
         if self._thrust_n is None:
             self._thrust_n = commanded_n
         k = 1.0 - math.exp(-dt_s / self._lag_s) if self._lag_s > 0 else 1.0

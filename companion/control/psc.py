@@ -5,7 +5,7 @@ has a joint impedance on a fixed base,
 
     tau = M_arm (alpha''_d - M_d^-1 (K_d e' + K_p e - (tau_ext - tau_d))) + C_arm alpha' + g_arm - tau_ext,    tau_ext = J'F.
 
-The vehicle has a PID controller with the mass of machine and payload, (m + m_hat) (p''_d - K_d e' - K_p e - K_i int e + g e_z). m_hat
+The vehicle has a PID controller with the mass of vehicle and payload, (m + m_hat) (p''_d - K_d e' - K_p e - K_i int e + g e_z). m_hat
 is estimated from the commanded thrust and the acceleration measured by the IMU.
 """
 

@@ -1,4 +1,4 @@
-"""Convert raw inputs for the law: acceleration from the IMU, the tared external force, and the catch."""
+"""Converts raw inputs for the control law: acceleration from the IMU, the tared external force, and the catch."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def acceleration_world_m_s2(vehicle: VehicleState) -> Vec3:
 
 
 class MeanAcceleration:
-    """Mean acceleration over all IMU samples since the last call. One sample per tick would alias vibration to a constant force."""
+    """Mean acceleration over all IMU samples since the last call. One sample per tick would alias vibration into a constant force."""
 
     GAP_MAX_S = 0.05
     """Longest interval between two calls over which the mean is taken. Beyond it, or without PX4's timestamps, the newest sample is
@@ -108,11 +108,11 @@ class CatchDetector:
     PULL_N = 0.3
     PULL_TIME_S = 0.25
     LEFT_SHARE = 0.3
-    """The net is empty when the force, in any direction, is less than this share of the measured payload's weight."""
+    """The net is empty when the force, in any direction, is less than this fraction of the payload's measured weight."""
     LEFT_TIME_S = 0.5
-    """Time for which the force must stay below that share. A bump from below unloads the net for a shorter time."""
+    """Time for which the force must stay below that fraction. A bump from below unloads the net for a shorter time."""
     FALLING_SHARE = 0.6
-    """Share of gravity. With less specific force the whole machine falls, and the force of a payload in the net is small as well."""
+    """Fraction of gravity. With less specific force the whole vehicle falls, and the force of a payload in the net is small too."""
     LOWPASS_S = 0.05
     WEIGHT_S = 1.0
 

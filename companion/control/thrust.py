@@ -1,4 +1,4 @@
-"""Convert a desired force to a saturated force, an attitude and a collective thrust."""
+"""Converts a desired force to a saturated force, an attitude and a collective thrust."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records and Protocols between the core and a controller."""
+"""Records and protocols between the core and a controller."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from companion.model.types import ControlLog, Quat, Reference, Vec2, Vec3
 
 
 class PlantState(Record, frozen=True, kw_only=True):
-    """State of the machine at one tick as a controller sees it; world ENU, body FLU."""
+    """State of the vehicle at one tick as passed to a controller; world ENU, body FLU."""
 
     position_world_m: Vec3
     velocity_world_m_s: Vec3
@@ -22,7 +22,7 @@ class PlantState(Record, frozen=True, kw_only=True):
     force_ext_world_n: Vec3 | None = None
     """Force on the net, tared, without the net's weight, not filtered; None without a valid sample."""
     airborne: bool = True
-    """Whether only the rotors carry the machine. While the ground may carry a part of it, no integrator of a law changes."""
+    """Whether only the rotors carry the vehicle. While the ground may carry a part of it, a law's integrators do not change."""
 
 
 class Wrench(Record, frozen=True, kw_only=True):
@@ -45,4 +45,4 @@ class Law(Controller, Protocol):
     """Protocol of a controller as `VehicleControl` uses it."""
 
     hover_thrust: float
-    """Normalised thrust that carries the machine without payload, for the log; set before every step."""
+    """Normalised thrust that carries the vehicle without payload, for the log; set before every step."""

@@ -1,4 +1,4 @@
-"""Convert inputs and a reference to an attitude setpoint and joint torques. Pure; time is an argument."""
+"""Converts inputs and a reference to an attitude setpoint and joint torques. Pure; time is an argument."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Command(Record, frozen=True):
 
 
 class VehicleControl:
-    """Owner of the control law, the force sensor's tare and the arm's holding target.
+    """Owns the control law, the force sensor's tare and the arm's holding target.
 
     Args:
         config: the effective configuration; `vehicle.airframe.hover_thrust` must be set.
@@ -68,15 +68,15 @@ class VehicleControl:
             vehicle.airframe.mass_kg, (PULL_TIME_S, PULL_TIME_S, PULL_TIME_S), PULL_LAG_S, PULL_MAX_N
         )
         self.disturbance_world_n: Vec3 | None = None
-        """Force on the machine other than rotors and weight, payload included, world frame, N. None on the ground."""
+        """Force on the vehicle other than rotor thrust and weight, payload included, world frame, N. None on the ground."""
 
     @property
     def thrust_share(self) -> float:
-        """Return the thrust of the law's last command as a share of hover thrust."""
+        """Return the thrust of the law's last command divided by hover thrust."""
         return self._thrust_sent / self._hover.value
 
     def begin_tare(self) -> None:
-        """Start a new tare. The previous one holds until it is finished."""
+        """Start a new tare. The previous one stays valid until the new one is finished."""
         self._sensing.begin_tare()
 
     def collect_tare(self, i: Inputs) -> None:
@@ -97,13 +97,13 @@ class VehicleControl:
         return AttitudeSetpoint(quat_from_euler_zyx(0.0, 0.0, yaw), 0.0)
 
     def wait(self, i: Inputs) -> Command:
-        """Return zero thrust with the arm held in place: the stream before take-off and after touchdown."""
+        """Return the command that is streamed before take-off and after touchdown: zero thrust, with the arm held in place."""
         return Command(self.level(i), self._hold(i))
 
     def fold(self, i: Inputs, dt_s: float) -> Command:
-        """Return no setpoint for the vehicle and move the arm to its folded pose at a limited rate."""
+        """Return the command that moves the arm to its folded pose at a limited rate, without an attitude setpoint."""
         goal, step = self.fold_rad, FOLD_RATE_RAD_S * dt_s
-        # Not held before: start from the present angle.
+        # The arm was not held before: start from the present angle.
         now = self._arm_target_rad or (i.arm.angle_rad if i.arm is not None else None)
         if now is None:
             return Command()
@@ -178,5 +178,5 @@ class VehicleControl:
         state = self._state
         if self._catch.caught_s is None or state is None:
             return False
-        # Not the law's log record, which is zero while the sensor is silent, too.
+        # Not from the law's log record, which is also zero while the sensor is silent.
         return self._catch.left(t_s, state.force_ext_world_n, state.acceleration_world_m_s2[2])

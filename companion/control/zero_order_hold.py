@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 _MOST = 64
-"""Largest number of stored steps: a simulation has a few step lengths, a real clock one per tick."""
+"""Largest number of stored step lengths: a simulation has a few, a real clock a new one in every tick."""
 
 
 class HoldTable(dict[float, tuple[float, ...]]):

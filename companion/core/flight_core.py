@@ -1,4 +1,4 @@
-"""The flight core: a pure function of inputs and its own state. No I/O, no clock, no randomness: time arrives inside `Inputs`.
+"""The flight core: a pure function of inputs and its own state. No I/O, no clock, no randomness: time is part of `Inputs`.
 
 One `step` is one control tick: monitors -> state machine -> reference -> governor -> control law -> gate.
 """
@@ -45,7 +45,7 @@ class FlightCore:
         vehicle = config.vehicle
         self._vehicle = vehicle
         self._control = VehicleControl(config)
-        # Solved here once, so that the plan from the measured start costs a tick next to nothing.
+        # Solved once here, so that planning from the measured start costs next to nothing in a tick.
         Plan.build(config.mission, config.vehicle)
         self._monitors = Monitors(vehicle)
         self._watch = TetherWatch(vehicle)
@@ -55,20 +55,20 @@ class FlightCore:
         self._state = self._parameters.initial_state()
         self._situation = Situation(False, False, None)
         self._situation_stage: Stage | None = None
-        """The stage that the situation was made for."""
+        """The stage for which the situation was made."""
         self._tether_watched = False
         self._last_t_s: float | None = None
         self._pose_s = -math.inf
         """Stamp of the newest trusted pose, which was passed on to PX4."""
         self._reference: Reference | None = None
-        """Reference that the law followed last, constrained by the governor."""
+        """The last reference that the controller followed, constrained by the governor."""
         self._limited_by: tuple[str, ...] = ()
         self._log: ControlLog | None = None
         self._refused: tuple[Refusal, ...] = ()
         """Commands that the gate rejected in the last tick; a new rejection is reported once."""
 
     def step(self, inputs: Inputs) -> Outputs:
-        """Take one control tick."""
+        """Run one control tick."""
         t_s, dt_s = inputs.t_s, self._dt_s(inputs.t_s)
         observed, observation = self._observe(inputs)
         i = observation.inputs
@@ -158,7 +158,7 @@ class FlightCore:
         )
 
     def _watch_tether(self, i: Inputs) -> None:
-        """Update the tether's state from arming on. Turns from before that are unknown; zero turns are assumed."""
+        """Update the tether's state once the vehicle is armed. Earlier turns are unknown and assumed to be zero."""
         v = i.vehicle
         if v is None or not self._tether_watched:
             return
@@ -174,7 +174,7 @@ class FlightCore:
         )
 
     def _carry_out(self, request: Request, i: Inputs) -> None:
-        """Execute the requests of a transition to the core."""
+        """Carry out what a transition requests from the core."""
         if i.mocap is not None and i.mocap.tracking_valid:
             self._pose_s = i.mocap.stamp_s
         if request.resumed:

@@ -1,4 +1,4 @@
-"""State of one flight, input and requests of a transition: frozen records."""
+"""Frozen records: the state of one flight, and the input and the requests of a transition."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from companion.safety.touchdown import Touchdown
 
 
 class Tare(Enum):
-    """Step of the force sensor's tare."""
+    """A step of the force sensor's tare."""
 
     BEGIN = "begin"
     COLLECT = "collect"  # add this tick's sample
@@ -33,11 +33,11 @@ class Waiting:
 
     tare_start_s: float | None = None
     was_ready: bool = False
-    """Everything was ready before: a lost input may return for as long as the operator waits."""
+    """Whether everything has been ready once: a lost input may then return as long as the operator waits."""
     unready: str = "the inputs have not been checked yet"
     """Why the vehicle is not ready."""
     looked_s: float = 0.0
-    """Time of the last check of estimate and position."""
+    """Time of the last check of the estimate and the position."""
     settled: SettledEstimate = field(default_factory=SettledEstimate)
 
 
@@ -47,7 +47,7 @@ class FlightState:
 
     touchdown: Touchdown
     rotor_stop: RotorStop
-    """State of the rotor stop, for the stages that disarm."""
+    """Evidence for stopping the rotors, in the stages that disarm."""
     stage: Stage = Stage.WAIT
     entered_s: float | None = None
     """Flight clock when the stage was entered; None before the first tick."""
@@ -56,12 +56,12 @@ class FlightState:
     plan: Plan | None = None
     """Plan of the mission from the measured start."""
     course: Course | None = None
-    """Flown course with its clock; None before arming."""
+    """The plan being flown with its start time and rate; None before arming."""
     aborting: bool = False
-    """Whether the course is an abort and no longer the mission."""
+    """Whether `course` is an abort instead of the mission."""
     mission_start_s: float | None = None
     armed_by_others: bool = False
-    """PX4 was armed without a request of the companion: no setpoint is sent."""
+    """PX4 was armed without a request from the companion: no setpoint is sent."""
     arm_requested_s: float = -math.inf
     """Time of the last request to arm."""
     zero_thrust: bool = False
@@ -81,7 +81,7 @@ class FlightState:
         return self.outcome if self.stage is Stage.DONE else None
 
     def phase(self, t_s: float) -> tuple[str, PhaseKind]:
-        """Return the phase: its name for the operator, its kind for programs."""
+        """Return the phase's name for the operator and its kind for programs."""
         stage = self.stage
         if stage is Stage.PLAN and self.course is not None:
             segment = self.course.segment(t_s)
@@ -92,13 +92,13 @@ class FlightState:
         return stage.value, PhaseKind.DONE if done else PhaseKind.GROUND
 
     def progress(self, t_s: float) -> float:
-        """Return the share of the plan's time, 0 to 1."""
+        """Return the completed fraction of the plan, 0 to 1."""
         if self.mission_start_s is None or self.course is None:
             return 0.0
         return self.course.progress(t_s) if self.stage is Stage.PLAN else 1.0
 
     def vertical_scale(self, t_s: float) -> float:
-        """Return the share of the vertical force that the law may command: rotors spool up and down on the ground."""
+        """Return the fraction of the vertical force that the controller may command while the rotors spool up or down on the ground."""
         assert self.entered_s is not None
         elapsed_s = t_s - self.entered_s
         if self.stage is Stage.SPOOL:
@@ -111,7 +111,7 @@ class FlightState:
 
 
 class Observation(Record, frozen=True):
-    """Input of a transition in addition to state and events."""
+    """The input of a transition in addition to state and events."""
 
     inputs: Inputs
     """Validated inputs of this tick."""
@@ -120,18 +120,18 @@ class Observation(Record, frozen=True):
     armed_by_others: bool
     """PX4 is armed before the companion has requested it."""
     standing: str | None
-    """Rule that forbids to resume, because it still requires a hold; None if there is none."""
+    """Message of the active rule that still requires a hold and therefore forbids resuming; None if there is none."""
     reference: Reference | None
-    """Reference that the law followed in the last tick; None before its first tick."""
+    """Reference that the controller followed in the last tick; None before its first tick."""
     tether: TetherState | None
     thrust_share: float
-    """Share of hover thrust in the last command."""
+    """Thrust of the last command divided by hover thrust."""
     pose_s: float
     """Stamp of the newest trusted pose before this tick; -inf before the first."""
 
 
 class Request(Record, frozen=True):
-    """Requests of a transition to the core."""
+    """What a transition requests from the core."""
 
     autopilot: AutopilotRequest = AutopilotRequest.NONE
     events: tuple[Event, ...] = ()

@@ -1,4 +1,4 @@
-"""Effect of the safety state on the flight: updates the supervisor and reacts when its action escalates. Pure."""
+"""Applies the safety state to the flight: updates the supervisor and reacts when its action escalates. Pure."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _COMMANDED_HOLD = OperatorCommand.HOLD
 
 
 def supervise(t: Transition) -> None:
-    """Update the supervisor by this tick's events, and react to its new action."""
+    """Update the supervisor with this tick's events, and react to its new action."""
     i, state = t.i, t.state
     if i.command is _COMMANDED_HOLD and state.stage in seq.BEFORE_LIFT:
         _hold_on_ground(t)
@@ -129,7 +129,7 @@ def _land_instead(t: Transition, text: str) -> None:
 def _land(t: Transition) -> None:
     """Stop from the last reference, fold the arm and descend."""
     now, p = t.o.reference, t.parameters
-    if now is None:  # the law has never flown
+    if now is None:  # the controller has not flown yet
         t.finish(Outcome.ABORTED)
         t.enter(Stage.AUTOPILOT_LAND)
         return

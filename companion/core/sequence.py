@@ -1,4 +1,4 @@
-"""The stages of one flight: what each waits for, what it requests from PX4, and its timeout. Pure."""
+"""The stages of one flight: each defines what it waits for, what it requests from PX4, and its timeout. Pure."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from companion.safety.notices import Notice
 from companion.safety.rules import CRASHED, PILOT_TOOK_OVER
 
 ARMED_SHOWN_S = 1.5
-"""PX4's HEARTBEAT reports once a second whether it is armed: after a request to arm, an older "not armed" proves nothing."""
+"""PX4's HEARTBEAT reports once a second whether it is armed: for this time after a request to arm, "not armed" may be outdated."""
 NO_TOUCHDOWN_S = 5.0
-"""Timeout of the touchdown after the plan's end; then PX4 lands."""
+"""Time after the plan's end within which touchdown must be detected; otherwise PX4 lands."""
 _NONE = AutopilotRequest.NONE
 
 
@@ -75,7 +75,7 @@ def _wait_for_readiness(t: Transition, elapsed_s: float) -> None:
     problems = _misplaced(t)
     if not problems:
         _is_ready(t)
-    elif was_ready:  # it was moved, and may be put back
+    elif was_ready:  # the vehicle was moved, and may be put back
         t.change_waiting(unready=problems[0])
     else:
         for problem in problems:
@@ -134,7 +134,7 @@ def _weigh(t: Transition) -> None:
 
 
 def _misplaced(t: Transition) -> list[str]:
-    """Return how the vehicle's pose differs from the mission's start, or an empty text if it does not."""
+    """Return how the vehicle's pose differs from the mission's start, or an empty list if it does not."""
     vehicle, arm, p = t.i.vehicle, t.i.arm, t.parameters
     assert vehicle is not None and arm is not None
     yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2]
@@ -295,7 +295,7 @@ def _left_to_pilot(t: Transition) -> bool:
 
 
 def _crash(t: Transition, text: str) -> None:
-    """Report a crash, unless the rule of the same id has done so."""
+    """Report a crash, unless the rule with the same id has already done so."""
     if t.state.outcome is not Outcome.CRASHED:
         t.report_rule(CRASHED, SafetyAction.TERMINATE, text)
         t.finish(Outcome.CRASHED)

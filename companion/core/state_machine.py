@@ -1,7 +1,7 @@
-"""The flight's state machine: one pure transition function. Time is in the inputs.
+"""The flight's state machine, a pure transition function. Time is part of the inputs.
 
-A transition updates the supervisor by the tick's events and reacts to its action (`companion.core.reactions`); then it moves the
-sequence of stages on (`companion.core.sequence`, `companion.model.flight_stage`).
+A transition updates the supervisor with the tick's events and reacts to its action (`companion.core.reactions`); then it advances the
+sequence of stages (`companion.core.sequence`, `companion.model.flight_stage`).
 """
 
 from __future__ import annotations

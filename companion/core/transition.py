@@ -29,13 +29,13 @@ class Parameters:
     config: FlightConfig
     vehicle: Vehicle
     clearance_m: float
-    """Height of the body's origin when the vehicle stands."""
+    """Height of the body's origin when the vehicle is on the ground."""
     tilt_max_rad: float
     """`safety.tilt_abort_deg`."""
     fold_rad: Vec2
     times: LadderTimes
     waits_for_start: bool
-    """The operator starts the take-off."""
+    """Whether the take-off waits for the operator's start command."""
 
     @classmethod
     def of(cls, config: FlightConfig) -> Parameters:
@@ -115,7 +115,7 @@ class Transition:
         )
 
     def enter(self, stage: Stage, *, pilot_flies: bool = False, flipped: bool = False) -> None:
-        """Enter a stage. For a landing by PX4: `pilot_flies` if it is only monitored, `flipped` if the vehicle has flipped."""
+        """Enter a stage. For a landing by PX4, `pilot_flies` means that it is only monitored, `flipped` that the vehicle flipped."""
         p, t_s = self.parameters, self.i.t_s
         if stage is Stage.AUTOPILOT_LAND:
             self.enter_landing(pilot_flies, self.pose_s, flipped)
@@ -138,11 +138,11 @@ class Transition:
             self.change(outcome=outcome)
 
     def stand_down(self, outcome: Outcome) -> None:
-        """Disarm and end, on the ground."""
+        """Disarm and end the flight, on the ground."""
         self.finish(outcome)
         self.enter(Stage.STAND_DOWN)
 
     def leave_mission(self, plan: Plan) -> None:
-        """Replace the mission by this plan."""
+        """Replace the mission with this plan."""
         self.finish(Outcome.ABORTED)
         self.change(course=Course(plan, self.i.t_s), aborting=True)

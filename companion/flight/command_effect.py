@@ -86,7 +86,7 @@ def _start(before: Outputs | None, after: Outputs) -> Effect:
     if after.phase in _RISING:
         return True, "taking off"
     if after.phase_kind is PhaseKind.DONE:
-        return False, "start refused: the vehicle stands down"
+        return False, "start refused: the start has been cancelled"
     return False, _NOT_GROUNDED
 
 

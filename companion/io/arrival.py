@@ -10,13 +10,11 @@ from typing import Final
 
 from companion.runtime.clock import Clock
 
-_SO_TIMESTAMPNS: Final = 35  # <asm-generic/socket.h>: of x86 and ARM; Python has no name for it
+_SO_TIMESTAMPNS: Final = 35  # from <asm-generic/socket.h>, valid on x86 and ARM; Python has no name for it
 _TIMESPEC: Final = struct.Struct("=qq")
 STAMP_ROOM_BYTES: Final = socket.CMSG_SPACE(_TIMESPEC.size)
 _WAITED_MAX_S = 0.1
-"""A longer wait counts as none: the wall clock may have been set meanwhile, and no valid frame may be taken for stale because
-of that.
-"""
+"""A longer wait is not believed: the wall clock may have been set in between, and that must not make a valid frame stale."""
 
 
 def stamp_arrivals(opened: socket.socket) -> None:
@@ -29,7 +27,7 @@ def arrived_s(notes: list[tuple[int, int, bytes]], clock: Clock) -> float:
     """Return the arrival of a datagram that has just been read, on `clock`.
 
     Args:
-        notes: ancillary data of `recvmsg`, with room for `STAMP_ROOM_BYTES`.
+        notes: ancillary data of `recvmsg`, read with a buffer of `STAMP_ROOM_BYTES`.
         clock: the flight clock.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Opens the devices of the vehicle: all of them for a flight; for a check, those that can be opened."""
+"""Opens the vehicle's devices: for a flight all of them, for a check those that can be opened."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ARM_TIMEOUT_S = 1.5
 
 @dataclass(slots=True)
 class VisionFilter:
-    """Forwards motion-capture poses to PX4 while it is open; the core closes it while it does not trust them."""
+    """Forwards motion-capture poses to PX4 while the filter is open; the core closes it while it does not trust the poses."""
 
     open: bool = True
     watch: Callable[[MocapPose], None] | None = None

@@ -34,11 +34,11 @@ from companion.model.types import (
 
 
 class DeviceError(Exception):
-    """A device is absent or wrong. The text is one line: device, address, expected, found, and how to fix it."""
+    """A device is missing or is not as expected. The text is one line: device, address, expected, found, and how to fix it."""
 
 
 class Device(Protocol):
-    """A device that is opened and closed."""
+    """A device that can be opened and closed."""
 
     async def __aenter__(self) -> Self: ...
 
@@ -66,7 +66,7 @@ class Autopilot(Device, Protocol):
         """Send a setpoint at once; None stops the setpoints. Return False if nothing was sent."""
 
     def send_vision(self, pose: MocapPose) -> bool:
-        """Send a pose of motion capture at once. Return False if nothing was sent."""
+        """Send a motion-capture pose at once. Return False if nothing was sent."""
 
     def request(self, request: AutopilotRequest) -> None:
         """Send a request without waiting for the answer, unless the same request is in progress."""
@@ -110,11 +110,11 @@ class Mocap(Device, Protocol):
 
     @property
     def server(self) -> MocapServer | None:
-        """The server that streams the poses, or None before it has answered."""
+        """Return the server that streams the poses, or None before it has answered."""
 
     @property
     def bodies(self) -> dict[int, str]:
-        """Rigid bodies of the newest frame by streaming id; the name is empty if the server has not sent it."""
+        """Return the rigid bodies of the newest frame by streaming id; the name is empty if the server has not sent it."""
 
 
 class Arm(Device, Protocol):
@@ -125,11 +125,11 @@ class Arm(Device, Protocol):
 
     @property
     def servos(self) -> tuple[ServoReport, ...]:
-        """Identity and settings of the servos when they were opened."""
+        """Return the servos' identity and settings as read when the arm was opened."""
 
     @property
     def read_takes_s(self) -> float:
-        """Time within which most reads complete, s."""
+        """Return the time within which most reads complete, s."""
 
     def begin_read(self, at_s: float = 0.0) -> None:
         """Start the read that the next `read` waits for, at a time of the flight clock or at once; never blocks."""
@@ -138,7 +138,7 @@ class Arm(Device, Protocol):
         """Return the newest joint state, whose `read_failures` counts failed reads, or None before the first."""
 
     def write_torque(self, torque_nm: Vec2) -> Vec2:
-        """Command both joint torques, N m. Return the torques that are sent after clipping and rounding to counts."""
+        """Command both joint torques, N m. Return the torques that are sent, clipped and rounded to counts."""
 
 
 class ForceTorque(Device, Protocol):
@@ -161,7 +161,7 @@ class GroundLink(Device, Protocol):
 
     @property
     def line(self) -> str:
-        """Destination of the forwarded MAVLink, as one line for the operator."""
+        """Return the destination of the forwarded MAVLink, as one line for the operator."""
 
     def report_tick(self, inputs: Inputs, outputs: Outputs) -> None:
         """Report one control tick to the ground station."""

@@ -1,4 +1,4 @@
-"""The active plan, its start time, and the rate of its time.
+"""The active plan, its start time, and the rate at which its time runs.
 
 A HOLD does not leave the plan: it slows the plan's time down to a standstill. Vehicle and arm come to rest on the planned path, which
 was checked against tether and room, and a resume continues from there.
@@ -20,16 +20,16 @@ HOLD_DECELERATION_M_S2 = 1.5
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A change of the rate of the plan's time."""
+    """A change of the rate at which the plan's time runs."""
 
     begin_s: float
-    """Flight time."""
+    """Begin of the change on the flight clock."""
     plan_s: float
-    """Plan time at the begin."""
+    """Plan time when the change begins."""
     duration_s: float
     before: float
     after: float
-    """Rates before and after; 0 or 1 after it."""
+    """Rates before and after the change; 0 or 1 after it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,17 +38,19 @@ class Course:
 
     plan: Plan
     start_s: float
-    """Flight time at the plan's beginning."""
+    """Time on the flight clock at which the plan begins."""
     change: Change | None = None
-    """The newest change of the rate; None if the plan's time has always run as fast as the flight's."""
+    """The newest change of the rate; None if the plan's time has always run as fast as the flight clock."""
 
     @property
     def held(self) -> bool:
-        """Return whether the plan's time stands still or slows down to a standstill."""
+        """Return whether the plan's time has stopped or is slowing down to a stop."""
         return self.change is not None and self.change.after == 0.0
 
     def pace(self, t_s: float) -> tuple[float, float, float, float]:
-        """Return plan time, its rate (1: as the flight's, 0: held), and the rate's first and second derivative, at a flight time."""
+        """Return, at `t_s` on the flight clock, plan time, its rate (1: as the flight clock, 0: held), and the rate's first and second
+        derivatives.
+        """
         change = self.change
         if change is None:
             return t_s - self.start_s, 1.0, 0.0, 0.0
@@ -70,7 +72,7 @@ class Course:
         return now_s, before + rise * rate, rise * slope * once, rise * jerk * twice
 
     def hold(self, t_s: float) -> Course:
-        """Return the course that brakes on the planned path to rest from this flight time on."""
+        """Return the course that brakes to rest on the planned path from `t_s`."""
         return self if self.held else self._turned_to(0.0, t_s)
 
     def resume(self, t_s: float) -> Course:
@@ -84,13 +86,13 @@ class Course:
         return replace(self, change=Change(begin_s=t_s, plan_s=plan_s, duration_s=duration_s, before=rate, after=after))
 
     def reference(self, t_s: float) -> Reference:
-        """Return the reference at a flight time."""
+        """Return the reference at `t_s` on the flight clock."""
         plan_s, rate, change, jerk = self.pace(t_s)
         reference = self.plan.reference(plan_s)
         return reference if rate == 1.0 and change == 0.0 else _paced(reference, rate, change, jerk)
 
     def segment(self, t_s: float) -> Segment:
-        """Return the plan's segment at a flight time."""
+        """Return the plan's segment at `t_s` on the flight clock."""
         return self.plan.segment(self.pace(t_s)[0])
 
     def left_s(self, t_s: float) -> float:
@@ -98,7 +100,7 @@ class Course:
         return self.plan.duration_s - self.pace(t_s)[0]
 
     def progress(self, t_s: float) -> float:
-        """Return the share of the plan's duration, 0 to 1."""
+        """Return the completed fraction of the plan's duration, 0 to 1."""
         return self.plan.progress(self.pace(t_s)[0])
 
 

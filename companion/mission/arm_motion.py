@@ -17,11 +17,11 @@ from companion.mission.reference import Shape
 from companion.model.types import Vec2
 
 _DECIMALS = 12
-"""Times of the profile are rounded, so that a replay on another machine, whose roots differ in the last bit, builds the same plan."""
+"""Times of the profile are rounded, so that a replay on another computer, whose roots differ in the last bit, builds the same plan."""
 
 
 JERK_BOUND = 32.0
-"""Jerk times duration cubed over distance of the fastest move that is limited by jerk alone."""
+"""jerk duration^3 / distance of the fastest move that is limited by jerk alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class ArmLimits:
 
 @dataclass(frozen=True, slots=True)
 class JerkLimited:
-    """A profile from 0 at u = 0 to 1 at u = 1, at rest at both ends, made of consecutive cubics. A `Profile`."""
+    """A profile from 0 at u = 0 to 1 at u = 1, at rest at both ends, made of consecutive cubics; implements `Profile`."""
 
     knots: tuple[float, ...]
     """Start of each cubic."""
@@ -58,7 +58,7 @@ class JerkLimited:
 
 
 SPEED_ENOUGH, ACCELERATION_ENOUGH, JERK_ENOUGH = 20.0, 400.0, 2.0e4
-"""Limits in units of the whole move and its least duration. With these a move takes an eighth of it."""
+"""Limits in units of the whole move and its shortest duration. With these limits alone a move would take an eighth of that duration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,19 +67,19 @@ class ArmMotion:
 
     profile: JerkLimited
     duration_s: float
-    """Duration as planned by ruckig: the least possible, or the requested one if that is longer."""
+    """Duration planned by Ruckig: the shortest possible, or the requested one if that is longer."""
 
 
 def plan_arm(delta_rad: Vec2, limits: ArmLimits, duration_s: float = 0.0) -> ArmMotion:
-    """Plan one move. It takes some microseconds.
+    """Plan one move; takes a few microseconds.
 
     Args:
         delta_rad: displacement of each joint; not both zero.
-        limits: speed of each joint, acceleration and jerk of any joint.
-        duration_s: requested least duration.
+        limits: speed limit of each joint; acceleration and jerk limits common to both.
+        duration_s: requested minimum duration.
 
     Raises:
-        ValueError: ruckig refuses the input. Finite angles and positive limits are always accepted.
+        ValueError: Ruckig rejects the input. Finite angles and positive limits are always accepted.
     """
     farthest_rad = max(map(abs, delta_rad))
     if not farthest_rad > 0.0:
@@ -94,7 +94,8 @@ def plan_arm(delta_rad: Vec2, limits: ArmLimits, duration_s: float = 0.0) -> Arm
     wanted = ruckig.InputParameter(1)
     wanted.current_position = [0.0]
     wanted.target_position = [1.0]
-    # Limits far beyond what a move of one unit needs only make ruckig's equations ill-conditioned: a small move in a long time.
+    # Limits far beyond what a move of one unit needs (a small move in a long time) only make Ruckig's equations
+    # ill-conditioned.
     wanted.max_velocity = [min(speed_per_s * unit_s, SPEED_ENOUGH)]
     wanted.max_acceleration = [min(acceleration_per_s2 * unit_s**2, ACCELERATION_ENOUGH)]
     wanted.max_jerk = [min(jerk_per_s3 * unit_s**3, JERK_ENOUGH)]
@@ -108,7 +109,7 @@ def plan_arm(delta_rad: Vec2, limits: ArmLimits, duration_s: float = 0.0) -> Arm
         raise ValueError(f"ruckig finds no motion of the arm over {delta_rad} rad within {limits}: {result.name}")
     profile = trajectory.profiles[0][0]
     planned_s = round(trajectory.duration * unit_s, _DECIMALS)
-    # The least duration contains ruckig's rounding.
+    # The shortest duration contains Ruckig's rounding.
     return ArmMotion(_share(profile.t, profile.j), planned_s if planned_s > duration_s * (1.0 + 1e-9) else duration_s)
 
 

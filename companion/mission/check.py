@@ -1,4 +1,4 @@
-"""Check whether a mission can be flown as written, by geometry and mechanics, before anything is armed.
+"""Checks before arming, from geometry and mechanics, whether a mission can be flown as written.
 
 Pure: the plan is sampled finely and every sample is checked against room, tether, joint limits, floor, motion limits and thrust.
 """
@@ -22,7 +22,9 @@ SAMPLE_S = 0.02
 SAMPLES_PER_SEGMENT_MAX = 3000
 TAKEOFF_RISE_MIN_M = 0.2
 SPEED_SHARE_MAX = 0.8
-"""Largest planned share of the speed at which the flight is stopped. The rest is for a caught payload, gusts and tracking errors."""
+"""Largest planned speed as a fraction of the speed at which the flight is stopped. The rest is for a caught payload, gusts and tracking
+errors.
+"""
 
 
 def check_mission(
@@ -37,17 +39,17 @@ def check_mission(
 ) -> list[str]:
     """Return every reason not to fly this mission, one line each: what, where, when, and how to fix it. Empty if there is none.
 
-    For each limit the worst violation in the first phase that exceeds it is reported, with the names of the other phases that do. Of a
-    repeated mission two repetitions are checked: from the second on only the winding of the tether differs, and it adds up.
+    For each limit the worst violation in the first phase that exceeds it is reported, with the names of the other phases that do. Two
+    repetitions of a repeated mission are checked: later ones differ from the second only in the winding of the tether, which adds up.
 
     Args:
         mission: the mission to check.
         vehicle: vehicle, tether and room.
-        start_position_world_m: measured, body origin; None for the mission's start, on the floor.
-        start_yaw_rad: measured; None for the mission's value.
-        start_arm_rad: measured, the paper's angles; None for the mission's values.
-        phase_origins: file:line:col of each phase (`FlightConfig.sources.phases`).
-        progress: called with the completed share of the planning, 0 to 1, while paths are solved.
+        start_position_world_m: measured position of the body's origin; None for the mission's start, on the floor.
+        start_yaw_rad: measured yaw; None for the mission's value.
+        start_arm_rad: measured joint angles as in the paper; None for the mission's values.
+        phase_origins: file:line:col of each phase (`FlightConfig.sources.phases`). progress: called with the completed fraction of the
+        planning, 0 to 1, while paths are solved.
     """
     start = mission.start
     position = start_position_world_m or (*start.position_m, vehicle.airframe.ground_clearance_m)
@@ -101,13 +103,13 @@ def check_mission(
 
 
 def check_vehicle(vehicle: Vehicle) -> list[str]:
-    """Return the reasons for which nothing can be flown with this machine, tether and room, whatever the mission; one line each."""
+    """Return the reasons why nothing can be flown with this vehicle, tether and room, whatever the mission; one line each."""
     problems = []
     rating_n, thrust_n = vehicle.tether.load_rating_n, vehicle.airframe.thrust_max_n
     if rating_n < thrust_n:
         problems.append(
             f"vehicle '{vehicle.name}': tether.load_rating_n is {rating_n:g} N, but the rotors pull with {thrust_n:g} N "
-            "(airframe.thrust_max_n); a tether must hold them: take a stronger one"
+            "(airframe.thrust_max_n); the tether must hold them: use a stronger one"
         )
     try:
         SafeSet(vehicle)
@@ -126,25 +128,25 @@ def _samples(segment: Segment) -> Iterator[float]:
     count = min(SAMPLES_PER_SEGMENT_MAX, max(20, math.ceil(duration_s / SAMPLE_S)))
     for index in range(count):
         yield segment.start_s + duration_s * index / count
-    yield segment.end_s - 1e-9  # the end itself is the next one's beginning
+    yield segment.end_s - 1e-9  # the end belongs to the next segment
 
 
 def check_start(
     mission: Mission, vehicle: Vehicle, position_world_m: Vec3, yaw_rad: float, arm_rad: Vec2 | None
 ) -> list[str]:
-    """Check only what depends on the measured start. Fast enough for a control tick. Arguments are those of `check_mission`."""
+    """Check only what depends on the measured start; fast enough for a control tick. The arguments are those of `check_mission`."""
     found = _start(mission, vehicle, position_world_m, yaw_rad, arm_rad)
     return [f"mission '{mission.name}': {text}" for text in found]
 
 
 def _start(mission: Mission, vehicle: Vehicle, position: Vec3, yaw_rad: float, arm_rad: Vec2 | None) -> Iterator[str]:
-    """Check position, yaw and arm of the machine against the mission's start."""
+    """Check the vehicle's position, yaw and arm against the mission's start."""
     start = mission.start
     x_m, y_m = start.position_m
     away_m = math.dist(position[:2], start.position_m)
     if away_m > start.tolerance_m:
         yield (
-            f"starts at ({x_m:g}, {y_m:g}) m, but the vehicle stands at ({position[0]:.2f}, {position[1]:.2f}) m, "
+            f"starts at ({x_m:g}, {y_m:g}) m, but the vehicle is at ({position[0]:.2f}, {position[1]:.2f}) m, "
             f"{away_m:.2f} m away, {start.tolerance_m:g} m allowed; carry it there or change start.position_m"
         )
     clearance_m = vehicle.airframe.ground_clearance_m
@@ -156,7 +158,7 @@ def _start(mission: Mission, vehicle: Vehicle, position: Vec3, yaw_rad: float, a
     turned_deg = abs(math.degrees(wrap_rad(yaw_rad - math.radians(start.yaw_deg))))
     if turned_deg > start.yaw_tolerance_deg:
         yield (
-            f"starts at a yaw of {start.yaw_deg:g} deg, but the vehicle stands at {math.degrees(wrap_rad(yaw_rad)):.0f} deg, "
+            f"starts at a yaw of {start.yaw_deg:g} deg, but the vehicle is at {math.degrees(wrap_rad(yaw_rad)):.0f} deg, "
             f"{start.yaw_tolerance_deg:g} deg of difference allowed; turn it or change start.yaw_deg"
         )
     if arm_rad is not None:
@@ -188,7 +190,8 @@ def _whole(mission: Mission, vehicle: Vehicle, plan: Plan, phase_origins: Sequen
     if top_m < clearance_m + TAKEOFF_RISE_MIN_M:
         problems.append(
             f"{_place(mission, takeoff, phase_origins)} ends at {top_m:g} m, but the body's origin is "
-            f"{clearance_m:g} m above the floor when the vehicle stands; set height_m to {clearance_m + TAKEOFF_RISE_MIN_M:g} or more"
+            f"{clearance_m:g} m above the floor when the vehicle is on the ground; "
+            f"set height_m to {clearance_m + TAKEOFF_RISE_MIN_M:g} or more"
         )
     if mission.catch is not None:
         flown = [segment for segment in plan.segments if segment.kind is PhaseKind.FLIGHT]
@@ -203,7 +206,7 @@ def _whole(mission: Mission, vehicle: Vehicle, plan: Plan, phase_origins: Sequen
         if near_m > CATCH_NEAR_M:
             x_m, y_m = mission.catch.expected_at_m
             problems.append(
-                f"mission '{mission.name}': expects the payload at ({x_m:g}, {y_m:g}) m, but never comes nearer than {near_m:.2f} m; "
+                f"mission '{mission.name}': expects the payload at ({x_m:g}, {y_m:g}) m, but never comes closer than {near_m:.2f} m; "
                 "change catch.expected_at_m or the lines"
             )
     return problems

@@ -1,4 +1,4 @@
-"""Minimum-snap motion of the vehicle: the least duration of a straight line, and paths through several points without a stop.
+"""Minimum-snap motion of the vehicle: the shortest duration of a straight line, and paths through several points without a stop.
 
 Mellinger and Kumar 2011, Richter et al. 2016. A line from rest to rest is the septic `reference.minimum_snap`. A path is solved by
 minsnap-trajectories, which needs the time of every waypoint; this module finds those times.
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Progress: TypeAlias = Callable[[float], None]
-"""Callback with the completed share of the work, 0 to 1."""
+"""Callback with the completed fraction of the work, 0 to 1."""
 
 PEAK_SPEED = 2.1875
 """Largest f' of `minimum_snap`: 35 / 16, at half time."""
@@ -29,19 +29,19 @@ PEAK_ACCELERATION = 84.0 * math.sqrt(5.0) / 25.0
 PEAK_JERK = 52.5
 """Largest |f'''|, at half time."""
 LEAST_S = 0.2
-"""Least duration of a line, however short."""
+"""Shortest duration of a line, however short the line is."""
 TIME_STEP_S = 1e-3
 """Computed durations are rounded up to a multiple of this."""
 _STEPS = (1.25, 1.12, 1.06, 1.03)
-"""Changes of one piece's share of time in the search for a shorter flight, coarse first."""
+"""Factors by which the search for a shorter flight changes one piece's time, coarse ones first."""
 _PIECES_FOR_TWO_PASSES = 12
 _WORTH = 1e-4
-"""A smaller gain counts as none, so that no rounding error decides."""
+"""A smaller relative gain is ignored, so that rounding errors do not decide."""
 _SAMPLES = 150
 _MARGIN = 1.001
 """Margin over the largest of `_SAMPLES` samples of a piece, which covers the true peak."""
 _DECIMALS = 9
-"""Velocities, accelerations and jerks at the waypoints are rounded, so that a replay on another machine, whose linear algebra differs
+"""Velocities, accelerations and jerks at the waypoints are rounded, so that a replay on another computer, whose linear algebra differs
 in the last bit, builds the same plan.
 """
 _KNOWN_MAX = 32
@@ -58,18 +58,18 @@ class VehicleLimits:
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """A path through points, in a normalised time in which a piece takes 1 on average."""
+    """A path through points in normalised time, in which a piece takes 1 on average."""
 
     knots: tuple[float, ...]
     """Time at each point, from 0."""
     pieces: tuple[tuple[Septic, Septic, Septic], ...]
-    """Polynomials of x, y, z of each piece, m, against the time since its first knot."""
+    """Polynomials of x, y, z of each piece, m, in the time since its first knot."""
     least_scale_s: float
-    """Least number of seconds per unit of normalised time at which no limit is exceeded."""
+    """Smallest number of seconds per unit of normalised time at which no limit is exceeded."""
 
 
 def least_line_s(distance_m: float, limits: VehicleLimits) -> float:
-    """Return the least duration of a straight minimum-snap line from rest to rest, in whole milliseconds."""
+    """Return the shortest duration of a straight minimum-snap line from rest to rest, in whole milliseconds."""
     needed_s = max(
         PEAK_SPEED * distance_m / limits.speed_max_m_s,
         math.sqrt(PEAK_ACCELERATION * distance_m / limits.acceleration_max_m_s2),
@@ -85,12 +85,12 @@ _known: dict[tuple[tuple[Vec3, ...], VehicleLimits], Route] = {}
 def route(points_m: tuple[Vec3, ...], limits: VehicleLimits, progress: Progress | None = None) -> Route:
     """Return the minimum-snap path through three or more points, at rest at the first and the last, without a stop at the others.
 
-    The pieces' shares of time are searched one by one for the shortest flight within the limits; the result is good, but not provably
+    The times of the pieces are varied one by one to find the shortest flight within the limits; the result is good, but not provably
     optimal. The search takes tens of milliseconds for a few points and a second for thirty. Results are cached, so a repeated call
     costs nothing in a control tick.
 
     Args:
-        points_m: world frame; no two consecutive points alike.
+        points_m: world frame; no two consecutive points are equal.
         limits: speed, acceleration and jerk, each as the length of the vector.
         progress: called several times during the search.
     """
@@ -134,10 +134,10 @@ def _total_s(points_m: tuple[Vec3, ...], shares: tuple[float, ...], limits: Vehi
 
 
 def fast_coefficients(points_m: tuple[Vec3, ...], shares: tuple[float, ...]) -> NDArray[np.float64]:
-    """Return the same coefficients as minsnap-trajectories, in linear time, for a search with hundreds of evaluations.
+    """Return the coefficients that minsnap-trajectories computes, but in linear time, for a search with hundreds of evaluations.
 
     Derivatives 4 to 6 are continuous at each inner point. This gives three equations per point, coupled to its neighbours: a
-    block-tridiagonal system. The library solves a dense system instead; for ten pieces on a busy machine it took 100 ms, this function
+    block-tridiagonal system. The library solves a dense system instead; for ten pieces on a busy computer it took 100 ms, this function
     2 ms.
 
     Returns:
@@ -176,7 +176,7 @@ def fast_coefficients(points_m: tuple[Vec3, ...], shares: tuple[float, ...]) -> 
 
 
 def _normalised(shares: Sequence[float]) -> tuple[float, ...]:
-    """Return the shares scaled to 1 on average, in thousandths."""
+    """Return the pieces' times scaled to 1 on average and rounded to thousandths."""
     mean = sum(shares) / len(shares)
     return tuple(max(0.02, round(share / mean, 3)) for share in shares)
 
@@ -186,7 +186,10 @@ def library_coefficients(points_m: tuple[Vec3, ...], shares: tuple[float, ...]) 
     origin.
     """
     import numpy as np
-    from minsnap_trajectories import Waypoint, generate_trajectory  # SciPy: 0.3 s, spent only on a mission with a path
+    from minsnap_trajectories import (
+        Waypoint,
+        generate_trajectory,
+    )  # imports SciPy, which takes 0.3 s: only for a mission with a path
 
     origin = np.asarray(points_m[0])
     rest = np.zeros(3)
@@ -258,7 +261,7 @@ def _septic(start: tuple[float, ...], end: tuple[float, ...], duration: float) -
     p1, v1, a1, j1 = end
     t = duration
     c2, c3 = a0 / 2.0, j0 / 6.0
-    # What the end wants beyond the cubic that the start fixes, in units of the piece's duration.
+    # What the end requires beyond the cubic that the start determines, in units of the piece's duration.
     dp = p1 - (p0 + t * (v0 + t * (c2 + t * c3)))
     dv = (v1 - (v0 + t * (a0 + t * j0 / 2.0))) * t
     da = (a1 - (a0 + t * j0)) * t * t

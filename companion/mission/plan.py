@@ -19,15 +19,16 @@ from companion.mission.segments import Repeats, Segment, counted, flown_phases, 
 from companion.model.types import PhaseKind, Reference, Vec2, Vec3
 
 BELOW_GROUND_M = 0.4
-"""A landing's reference continues below the floor, so that the vehicle is pressed down until touchdown is detected. A soft law flies up
-to 0.35 m above its reference in a sound laboratory; a standing vehicle stays within `tracking_error_warn_m` of it."""
+"""A landing's reference continues below the floor, so that the vehicle is pressed down until touchdown is detected. A soft controller
+flies up to 0.35 m above its reference; on the ground the vehicle stays within `tracking_error_warn_m` of it.
+"""
 FOLD_SPEED_RAD_S = math.radians(75.0)
 FOLD_MIN_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Segments from 0 to `duration_s` and their motion. Built by `Plan.build` or `landing_from`."""
+    """The segments from 0 to `duration_s` and their motion. `Plan.build` and `landing_from` build it."""
 
     name: str
     segments: tuple[Segment, ...]
@@ -56,16 +57,16 @@ class Plan:
         the start's tolerances at most (`check_mission`), and the difference is removed during the climb. A move with less time than the
         limits allow is still planned in that time; `check_mission` then reports which limit is exceeded, where and when.
 
-        A path takes up to seconds to solve, once per process: its motion is the same from every start and is cached. Build a mission
-        with paths once before the first control tick.
+        A path may take seconds to solve, once per process: its motion is the same from every start and is cached. Build a mission with
+        paths once before the first control tick.
 
         Args:
             mission: phases; positions in the world frame.
-            vehicle: height of the body's origin on the ground, and speed of the joints.
-            start_position_world_m: measured, body origin; None for the mission's start, on the floor.
-            start_yaw_rad: measured; None for the mission's value.
-            start_arm_rad: measured joint angles as in the paper; None for the mission's values.
-            progress: called with the completed share of the planning, 0 to 1, while paths are solved.
+            vehicle: provides the height of the body's origin on the ground and the speed of the joints.
+            start_position_world_m: measured position of the body's origin; None for the mission's start, on the floor.
+            start_yaw_rad: measured yaw; None for the mission's value.
+            start_arm_rad: measured joint angles as in the paper; None for the mission's values. progress: called with the completed
+            fraction of the planning, 0 to 1, while paths are solved.
         """
         start = mission.start
         arm_start = _radians(start.arm_deg)
@@ -113,7 +114,7 @@ class Plan:
 
     @classmethod
     def of(cls, name: str, builder: PlanBuilder, repeats: Repeats | None = None) -> Plan:
-        """Return the plan of a builder's segments and tracks. Its second repetition represents all further ones."""
+        """Return the plan of a builder's segments and tracks. Its second repetition stands in for all later ones."""
         segments, left_out_s = builder.segments, 0.0
         starts_s = tuple(segment.start_s for segment in segments)
         if repeats is not None:
@@ -156,7 +157,7 @@ class Plan:
         return self.segments[index - 1 if index else 0]
 
     def _repeated(self, t_s: float, repeats: Repeats) -> Segment:
-        """Return the segment of a repetition that the second one represents."""
+        """Return the segment of a repetition that the second one stands in for."""
         before = repeats.before(t_s)
         shift_s = before * repeats.period_s
         # The shift is rounded: just after the seam the shifted time may lie just before it.
@@ -174,7 +175,7 @@ class Plan:
         )
 
     def progress(self, t_s: float) -> float:
-        """Return the completed share of the whole duration, 0 to 1."""
+        """Return the completed fraction of the whole duration, 0 to 1."""
         share = t_s / self.duration_s
         return 0.0 if share <= 0.0 else share if share < 1.0 else 1.0
 
@@ -196,10 +197,9 @@ def landing_from(
         position_world_m: start of the reference: the measured position, or the last reference.
         velocity_world_m_s: initial velocity; limited to `STOP_SPEED_MAX_M_S`.
         yaw_rad: kept constant.
-        arm_rad: start of the arm, from rest.
-        arm_fold_rad: end of the arm.
-        speed_m_s: speed of the descent.
-        vehicle: height of the floor and reach of the arm.
+        arm_rad: joint angles at the start, at rest.
+        arm_fold_rad: joint angles at the end.
+        speed_m_s: speed of the descent. vehicle: provides the height of the floor and the reach of the arm.
     """
     builder = PlanBuilder(position_world_m, yaw_rad, arm_rad)
     fold_rad = max(abs(arm_fold_rad[0] - arm_rad[0]), abs(arm_fold_rad[1] - arm_rad[1]))
@@ -219,7 +219,7 @@ def landing_from(
 
 
 def _line(builder: PlanBuilder, phase: Line, limits: VehicleLimits, arm_limits: ArmLimits) -> float:
-    """Append a line and the arm's simultaneous move; returns the duration, s."""
+    """Append a line and the arm's simultaneous move; return the duration, s."""
     arm_rad = None if phase.arm_deg is None else _radians(phase.arm_deg)
     delay_s = phase.arm_delay_s or 0.0
     duration_s = phase.duration_s

@@ -81,7 +81,7 @@ class PlanBuilder:
     def follow(
         self, points_m: tuple[Vec3, ...], duration_s: float | None, limits: VehicleLimits, progress: Progress | None
     ) -> float:
-        """Append a path through points without a stop; returns its duration, s."""
+        """Append a path through points without a stop; return its duration, s."""
         if len(points_m) == 1:
             duration_s = duration_s or least_line_s(self.line_m(points_m[0]), limits)
             self.move_vehicle(points_m[0], duration_s)
@@ -109,23 +109,23 @@ class PlanBuilder:
         self._go(1, (yaw_rad + wrap_rad(to_yaw_rad - yaw_rad),), self.t_s, duration_s, rest_to_rest)
 
     def least_arm_s(self, to_rad: Vec2, limits: ArmLimits) -> float:
-        """Return the least duration of a move of the arm, s."""
+        """Return the shortest duration of a move of the arm, s."""
         delta_rad = self._arm_delta(to_rad)
         return plan_arm(delta_rad, limits).duration_s if any(delta_rad) else ARM_LEAST_S
 
     def move_arm(self, to_rad: Vec2, delay_s: float, duration_s: float, limits: ArmLimits) -> None:
-        """Append a move of the arm by ruckig with the given duration."""
+        """Append a move of the arm planned by Ruckig with the given duration."""
         delta_rad = self._arm_delta(to_rad)
         if any(delta_rad):
             profile = plan_arm(delta_rad, limits, duration_s).profile
             self._go(2, to_rad, self.t_s + delay_s, duration_s, profile)
 
     def fold_arm(self, to_rad: Vec2, duration_s: float) -> None:
-        """Append a move of the arm without ruckig, for emergencies."""
+        """Append a move of the arm without Ruckig, for emergencies."""
         self._go(2, to_rad, self.t_s, duration_s, rest_to_rest)
 
     def stop(self, velocity_world_m_s: Vec3) -> float:
-        """Append a stop from a velocity; returns its end, s."""
+        """Append a stop from a velocity; return its end, s."""
         return self.stop_within(*stopping(velocity_world_m_s))
 
     def stop_within(self, velocity_world_m_s: Vec3, duration_s: float) -> float:
@@ -145,7 +145,7 @@ class PlanBuilder:
         return self.t_s + duration_s
 
     def descend(self, speed_m_s: float, to_height_m: float) -> float:
-        """Append a vertical descent from rest to rest; returns its end, s."""
+        """Append a vertical descent from rest to rest; return its end, s."""
         x_m, y_m, z_m = self._at[0]
         depth_m = z_m - to_height_m
         ramps_m = 0.5 * speed_m_s * (LAND_SPEED_UP_S + LAND_SLOW_DOWN_S)
@@ -188,7 +188,7 @@ class PlanBuilder:
                 track,
                 Move(start_s=start_s, duration_s=duration_s, origin=self._at[track], delta=delta, profile=profile),
             )
-            self._at[track] = to  # no difference in the last bit: the next phase does not depend on the previous one
+            self._at[track] = to  # exact to the last bit, so that the next phase does not depend on the previous one
 
     def _append(self, track: int, move: Motion) -> None:
         self._moves[track].append(move)

@@ -1,6 +1,6 @@
 """Smooth reference motion: polynomial profiles along straight moves, polynomial curves, and tracks made of both.
 
-Plain tuples and arithmetic without arrays, because a track is evaluated in every control tick.
+It uses plain tuples and no arrays, because a track is evaluated in every control tick.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ Septic: TypeAlias = tuple[float, float, float, float, float, float, float, float
 
 
 def minimum_snap(u: float) -> Shape:
-    """Return the profile with the least integral of f'''' squared, with f', f'' and f''' zero at both ends: 35 u^4 - 84 u^5 + 70 u^6 -
-    20 u^7.
+    """Return the profile that minimises the integral of f'''' squared, with f', f'' and f''' zero at both ends: 35 u^4 - 84 u^5 + 70
+    u^6 - 20 u^7.
     """
     u2 = u * u
     u3 = u2 * u
@@ -51,20 +51,20 @@ def rest_to_rest(u: float) -> Shape:
 
 
 def speed_up(u: float) -> Shape:
-    """Return the profile from rest to f' = 1, where f' rises as `rest_to_rest`; covers 1/2."""
+    """Return the profile that accelerates from rest to f' = 1, with f' following `rest_to_rest`; f(1) = 1/2."""
     u2 = u * u
     speed, acceleration, jerk, _ = rest_to_rest(u)
     return (u2 * u2 * (2.5 + u * (u - 3.0)), speed, acceleration, jerk)
 
 
 def slow_down(u: float) -> Shape:
-    """Return the profile from f' = 1 to rest, the mirror of `speed_up`; covers 1/2."""
+    """Return the profile from f' = 1 to rest, the mirror image of `speed_up`; f(1) = 1/2."""
     distance, speed, acceleration, jerk = speed_up(u)
     return (u - distance, 1.0 - speed, -acceleration, -jerk)
 
 
 def steady(u: float) -> Shape:
-    """Return the profile with f' = 1 throughout; covers 1."""
+    """Return the profile with f' = 1 throughout; f(1) = 1."""
     return (u, 1.0, 0.0, 0.0)
 
 
@@ -74,7 +74,7 @@ REST_TO_REST_PEAK_SPEED = 1.875
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """value(t) = origin + delta profile((t - start) / duration); at rest before and after, unless another move follows."""
+    """value(t) = origin + delta profile((t - start) / duration); at rest before it, and after it until the next move."""
 
     start_s: float
     duration_s: float
@@ -101,7 +101,7 @@ class Move:
         ddf /= duration_s * duration_s
         dddf /= duration_s * duration_s * duration_s
         delta = self.delta
-        if len(delta) == 3:  # most of a flight; written out it takes a third of the time
+        if len(delta) == 3:  # the case of most of a flight; written out it takes a third of the time
             (x, y, z), (a, b, c) = self.origin, delta
             return (
                 (x + a * f, y + b * f, z + c * f),
@@ -122,7 +122,7 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Consecutive pieces of polynomials of degree 7 in every axis; at rest before and after."""
+    """Consecutive polynomial pieces of degree 7 in every axis; at rest before and after."""
 
     start_s: float
     duration_s: float
@@ -168,7 +168,7 @@ Motion: TypeAlias = Move | Curve
 
 
 class Track:
-    """One quantity over time: consecutive motions, constant between them."""
+    """One quantity over time: consecutive motions with constant values between them."""
 
     __slots__ = ("_ends_s", "_moves", "_rests", "_starts_s")
 
@@ -177,7 +177,7 @@ class Track:
         self._starts_s = [move.start_s for move in moves]
         self._ends_s = [move.end_s for move in moves]
         zero = (0.0,) * len(initial)
-        # Before the first motion, and after each.
+        # Values before the first motion and after each.
         self._rests: list[Sample] = [(at, zero, zero, zero) for at in (initial, *(move.end for move in moves))]
         for before, after in pairwise(moves):
             if after.start_s < before.end_s - 1e-9:

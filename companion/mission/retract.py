@@ -1,4 +1,4 @@
-"""Retraction along the tether: come to rest, fold the arm, move inward. Never outward, never up."""
+"""Plans the retraction along the tether: come to rest, fold the arm, move inward, never outward or up."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from companion.mission.segments import Segment
 from companion.model.types import PhaseKind, Vec2, Vec3
 
 LEAST_WAY_M = 0.5
-"""Least distance inward, because a tether under tension is shorter than configured, or caught."""
+"""Minimum distance inward, because a tether under tension is shorter than configured or is caught."""
 BESIDE_ANCHOR_M = 0.3
 """Distance between rotors and the anchor's vertical, so that the vehicle does not land on the anchor."""
 RETURN_MIN_S = 1.0
@@ -40,8 +40,7 @@ def retract_from(
     arm_fold_rad: Vec2,
     vehicle: Vehicle,
 ) -> Plan:
-    """Plan a stop and a slow return towards the anchor's vertical until the tether has `retract_slack_m` of slack; the arm folds
-    meanwhile.
+    """Plan a stop and a slow return towards the anchor's vertical until the tether has `retract_slack_m` of slack, while the arm folds.
 
     Neither the distance from the anchor's vertical nor the height ever increases, and the path stays in the room. Two segments; a
     landing follows.
@@ -50,9 +49,8 @@ def retract_from(
         position_world_m: start of the reference: the last reference.
         velocity_world_m_s: initial velocity; its components outward and up are removed, the rest is limited to `STOP_SPEED_MAX_M_S`.
         yaw_rad: kept constant.
-        arm_rad: start of the arm, from rest.
-        arm_fold_rad: end of the arm.
-        vehicle: tether, room, airframe and speed of the return.
+        arm_rad: joint angles at the start, at rest.
+        arm_fold_rad: joint angles at the end. vehicle: provides tether, room, airframe and the speed of the return.
     """
     tether, safety, anchor = vehicle.tether, vehicle.safety, vehicle.tether.anchor_world_m
     builder = PlanBuilder(position_world_m, yaw_rad, arm_rad)
@@ -85,7 +83,8 @@ def retract_from(
 
 
 def _never_outward(velocity_m_s: Vec3, duration_s: float, position_m: Vec3, anchor_m: Vec3) -> Vec3:
-    """Return the velocity turned inward so far that the straight path to the point of rest never leads away from the anchor's vertical.
+    """Return the velocity turned inward just so far that the straight path to the point of rest never leads away from the anchor's
+    vertical.
 
     With the distance r at the start, a path of n inward and t sideways never leads outward if n (r - n) >= t^2.
     """
@@ -108,7 +107,7 @@ def _never_outward(velocity_m_s: Vec3, duration_s: float, position_m: Vec3, anch
 
 
 def _inside(to_m: Vec2, from_m: Vec2, room: Room, reach_m: float) -> Vec2:
-    """Limit the path to where the rotors stay in the room. A start outside of the room is not limited."""
+    """Limit the path so that the rotors stay in the room. A start outside the room is not limited."""
     share = 1.0
     for goal, start, (low, high) in zip(to_m, from_m, (room.x_m, room.y_m), strict=True):
         low, high = min(low + reach_m, start), max(high - reach_m, start)

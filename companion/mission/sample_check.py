@@ -1,4 +1,4 @@
-"""Check one instant of a plan against every limit: room, tether, floor, joints, motion, thrust.
+"""Checks one instant of a plan against every limit: room, tether, floor, joints, motion, thrust.
 
 Pure. A position is checked with the expected tracking error (`TRACKING_M`, more around a catch), and so is the position where the
 vehicle would come to rest after a fault. The check uses the governor's own `SafeSet` and is stricter, so the governor never constrains
@@ -25,23 +25,24 @@ ARM_RADIUS_M = 0.03
 """Half the thickness of servos and links, m."""
 FLOOR_GAP_M = 0.01
 TRACKING_M = 0.10
-"""Largest expected distance from the plan, m; measured over random missions in winds of 3 m/s."""
+"""Largest expected distance from the plan, m; measured over random missions in a wind of 3 m/s."""
 CATCH_M = 0.20
 """Largest expected distance from the plan from the catch until the impact has decayed, m."""
 CATCH_NEAR_M = 0.05
 """Largest horizontal distance from the expected place at which the catch can happen, m."""
 CATCH_S = 2.0
 THRUST_SHARE_MAX = 0.9
-"""Upper bound of `limits.thrust_share_max`; the rest is reserved for attitude control."""
+"""Upper bound on `limits.thrust_share_max`; the rest is reserved for attitude control."""
 STOP = "stop "
-"""Prefix of a limit's name: the planned position keeps the limit, but the position where the vehicle would come to rest does not."""
+"""Prefix of a limit's name if the planned position respects the limit, but the position where the vehicle would come to rest does not.
+"""
 TOLERANCE = 1e-6
 """Relative tolerance, so that a mission may use its limits fully."""
 
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """One limit exceeded in one sample. `excess` orders violations of the same limit."""
+    """A limit that one sample exceeds. `excess` orders violations of the same limit."""
 
     limit: str
     excess: float
@@ -51,10 +52,10 @@ class Violation:
 
 
 class SampleCheck:
-    """Check of consecutive instants of a plan against every limit.
+    """Checks consecutive instants of a plan against every limit.
 
     Raises:
-        ValueError: vehicle, tether and room leave no space to fly in; one line.
+        ValueError: vehicle, tether and room leave no space to fly in; the text is one line.
     """
 
     def __init__(self, mission: Mission, vehicle: Vehicle) -> None:
@@ -69,19 +70,19 @@ class SampleCheck:
         self._payload_kg = airframe.payload_max_kg if mission.catch is None else mission.catch.payload_max_kg
         self._tether_n = tether.weight_n_per_m * tether.length_m
         self._blow_until_s = 0.0
-        """Time at which the catch's impact has decayed; 0 before the catch. A way back over the same place is not a catch."""
+        """Time at which the catch's impact has decayed; 0 before the catch. Passing the same place again is not a catch."""
         self._repetition = 0
         self._windings: list[tuple[float, float]] = []
         """Turns about anchor and vehicle during the second repetition."""
 
     def begin_repetition(self, repetition: int) -> None:
-        """Start a repetition, from 1, with a catch of its own; 0 for the part that is flown once."""
+        """Start a repetition, counted from 1, with a catch of its own; 0 is the part that is flown once."""
         self._repetition = repetition
         self._blow_until_s = 0.0
 
     def turns_in_the_end(self, repetitions: int) -> float:
-        """Return the largest number of turns of the tether in the last repetition. Each one after the second winds as much as the
-        second.
+        """Return the largest number of turns of the tether in the last repetition. Each repetition after the second winds it as much as
+        the second.
         """
         if not self._windings:
             return 0.0
@@ -94,7 +95,7 @@ class SampleCheck:
     def violations(
         self, t_s: float, reference: Reference, jerks: tuple[Vec3, Vec2], kind: PhaseKind
     ) -> Iterator[Violation]:
-        """Return the violations at one instant. Instants must be passed in order.
+        """Return the violations at one instant. Instants must be passed in chronological order.
 
         Args:
             t_s: time of the plan.
@@ -105,13 +106,13 @@ class SampleCheck:
         clearance_m = self._vehicle.airframe.ground_clearance_m
         x_m, y_m, z_m = reference.position_world_m
         if kind is PhaseKind.LANDING and z_m < clearance_m:
-            return  # the reference goes on below the floor until touchdown is detected
+            return  # the reference continues below the floor until touchdown is detected
         if kind is PhaseKind.FLIGHT and z_m < clearance_m - TOLERANCE:
             yield Violation(
                 limit="floor",
                 excess=clearance_m - z_m,
                 what="flies into the floor",
-                detail=f"the body's origin at {z_m:.2f} m, {clearance_m:.2f} m is the lowest",
+                detail=f"the body's origin at {z_m:.2f} m, {clearance_m:.2f} m is the minimum",
                 advice="raise the waypoint",
             )
         position = (x_m, y_m, max(z_m, clearance_m)) if kind is PhaseKind.TAKEOFF else reference.position_world_m
@@ -148,7 +149,8 @@ class SampleCheck:
                         limit=f"room {name} {edge}",
                         excess=excess,
                         what="leaves the room",
-                        detail=f"rotors, arm and net reach {name} = {reach:.2f} m, the room is {span[0]:g} to {span[1]:g} m less {why}",
+                        detail=f"rotors, arm and net reach {name} = {reach:.2f} m, "
+                        f"the room is {span[0]:g} to {span[1]:g} m minus {why}",
                         advice="move the waypoint inwards",
                     )
         beyond_m = self._safe.breach_tether_m(position) + off_m
@@ -158,7 +160,7 @@ class SampleCheck:
                 limit="tether",
                 excess=beyond_m,
                 what="leaves the tether sphere",
-                detail=f"{limit_m + beyond_m:.2f} m from the anchor, {limit_m:.2f} m (length less margin and {why}) allowed",
+                detail=f"{limit_m + beyond_m:.2f} m from the anchor, {limit_m:.2f} m (length minus margin and {why}) allowed",
                 advice="shorten the line or move the anchor",
             )
 
@@ -174,7 +176,7 @@ class SampleCheck:
         x_m, y_m, z_m = (p + v * stop_s for p, v in zip(position, reference.velocity_world_m_s, strict=True))
         floor_m = self._vehicle.airframe.ground_clearance_m
         if kind is PhaseKind.LANDING:
-            z_m = max(z_m, floor_m)  # the floor is where it is going
+            z_m = max(z_m, floor_m)  # a landing ends on the floor
         stop = (x_m, y_m, z_m)
         less = f" with {_allowance(off_m)}"
         found = (
@@ -189,11 +191,11 @@ class SampleCheck:
                     excess=beyond_m,
                     what=f"could not stop within the {what}",
                     detail=f"{speed:.2f} m/s needs {speed * stop_s:.2f} m to stop, {beyond_m:.2f} m too far{with_m}",
-                    advice="fly slower towards its edge or turn round earlier",
+                    advice="fly more slowly towards its edge or turn back earlier",
                 )
 
     def _line(self, t_s: float, position: Vec3, reference: Reference) -> Iterator[Violation]:
-        """Check the tether itself: wound up, or in the rotors' way."""
+        """Check the tether itself: whether it is wound up or too close to the rotors or the arm."""
         tether = self._vehicle.tether
         attitude = _leaning(reference)
         state = self._watch.update(t_s, position, reference.velocity_world_m_s, attitude, reference.arm_rad, None, None)
@@ -206,18 +208,18 @@ class SampleCheck:
                 excess=abs(state.turns),
                 what="winds up the tether",
                 detail=detail,
-                advice="fly back the way it came, or turn back",
+                advice="fly back the way it came, or turn the other way",
             )
         if state.clearance_m < tether.clearance_min_m:
             detail = (
                 f"{state.clearance_m:.3f} m between line and rotors or arm, tether.clearance_min_m is {tether.clearance_min_m:g} "
-                f"(it is seen {math.degrees(state.elevation_rad):.0f} deg below the horizon)"
+                f"(the anchor is seen {math.degrees(state.elevation_rad):.0f} deg below the horizon)"
             )
             advice = "fly higher or nearer to the anchor, accelerate less, or tie it elsewhere"
             yield Violation(
                 limit="line",
                 excess=tether.clearance_min_m - state.clearance_m,
-                what="brings the tether to the rotors",
+                what="brings the tether too close to the rotors or the arm",
                 detail=detail,
                 advice=advice,
             )
@@ -229,7 +231,7 @@ class SampleCheck:
             low_deg, high_deg = joint.angle_deg
             excess = max(low_deg - angle_deg, angle_deg - high_deg)
             if excess > TOLERANCE:
-                what = f"drives joint {number} through its wall"
+                what = f"drives joint {number} beyond its limit"
                 detail = f"{angle_deg:.1f} deg, {low_deg:g} to {high_deg:g} deg allowed"
                 yield Violation(
                     limit=f"joint {number}", excess=excess, what=what, detail=detail, advice="change arm_deg"
@@ -239,7 +241,7 @@ class SampleCheck:
         for part, lowest_m in (("net", net_z_m), ("elbow", elbow_z_m)):
             if lowest_m < FLOOR_GAP_M:
                 what = f"drags the {part} over the floor"
-                detail = f"its lowest point is {lowest_m:.2f} m high, {FLOOR_GAP_M:g} m is the least"
+                detail = f"its lowest point is {lowest_m:.2f} m high, {FLOOR_GAP_M:g} m is the minimum"
                 yield Violation(
                     limit=f"floor {part}",
                     excess=FLOOR_GAP_M - lowest_m,
@@ -274,7 +276,11 @@ class SampleCheck:
             if value > limit * (1.0 + TOLERANCE):
                 detail = f"{value:.3g} {unit}, limits.{key} is {limit:g}"
                 yield Violation(
-                    limit=key, excess=value / limit, what=what, detail=detail, advice="take longer or go less far"
+                    limit=key,
+                    excess=value / limit,
+                    what=what,
+                    detail=detail,
+                    advice="allow more time or shorten the move",
                 )
         for number, joint in enumerate(self._vehicle.arm.joints, start=1):
             rate = abs(math.degrees(reference.arm_rate_rad_s[number - 1]))
@@ -286,7 +292,7 @@ class SampleCheck:
                     excess=rate,
                     what=what,
                     detail=detail,
-                    advice="take longer or go less far",
+                    advice="allow more time or shorten the move",
                 )
 
     def _thrust(self, reference: Reference) -> Iterator[Violation]:
@@ -306,13 +312,17 @@ class SampleCheck:
                 excess=thrust_n,
                 what="needs too much thrust",
                 detail=detail,
-                advice="take longer or carry less",
+                advice="allow more time or carry less",
             )
         tilt_deg = math.degrees(math.atan2(math.hypot(ax, ay), az + GRAVITY_M_S2))
         if tilt_deg > airframe.tilt_max_deg * (1.0 + TOLERANCE):
             detail = f"{tilt_deg:.1f} deg, airframe.tilt_max_deg is {airframe.tilt_max_deg:g}"
             yield Violation(
-                limit="tilt", excess=tilt_deg, what="leans too far", detail=detail, advice="take longer or go less far"
+                limit="tilt",
+                excess=tilt_deg,
+                what="tilts too far",
+                detail=detail,
+                advice="allow more time or shorten the move",
             )
 
 

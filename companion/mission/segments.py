@@ -1,4 +1,4 @@
-"""Phases on a plan's clock. Of a repeated mission two repetitions are planned; the second represents all further ones."""
+"""Phases on a plan's clock. At most two repetitions of a repeated mission are planned; the second stands in for all later ones."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from companion.model.types import PhaseKind
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """One phase on the plan's clock."""
+    """One phase with its start and end on the plan's clock."""
 
     name: str
     kind: PhaseKind
@@ -20,12 +20,12 @@ class Segment:
     index: int
     """Number of the phase in the mission, from 0; -1 in a plan without a mission."""
     repetition: int = 0
-    """Number of the repetition, from 1; 0 in the part that is flown once."""
+    """Number of the repetition, from 1; 0 for a phase that is flown once."""
 
 
 @dataclass(frozen=True, slots=True)
 class Repeats:
-    """Further repetitions that the second one represents: each starts where the one before it ended and has the same motion."""
+    """Later repetitions that the second one stands in for: each starts where the one before it ended and has the same motion."""
 
     count: int
     """Number of all repetitions, 3 or more."""
@@ -39,7 +39,7 @@ class Repeats:
 
     @property
     def left_out_s(self) -> float:
-        """Return the duration of the repetitions that the second one represents, s."""
+        """Return the duration of the repetitions that the second one stands in for, s."""
         return (self.count - 2) * self.period_s
 
     @property
@@ -48,13 +48,15 @@ class Repeats:
         return self.begin_s + self.period_s + self.left_out_s
 
     def before(self, t_s: float) -> int:
-        """Return the number of represented repetitions that are complete at a time."""
+        """Return how many of the repetitions that the second one stands in for are complete at a time."""
         whole = int((t_s - self.begin_s) / self.period_s)
         return 0 if whole < 1 else min(whole, self.count - 2)
 
 
 def flown_phases(mission: Mission) -> list[tuple[int, int]]:
-    """Return the indices of the phases in the planned order, each with its repetition. The second repetition represents the third."""
+    """Return (phase index, repetition) in planned order. At most two repetitions are planned; the second stands in for all later ones.
+    The repetition is 0 for a phase that is flown once.
+    """
     last = len(mission.phases) - 1
     middle = range(1, last)
     if mission.repeat == 1:
@@ -63,7 +65,7 @@ def flown_phases(mission: Mission) -> list[tuple[int, int]]:
 
 
 def repeats_of(mission: Mission, segments: Sequence[Segment], names: tuple[str, ...]) -> Repeats | None:
-    """Return the repetitions that the second one represents, or None if there are none."""
+    """Return the repetitions that the second one stands in for, or None if there are none."""
     if mission.repeat < 3:
         return None
     second = [number for number, segment in enumerate(segments) if segment.repetition == 2]

@@ -1,8 +1,8 @@
-"""Check that PX4's estimate has converged to motion capture: the core's last check before it requests OFFBOARD. Pure; time is an
+"""Checks that PX4's estimate has converged to motion capture, as the core's last check before it requests OFFBOARD. Pure; time is an
 argument.
 
 An estimate that has only begun to follow is close for a moment; one that has converged stays close. PX4's position and yaw are compared
-with motion capture's while the machine stands.
+with motion capture's while the vehicle is on the ground.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from companion.model.frames import euler_zyx_from_quat, wrap_rad
 from companion.model.types import MocapPose, Vec3, VehicleState
 
 SETTLED_S = TARE_S
-"""Time for which the estimate must be close and steady; as long as the tare, which runs meanwhile."""
+"""Time for which the estimate must be close and steady; equal to the duration of the tare, which runs at the same time."""
 OFF_MAX_M = 0.05
-"""Largest mean distance, with a real EKF2's noise averaged out, m."""
+"""Largest mean distance, m; the mean removes the noise of EKF2."""
 SPREAD_MAX_M = 0.02
-"""Largest standard deviation of the distance over all three axes, m. EKF2 with 1 cm of vision noise has a few millimetres at rest."""
+"""Largest standard deviation of the distance over all three axes, m. EKF2 shows a few millimetres at rest with 1 cm of vision noise."""
 YAW_OFF_MAX_RAD = math.radians(5.0)
 YAW_SPREAD_MAX_RAD = math.radians(2.0)
 
@@ -29,12 +29,12 @@ class SettledEstimate:
     """Differences between PX4's estimate and motion capture over the last `SETTLED_S`."""
 
     seen: tuple[tuple[float, Vec3, float], ...] = ()
-    """Flight time, position and yaw of the estimate less motion capture's: s, m, rad."""
+    """Time on the flight clock (s), and position (m) and yaw (rad) of the estimate minus those of motion capture."""
     since_s: float | None = None
-    """Flight time of the first tick; None before it."""
+    """Time on the flight clock of the first tick; None before it."""
 
     def take(self, t_s: float, vehicle: VehicleState, pose: MocapPose) -> SettledEstimate:
-        """Return the evidence with one more tick."""
+        """Return the evidence after one more tick."""
         (x, y, z), (a, b, c) = vehicle.position_world_m, pose.position_world_m
         yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2] - euler_zyx_from_quat(pose.attitude_wxyz)[2]
         first = 0
@@ -44,9 +44,9 @@ class SettledEstimate:
         return SettledEstimate(seen, t_s if self.since_s is None else self.since_s)
 
     def problem(self, t_s: float) -> str | None:
-        """Return what has not converged, as a message, or None if all has for `SETTLED_S`."""
+        """Return a message that says what has not converged, or None if everything has for `SETTLED_S`."""
         if self.since_s is None or t_s - self.since_s < SETTLED_S:
-            return f"PX4's estimate has not followed motion capture for {SETTLED_S:g} s at a time"
+            return f"PX4's estimate has not followed motion capture for {SETTLED_S:g} s without interruption"
         count = len(self.seen)
         mean = [math.fsum(off[axis] for _, off, _ in self.seen) / count for axis in range(3)]
         spread_m = math.sqrt(math.fsum(math.dist(off, mean) ** 2 for _, off, _ in self.seen) / count)
@@ -56,13 +56,13 @@ class SettledEstimate:
         wrong = []
         if off_m > OFF_MAX_M or spread_m > SPREAD_MAX_M:
             wrong.append(
-                f"its position is {off_m * 1e3:.0f} mm off motion capture and wanders by {spread_m * 1e3:.0f} mm "
+                f"its position is {off_m * 1e3:.0f} mm from motion capture's and drifts by {spread_m * 1e3:.0f} mm "
                 f"(allowed: {OFF_MAX_M * 1e3:.0f} and {SPREAD_MAX_M * 1e3:.0f} mm)"
             )
         if abs(yaw_rad) > YAW_OFF_MAX_RAD or yaw_spread_rad > YAW_SPREAD_MAX_RAD:
             limits = f"{math.degrees(YAW_OFF_MAX_RAD):.0f} and {math.degrees(YAW_SPREAD_MAX_RAD):.0f} deg"
             off_deg, spread_deg = math.degrees(yaw_rad), math.degrees(yaw_spread_rad)
-            wrong.append(f"its yaw is {off_deg:.1f} deg off and wanders by {spread_deg:.1f} deg (allowed: {limits})")
+            wrong.append(f"its yaw is {off_deg:.1f} deg off and drifts by {spread_deg:.1f} deg (allowed: {limits})")
         if not wrong:
             return None
         return (

@@ -35,16 +35,16 @@ class Row(Record, frozen=True, kw_only=True):
     why: str = ""
     """Consequence of a wrong value, in one sentence."""
     fix: str = ""
-    """What to do; empty if the check passed."""
+    """Remedy; empty if the check passed."""
     level: Level = Level.REFUSE
 
     @property
     def refuses(self) -> bool:
-        """Whether this row forbids take-off."""
+        """Return whether this row forbids take-off."""
         return not self.ok and self.level is Level.REFUSE
 
     def line(self) -> str:
-        """Return the row as one line, as in a refusal."""
+        """Return the row as one line of text, as listed when the preflight refuses."""
         wanted = f", wanted {self.wanted}" if self.wanted else ""
         fix = f"; {self.fix}" if self.fix else ""
         return f"{self.title}: {self.read}{wanted}{fix}"

@@ -1,12 +1,11 @@
-"""The base class of frozen records, and the one codec that carries them between processes and into logs.
+"""The base class of frozen records, and the only codec for sending them between processes and writing them to logs.
 
-A record has two encodings, both by field name:
-    * a *packet*: MessagePack, for another process on the same computer. Floats travel as their 64 bits.
-    * *JSON*: for logs and telemetry. The text restores every finite float exactly. JSON has no NaN and no infinity; the text holds
-      them as the strings "nan", "inf" and "-inf".
+A record has two encodings, both by field name: * a *packet*: MessagePack, for another process on the same computer. Floats keep all 64
+    bits. * *JSON*: for logs and telemetry. The text restores every finite float exactly. JSON has no NaN or infinity; the text contains
+    them as the strings "nan", "inf" and "-inf".
 
-Both leave out a field that is None, so that a log's JSON Schema needs no union types (viewers do not know them). Both reject unknown
-fields, missing fields and wrong types when they decode.
+Both leave out a field that is None, so that a log's JSON Schema needs no union types (viewers do not know them). Decoding rejects
+unknown fields, missing fields and wrong types.
 
 A field that may be None has None as its default. No other field of an encoded record has a default: msgspec leaves out every field
 that equals its default.
@@ -60,7 +59,7 @@ def from_packet(cls: Any, packet: bytes) -> Any:
     """Decode the bytes of `to_packet` into a record of this class, or of one of this union's classes.
 
     Raises:
-        RecordError: the bytes are damaged or hold something else.
+        RecordError: the bytes are corrupt or are not a record of this kind.
     """
     try:
         return _packet_decoder(cls).decode(packet)
@@ -78,7 +77,8 @@ def to_json(record: Any) -> bytes:
         text = _JSON.encode(record)
     except UnicodeEncodeError:
         text = b"null"
-    # msgspec writes a float that is not finite as null. No other value is written so, but a text may contain the word.
+    # msgspec writes a float that is not finite as null. No other value is written as null, but a text may contain the
+    # word.
     return _JSON.encode(_mended(to_jsonable(record), spell_floats=True)) if b"null" in text else text
 
 
@@ -86,7 +86,7 @@ def from_json(cls: type[R], text: bytes) -> R:
     """Decode the text of `to_json` into a record.
 
     Raises:
-        RecordError: the text is damaged or holds something else.
+        RecordError: the text is corrupt or is not a record of this class.
     """
     try:
         return typing.cast(R, _json_decoder(typing.cast(Hashable, cls)).decode(text))
@@ -103,7 +103,7 @@ def from_jsonable(cls: type[R], data: Any) -> R:
     """Convert nested dicts, as `json.loads` returns them, into a record.
 
     Raises:
-        RecordError: unknown or missing field, or a value of the wrong type; a number must be a number, not a string.
+        RecordError: a field is unknown or missing, or a value has the wrong type; a number must be a number, not a string.
     """
     try:
         return msgspec.convert(data, cls)
@@ -154,7 +154,7 @@ def _from_numpy(value: Any) -> Any:
     """Convert a NumPy scalar or array in a record to a Python number or list.
 
     Raises:
-        TypeError: the value is of another type, which no record may hold.
+        TypeError: the value has a type that no record may hold.
     """
     tolist = getattr(value, "tolist", None)
     if tolist is None:
@@ -183,8 +183,9 @@ def _refused(cls: Any, error: Exception) -> RecordError:
 
 
 def _mended(value: Any, *, spell_floats: bool) -> Any:
-    """Return the same data in the form that every parser accepts: a text that has no UTF-8 form (half of a surrogate pair) with "?"
-    for what it lacks and, if `spell_floats`, floats that are not finite as strings."""
+    """Return the same data in the form that every parser accepts: "?" replaces what has no UTF-8 form (half of a surrogate pair) and,
+    if `spell_floats`, strings replace floats that are not finite.
+    """
     if isinstance(value, float) and spell_floats and not math.isfinite(value):
         return repr(value)
     if isinstance(value, str):
@@ -218,11 +219,11 @@ def _schema(hint: Any) -> dict[str, Any]:
     if typing.get_origin(hint) is tuple:
         element, *others = typing.get_args(hint)
         if set(others) - {element, Ellipsis}:
-            raise TypeError(f"{hint}: the elements of a record's tuple have one type")
+            raise TypeError(f"{hint}: the elements of a record's tuple must have one type")
         size = len(others) + 1
         bounds = {} if others == [Ellipsis] else {"minItems": size, "maxItems": size}
         return {"type": "array", "items": _schema(element), **bounds}
-    raise TypeError(f"{hint}: not the type of a record's field")
+    raise TypeError(f"{hint}: not a valid type for a record's field")
 
 
 _LEAVES = {bool: "boolean", int: "integer", float: "number", str: "string"}

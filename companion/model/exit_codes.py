@@ -1,4 +1,4 @@
-"""Exit codes of `companion`, a contract with outside scripts."""
+"""Exit codes of `companion`, which users' scripts rely on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stages of a flight, their times, and the pilot's state by PX4's status. `companion.core.sequence` executes the stages.
+"""The stages of a flight, their times, and what PX4's status shows about a pilot. `companion.core.sequence` executes the stages.
 
 WAIT -> OFFBOARD -> ARM -> SPOOL -> PLAN -> TOUCHDOWN -> DISARM -> DONE
 WAIT <-> READY -> OFFBOARD, if the operator starts the take-off
@@ -22,7 +22,7 @@ OFFBOARD_TIMEOUT_S = 8.0
 ARM_TIMEOUT_S = 10.0
 SPOOL_S = 1.2
 SPOOL_SHARE = 0.7
-"""Share of hover thrust at the end of spooling up; the plan begins with it."""
+"""Fraction of hover thrust at the end of spooling up, with which the plan begins."""
 SPOOL_TO_FULL_S = 0.4
 TOUCHDOWN_RAMP_S = 0.4
 DISARM_TIMEOUT_S = 8.0
@@ -53,11 +53,11 @@ DISARMING = frozenset({Stage.DISARM, Stage.STAND_DOWN})
 COMMANDING = frozenset({Stage.ARM, Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN})
 """Stages in which the companion commands, so PX4 must be in OFFBOARD."""
 PILOT_FLIES = "a pilot flies"
-"""Name of the phase in which nothing is sent because a pilot has the vehicle."""
+"""Name of the phase in which nothing is sent because a pilot has control."""
 PILOT_MODES = frozenset({FlightMode.MANUAL, FlightMode.HOLD, FlightMode.RETURN, FlightMode.TAKEOFF})
 """Modes that only a pilot chooses, or one of PX4's failsafes. While a pilot flies nothing is sent."""
 FAILSAFE_STATES = frozenset({5, 6, 8})
-"""MAV_STATE_CRITICAL, EMERGENCY and FLIGHT_TERMINATION: HEARTBEAT.system_status while one of PX4's failsafes acts."""
+"""MAV_STATE_CRITICAL, EMERGENCY and FLIGHT_TERMINATION: HEARTBEAT.system_status while one of PX4's failsafes is active."""
 
 
 def in_offboard(status: AutopilotStatus | None) -> bool:
@@ -76,7 +76,7 @@ def on_ground(status: AutopilotStatus | None) -> bool:
 
 
 def failsafe_chose(status: AutopilotStatus) -> bool:
-    """Return whether a failsafe of PX4 is active and has chosen the mode. In MANUAL a pilot steers, failsafe or not."""
+    """Return whether a failsafe of PX4 is active and has chosen the mode. In MANUAL a pilot has control, failsafe or not."""
     return status.system_status in FAILSAFE_STATES and status.mode is not FlightMode.MANUAL
 
 

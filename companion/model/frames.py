@@ -14,7 +14,7 @@ _SQRT_HALF = math.sqrt(0.5)
 
 
 def quat_multiply(a: Quat, b: Quat) -> Quat:
-    """Hamilton product a * b."""
+    """Return the Hamilton product a * b."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return (
@@ -26,15 +26,15 @@ def quat_multiply(a: Quat, b: Quat) -> Quat:
 
 
 def quat_conjugate(q: Quat) -> Quat:
-    """Inverse of a unit quaternion."""
+    """Return the inverse of a unit quaternion."""
     return (q[0], -q[1], -q[2], -q[3])
 
 
 def quat_normalize(q: Quat) -> Quat:
-    """Unit quaternion of the same direction.
+    """Return the unit quaternion in the direction of q.
 
     Raises:
-        ValueError: if the norm is zero or not finite.
+        ValueError: the norm is zero or not finite.
     """
     norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     if not norm > 1e-9 or not math.isfinite(norm):
@@ -57,7 +57,7 @@ def quat_rotate(q: Quat, v: Vec3) -> Vec3:
 
 
 def body_z_component(q: Quat, v: Vec3) -> float:
-    """The last component of a world vector seen from the body: `quat_rotate(quat_conjugate(q), v)[2]`, to the last bit."""
+    """Return the z component of a world vector in the body frame: `quat_rotate(quat_conjugate(q), v)[2]`, to the last bit."""
     w, x, y, z = q
     vx, vy, vz = v
     tx = 2.0 * (z * vy - y * vz)
@@ -67,7 +67,7 @@ def body_z_component(q: Quat, v: Vec3) -> float:
 
 
 def body_x_z_axes_world(q: Quat) -> tuple[Vec3, Vec3]:
-    """The body's x and z axis in the world: first and third column of the rotation matrix."""
+    """Return the body's x and z axes in the world: the first and third columns of the rotation matrix."""
     w, x, y, z = q
     yy = y * y
     return (
@@ -77,7 +77,7 @@ def body_x_z_axes_world(q: Quat) -> tuple[Vec3, Vec3]:
 
 
 def quat_from_euler_zyx(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quat:
-    """Attitude from ZYX Euler angles (the paper's q = [roll, pitch, yaw])."""
+    """Return the attitude from ZYX Euler angles (the paper's q = [roll, pitch, yaw])."""
     cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
     cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
     cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
@@ -90,7 +90,7 @@ def quat_from_euler_zyx(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Qu
 
 
 def euler_zyx_from_quat(q: Quat) -> Vec3:
-    """Roll, pitch, yaw in rad; pitch in [-pi/2, pi/2]."""
+    """Return roll, pitch, yaw in rad; pitch in [-pi/2, pi/2]."""
     w, x, y, z = q
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
@@ -99,38 +99,38 @@ def euler_zyx_from_quat(q: Quat) -> Vec3:
 
 
 def yaw_from_quat(q: Quat) -> float:
-    """The yaw of `euler_zyx_from_quat` alone, rad."""
+    """Return only the yaw of `euler_zyx_from_quat`, rad."""
     w, x, y, z = q
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def wrap_rad(angle_rad: float) -> float:
-    """Angle in [-pi, pi)."""
+    """Return the equivalent angle in [-pi, pi)."""
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def tilt_rad(q: Quat) -> float:
-    """Angle between the body z axis and the vertical."""
+    """Return the angle between the body z axis and the vertical."""
     return math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2]))))
 
 
 def ned_from_enu(v: Vec3) -> Vec3:
-    """World vector, ENU -> NED."""
+    """Convert a world vector from ENU to NED."""
     return (v[1], v[0], -v[2])
 
 
 def enu_from_ned(v: Vec3) -> Vec3:
-    """World vector, NED -> ENU (its own inverse)."""
+    """Convert a world vector from NED to ENU."""
     return (v[1], v[0], -v[2])
 
 
 def flu_from_frd(v: Vec3) -> Vec3:
-    """Body vector, FRD -> FLU (its own inverse)."""
+    """Convert a body vector from FRD to FLU, or back."""
     return (v[0], -v[1], -v[2])
 
 
 def attitude_ned_frd_from_enu_flu(q: Quat) -> Quat:
-    """Attitude FLU->ENU to attitude FRD->NED, w >= 0."""
+    """Convert an attitude FLU->ENU to FRD->NED, with w >= 0."""
     # (0, s, s, 0) * q * (0, 1, 0, 0) with s = sqrt(1/2), up to the sign: rotation by pi about (1, 1, 0), then by pi about x.
     w, x, y, z = _SQRT_HALF * q[0], _SQRT_HALF * q[1], _SQRT_HALF * q[2], _SQRT_HALF * q[3]
     w, x, y, z = w + z, x + y, x - y, w - z
@@ -138,5 +138,5 @@ def attitude_ned_frd_from_enu_flu(q: Quat) -> Quat:
 
 
 def attitude_enu_flu_from_ned_frd(q: Quat) -> Quat:
-    """Attitude FRD->NED to attitude FLU->ENU, w >= 0 (its own inverse)."""
+    """Convert an attitude FRD->NED to FLU->ENU, with w >= 0."""
     return attitude_ned_frd_from_enu_flu(q)

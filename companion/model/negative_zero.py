@@ -13,7 +13,7 @@ _NEGATIVE_ZERO = re.compile(
 
 
 def without_negative_zero(text: str) -> str:
-    """Return the text with every `-0`, `-0.0`, `-0.00` ... as zero without a sign.
+    """Return the text with the sign of every `-0`, `-0.0`, `-0.00` ... removed.
 
     After two spaces, as in a table column, a space replaces the sign. Names that contain `-0` are not changed.
     """

@@ -1,4 +1,4 @@
-"""What a preflight observed: gathered by `companion.preflight.observe`, evaluated by the other modules of `companion.preflight`."""
+"""What a preflight observes; `companion.preflight.observe` gathers it, the other modules of `companion.preflight` evaluate it."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ class EstimatorReport(Record, frozen=True, kw_only=True):
 
     stamp_s: float
     flags: int
-    """ESTIMATOR_STATUS_FLAGS."""
+    """Bits of ESTIMATOR_STATUS_FLAGS."""
     velocity_ratio: float
-    """Innovation test ratios: below 1 if the measurements are accepted, exactly 0 if nothing is fused."""
+    """Innovation test ratios: below 1 if the measurements are accepted, exactly 0 if nothing is fused. The next three fields are of the
+    same kind.
+    """
     position_horizontal_ratio: float
     position_vertical_ratio: float
     position_horizontal_accuracy_m: float
@@ -55,7 +57,7 @@ class Machine(Record, frozen=True, kw_only=True):
     realtime: str | None
     """Real-time priority that the system permits, as `companion.runtime.realtime` describes it; None if SCHED_FIFO is refused."""
     memory_lock: str | None
-    """Why the system permits no locked memory; None if it does."""
+    """Why memory must not be locked; None if it may be."""
     cpus: tuple[int, ...]
     """Cores that a process may run on, in ascending order."""
     arm_latency_ms: int | None
@@ -67,7 +69,7 @@ class MocapCounts(Record, frozen=True, kw_only=True):
     """Counts of the motion-capture driver since it was opened."""
 
     frames: int
-    """Frames that became a pose."""
+    """Frames that yielded a pose."""
     superseded: int
     """Frames that were read together with a newer one and therefore not delivered."""
     out_of_order: int
@@ -77,7 +79,7 @@ class MocapCounts(Record, frozen=True, kw_only=True):
     problem: str | None
     """Reason of the newest rejected datagram; None if none was rejected."""
     callback_error: str | None
-    """First exception that the receiver of the poses raised."""
+    """First exception that `on_pose` raised."""
 
 
 class MocapServer(Record, frozen=True):
@@ -101,7 +103,7 @@ class ForceCounts(Record, frozen=True, kw_only=True):
 
 
 class MocapStream(Record, frozen=True, kw_only=True):
-    """What the motion-capture driver counted while it was watched."""
+    """What the motion-capture driver counted during the observation."""
 
     frames: int
     """Frames that arrived, with or without the body in view."""
@@ -116,7 +118,7 @@ class MocapStream(Record, frozen=True, kw_only=True):
 
 
 class ForceStream(Record, frozen=True, kw_only=True):
-    """What the force sensor's driver counted while it was watched."""
+    """What the force sensor's driver counted during the observation."""
 
     samples: int
     bad_sums: int
@@ -170,11 +172,11 @@ class Observations(Record, frozen=True, kw_only=True):
     mission_s: float | None = None
     """Duration of the planned mission."""
     plan: tuple[str, ...] | None = None
-    """Reasons why the mission cannot be flown, one line each; None if this was checked before."""
+    """Reasons why the mission cannot be flown, one line each; None if this was already checked."""
     recorder: str | None = None
     """Why no log can be opened; empty if one can, None if this was not tried."""
     failures: Mapping[str, str] = msgspec.field(default_factory=dict)
-    """Device that could not be opened or read (`autopilot`, `mocap`, `arm`, `force`), and the driver's error line."""
+    """Error line of the driver, by device that could not be opened or read (`autopilot`, `mocap`, `arm`, `force`)."""
 
 
 class Waiting(Record, frozen=True):

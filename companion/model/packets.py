@@ -1,4 +1,4 @@
-"""Packets on the channel from the flight process to the recorder. The guardian and the telemetry send `LogLine` on it as well."""
+"""Packets on the channel from the flight process to the recorder. The guardian and the telemetry also send `LogLine` on it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class Tick(Record, frozen=True, kw_only=True, tag=True):
     """One control tick."""
 
     number: int
-    """Number of this packet, counted by the flight process from 0: a gap shows the recorder how many packets were dropped."""
+    """Number of this packet, counted from 0 by the flight process; gaps show the recorder how many packets were dropped."""
     inputs: Inputs
     outputs: Outputs
     sent: Sent
@@ -47,7 +47,7 @@ class CommandAnswer(Record, frozen=True, kw_only=True, tag=True):
     accepted: bool
     """The command took effect, or the requested state was reached before."""
     text: str
-    """What was done, or why the command was refused."""
+    """Effect of the command, or the reason why it was refused."""
     t_s: float
     """Flight clock of the tick that answered; phase and action are from that tick's `Outputs`."""
     phase: str
@@ -58,7 +58,7 @@ class Close(Record, frozen=True, tag=True):
     """Last packet of a flight that ends normally."""
 
     number: int
-    """How many packets the flight process has offered before this one."""
+    """Number of packets that the flight process has sent or dropped before this one."""
 
 
 Packet = Tick | LogLine | Metadata | CommandAnswer | Close

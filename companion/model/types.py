@@ -1,7 +1,7 @@
 """Frozen records that pass between the packages of the companion.
 
-They hold floats, tuples of floats, enums and other records. Tuples instead of arrays, because tuples are immutable, compare with
-``==`` and survive a JSON round trip exactly. Packages that do linear algebra make arrays of them.
+They hold floats, tuples of floats, enums and other records. They use tuples instead of arrays because tuples are immutable, compare
+with ``==`` and survive a JSON round trip exactly. Packages that do linear algebra convert them to arrays.
 
 Conventions
     * World frame: ENU-like, z up, metres. Body frame: FLU (x forward, y left, z up).
@@ -69,7 +69,7 @@ class SafetyAction(Enum):
 
     @property
     def rank(self) -> int:
-        """Position in the order of escalation, 0 for NOMINAL."""
+        """Return the position in the order of escalation, 0 for NOMINAL."""
         return _ACTION_RANK[self]
 
 
@@ -84,7 +84,9 @@ class AutopilotRequest(Enum):
     ARM = "arm"
     LAND = "land"  # PX4's own LAND mode
     DISARM = "disarm"
-    FORCE_DISARM = "force_disarm"  # overrides PX4's land detector; companion.safety.rotor_stop says when it is allowed
+    FORCE_DISARM = (
+        "force_disarm"  # overrides PX4's land detector; companion.safety.rotor_stop decides when it is allowed
+    )
 
 
 class Outcome(Enum):
@@ -159,7 +161,7 @@ class AutopilotStatus(Record, frozen=True, kw_only=True):
     landed: LandedState
     battery_voltage_v: float | None = None
     battery_remaining: float | None = None
-    """Remaining charge, 0 to 1; None if PX4 reports none."""
+    """Remaining charge, 0 to 1; None if PX4 does not report it."""
     system_status: int | None = None
     """HEARTBEAT.system_status (MAV_STATE); None in older logs."""
 
@@ -193,7 +195,7 @@ class ArmState(Record, frozen=True, kw_only=True):
     """Register 70 of each servo, 0 if healthy. The companion sets bit 7 after the bus watchdog has tripped and was restarted."""
     temperature_c: Vec2
     read_failures: int
-    """Number of the newest consecutive bus cycles in which not every servo answered."""
+    """Number of consecutive bus cycles up to now in which not every servo answered."""
     written_s: float | None = None
     """Flight clock when the bus thread had written the last currents before this read; None before the first write."""
     asked_s: float | None = None
@@ -222,7 +224,7 @@ class Inputs(Record, frozen=True, kw_only=True):
     command: OperatorCommand
     recorder_dropped: int
     guardian_ready: bool | None = None
-    """The guardian reported within the last second that it can take over; None if there is no guardian (fast loop)."""
+    """Whether the guardian reported within the last second that it can take over; None if there is no guardian (fast loop)."""
 
 
 class Reference(Record, frozen=True, kw_only=True):
@@ -237,7 +239,7 @@ class Reference(Record, frozen=True, kw_only=True):
     arm_rate_rad_s: Vec2
     arm_acceleration_rad_s2: Vec2
     jerk_world_m_s3: Vec3
-    """Used by laws that feed the acceleration forward with lead time."""
+    """Jerk, used by laws that feed the acceleration forward with a lead."""
 
 
 class AttitudeSetpoint(Record, frozen=True):
@@ -296,7 +298,7 @@ class TetherState(Record, frozen=True, kw_only=True):
     slack_m: float
     """Tether length minus range."""
     stop_slack_m: float
-    """Slack at the earliest point where the machine could stop: after v t_react + v^2 / (2 a) at outward speed v."""
+    """Slack at the predicted stop after a fault (`companion.safety.stop`)."""
     elevation_rad: float
     """Elevation of the straight line from the vehicle to the anchor, positive below the horizontal."""
     clearance_m: float
@@ -307,13 +309,13 @@ class TetherState(Record, frozen=True, kw_only=True):
     pull_n: float
     """Force toward the anchor that rotors, gravity and tool do not explain, low-pass filtered; 0 if unknown, never negative."""
     taut: bool
-    """The slack is used up, or the tension grows with the range."""
+    """Whether the slack is used up, or the tension grows with the range."""
     snagged: bool
-    """There is tension toward the anchor or sideways although there is slack."""
+    """Whether there is tension toward the anchor or sideways although there is slack."""
     separated: bool
-    """The range exceeds the tether's length and there is no tension."""
+    """Whether the range exceeds the tether's length without tension."""
     vehicle_turns: float
-    """Always 0: `turns` is the larger of the windings about anchor and vehicle. Kept because logs have the field."""
+    """Always 0: `turns` is the larger of the windings about anchor and vehicle. Kept because logs contain the field."""
 
 
 class Outputs(Record, frozen=True, kw_only=True):
@@ -326,12 +328,12 @@ class Outputs(Record, frozen=True, kw_only=True):
     phase: str
     phase_kind: PhaseKind
     progress: float
-    """Share of the mission's planned duration that has passed, 0 to 1."""
+    """Elapsed fraction of the mission's planned duration, 0 to 1."""
     reference: Reference | None = None
     attitude: AttitudeSetpoint | None = None
-    """None if no setpoint must be sent to the autopilot in this tick."""
+    """Setpoint to send; None if none may be sent to the autopilot in this tick."""
     arm_torque_nm: Vec2 | None = None
-    """None if no command must be sent to the arm in this tick; without commands its bus watchdog trips."""
+    """Joint torques to send; None if none may be sent to the arm in this tick. Without commands its bus watchdog trips."""
     request: AutopilotRequest
     action: SafetyAction
     events: tuple[Event, ...]
@@ -339,7 +341,7 @@ class Outputs(Record, frozen=True, kw_only=True):
     outcome: Outcome | None = None
     """Outcome of the flight; None until it has ended."""
     mocap_trusted: bool
-    """Motion capture is plausible. While False no pose must be forwarded to PX4."""
+    """Whether motion capture is trusted. While False no pose may be forwarded to PX4."""
     tether: TetherState | None = None
     limited_by: tuple[str, ...]
     """Reasons for which the governor constrained the reference."""
@@ -348,7 +350,7 @@ class Outputs(Record, frozen=True, kw_only=True):
 
 
 class Sent(Record, frozen=True, kw_only=True):
-    """What the drivers sent in one tick, and when."""
+    """What the drivers sent in one tick, and at what time."""
 
     tick: int
     attitude_sent: bool

@@ -1,7 +1,7 @@
 """Parameter files in QGroundControl's format: tab-separated Vehicle-Id, Component-Id, Name, Value, Type; `#` begins a comment.
 
 Types are MAV_PARAM_TYPE: 6 is INT32, 9 is REAL32; PX4 has no others. The reader rejects everything that QGroundControl rejects and
-reports each error with file and line. Written values read back equal.
+reports each error with file and line. Values are written so that they read back equal.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from companion.config.document import ConfigError
 
 PACKAGED = Path(__file__).parent / "indoor_mocap.params"
-"""The project's parameter file as package data, so that an installation finds it; configs/px4/ holds the same file."""
+"""The project's parameter file as package data, so that every installation finds it; configs/px4/ contains a copy."""
 INT32, REAL32 = 6, 9
 COLUMNS = "# Vehicle-Id\tComponent-Id\tName\tValue\tType"
 VEHICLE_ID = COMPONENT_ID = 1
@@ -36,7 +36,7 @@ class Entry:
 
     name: str
     value: Value
-    """Value: int for INT32, float in single precision for REAL32."""
+    """The value, an int for INT32 and a float in single precision for REAL32."""
     line: int
     vehicle_id: int = VEHICLE_ID
     component_id: int = COMPONENT_ID
@@ -93,7 +93,7 @@ def _entry(line: str, number: int) -> Entry:
         if not (_INTEGER.fullmatch(cell) and 1 <= int(cell) <= 255):
             raise _WrongError(f"expected a {title} from 1 to 255, found {cell!r}")
     if _NAME.fullmatch(name) is None:
-        raise _WrongError(f"expected a name of up to 16 of A-Z 0-9 _, found {name!r}")
+        raise _WrongError(f"expected a name of up to 16 characters A-Z, 0-9 and _, found {name!r}")
     if kind not in (str(INT32), str(REAL32)):
         raise _WrongError(f"{name}: expected type {INT32} (INT32) or {REAL32} (REAL32), found {kind!r}")
     number_of = _int32 if kind == str(INT32) else _real32

@@ -1,8 +1,8 @@
-"""PX4 parameters that a flight depends on: required value, reason, and consequence of another value.
+"""PX4 parameters that a flight depends on: required value, and the consequence of any other value.
 
-One table. The preflight's rows, `companion px4 params`, configs/px4/indoor_mocap.params, the table of docs/px4.md and the stub's own
-settings are made from it. Names, types and limits are those of PX4 1.16.1 and 1.18 (their parameter metadata); whether a change needs
-a reboot is taken from PX4's metadata.
+The preflight's rows, `companion px4 params`, configs/px4/indoor_mocap.params, the table of docs/px4.md and the stub's own settings come
+from this one table. Names, types and limits are those of PX4 1.16.1 and 1.18 (their parameter metadata); whether a change needs a
+reboot is taken from PX4's metadata.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _HOVER_OFF_MAX = 0.35
 _ROOM_MARGIN_M = 0.3
 _FAILURE_MARGIN_DEG = 10.0
 _RELATIVE = 1e-6
-"""A REAL32 is compared with this tolerance."""
+"""Relative tolerance for comparing a REAL32."""
 
 Value = float | int
 Limits = Callable[[Vehicle], tuple[float, float]]
@@ -30,13 +30,13 @@ Limits = Callable[[Vehicle], tuple[float, float]]
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """One parameter. Accepted are the values of `ok`, or values within `limits`, else only `value`."""
+    """One parameter. The values of `ok` or those within `limits` are accepted; if neither is set, only `value`."""
 
     name: str
     value: Value | None
     """Value in the file, of PX4's type: int for INT32, float for REAL32. None if it is measured on each vehicle."""
     why: str
-    """Consequence of another value."""
+    """Consequence of a wrong value, or meaning of the values."""
     level: Level = Level.REFUSE
     reboot: bool = False
     ok: tuple[int, ...] = ()
@@ -44,7 +44,7 @@ class Wanted:
     limits_text: str = ""
     """Limits as text if they depend on the vehicle file."""
     fix: str = ""
-    """Remedy, if it is not to set the parameter."""
+    """Remedy, if it is something other than setting the parameter."""
     hardware: bool = False
     """Whether it belongs to the serial port TELEM2. It is checked only on a serial link; PX4's simulator lacks some of them."""
     file: bool = True
@@ -111,17 +111,19 @@ def _above_abort(vehicle: Vehicle) -> tuple[float, float]:
 
 _WARN = Level.WARN
 _RAISES = (
-    "ms; the sensor is not fused, but PX4 raises EKF2_DELAY_MAX to this delay if it is larger; so it is written first"
+    "delay of a sensor that is not fused, ms; if it is larger, PX4 raises EKF2_DELAY_MAX to it, so it is written first"
 )
 _FOLLOWS = (
-    "s; time constant with which the output follows the delayed filter; a larger one keeps IMU errors in it for longer"
+    "time constant with which the output follows the delayed filter, s; a larger one keeps IMU errors in it for longer"
 )
-_CEILING = "0 to `room.z_m` less 0.3"
+_CEILING = "0 to `room.z_m` minus 0.3"
 
 GROUPS: dict[str, tuple[Wanted, ...]] = {
     "Estimator: motion capture alone": (
         Wanted("EKF2_EN", 1, "without EKF2 there is no estimate at all"),
-        Wanted("EKF2_EV_CTRL", 11, "position, height and yaw come from vision; the others would drift", ok=(11, 15)),
+        Wanted(
+            "EKF2_EV_CTRL", 11, "position, height and yaw come from vision; whatever did not would drift", ok=(11, 15)
+        ),
         Wanted(
             "EKF2_HGT_REF",
             3,
@@ -146,7 +148,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "EKF2_EV_DELAY",
             5.0,
-            "ms from exposure to arrival; with a wrong delay the estimate oscillates with the vehicle's motion",
+            "delay from exposure to arrival, ms; if it is wrong, the estimate oscillates with the vehicle's motion",
             reboot=True,
             limits=_between(0.0, 30.0),
             measured=True,
@@ -160,8 +162,8 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "EKF2_DELAY_MAX",
             50.0,
-            "ms; the filter lags by this time, and its output is predicted to the present: with PX4's 200, and "
-            "0.25 s for the next two, the estimate wanders by 3 to 4 mm",
+            "lag of the filter, ms, over which its output is predicted forward: with PX4's 200, and 0.25 s for the next two, "
+            "the estimate drifts by 3 to 4 mm",
             _WARN,
             reboot=True,
             limits=_between(30.0, 60.0),
@@ -170,25 +172,25 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "EKF2_EVP_NOISE",
             0.01,
-            "m; with a much larger value the estimate follows the IMU's drift, not motion capture",
+            "noise of the position, m; if it is much larger, the estimate follows the IMU's drift, not motion capture",
             _WARN,
             limits=_between(0.005, 0.05),
         ),
         Wanted(
             "EKF2_EVA_NOISE",
             0.05,
-            "rad; with a much larger value yaw lags behind motion capture",
+            "noise of the attitude, rad; if it is much larger, yaw lags behind motion capture",
             _WARN,
             limits=_between(0.01, 0.1),
         ),
         Wanted(
-            "EKF2_EV_QMIN", 0, "VISION_POSITION_ESTIMATE carries no quality: with any minimum above 0 nothing is fused"
+            "EKF2_EV_QMIN", 0, "VISION_POSITION_ESTIMATE carries no quality: if the minimum is above 0 nothing is fused"
         ),
         *(
             Wanted(
                 f"EKF2_EV_POS_{axis}",
                 0.0,
-                "m; the body's pivot is PX4's centre of mass: an offset moves the estimate when it tilts",
+                "offset of the body's pivot from PX4's centre of mass, m: it moves the estimate when the vehicle tilts",
                 limits=_between(-0.02, 0.02),
             )
             for axis in "XYZ"
@@ -197,14 +199,14 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "SYS_HAS_GPS", 0, "PX4 waits for a GPS that is not used, and warns that it is missing", _WARN, reboot=True
         ),
         Wanted("SYS_HAS_MAG", 0, "PX4 refuses to arm if a compass is missing or disturbed by steel", reboot=True),
-        Wanted("COM_ARM_WO_GPS", 1, "with 0 PX4 refuses to arm without GPS", ok=(1, 2)),
+        Wanted("COM_ARM_WO_GPS", 1, "if 0, PX4 refuses to arm without GPS", ok=(1, 2)),
     ),
     "Loss of the companion": (
         Wanted(
             "COM_OF_LOSS_T",
             0.5,
-            "s without a setpoint until the failsafe; with more the vehicle continues on its last attitude, with less one "
-            "delayed packet ends the flight",
+            "time without a setpoint until the failsafe, s; if longer, the vehicle continues at its last attitude; if shorter, "
+            "one delayed packet ends the flight",
             limits=_between(0.2, 0.5),
         ),
         Wanted(
@@ -230,12 +232,12 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "COM_RCL_EXCEPT",
             0,
-            "with bit 2 a lost radio goes unnoticed in OFFBOARD, and the pilot cannot take over",
+            "if bit 2 is set, PX4 ignores a lost radio in OFFBOARD, and the pilot cannot take over",
             _WARN,
         ),
     ),
     "Other failsafes": (
-        Wanted("NAV_DLL_ACT", 0, "with another value closing QGroundControl ends the flight, with 2 by a climb"),
+        Wanted("NAV_DLL_ACT", 0, "any other value ends the flight when QGroundControl is closed, 2 with a climb"),
         Wanted(
             "COM_LOW_BAT_ACT",
             2,
@@ -245,29 +247,29 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "BAT_CRIT_THR",
             0.1,
-            "PX4's own landing must come after the companion's, which lands with position",
+            "PX4's own landing must come after the companion's, which controls the position",
             _WARN,
             limits=_below_own_landing,
-            limits_text="0.05 to `safety.battery_min` less 0.02",
+            limits_text="0.05 to `safety.battery_min` minus 0.02",
         ),
         Wanted(
             "COM_FLTT_LOW_ACT",
             1,
-            "3 returns when PX4 estimates that the flight time is used up; with 0 PX4 has left OFFBOARD for HOLD",
+            "3 returns when PX4 estimates that the flight time is used up; with 0, PX4 has been seen to leave OFFBOARD for HOLD",
             _WARN,
         ),
         Wanted("GF_ACTION", 2, "3 climbs and returns at PX4's own fence, 4 stops the motors", ok=(0, 1, 2, 5)),
         Wanted(
             "RTL_RETURN_ALT",
             1.5,
-            "m; every return of PX4 first climbs to this height: into the ceiling, or until the tether stops it",
+            "height to which every return of PX4 climbs first, m: into the ceiling, or until the tether stops it",
             limits=_below_ceiling,
             limits_text=_CEILING,
         ),
         Wanted(
             "CBRK_FLIGHTTERM",
             121212,
-            "with another value PX4 stops the motors in the air when it detects an attitude failure",
+            "any other value makes PX4 stop the motors in the air when it detects an attitude failure",
             _WARN,
             reboot=True,
         ),
@@ -275,7 +277,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             Wanted(
                 f"FD_FAIL_{axis}",
                 60,
-                "deg; beyond it PX4 stops the motors in the first seconds after take-off; must lie well beyond "
+                "tilt, deg, beyond which PX4 stops the motors in the first seconds after take-off; must be well above "
                 "`safety.tilt_abort_deg`",
                 _WARN,
                 limits=_above_abort,
@@ -283,7 +285,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             )
             for axis in "RP"
         ),
-        Wanted("CBRK_SUPPLY_CHK", 0, "with another value the check of the supply voltage is off", _WARN),
+        Wanted("CBRK_SUPPLY_CHK", 0, "any other value switches the check of the supply voltage off", _WARN),
         Wanted("SYS_FAILURE_EN", 0, "one stray message could switch off a motor", reboot=True),
         Wanted("COM_THROW_EN", 0, "an armed vehicle that is picked up and moved fast would start its motors"),
     ),
@@ -291,42 +293,42 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             HOVER,
             None,
-            "PX4 holds and lands with it, and the companion starts from it: with too much the vehicle jumps, with too little "
-            "it does not lift",
+            "PX4 holds and lands with it, and the companion starts from it: if it is too large the vehicle jumps, if it is too "
+            "small it does not lift",
             limits=_hover,
-            limits_text="within 35 % of `airframe.hover_thrust`, or of weight over `airframe.thrust_max_n`",
+            limits_text="within 35 % of `airframe.hover_thrust`, or of weight / `airframe.thrust_max_n`",
             fix="measure it (companion hover fit) and set it, or correct airframe.mass_kg and airframe.thrust_max_n",
             file=False,
         ),
         Wanted(
             "COM_SPOOLUP_TIME",
             1.0,
-            "s; for this time after arming PX4 limits thrust while the companion spools up",
+            "time after arming for which PX4 limits thrust, s, while the companion spools up",
             limits=_between(0.0, SPOOL_S),
         ),
         Wanted(
             "COM_DISARM_LAND",
             2.0,
-            "s; with 0 or less the rotors continue to turn after PX4's own landing",
+            "time from PX4's own landing to its disarm, s; if 0 or less, the rotors continue to turn",
             limits=_between(0.1, 5.0),
         ),
         Wanted(
             "COM_DISARM_PRFLT",
             10.0,
-            "s; with less PX4 disarms while the companion spools up",
+            "time after arming within which the vehicle must take off, s; if too short, PX4 disarms while the companion spools up",
             limits=_between(5.0, 60.0),
         ),
         Wanted(
             "MPC_LAND_SPEED",
             0.7,
-            "m/s; descent speed of PX4's own landing, in which the net touches down first",
+            "descent speed of PX4's own landing, m/s, in which the net touches down first",
             _WARN,
             limits=_between(0.3, 1.0),
         ),
         Wanted(
             "MIS_TAKEOFF_ALT",
             1.0,
-            "m; height to which a pilot's Takeoff mode climbs",
+            "height to which a pilot's Takeoff mode climbs, m",
             _WARN,
             limits=_below_ceiling,
             limits_text=_CEILING,
@@ -336,51 +338,49 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "MPC_TILTMAX_AIR",
             25.0,
-            "deg; with more PX4 may cross the room fast after a takeover",
+            "tilt limit of PX4's own modes, deg; if larger, PX4 may cross the room fast after a takeover",
             _WARN,
             limits=_between(20.0, 45.0),
         ),
         Wanted(
             "MPC_ACC_HOR",
             8.0,
-            "m/s^2; with less LAND stops further ahead, 0.53 m after a takeover with PX4's 3; the flown acceleration stays "
-            "below it because of MPC_JERK_AUTO and MPC_TILTMAX_AIR",
+            "acceleration, m/s^2; if smaller, LAND stops further ahead, 0.53 m after a takeover with PX4's 3; the flown "
+            "acceleration stays below it because of MPC_JERK_AUTO and MPC_TILTMAX_AIR",
             _WARN,
             limits=_between(5.0, 10.0),
         ),
         Wanted(
             "MPC_JERK_AUTO",
             6.0,
-            "m/s^3; with less PX4 brakes later, with more LAND approaches its stop point faster",
+            "jerk, m/s^3; if smaller, PX4 brakes later; if larger, LAND approaches its stop point faster",
             _WARN,
             limits=_between(4.0, 8.0),
         ),
         Wanted(
             "MPC_XY_VEL_MAX",
             2.0,
-            "m/s; with more there is not enough distance to stop",
+            "horizontal speed, m/s; if larger, there is not enough distance to stop",
             _WARN,
             limits=_between(0.5, 3.0),
         ),
         Wanted(
             "MPC_Z_VEL_MAX_UP",
             1.0,
-            "m/s; with more there is not enough distance to stop below the ceiling",
+            "climb speed, m/s; if larger, there is not enough distance to stop below the ceiling",
             _WARN,
             limits=_between(0.5, 2.0),
         ),
     ),
     "Serial link to the companion: TELEM2": (
-        Wanted(
-            "MAV_1_CONFIG", 102, "with another value there is no MAVLink on TELEM2", _WARN, reboot=True, hardware=True
-        ),
+        Wanted("MAV_1_CONFIG", 102, "any other value means no MAVLink on TELEM2", _WARN, reboot=True, hardware=True),
         Wanted(
             "MAV_1_MODE", 2, "other modes send too few messages at too low rates", _WARN, reboot=True, hardware=True
         ),
         Wanted(
             "MAV_1_RATE",
             80000,
-            "B/s; 0 means half of the link's bandwidth, at which PX4 reduces the rate of every stream",
+            "data rate, B/s; 0 means half of the link's bandwidth, at which PX4 reduces the rate of every stream",
             _WARN,
             reboot=True,
             hardware=True,

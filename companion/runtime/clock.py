@@ -1,4 +1,6 @@
-"""The flight clock: monotonic seconds since the flight process started. The core never reads it; drivers and flight process do."""
+"""The flight clock: monotonic seconds since the flight process started. The drivers and the flight process read it; the core never
+does.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Which build of the computing modules this process runs: plain Python, or compiled by `make compile`. Both compute the same bits."""
+"""Tells which build of the computing modules this process runs: plain Python, or compiled by `make compile`. Both give identical
+results to the bit.
+"""
 
 from __future__ import annotations
 

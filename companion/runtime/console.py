@@ -53,7 +53,7 @@ class SteadyStream:
 
 
 class _PlainNumbers(SteadyStream):
-    """Stream that prints negative zeros as zero and ignores that its reader has gone."""
+    """Stream that prints negative zeros as zero and never fails when its reader has gone."""
 
     def write(self, text: str) -> int:
         """Write the text without negative zeros."""
@@ -108,7 +108,7 @@ class FlightDisplay:
         self._title = title
         self._phase = ""
         self._event = ""
-        """Text of the newest event; a phase that begins with an event of the same name gets no line of its own."""
+        """Text of the newest event; no line is printed for a phase that begins with an event of the same name."""
         self._progress = Progress(
             TextColumn("[bold]{task.description:<22}"),
             BarColumn(bar_width=28),
@@ -141,7 +141,7 @@ class FlightDisplay:
                     self._console.print(f"  t {message['mission_t_s']:6.2f} s  {escape(self._phase)}")
                 self._event = ""
                 if self._phase == Stage.READY.value:
-                    self.say("everything is ready; take off with: companion command start (Ctrl-C stands down)")
+                    self.say("everything is ready; take off with: companion command start (Ctrl-C cancels the start)")
         elif kind == "event" and message.get("source") == "sitl":
             if message["kind"] in ("missed", "crashed"):
                 self._line(
@@ -171,7 +171,7 @@ class FlightDisplay:
             self._line("ground", message["text"], "cyan")
 
     def _preflight(self, rows: list[Message]) -> None:
-        """Show the preflight's result; the rows that refuse are printed at the end, as the reason of the refusal."""
+        """Show the preflight's result; the rows that refuse are printed at the end as the reason for the refusal."""
         self._progress.update(self._task, description="starting", completed=0.0, note="")
         bad = [row for row in rows if not row["ok"]]
         warned = [row for row in bad if row["level"] == Level.WARN.value]
@@ -182,7 +182,7 @@ class FlightDisplay:
             self._line("", Row(**{**row, "level": Level.WARN}).line(), "yellow")
 
     def say(self, text: str) -> None:
-        """Print one line of the launcher."""
+        """Print one line from the launcher."""
         self._line("", text, "yellow")
 
     def _line(self, head: str, text: str, style: str) -> None:
@@ -243,7 +243,7 @@ def print_result(console: Console, summary: dict[str, Any], out: Path, report: P
     every = summary.get("graded_every", 1)
     if every > 1:
         facts.add_row("graded", f"every {every}th tick of a long flight; loop and latencies: every tick")
-    facts.add_row("report", str(report) if report else f"none; what there is lies in {out}")
+    facts.add_row("report", str(report) if report else f"none; any other files are in {out}")
     console.print()
     console.print(facts, highlight=False, soft_wrap=True)
     if outcome != "refused":

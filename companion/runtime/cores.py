@@ -1,4 +1,4 @@
-"""CPU cores: finds the usable ones and keeps other processes off the cores that are reserved for the flight process."""
+"""Finds the usable CPU cores and keeps other processes off those that are reserved for the flight process."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ CPU_MAX = 1023
 def usable_cpus() -> tuple[int, ...]:
     """Return the cores that this process may run on, in ascending order.
 
-    They include isolated cores (isolcpus=) and cores outside its present affinity, but not those that a cpuset excludes. A short
-    thread finds out by trying.
+    They include isolated cores (isolcpus=) and cores outside its present affinity, but not those that a cpuset excludes. A short-lived
+    thread finds them by trying.
     """
     found: set[int] = set()
 
@@ -48,7 +48,7 @@ def others(own: Collection[int], now: Collection[int], usable: Collection[int]) 
 
 
 def keep_off(own: Collection[int]) -> None:
-    """Move all threads of this process, and the children it will start, off the flight's `own` cores, if there are others."""
+    """Move all threads of this process, and the children that it will start, off the flight's `own` cores if there are others."""
     if not own:
         return
     cpus = others(own, os.sched_getaffinity(0), usable_cpus())

@@ -49,7 +49,7 @@ def run_until_interrupted(work: Coroutine[Any, Any, _T]) -> _T:
             loop.remove_signal_handler(signal.SIGINT)
         if interrupted.is_set():
             if not task.cancelled():
-                task.exception()  # retrieved: it is not what ended the work
+                task.exception()  # the result is retrieved because it did not end the work
             return None
         return (task.result(),)
 

@@ -2,7 +2,7 @@
 
 Flight to launcher: `status` (10 a second), `event`, `px4`, `command` (a command from the ground, and its effect), `ground` (state of
 the connection to ground stations), `started`, `refused`, `result`. Launcher to flight: `land`. The flight never waits for the
-launcher: if the channel is full the message is lost. If the launcher is gone (end of file) the flight lands.
+launcher: if the channel is full the message is lost. If the launcher has ended (end of file) the flight lands.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Threads of native libraries that call Python."""
+"""Support for threads of native libraries that call Python."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import ctypes
 import threading
 
 _own = threading.local()
-"""Exists as long as the calling thread's interpreter state."""
+"""Its values exist as long as the calling thread's interpreter state."""
 
 
 def keep_interpreter_state() -> None:
     """Keep the interpreter state of the calling native thread after its callback; call it in the callback.
 
-    Otherwise each callback allocates and frees an interpreter state of 16 kB, which costs a page fault per callback, 900 a second.
-    One PyGILState_Ensure without a release keeps the first state. It leaks when the thread ends, so use it only for threads that
-    live as long as the process.
+    Otherwise each callback allocates and frees an interpreter state of 16 kB, which costs a page fault per callback, of which there are
+    900 a second. One PyGILState_Ensure without a release keeps the first state. It leaks when the thread ends, so use it only for
+    threads that live as long as the process.
     """
     if not getattr(_own, "kept", False):
         _own.kept = True

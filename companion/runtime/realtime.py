@@ -15,12 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 GIL_SWITCH_S = 0.0005
-"""Interpreter switch interval, for which the bus thread waits for a computing tick. Python's default of 5 ms is a whole period."""
+"""Interpreter switch interval: the longest time that the bus thread waits for a tick that is computing. Python's default of 5 ms is a
+whole tick.
+"""
 FLIGHT_PRIORITY = 50
 GUARDIAN_PRIORITY = 60
 """Priority of the guardian, above the flight process, so that it runs even if the flight process spins."""
 WORLD_PRIORITY = 40
-"""Priority of the simulated world, below the flight process, which it must not disturb."""
+"""Priority of the simulated world, below the flight process, which the world must not disturb."""
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # <bits/mman.h>, the same numbers on x86 and ARM
 _CAP_IPC_LOCK = 14  # <linux/capability.h>
@@ -77,7 +79,7 @@ def claim_realtime(priority: int, *, cpus: Collection[int] = (), lock_memory: bo
 
 
 def realtime_permitted(priority: int) -> str | None:
-    """Return the scheduling that `claim_realtime` would get, tried on a short thread; None if it would be refused."""
+    """Return the scheduling that `claim_realtime` would get, tried on a short-lived thread; None if it would be refused."""
     got: list[str] = []
 
     def attempt() -> None:
@@ -94,7 +96,8 @@ def realtime_permitted(priority: int) -> str | None:
 def memory_lock_refused() -> str | None:
     """Return why memory must not be locked, or None if it may be.
 
-    It must not under a finite RLIMIT_MEMLOCK: once the limit is used up, the process would get no more memory, in flight.
+    It must not be locked under a finite RLIMIT_MEMLOCK: once the limit is used up, the process would get no more memory, even in
+    flight.
     """
     limit_bytes = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     if limit_bytes == resource.RLIM_INFINITY or _has_capability(_CAP_IPC_LOCK):

@@ -1,4 +1,4 @@
-"""Child processes: default signals, termination, JSON lines from their pipes, and the reason of their exit."""
+"""Child processes: default signals, termination, JSON lines from their pipes, and the reason for their exit."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class LaunchError(Exception):
 def use_default_signals() -> None:
     """Restore signals that the parent process left ignored or blocked, so that Ctrl-C and `kill -INT` always work.
 
-    A shell without job control starts `companion ... &` with SIGINT ignored, and children inherit that. With SIGCHLD ignored, the
-    exit code of a child is lost. SIGHUP is left unchanged, because `nohup` relies on it. Does nothing outside of the main thread,
-    which alone can set handlers.
+    A shell without job control starts `companion ... &` with SIGINT ignored, and children inherit that. With SIGCHLD ignored, the exit
+    code of a child is lost. SIGHUP is left unchanged, because `nohup` relies on it. Does nothing outside the main thread, which alone
+    can set handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         return
@@ -75,7 +75,7 @@ def remove_file(path: Path) -> None:
 def scratch_folder(out: Path) -> Iterator[Path]:
     """Create a folder for temporary files in `out`, yield its absolute path, and remove it with all its contents.
 
-    The folder is always a new one: an existing folder would be removed with it.
+    The folder is always new, because an existing one would be removed with its contents.
 
     Raises:
         LaunchError: the folder cannot be created.
@@ -83,7 +83,7 @@ def scratch_folder(out: Path) -> Iterator[Path]:
     try:
         path = Path(tempfile.mkdtemp(prefix=TMP_PREFIX, dir=out))
     except OSError as error:
-        raise LaunchError(f"{out}: a folder in it cannot be made: {error.strerror}; choose another --out") from None
+        raise LaunchError(f"{out}: a folder in it cannot be created: {error.strerror}; choose another --out") from None
     try:
         yield path.absolute()
     finally:
@@ -91,7 +91,7 @@ def scratch_folder(out: Path) -> Iterator[Path]:
 
 
 def how_it_ended(code: int) -> str:
-    """Return text for a return code of `subprocess`."""
+    """Return a description of a return code of `subprocess`."""
     if code >= 0:
         return f"ended with exit code {code}"
     try:
@@ -143,7 +143,7 @@ def _tail(path: Path) -> str:
 
 
 def holds_traceback(path: Path) -> bool:
-    """Whether the end of a log shows an internal error."""
+    """Return whether the end of a log shows an internal error."""
     return "Traceback (most recent call last)" in _tail(path)
 
 

@@ -17,11 +17,10 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 
 class Bars:
-    """Live bars with a text behind each; without a terminal only the lines of `say` are printed.
+    """Live progress bars, each followed by a text; without a terminal only the lines of `say` are printed.
 
     Args:
-        console: where they are shown.
-        names: one bar each.
+        console: where they are shown. names: the bars' names.
     """
 
     def __init__(self, console: Console, names: Sequence[str]) -> None:
@@ -44,7 +43,7 @@ class Bars:
         self._progress.stop()
 
     def show(self, shares: Sequence[float], seen: Sequence[str]) -> None:
-        """Fill each bar to its share, 0 to 1, and show the text behind it."""
+        """Fill each bar to its fraction, 0 to 1, and show the text that follows it."""
         for task, share, text in zip(self._tasks, shares, seen, strict=True):
             self._progress.update(task, completed=max(0.0, min(1.0, share)), seen=text)
 

@@ -12,7 +12,7 @@ WATCHDOG_RESTARTED = 0x80
 ERROR_NAMES = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
 """Bits of register 70, Hardware Error Status, of the XM430."""
 AT_LIMIT = 0.97
-"""Share of the torque limit from which on a joint counts as at its limit."""
+"""Fraction of the torque limit at which a joint counts as being at its limit."""
 DRIFT_TIME_S = 1.0
 """Time constant of the mean force."""
 _NO_FORCE: Vec3 = (0.0, 0.0, 0.0)
@@ -118,7 +118,7 @@ def servo_overload(a: ArmTracker, torque_max_nm: Vec2) -> Values | None:
 
 
 def joint_rate(a: ArmTracker, rate_max_rad_s: float) -> Values | None:
-    """A joint speed exceeds the threshold."""
+    """The speed of a joint exceeds the threshold."""
     if a.arm is None:
         return None
     w1, w2 = a.arm.velocity_rad_s
@@ -158,7 +158,7 @@ class ForceTracker:
         self.trusted = True
         """Whether samples are passed on; False while they repeat themselves."""
         self.mean_n: Vec3 = _NO_FORCE
-        """Low-passed external force in the world frame while the law flies with an empty net; else 0."""
+        """Low-passed external force in the world frame while the controller flies with an empty net; else 0."""
 
     def update(self, i: Inputs, situation: Situation, awake_s: float, dt_s: float, moving: bool) -> None:
         """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle moves."""

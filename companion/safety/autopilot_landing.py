@@ -1,11 +1,11 @@
 """Landing in PX4's LAND mode, supervised by the companion, which completes what PX4 cannot.
 
-PX4 lands on its own estimate. Without vision its height becomes invalid 4.5 s after the last pose; from then on it descends at constant
-thrust and never detects the ground (measured). The companion therefore watches for touchdown as long as the dead-reckoned height is
-valid, takes OFFBOARD back with zero thrust once the vehicle has landed, and disarms. No single source decides: PX4's estimate and
-motion capture must both show a vehicle at rest while PX4 descends. If PX4's land detector alone does not respond, the vehicle is
-disarmed all the same. `companion.safety.rotor_stop` decides when a stop of the rotors may be requested, also for a vehicle that is
-flipped or tipped over. Pure; time is an argument.
+PX4 lands using its own estimate. Without vision its height becomes invalid 4.5 s after the last pose; from then on it descends at
+constant thrust and never detects the ground (measured). The companion therefore watches for touchdown as long as the dead-reckoned
+height is valid, returns PX4 to OFFBOARD with zero thrust once the vehicle has landed, and disarms. No single source decides: PX4's
+estimate and motion capture must both show a vehicle at rest while PX4 descends. The vehicle is disarmed even if PX4's land detector
+alone does not respond. `companion.safety.rotor_stop` decides when a stop of the rotors may be requested, including that of a vehicle
+that is flipped or tipped over. Pure; time is an argument.
 """
 
 from __future__ import annotations
@@ -42,8 +42,9 @@ DESCENT_HOLD_S = 0.3
 DESCENT_COUNTED_M_S = 0.7
 """MPC_LAND_SPEED. A faster descent counts as this one: PX4 brakes a vehicle that falls to this speed, in the air."""
 ARRESTED_SHARE = 0.5
-"""Share of the fastest descent. PX4 controls its estimated speed, so in the air the estimate does not slow down to less: the floor
-stops it."""
+"""Fraction of the fastest descent. PX4 controls its estimated speed, so an estimate that slows down to less than this was stopped by
+the floor.
+"""
 DRIFT_M_S2 = 0.5
 """Without motion capture the estimated height may be off by half of this times the square of the time."""
 STANDING_S = 3.0
@@ -60,24 +61,24 @@ class LandingStep:
     zero_thrust: bool
     """Whether to send a level, zero-thrust setpoint."""
     ended: bool
-    """Whether the vehicle stands disarmed, or nothing more can be done."""
+    """Whether the vehicle is disarmed on the ground, or nothing more can be done."""
     landed: bool
     """Whether the vehicle has landed. Valid with `ended`."""
     text: str | None = None
-    """Message to report, or an empty text."""
+    """Event to report and its text, if any."""
 
 
 @dataclass(frozen=True, slots=True)
 class Arrest:
-    """Evidence of touchdown for an estimate that drifts: PX4's descent, by its own estimate, was stopped and not resumed.
+    """Evidence of touchdown for an estimate that drifts: according to PX4's own estimate its descent was stopped and not resumed.
 
-    Dead reckoning on an accelerometer with an error of 0.2 m/s^2 is 0.4 m/s and 0.4 m off after 2 s, so speed and height do not show
-    rest. The change of speed at the floor does.
+    Dead reckoning from an accelerometer with an error of 0.2 m/s^2 is wrong by 0.4 m/s and 0.4 m after 2 s, so speed and height do not
+    show rest, but the change of speed at the floor does.
     """
 
     descends_since_s: float | None = None
     fastest_m_s: float = 0.0
-    """Fastest descent that lasted for `DESCENT_HOLD_S`, `DESCENT_COUNTED_M_S` at most; 0 before there was one."""
+    """Fastest descent that lasted for `DESCENT_HOLD_S`, limited to `DESCENT_COUNTED_M_S`; 0 before the first."""
     arrested_since_s: float | None = None
 
     def update(self, t_s: float, up_m_s: float) -> Arrest:
@@ -100,13 +101,13 @@ class AutopilotLanding:
     """One landing in LAND mode."""
 
     start_s: float
-    """Flight time at its start."""
+    """Time on the flight clock at its start."""
     clearance_m: float
-    """Height of the body's origin when the vehicle stands."""
+    """Height of the body's origin when the vehicle is on the ground."""
     pilot: bool
     """Whether a pilot has taken over; the landing is then only monitored."""
     pose_s: float
-    """Flight time of the newest pose that PX4 received; with -inf its estimate does not count until poses arrive."""
+    """Time on the flight clock of the newest pose that PX4 received; if -inf, its estimate does not count until poses arrive."""
     stop: RotorStop
     height: HeightEvidence
     sinking: Sinking = field(default_factory=Sinking)
@@ -133,11 +134,11 @@ class AutopilotLanding:
         """Return the landing before its first tick.
 
         Args:
-            start_s: flight time.
-            clearance_m: height of the body's origin when the vehicle stands.
+            start_s: time on the flight clock.
+            clearance_m: height of the body's origin when the vehicle is on the ground.
             tilt_max_rad: `safety.tilt_abort_deg`; a vehicle that lies on the floor beyond it is tipped over.
             pilot: a pilot has taken over. PX4's mode shows a later takeover.
-            pose_s: flight time of the newest pose that PX4 received; -inf if unknown.
+            pose_s: time on the flight clock of the newest pose that PX4 received; -inf if unknown.
             flipped: the vehicle is known to have been flipped for long enough.
         """
         stop = RotorStop.begin(clearance_m, tilt_max_rad, pose_s, flipped=flipped)
@@ -167,7 +168,7 @@ class AutopilotLanding:
             return now, LandingStep(
                 request=AutopilotRequest.NONE, zero_thrust=False, ended=True, landed=True, text=overturned
             )
-        if elapsed > TIMEOUT_S and not (now.pilot and heard):  # a pilot may fly for any time
+        if elapsed > TIMEOUT_S and not (now.pilot and heard):  # a pilot may fly for any length of time
             text = "the landing could not be confirmed"
             return now, LandingStep(
                 request=AutopilotRequest.NONE, zero_thrust=False, ended=True, landed=False, text=text
@@ -206,14 +207,16 @@ class AutopilotLanding:
         return now, LandingStep(AutopilotRequest.NONE if wait else AutopilotRequest.OFFBOARD, True, False, False)
 
     def _watch_mode(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
-        """Return whether a pilot takes over: PX4 is in a manual mode or, once it was landing, in any mode that only a pilot selects."""
+        """Return whether a pilot has taken over: PX4 is in a manual mode or, after it began to land, in any mode that only a pilot
+        selects.
+        """
         mode = i.status.mode if i.status is not None else FlightMode.UNKNOWN
         now = self if self.was_landing or mode is not FlightMode.LAND else replace(self, was_landing=True)
         chosen = i.status is not None and chosen_by_pilot(i.status)
         return now, mode is FlightMode.MANUAL or (now.was_landing and chosen)
 
     def _watch_touchdown(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
-        """Handle a touchdown: PX4 lands, its height shows a vehicle on the ground, and motion capture does not contradict."""
+        """Handle a touchdown: PX4 is landing, its height shows a vehicle on the ground, and motion capture does not contradict it."""
         pose, vehicle, t_s = fresh_pose(i), i.vehicle, i.t_s
         pose_s = pose.stamp_s if pose is not None else self.pose_s
         sinking = self.sinking.update(t_s, i.mocap)

@@ -1,4 +1,4 @@
-"""The loop over the event table: which rules hold in a tick, for how long, and which of them become an event."""
+"""The loop over the event table: evaluates in every tick which rules hold and for how long, and returns the events."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _Bound = tuple[Rule, Any, Any, Any]
 
 
 class Evaluation:
-    """Evaluates the rules in every tick. Its state is the time since which each rule holds, and which rules are active.
+    """Evaluates the rules in every tick. Its state is the time since when each rule has held, and the active rules.
 
     Args:
         vehicle: vehicle file with thresholds and hold times.

@@ -1,4 +1,6 @@
-"""Rules of the vehicle in the air: tilt, tracking, thrust, speed, room and tether. Only the vertical force is tracked over time."""
+"""Tracker and predicates of the vehicle in the air: tilt, tracking, thrust, speed, room and tether. Only the limited thrust is tracked
+over time.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,7 @@ class FlightTracker:
         self.tracking_error_m: float | None = None
         self.tether: TetherState | None = None
         self.vertical_n: float | None = None
-        """Vertical force of the law while it is limited above the weight; else None."""
+        """Vertical force commanded by the control law while it is limited above the weight; else None."""
         self.saturated_s = 0.0
         """Counter that rises while the vertical force is limited and falls otherwise, because noise makes the limit flicker."""
 
@@ -67,12 +69,12 @@ class FlightTracker:
         return self._inputs is not None and seems_flipped(self._inputs)
 
     def stop_s(self, vehicle: VehicleState) -> float:
-        """Return the stopping time: times the velocity it is the displacement to the predicted stop after a fault."""
+        """Return the stopping time; multiplied by the velocity it is the displacement to the predicted stop after a fault."""
         vx, vy, vz = vehicle.velocity_world_m_s
         return self._stop.time_s(math.sqrt(vx * vx + vy * vy + vz * vz))
 
     def rotors_in_room(self, x: float, y: float, z: float, tolerance_m: float) -> bool:
-        """Whether the rotors of a vehicle at this position, in m, are in the room."""
+        """Return whether the rotors of a vehicle at this position, in m, are in the room."""
         room, inset_m = self._room, self._radius_m - tolerance_m
         (x_low, x_high), (y_low, y_high) = room.x_m, room.y_m
         return (
@@ -151,7 +153,7 @@ def thrust_saturated(f: FlightTracker, saturated_max_s: float) -> Values | None:
 
 
 def tether_short(f: FlightTracker, slack_min_m: float) -> Values | None:
-    """At the predicted stop after a fault less tether than the threshold would be left."""
+    """Less tether than the threshold would be left at the predicted stop after a fault."""
     t = f.tether
     return (t.stop_slack_m, slack_min_m) if t is not None and t.stop_slack_m < slack_min_m else None
 

@@ -1,7 +1,7 @@
-"""The last check of everything that is sent: values must be finite, in range, fresh and without jumps. A bad command is never sent.
+"""The last check of every command: values must be finite, in range, fresh and without jumps. A command that fails it is not sent.
 
-A rejected command is not replaced: PX4's offboard-loss failsafe and the servos' bus watchdog then decide. An excess is
-reduced: thrust that changes too fast, torque beyond its limit, torque that drives a joint further beyond its limit or speed.
+A rejected command is not replaced: PX4's offboard-loss failsafe and the servos' bus watchdog then act. An excess is reduced: thrust
+that changes too fast, torque beyond its limit, torque that drives a joint further beyond its limit or speed.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Verdict(Record, frozen=True):
 
 
 class Gate:
-    """Check of each tick's commands against the vehicle file; keeps the last thrust sent."""
+    """Checks each tick's commands against the vehicle file; keeps the last thrust sent."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         safety, joints = vehicle.safety, vehicle.arm.joints
@@ -70,10 +70,9 @@ class Gate:
             attitude: requested setpoint.
             arm_torque_nm: requested joint torques.
             arm_rad: joint angles now; None if unknown.
-            arm_fresh: the joint state is fresh enough to close a loop on.
+            arm_fresh: the joint state is fresh enough for closed-loop control.
             t_s: flight clock.
-            state_age_s: age of the attitude that the setpoint was computed from.
-            arm_rate_rad_s: joint speeds now.
+            state_age_s: age of the attitude that the setpoint was computed from. arm_rate_rad_s: joint speeds now, rad/s.
         """
         refused: list[Refusal] = []
         if attitude is not None:
@@ -101,7 +100,7 @@ class Gate:
     def _attitude_fault(self, setpoint: AttitudeSetpoint, state_age_s: float) -> Refusal | None:
         w, x, y, z = setpoint.attitude_wxyz
         norm2, sin2_half_tilt, thrust = w * w + x * x + y * y + z * z, x * x + y * y, setpoint.thrust
-        # Written so that NaN fails all of it.
+        # Written so that NaN fails every condition.
         if 0.998 < norm2 < 1.002 and sin2_half_tilt <= self._tilt_limit and 0.0 <= thrust <= 1.0:
             if state_age_s <= self._state_age_max_s:
                 return None

@@ -1,11 +1,12 @@
-"""The governor constrains references so that they cannot leave the tether sphere and the room, whatever the input. Pure.
+"""The governor constrains references so that they cannot leave the tether sphere and the room, whatever the input reference. Pure.
 
-The safe set is convex: a ball about the anchor (length less margin less lever of the attachment) and a box (the room less the rotors).
-A state (p, v) of the reference is *safe* if p, and the point q at which the vehicle would come to rest after a fault
-(`companion.safety.stop`), both lie in the set, and the speed is within its limit. Braking straight at a never moves q outward, and p
-and q stay on the segment from the first p to the first q, which lies in a convex set with its ends: from a safe state braking is always
-possible and stays safe. So it is enough to accept a step towards the input reference only if the state after it is safe, and otherwise
-to mix in as much braking as that takes. No constraint needs a look-ahead, and no reference can violate one.
+The safe set is convex: a ball about the anchor (its radius is the tether's length minus the margin and the lever of the attachment) and
+a box (the room minus the space for the rotors). A state (p, v) of the reference is *safe* if p, and the point q at which the vehicle
+would come to rest after a fault (`companion.safety.stop`), both lie in the set, and the speed is within its limit. Straight braking
+never moves q beyond its first position, and p and q stay on the segment from the first p to the first q, which lies in the convex set
+because its ends do: from a safe state braking is always possible and stays safe. It is therefore enough to accept a step towards the
+input reference only if the state after it is safe, and otherwise to blend in as much braking as that requires. No constraint needs a
+look-ahead, and no reference can violate one.
 
 A safe reference that continues the previous one passes unchanged, as the same object. The mission check uses the same `SafeSet`, so an
 accepted plan is never constrained.
@@ -44,8 +45,9 @@ class Governed(Record, frozen=True):
 
     reference: Reference
     limited_by: tuple[str, ...]
-    """Reasons for a constraint: "tether", "geofence", "speed", "acceleration" (the input steps, or the governor is still returning to
-    it). Empty if the reference is the unchanged input object."""
+    """Reasons for a constraint: "tether", "geofence", "speed", "acceleration" (the input jumps, or the governor is still returning to
+    it). Empty if the reference is the unchanged input object.
+    """
 
 
 class SafeSet:
@@ -70,13 +72,13 @@ class SafeSet:
         for name, low, high, span in zip("xyz", self.low_m, self.high_m, (room.x_m, room.y_m, room.z_m), strict=True):
             if low > high:
                 raise ValueError(
-                    f"vehicle '{vehicle.name}': room.{name}_m is {span[0]:g} to {span[1]:g} m, too small for the machine; "
-                    f"measure the room, or airframe.radius_m ({reach_m:g} m)"
+                    f"vehicle '{vehicle.name}': room.{name}_m is {span[0]:g} to {span[1]:g} m, too "
+                    f"small for the vehicle; measure the room, or airframe.radius_m ({reach_m:g} m)"
                 )
         into = math.dist(self.anchor_m, _clamped(self.anchor_m, self.low_m, self.high_m))
         if into > self.radius_m:
             raise ValueError(
-                f"vehicle '{vehicle.name}': the tether reaches {max(0.0, self.radius_m):.2f} m (length_m {tether.length_m:g} less "
+                f"vehicle '{vehicle.name}': the tether reaches {max(0.0, self.radius_m):.2f} m (length_m {tether.length_m:g} minus "
                 f"margin_m {tether.margin_m:g} and the lever of attachment_body_m), but the room begins {into:.2f} m from the anchor; "
                 "correct tether.anchor_world_m or tether.length_m"
             )
@@ -133,7 +135,7 @@ class Governor:
         self._restrained = False
 
     def reset(self) -> None:
-        """Begin a new motion with the next reference: it is not compared with the previous one."""
+        """Begin a new motion with the next reference, without comparing it with the previous one."""
         self._p = None
         self._v = (0.0, 0.0, 0.0)
 
@@ -220,7 +222,7 @@ class Governor:
         return self._set.holds(stop) and self._admits_restrained(p, v, speed)
 
     def _admits_restrained(self, p: Vec3, v: Vec3, speed: float) -> bool:
-        """Return whether p and the end of straight braking lie in the present set; without restraint p in it is enough."""
+        """Return whether p and the end of straight braking lie in the present set; without restraint it is enough that p does."""
         return self._admits(p) and (not self._restrained or self._admits(_ahead(p, v, speed * self._half_per_a)))
 
     def _admits(self, p: Vec3) -> bool:
@@ -271,7 +273,7 @@ class Governor:
             if not self._restrained:
                 target = self._nearest(target, INSIDE_M)
         if self._restrained and not self._admits(target):
-            # The target lies outward: sliding along the boundary to the nearest point has no use.
+            # The target lies outward: sliding along the boundary to the nearest point is of no use.
             wish_p, wish_v = brake_p, brake_v
         else:
             wish_p, wish_v = self._wished(dt_s, target, follow, feed)
@@ -338,7 +340,7 @@ class Governor:
 
 
 def _share_within(inside: Vec3, p: Vec3, centre: Vec3, radius_m: float) -> float:
-    """Return the largest share, 0 to 1, of the segment from a point inside a ball to p that stays in the ball."""
+    """Return the largest fraction, 0 to 1, of the segment from a point inside a ball to p that stays in the ball."""
     dx, dy, dz = p[0] - inside[0], p[1] - inside[1], p[2] - inside[2]
     cx, cy, cz = inside[0] - centre[0], inside[1] - centre[1], inside[2] - centre[2]
     a = dx * dx + dy * dy + dz * dz

@@ -1,15 +1,16 @@
-"""Check that motion capture moves as the IMU measures. Pure.
+"""Checks that motion-capture poses move as the IMU measures. Pure.
 
 PX4 fuses the poses of motion capture, so its position agrees with them even when an attacker drags them away. The accelerometer does
-not: an observer of position, velocity and accelerometer bias integrates it, and each pose corrects the observer. The innovation, pose
-minus predicted position, stays near zero while both measure the same motion. A drag that begins at v m/s raises it to 0.08 s x v after
-0.2 s; then the observer follows the drag, as it follows a constant acceleration error. A drag that begins slowly is not found.
+not agree then: an observer of position, velocity and accelerometer bias integrates it, and each pose corrects the observer. The
+innovation, pose minus predicted position, stays near zero while both measure the same motion. A drag that begins at v m/s raises it to
+0.08 s x v after 0.2 s; then the observer follows the drag, as it follows a constant acceleration error. A drag that begins slowly is
+not found.
 
-The attitude that turns the specific force into the world is PX4's. PX4 corrects its tilt by the same poses, but slowly (0.4 rad/s).
+The attitude that turns the specific force into the world is PX4's. PX4 corrects its tilt with the same poses, but slowly (0.4 rad/s).
 
 The observer gets the integral of the specific force over every sample that PX4 sent (`companion.io.px4.delta_velocity`). One sample for
-each tick would alias vibration of 5 to 10 m/s2 into the velocity. Times are those of exposure and sample, on the clocks of cameras and
-PX4 (`RemoteClock`), not of arrival: a message that waits on its way does not change when its sample was taken.
+each tick would alias vibration of 5 to 10 m/s2 into the velocity. Times are those of exposure and sample, on the clocks of motion
+capture and PX4 (`RemoteClock`), not of arrival, because transport delays vary.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ IMU_GAP_MAX_S = 0.05
 
 
 CLOCK_GROWTH = 1e-3
-"""Two clocks may drift apart by this, s/s."""
+"""Largest drift between two clocks, s/s."""
 CLOCK_RESTART_S = 0.5
-"""Later than this, it is another clock: its device restarted."""
+"""A message later than this shows a different clock: its device restarted."""
 
 
 class RemoteClock:
@@ -42,11 +43,10 @@ class RemoteClock:
         self._arrived_s = 0.0
 
     def local_s(self, remote_s: float, arrived_s: float) -> float:
-        """Return the flight time of `remote_s`, plus the least delay.
+        """Convert `remote_s` to the flight clock. The result is late by the smallest transport delay seen.
 
         Args:
-            remote_s: time on the device's clock at which it sent a message.
-            arrived_s: arrival of that message, flight clock.
+            remote_s: time on the device's clock at which it sent a message. arrived_s: arrival of that message on the flight clock.
         """
         offset_s = arrived_s - remote_s
         grown_s = self._offset_s + CLOCK_GROWTH * max(0.0, arrived_s - self._arrived_s)
@@ -60,7 +60,7 @@ class InertialCheck:
 
     Args:
         limit_m: threshold of the innovation's length.
-        hold_s: hold time: the innovation must exceed the threshold in every pose for this long.
+        hold_s: hold time: the innovation must exceed the threshold at every pose for this long.
         gap_max_s: the observer starts again after a longer gap between poses.
     """
 
@@ -79,7 +79,7 @@ class InertialCheck:
 
         Args:
             stamp_s: arrival of that sample.
-            dt_s: interval since the last call, by the clock of the samples; unless it is positive and short, the observer starts again.
+            dt_s: interval since the last call on the clock of the samples; unless it is positive and short, the observer starts again.
             delta_velocity_world_m_s: change of the velocity in that interval: specific force turned into the world, gravity removed.
         """
         self._imu_s = stamp_s
@@ -100,8 +100,8 @@ class InertialCheck:
         Args:
             stamp_s: time of arrival.
             position_world_m: measured position.
-            age_s: time from the exposure to the newest IMU sample; the prediction is taken back by as much,
-                or forward if it is negative.
+            age_s: time from the exposure to the newest IMU sample; the prediction is moved back by this time, or forward if it is
+                negative.
 
         Returns:
             True if the innovation has exceeded the threshold for the hold time.

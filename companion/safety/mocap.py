@@ -1,9 +1,8 @@
-"""Motion capture: which poses are trusted, and the predicates of its rules.
+"""Motion capture: decides which poses are trusted; the predicates of its rules.
 
-A pose is trusted if it is near the one that PX4's velocity and rates predict. A pose that is not trusted counts as
-not received and is not passed on to PX4: an estimator that has fused another body's pose is useless in a landing.
-Thresholds are keys of `safety:` in the vehicle file (`companion.config.vehicle.Safety`); `companion.safety.rules` names them per rule
-and has the texts for the operator.
+A pose is trusted if it is near the one that PX4's velocity and rates predict. A pose that is not trusted counts as not received and is
+not passed on to PX4: an estimator that has fused another body's pose is useless for a landing. Thresholds are keys of `safety:` in the
+vehicle file (`companion.config.vehicle.Safety`); `companion.safety.rules` lists them per rule and contains the texts for the operator.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ CONTINUOUS_S = 0.1
 FORGET_S = 1.0
 """After a gap this long the next frame is trusted: `mocap_lost` has reported the gap."""
 DRIFT_M_S = 0.3
-"""Drift that is granted to PX4's position without a trusted pose."""
+"""Drift that PX4's position may have without a trusted pose, m/s."""
 RATE_WINDOW_S = 1.0
 
 
 def unfused(i: Inputs) -> str | None:
     """Return why PX4 appears not to fuse vision, or None if position and yaw of its estimate agree with motion capture.
 
-    PX4 accepts poses that it does not fuse without a message, so having sent them proves nothing.
+    PX4 accepts poses without fusing them and does not report it, so having sent them proves nothing.
     """
     if i.vehicle is None or i.mocap is None:
         return "no state to compare"
@@ -47,7 +46,7 @@ def unfused(i: Inputs) -> str | None:
 
 
 class MocapTracker:
-    """Evaluates each frame once: is it trusted, does it repeat the previous one, does it agree with the IMU?
+    """Evaluates each frame once: whether it is trusted, repeats the previous one, and agrees with the IMU.
 
     Args:
         safety: thresholds for a trusted pose.
@@ -65,9 +64,9 @@ class MocapTracker:
         self._streams = StreamWatch()
         self._inertial = InertialCheck(s.mocap_inertial_m, s.mocap_inertial_s, s.mocap_timeout_s)
         self._imu: VehicleState | None = None
-        """State whose IMU samples were used last."""
+        """PX4's state whose IMU samples were used last."""
         self._imu_s = 0.0
-        """End of the newest IMU sample, flight clock."""
+        """End of the newest IMU sample on the flight clock."""
         self._px4_clock, self._server_clock = RemoteClock(), RemoteClock()
         self._against_imu = False
         """Whether the newest trusted pose disagrees with the IMU."""
@@ -88,13 +87,13 @@ class MocapTracker:
         self.two_streams = False
         self.dragged = False
         """In the air, while the companion commanded, poses disagreed with the IMU. Latched: the observer soon follows the
-        drag, and the poses must not be trusted again. Not judged once PX4 lands for another reason: behind a late link the check can
-        be wrong, and PX4 needs the poses."""
+        drag, and the poses must not be trusted again. Not evaluated once PX4 lands for another reason: with a delayed link the check
+        can be wrong, and PX4 needs the poses."""
         self.rate_hz: float | None = None
         self.compared: tuple[MocapPose, VehicleState] | None = None
         """A fresh, trusted pose and PX4's state in the air; else None."""
         self.trusted = True
-        """Whether poses are trusted: the newest one is plausible, and they are not frozen, dragged or of two servers."""
+        """Whether poses are trusted: the newest one is plausible, and they are not frozen, dragged or from two servers."""
         self.repeats = False
         """Whether the newest pose equals the previous one bit for bit, which no measurement does in the air."""
 
@@ -126,11 +125,11 @@ class MocapTracker:
 
     @property
     def innovation_m(self) -> float:
-        """Distance between the newest pose and the position predicted by the IMU; 0 while that is not evaluated."""
+        """Return the distance between the newest pose and the position predicted from the IMU; 0 while that is not evaluated."""
         return self._inertial.innovation_m
 
     def untrusted(self, timeout_s: float) -> bool:
-        """Frames arrive, but none was trusted for longer than the timeout."""
+        """Return whether frames arrive but none was trusted for longer than the timeout."""
         return self.trusted_age_s > timeout_s and not self.frame_age_s > timeout_s
 
     def _predict(self, vehicle: VehicleState, boot_s: float) -> None:
@@ -177,7 +176,7 @@ class MocapTracker:
         )
         if self.plausible:
             self._trusted_pose, self._trusted_awake_s = pose, awake_s
-            # mocap_frozen evaluates repeated poses; they are not passed on, and are no evidence of motion.
+            # mocap_frozen evaluates repeated poses; they are not passed on and are not evidence of motion.
             if not self.repeats:
                 self._against_imu = self._inertial.pose(pose.stamp_s, pose.position_world_m, self._age_s(pose))
         else:

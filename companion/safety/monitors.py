@@ -1,4 +1,4 @@
-"""All monitors of one flight: trackers take each tick's inputs, then the loop evaluates the event table. Pure.
+"""All monitors of one flight: the trackers are updated with each tick's inputs, then the event table is evaluated. Pure.
 
 `companion.safety` says where a new rule begins.
 """
@@ -20,9 +20,9 @@ from companion.safety.situation import Situation
 from companion.safety.validity import InputFilter
 
 AWAKE_STEP_MAX_S = 0.02
-"""A tick adds no more than this to the age of inputs."""
+"""Largest time that one tick adds to the age of inputs."""
 MOVING_M_S, MOVING_RAD_S = 0.03, 0.05
-"""Motion above the noise of a vehicle at rest: its measurements must change."""
+"""Motion that exceeds the noise of a vehicle at rest, so that its measurements must change."""
 
 
 class Monitors:
@@ -58,16 +58,18 @@ class Monitors:
         self._last_t_s: float | None = None
         self._airborne = False
         self.trusted: Inputs | None = None
-        """Inputs of the last tick without records that are not trusted; the same object if all are trusted."""
+        """Inputs of the last tick without the records that are not trusted; the same object if all are trusted."""
 
     @property
     def mocap_trusted(self) -> bool:
-        """Whether poses may be passed on to PX4. In the air a repeated pose is withheld, long before `mocap_frozen`: it feigns rest."""
+        """Return whether poses may be passed on to PX4. In the air a repeated pose is withheld, long before `mocap_frozen`, because it
+        suggests a vehicle at rest.
+        """
         return self._mocap.trusted and not (self._mocap.repeats and self._airborne)
 
     @property
     def mocap_innovation_m(self) -> float:
-        """Distance between the newest pose and the position predicted by the IMU; 0 while that is not evaluated."""
+        """Return the distance between the newest pose and the position predicted from the IMU; 0 while that is not evaluated."""
         return self._mocap.innovation_m
 
     def forget(self) -> None:

@@ -1,6 +1,6 @@
 """Events that the state machine and the core report themselves, without a rule in `companion.safety.rules`.
 
-One row each; docs/safety.md is made from them. Ids are stable: logs, summaries and outside scripts name them.
+Each is one row; docs/safety.md is generated from them. Ids are stable because logs, summaries and users' scripts contain them.
 """
 
 from __future__ import annotations
@@ -30,19 +30,25 @@ _NOMINAL, _WARN, _LAND, _PX4_LANDS = (
     SafetyAction.AUTOPILOT_LAND,
 )
 
-INPUTS_MISSING = Notice("inputs_missing", _CRITICAL, _NOMINAL, "a device delivered nothing within 15 s: refused")
+INPUTS_MISSING = Notice(
+    "inputs_missing", _CRITICAL, _NOMINAL, "a device delivered nothing within 15 s: the flight is refused"
+)
 VISION_NOT_FUSED = Notice(
     "vision_not_fused", _CRITICAL, _NOMINAL,
-    "PX4's position or yaw does not agree with motion capture (0.10 m, 8 deg): refused",
+    "PX4's position or yaw does not agree with motion capture (0.10 m, 8 deg): the flight is refused",
 )  # fmt: skip
 ESTIMATE_UNSTEADY = Notice(
     "estimate_unsteady", _CRITICAL, _NOMINAL,
-    "PX4's estimate has not been near motion capture and steady for 1 s (0.05 m, 5 deg in the mean; 0.02 m, 2 deg of wandering): "
-    "refused",
+    "PX4's estimate has not been near motion capture and steady for 1 s (0.05 m, 5 deg on average; 0.02 m, 2 deg of "
+    "drift): the flight is refused",
 )  # fmt: skip
-START_REFUSED = Notice("start_refused", _CRITICAL, _NOMINAL, "the vehicle's pose is not the mission's start: refused")
-OFFBOARD_REFUSED = Notice("offboard_refused", _CRITICAL, _NOMINAL, "PX4 did not enter OFFBOARD within 8 s: refused")
-ARMING_REFUSED = Notice("arming_refused", _CRITICAL, _NOMINAL, "PX4 did not arm within 10 s: refused")
+START_REFUSED = Notice(
+    "start_refused", _CRITICAL, _NOMINAL, "the vehicle's pose is not the mission's start: the flight is refused"
+)
+OFFBOARD_REFUSED = Notice(
+    "offboard_refused", _CRITICAL, _NOMINAL, "PX4 did not enter OFFBOARD within 8 s: the flight is refused"
+)
+ARMING_REFUSED = Notice("arming_refused", _CRITICAL, _NOMINAL, "PX4 did not arm within 10 s: the flight is refused")
 NOT_READY = Notice(
     "not_ready", _WARNING, _NOMINAL,
     "a flight that waits for its start has lost its inputs, its estimate or its start position; it waits until they return",
@@ -52,7 +58,7 @@ START_DECLINED = Notice(
 )
 CALLED_OFF = Notice(
     "called_off", _INFO, _LAND,
-    "HOLD was commanded before take-off: aborted. A flight that waits for its start continues to wait",
+    "HOLD was commanded before take-off: the flight is aborted. A flight that waits for its start continues to wait",
 )  # fmt: skip
 RESUME_REFUSED = Notice(
     "resume_refused", _WARNING, _NOMINAL,
@@ -64,22 +70,25 @@ PAYLOAD_LEFT = Notice(
     "payload_left", _INFO, _NOMINAL,
     "no pull on the net for 0.5 s without free fall: the net is empty and ready for the next catch",
 )  # fmt: skip
-TOUCHDOWN = Notice("touchdown", _INFO, _NOMINAL, "the vehicle stands")
+TOUCHDOWN = Notice("touchdown", _INFO, _NOMINAL, "the vehicle is on the ground")
 NO_TOUCHDOWN = Notice("no_touchdown", _CRITICAL, _PX4_LANDS, "no touchdown 5 s after the plan's end: PX4 lands")
 DISARM_REFUSED = Notice(
     "disarm_refused", _CRITICAL, _NOMINAL,
-    "PX4 did not disarm within 8 s, or left OFFBOARD before: PX4 lands; if the vehicle had not lifted: the crew is asked to "
-    "disarm it, and the guardian takes over",
+    "PX4 did not disarm within 8 s, or left OFFBOARD before: PX4 lands. If the vehicle had not "
+    "lifted, the crew is asked to disarm it, and the guardian takes over",
 )  # fmt: skip
 AUTOPILOT_LANDING = Notice("autopilot_landing", _CRITICAL, _PX4_LANDS, "progress of the landing by PX4")
 GATE = Notice("gate", _WARNING, _WARN, "the gate rejected or limited a command")
-HOLD_EXPIRED = Notice("hold_expired", _CRITICAL, _LAND, "a HOLD lasted longer than `hold_max_s`: it lands")
+HOLD_EXPIRED = Notice("hold_expired", _CRITICAL, _LAND, "a HOLD lasted longer than `hold_max_s`: the vehicle lands")
 RETRACT_EXPIRED = Notice(
-    "retract_expired", _CRITICAL, _LAND, "a RETRACT lasted longer than `retract_max_s`: it lands where it is"
+    "retract_expired", _CRITICAL, _LAND, "a RETRACT lasted longer than `retract_max_s`: the vehicle lands where it is"
 )
 RETRACT_DONE = Notice("retract_done", _INFO, _LAND, "RETRACT complete: the vehicle lands")
 NO_ROOM_TO_STAY = Notice(
-    "no_room_to_stay", _CRITICAL, _LAND, "a HOLD lower than 0.3 m above standing, or a RETRACT in a landing: it lands"
+    "no_room_to_stay",
+    _CRITICAL,
+    _LAND,
+    "a HOLD less than 0.3 m above standing height, or a RETRACT during a landing: the vehicle lands",
 )
 
 NOTICES: tuple[Notice, ...] = (

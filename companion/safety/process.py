@@ -1,4 +1,4 @@
-"""The companion's own processes and the operator's commands: their tracker, and the predicates of their rules."""
+"""Tracker of the companion's own processes and of the operator's commands, and the predicates of their rules."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class ProcessTracker:
     def __init__(self) -> None:
         self._command = OperatorCommand.NONE
         self.command = OperatorCommand.NONE
-        """The command that begins in this tick: one that lasts for several ticks counts once."""
+        """The command that begins in this tick; one that lasts for several ticks counts once."""
         self.gap_s = 0.0
         """Time since the previous tick."""
         self.recorder_dropped = 0

@@ -1,4 +1,4 @@
-"""PX4: tracker of its state, clock and status, and the predicates of its rules."""
+"""Tracker of PX4's state, clock and status, and the predicates of its rules."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Px4Tracker:
     """Tracks age, lag and repetition of PX4's state, its restarts and its mode.
 
     Args:
-        clearance_m: height of the body's origin when the vehicle stands.
+        clearance_m: height of the body's origin when the vehicle is on the ground.
     """
 
     def __init__(self, clearance_m: float) -> None:
@@ -30,7 +30,7 @@ class Px4Tracker:
         self._moved = False
         self._boot_s: float | None = None
         self._offset_s = math.inf
-        """Flight clock less PX4's clock, without lag."""
+        """Flight clock minus PX4's clock, without lag."""
         self._lag_awake_s = 0.0
         self.vehicle: VehicleState | None = None
         self.status: AutopilotStatus | None = None
@@ -73,7 +73,7 @@ class Px4Tracker:
             if self._boot_s is not None and v.boot_s < self._boot_s - CLOCK_BACK_S:
                 self.rebooted_s = v.boot_s
                 self._offset_s = math.inf
-            # The clock offset is unknown: its smallest value counts as no lag, and slowly grows.
+            # The clock offset is unknown: its smallest value counts as zero lag and slowly grows.
             offset_s = v.attitude_stamp_s - v.boot_s
             grown_s = LAG_FORGOTTEN_S_PER_S * (awake_s - self._lag_awake_s)
             self._lag_awake_s = awake_s
@@ -91,7 +91,7 @@ class Px4Tracker:
 
 
 def reattached(p: Px4Tracker, _: None) -> Values | None:
-    """PX4 is armed without a request of the companion."""
+    """PX4 is armed without a request from the companion."""
     found = p.situation.found_armed
     return None if found is None else (found,)
 
@@ -128,7 +128,7 @@ def pilot_took_over(p: Px4Tracker, _: None) -> Values | None:
 
 
 def offboard_left(p: Px4Tracker, _: None) -> Values | None:
-    """PX4 is in another mode that it has chosen itself."""
+    """PX4 has itself changed to a mode other than OFFBOARD."""
     status = p.left_offboard
     if status is None or chosen_by_pilot(status):
         return None

@@ -1,4 +1,4 @@
-"""Decide whether a vehicle that is armed without a request of this companion is flying, and who has control. Pure.
+"""Decides whether a vehicle that was armed without a request from this companion is flying, and who has control. Pure.
 
 This happens after companion, guardian and launcher have died in flight or the computer has restarted, and when a pilot arms by radio
 before the companion does. The vehicle never takes off in this case.
@@ -18,8 +18,7 @@ def found_armed(i: Inputs, clearance_m: float) -> tuple[bool, str]:
     OFFBOARD nor LAND, or if motion capture does not measure its height.
 
     Args:
-        i: inputs with PX4 armed.
-        clearance_m: height of the body's origin when the vehicle stands on the ground.
+        i: inputs with PX4 armed. clearance_m: height of the body's origin when the vehicle is on the ground.
     """
     pose, vehicle = fresh_pose(i), i.vehicle
     height_m = pose.position_world_m[2] if pose is not None else None
@@ -29,7 +28,7 @@ def found_armed(i: Inputs, clearance_m: float) -> tuple[bool, str]:
         height_m = vehicle.position_world_m[2]
     where = "at an unknown height" if height_m is None else f"at a height of {height_m:.2f} m"
     mode = i.status.mode.value.upper() if i.status is not None else "?"
-    found = f"PX4 is armed and the companion has not armed it: {where}, in {mode}"
+    found = f"PX4 is armed, but the companion has not armed it: {where}, in {mode}"
     if flown_by_pilot(i.status):
         return True, f"{found}, which a pilot has chosen: only motion capture is sent to PX4"
     if stands:

@@ -2,20 +2,19 @@
 
 There are three cases:
 
-* **The vehicle stands.** PX4 is in OFFBOARD or LAND, so no pilot flies; every fresh height is near standing height; and the vehicle has
-  not moved. All of this must hold without a break: for `DISARM_STILL_S` before DISARM, which PX4 itself refuses in the air, and for
-  `FORCE_DISARM_S` by motion capture before FORCE_DISARM, which PX4 does not refuse.
-* **The vehicle is flipped.** Beyond `FLIPPED_TILT_RAD` by PX4's attitude, confirmed by motion capture, or by the accelerometer where
-  motion capture does not see the body, for `FLIPPED_HOLD_S`. Then PX4's LAND drives it into the floor, so FORCE_DISARM follows
-  at once and at any height, unless a pilot flies.
-* **The vehicle is tipped over.** For `TIPPED_HOLD_S`, in OFFBOARD or LAND: tilted by more than `safety.tilt_abort_deg` by PX4's
-  attitude and by motion capture, and less than `LOW_WITHIN_M` above standing height by motion capture. It lies on its rotors, and PX4's
-  LAND goes on driving them. Without a fresh pose this is not evaluated.
+* **The vehicle is on the ground.** PX4 is in OFFBOARD or LAND, so no pilot flies; every fresh height is near standing height; and the
+  vehicle has not moved. All of this must hold without a break: for `DISARM_STILL_S` before DISARM, which PX4 itself refuses in the air,
+  and for `FORCE_DISARM_S`, measured by motion capture, before FORCE_DISARM, which PX4 does not refuse. * **The vehicle is flipped.**
+  PX4's attitude is beyond `FLIPPED_TILT_RAD`, confirmed by motion capture, or by the accelerometer if motion capture does not see the
+  body, for `FLIPPED_HOLD_S`. PX4's LAND would drive it into the floor, so FORCE_DISARM follows at once and at any height, unless a
+  pilot flies. * **The vehicle is tipped over.** For `TIPPED_HOLD_S`, in OFFBOARD or LAND, PX4 and motion capture both show a tilt above
+  `safety.tilt_abort_deg`, and motion capture shows less than `LOW_WITHIN_M` above standing height. The vehicle lies on its rotors, and
+  PX4's LAND continues to drive them. Without a fresh pose this is not evaluated.
 
-A normal flight is never mistaken for a vehicle that is tipped over. The law's setpoints stay within `airframe.tilt_max_deg`, PX4's own
-landing within `MPC_TILTMAX_AIR` (25 deg) and `MPC_TILTMAX_LND` (12 deg). Beyond 40 deg a free vehicle accelerates sideways by more than
-8 m/s^2, and PX4, commanded to land after 0.1 s (`tilt`), either levels it within 0.5 s or it is on the floor. Only a tether that pulls
-the vehicle over can hold it at this tilt so low; it then falls by `LOW_WITHIN_M` at most.
+A normal flight is never mistaken for a vehicle that is tipped over. The controller's setpoints stay within `airframe.tilt_max_deg`,
+PX4's own landing within `MPC_TILTMAX_AIR` (25 deg) and `MPC_TILTMAX_LND` (12 deg). Beyond 40 deg a free vehicle accelerates sideways by
+more than 8 m/s^2, and PX4, commanded to land after 0.1 s (`tilt`), either levels it within 0.5 s or it is on the floor. Only a tether
+that pulls the vehicle over can hold it at this tilt so low; when its rotors stop it falls by `LOW_WITHIN_M` at most.
 """
 
 from __future__ import annotations
@@ -30,9 +29,9 @@ from companion.model.types import FlightMode, Inputs, MocapPose, Vec3
 from companion.safety.touchdown import MOCAP_FRESH_S, STILL_M_S, Sinking
 
 LOW_WITHIN_M = 0.25
-"""Margin over standing height: above it the vehicle does not count as standing."""
+"""Margin over standing height: above it the vehicle does not count as being on the ground."""
 STILL_WITHIN_M = 0.05
-"""A vehicle that has moved further than this since its rest began has not stood still."""
+"""A vehicle that has moved further than this since it came to rest is not at rest."""
 DISARM_STILL_S = 0.35
 FORCE_DISARM_S = 4.0
 """Time at rest after which the vehicle is disarmed although PX4's land detector reports no landing."""
@@ -43,7 +42,7 @@ FLIPPED_TILT_RAD = math.radians(70.0)
 FLIPPED_HOLD_S = 0.3
 TIPPED_HOLD_S = 0.5
 _UPRIGHT_MIN_M_S2 = GRAVITY_M_S2 * math.cos(FLIPPED_TILT_RAD)
-"""Specific force along body z; a vehicle that stands or hovers with less tilt measures more."""
+"""Specific force along body z; a vehicle that rests or hovers with less tilt measures more."""
 Places = dict[str, Vec3]
 """Position in the world frame by source, "mocap" or "PX4"."""
 OWN_MODES = frozenset({FlightMode.OFFBOARD, FlightMode.LAND})
@@ -57,7 +56,7 @@ def fresh_pose(i: Inputs) -> MocapPose | None:
 
 
 def hears_px4(i: Inputs) -> bool:
-    """Return whether a heartbeat of PX4 has arrived within `HEARTBEAT_FRESH_S`."""
+    """Return whether a heartbeat from PX4 has arrived within `HEARTBEAT_FRESH_S`."""
     return i.status is not None and i.t_s - i.status.heartbeat_stamp_s < HEARTBEAT_FRESH_S
 
 
@@ -69,8 +68,8 @@ def is_ours(i: Inputs) -> bool:
 def seems_flipped(i: Inputs) -> bool:
     """Return whether two sources report in this tick that the vehicle is tilted by more than `FLIPPED_TILT_RAD`.
 
-    PX4's attitude must report it and motion capture confirm it; without a fresh pose the accelerometer does, which
-    confirms a vehicle that lies on its side or back or falls freely, not one whose rotors still push against gravity.
+    PX4's attitude must report it and motion capture confirm it; without a fresh pose the accelerometer does. It confirms the tilt of a
+    vehicle that lies on its side or back or falls freely, but not of one whose rotors still push against gravity.
     """
     if not _tilted_by_px4(i, FLIPPED_TILT_RAD):
         return False
@@ -92,23 +91,23 @@ def _tilted_by_px4(i: Inputs, limit_rad: float) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class RotorStop:
-    """Evidence, updated in every tick, whether the rotors may be stopped."""
+    """Evidence, updated in every tick, on whether the rotors may be stopped."""
 
     low_m: float
-    """Below this height the vehicle may stand."""
+    """Below this height the vehicle may be on the ground."""
     tilt_max_rad: float
     """`safety.tilt_abort_deg`; a vehicle that lies on the floor beyond it is tipped over."""
     pose_s: float = -math.inf
-    """Flight time of the newest pose that PX4 received; -inf if unknown."""
+    """Time on the flight clock of the newest pose that PX4 received; -inf if unknown."""
     sinking: Sinking = field(default_factory=Sinking)
     rest: tuple[float, Places] | None = None
-    """Time since which the vehicle stands still, and its position by each source; None if it does not."""
+    """Time since when the vehicle has been at rest, and its position from each source; None if it is not at rest."""
     flipped_since_s: float | None = None
     tipped_since_s: float | None = None
     may_disarm: bool = False
     """Whether DISARM may be requested now."""
     may_force: bool = False
-    """Whether FORCE_DISARM of a standing vehicle may be requested now."""
+    """Whether FORCE_DISARM of a vehicle on the ground may be requested now."""
     flipped: bool = False
     tipped: bool = False
 
@@ -119,15 +118,17 @@ class RotorStop:
         """Return the evidence before the first tick.
 
         Args:
-            clearance_m: height of the body's origin when the vehicle stands.
+            clearance_m: height of the body's origin when the vehicle is on the ground.
             tilt_max_rad: `safety.tilt_abort_deg`.
-            pose_s: flight time of the newest pose that PX4 received; -inf if unknown.
+            pose_s: time on the flight clock of the newest pose that PX4 received; -inf if unknown.
             flipped: the vehicle is known to have been flipped for long enough.
         """
         return cls(clearance_m + LOW_WITHIN_M, tilt_max_rad, pose_s, flipped_since_s=-math.inf if flipped else None)
 
     def update(self, i: Inputs) -> RotorStop:
-        """Return the evidence after one more tick. Call it in every tick of the stage: all conditions hold without a break."""
+        """Return the evidence after one more tick. Call it in every tick of the stage, because the conditions must hold without a
+        break.
+        """
         pose, t_s = fresh_pose(i), i.t_s
         sinking = self.sinking.update(t_s, pose)
         pose_s = max(self.pose_s, i.mocap.stamp_s) if i.mocap is not None and i.mocap.tracking_valid else self.pose_s
@@ -162,19 +163,19 @@ class RotorStop:
         return rest
 
     def _lies_tilted(self, i: Inputs, pose: MocapPose | None) -> bool:
-        """Return whether, in this tick, PX4 is in an own mode, motion capture shows it low, and both show it tilted too far."""
+        """Return whether PX4 is in one of `OWN_MODES`, motion capture shows the vehicle low, and both show it tilted too far."""
         if pose is None or pose.position_world_m[2] >= self.low_m or not is_ours(i):
             return False
         return tilt_rad(pose.attitude_wxyz) > self.tilt_max_rad and _tilted_by_px4(i, self.tilt_max_rad)
 
 
 def _since(before_s: float | None, t_s: float, holds: bool) -> float | None:
-    """Return the time since which a condition has held, or None if it does not hold."""
+    """Return the time since when a condition has held, or None if it does not hold."""
     return (t_s if before_s is None else before_s) if holds else None
 
 
 def _low_and_still(i: Inputs, pose: MocapPose | None, sink_m_s: float | None, low_m: float, pose_s: float) -> Places:
-    """Return the position by each trusted source; empty unless all are near the floor and the best source measures no motion."""
+    """Return the position from each trusted source; empty unless all are near the floor and the best source measures no motion."""
     places: Places = {}
     vehicle = i.vehicle
     if vehicle is not None and i.t_s - vehicle.position_stamp_s < STATE_FRESH_S:

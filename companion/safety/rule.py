@@ -1,4 +1,4 @@
-"""Row of the event table, and access to its thresholds in the vehicle file."""
+"""A row of the event table, and access to its thresholds in the vehicle file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from companion.safety.situation import Values
 
 
 class Subject(Enum):
-    """Subject of a rule."""
+    """What a rule observes; each subject has one tracker."""
 
     INPUTS = "inputs"
     OPERATOR = "operator"
@@ -44,8 +44,9 @@ class Rule:
     what: str
     """Description of the condition."""
     predicate: Callable[[Any, Any], Values | None]
-    """Takes the subject's tracker and the thresholds, as `thresholds_of` returns them. Returns the values for the message if the
-    condition holds in this tick, else None. Pure."""
+    """Pure function of the subject's tracker and the thresholds (see `thresholds_of`). It returns the values for the message if the
+    condition holds in this tick, else None.
+    """
     thresholds: tuple[str, ...] = ()
     """Keys of the vehicle file, below `safety:` if they have no dot, whose values the predicate gets."""
     tracked_by: tuple[str, ...] = ()
@@ -53,22 +54,23 @@ class Rule:
     hold_time: float | str = 0.0
     """Time for which the condition must hold, s, or the key of `safety:` with this time."""
     ground: SafetyAction | None
-    """Action before the rotors may lift: from LAND on the companion stands down. None: not evaluated there."""
+    """Action before the rotors may lift; LAND and more severe actions cancel the start. None if the rule is not evaluated there."""
     air: SafetyAction | None
-    """Action while the rotors may lift. None: not evaluated there."""
+    """Action while the rotors may lift. None if the rule is not evaluated there."""
     message: str
-    """Text of the event, with braces for the predicate's values."""
+    """Text of the event, a format string for the predicate's values."""
     severity: Severity | None = None
-    """Severity; if None, CRITICAL for RETRACT and more severe actions in the air, else WARNING."""
+    """Severity of the event; None means CRITICAL for RETRACT and more severe actions in the air, else WARNING."""
     pilot_flies: bool = False
-    """Whether a pilot has the vehicle from this event on: with AUTOPILOT_LAND the companion sends PX4 no command and only
-    monitors the landing."""
+    """Whether a pilot has control after this event: with AUTOPILOT_LAND the companion sends PX4 no command and only monitors the
+    landing.
+    """
     repeat: Repeat = Repeat.AFTER_QUIET
     while_waiting: bool = False
-    """Evaluated also while inputs are still missing on the ground."""
+    """Whether the rule is also evaluated while inputs are still missing on the ground."""
 
     def verdict(self, airborne: bool) -> tuple[SafetyAction, Severity]:
-        """Return action and severity of the event; NOMINAL where the rule is not evaluated."""
+        """Return action and severity of the event; the action is NOMINAL if the rule is not evaluated."""
         action = (self.air if airborne else self.ground) or SafetyAction.NOMINAL
         if self.severity is not None:
             return action, self.severity

@@ -1,7 +1,7 @@
 """The event table: every rule of the monitors, one row each.
 
-The loop in `companion.safety.evaluation` executes the rows, `tools.docs.safety` prints them into docs/safety.md, and the tests walk
-them. Ids are stable: logs, summaries and outside scripts name them. Simultaneous events come in the order of the rows.
+`companion.safety.evaluation` evaluates the rows, `tools.docs.safety` prints them into docs/safety.md, and the tests go through them.
+Ids are stable because logs, summaries and users' scripts contain them. Simultaneous events are in the order of the rows.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ OPERATOR_LAND, OPERATOR_ABORT = "operator_land", "operator_abort"
 
 
 def _invalid(id_: str, field: str, what: str, message: str) -> Rule:
-    """Return the rule for an invalid record, which counts as not received; another rule covers its loss."""
+    """Return the rule for an invalid record, which counts as not received; a separate rule covers its loss."""
     return Rule(
         id=id_, subject=Subject.INPUTS, what=what, predicate=invalid(field), ground=_WARN, air=_WARN, message=message,
         while_waiting=True,
@@ -33,7 +33,7 @@ def _invalid(id_: str, field: str, what: str, message: str) -> Rule:
 def _operator(
     command: OperatorCommand, what: str, ground: SafetyAction | None, air: SafetyAction, message: str
 ) -> Rule:
-    """Return the rule for an operator's command; a command that lasts several ticks counts once."""
+    """Return the rule for an operator's command; a command that lasts for several ticks counts once."""
     return Rule(
         id=f"operator_{command.value}", subject=Subject.OPERATOR, what=what, predicate=commanded(command), ground=ground,
         air=air, message=message, severity=Severity.INFO, repeat=Repeat.AT_ONCE, while_waiting=True,
@@ -43,23 +43,23 @@ def _operator(
 RULES: tuple[Rule, ...] = (
     _invalid(
         "vehicle_not_finite", "vehicle", "PX4's state with a value that is not finite or out of range, or an invalid attitude",
-        "PX4's state is invalid and ignored: {}",
+        "PX4's state is invalid and is ignored: {}",
     ),
     _invalid(
         "mocap_not_finite", "mocap", "a pose with a value that is not finite or out of range, or an invalid attitude",
-        "the motion-capture pose is invalid and ignored: {}",
+        "the motion-capture pose is invalid and is ignored: {}",
     ),
     _invalid(
         "arm_not_finite", "arm", "a joint state with a value that is not finite or out of range",
-        "the joint state is invalid and ignored: {}",
+        "the joint state is invalid and is ignored: {}",
     ),
     _invalid(
         "force_not_finite", "force", "a force sample with a value that is not finite or out of range",
-        "the force sample is invalid and ignored: {}",
+        "the force sample is invalid and is ignored: {}",
     ),
     _invalid(
         "status_not_finite", "status", "PX4's status with a value that is not finite or out of range",
-        "PX4's status is invalid and ignored: {}",
+        "PX4's status is invalid and is ignored: {}",
     ),
 
     _operator(OperatorCommand.HOLD, "HOLD was commanded", None, _HOLD, "hold commanded"),
@@ -73,7 +73,7 @@ RULES: tuple[Rule, ...] = (
 
     Rule(
         id=REATTACHED, subject=Subject.PX4,
-        what="PX4 was armed without a request of the companion: the companion was started in the air, or a pilot armed",
+        what="PX4 was armed without a request from the companion: the companion was started in the air, or a pilot armed it",
         predicate=px4.reattached, ground=_LAND, air=_PX4_LANDS, message="{}", severity=Severity.CRITICAL,
         repeat=Repeat.NEVER, while_waiting=True,
     ),
@@ -89,14 +89,14 @@ RULES: tuple[Rule, ...] = (
         message="motion capture has not tracked the body for more than {:.2f} s",
     ),
     Rule(
-        id=MOCAP_SWAPPED, subject=Subject.MOCAP, what="poses jumped and stay there: another body, or a shifted one",
+        id=MOCAP_SWAPPED, subject=Subject.MOCAP, what="the pose jumped and stayed there: another body, or this one has shifted",
         predicate=mocap.mocap_swapped, thresholds=("mocap_timeout_s",), tracked_by=("mocap_jump_m", "mocap_jump_deg"),
         ground=_PX4_LANDS, air=_PX4_LANDS,
-        message="motion capture jumped by {:.2f} m and {:.0f} deg and stays there: another body?",
+        message="motion capture jumped by {:.2f} m and {:.0f} deg and stayed there: another body, or this one has shifted",
     ),
     Rule(
         id="mocap_jump", subject=Subject.MOCAP,
-        what="a pose further off than PX4's velocity and rates explain; it is ignored",
+        what="a pose further from the previous one than PX4's velocity and rates explain; it is ignored",
         predicate=mocap.mocap_jump, thresholds=("mocap_timeout_s",), tracked_by=("mocap_jump_m", "mocap_jump_deg"),
         ground=_WARN, air=_WARN, message="motion capture jumped by {:.2f} m and {:.0f} deg; the pose is ignored",
     ),
@@ -108,7 +108,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         id=MOCAP_DRAGGED, subject=Subject.MOCAP,
-        what="poses do not move as the IMU measures: an attacker shifts them, or the calibration drifts",
+        what="poses do not move as the IMU measures: an attacker is shifting them, or the calibration is drifting",
         predicate=mocap.mocap_dragged, thresholds=("mocap_inertial_m",), tracked_by=("mocap_inertial_s",), ground=None,
         air=_PX4_LANDS, repeat=Repeat.NEVER,
         message="motion capture does not move as the IMU measures: {:.0f} mm off (limit {:.0f} mm); PX4 lands without it",
@@ -150,7 +150,7 @@ RULES: tuple[Rule, ...] = (
         message="PX4 restarted: its clock went back to {:.1f} s",
     ),
     Rule(
-        id="link_late", subject=Subject.PX4, what="PX4's state is delayed: its lag, by PX4's clock, exceeds the smallest lag seen",
+        id="link_late", subject=Subject.PX4, what="PX4's state is delayed: its lag on PX4's clock exceeds the smallest lag seen",
         predicate=px4.link_late, thresholds=("link_lag_max_s",), hold_time=0.15, ground=_PX4_LANDS, air=_PX4_LANDS,
         message="messages from PX4 are {:.0f} ms late (limit {:.0f} ms)",
     ),
@@ -160,7 +160,7 @@ RULES: tuple[Rule, ...] = (
         message="PX4 repeats the same position and velocity although the vehicle moves",
     ),
     Rule(
-        id="vehicle_state_lost", subject=Subject.PX4, what="position, attitude or IMU sample from PX4 stale",
+        id="vehicle_state_lost", subject=Subject.PX4, what="PX4's position, attitude or IMU sample is stale",
         predicate=px4.vehicle_state_lost, thresholds=("vehicle_timeout_s",), ground=_PX4_LANDS, air=_PX4_LANDS,
         message="no position, attitude or IMU sample from PX4 for more than {:.2f} s",
     ),
@@ -171,12 +171,12 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         id=PILOT_TOOK_OVER, subject=Subject.PX4,
-        what="PX4 left OFFBOARD for a mode that only a pilot chooses (manual, hold, return or take-off), and not by its failsafe",
+        what="PX4 left OFFBOARD for a mode that only a pilot chooses (manual, hold, return or take-off), without a failsafe",
         predicate=px4.pilot_took_over, ground=_PX4_LANDS, air=_PX4_LANDS, pilot_flies=True,
         message="PX4 left OFFBOARD for {}{}",
     ),
     Rule(
-        id="offboard_left", subject=Subject.PX4, what="PX4 left OFFBOARD for another mode (its own failsafe)",
+        id="offboard_left", subject=Subject.PX4, what="PX4 left OFFBOARD for any other mode (its own failsafe)",
         predicate=px4.offboard_left, ground=_PX4_LANDS, air=_PX4_LANDS, message="PX4 left OFFBOARD for {}{}",
     ),
     Rule(
@@ -205,7 +205,7 @@ RULES: tuple[Rule, ...] = (
         message="no joint state from the arm for more than {:.2f} s",
     ),
     Rule(
-        id="arm_read_failures", subject=Subject.ARM, what="consecutive bus cycles without an answer",
+        id="arm_read_failures", subject=Subject.ARM, what="several bus cycles in a row without an answer",
         predicate=arm.arm_read_failures, thresholds=("arm_read_failures_max",), ground=_WARN, air=_WARN,
         message="{} bus cycles without an answer",
     ),
@@ -257,7 +257,7 @@ RULES: tuple[Rule, ...] = (
     Rule(
         id="force_lost", subject=Subject.FORCE, what="force sample stale", predicate=arm.force_lost,
         thresholds=("force_timeout_s",), ground=_LAND, air=_WARN,
-        message="no force sample for more than {:.2f} s; the law flies without it",
+        message="no force sample for more than {:.2f} s; the controller flies without it",
     ),
     Rule(
         id="force_overload", subject=Subject.FORCE, what="the sensor reports an overload, or a force beyond its range",
@@ -267,7 +267,7 @@ RULES: tuple[Rule, ...] = (
     Rule(
         id="force_stuck", subject=Subject.FORCE, what="samples repeat the same values although the vehicle moves; they count as lost",
         predicate=arm.force_stuck, tracked_by=("force_stuck_s",), ground=None, air=_WARN,
-        message="the force sensor repeats the same values although the vehicle moves; the law flies without it",
+        message="the force sensor repeats the same values although the vehicle moves; the controller flies without it",
     ),
     Rule(
         id="force_drift", subject=Subject.FORCE, what="a lasting force on an empty net",
@@ -300,7 +300,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         id=CRASHED, subject=Subject.FLIGHT,
-        what="tilted by more than 70 deg, by PX4 and by motion capture (or by the accelerometer without a fresh pose)",
+        what="tilted by more than 70 deg according to PX4 and to motion capture (without a fresh pose, to the accelerometer)",
         predicate=flight.crashed, hold_time=0.3, ground=None, air=_TERMINATE, repeat=Repeat.NEVER,
         message="flipped: tilt {:.0f} deg, confirmed by a second source",
     ),
@@ -359,12 +359,12 @@ RULES: tuple[Rule, ...] = (
     Rule(
         id="tether_taut", subject=Subject.TETHER, what="the tether pulls, or no slack is left", predicate=flight.tether_taut,
         tracked_by=("tether.taut_slack_m", "tether.pull_min_n"), hold_time=0.05, ground=None, air=_RETRACT,
-        message="the tether is taut: {:.2f} m left, pull {:.0f} N",
+        message="the tether is taut: {:.2f} m left, tension {:.0f} N",
     ),
     Rule(
         id="tether_snagged", subject=Subject.TETHER, what="the tether pulls although there is slack",
         predicate=flight.tether_snagged, tracked_by=("tether.pull_min_n",), hold_time=0.1, ground=None, air=_LAND,
-        message="the tether pulls with {:.0f} N although {:.2f} m are left: it is snagged",
+        message="the tether pulls with {:.0f} N although {:.2f} m are left: the tether is snagged",
     ),
     Rule(
         id="tether_near", subject=Subject.TETHER, what="the tether is close to rotors or arm",

@@ -1,4 +1,4 @@
-"""Context of the trackers in addition to the inputs: activity of the core, and age of an input."""
+"""What the trackers need in addition to the inputs: the activity of the core, and the age of an input."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from companion.model.types import ControlLog, TetherState
 
 Values = tuple[object, ...]
-"""Values for the braces of the rule's message, returned by a predicate whose condition holds."""
+"""Values for a rule's message, returned by a predicate whose condition holds."""
 HOLDS: Values = ()
-"""The condition holds, and the message has no braces."""
+"""The condition holds, and the message contains no values."""
 
 
 @dataclass(slots=True)
@@ -24,12 +24,12 @@ class Situation:
     tracking_error_m: float | None
     """Distance from the reference; None while no plan is flown."""
     control: ControlLog | None = None
-    """Log record of the control law in the last tick; None while it does not fly."""
+    """Log record of the control law in the last tick; None while the law is not active."""
     caught: bool = False
     """A payload is on board."""
     tether: TetherState | None = None
     found_armed: str | None = None
-    """Description of a PX4 that is armed without a request of the companion; `airborne` then shows whether it flies."""
+    """Event text if PX4 was armed without a request from the companion; `airborne` then shows whether it flies."""
     waiting: bool = False
     """Inputs are still missing on the ground: only rules with `while_waiting` are evaluated."""
 
@@ -37,8 +37,8 @@ class Situation:
 class Age:
     """Age of an input, counted only while this process was awake.
 
-    When the process itself is delayed, all inputs appear stale although nothing was lost: what arrived meanwhile is read a moment
-    later. The rules `loop_late` and `loop_stalled` report the delay.
+    When the process itself is delayed, all inputs appear stale although nothing was lost: what arrived during the delay is read a
+    moment later. The rules `loop_late` and `loop_stalled` report the delay.
     """
 
     __slots__ = ("_seen_awake_s", "_stamp_s")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 
 STEPS_BACK_MAX = 2
-"""A server that restarts begins its numbers again: one step back, and another with a second restart."""
+"""A server that restarts begins its numbers again: one step back, and another one at a second restart."""
 WINDOW_S = 1.0
 REORDERED_MAX = 8
-"""A network may deliver a frame this many numbers behind the newest one."""
+"""A network may deliver a frame up to this many numbers behind the newest one."""
 _MASK = 0xFFFFFFFF
 _HALF = 0x80000000
 
@@ -17,8 +17,8 @@ class StreamWatch:
     """Counts frames whose number (uint32, so it wraps) steps back.
 
     A frame that the network reordered or duplicated does not count as a step back: it is at most REORDERED_MAX behind the newest one,
-    and its number was skipped before, or came with the same content. A second stream with numbers close to those of the first repeats
-    them with another content.
+    and its number was skipped before or was received with the same content. A second stream with numbers close to those of the first
+    repeats them with different content.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,7 @@
-"""The safety ladder: one pure update, latched.
+"""The safety ladder: a pure, latched state machine.
 
 NOMINAL -> WARN -> HOLD -> RETRACT -> LAND -> AUTOPILOT_LAND -> TERMINATE. An event carries the action that it requests; the ladder
-takes the most severe one. By itself it only escalates: a HOLD or RETRACT that exceeds its time limit becomes a LAND. Only the operator
+adopts the most severe one. By itself it only escalates: a HOLD or RETRACT that exceeds its time limit becomes a LAND. Only the operator
 de-escalates: `operator_resume` ends a HOLD and no other state, and only if no active rule requires a HOLD or more.
 """
 
@@ -18,7 +18,7 @@ from companion.safety.rules import OPERATOR_RESUME
 
 @dataclass(frozen=True, slots=True)
 class LadderTimes:
-    """How long a HOLD and a RETRACT may last, s."""
+    """Maximum durations of a HOLD and of a RETRACT, s."""
 
     hold_max_s: float
     retract_max_s: float
@@ -42,14 +42,14 @@ class SupervisorState:
 def update(
     state: SupervisorState, events: Iterable[Event], t_s: float, times: LadderTimes, standing: str | None = None
 ) -> SupervisorState:
-    """Return the ladder after the events of a tick; the same object if nothing changes.
+    """Return the ladder's state after the events of a tick; the same object if nothing changes.
 
     Args:
         state: state before the tick.
         events: events of this tick.
         t_s: flight clock.
-        times: max duration of a HOLD and of a RETRACT.
-        standing: message of the active rule that requires a HOLD; None if there is none, so that the operator may end a HOLD.
+        times: maximum durations of a HOLD and of a RETRACT. standing: message of the active rule that requires a HOLD or more; the
+        operator may end a HOLD only if it is None.
     """
     held = state.action is SafetyAction.HOLD  # a RESUME does not end a HOLD that begins in the same tick
     for event in events:

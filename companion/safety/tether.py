@@ -1,4 +1,4 @@
-"""The safety tether: slack now and at the predicted stop, sag against rotors and arm, winding, pull, separation. Pure.
+"""The safety tether: slack now and at the predicted stop, clearance from rotors and arm, winding, pull, separation. Pure.
 
 The tether is a line between its anchor and an attachment point on the vehicle that can be no longer than `tether.length_m`.
 Unmeasured quantities are bounded: the shape of the line (`companion.safety.tether_shape`) and its pull
@@ -18,7 +18,7 @@ from companion.safety.tether_shape import Clearance, steepest_slope
 
 _TWO_PI = 2.0 * math.pi
 _ABOVE_M = 0.05
-"""Distance to a vertical below which the direction to it is undefined and the winding is held."""
+"""Distance to a vertical below which the direction to it is undefined and the winding stays unchanged."""
 _DT_MAX_S = 0.05
 """Longest time step of the filters; a longer gap between two updates counts as this."""
 
@@ -45,7 +45,7 @@ def allowed_m(tether: Tether) -> float:
 
 
 class Winding:
-    """Turns of a direction, counted from the first one."""
+    """Counts the turns of a direction from the first one."""
 
     __slots__ = ("_last_rad", "turns")
 
@@ -54,7 +54,7 @@ class Winding:
         self.turns = 0.0
 
     def update(self, x: float, y: float) -> float:
-        """Take the direction (x, y), m, and return the turns. A vector shorter than `_ABOVE_M` changes nothing."""
+        """Update with the direction (x, y), m, and return the turns. A vector shorter than `_ABOVE_M` changes nothing."""
         if x * x + y * y < _ABOVE_M * _ABOVE_M:
             return self.turns
         angle = math.atan2(y, x)
@@ -96,7 +96,7 @@ class TetherWatch:
 
     @property
     def windings(self) -> tuple[float, float]:
-        """Turns of the vehicle about the anchor's vertical, and of the tether about the vehicle."""
+        """Return the turns of the vehicle about the anchor's vertical, and those of the tether about the vehicle."""
         return self._about_anchor.turns, self._about_vehicle.turns
 
     def update(
@@ -116,9 +116,9 @@ class TetherWatch:
             position_world_m: position of the body's origin.
             velocity_world_m_s: velocity of the body's origin.
             attitude_wxyz: rotation from body to world.
-            arm_rad: joint angles as in the paper; None if unknown: the arm is assumed anywhere within its reach.
+            arm_rad: joint angles as in the paper; if None, the arm is assumed to be anywhere within its reach.
             disturbance_world_n: force on the vehicle other than rotor thrust and gravity, N; None if unknown or on the ground.
-            tool_force_world_n: the part of this force that acts on the net, tared, N; None if unknown.
+            tool_force_world_n: the part of this force that acts on the net, with the bias removed, N; None if unknown.
         """
         dt_s = 0.0
         if self._last_t_s is not None:

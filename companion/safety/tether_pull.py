@@ -1,6 +1,6 @@
 """Pull of the tether, estimated from the residual force on the vehicle.
 
-The residual is the disturbance of the whole machine less the force at the net: a caught payload is in both and cancels. The rest is
+The residual is the disturbance of the whole vehicle minus the force at the net: a caught payload is in both and cancels. The rest is
 wind, errors of the thrust model, and the tether. Errors of the thrust lie along the rotors' axis, nearly vertical, so the vertical part
 of the residual has less weight than the horizontal: the pull is the weighted least-squares fit of a force along the line. For the same
 reason a payload is not mistaken for the tether when the force sensor is lost: it pulls down only, and a pull along the line has a
@@ -19,16 +19,16 @@ HORIZONTAL_N = 0.7
 VERTICAL_N = 2.0
 """Standard deviation of the vertical residual: 7 % of the hover thrust."""
 CERTAIN = 3.0
-"""Number of standard deviations of the fit from which on a pull counts."""
+"""Number of standard deviations of the fit at which a pull counts."""
 RELEASE = 0.6
-"""A pull ends when it falls below this share of its threshold."""
+"""A pull ends when it falls below this fraction of its threshold."""
 SIDEWAYS_N = 6.0
 """A horizontal residual of this size in any direction means that something other than the anchor holds the vehicle."""
 _FLAT, _STEEP = 1.0 / HORIZONTAL_N**2, 1.0 / VERTICAL_N**2
 """Weights of the fit."""
 GROWTH_S = 0.3
 GROWTH_N_PER_M = 10.0
-"""Slope of the pull over the range from which on the line counts as tightening."""
+"""Slope of the pull over the range at which the line counts as tightening."""
 GROWTH_SPREAD_M2 = 1e-6
 """Below this variance of the range no slope can be estimated."""
 

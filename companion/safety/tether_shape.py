@@ -1,9 +1,9 @@
 """Clearance between the hanging tether and rotors and arm.
 
-A line that hangs still lies in the vertical plane through its two ends, below their chord, and above its own tangent at the vehicle:
-a hanging line is convex. So it is bounded by two rays from the attachment, the chord and the steepest tangent that its slack allows;
-its shape beyond a metre from the vehicle is irrelevant for rotors and arm. The tangent is that of the parabola of the same length,
-which for much slack goes straight down, as the line does. `clearance_min_m` covers wind and rotor wash on the line.
+A line that hangs still lies in the vertical plane through its two ends, below their chord, and above its own tangent at the vehicle: a
+hanging line is convex. It is therefore bounded by two rays from the attachment, the chord and the steepest tangent that its slack
+allows; its shape beyond a metre from the vehicle is irrelevant for rotors and arm. The tangent is that of the parabola of the same
+length, which for much slack goes straight down, as the line does. `clearance_min_m` covers wind and rotor wash on the line.
 """
 
 from __future__ import annotations
@@ -14,20 +14,19 @@ from companion.config.vehicle import Vehicle
 from companion.model.types import Vec2, Vec3
 
 _NEVER = 1.0
-"""Length, m, to which a line is followed that does not leave the disk."""
+"""Length, m, to which a line that does not leave the disk is followed."""
 
 
 def steepest_slope(level_m: float, drop_m: float, chord_m: float, slack_m: float) -> Vec2:
     """Return the unit direction (towards the anchor's vertical, up) of the hanging line at the vehicle.
 
-    A parabola over the horizontal span h with the sag s has the length c + 8/3 s^2 h^2 / c^3 (c the chord, flat enough), so
-    s = sqrt(3/8 slack c^3) / h, and the slope at its end is that of the chord less 4 s / h.
+    A parabola over the horizontal span h with the sag s has the length c + 8/3 s^2 h^2 / c^3 (c the chord, flat enough), so s =
+    sqrt(3/8 slack c^3) / h, and the slope at its end is that of the chord minus 4 s / h.
 
     Args:
         level_m: horizontal distance to the anchor, h.
         drop_m: height of the anchor above the attachment (negative: below).
-        chord_m: straight distance, c.
-        slack_m: length less chord, not negative.
+        chord_m: straight distance, c. slack_m: length minus chord, not negative.
     """
     along = level_m * level_m
     up = drop_m * level_m - 4.0 * chord_m * math.sqrt(0.375 * slack_m * chord_m)
@@ -36,7 +35,7 @@ def steepest_slope(level_m: float, drop_m: float, chord_m: float, slack_m: float
 
 
 class Clearance:
-    """Rotors as a ring in the plane through the body's origin, the arm as a slab about its plane.
+    """Models the rotors as a ring in the plane through the body's origin and the arm as a slab about its plane.
 
     Args:
         vehicle: airframe, arm, tool, and the tether's attachment.
@@ -60,14 +59,14 @@ class Clearance:
         """False if `least_m` does not use the hanging direction."""
 
     def least_m(self, straight_body: Vec3, hanging_body: Vec3 | None, arm_rad: Vec2 | None) -> float:
-        """Return the least distance, m, negative if the line touches.
+        """Return the smallest distance, m; negative if the line touches.
 
         Args:
             straight_body: unit direction from the attachment to the anchor.
-            hanging_body: unit direction in which the line leaves when it hangs deepest; None if it is straight.
-            arm_rad: the paper's angles; None if unknown: the arm is assumed anywhere within its reach.
+            hanging_body: unit direction in which the line leaves when it hangs deepest; None if it is straight. arm_rad: the paper's
+            angles; if None, the arm is assumed to be anywhere within its reach.
         """
-        # Tied below the rotors the line comes nearest when it is straight, tied above them when it hangs deepest.
+        # A line tied below the rotors comes nearest when it is straight, one tied above them when it hangs deepest.
         nearest = straight_body if self._below or hanging_body is None else hanging_body
         least = self._rotors_m(nearest)
         if self.judges_arm:

@@ -1,9 +1,9 @@
-"""Touchdown detection: two of three independent sources must agree that the vehicle stands. Pure; time is an argument.
+"""Touchdown detection: two of three independent sources must agree that the vehicle is on the ground. Pure; time is an argument.
 
-* **Height**: PX4's estimate is near standing height and does not sink, although the reference is below it.
-* **Thrust**: much less than hover thrust is commanded, and motion capture sees no sinking: the floor carries the vehicle.
-* **PX4**: its land detector (EXTENDED_SYS_STATE). In attitude control it waits for almost zero thrust, which no control law gives by
-  itself. So when one of the other sources is alone, thrust is reduced gradually (`relief`) as long as the vehicle does not sink.
+* **Height**: PX4's estimate is near standing height and does not sink, although the reference is below it. * **Thrust**: the command is
+much less than hover thrust, and motion capture sees no descent: the floor carries the vehicle. * **PX4**: its land detector
+(EXTENDED_SYS_STATE). In attitude control it waits for almost zero thrust, which no control law commands by itself. When one of the
+other sources is alone, thrust is therefore reduced gradually (`relief`) as long as the vehicle does not sink.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from dataclasses import dataclass, field, replace
 from companion.model.types import MocapPose, VehicleState
 
 HEIGHT_MARGIN_M = 0.12
-"""Margin over standing height below which the height counts as standing."""
+"""Margin over standing height below which the vehicle may be on the ground."""
 STILL_M_S = 0.08
 REFERENCE_BELOW_M = 0.05
 HEIGHT_HOLD_S = 0.35
 THRUST_SHARE = 0.75
-"""Share of hover thrust at which a vehicle in the air falls 0.2 m within 0.4 s."""
+"""Fraction of hover thrust at which a vehicle in the air falls 0.2 m within 0.4 s."""
 THRUST_HOLD_S = 0.2
 NEVER_ABOVE_M = 0.5
-"""Margin over standing height. Above it, by motion capture, thrust and PX4 are no evidence: the tether may carry the vehicle."""
+"""Margin over standing height. If motion capture is above it, thrust and PX4 are not evidence: the tether may carry the vehicle."""
 ALONE_S = 0.4
 """Time for which one source may be alone before thrust is reduced."""
 RELIEF_S = 1.0
@@ -34,12 +34,12 @@ MOCAP_FRESH_S = 0.3
 
 @dataclass(frozen=True, slots=True)
 class HeightEvidence:
-    """Evidence by PX4's estimate: low and still for `HEIGHT_HOLD_S`."""
+    """Evidence from PX4's estimate: the vehicle has been low and still for `HEIGHT_HOLD_S`."""
 
     low_m: float
-    """Height below which the vehicle may stand, from `low_below_m`."""
+    """Height below which the vehicle may be on the ground, from `low_below_m`."""
     since_s: float | None = None
-    """Flight time since when it has been low and still."""
+    """Time on the flight clock since when it has been low and still."""
 
     def update(self, t_s: float, height_m: float, vertical_m_s: float, reference_height_m: float) -> HeightEvidence:
         """Return the evidence after one more tick."""
@@ -49,18 +49,18 @@ class HeightEvidence:
         return replace(self, since_s=t_s) if self.since_s is None else self
 
     def stands(self, t_s: float) -> bool:
-        """Return whether the vehicle stands by this evidence."""
+        """Return whether this evidence shows that the vehicle is on the ground."""
         return self.since_s is not None and t_s - self.since_s >= HEIGHT_HOLD_S
 
 
 def low_below_m(clearance_m: float) -> float:
-    """Return the height below which a vehicle may stand; `clearance_m` is that of its origin when it stands."""
+    """Return the height below which a vehicle may be on the ground; `clearance_m` is that of its origin when it is."""
     return clearance_m + HEIGHT_MARGIN_M
 
 
 @dataclass(frozen=True, slots=True)
 class Sinking:
-    """Descent speed by motion capture alone, measured over `SINK_WINDOW_S`."""
+    """Measures the descent speed from motion capture alone, over `SINK_WINDOW_S`."""
 
     seen: tuple[tuple[float, float], ...] = ()
     """Stamp and height of the poses, s and m."""
@@ -79,7 +79,7 @@ class Sinking:
 
     @property
     def speed_m_s(self) -> float | None:
-        """Descent speed, positive downward; None if the poses do not span enough time."""
+        """Return the descent speed, positive downward, or None if the poses do not span enough time."""
         if not self.seen:
             return None
         (first_s, first_m), (last_s, last_m) = self.seen[0], self.seen[-1]
@@ -91,20 +91,20 @@ class Touchdown:
     """Evidence of touchdown from three sources, of which two must agree, in a landing that the companion flies itself."""
 
     ceiling_m: float
-    """Height by motion capture above which thrust and PX4 are no evidence."""
+    """Height from motion capture above which thrust and PX4 are not evidence."""
     height: HeightEvidence
     sinking: Sinking = field(default_factory=Sinking)
     thrust_since_s: float | None = None
     alone_since_s: float | None = None
     last_s: float | None = None
     relief: float = 1.0
-    """Share of its thrust that the law may command."""
+    """Fraction of its thrust that the controller may command."""
     certain: bool = False
     """Whether touchdown is certain."""
 
     @classmethod
     def begin(cls, clearance_m: float) -> Touchdown:
-        """Return the evidence before a landing; `clearance_m` is the height of the body's origin when the vehicle stands."""
+        """Return the evidence before a landing; `clearance_m` is the height of the body's origin when the vehicle is on the ground."""
         return cls(clearance_m + NEVER_ABOVE_M, HeightEvidence(low_below_m(clearance_m)))
 
     def update(
@@ -123,7 +123,7 @@ class Touchdown:
             vehicle: PX4's state.
             pose: motion-capture pose, None if it is not trusted.
             reference_height_m: height of the body's origin in the reference.
-            thrust_share: share of hover thrust in the last command.
+            thrust_share: the last thrust command divided by hover thrust.
             landed: whether PX4's land detector reports a landing.
         """
         dt_s = 0.0 if self.last_s is None else t_s - self.last_s
@@ -144,7 +144,7 @@ class Touchdown:
         return after._relieved(t_s, dt_s, sink_m_s, (low or carried) and below)
 
     def _relieved(self, t_s: float, dt_s: float, sink_m_s: float | None, seems_to_stand: bool) -> Touchdown:
-        """Reduce thrust while only one source shows that the vehicle stands; restore it at once when the vehicle sinks."""
+        """Reduce thrust while only one source shows that the vehicle is on the ground; restore it at once when the vehicle sinks."""
         if not seems_to_stand or sink_m_s is None or sink_m_s > RELIEF_SINK_MAX_M_S:
             return replace(self, relief=1.0, alone_since_s=None)
         since_s = t_s if self.alone_since_s is None else self.alone_since_s

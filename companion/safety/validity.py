@@ -1,4 +1,6 @@
-"""Records with a value that is not finite or out of range: they count as not received, and the rules `*_not_finite` report them."""
+"""Removes records with a value that is not finite or out of range: they count as not received, and the rules `*_not_finite` report
+them.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from companion.model.types import ArmState, AutopilotStatus, ForceSample, Inputs
 from companion.safety.situation import Values
 
 OUT_OF_RANGE = 1.0e4
-"""No quantity of the inputs is this large in its unit."""
+"""Largest permitted value; no valid quantity reaches it, in whatever unit."""
 _STAMP_MAX_S = 1.0e9
 
 
@@ -61,7 +63,7 @@ class InputFilter:
 
 
 def invalid(field: str) -> Callable[[InputFilter, None], Values | None]:
-    """Return the predicate: this field of the inputs was invalid."""
+    """Return the predicate that holds if this field of the inputs was invalid."""
 
     def predicate(f: InputFilter, _: None) -> Values | None:
         return (f.invalid[field],) if field in f.invalid else None
@@ -111,7 +113,7 @@ def _mocap_is_valid(m: MocapPose) -> bool:
         _stamp(m.stamp_s)
         and (m.latency_s is None or _stamp(m.latency_s))
         and (m.exposure_server_s is None or _stamp(m.exposure_server_s))
-        # Motive may send any values for an untracked body; the pose is not used then.
+        # Motive may send any values for an untracked body; its pose is not used.
         and (not m.tracking_valid or (_in_range3(m.position_world_m) and _is_rotation(m.attitude_wxyz)))
     )
 

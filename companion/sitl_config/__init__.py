@@ -1,1 +1,1 @@
-"""Configuration of the simulated world: for the commands, the launcher, the campaigns and sitl, never for a flight."""
+"""Configuration of the simulated world, for the commands, the launcher, the campaigns and sitl; a flight never reads it."""

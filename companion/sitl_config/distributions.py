@@ -1,4 +1,6 @@
-"""Differences between laboratories, drawn by the seed: numbers of a world file that are distributions, and signs of the model error."""
+"""Differences between laboratories, drawn by the seed: numbers that a world file gives as distributions, and the signs of the model
+error.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,7 @@ _FAULTLESS = Machine(
     link_length_error_m=(0.0, 0.0),
     link_com_error_m=(0.0, 0.0),
 )
-"""The machine as the vehicle file describes it."""
+"""The vehicle exactly as the vehicle file describes it."""
 NORMAL_ENDS = 3.0
 """A normal distribution is truncated at this many standard deviations."""
 DISTRIBUTIONS = ("uniform", "normal")
@@ -37,14 +39,14 @@ _EXPECTED = "expected a number, {uniform: [low, high]} or {normal: [mean, sigma]
 
 
 class Uniform(Model):
-    """A number that is drawn uniformly between two ends."""
+    """A number drawn uniformly from an interval."""
 
     uniform: Vector2
     """[low, high], low < high."""
 
 
 class Normal(Model):
-    """A number that is drawn from a normal distribution, truncated at 3 sigma."""
+    """A number drawn from a normal distribution, truncated at 3 sigma."""
 
     normal: Vector2
     """[mean, sigma], sigma > 0."""
@@ -71,7 +73,7 @@ class Range(Model):
         return (mean - NORMAL_ENDS * sigma, mean + NORMAL_ENDS * sigma)
 
     def sample(self, seed: int) -> float:
-        """Draw the number, with six digits; it depends on the seed and the key only."""
+        """Draw the number, with six digits; it depends only on the seed and the key."""
         rng = _generator(seed, self.key)
         low, high = self.ends
         if isinstance(self.distribution, Uniform):
@@ -85,10 +87,10 @@ class Range(Model):
 
 
 class Laboratory(Model):
-    """The file of a world and the numbers that the seed draws."""
+    """A world file and the numbers in it that the seed draws."""
 
     name: str = "ideal"
-    """Built-in world, or file as given by the user."""
+    """Name of a built-in world, or path of a file as given by the user."""
     ranges: tuple[Range, ...] = ()
 
     def drawn(self, world: World) -> dict[str, Any]:
@@ -102,7 +104,7 @@ class Laboratory(Model):
 
 
 def _generator(seed: int, key: str) -> np.random.Generator:
-    import numpy as np  # takes a tenth of a second, and a command in the ideal world draws nothing
+    import numpy as np  # the import takes a tenth of a second, and a command in the ideal world draws nothing
 
     return np.random.default_rng((seed, zlib.crc32(key.encode())))
 
@@ -113,7 +115,7 @@ def draw(data: dict[str, Any], ranges: Sequence[Range], seed: int) -> dict[str, 
     The same seed gives the same laboratory; adding or removing a range changes no other sample.
 
     Args:
-        data: plain data of a world. A range at a missing location (a section that is null, a shorter list) is left out.
+        data: plain data of a world. A range at a missing location (a section that is null, a shorter list) is ignored.
         ranges: ranges to draw.
         seed: seed of the world.
     """
@@ -150,7 +152,7 @@ def with_model_error(world: World) -> World:
 def take_ranges(document: Document) -> tuple[Range, ...]:
     """Return the distributions in a document of a world; invalid ones are appended to the document's problems.
 
-    An invalid one leaves an acceptable number in its place, so that it is reported once.
+    A valid number replaces an invalid one, so that it is reported only once.
     """
     found: list[Range] = []
     for at, node, value in list(values(schema_of(World), document.data)):
@@ -165,7 +167,7 @@ def take_ranges(document: Document) -> tuple[Range, ...]:
 
 
 def check_world(document: Document, ranges: Sequence[Range], seed: int) -> World:
-    """Draw and validate a world. Both ends of every range must be valid, so that the seed does not decide whether a file is refused.
+    """Draw and validate a world. Both ends of every range must be valid, so that the seed does not decide whether a file is rejected.
 
     Raises:
         ConfigError: one message per problem.

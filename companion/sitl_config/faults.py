@@ -1,7 +1,7 @@
 """Faults of the simulated world: their kinds, the meaning of their size, and one injected fault.
 
-One table: the world injects from it, `companion faults --list` prints it, docs/faults.md shows it.
-The effect of a kind is in `sitl.faults`; `companion.campaigns.faults.variants` lists what a campaign flies.
+The world, `companion faults --list` and docs/faults.md use the same table. `sitl.faults` implements the effect of each kind;
+`companion.campaigns.faults.variants` lists what a campaign flies.
 """
 
 from __future__ import annotations
@@ -72,11 +72,11 @@ class Kind:
     default: float | None = None
     """Default of the size."""
     named_by: tuple[str, ...] = ()
-    """Events that name the fault or its consequence."""
+    """Events that report the fault or its consequence."""
     phases: tuple[FlightPhase, ...] = IN_FLIGHT
     """Phases in which a campaign injects it."""
     process: bool = False
-    """Whether the fault is in a process of the companion and not in the world."""
+    """Whether the fault is in a process of the companion instead of the world."""
 
 
 _MOCAP_GONE = ("mocap_lost", "mocap_invalid", "mocap_too_late")
@@ -94,7 +94,7 @@ _WEAK = ("thrust_saturated", "tracking_warn", "tracking_hold", "tracking_error",
 _GUARDIAN = ("guardian_took_over",)
 
 KINDS: dict[FaultKind, Kind] = {
-    "mocap_loss": Kind("no frame leaves the motion-capture machine", named_by=_MOCAP_GONE),
+    "mocap_loss": Kind("no frame leaves the motion-capture computer", named_by=_MOCAP_GONE),
     "mocap_occluded": Kind("frames arrive, but the body is not tracked", named_by=_MOCAP_GONE),
     "mocap_jump": Kind(what="poses are shifted sideways", size="shift", unit="m", default=0.3, named_by=_MOCAP_WRONG),
     "mocap_drag": Kind(
@@ -106,7 +106,7 @@ KINDS: dict[FaultKind, Kind] = {
     ),
     "mocap_swap": Kind(
         what="poses are those of another body on the floor",
-        size="distance to it",
+        size="distance to that body",
         unit="m",
         default=1.0,
         named_by=_MOCAP_WRONG,
@@ -131,7 +131,7 @@ KINDS: dict[FaultKind, Kind] = {
         named_by=("link_late", *_PX4_GONE, *_MOCAP_WRONG, "gate"),
     ),
     "autopilot_reboot": Kind(
-        what="PX4 restarts: rotors off, disarmed, its clock at zero; in the air the vehicle falls",
+        what="PX4 restarts: rotors off, disarmed, clock at zero; in the air the vehicle falls",
         size="time to boot",
         unit="s",
         default=2.0,
@@ -139,7 +139,7 @@ KINDS: dict[FaultKind, Kind] = {
         phases=("ground",),
     ),
     "offboard_refused": Kind(
-        "PX4 refuses OFFBOARD, and leaves it", named_by=("offboard_refused", "offboard_left"), phases=PHASES
+        "PX4 leaves OFFBOARD and refuses to enter it", named_by=("offboard_refused", "offboard_left"), phases=PHASES
     ),
     "arming_refused": Kind("PX4 refuses to arm", named_by=("arming_refused",), phases=("ground",)),
     "servo_loss": Kind("a servo neither receives nor answers", named_by=_ARM_GONE),
@@ -152,14 +152,18 @@ KINDS: dict[FaultKind, Kind] = {
         named_by=("servo_warm", "servo_hot", "servo_error"),
     ),
     "servo_angle": Kind(
-        what="a servo's angle is off: its horn has slipped",
+        what="a servo's angle is wrong: its horn has slipped",
         size="offset",
         unit="deg",
         default=30.0,
         named_by=("joint_jump", "joint_wall", "joint_far_past_wall", "joint_rate", "servo_overload"),
     ),
     "bus_noise": Kind(
-        what="packets on the servo bus are damaged", size="share of them", unit="", default=0.3, named_by=_ARM_GONE
+        what="packets on the servo bus are corrupt",
+        size="fraction of packets",
+        unit="",
+        default=0.3,
+        named_by=_ARM_GONE,
     ),
     "force_loss": Kind("the force sensor stops sending", named_by=("force_lost",)),
     "force_stuck": Kind("the force sensor repeats its last reading", named_by=("force_stuck",)),
@@ -171,7 +175,7 @@ KINDS: dict[FaultKind, Kind] = {
         named_by=("force_drift", "force_overload", "tether_snagged", "tether_taut", "catch"),
     ),
     "motor_weak": Kind(
-        what="a rotor loses thrust", size="share lost", unit="", default=0.15, named_by=(*_WEAK, "crashed")
+        what="a rotor loses thrust", size="fraction lost", unit="", default=0.15, named_by=(*_WEAK, "crashed")
     ),
     "battery_sag": Kind(
         what="the battery's voltage drops, thrust with its square",
@@ -224,7 +228,7 @@ KINDS: dict[FaultKind, Kind] = {
     ),
     "disk_full": Kind("the log cannot be written any more", named_by=("recorder_drops",), process=True),
     "clock_step": Kind(
-        what="the clock of the motion-capture machine steps",
+        what="the clock of the motion-capture computer jumps",
         size="step",
         unit="s",
         default=5.0,
@@ -234,7 +238,7 @@ KINDS: dict[FaultKind, Kind] = {
     "stall_loop": Kind(
         "a blocking call on the event loop", named_by=("loop_late", "loop_stalled", *_GUARDIAN), process=True
     ),
-    "hold_gil": Kind("the interpreter's lock is held permanently", named_by=_GUARDIAN, process=True),
+    "hold_gil": Kind("the interpreter lock (GIL) is held permanently", named_by=_GUARDIAN, process=True),
     "stop_flight": Kind(
         "SIGSTOP to the flight process", named_by=("loop_late", "loop_stalled", *_GUARDIAN), process=True
     ),
@@ -253,7 +257,7 @@ KINDS: dict[FaultKind, Kind] = {
 
 
 class Fault(Model):
-    """One injected fault: start, duration and size. docs/faults.md describes kinds and sizes."""
+    """An injected fault with its start, duration and size. docs/faults.md describes kinds and sizes."""
 
     kind: FaultKind
     t_s: NonNegative | None = None
@@ -261,17 +265,17 @@ class Fault(Model):
     after: Literal["start", "arming", "catch"] = "arming"
     """Event from which `t_s` counts: the world's start, the rotors' arming or the catch."""
     phase: FlightPhase | None = None
-    """Alternative to `t_s`: the middle of this part of the mission, or the time just after the catch."""
+    """Alternative to `t_s`: the fault starts in the middle of this part of the mission, or just after the catch."""
     duration_s: Positive | None = None
     """Duration. If it is absent, the fault is permanent."""
     size: float | None = Field(default=None)
     """Size. If it is absent, the kind's default is used."""
     servo: Literal[1, 2] = 1
-    """Servo of a fault of one servo."""
+    """The servo that fails, for faults of one servo."""
 
     @property
     def magnitude(self) -> float:
-        """Size, or the kind's default; 0 for a kind without a size."""
+        """Return the size, or the kind's default; 0 for a kind without a size."""
         default = KINDS[self.kind].default
         return self.size if self.size is not None else default if default is not None else 0.0
 
@@ -287,7 +291,7 @@ class Fault(Model):
             problems.append((("size",), f"must not be negative, got {self.magnitude:g}"))
         elif kind.unit == "Hz" and self.magnitude == 0.0:
             problems.append((("size",), "must be above 0"))
-        elif kind.size is not None and kind.size.startswith("share") and self.magnitude > 1.0:
-            problems.append((("size",), f"is a share, 0 to 1, got {self.magnitude:g}"))
+        elif kind.size is not None and kind.size.startswith("fraction") and self.magnitude > 1.0:
+            problems.append((("size",), f"is a fraction, 0 to 1, got {self.magnitude:g}"))
         refuse("fault", problems)
         return self

@@ -14,7 +14,7 @@ from companion.sitl_config.distributions import Laboratory, check_world, take_ra
 from companion.sitl_config.world import World
 
 WORLD_DIRECTORY = Path(__file__).parent / "worlds"
-"""Built-in worlds are package data, so that they are found wherever the package is installed."""
+"""Folder of the built-in worlds: package data, so that every installation finds them."""
 WORLDS = tuple(sorted(path.stem for path in WORLD_DIRECTORY.glob("*.yaml")))
 """Names of the built-in worlds."""
 DEFAULT_WORLD = "ideal"
@@ -28,7 +28,7 @@ class SitlConfig(FlightConfig):
 
     world: World = World()
     laboratory: Laboratory = Laboratory()
-    """Source of the world; its ranges are drawn in `world`."""
+    """Source of the world; `world` contains the numbers drawn from its ranges."""
 
     @property
     def flight(self) -> FlightConfig:
@@ -46,7 +46,7 @@ def load_sitl(
     hardware: bool = False,
     world: str = DEFAULT_WORLD,
 ) -> SitlConfig:
-    """Read, override, draw and check everything; arguments are those of `load_flight`, with overrides of `world.` as well.
+    """Read, override, draw and check everything; arguments are those of `load_flight`, and overrides may also set keys of `world.`.
 
     Args:
         world: a built-in world, or a file.
@@ -101,6 +101,6 @@ def _open_world(world: str) -> Document:
 
 
 def _seed_of(data: dict[str, Data]) -> int:
-    """Return the seed of a world's data; an invalid one is reported by the model."""
+    """Return the seed in a world's data; validation reports an invalid one."""
     seed = data.get("seed", World().seed)
     return seed if type(seed) is int and seed >= 0 else 0

@@ -66,9 +66,9 @@ class Servo(Model):
     """True settings of one servo and its joint. The defaults are the factory settings, with id and baud rate of the vehicle file."""
 
     id: Annotated[int, Field(ge=0, le=252)] | None = None
-    """Register 7; null for the id of the vehicle file. The answers of two servos with the same id collide."""
+    """Register 7; null for the vehicle file's id. The answers of two servos with the same id collide."""
     baud: Literal[9600, ServoBaud] | None = None
-    """Register 8; null for the baud rate of the vehicle file."""
+    """Register 8; null for the vehicle file's baud rate."""
     firmware: Annotated[int, Field(ge=0, le=255)] = 48
     return_delay_us: Annotated[int, Field(ge=0, le=508, multiple_of=2)] = 500
     operating_mode: Literal[0, 3, 5] = 3
@@ -79,11 +79,11 @@ class Servo(Model):
     connected: bool = True
     """Whether its plug is connected."""
     reversed: bool = False
-    """Whether its counts run against the sign in the vehicle file."""
+    """Whether its counts increase opposite to the sign in the vehicle file."""
     zero_error_deg: float = 0.0
     """True zero of the joint minus the zero in the vehicle file, in the direction of the joint angle."""
     torque_per_amp_error: RelativeError = 0.0
-    """Relative error of the vehicle file's torque constant against the truth."""
+    """Relative error of the vehicle file's torque constant with respect to the true one."""
 
 
 class World(Model):
@@ -101,9 +101,9 @@ class World(Model):
     """Number of throws. The payload is removed from the net `keep_s` after a catch and thrown again on the next pass."""
     keep_s: Positive = 6.0
     hover_thrust_error: RelativeError = 0.0
-    """Relative error of MPC_THR_HOVER against the truth."""
+    """Relative error of MPC_THR_HOVER with respect to the true hover thrust."""
     rotor_lag_s: Positive = 0.04
-    """Time constant of each rotor's thrust; not with `rotors.on`, which has its own."""
+    """Time constant of each rotor's thrust; with `rotors.on` those of that section act instead."""
     setpoint_delay_s: NonNegative = 0.010
     """Delay from the arrival of a setpoint to the attitude loop, in addition to the link's."""
     arm_delay_s: NonNegative = 0.0
@@ -125,22 +125,25 @@ class World(Model):
     joint_friction_nm: NonNegative = 0.04
     """Constant friction of each joint; with `servo_mechanics` that section's friction acts instead."""
     joint_damping_nms: NonNegative = 0.02
-    """Viscous friction of each joint, N m s/rad; replaced by `servo_mechanics` as well."""
+    """Viscous friction of each joint, N m s/rad; `servo_mechanics` replaces it too."""
     servos: tuple[Servo, Servo] | None = None
     """null for the defaults of `Servo`."""
     arm_hand: bool = False
-    """Whether a simulated user holds the limp arm and moves it as `companion arm zero` requests, whenever the servos' LEDs go on."""
+    """Whether a simulated user holds the limp arm and moves it as `companion arm zero` requests, whenever the servos' LEDs are switched
+    on.
+    """
     wind_m_s: Vector3 = (0.0, 0.0, 0.0)
     mass_error: RelativeError = 0.0
-    """Relative error of the vehicle file's base mass against the truth."""
+    """Relative error of the vehicle file's base mass with respect to the true one."""
     link_mass_error: tuple[RelativeError, RelativeError] = (0.0, 0.0)
-    """Relative error of the vehicle file's link masses against the truth; the base's mass does not change."""
+    """Relative error of the vehicle file's link masses with respect to the true ones; the base's mass does not change."""
     model_error: Annotated[float, Field(ge=0, le=0.3)] = 0.0
     """Error by which the true base mass, inertia, link masses and torque constants differ from the vehicle file, in addition to the
-    other errors: each is multiplied by 1 plus or minus this share, with a sign drawn by the seed (the moments of inertia share one)."""
+    other errors: each is multiplied by 1 plus or minus this value, with a sign drawn by the seed (the moments of inertia have a common
+    sign)."""
     battery_start: Fraction = 1.0
     battery_life_s: Positive = 900.0
-    """Time from arming until a full battery is empty; with `battery.on`, in hover."""
+    """Time from arming until a full battery is empty; with `battery.on`, the time in hover."""
     push: Push | None = None
     """A push on the net, for tests of the impedance."""
     natnet_version: Literal["3.0", "4.1"] = "4.1"
@@ -153,15 +156,15 @@ class World(Model):
     mocap_other_id: Annotated[int, Field(ge=0)] | None = None
     """Streaming id of another rigid body, which lies on the floor; null if there is none."""
     hand: bool = False
-    """Whether the vehicle is carried through the guided hand test, rotors off, again and again."""
+    """Whether a simulated user carries the vehicle through the guided hand test, rotors off, again and again."""
     hand_t_s: NonNegative = 20.0
     """World time at which the first test begins."""
     hand_taps: Annotated[int, Field(ge=0, le=100)] = 0
-    """Taps on the frame per round. Above 0 the vehicle is only lifted and held, for the measurement of the latency."""
+    """Number of taps on the frame per round. If above 0, the vehicle is only lifted and held, for the measurement of the latency."""
     hand_tap_n: Positive = 30.0
     """Peak force of a tap."""
     px4_params: Px4Params = Field(default={})
-    """PX4 parameters by name; they override those of the configured vehicle."""
+    """PX4 parameters by name; they override those of the simulated vehicle."""
     faults: tuple[Fault, ...] = ()
     air: Air = Air()
     downwash: Downwash = Downwash()
@@ -183,7 +186,7 @@ class World(Model):
 
     @property
     def thr_mdl_fac(self) -> float:
-        """PX4's THR_MDL_FAC: from `px4_params`, else from `rotors` if that effect is on, else 0 for linear rotors."""
+        """Return PX4's THR_MDL_FAC: from `px4_params`, else from `rotors` if that effect is on, else 0 for linear rotors."""
         return self.px4_params.get("THR_MDL_FAC", self.rotors.thr_mdl_fac if self.rotors.on else 0.0)
 
     def overridden_px4_params(self) -> dict[str, float | int]:

@@ -139,7 +139,7 @@ BAD_MISSION = [
     (
         "{law: adaptive, preset: recommended}",
         "{file: mine.yaml, preset: paper}",
-        [f"{CATCH}:9:39: controller.preset: either a preset or a file, not both"],
+        [f"{CATCH}:9:39: controller.preset: give either a preset or a file, not both"],
     ),
     (
         "{law: adaptive, preset: recommended}",
@@ -188,7 +188,7 @@ BAD_VEHICLE = [
     ("x_m: [-2.2, 2.2]", "x_m: [2.2, -2.2]", ["room.x_m: the first must be below the second, got [2.2, -2.2]"]),
     ("link_com_m: [0.16, 0.08]", "link_com_m: [0.26, 0.08]", ["the centre of mass lies beyond the link's end: 0.26 m on 0.2 m"]),
     ("fold_arm_deg: [165.0, 140.0]", "fold_arm_deg: [165.0, 151.0]", ["fold_arm_deg[1]: 151 deg is outside the joint limits, -10 to 150 deg"]),
-    ("mass_kg: 3.0 ", "mass_kg: 0.4 ", ["mass_kg: 0.4 kg is the whole machine, but arm and tool alone weigh 0.45 kg"]),
+    ("mass_kg: 3.0 ", "mass_kg: 0.4 ", ["mass_kg: 0.4 kg is the whole vehicle, but arm and tool alone weigh 0.45 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 20.0", ["thrust_max_n: 20 N do not lift 3 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 60.0\n  inertia_kg_m2: [0.02, 0.02, 0.05]", ["inertia_kg_m2[2]: expected at most 0.04 kg m^2, the sum of the other two, as for every rigid body, got 0.05"]),
     ("servo_id: 2", "servo_id: 2.0", ["servo_id: expected a whole number from 0 to 252, got 2.0"]),
@@ -229,7 +229,7 @@ BAD_OVERRIDES = [
     ("mission.phases.duration_s=3", "--set mission.phases.duration_s: mission.phases has no keys, it is a list"),
     ("mission.name.x=3", "--set mission.name.x: mission.name has no keys, it is a single value"),
     ("mission.name[0]=3", "--set mission.name[0]: mission.name is not a list"),
-    ("mission.phases=[]", "--set mission.phases: expected a list of at least 2, got []"),
+    ("mission.phases=[]", "--set mission.phases: expected a list of at least 2 items, got []"),
     ("mission.vehicle=none.yaml", "--set mission.vehicle: vehicle: none.yaml: no such file"),
     ("controller.rho_max=0", "--set controller.rho_max: expected a number > 0, got 0"),
     ("controller.stiffness_kp[2]=90", "--set controller.stiffness_kp[2]: gain_cond requires (K_d - M_d Phi) Phi = 144, got 90"),

@@ -57,7 +57,7 @@ BAD = [
     ("a: !!python/object:os.system x\n", None),
     ("<<: {a: 1}\n", ["f.yaml:1:1: merge keys (<<) are not accepted; write the keys out"]),
     ("[a]: 1\n", ["f.yaml:1:1: a key must be plain text"]),
-    ("a: 1\n---\nb: 1\n", ["f.yaml:2:1: not YAML: a second document (---); one per file"]),
+    ("a: 1\n---\nb: 1\n", ["f.yaml:2:1: not YAML: a second document (---); only one per file is accepted"]),
     ("a: " + "[" * 5000 + "]" * 5000, ["f.yaml:1:35: not YAML: nested more than 32 levels deep"]),
     ("a: " + "9" * 5000, ["f.yaml:1:4: a: a number of 5000 digits"]),
     ("a: \x07\n", ["f.yaml:1:4: not YAML: control character U+0007 is not allowed"]),

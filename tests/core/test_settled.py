@@ -1,4 +1,4 @@
-"""No take-off on an estimate that wanders, and none without a stream of setpoints."""
+"""No take-off on an estimate that drifts, and none without a stream of setpoints."""
 
 from __future__ import annotations
 
@@ -53,24 +53,24 @@ def events(outputs: list[Outputs]) -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(
-    ("change", "wanders"),
+    ("change", "drifts"),
     [
         (off_by(0.07, 0.0), "its position is 7"),
-        (off_by(0.05, 0.0, swing_s=0.7), "wanders by 3"),
+        (off_by(0.05, 0.0, swing_s=0.7), "drifts by 3"),
         (off_by(0.0, 6.5), "its yaw is 6."),
-        (off_by(0.0, 5.0, swing_s=0.6), "wanders by 3."),
+        (off_by(0.0, 5.0, swing_s=0.6), "drifts by 3."),
     ],
     ids=["off", "swings", "turned", "swings in yaw"],
 )
 def test_an_estimate_that_has_not_settled_is_refused_and_named(
-    change: Change, wanders: str, monkeypatch: pytest.MonkeyPatch
+    change: Change, drifts: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(seq, "WAIT_TIMEOUT_S", 3.0)
     result = Changed(change).run(limit_s=20.0)
     assert result.outputs[-1].outcome is Outcome.REFUSED
     [(id_, text)] = events(result.outputs)
     assert id_ == "estimate_unsteady"
-    assert wanders in text
+    assert drifts in text
     assert {o.request for o in result.outputs} <= {AutopilotRequest.NONE, AutopilotRequest.DISARM}
     assert result.outputs[-1].t_s == pytest.approx(seq.WAIT_TIMEOUT_S, abs=0.5)
 

@@ -64,7 +64,7 @@ def test_text() -> None:
 
 
 def test_data_field_that_does_not_fit() -> None:
-    with pytest.raises(ValueError, match="9 bytes, 8 fit"):
+    with pytest.raises(ValueError, match="9 bytes, at most 8 fit"):
         rft.pack(bytes(9), rft.COMMAND_BYTES)
 
 
@@ -245,7 +245,7 @@ def test_sensor_falls_silent_in_flight() -> None:
         async with ForceTorqueServer() as server, world(server), driver(server.port) as edge:
             server.silent = True
             with pytest.raises(
-                DeviceError, match="of 100 samples came within 2 s while taring; the sensor fell silent"
+                DeviceError, match="of 100 samples received within 2 s while taring; the sensor fell silent"
             ):
                 await edge.tare_samples(0.5)
             assert edge.latest() is not None
@@ -282,7 +282,7 @@ async def refusal(edge: RobotousForceTorque) -> str:
 
 def test_no_such_port() -> None:
     text = asyncio.run(refusal(driver("/dev/no-such-port")))
-    assert text.startswith("force sensor /dev/no-such-port: no such port; serial ports of this machine: ")
+    assert text.startswith("force sensor /dev/no-such-port: no such port; serial ports of this computer: ")
 
 
 def test_port_in_use() -> None:
@@ -348,7 +348,7 @@ def test_wrong_checksums() -> None:
         packet[-2] ^= 0xFF
         with babbler(bytes(packet)) as port:
             text = await refusal(driver(port, answer_timeout_s=1.0))
-            assert "bytes came but no valid packet" in text
+            assert "bytes received but no valid packet" in text
             assert "(0 wrong checksums)" not in text
             assert "baud rate (115200)" in text
 

@@ -346,7 +346,7 @@ def test_server_that_does_not_stream(transport: Transport) -> None:
         group = GROUP if transport == "multicast" else None
         async with NatNetServer(multicast_group=group) as server:
             text = await refusal(mocap(device_for(server, transport), body_timeout_s=0.2))
-            assert "no frame of data came within 0.2 s" in text
+            assert "no frame of data arrived within 0.2 s" in text
             assert transport in text
 
     asyncio.run(run())
@@ -397,7 +397,7 @@ def test_interface_of_another_machine() -> None:
     async def run() -> None:
         async with NatNetServer() as server:
             text = await refusal(mocap(device_for(server, interface="192.0.2.1")))
-            assert "set devices.mocap.interface to an address of this machine" in text
+            assert "set devices.mocap.interface to an address of this computer" in text
 
     asyncio.run(run())
 

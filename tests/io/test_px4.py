@@ -469,7 +469,9 @@ def test_a_silent_px4_does_not_pass_for_one_without_parameters(monkeypatch: pyte
         with Px4Peer(port) as peer:
             async with edge(port) as autopilot:
                 peer.params.clear()
-                with pytest.raises(DeviceError, match=r"PX4's parameters \(2 of them, first COM_RC_IN_MODE\), found 0"):
+                with pytest.raises(
+                    DeviceError, match=r"PX4's parameters \(2 names, the first COM_RC_IN_MODE\), found 0"
+                ):
                     await autopilot.read_params(["COM_RC_IN_MODE", "SDLOG_MODE"])
 
     asyncio.run(fly())

@@ -254,7 +254,7 @@ def test_nothing_that_the_ground_forges_enters_the_companions_state() -> None:
                 assert {m.get_srcSystem() for m in forged} <= {255}  # PX4 takes a ground station's for what it is
                 assert not px4.of("ATTITUDE_QUATERNION") and not px4.of("COMMAND_ACK") and not px4.of("STATUSTEXT")
                 said = station.take_messages()
-                assert any("in the vehicle's name (system id 1)" in line for line in said), said
+                assert any("sent with the vehicle's system id 1" in line for line in said), said
                 # The same from PX4's side is believed: this test can tell.
                 for message in _forgeries():
                     px4.say(message)

@@ -54,7 +54,7 @@ def test_a_file_of_qgroundcontrol_is_read() -> None:
         ("1\t1\tEKF2_EV_CTRL\t11", "expected 5 fields"),
         ("0\t1\tEKF2_EV_CTRL\t11\t6", "a vehicle id from 1 to 255, found '0'"),
         ("1\tx\tEKF2_EV_CTRL\t11\t6", "a component id from 1 to 255, found 'x'"),
-        ("1\t1\tekf2\t11\t6", "a name of up to 16 of A-Z 0-9 _, found 'ekf2'"),
+        ("1\t1\tekf2\t11\t6", "a name of up to 16 characters A-Z, 0-9 and _, found 'ekf2'"),
         ("1\t1\tEKF2_EV_CTRL_TOO_LONG\t11\t6", "a name of up to 16"),
         ("1\t1\tEKF2_EV_CTRL\t11\t8", "type 6 (INT32) or 9 (REAL32), found '8'"),
         ("1\t1\tEKF2_EV_CTRL\t11.0\t6", "EKF2_EV_CTRL: expected a whole number (type 6), found '11.0'"),

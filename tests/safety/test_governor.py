@@ -253,7 +253,7 @@ def test_after_a_reset_a_new_motion_begins_where_it_says() -> None:
 @pytest.mark.parametrize(
     ("overrides", "text"),
     [
-        (("vehicle.room.x_m=[-0.4, 0.4]",), "room.x_m is -0.4 to 0.4 m, too small for the machine"),
+        (("vehicle.room.x_m=[-0.4, 0.4]",), "room.x_m is -0.4 to 0.4 m, too small for the vehicle"),
         (("vehicle.tether.anchor_world_m=[0, -9, 0]",), "the room begins 7.65 m from the anchor"),
         (("vehicle.tether.length_m=0.2",), "the tether reaches 0.00 m"),
     ],

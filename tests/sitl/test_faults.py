@@ -91,7 +91,7 @@ def test_a_mission_without_a_way_back_has_no_such_phase() -> None:
         ({"kind": "mocap_loss", "t_s": 1.0, "phase": "line"}, "give either t_s or phase"),
         ({"kind": "mocap_loss", "t_s": 1.0, "size": 2.0}, "a mocap_loss has no size"),
         ({"kind": "gust", "t_s": 1.0, "size": -2.0}, "must not be negative"),
-        ({"kind": "bus_noise", "t_s": 1.0, "size": 2.0}, "is a share, 0 to 1"),
+        ({"kind": "bus_noise", "t_s": 1.0, "size": 2.0}, "is a fraction, 0 to 1"),
         ({"kind": "mocap_rate", "t_s": 1.0, "size": 0.0}, "must be above 0"),
     ],
 )

@@ -16,7 +16,7 @@ from companion.cli.schema import KINDS
 
 Schema = dict[str, Any]
 _INTRO = {
-    "mission": "One flight: start pose of the machine, motion limits, and phases in order. [Mission files](../missions.md) explains "
+    "mission": "One flight: start pose of the vehicle, motion limits, and phases in order. [Mission files](../missions.md) explains "
     "the phases.",
     "vehicle": "One machine: masses and dimensions, devices, tether, room and limits. [Safety](../safety.md) explains the limits of "
     "`safety`.",

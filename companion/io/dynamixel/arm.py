@@ -1,4 +1,4 @@
-"""Driver of the arm: one thread owns the servo bus, the event loop exchanges data with it."""
+"""Driver of the arm: one thread owns the servo bus and exchanges data with the event loop."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _T = TypeVar("_T")
 _WRITE = object()
 _STOP = object()
 _NOW = object()
-"""Job that starts a scheduled read at once."""
+"""Queue entry that starts a scheduled read at once."""
 
 
 @dataclass(slots=True)
@@ -68,7 +68,7 @@ class DynamixelArm:
         self._arm = arm
         self._clock = clock
         self._jobs: queue.SimpleQueue[object] = queue.SimpleQueue()
-        """Queue of `_Read` or of one of the marks above."""
+        """Queue of `_Read` objects and of the markers above."""
         self._goals: deque[Pair] = deque(maxlen=1)
         self._goal_handed_s = 0.0
         self._state: ArmState | None = None
@@ -120,7 +120,7 @@ class DynamixelArm:
 
     @property
     def servos(self) -> tuple[ServoReport, ...]:
-        """Return the state of both servos when the driver had been opened."""
+        """Return the state of both servos at the time when the driver was opened."""
         return self._servos
 
     @property
@@ -158,7 +158,7 @@ class DynamixelArm:
                 self._jobs.put(_NOW)
             assert self._loop is not None, "the arm is not open"
             waiter = reading.waiter = self._loop.create_future()
-            if not reading.done:  # else the thread may have looked for a waiter before there was one
+            if not reading.done:  # otherwise the thread may have checked for a waiter before there was one
                 await asyncio.wait((waiter,), timeout=timeout_s)
             if not reading.done:
                 return self._state
@@ -192,7 +192,7 @@ class DynamixelArm:
             return
         await asyncio.wait((self._finished,), timeout=_CLOSE_TIMEOUT_S)
         if self._finished.done():
-            self._thread.join(_CLOSE_TIMEOUT_S)  # has nothing left to do but end
+            self._thread.join(_CLOSE_TIMEOUT_S)  # it only has to end
 
     # --- bus thread --------------------------------------------------------------------------------------------------
 
@@ -249,10 +249,10 @@ class DynamixelArm:
                 if job.at_s > self._clock():
                     continue
             elif job is _NOW and later is None:
-                continue  # it has begun meanwhile
+                continue  # it has begun since
             reading = later
             if job is None and later is not None and later.at_s > self._clock():
-                reading = None  # far in the future: meanwhile feed the watchdogs and withdraw an expired torque
+                reading = None  # far in the future: until then feed the watchdogs and withdraw an expired torque
             if reading is not None:
                 later = None
                 reading.begun = True
@@ -273,7 +273,7 @@ class DynamixelArm:
         try:
             goal = self._goals.pop()
         except IndexError:
-            return sent  # an earlier turn took the newest already
+            return sent  # an earlier pass has already taken the newest
         self._try(lambda: bus.write_currents(goal))
         self._written_s = self._clock()
         return goal
@@ -314,7 +314,7 @@ class DynamixelArm:
         )
 
     def _try(self, transaction: Callable[[], None]) -> None:
-        # A lost port raises any exception of its driver; the thread must survive it to release the arm in the end.
+        # A lost port raises any exception of its driver; the thread must survive it to release the arm at the end.
         try:
             transaction()
         except Exception as error:

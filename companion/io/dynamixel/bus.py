@@ -23,7 +23,8 @@ _USB_LATENCY_MAX_MS = 4
 _ERROR_NUMBER = 0x7F
 _CRC_ERROR = 3
 SETUP_ATTEMPTS = 5
-"""Number of times that set-up sends a read or write: interference damages single packets, and a busy computer delays an answer."""
+"""Number of attempts at each read or write during set-up: interference corrupts single packets, and a busy computer delays an answer.
+"""
 
 Pair = tuple[int, int]
 
@@ -55,7 +56,7 @@ class ArmBus:
         """Open the port, check both servos, set them up and switch torque on with goal current 0.
 
         Raises:
-            DeviceError: anything is not as required; one line.
+            DeviceError: a servo or the port is not as required; the text is one line.
         """
         self._deadline_s = time.monotonic() + timeout_s
         self._open_port()
@@ -66,7 +67,7 @@ class ArmBus:
         blocks = next((pair for pair in (self.read() for _ in range(SETUP_ATTEMPTS)) if pair is not None), None)
         if blocks is None:
             raise self._error(
-                "servos", self._ids, "answered individually but not to a sync read; look for a loose cable"
+                "servos", self._ids, "answered individually but not to a sync read; check for a loose cable"
             )
         scales = tuple(
             self._within_walls(joint, scale, block)
@@ -272,7 +273,7 @@ class ArmBus:
         self._write_bytes(joint, register, list(value.to_bytes(register.size, "little", signed=register.signed)))
 
     def _write_bytes(self, joint: Joint, register: Register, data: list[int]) -> None:
-        """Write and read back; a lost or damaged packet is repeated, as in `_read_bytes`."""
+        """Write and read back; a lost or corrupt packet is repeated, as in `_read_bytes`."""
         for _ in range(SETUP_ATTEMPTS):
             self._check_time()
             self._port.is_using = False
@@ -294,7 +295,7 @@ class ArmBus:
     def _check_answer(self, joint: Joint, doing: str, result: int, error: int) -> None:
         if result != COMM_SUCCESS:
             text = self._protocol.getTxRxResult(result).removeprefix("[TxRxResult] ")
-            raise self._error("servo", joint.servo_id, f"{doing} failed: {text} Look for a loose cable.")
+            raise self._error("servo", joint.servo_id, f"{doing} failed: {text} Check for a loose cable.")
         if error & _ERROR_NUMBER:
             text = self._protocol.getRxPacketError(error & _ERROR_NUMBER).removeprefix("[RxPacketError] ")
             raise self._error("servo", joint.servo_id, f"{doing} was refused: {text}")
@@ -314,5 +315,5 @@ class ArmBus:
 
 
 def _arrived(result: int, error: int) -> bool:
-    """Return whether request and answer arrived undamaged."""
+    """Return whether request and answer arrived intact."""
     return bool(result == COMM_SUCCESS and error & _ERROR_NUMBER != _CRC_ERROR)

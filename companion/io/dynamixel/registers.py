@@ -125,7 +125,7 @@ class JointScale:
         return self.sign * velocity_count * RAD_S_PER_COUNT
 
     def torque_nm(self, current_count: int) -> float:
-        """Return the joint torque of a current, N m."""
+        """Return the joint torque that a current produces, N m."""
         return self.sign * current_count * self.torque_nm_per_count
 
     def current_counts(self, torque_nm: float) -> int:
@@ -160,7 +160,7 @@ def turn_offset_counts(joint: Joint, position_count: int) -> int:
     """Return the whole turns, in counts, to add to `zero_count` so that the joint angle lies within its limits, or 0 if none fits.
 
     The encoder measures the angle within one turn; the servo loses the number of turns when it is switched off. A joint with less than
-    a turn between its limits is unambiguous all the same.
+    one turn between its limits is still unambiguous.
     """
     low_deg, high_deg = joint.angle_deg
     if high_deg - low_deg >= 360.0:
@@ -175,8 +175,8 @@ def turn_offset_counts(joint: Joint, position_count: int) -> int:
 class ServoPort(PortHandler):  # type: ignore[misc]
     """The SDK's port with a serial timeout (the original busy-polls while holding the GIL), a lock, and its own packet timeout.
 
-    A reply times out when the time is over and the process has spent most of it waiting at the port: a process that was not scheduled
-    for a while reads the port again before it gives up.
+    A reply times out only if the process spent most of the timeout waiting at the port: a process that was not scheduled for a while
+    reads the port again before it gives up.
     """
 
     is_open: bool
@@ -189,13 +189,14 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         """Open the port at `self.baudrate` (called by the SDK).
 
         Raises:
-            DeviceError: the port does not exist, is busy, is not permitted, or is not a serial port.
+            DeviceError: the port does not exist, is busy, is not accessible, or is not a serial port.
         """
         if self.is_open:
             self.closePort()
         try:
-            # A write that cannot proceed means that no device is present; it must not block the bus thread for ever. Not shorter:
-            # pyserial looks at the time after a write that succeeded, too, and the process may have been held up meanwhile.
+            # A write that cannot proceed means that no device is present; it must not block the bus thread for ever.
+            # Not shorter: pyserial checks the time even after a successful write, and the process may have been held up
+            # during it.
             self.ser = serial.Serial(
                 self.port_name,
                 cflag_baud,
@@ -238,7 +239,7 @@ class ServoPort(PortHandler):  # type: ignore[misc]
             OSError: the port is gone.
         """
         if self._taken_bytes > _NOISE_BYTES:
-            return b""  # the SDK looks at the time only when it lacks bytes: noise without end would keep it for ever
+            return b""  # the SDK checks the time only when it lacks bytes: endless noise would keep it reading for ever
         data: bytes = self.ser.read(length)
         if data:
             self._taken_bytes += len(data)
@@ -259,7 +260,7 @@ def _open_failure(port: str, error: Exception) -> str:
     number = getattr(error, "errno", None)
     if number == errno.ENOENT or not Path(port).exists():
         found = sorted(p.device for p in list_ports.comports())
-        there = f"serial ports here: {', '.join(found)}" if found else "this machine has no serial port"
+        there = f"serial ports here: {', '.join(found)}" if found else "this computer has no serial port"
         return f"no such port; {there}; correct devices.arm.port or plug the U2D2 in"
     if number in (errno.EACCES, errno.EPERM):
         return "no permission to open it; add this user to the group that owns the port (usually dialout)"

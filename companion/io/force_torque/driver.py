@@ -81,7 +81,7 @@ class RobotousForceTorque:
         samples = await self._collect(count, deadline_s)
         if len(samples) < count:
             raise DeviceError(
-                f"{self._where}: {len(samples)} of {count} samples came within {deadline_s:g} s while taring; "
+                f"{self._where}: {len(samples)} of {count} samples received within {deadline_s:g} s while taring; "
                 f"{self._lost or 'the sensor fell silent'}"
             )
         return samples
@@ -90,7 +90,7 @@ class RobotousForceTorque:
         """Open the port, identify the sensor, set its rate, start continuous output, wait for the first samples.
 
         Raises:
-            DeviceError: the port does not exist or is in use, the device is silent or another one, or no samples arrive.
+            DeviceError: the port does not exist or is in use, the device is silent or is a different one, or no samples arrive.
         """
         self._serial = self._open()
         try:
@@ -137,7 +137,7 @@ class RobotousForceTorque:
         number = error.errno if isinstance(error, OSError) else None
         if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
             found = ", ".join(sorted(port.device for port in list_ports.comports())) or "none"
-            return f"no such port; serial ports of this machine: {found}; plug the sensor in or set devices.force.port"
+            return f"no such port; serial ports of this computer: {found}; plug the sensor in or set devices.force.port"
         if number in (errno.EBUSY, errno.EAGAIN):
             return "in use by another program; close it (lsof names it)"
         if number in (errno.EACCES, errno.EPERM):
@@ -154,7 +154,7 @@ class RobotousForceTorque:
         rate_hz = await self._read_rate()
         if rate_hz != wanted_hz:
             raise DeviceError(
-                f"{self._where}: output rate {wanted_hz} Hz was refused (error {answer[2]}), it stays at {rate_hz or 'unknown'} Hz; "
+                f"{self._where}: output rate {wanted_hz} Hz was rejected (error {answer[2]}), it stays at {rate_hz or 'unknown'} Hz; "
                 "set devices.force.rate_hz to a rate that the sensor offers"
             )
 
@@ -196,13 +196,11 @@ class RobotousForceTorque:
             return f"{within}, nothing was received; check the sensor's power and cable"
         if self._scanner.packets == 0:
             return (
-                f"{within}; {self._received_bytes} bytes came but no valid packet ({self._scanner.bad_sums} wrong checksums); "
+                f"{within}; {self._received_bytes} bytes received but no valid packet ({self._scanner.bad_sums} wrong checksums); "
                 "check that this is the sensor's port, its baud rate (115200) and the cable"
             )
-        return (
-            f"{within}; {self._scanner.packets} valid packets and {self._scanner.bad_sums} wrong checksums came; "
-            "check the cable and power-cycle the sensor"
-        )
+        counts = f"{self._scanner.packets} valid packets and {self._scanner.bad_sums} wrong checksums"
+        return f"{within}; {counts} received; check the cable and power-cycle the sensor"
 
     # -- running ---------------------------------------------------------------------------------------------------------------
 

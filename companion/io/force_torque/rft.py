@@ -1,4 +1,4 @@
-"""Serial protocol of the Robotous RFT60-HA01, pure: bytes in, records out.
+"""Serial protocol of the Robotous RFT60-HA01. Pure: bytes in, records out.
 
 Source: Robotous RFT series manual 1.8, section 3, and the vendor's packet definitions. 115200 8N1. A command has 11 bytes `55 | data 8
 | sum | AA`, a response 19 bytes `55 | data 16 | sum | AA`; sum is the sum of the data modulo 256, data byte 0 is the command id. Fx..Tz
@@ -47,7 +47,7 @@ COMMAND_IDS: Final = frozenset(int(command) for command in Command)
 
 
 class SetError(IntEnum):
-    """Error code of a refused setting, data byte 2 of the response."""
+    """Error code of a rejected setting, data byte 2 of the response."""
 
     NONE = 0
     NOT_SUPPORTED = 1
@@ -88,7 +88,7 @@ def pack(data: bytes, packet_bytes: int) -> bytes:
     """
     room = packet_bytes - 3
     if len(data) > room:
-        raise ValueError(f"data field of {len(data)} bytes, {room} fit")
+        raise ValueError(f"data field of {len(data)} bytes, at most {room} fit")
     field = data.ljust(room, b"\0")
     return bytes((SOP,)) + field + bytes((sum(field) & 0xFF, EOP))
 
@@ -105,7 +105,7 @@ def _count(value: float, per_unit: float) -> int:
 
 
 def decode_wrench(data: bytes) -> Wrench:
-    """Return N and N m from the 16 data bytes of a READ_ONCE or START response."""
+    """Return force (N) and torque (N m) from the 16 data bytes of a READ_ONCE or START response."""
     fx, fy, fz, tx, ty, tz, bits = _WRENCH.unpack_from(data, 1)
     return Wrench(
         force_n=(fx / FORCE_PER_N, fy / FORCE_PER_N, fz / FORCE_PER_N),
@@ -115,7 +115,7 @@ def decode_wrench(data: bytes) -> Wrench:
 
 
 def decode_text(data: bytes) -> str:
-    """Return name, serial number or firmware version: printable ASCII from data byte 1 on."""
+    """Return name, serial number or firmware version: the printable ASCII that starts at data byte 1."""
     text = data[1:].partition(b"\0")[0].decode("ascii", "replace")
     return "".join(character if character.isprintable() else "?" for character in text).strip()
 
@@ -134,10 +134,10 @@ class PacketScanner:
         self.skipped_bytes = 0
         """Bytes that belong to no packet."""
         self.bad_sums = 0
-        """Candidates framed by SOP and EOP with a wrong sum."""
+        """Candidates framed by SOP and EOP whose checksum is wrong."""
 
     def feed(self, received: bytes) -> list[bytes]:
-        """Return the data fields (packet without SOP, sum, EOP) that are now complete, in order."""
+        """Return the data fields (packets without SOP, sum and EOP) that `received` completes, in order."""
         stream = self._tail + received
         size = self._packet_bytes
         fields: list[bytes] = []

@@ -50,7 +50,7 @@ class NatNetClient:
         self.names: dict[int, str] = {}
         """Names of the rigid bodies by streaming id, once the server has sent them."""
         self.two_streams = False
-        """The newest frame belongs to one of two mixed streams: two servers send from the same address."""
+        """The newest frame belongs to one of two mixed streams: two servers are sending from the same address."""
         self.out_of_order = 0
         self.malformed = 0
         self.problem: str | None = None
@@ -77,7 +77,7 @@ class NatNetClient:
         return [natnet.encode_message(Message.DISCONNECT)] if self._unicast else []
 
     def receive(self, datagram: bytes, arrived_s: float) -> Frame | None:
-        """Process a datagram of the server.
+        """Process a datagram from the server.
 
         Returns:
             The datagram's frame, or None if it has none or its frame is malformed, repeated or late. While two streams are mixed

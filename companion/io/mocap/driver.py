@@ -149,7 +149,7 @@ class NatNetMocap:
                 found = await request
         except (TimeoutError, socket.gaierror):
             raise DeviceError(
-                f"{self._where}: the name cannot be resolved; put the Motive machine's IPv4 address into devices.mocap.server"
+                f"{self._where}: the name cannot be resolved; put the Motive computer's IPv4 address into devices.mocap.server"
             ) from None
         self.server_ip = str(found[0][4][0])
 
@@ -167,7 +167,7 @@ class NatNetMocap:
         except OSError as error:
             raise DeviceError(
                 f"{self._where}: cannot join {device.multicast_group} on {device.interface} ({error}); "
-                "set devices.mocap.interface to this machine's address on the camera network"
+                "set devices.mocap.interface to this computer's address on the camera network"
             ) from None
         self._watch(data)
 
@@ -178,7 +178,7 @@ class NatNetMocap:
             if error.errno == errno.EADDRINUSE:
                 problem = "another program holds the port; close it or change devices.mocap.data_port"
             else:
-                kind = "the group that Motive streams to" if key == "multicast_group" else "an address of this machine"
+                kind = "the group that Motive streams to" if key == "multicast_group" else "an address of this computer"
                 problem = f"{error.strerror}; set devices.mocap.{key} to {kind}"
             raise DeviceError(f"{self._where}: cannot open UDP {address}:{port}: {problem}") from None
 
@@ -249,7 +249,7 @@ class NatNetMocap:
             malformed, last = self._client.malformed, self._client.problem
             bad = f"; {malformed} malformed, the last: {last}" if malformed else ""
             raise DeviceError(
-                f"{self._where}: the server answers but no frame of data came {within} ({how}); check that Motive streams and "
+                f"{self._where}: the server answers but no frame of data arrived {within} ({how}); check that Motive streams and "
                 f"is not paused, its local interface and the firewall{bad}{self._foreign_hint()}"
             )
         if device.rigid_body_id in ids:

@@ -1,8 +1,9 @@
-"""NatNet 3.0 and 4.1 datagrams, pure: bytes in, frozen records out. No sockets and no clock here.
+"""NatNet 3.0 and 4.1 datagrams. Pure: bytes in, frozen records out; no sockets and no clock.
 
 Source: NatNet SDK, `NatNetTypes.h` and the depacketisation of its packet client. Little endian; every datagram starts with `<HH`
-(message id, bytes that follow). A section of a frame is `u32 count`, since 4.1 followed by `u32 bytes`. Positions are metres, angles
-quaternions, both in the axes that Motive streams; `z_up_from_y_up` turns a y-up stream into the companion's world.
+(message id, bytes that follow). A section of a frame starts with `u32 count`, since 4.1 followed by `u32 bytes`. Positions are in
+metres, attitudes are quaternions, both in the axes that Motive streams; `z_up_from_y_up` turns a y-up stream into the companion's
+world.
 
 Nothing here raises on a bad datagram: parsers return `Malformed` with a reason.
 """
@@ -54,7 +55,7 @@ MAX_NAME_BYTES: Final = 256
 RIGID_BODY_BYTES: Final = 38
 LABELLED_MARKER_BYTES: Final = 26
 RESTART_GAP_FRAMES: Final = 200
-"""UDP does not reorder over a second of frames: a jump back this far is a restarted server."""
+"""UDP does not reorder over a second of frames: a jump back this far means that the server was restarted."""
 RESTART_SILENCE_S: Final = 0.5
 
 _HEADER = struct.Struct("<HH")
@@ -92,12 +93,12 @@ class ServerInfo:
 
     @property
     def version(self) -> str:
-        """Major and minor NatNet version, as "4.1"."""
+        """Major and minor NatNet version, such as "4.1"."""
         return f"{self.natnet_version[0]}.{self.natnet_version[1]}"
 
     @property
     def name(self) -> str:
-        """Program, its version and NatNet's, as "Motive 3.1, NatNet 4.1"."""
+        """Program, its version and NatNet's, such as "Motive 3.1, NatNet 4.1"."""
         version = ".".join(map(str, self.application_version)).removesuffix(".0").removesuffix(".0")
         return f"{self.application} {version}, NatNet {self.version}".strip()
 
@@ -119,11 +120,11 @@ class Frame:
 
     number: int
     timestamp_s: float
-    """On the server's own time base."""
+    """Time of the frame on the server's own time base."""
     latency_s: float | None
-    """Mid-exposure to transmission; None if the server has no exposure stamp or no clock frequency."""
+    """Time from mid-exposure to transmission; None if the server has no exposure stamp or no clock frequency."""
     exposure_s: float | None
-    """Mid-exposure on the server's own clock; None in the same cases."""
+    """Time of mid-exposure on the server's own clock; None in the same cases."""
     body: RigidBody | None
     """The requested rigid body; None if it is not in this frame."""
     body_ids: tuple[int, ...]
@@ -230,12 +231,12 @@ def parse_frame(
     try:
         return _frame(payload, version == "4.1", body_id, clock_frequency_hz)
     except (struct.error, ValueError) as error:
-        # Every read past the end and every missing terminator lands here, so the walk needs no check of its own per field.
+        # Every read past the end and every missing terminator ends up here, so no field needs a check of its own.
         return Malformed(f"frame of {len(payload)} bytes ends early or has wrong section sizes ({error})")
 
 
 def parse_model_definitions(datagram: Buffer, version: NatNetVersion) -> tuple[BodyDefinition, ...] | Malformed:
-    """Parse NAT_MODELDEF: ids and names of the rigid bodies, not those of skeletons and assets."""
+    """Parse NAT_MODELDEF: ids and names of the rigid bodies, without those of skeletons and assets."""
     payload = _payload(datagram, Message.MODELDEF)
     if isinstance(payload, Malformed):
         return payload
@@ -252,7 +253,7 @@ def _payload(datagram: Buffer, expected: Message) -> bytes | Malformed:
     if message != expected:
         return Malformed(f"message id {message}, expected {expected.value}")
     if len(datagram) < _HEADER.size + size:
-        return Malformed(f"header announces {size} bytes, {len(datagram) - _HEADER.size} came")
+        return Malformed(f"header announces {size} bytes, received {len(datagram) - _HEADER.size}")
     return bytes(datagram[_HEADER.size : _HEADER.size + size])
 
 
@@ -266,7 +267,7 @@ def _frame(data: bytes, sized: bool, body_id: int, clock_frequency_hz: int | Non
     if offset > len(data):
         return Malformed(f"{count} rigid bodies do not fit into {len(data)} bytes")
     if sized and _U32.unpack_from(data, start - 4)[0] != RIGID_BODY_BYTES * count:
-        return Malformed(f"{count} rigid bodies are not {RIGID_BODY_BYTES} bytes each: another bitstream version")
+        return Malformed(f"{count} rigid bodies are not {RIGID_BODY_BYTES} bytes each: a different bitstream version")
     ids = tuple(_U32.unpack_from(data, start + RIGID_BODY_BYTES * i)[0] for i in range(count))
     body: RigidBody | None = None
     if body_id in ids:

@@ -10,18 +10,18 @@ from typing import Final, NamedTuple
 from companion.io.arrival import STAMP_ROOM_BYTES, stamp_arrivals
 
 _IP_ADD_SOURCE_MEMBERSHIP: Final = 39
-"""linux/in.h; `socket` defines the name since Python 3.12."""
+"""From linux/in.h; `socket` defines the name since Python 3.12."""
 _MAX_DATAGRAMS: Final = 256
 """Limit per call of `waiting`, so that a flood does not block the caller."""
 _MAX_BYTES: Final = 65535
 
 
 class Datagram(NamedTuple):
-    """A datagram from the network."""
+    """One received datagram."""
 
     data: bytes
     ancillary: list[tuple[int, int, bytes]]
-    """For `companion.io.arrival.arrived_s`."""
+    """Ancillary data for `companion.io.arrival.arrived_s`."""
     sender_ip: str
 
 
@@ -34,7 +34,7 @@ def open_udp(address: str, port: int = 0, *, shared: bool = False) -> socket.soc
         shared: other processes may bind to the same address and port.
 
     Raises:
-        OSError: the address is not of this computer, or the port is in use.
+        OSError: the address is not one of this computer, or the port is in use.
     """
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -50,13 +50,13 @@ def open_udp(address: str, port: int = 0, *, shared: bool = False) -> socket.soc
 
 
 def join_source(opened: socket.socket, group: str, interface: str, source: str) -> None:
-    """Join a multicast group for datagrams of one sender: the kernel (and a switch with IGMPv3) drops those of other senders.
+    """Join a multicast group for datagrams from one sender: the kernel (and a switch with IGMPv3 snooping) drops those from others.
 
     Args:
         opened: UDP socket, bound to the group.
         group: multicast address, IPv4.
         interface: this computer's address on the camera network.
-        source: address of the Motive machine.
+        source: address of the Motive computer.
 
     Raises:
         OSError: no such interface, or not a multicast address.
@@ -72,7 +72,7 @@ def waiting(opened: socket.socket) -> Iterator[Datagram]:
             data, ancillary, _, address = opened.recvmsg(_MAX_BYTES, STAMP_ROOM_BYTES)
         except (BlockingIOError, InterruptedError):
             return
-        except OSError:  # an ICMP error of an earlier send
+        except OSError:  # an ICMP error from an earlier send
             continue
         yield Datagram(data, ancillary, str(address[0]))
 

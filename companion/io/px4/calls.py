@@ -1,4 +1,4 @@
-"""Blocking calls into MAVSDK outside of the event loop, one at a time, each with a deadline and a name."""
+"""Runs blocking calls into MAVSDK outside the event loop, one at a time, each with a deadline and a name."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _T = TypeVar("_T")
 
 
 class NativeCalls:
-    """One worker thread per link."""
+    """The worker thread of one link."""
 
     def __init__(self, address: str) -> None:
         self._address = address
@@ -27,7 +27,7 @@ class NativeCalls:
         """Run a blocking native call; `expected` names its purpose for the error text.
 
         Raises:
-            DeviceError: it did not return within `deadline_s`.
+            DeviceError: the call did not return within `deadline_s`.
         """
         future = self._worker.submit(call, *args)
         self._last = future
@@ -39,6 +39,6 @@ class NativeCalls:
             raise device_error(self._address, expected, found, "check the link") from None
 
     def finish(self, deadline_s: float) -> bool:
-        """Accept no more calls and wait for the one in progress. Returns False if it hangs; MAVSDK must not be destroyed then."""
+        """Accept no more calls and wait for the one in progress. Return False if that call hangs; MAVSDK must not be destroyed then."""
         self._worker.shutdown(wait=False, cancel_futures=True)
         return self._last is None or not wait([self._last], deadline_s).not_done

@@ -35,9 +35,9 @@ _CALL_PERIOD_S = 1.0
 class LinkClaim:
     """This process's hold on a link, besides MAVSDK's own descriptor.
 
-    A serial port is locked with flock on the device itself, so that every name of the device counts and pyserial's `exclusive`
-    conflicts with the same lock. A `udpin` port is bound without SO_REUSEADDR and only then shared with MAVSDK, which sets that option
-    and would join any program on the port. MAVSDK's socket is connected to PX4's address once that is verified; from then on the kernel
+    A serial port is locked with flock on the device itself, so that every name of the device counts and pyserial's `exclusive` mode
+    conflicts with the lock. A `udpin` port is bound without SO_REUSEADDR and only then shared with MAVSDK, which sets that option and
+    would join any program on the port. MAVSDK's socket is connected to PX4's address once that is verified; from then on the kernel
     delivers datagrams of all other senders to the socket held here. When PX4 is silent for REPIN_SILENCE_S and another port of the same
     IPv4 address sends a HEARTBEAT of its system, MAVSDK's socket is connected to that port, because a restarted router sends from
     another one.
@@ -78,7 +78,7 @@ class LinkClaim:
             DeviceError: no HEARTBEAT within `timeout_s`, or HEARTBEATs from two addresses while PX4 is not armed.
         """
         if self._parts.kind == "udpout":
-            with contextlib.suppress(OSError):  # MAVSDK names a host that does not resolve
+            with contextlib.suppress(OSError):  # MAVSDK reports a host name that does not resolve
                 self.peer = (socket.gethostbyname(self._parts.host), self._parts.port)
         self._before = frozenset(udp_sockets())
         if self._port is None:
@@ -94,7 +94,8 @@ class LinkClaim:
 
     @contextlib.asynccontextmanager
     async def calling(self, own: tuple[int, int]) -> AsyncIterator[None]:
-        """Send PX4 a HEARTBEAT from the port of a `udpin` link, at once and every second, until MAVSDK has received one from PX4.
+        """While the context is open, send PX4 a HEARTBEAT from the port of a `udpin` link every second until MAVSDK has received one
+        from PX4.
 
         PX4 on Ethernet may broadcast until it has received a partner's message (MAV_x_BROADCAST), and MAVSDK's connected socket
         receives no broadcasts. Several are needed, because PX4 accepts no partner in the first 3 s after it has opened its port.
@@ -107,10 +108,10 @@ class LinkClaim:
             yield
         finally:
             calls.cancel()
-            await asyncio.wait([calls])  # the port may be closed next, and the loop
+            await asyncio.wait([calls])  # the port may be closed next, and so may the event loop
 
     def pin(self) -> int:
-        """Connect the UDP socket that MAVSDK opened since `find_px4` to PX4's address; returns its local port, 0 if the link is not
+        """Connect the UDP socket that MAVSDK opened since `find_px4` to PX4's address; return its local port, or 0 if the link is not
         UDP.
 
         Raises:
@@ -130,8 +131,8 @@ class LinkClaim:
             raise device_error(self._address, "MAVSDK's socket in /proc", found, "mount /proc") from None
 
     def refuse_rivals(self) -> None:
-        """Read what other senders have sent so far. A PX4 that was found armed may be in the air; `take_rival` then handles other
-        senders.
+        """Check what other senders have sent so far. If PX4 was found armed it may be in the air; then do nothing, and `take_rival`
+        handles other senders.
 
         Raises:
             DeviceError: one of them claims to be PX4, which was found disarmed.
@@ -190,7 +191,7 @@ class LinkClaim:
                 self._hear(datagram, sender)
         except BlockingIOError:
             return False
-        except OSError:  # an ICMP error: nothing was read, there may be more
+        except OSError:  # an ICMP error: nothing was read, but more may be waiting
             return True
         return True
 
@@ -228,13 +229,13 @@ class LinkClaim:
         )
         data = message.pack(mavlink.MAVLink(None, srcSystem=own[0], srcComponent=own[1]))
         while self._port is not None and self.peer is not None:
-            with contextlib.suppress(OSError):  # no route at this moment; the next one may pass
+            with contextlib.suppress(OSError):  # no route at this moment; the next datagram may get through
                 self._port.sendto(data, self.peer)
             await asyncio.sleep(_CALL_PERIOD_S)
 
 
 def _lock(address: str, path: str) -> int:
-    """Return the descriptor that holds the lock. No child process inherits it."""
+    """Lock a serial port and return the descriptor that holds the lock. No child process inherits it."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Sum of an IMU's samples: the change of velocity over all samples, with none skipped and none counted twice. Pure."""
+"""Sum of an IMU's samples: the change of velocity, with no sample skipped or counted twice. Pure."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from companion.model.types import Vec3
 
 GAP_MAX_S = 0.05
-"""A longer gap between two samples adds nothing to the sum, because the motion in it was not measured."""
+"""Longest gap that the sum bridges. A longer one adds nothing, because the motion during it was not measured."""
 _REORDERED_MAX_S = 1.0
 _LOST_INTERVALS = 1.5
 """After a gap of more than this many usual intervals at least one sample was lost."""
@@ -28,7 +28,7 @@ class DeltaVelocity:
 
     def __init__(self) -> None:
         self.boot_s: float | None = None
-        """End of the newest sample's interval, PX4's clock; None before the first sample."""
+        """End of the newest sample's interval on PX4's clock; None before the first sample."""
         self.sum_m_s: Vec3 = (0.0, 0.0, 0.0)
         """Integral of the specific force since the first sample, in the axes of the samples."""
         self._interval_s = math.inf
@@ -38,8 +38,7 @@ class DeltaVelocity:
         """Add a sample. A repeated, late or non-finite one is ignored.
 
         Args:
-            boot_s: end of its interval, PX4's clock.
-            specific_force_m_s2: mean over the interval, in the axes of the body.
+            boot_s: end of its interval on PX4's clock. specific_force_m_s2: mean over the interval, in body axes.
         """
         x, y, z = specific_force_m_s2
         if not math.isfinite(boot_s + x + y + z):

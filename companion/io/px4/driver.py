@@ -1,4 +1,4 @@
-"""PX4 through MAVSDK's native binding.
+"""Driver of PX4 that uses MAVSDK's native binding.
 
 MAVSDK's callbacks run in C++ threads and only store the newest values; frames are converted when the flight loop reads them. The hot
 path (`send_attitude`, `send_vision`) is one synchronous native call each.
@@ -55,7 +55,7 @@ _CONNECT_DEADLINE_S = 5.0
 _HEARTBEAT_DEADLINE_S = 5.0
 """PX4 sends one per second."""
 _CLOSE_DEADLINE_S = 4.0
-# One NaN: PX4 takes EKF2_EVP_NOISE and EKF2_EVA_NOISE instead of a covariance.
+# One NaN makes PX4 use EKF2_EVP_NOISE and EKF2_EVA_NOISE instead of a covariance.
 _COVARIANCE_FROM_PARAMS = Covariance([float("nan")])
 
 _log = logging.getLogger(__name__)
@@ -67,7 +67,7 @@ class MavsdkAutopilot:
     Attitude setpoints are sent by the path in `devices.autopilot.setpoint_path`; see `companion.io.px4.setpoints`.
 
     Args:
-        device: address, and setpoint path.
+        device: address and setpoint path.
         clock: the flight clock.
         forwarding: whether a second connection is needed, see `forward_to`.
     """
@@ -99,7 +99,7 @@ class MavsdkAutopilot:
         """Open the link, find PX4, request the streams, and set a global origin if PX4 has none and is not armed.
 
         Raises:
-            DeviceError: one line for each kind of failure; nothing stays open.
+            DeviceError: with one line for each kind of failure; nothing stays open.
         """
         address = self._device.address
         check_address(address)
@@ -141,7 +141,7 @@ class MavsdkAutopilot:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the connection at once, then let MAVSDK's threads end. No packet is sent after this; PX4 keeps its mode."""
+        """Close the connection at once, then let MAVSDK's threads end. Nothing is sent after that; PX4 stays in its mode."""
         await self._close()
 
     def identity(self) -> LinkIdentity:
@@ -166,7 +166,7 @@ class MavsdkAutopilot:
             DeviceError: the connection cannot be opened, or cannot be restricted to that one peer.
         """
         self._require_open()
-        assert self._forwarding, "made without forwarding"
+        assert self._forwarding, "a driver made without forwarding"
         address = f"udpout://127.0.0.1:{port}"
         before = frozenset(udp_sockets())
         expected = "the connection for forwarding to open"
@@ -214,7 +214,7 @@ class MavsdkAutopilot:
         return self._setpoints.send(setpoint, self._clock())
 
     def send_vision(self, pose: MocapPose) -> bool:
-        """Send VISION_POSITION_ESTIMATE at once. Returns False if the link is closed or refused it.
+        """Send VISION_POSITION_ESTIMATE at once. Return False if the link is closed or MAVSDK rejected it.
 
         Raises:
             ValueError: the pose is not finite.
@@ -223,8 +223,8 @@ class MavsdkAutopilot:
         if not self._open:
             return False
         estimate = VisionPositionEstimate(
-            # Without TIMESYNC, which PX4 1.16 does not take from MAVSDK, PX4 stamps on arrival (and subtracts EKF2_EV_DELAY);
-            # the companion's own clock is what a log reader can use. MAVSDK would replace 0.
+            # Without TIMESYNC, which PX4 1.16 does not accept from MAVSDK, PX4 stamps on arrival (and subtracts
+            # EKF2_EV_DELAY); the companion's own clock is what a log reader can use. MAVSDK would replace 0.
             time_usec=max(1, int(pose.stamp_s * 1e6)),
             position_body=PositionBody(*position_ned_m),
             angle_body=AngleBody(roll_rad, pitch_rad, yaw_rad),
@@ -295,12 +295,12 @@ class MavsdkAutopilot:
         """Write one PX4 parameter, read it back and return the value that PX4 now holds, a float in single precision.
 
         Raises:
-            DeviceError: no such name, a value that PX4's type cannot hold, a refusal by PX4, or another value in PX4 afterwards.
+            DeviceError: no such name, a value that PX4's type cannot hold, PX4 refuses the value, or afterwards holds a different one.
         """
         return await self._transfer().write(name, value)
 
     async def ensure_origin(self) -> bool:
-        """Set PX4's global origin (`companion.io.px4.origin`) unless it has one or is armed. Returns whether PX4 reports an origin.
+        """Set PX4's global origin (`companion.io.px4.origin`) unless it has one or is armed. Return whether PX4 reports an origin.
 
         PX4 reports one only while its position is valid, so False right after boot has no meaning.
 
@@ -353,7 +353,7 @@ class MavsdkAutopilot:
             self._loop.call_soon_threadsafe(self._show_ground_station)
 
     def _show_ground_station(self) -> None:
-        """Answer the heartbeat of a disarmed PX4 with a ground station's: PX4 reports the reasons of a refusal only to one.
+        """Answer the heartbeat of a disarmed PX4 with that of a ground station, because PX4 reports why it refuses arming only to one.
 
         While PX4 is armed nothing is sent, because PX4 must notice the loss of the real ground station, whatever NAV_DLL_ACT
         is set to.

@@ -63,7 +63,7 @@ class Inbox:
         self._estimator_report: EstimatorReport | None = None
 
     def subscribe(self, telemetry: Telemetry, direct: MavlinkDirect) -> None:
-        """Store everything that arrives from now on."""
+        """Subscribe to PX4's messages; every one that arrives is stored from then on."""
         self._telemetry = telemetry  # MAVSDK's plugin ends its subscriptions when it is garbage-collected
         telemetry.subscribe_position_velocity_ned(self._on_position)
         telemetry.subscribe_attitude_quaternion(self._on_attitude)
@@ -137,7 +137,8 @@ class Inbox:
         """Return the number of state messages since the link was opened."""
         return StateCounts(self._positions, self._attitudes, self._imus)
 
-    # Callbacks: C++ threads, one message type in one thread. Nothing but an assignment, and one more in a count or a sum.
+    # Callbacks: C++ threads, one message type in one thread. Each makes one assignment, and one more for a count or a
+    # sum.
 
     def _on_position(self, value: Any, _: Any) -> None:
         p, v = value.position, value.velocity
@@ -218,4 +219,4 @@ async def ask_for_streams(
 
 
 class _RefusedError(Exception):
-    """PX4 denied a command; the text is its reason."""
+    """PX4 denied a command; the text is PX4's reason."""

@@ -49,7 +49,8 @@ def check_address(address: str) -> None:
     reason.
 
     Raises:
-        DeviceError: syntax, port range, busy or foreign local address, serial port missing or not accessible.
+        DeviceError: syntax, port range, the local address is busy or not one of this computer, or the serial port is missing or not
+            accessible.
     """
     match = _ADDRESS.fullmatch(address)
     if match is None:
@@ -109,10 +110,10 @@ def _check_serial(address: str, path: str) -> None:
 
 
 def bind_alone(address: str, host: str, port: int, kind: socket.SocketKind) -> socket.socket:
-    """Bind a local port that no other socket has.
+    """Bind a local port that no other socket uses.
 
     Raises:
-        DeviceError: the port is busy, or the host is not this machine.
+        DeviceError: the port is busy, or the host is not this computer.
     """
     bound = socket.socket(socket.AF_INET, kind)
     try:
@@ -122,7 +123,7 @@ def bind_alone(address: str, host: str, port: int, kind: socket.SocketKind) -> s
         if error.errno == errno.EADDRINUSE:
             fix = "stop that program (another companion, QGroundControl, a MAVLink router?) or use another port"
             raise device_error(address, f"port {port} to be free", "another program on it", fix) from None
-        fix = "use an address of this machine, 0.0.0.0 for all"
+        fix = "use an address of this computer, 0.0.0.0 for all"
         raise device_error(address, f"a local address in {host}", error.strerror or str(error), fix) from None
     return bound
 
@@ -154,7 +155,7 @@ async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any
     """Return the first MAVSDK system with a heartbeat, if it is PX4.
 
     Raises:
-        DeviceError: no heartbeat within `timeout_s`, or another autopilot's.
+        DeviceError: no heartbeat within `timeout_s`, or only that of another autopilot.
     """
     loop = asyncio.get_running_loop()
     found: asyncio.Future[Any] = loop.create_future()
@@ -235,7 +236,7 @@ def pin_new_udp(before: Container[int], peer: tuple[str, int]) -> tuple[socket.s
 def _link_of(descriptor: str) -> str | None:
     try:
         return os.readlink(f"/proc/self/fd/{descriptor}")
-    except OSError:  # closed while we looked
+    except OSError:  # closed in the meantime
         return None
 
 
@@ -246,7 +247,7 @@ def _log_native(level: Any, message: str, file: str | None, line: int) -> bool:
 
 
 def quiet_native_log() -> Callable[[], None]:
-    """Redirect MAVSDK's log from the terminal to the logger `companion.mavsdk` at DEBUG. Returns a function that restores it."""
+    """Redirect MAVSDK's log from the terminal to the logger `companion.mavsdk` at DEBUG. Return a function that restores it."""
     global _log_users
     with _log_lock:
         _log_users += 1

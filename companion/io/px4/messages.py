@@ -1,6 +1,6 @@
 """Conversion between PX4's MAVLink messages and the companion's records. Pure: no socket, no MAVSDK, no clock.
 
-All conversions of frames between companion and PX4 are here: NED/FRD on the wire, world ENU / body FLU in the records.
+All frame conversions between companion and PX4 are here: NED/FRD on the wire, world ENU / body FLU in the records.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def landed_state(value: int) -> LandedState:
 
 
 def battery(voltage_v: float, remaining_percent: float) -> tuple[float | None, float | None]:
-    """Return voltage in V and remaining charge, 0 to 1; None where the autopilot reports it as unknown (NaN or negative)."""
+    """Return voltage in V and remaining charge, 0 to 1; a value is None if the autopilot reports it as unknown (NaN or negative)."""
     voltage = voltage_v if math.isfinite(voltage_v) and voltage_v > 0.0 else None
     known = math.isfinite(remaining_percent) and remaining_percent >= 0.0
     return voltage, min(remaining_percent / 100.0, 1.0) if known else None
@@ -152,7 +152,7 @@ def attitude_target_ned(setpoint: AttitudeSetpoint) -> Quat:
     """
     w, x, y, z = setpoint.attitude_wxyz
     norm_squared = w * w + x * x + y * y + z * z
-    # Written so that NaN fails both.
+    # Written so that NaN fails both tests.
     if not abs(norm_squared - 1.0) <= _QUAT_NORM_TOLERANCE:
         raise ValueError(f"attitude setpoint {setpoint.attitude_wxyz} is not a unit quaternion")
     if not 0.0 <= setpoint.thrust <= 1.0:
@@ -209,13 +209,13 @@ def request_message_json(message_id: int, target_system: int) -> str:
 
 
 def set_message_interval_json(message_id: int, rate_hz: float, target_system: int) -> str:
-    """Return COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL (511), which requests a stream; PX4 takes the interval in us."""
+    """Return COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL (511), which requests a stream; PX4 expects the interval in us."""
     return _command_json(_SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate_hz, target_system)
 
 
 def estimator_report(fields_json: str, stamp_s: float) -> EstimatorReport:
-    """Convert ESTIMATOR_STATUS. PX4 sends NaN for the ratio of a source that it does not fuse, which becomes 0, and for an unknown
-    accuracy, which becomes infinite.
+    """Convert ESTIMATOR_STATUS. PX4 sends NaN for the test ratio of a source that it does not fuse (converted to 0) and for an unknown
+    accuracy (converted to infinity).
     """
     fields = json.loads(fields_json)
 
@@ -248,7 +248,7 @@ def _command_json(number: int, param1: float, param2: float, target_system: int)
 
 
 def refusal(ack_json: str) -> str | None:
-    """Return why a COMMAND_ACK is a refusal, as text, or None if it is an acceptance."""
+    """Return the reason if a COMMAND_ACK is a refusal, or None if it is an acceptance."""
     result = int(json.loads(ack_json)["result"])
     return None if result == 0 else result_text(result)
 

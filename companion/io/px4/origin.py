@@ -1,6 +1,6 @@
 """Global origin for a vehicle without GPS.
 
-PX4 considers its global position valid only with an origin; HOLD, RETURN and LAND then work on motion capture alone. The origin is
+PX4 considers its global position valid only with an origin; with one, HOLD, RETURN and LAND work on motion capture alone. The origin is
 latitude 0, longitude 0, altitude 0, because EKF2 without GPS has placed local (0, 0, 0) there by itself: the local position does not
 move, whether vision is fused already or not. Any other origin shifts the local position (measured on PX4 1.16.1 with 47.4 deg N, 8.5
 deg E, 488 m). If it is set before vision is fused, LOCAL_POSITION_NED is off by thousands of kilometres until fusion starts, and z
@@ -41,7 +41,7 @@ def set_origin_json(system_id: int) -> str:
 async def ensure_origin(
     address: str, calls: NativeCalls, direct: MavlinkDirect, system_id: int, armed: Callable[[], Awaitable[bool]]
 ) -> bool:
-    """Set PX4's origin unless it has one or is armed. Returns whether PX4 reports an origin.
+    """Set PX4's origin unless it has one or is armed. Return whether PX4 reports an origin.
 
     PX4 reports its origin only while its position is valid, so right after boot, before any vision, the result is False although the
     origin was accepted. Sending the same origin again has no effect.
@@ -64,5 +64,5 @@ async def _has_origin(address: str, calls: NativeCalls, direct: Any, system_id: 
         ack = await calls.run(expected, NATIVE_CALL_DEADLINE_S, direct.send_command, command)
     except MavsdkError as error:
         raise device_error(address, expected, str(error).split(";")[0], "check the link") from None
-    # PX4 sends the message before it accepts, and denies where it has none to send.
+    # PX4 sends the message before it accepts the request, and denies the request if it has no origin.
     return refusal(ack.fields_json) is None

@@ -1,8 +1,8 @@
-"""PX4's parameters: reading of many names with a window of requests, and writing of one value with verification.
+"""Reads many of PX4's parameters with a window of requests, and writes one value with verification.
 
-PARAM_REQUEST_READ by name is sent through MavlinkDirect, several at a time, because MAVSDK's Param plugin requests one after the other
-and spends seconds on each name that PX4 does not have (PX4 1.16 does not answer those). A parameter counts as absent if PX4 does not
-answer while it answers requests that were sent later.
+PARAM_REQUEST_READ by name is sent through MavlinkDirect, several at a time, because MAVSDK's Param plugin requests them one after the
+other and spends seconds on each name that PX4 does not have (PX4 1.16 does not answer those). A parameter counts as absent if PX4 does
+not answer although it answers requests that were sent later.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from companion.px4.params_file import single
 from companion.runtime.clock import Clock
 
 WINDOW = 8
-"""Largest number of outstanding requests: their answers fit into PX4's transmit buffer beside the telemetry."""
+"""Largest number of outstanding requests: their answers fit into PX4's transmit buffer together with the telemetry."""
 ANSWER_S = 0.4
 """Timeout after which a request is repeated."""
 ASKS = 4
-"""Number of requests for a name, while PX4 answers others, after which it counts as absent."""
+"""A name counts as absent after this many requests without an answer while PX4 answers others."""
 READ_DEADLINE_S = 10.0
 ALWAYS_THERE = "MAV_SYS_ID"
-"""Parameter of every PX4. Its answer shows that PX4 has received the requests sent before."""
+"""Parameter that every PX4 has. Its answer shows that PX4 has received the requests sent before."""
 
 _NAME = re.compile(r"[A-Z0-9_]{1,16}")
 _REAL32 = 9
@@ -44,7 +44,7 @@ Value = float | int
 
 
 class ParamQueries:
-    """Schedule of the requests. Pure: time is an argument, names are the result."""
+    """Decides when to request which name. Pure: time is an argument, names are the result."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self.answered: set[str] = set()
@@ -62,9 +62,7 @@ class ParamQueries:
         return len(self.answered) + len(self.absent) == len(self._names)
 
     def due(self, now_s: float) -> list[str]:
-        """Return the names to request at `now_s`, with ALWAYS_THERE last if PX4 must show that it still answers. Empty if none is
-        due.
-        """
+        """Return the names to request at `now_s`, with ALWAYS_THERE last if PX4 must show that it still answers."""
         for name in [name for name, sent_s in self._sent_s.items() if now_s >= sent_s + ANSWER_S]:
             # A missing answer counts only if PX4 has answered since.
             self._unheard[name] += self._heard_s > self._sent_s.pop(name)
@@ -96,7 +94,7 @@ class ParamQueries:
 def value_of(fields: dict[str, Any]) -> tuple[str, Value | None]:
     """Return name and value of a PARAM_VALUE's fields, an int where PX4 stores one.
 
-    PX4 puts the bytes of an INT32 in place of the float. The value is None where those are a NaN (negative numbers), which JSON cannot
+    PX4 sends the bytes of an INT32 in place of the float. The value is None where those are a NaN (negative numbers), which JSON cannot
     represent.
     """
     name, wire = str(fields["param_id"]), fields["param_value"]
@@ -129,7 +127,7 @@ class ParamTransfer:
         wanted = tuple(dict.fromkeys(names))
         for name in wanted:
             if _NAME.fullmatch(name) is None:
-                expected = "a parameter name of up to 16 of A-Z 0-9 _"
+                expected = "a parameter name of up to 16 characters A-Z, 0-9 and _"
                 raise device_error(self._address, expected, repr(name), "correct the name")
         queries, got = ParamQueries(wanted), dict[str, Value | None]()
         loop, changed = asyncio.get_running_loop(), asyncio.Event()
@@ -155,7 +153,7 @@ class ParamTransfer:
                         async with asyncio.timeout(ANSWER_S / 4):
                             await changed.wait()
         except TimeoutError:
-            expected = f"PX4's parameters ({len(wanted)} of them, first {wanted[0]})"
+            expected = f"PX4's parameters ({len(wanted)} names, the first {wanted[0]})"
             found = f"{len(queries.answered)} within {READ_DEADLINE_S:g} s"
             raise device_error(self._address, expected, found, "check the link") from None
         finally:
@@ -171,7 +169,7 @@ class ParamTransfer:
         """Write one value, read it back and return the value that PX4 now holds.
 
         Raises:
-            DeviceError: no such name, a value that the type cannot hold, a refusal by PX4, or another value in PX4 afterwards.
+            DeviceError: no such name, a value that the type cannot hold, PX4 refuses the value, or afterwards holds a different one.
         """
         before = (await self.read([name])).get(name)
         if before is None:
@@ -189,7 +187,7 @@ class ParamTransfer:
             raise device_error(self._address, f"PX4 to accept {name} = {wanted:g}", found, fix) from None
         after = (await self.read([name])).get(name)
         if after != wanted:
-            fix = "PX4 clipped or refused the value; choose one within the parameter's range"
+            fix = "PX4 clipped or rejected the value; choose one within the parameter's range"
             raise device_error(self._address, f"{name} = {wanted:g} after writing", f"{after}", fix)
         return after
 
@@ -211,7 +209,7 @@ class ParamTransfer:
             "param_id": name,
             "param_index": -1,
         }
-        # A message that the link refuses counts as unanswered and is repeated.
+        # A message that MAVSDK rejects counts as unanswered and is repeated.
         self._direct.send_message(MavlinkMessage("PARAM_REQUEST_READ", fields_json=json.dumps(fields)))
 
     async def _read_int(self, name: str) -> Value:

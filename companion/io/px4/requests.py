@@ -1,7 +1,7 @@
-"""Schedule by which requests of the core become commands on the wire. Pure: time is an argument, nothing is sent here.
+"""Turns requests of the core into commands for PX4, paced over time. Pure: time is an argument, nothing is sent here.
 
 The core repeats a request in every tick until the status shows it done. The queue turns that into one command at a time per kind of
-request, with pauses. A kind never waits for another, so LAND is sent while ARM hangs.
+request, with pauses. One kind never waits for another, so LAND is sent even while ARM hangs.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from companion.io.px4.texts import Texts
 from companion.model.types import AutopilotRequest
 
 SENT_ONCE = frozenset({AutopilotRequest.DISARM, AutopilotRequest.FORCE_DISARM})
-"""Requests sent as one plain message: MAVSDK repeats a command for 2 s until it is answered, and a request that the core no longer
-makes must not stop rotors. The core repeats the request in every tick for as long as its rule holds.
+"""Requests that are sent as a single message without MAVSDK's repetition: MAVSDK repeats an unanswered command for 2 s, and a request
+that the core no longer makes must not stop the rotors. The core repeats the request in every tick while its rule is active.
 """
 RETRY_S = 0.5
-"""Min time between two commands of one kind."""
+"""Shortest time between two commands of one kind."""
 SETTLE_S = 1.5
 """Pause after an accepted command, because the heartbeat that shows its effect is sent once per second."""
 ANSWER_DEADLINE_S = 3.0
-"""MAVSDK gives a command up after about 2 s; after this time its answer is lost and the request may be repeated."""
+"""Time after which an answer counts as lost and the request may be repeated; MAVSDK abandons a command after about 2 s."""
 _MESSAGES_KEPT = 200
 
 
@@ -54,14 +54,16 @@ class RequestQueue:
                 if kind.pending and request not in SENT_ONCE:
                     if now_s < kind.sent_s + ANSWER_DEADLINE_S:
                         return False
-                    self._messages.append(f"{request.name}: no answer within {ANSWER_DEADLINE_S:g} s, asking again")
+                    self._messages.append(
+                        f"{request.name}: no answer within {ANSWER_DEADLINE_S:g} s, requesting it again"
+                    )
                 elif now_s < kind.not_before_s:
                     return False
             self._kinds[request] = _Kind(sent_s=now_s, pending=True, not_before_s=now_s + RETRY_S)
             return True
 
     def answer(self, request: AutopilotRequest, refusal: str | None, now_s: float) -> None:
-        """Report that the autopilot accepted (None) or refused, with the reason."""
+        """Record the autopilot's answer: `refusal` is the reason, or None if it accepted."""
         with self._lock:
             kind = self._kinds.get(request)
             if kind is None:

@@ -23,28 +23,28 @@ class SetpointPath(Protocol):
     """A path of setpoints to PX4."""
 
     def send(self, setpoint: AttitudeSetpoint, t_s: float) -> bool:
-        """Send at once. Returns False if MAVSDK refused it.
+        """Send at once. Return False if MAVSDK rejected it.
 
         Raises:
-            ValueError: an invalid value; nothing was sent.
+            ValueError: a value is invalid; nothing was sent.
         """
 
     def stop(self) -> None:
-        """Send nothing until the next `send`."""
+        """Stop sending until the next `send`."""
 
 
 def setpoint_path(kind: Literal["direct", "offboard"], system: Any, direct: MavlinkDirect) -> SetpointPath:
-    """Return the path of `devices.autopilot.setpoint_path` to a MAVSDK system."""
+    """Return the path selected by `devices.autopilot.setpoint_path` to a MAVSDK system."""
     if kind == "offboard":
         return OffboardSetpoints(system)
     return DirectSetpoints(direct, int(system.get_system_id()))
 
 
 class DirectSetpoints:
-    """Setpoints through MavlinkDirect. Only the flight loop's calls send: PX4's offboard-loss failsafe triggers for a hung companion.
+    """Setpoints through MavlinkDirect. A setpoint is sent only when the flight loop calls, so PX4's offboard-loss failsafe triggers if
+    the companion hangs.
 
-    The cost was measured: 0.03 to 0.06 ms more from datagram to wire (p50; 0.1 ms at p99), in a tick of 5 ms.
-    `python -m benchmarks --only setpoint` measures both paths.
+    It adds 0.03 to 0.06 ms (median; 0.1 ms at p99) to a tick of 5 ms, as measured by `python -m benchmarks --only setpoint`.
     """
 
     def __init__(self, direct: MavlinkDirect, system_id: int) -> None:
@@ -68,9 +68,10 @@ class DirectSetpoints:
 class OffboardSetpoints:
     """Setpoints through the Offboard plugin, which takes Euler angles and does not check values.
 
-    A thread of the plugin repeats the last setpoint at 20 Hz until PX4's heartbeat shows another mode than OFFBOARD, the plugin is
-    destroyed or the process dies: PX4's offboard-loss failsafe does not detect that Python hangs. The guardian does, and kills the
-    process. The plugin's own `start` and `stop` are never used: the request queue changes modes, and `stop` would command HOLD.
+    A thread of the plugin repeats the last setpoint at 20 Hz until PX4's heartbeat shows a mode other than OFFBOARD, the plugin is
+    destroyed or the process dies. PX4's offboard-loss failsafe therefore does not detect that Python hangs; the guardian does, and
+    kills the process. The plugin's own `start` and `stop` are never used: the request queue changes modes, and `stop` would command
+    HOLD.
     """
 
     def __init__(self, system: Any) -> None:

@@ -1,8 +1,8 @@
 """PX4's STATUSTEXT messages: assembled from chunks, cleaned, each line reported once. Pure: time is an argument, nothing is sent.
 
 PX4 sends a long text in chunks of 50 characters (`id`, `chunk_seq`), ends most texts with a tab, which shows a ground station that the
-same text was sent as an event too, and repeats a complaint for as long as it holds. Its first text after boot has the id 0, which by
-the message's definition has no chunks; it may have some all the same (measured on 1.16.1 and 1.18).
+same text was sent as an event too, and repeats a complaint for as long as it holds. Its first text after boot has id 0, which by the
+message's definition means a text without chunks; it may have chunks nevertheless (measured on 1.16.1 and 1.18).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ CHUNK_CHARACTERS = 50
 CHUNK_PATIENCE_S = 0.5
 """Timeout for the successor of a full chunk; PX4 sends them together."""
 SAME_TEXT_S = 10.0
-"""Time for which a repeated line is not reported again."""
+"""Time during which a repeated line is not reported again."""
 _SEVERITIES = ("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug")
 _LEAST_SEVERE = _SEVERITIES.index("notice")
 

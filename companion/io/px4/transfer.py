@@ -1,4 +1,4 @@
-"""Comparison of a parameter file with a PX4, and writing of the file's values to PX4. Prints nothing."""
+"""Compares a parameter file with PX4's values and writes the file's values to PX4. Prints nothing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class ParamLink(Protocol):
     """The part of the autopilot driver that parameter transfer needs."""
 
     def status(self) -> AutopilotStatus | None:
-        """Return the latest slow state."""
+        """Return the latest status, or None before the first heartbeat."""
 
     async def read_params(self, names: Iterable[str]) -> dict[str, Value]:
         """Return values by name; absent names are left out."""
@@ -36,7 +36,7 @@ class Difference:
 
     @property
     def reboot(self) -> bool | None:
-        """Return whether it takes effect after a reboot only, or None if that is not known."""
+        """Return whether writing it takes effect only after a reboot, or None if that is not known."""
         wanted = BY_NAME.get(self.name)
         return None if wanted is None else wanted.reboot
 
@@ -57,11 +57,9 @@ class Comparison:
     absent: tuple[str, ...]
     """Parameters in the file that PX4 does not have, except those of another version of PX4 (`Wanted.only`)."""
     absent_port: tuple[str, ...]
-    """The same for a serial port that this PX4 does not have (a simulator, or a board without TELEM2). This is not an error."""
+    """Absent parameters of a serial port that this PX4 does not have (a simulator, or a board without TELEM2). This is not an error."""
     measured: tuple[Difference, ...] = ()
-    """Accepted values that differ from the file's because they are measured on each installation. They are kept; this is not
-    an error.
-    """
+    """Values that differ from the file's because they are measured on each installation. They are kept; this is not an error."""
 
     @property
     def same(self) -> bool:
@@ -75,7 +73,7 @@ class WriteResult:
 
     written: tuple[Difference, ...]
     problem: str | None
-    """Why it ended early, as one line; None if everything was written and read back."""
+    """Reason why writing ended early, as one line; None if everything was written and read back."""
 
 
 def compare(wanted: Mapping[str, Value], found: Mapping[str, Value]) -> Comparison:
@@ -113,7 +111,9 @@ async def write(link: ParamLink, differences: Iterable[Difference]) -> WriteResu
     for difference in differences:
         status = link.status()
         if status is None or status.armed:
-            return WriteResult(tuple(written), "PX4 is armed, or silent: parameters are written on the ground")
+            return WriteResult(
+                tuple(written), "PX4 is armed or silent; parameters are written only while it is disarmed"
+            )
         if difference.type_problem is not None:
             return WriteResult(tuple(written), f"{difference.name}: {difference.type_problem}; correct the file")
         try:

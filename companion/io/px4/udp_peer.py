@@ -1,4 +1,4 @@
-"""Release of a connected UDP socket whose peer has fallen silent."""
+"""Releases a connected UDP socket whose peer has fallen silent."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import socket
 
 REPIN_SILENCE_S = 1.0
-"""Silence after which PX4 may be searched at another port of its address; it sends hundreds of datagrams per second."""
+"""Silence after which PX4 may be sought at another port of its address; it sends hundreds of datagrams per second."""
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _ANY_PEER = bytes(16)

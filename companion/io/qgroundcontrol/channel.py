@@ -1,6 +1,7 @@
-"""Messages between flight process and relay: JSON objects. The relay faces the network, so nothing from it is decoded by `marshal`.
+"""Messages between flight process and relay, as JSON objects. The relay faces the network, so nothing from it is decoded by `marshal`.
 
-`marshal` would be five times as fast, but its decoder is not safe for forged data, and this is one small message at 4 Hz.
+`marshal` would be five times as fast, but its decoder is not safe for forged data, and JSON is fast enough for one small message at 4
+Hz.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""MAVLink frames to and from a ground station: extracted from datagrams, checked, passed or refused. Pure: no socket, no clock.
+"""Extracts MAVLink frames to and from a ground station from datagrams, checks them, and passes or refuses them. Pure: no socket, no
+clock.
 
 A message from the ground passes only as a whole frame with a valid checksum, of a kind that ground stations need, and never with the
 vehicle's own ids, because MAVSDK does not distinguish the connections of messages (`docs/qgroundcontrol.md`).
@@ -46,7 +47,7 @@ GROUND_MESSAGES = frozenset(
 among them.
 """
 REFUSED_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 611, 43003})
-"""Commands that would slow the streams of the flight (511), or move the estimate: SET_GLOBAL_ORIGIN, EXTERNAL_POSITION_ESTIMATE."""
+"""Commands that would slow the flight's streams (511) or move the estimate (SET_GLOBAL_ORIGIN, EXTERNAL_POSITION_ESTIMATE)."""
 COMMANDS = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
 _COMMAND_OFFSET = 28
 """Offset of the uint16 `command` in the payload of both COMMAND_LONG and COMMAND_INT."""
@@ -106,7 +107,7 @@ class TokenBucket:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One whole message as on the wire, checksum not checked yet."""
+    """One whole message as received, with its checksum not yet checked."""
 
     data: bytes
     message_id: int
@@ -126,7 +127,7 @@ class Frame:
 
     @property
     def checksum(self) -> int:
-        """Return the checksum in the frame."""
+        """Return the checksum that the frame carries."""
         return int(struct.unpack_from("<H", self.data, self._end)[0])
 
     def right_checksum(self, extra: int) -> int:
@@ -172,8 +173,8 @@ class AutopilotHeartbeat:
 def autopilot_heartbeat(datagram: bytes) -> AutopilotHeartbeat | None:
     """Return the HEARTBEAT of an autopilot with a correct checksum in the datagram, or None if there is none.
 
-    Unknown senders choose the content, and the control loop waits for this call: a datagram longer than one Ethernet frame is ignored,
-    of others only the first 32 frames and the first two checksums are checked.
+    Unknown senders choose the content, and the control loop waits for this call. A datagram longer than one Ethernet frame is therefore
+    ignored; of others only the first 32 frames are read and the first two checksums computed.
     """
     if len(datagram) > _PROOF_MAX_BYTES:
         return None
@@ -198,7 +199,7 @@ def _frame_at(datagram: bytes, at: int) -> Frame | None:
     if left >= _V2_HEADER_BYTES and datagram[at] == _V2:
         head, length, flags = _V2_HEADER_BYTES, datagram[at + 1], datagram[at + 2]
         if flags & ~_FLAG_SIGNED:
-            return None  # by the standard a frame with unknown incompatibility flags is not to be understood
+            return None  # the standard forbids interpreting a frame with unknown incompatibility flags
         tail = _CHECKSUM_BYTES + (_SIGNATURE_BYTES if flags & _FLAG_SIGNED else 0)
         system, component = datagram[at + 5], datagram[at + 6]
         message_id = int.from_bytes(datagram[at + 7 : at + 10], "little")
@@ -227,9 +228,9 @@ def command_of(payload: bytes) -> int:
 
 
 class DownlinkFilter:
-    """Filter of the vehicle's messages to the ground: without the companion's own traffic, and with fast streams reduced.
+    """Filter of the vehicle's messages to the ground: drops the companion's own traffic and thins fast streams.
 
-    The rest is renumbered for each sender, because a ground station counts gaps in the numbers as losses of the link.
+    The rest is renumbered for each sender, because a ground station counts gaps in the numbers as lost messages.
 
     Args:
         own: system and component id of MAVSDK.
@@ -272,6 +273,6 @@ class DownlinkFilter:
         due_s = self._next_s.get(key, now_s)
         if now_s < due_s:
             return False
-        # On a grid, so that a stream of 12 Hz does not become one of 6; a grid that was missed starts anew.
+        # On a grid, so that a stream of 12 Hz does not become one of 6; a grid that was missed starts again.
         self._next_s[key] = max(due_s + 1.0 / STREAM_RATE_HZ, now_s)
         return True

@@ -1,8 +1,8 @@
 """The process between MAVSDK and a MAVLink ground station: `python -m companion.io.qgroundcontrol.relay`.
 
-It holds three sockets: one to MAVSDK's second connection (loopback), one to the ground station, both connected, so that the kernel
-drops datagrams from anywhere else, and the channel to the flight process. A flood from the ground costs this process time, not the
-flight. It ends with the channel.
+It holds three sockets: the channel to the flight process, one to MAVSDK's second connection (loopback) and one to the ground station.
+The latter two are connected, so the kernel drops datagrams from any other address. A flood from the ground costs this process time, not
+the flight. It ends when the channel closes.
 
 Messages on the channel are JSON (`companion.io.qgroundcontrol.channel`). To the flight process: `{"port": N}` once, or `{"error":
 text}`; later `{"text": text}`. From it: `{"vehicle_port": N}` once; later `{"arming": true}` when it requests arming, `{"texts":
@@ -31,7 +31,7 @@ from companion.io.qgroundcontrol.uplink_filter import UplinkFilter
 
 NICENESS = 10
 CHANNEL_MAX_BYTES = 65_536
-GONE = "flight process gone: guardian lands, link ends"
+GONE = "flight process ended: guardian lands, link closes"
 _DATAGRAM_MAX_BYTES = 65535
 _ROUND_DATAGRAMS = 64
 """Largest number of datagrams from one socket before the others are read."""
@@ -109,7 +109,7 @@ class Relay:
                 self._say(message)
 
     def _hear(self) -> bool:
-        """Process messages of the flight process. Return False when the channel has ended."""
+        """Process messages from the flight process. Return False when the channel has closed."""
         for _ in range(_ROUND_DATAGRAMS):
             try:
                 data = self._channel.recv(CHANNEL_MAX_BYTES)
@@ -147,7 +147,7 @@ class Relay:
                 self._texts.say(int(mavlink.MAV_SEVERITY_INFO), self._situation)
             self._heard_s = now_s
             for frame in passed:
-                with contextlib.suppress(OSError):  # MAVSDK does not keep up: as on any link
+                with contextlib.suppress(OSError):  # MAVSDK does not keep up: the message is lost, as on any link
                     self._vehicle.send(frame)
 
     def _report(self, now_s: float) -> None:
@@ -165,7 +165,7 @@ class Relay:
         self._encoder.seq = (self._encoder.seq + 1) % 256
 
     def _to_ground(self, data: bytes) -> None:
-        with contextlib.suppress(OSError):  # no listener or no network; both may return
+        with contextlib.suppress(OSError):  # no listener or no network; either may come back
             self._ground.send(data)
 
     def _tell(self, text: str) -> None:
@@ -182,7 +182,7 @@ def _received(source: socket.socket) -> list[bytes]:
         except BlockingIOError:
             break
         except OSError:
-            continue  # an ICMP error of an earlier send: no listener
+            continue  # an ICMP error from an earlier send: no listener
     return datagrams
 
 

@@ -1,4 +1,4 @@
-"""Link to QGroundControl or any other MAVLink ground station: PX4's messages go there, the station's messages go to PX4.
+"""Link to QGroundControl or any other MAVLink ground station: forwards MAVLink between it and PX4.
 
 MAVSDK forwards between PX4's connection and a second one on loopback. It does not distinguish the connections of messages: a HEARTBEAT
 with PX4's ids from the ground would count as PX4's. The second connection therefore ends at a process
@@ -24,7 +24,7 @@ from companion.io.qgroundcontrol.channel import pack, unpack
 from companion.model.types import AutopilotRequest, Inputs, LinkIdentity, Outputs
 
 VALUES_EVERY = 50
-"""Ticks between values: 4 Hz at a control rate of 200 Hz."""
+"""Number of ticks between two sets of values: 4 Hz at a control rate of 200 Hz."""
 _FORM = "udpout://HOST:14550"
 _ADDRESS = re.compile(r"udpout://(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(?P<port>\d{1,5})")
 _RESOLVE_DEADLINE_S = 5.0
@@ -42,11 +42,11 @@ class Forwarder(Protocol):
         """Return the ids of both ends of the link to PX4."""
 
     async def forward_to(self, port: int) -> int:
-        """Open MAVSDK's second connection to a UDP port of 127.0.0.1; returns its own port."""
+        """Open MAVSDK's second connection to a UDP port of 127.0.0.1; return MAVSDK's own port."""
 
 
 def ground_error(address: str, expected: str, found: str, fix: str) -> DeviceError:
-    """Return the error with its one line for the user."""
+    """Return the error as one line for the user."""
     return DeviceError(f"ground.qgroundcontrol {address}: expected {expected}, found {found}; {fix}")
 
 
@@ -66,7 +66,8 @@ def check_address(address: str) -> tuple[str, int]:
 
 
 class GroundStation:
-    """Driver of the link. Enter it after the autopilot's, which must have been made with `forwarding`, and leave it before.
+    """Driver of the link. Enter it after the autopilot's driver, which must have been made with `forwarding`, and leave it before that
+    one.
 
     Args:
         address: `udpout://HOST:PORT`.
@@ -94,9 +95,10 @@ class GroundStation:
     @property
     def line(self) -> str:
         """Return one line about the open link for the operator."""
+        when = ", in flight too," if self._while_armed else " while it is disarmed,"
         return (
-            f"MAVLink goes to and from {self.address}: whoever sends from there can change PX4's mode and, while it is disarmed, its"
-            f" parameters{', and all of it in flight' if self._while_armed else ''}, but nothing in the companion"
+            f"MAVLink is forwarded to and from {self.address}. Anyone who can send from there can change PX4's mode, and its parameters"
+            f"{when} but nothing in the companion"
         )
 
     async def __aenter__(self) -> Self:
@@ -184,14 +186,14 @@ class GroundStation:
         return ip, port
 
     async def _start(self, ip: str, port: int) -> int:
-        """Start the relay; returns its UDP port on loopback."""
+        """Start the relay and return its UDP port on loopback."""
         self._channel = ours = self._spawn(ip, port)
         try:
             async with asyncio.timeout(_START_DEADLINE_S):
                 data = await asyncio.get_running_loop().sock_recv(ours, 4096)
         except TimeoutError:
             expected = f"the relay to be ready within {_START_DEADLINE_S:g} s"
-            raise ground_error(self.address, expected, "silence", "the machine is overloaded; try again") from None
+            raise ground_error(self.address, expected, "silence", "the computer is overloaded; try again") from None
         answer: dict[str, Any] = unpack(data) if data else {"error": "its end"}
         relay_port = answer.get("port")
         if type(relay_port) is not int or not 0 < relay_port <= 65535:

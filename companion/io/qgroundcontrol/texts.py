@@ -35,7 +35,7 @@ Text = tuple[int, str]
 
 
 def event_text(event: Event) -> Text:
-    """Return the text of an event, with the action first if there is one."""
+    """Return the text of an event, which starts with the action if there is one."""
     done = event.action.rank >= SafetyAction.HOLD.rank
     text = f"{event.action.value.replace('_', ' ').upper()}: {event.text}" if done else event.text
     return _SEVERITIES[event.severity], text
@@ -52,10 +52,10 @@ def outcome_text(outcome: Outcome) -> Text:
 
 
 def values(inputs: Inputs, outputs: Outputs) -> dict[str, float]:
-    """Return the known values by `VALUE_NAMES`.
+    """Return the known values by their names in `VALUE_NAMES`.
 
-    Metres for the tether's slack, the slack at the stopping position, and the position error; degrees for the angle between attitude
-    and setpoint; kg; rho of the control law; progress 0 to 1.
+    The tether's slack, the slack at the stopping position and the position error are in m, the angle between attitude and setpoint in
+    deg, masses in kg, progress from 0 to 1; rho is that of the control law.
     """
     found = {"progress": outputs.progress}
     if (tether := outputs.tether) is not None:
@@ -96,7 +96,7 @@ class Texts:
             self._waiting.remove((severity, text))
             messages += self._chunks(severity, text)
         if self._left_out and not self._waiting and self._bucket.take(now_s):
-            messages += self._chunks(_NOTICE, f"{self._left_out} messages left out, see the log")
+            messages += self._chunks(_NOTICE, f"{self._left_out} messages dropped, see the log")
             self._left_out = 0
         return messages
 
@@ -121,7 +121,7 @@ def value_messages(time_boot_ms: int, named: Mapping[str, float]) -> list[Any]:
     return [
         mavlink.MAVLink_named_value_float_message(time_boot_ms & 0xFFFFFFFF, name.encode(), value)
         for name, value in named.items()
-        if abs(value) <= FLOAT32_MAX  # not for NaN either
+        if abs(value) <= FLOAT32_MAX  # also false for NaN
     ]
 
 

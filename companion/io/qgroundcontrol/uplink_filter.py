@@ -1,8 +1,8 @@
-"""Filter of messages from a ground station to the vehicle. Pure: frames in, frames out; time is an argument.
+"""Filter of messages from a ground station to the vehicle. Pure: time is an argument.
 
-While PX4 is armed an allow-list applies: messages that read, and those that end or pause the flight (LAND, HOLD, a pilot's mode, a
-disarm that PX4 itself may refuse). Everything else is refused until PX4 is disarmed: a forced disarm, a restart, flight termination,
-parameters, missions, files, RETURN (which climbs, on a tether), and whatever is not listed here.
+While PX4 is armed only listed messages pass: those that read, and those that end or pause the flight (LAND, HOLD, a pilot's mode, a
+disarm that PX4 itself may refuse). Everything else is refused until PX4 is disarmed, among it a forced disarm, a restart, flight
+termination, parameters, missions, files, and RETURN, which climbs although the vehicle is tethered.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class ArmedState:
         self._arming_s = -math.inf
 
     def hear(self, datagram: bytes, now_s: float) -> None:
-        """Process messages that MAVSDK forwards from PX4."""
+        """Update from messages that MAVSDK forwards from PX4."""
         heard = autopilot_heartbeat(datagram)
         if heard is not None and heard.system == self._vehicle_system:
             self._disarmed_s = None if heard.armed else now_s
@@ -122,7 +122,7 @@ class UplinkFilter:
         if frame is None or not frame.intact():
             return "no MAVLink"
         if frame.system in (0, self._vehicle_system):
-            return f"in the vehicle's name (system id {frame.system})"
+            return f"sent with the vehicle's system id {frame.system}"
         if frame.message_id not in GROUND_MESSAGES:
             return f"{frame.name}, which a ground station may not send"
         if frame.message_id in COMMANDS and command_of(frame.payload) in REFUSED_COMMANDS:
@@ -137,7 +137,7 @@ class UplinkFilter:
         return None if self._bucket.take(now_s) else f"more than {UP_RATE_HZ:g} messages a second"
 
     def _now(self, frame: Frame, armed: bool) -> str | None:
-        """Return why the frame is refused now, or always."""
+        """Return why the frame is refused in the present state, or None if it passes."""
         if frame.message_id == mavlink.MAVLINK_MSG_ID_SERIAL_CONTROL:
             if not self._console:
                 return "SERIAL_CONTROL, which ground.qgroundcontrol_console does not allow"
@@ -167,7 +167,7 @@ def _command_allowed(frame: Frame) -> bool:
         return _mode_allowed(*params[:3])
     if command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
         return params[:2] == (0.0, 0.0)  # disarm, not forced: PX4 refuses it in the air
-    if command == mavlink.MAV_CMD_DO_REPOSITION:  # QGroundControl's Pause: hold where it is
+    if command == mavlink.MAV_CMD_DO_REPOSITION:  # QGroundControl's Pause: hold position
         return frame.message_id == mavlink.MAVLINK_MSG_ID_COMMAND_LONG and all(map(math.isnan, params[4:7]))
     return False
 

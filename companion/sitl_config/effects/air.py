@@ -6,7 +6,7 @@ from companion.config.base import Model, NonNegative, Positive
 
 
 class Air(Model):
-    """Gusts on the base. They grow with the rotors' thrust, and are zero while the rotors stand still."""
+    """Gusts on the base. They grow with the rotors' thrust and are zero while the rotors are stopped."""
 
     on: bool = False
     """Whether this effect acts."""

@@ -1,4 +1,4 @@
-"""Section `battery` of the simulated world: internal resistance, charge drawn by the current, thrust over voltage."""
+"""Section `battery` of the simulated world: internal resistance, charge, and thrust as a function of voltage."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Battery(Model):
     resistance_ohm: NonNegative = 0.028
     """Internal resistance with leads (p: 5 to 8 mohm per cell in good health, new packs 1 to 4, aged packs 8 to 12; e: leads 4)."""
     full_thrust_v: Positive = 16.0
-    """Voltage at which the vehicle file's `thrust_max_n` is true; thrust goes with the square of the voltage (e)."""
+    """Voltage at which the vehicle file's `thrust_max_n` is correct; thrust is proportional to the square of the voltage (e)."""
     power_w_n15: Positive = 3.9
     """Electrical power of a rotor over thrust^1.5, W/N^1.5 (e: 0.56 of the ideal 2.19 of a 13-inch rotor; 9.5 g/W at 7.4 N)."""
     electronics_w: NonNegative = 15.0

@@ -13,7 +13,7 @@ DegPerNm = Annotated[float, Field(ge=GEAR_MIN_DEG_PER_NM, le=10)]
 
 
 class Compliance(Model):
-    """Springs in the plane of the arm, one in series with each joint, which the servos' encoders do not measure."""
+    """Springs in the plane of the arm, one in series with each joint, whose deflection the servos' encoders do not measure."""
 
     on: bool = False
     """Whether this effect acts."""

@@ -13,9 +13,11 @@ class Downwash(Model):
     on: bool = False
     """Whether this effect acts."""
     spread: Positive = 0.2
-    """Standard deviation by which a wake's momentum has spread sideways, over the distance below the rotor. The four wakes are one jet
-    from the depth where this is the rotors' distance from the vehicle's planes, 0.23 m: with 0.14 from 2.5 vehicle sizes (p:
-    Bauersfeld et al., arXiv 2403.13321), with 0.44 from three rotor radii (p: a few, Wolf et al., Experiments in Fluids 2024)."""
+    """Standard deviation by which a wake's momentum has spread sideways, divided by the distance below the rotor. The four wakes form
+    one jet from the depth where this equals the rotors' distance from the vehicle's planes of symmetry, 0.23 m: with 0.14 from 2.5
+    vehicle sizes (p: Bauersfeld et al., arXiv 2403.13321), with 0.44 from three rotor radii (p: a few, Wolf et al., Experiments in
+    Fluids 2024).
+    """
     turbulence_intensity: NonNegative = 0.25
     """RMS of the velocity's fluctuation along each axis, over the local mean velocity (p: 0.25 on the axis of a round turbulent jet,
     Hussein et al., J. Fluid Mech. 1994)."""

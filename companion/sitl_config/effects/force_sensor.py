@@ -15,8 +15,9 @@ class ForceSensor(Model):
     resolution_nm: NonNegative = 0.008
     """Smallest step of a torque reading; 0 for the step on the wire. (m) 0.008 for the RFT40-SA01, (e) the same for this sensor."""
     cross_talk: Fraction = 0.02
-    """Largest share of one axis's load that another axis shows, each relative to its capacity (200 N, 4 N m). The seed draws each of
-    the 30 shares between minus and plus this. (e) 0.02-0.03."""
+    """Largest fraction of one axis's load that another axis reads, each relative to its capacity (200 N, 4 N m). The seed draws each of
+    the 30 fractions between minus and plus this. (e) 0.02-0.03.
+    """
     mounting_rpy_deg: Vector3 = (1.0, -1.0, 1.0)
     """True attitude of the sensor in the sensor frame of the vehicle file, ZYX roll, pitch, yaw. (e) within 2."""
     drift_n_per_min: Vector3 = (0.05, -0.04, 0.08)

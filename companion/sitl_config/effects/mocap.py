@@ -13,7 +13,7 @@ from companion.config.base import Model, NonNegative, Positive, Vector2, Vector3
 
 
 class Mocap(Model):
-    """Errors of the rigid body's pose and losses of its frames."""
+    """Errors of the rigid body's pose, and lost frames."""
 
     on: bool = False
     """Whether this effect acts."""
@@ -25,18 +25,21 @@ class Mocap(Model):
     body_tilt_deg: Vector2 = (0.3, -0.3)
     """Errors of the streamed roll and pitch; added to `mocap_body_tilt_deg`. (e)"""
     lost_share: Annotated[float, Field(ge=0, le=0.5)] = 0.005
-    """Share of frames in which the body is not tracked. (e) 0.1 to 1 %."""
+    """Fraction of frames in which the body is not tracked. (e) 0.1 to 1 %."""
     lost_burst_s: Positive = 0.02
-    """Mean length of such a burst; lengths are exponentially distributed. (e)"""
+    """Mean length of a burst of such frames; lengths are exponentially distributed. (e)"""
     wobble_m: NonNegative = 0.002
     """Standard deviation per axis of the position error while some markers are hidden. (p) Merriaux et al., "A Study of Vicon System
     Positioning Performance", Sensors 17 (2017): below 2 mm in motion, 0.15 mm at rest."""
     wobble_deg: NonNegative = 0.3
-    """Standard deviation per axis of the attitude error then: the position error over the distance of the markers, 0.2 to 0.4 m. (e)"""
+    """Standard deviation per axis of the attitude error at the same time: the position error divided by the distance between the
+    markers, 0.2 to 0.4 m. (e)
+    """
     wobble_s: Positive = 1.0
     """Time for which markers are hidden; the error rises and falls like sin^2. (e)"""
     wobble_every_s: Positive = 8.0
-    """Mean time from one such event to the next. (e)"""
+    """Mean time between the beginnings of two such events. (e)"""
     delivery_jitter_s: NonNegative = 0.0005
-    """Mean of the additional delay of each frame, exponentially distributed, by network and operating system; frames keep their
-    order. (e)"""
+    """Mean of the additional delay of each frame, exponentially distributed, caused by network and operating system; frames keep their
+    order. (e)
+    """

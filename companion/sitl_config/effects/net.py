@@ -20,9 +20,10 @@ class Net(Model):
     bag_stiffness_n_m: Annotated[float, Field(gt=0, le=5000)] = 500.0
     """Stiffness of the mesh: it stops 0.1 to 0.3 kg in 20 to 40 ms (e)."""
     restitution: Fraction = 0.3
-    """Speed at which the mesh and the hoop return a payload over the speed at which it arrived (e)."""
+    """Speed at which the mesh and the hoop return a payload, divided by the speed at which it arrived (e)."""
     pocket: Fraction = 0.5
-    """Distance of the settled payload from the centre over its distance at entry: 0 if it slides to the middle of the bag, 1 if the
-    mesh forms a pocket at the point of entry (e)."""
+    """Distance of the settled payload from the centre, divided by its distance at entry: 0 if it slides to the middle of the bag, 1 if
+    the mesh forms a pocket at the point of entry (e).
+    """
     swing_damping_ratio: Positive = 0.15
     """Damping ratio of the settled payload's swing (e)."""

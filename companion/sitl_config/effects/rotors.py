@@ -13,10 +13,12 @@ class Rotors(Model):
     on: bool = False
     """Whether this effect acts."""
     thrust_curve: Fraction = 0.5
-    """f of the true static curve: share of the full thrust = f s^2 + (1 - f) s at motor signal s. PX4's airframes for multirotors set
-    0.25 to 0.35 (p: ROMFS/px4fmu_common/init.d/airframes), ArduPilot's default for the same curve is 0.65 (p: MOT_THST_EXPO)."""
+    """f of the true static curve: thrust / full thrust = f s^2 + (1 - f) s at motor signal s. PX4's airframes for multirotors set 0.25
+    to 0.35 (p: ROMFS/px4fmu_common/init.d/airframes), ArduPilot's default for the same curve is 0.65 (p: MOT_THST_EXPO).
+    """
     thr_mdl_fac: Fraction = 0.3
-    """PX4's THR_MDL_FAC, which PX4 inverts in place of the true curve (p: 0.3 in PX4's airframes generic_250, qav250, px4vision)."""
+    """PX4's THR_MDL_FAC, whose curve PX4 inverts in place of the true one (p: 0.3 in PX4's airframes generic_250, qav250, px4vision).
+    """
     lag_up_s: Positive = 0.04
     """Time constant of a rotor that speeds up; replaces `world.rotor_lag_s` (e: 13-inch propellers, 0.03 to 0.05)."""
     lag_down_s: Positive = 0.07

@@ -9,7 +9,9 @@ from pydantic import Field
 from companion.config.base import Model, NonNegative, Positive, RelativeError
 
 GEAR_MIN_DEG_PER_NM = 0.15
-"""Stiffest gear; a stiffer one would oscillate against the lightest rotor and link too fast for the physics step of 2 ms."""
+"""Smallest compliance of the gear: a stiffer one would oscillate with the lightest rotor and link too fast for the physics step of 2
+ms.
+"""
 Share = Annotated[float, Field(ge=0, lt=0.5)]
 
 
@@ -24,8 +26,9 @@ class ServoMechanics(Model):
     on: bool = False
     """Whether this effect acts."""
     torque_per_amp_error: tuple[RelativeError, RelativeError] = (0.0, 0.0)
-    """Relative errors of the vehicle file's torque constant against the truth of each servo, in addition to `servos`
-    (m: the MX-106's differs by 5 % between stall currents; e: +-10 % between servos)."""
+    """Relative errors of the vehicle file's torque constant with respect to each servo's true one, in addition to `servos` (m: the
+    MX-106's differs by 5 % between stall currents; e: +-10 % between servos).
+    """
     current_loop_s: NonNegative = 0.003
     """Time constant of the current loop; 0 for none (e: ROBOTIS discloses only that the loop runs much faster than 1 kHz)."""
     friction_nm: NonNegative = 0.015
@@ -33,29 +36,31 @@ class ServoMechanics(Model):
     stiction_nm: NonNegative = 0.025
     """Additional friction without load at rest, which decays with the speed, N m (p, scaled: MX-64 0.012, MX-106 0.037)."""
     load_friction: Share = 0.005
-    """Additional Coulomb friction over the load of the gear, which is the difference between the motor's torque and the link's external
+    """Additional Coulomb friction divided by the load of the gear, which is the difference between the motor's torque and the link's
+    external
     torque: twice the torque that the servo holds (p: MX-64 0, MX-106 0.009, XL330 0.07)."""
     load_stiction: Share = 0.2
-    """Additional stiction over the load of the gear, which decays with the speed (p: MX-64 0.234, MX-106 0.222, XL330 0.07)."""
+    """Additional stiction divided by the load of the gear, which decays with the speed (p: MX-64 0.234, MX-106 0.222, XL330 0.07)."""
     stribeck_rad_s: Positive = 1.6
-    """Speed of the joint at which the share 1/e of the stiction is left (p: MX-64 1.52, MX-106 1.62)."""
+    """Speed of the joint at which the stiction has fallen to 1/e (p: MX-64 1.52, MX-106 1.62)."""
     stribeck_exponent: Annotated[float, Field(ge=0.5, le=4)] = 1.33
-    """Exponent of the decay over the speed (p: MX-64 1.33, MX-106 1.32)."""
+    """Exponent of the decay with the speed (p: MX-64 1.33, MX-106 1.32)."""
     viscous_nms: NonNegative = 0.012
     """Viscous friction, N m s/rad (p, scaled: MX-64 0.007, MX-106 0.018)."""
     backlash_deg: NonNegative = 0.25
     """Free play of the gear, from one end to the other (m: 15 arcmin)."""
     gear_deg_per_nm: Annotated[float, Field(ge=GEAR_MIN_DEG_PER_NM, le=5)] = GEAR_MIN_DEG_PER_NM
-    """Twist of the gear under load, deg per N m (e: not published; the default is as stiff as the physics step permits)."""
+    """Twist of the gear under load, deg per N m (e: not published; the default is the stiffest that the physics step permits)."""
     gear_relaxation_s: Annotated[float, Field(ge=0, le=0.0015)] = 0.0015
-    """Damping of the gear over its stiffness (e: the meshes damp well; at 50 Hz 0.25 of critical damping)."""
+    """Damping of the gear divided by its stiffness (e: the meshes damp well; 0.25 of critical damping at 50 Hz)."""
     warm_up_k: NonNegative = 25.0
-    """Temperature of the motor above that of the torque calibration, after a long time (e; an XL330 of Rhoban/bam's recordings warms by
-    11 K in 2 min)."""
+    """Final rise of the motor's temperature above that of the torque calibration (e; an XL330 of Rhoban/bam's recordings warms by 11 K
+    in 2 min).
+    """
     warm_up_s: Positive = 600.0
     """Time constant of the warm-up (e)."""
     warm_since_s: NonNegative = 0.0
-    """Time that the motors have been warming up before the world starts."""
+    """Time for which the motors have been warming up when the world starts."""
     torque_constant_per_k: Annotated[float, Field(ge=-0.01, le=0.01)] = -0.0011
     """Relative change of the torque constant per kelvin (p: of a Maxon motor, quoted in the LEO robot's file of its XM430-W210)."""
     friction_per_k: Annotated[float, Field(ge=-0.02, le=0.02)] = -0.005
