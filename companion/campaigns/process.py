@@ -1,4 +1,4 @@
-"""Parent side of a campaign: starts `python -m sitl.campaigns` and reads the results as the flights end."""
+"""Parent process of a campaign: starts `python -m sitl.campaigns` and reads the results as the flights end."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Self
 
 STALL_TIMEOUT_S = 300.0
-"""Time without a result after which a campaign counts as hung; a flight takes seconds."""
+"""Time without a result after which a campaign is treated as hung; a flight takes seconds."""
 STOP_TIMEOUT_S = 3.0
 _POLL_S = 0.2
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -29,11 +29,11 @@ class CampaignError(Exception):
     def __init__(self, text: str, *, bad_input: bool = False) -> None:
         super().__init__(text)
         self.bad_input = bad_input
-        """Whether the user's input is the cause; then nothing was flown."""
+        """Whether the user's input is the cause; if so, nothing was flown."""
 
 
 class CampaignProcess:
-    """A running campaign in a process group of its own. As a context manager it ends the campaign and all its workers.
+    """A running campaign in its own process group. As a context manager it ends the campaign and all of its workers.
 
     Args:
         job: see `sitl.campaigns`.

@@ -1,4 +1,4 @@
-"""Runner of all campaigns: fly, summarise, write CSV, JSON and HTML, print. A `Campaign` defines flights and output."""
+"""Runs any campaign: fly, summarise, write CSV, JSON and HTML, print. A `Campaign` defines flights and output."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ class Flights(Protocol):
     """Flights in progress."""
 
     def results(self) -> Iterator[Message]:
-        """Yield `{index, row, wall_s}` and more as each flight ends, in any order. Raises `CampaignError` if it cannot continue."""
+        """Yield a message with at least `{index, row, wall_s}` as each flight ends, in any order. Raises `CampaignError` if it
+        cannot continue.
+        """
 
     def ask_to_stop(self) -> None:
         """Make `results` end soon. Safe in a signal handler."""
@@ -57,7 +59,7 @@ class Campaign(ABC):
     jobs: int | None = None
     """Number of processes; None for one per core."""
     scheduler: str | None = None
-    """Address of a Dask scheduler; None to fly on this machine."""
+    """Address of a Dask scheduler; None to fly on this computer."""
 
     @property
     def world(self) -> str:
@@ -79,7 +81,7 @@ class Campaign(ABC):
         return CampaignProcess(self.job(), out / "campaign.log")
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings of the campaign, for the record."""
+        """Return the settings of the campaign for the results file."""
         sources = self.configs[0].sources
         return {
             "command": self.command,
@@ -123,7 +125,7 @@ class Campaign(ABC):
 
 @dataclass
 class Flown:
-    """The outcome of a whole campaign."""
+    """Results of a whole campaign."""
 
     messages: list[Message]
     """Results of the flights in the order of the campaign."""
@@ -159,7 +161,7 @@ def run(campaign: Campaign, out: Path, console: Console | None) -> int:
 
 
 def fly(campaign: Campaign, out: Path) -> Flown:
-    """Fly the campaign behind a progress bar. Ctrl-C and SIGTERM end it; the flights that have ended are kept."""
+    """Fly the campaign and show a progress bar. Ctrl-C and SIGTERM end it; flights that have ended are kept."""
     results: dict[int, Message] = {}
     notes: list[str] = []
     code, whole, bad = EXIT_OK, len(campaign.flights), 0
@@ -271,7 +273,7 @@ def to_json(data: Any) -> str:
 
 
 def write_csv(rows: Iterable[Mapping[str, Any]], path: Path) -> None:
-    """Write one line per row; the first row names the columns, an unknown value is empty."""
+    """Write one line per row below a header; the keys of the first row are the columns, an unknown value is empty."""
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer: csv.DictWriter[str] | None = None
         for row in rows:

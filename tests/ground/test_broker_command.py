@@ -279,7 +279,7 @@ def test_check_says_why_it_does_not_get_in(
         assert "3 " in told(tls, "--login", login, "--ca", str(other))
         assert "the broker's certificate is not trusted" in told(tls, "--login", login, "--ca", str(other))
         assert "does not use TLS" in told(f"mqtts://127.0.0.1:{made.plain_port}", "--ca", str(site.folder / "ca.pem"))
-        assert "for a port with TLS use mqtts://" in told(f"mqtt://127.0.0.1:{made.tls_port}", "--login", login)
+        assert "for a TLS port use mqtts://" in told(f"mqtt://127.0.0.1:{made.tls_port}", "--login", login)
     assert "Connection refused; check that the broker is running" in told(f"mqtt://127.0.0.1:{free_port()}")
     assert told("http://here").startswith("2 ")
     assert told(plain, "--vehicle", "#").startswith("2 --vehicle '#'")

@@ -83,7 +83,7 @@ async def test_an_unknown_operator_is_informed_that_the_vehicle_does_not_have_th
     async with played_vehicle(broker.port, OPERATORS) as vehicle:
         ended = await command(capsys, "start", broker, str(keys))
         assert ended.code == EXIT_REFUSED
-        assert "start: no message from rig is proven for anna: the vehicle does not have this key" in ended.err
+        assert "start: no message from rig is authenticated for anna: the vehicle does not have this key" in ended.err
         assert not vehicle.commands_heard
 
 

@@ -246,7 +246,7 @@ def test_a_burst_is_allowed_a_flood_is_not_and_it_is_forgotten() -> None:
         ("http://127.0.0.1", None, "--broker: expected mqtt://HOST:PORT"),
         ("mqtt://127.0.0.1:99999", None, "--broker: expected a port"),
         ("mqtts://127.0.0.1", "nofile.pem", "--ca nofile.pem: no such file"),
-        ("mqtts://127.0.0.1", "README.md", "--ca README.md: is not a certificate"),
+        ("mqtts://127.0.0.1", "README.md", "--ca README.md: not a certificate"),
         ("mqtt://127.0.0.1", "README.md", "--ca README.md: has no effect without TLS"),
     ],
 )

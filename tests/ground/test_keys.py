@@ -133,7 +133,9 @@ def test_own_file_that_cannot_be_made_is_one_line(home: Path) -> None:
 def test_file_open_to_others_is_refused_with_the_fix(tmp_path: Path, mode: int) -> None:
     path = private(tmp_path / "operators.yaml", one_operator(), mode)
     for load in (load_operators, load_login):
-        with pytest.raises(ConfigError, match=f"open to others .mode {mode:04o}.; run: chmod 600 {path}") as refused:
+        with pytest.raises(
+            ConfigError, match=f"accessible to others .mode {mode:04o}.; run: chmod 600 {path}"
+        ) as refused:
             load(path)
         assert len(refused.value.lines) == 1
 
@@ -153,7 +155,7 @@ BAD = {
     "no key": ("version: 1\noperators:\n  - name: anna\n", r":3:5: operators\[0\].key: missing"),
     "short key": (
         one_operator(key="c2hvcnQ="),
-        r":4:10: operators\[0\].key: expected base64 of 32 random bytes; these are 5",
+        r":4:10: operators\[0\].key: expected base64 of 32 random bytes; found 5 bytes",
     ),
     "no base64": (one_operator(key="'!!!!'"), r"operators\[0\].key: expected base64 of 32 random bytes"),
     "key is a number": (one_operator(key="12345678"), r"operators\[0\].key: expected text; put it in quotes"),

@@ -179,7 +179,7 @@ async def test_a_command_that_the_broker_does_not_let_pass_is_reported_as_that(t
             await viewer.until("stream")
             await viewer.order("start")
             refused = await viewer.until("refused")
-            assert refused["text"].startswith("the broker refused it: Not authorized")
+            assert refused["text"].startswith("the broker refused the command: Not authorized")
 
 
 def test_who_may_command_from_a_monitor(broker: Broker, tmp_path: Path) -> None:

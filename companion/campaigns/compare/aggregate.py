@@ -1,10 +1,9 @@
-"""Distributions of a comparison's figures over the seeds, and the paired comparison of two variants. `tables` has the columns of its
-tables.
+"""Distributions of a comparison's metrics over the seeds, and paired comparison with the adaptation on and off. `tables` formats them.
 
-A *row* holds the results of one flight as plain data: controller, preset, payload_kg, seed, world_seed, model_error, outcome, error,
-catch_t_s, rms {pre|post: e_p_m, e_q_deg, e_alpha_deg}, impedance_error {position_n, arm_nm}, final_e_z_m, peak_e_p_m,
-torque_activity_nm. A figure is None if its part of the flight was not flown to the end: errors before a crash do not characterise
-the controller.
+A *row* holds the results of one flight as plain data: controller, preset, payload_kg, seed, world_seed, model_error, outcome,
+error, catch_t_s, rms {pre|post: e_p_m, e_q_deg, e_alpha_deg}, impedance_error {position_n, arm_nm}, final_e_z_m, peak_e_p_m,
+torque_activity_nm. A metric is None if its part of the flight was not completed: errors before a crash do not characterise the
+controller.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from companion.campaigns.runner import Row, flat
 
 COMPLETED = "completed"
 MISSED = "missed"
-"""Key of `Group.failures` for flights completed without a catch."""
+"""Key in `Group.failures` of flights completed without a catch."""
 FIGURES = (
     *(f"rms.{part}.{key}" for part in ("pre", "post") for key in ("e_p_m", "e_q_deg", "e_alpha_deg")),
     "impedance_error.position_n",
@@ -31,12 +30,12 @@ FIGURES = (
     "peak_e_p_m",
     "torque_activity_nm",
 )
-"""Summarised figures: dotted keys of a row, and the absolute final height error, whose sign does not matter."""
+"""Metrics that are summarised: dotted keys of a row, and the absolute final height error, whose sign does not matter."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Percentiles of a figure over seeds, by nearest rank. A flight that failed counts as worse than every other."""
+    """Percentiles of a metric over seeds, by nearest rank. A failed flight counts as worse than all others."""
 
     p50: float | None
     """None if half of the flights or more failed."""
@@ -62,14 +61,14 @@ class Group:
         return f"{self.controller}/{self.preset}"
 
     def values(self, name: str) -> list[float]:
-        """Return one of `FIGURES` of each flight: infinite if the flight failed before it had the figure. A flight that was completed
-        without it is left out, such as one whose payload missed the net.
+        """Return one of `FIGURES` for each flight: infinite if the flight failed before its value was known. A completed flight
+        without a value, such as one whose payload missed the net, is left out.
         """
         found = ((row, figure(row, name)) for row in self.rows)
         return [math.inf if value is None else value for row, value in found if value is not None or _ended_early(row)]
 
     def spread(self, name: str) -> Spread | None:
-        """Return the percentiles of one of `FIGURES`; None if no flight has it."""
+        """Return the percentiles of one of `FIGURES`; None if no flight has a value."""
         values = sorted(self.values(name))
         if not values or math.isinf(values[0]):
             return None
@@ -77,17 +76,17 @@ class Group:
 
     @property
     def failures(self) -> dict[str, int]:
-        """Number of flights by outcome that were not completed with the payload on board."""
+        """Number of flights that did not end completed with the payload on board, by outcome."""
         return dict(Counter(what for row in self.rows if (what := _failure(row)) is not None))
 
     @property
     def failure_text(self) -> str:
-        """Failures as text, such as `crashed 2 of 5`; empty without a failure."""
+        """Failures as text, such as `crashed 2 of 5`; empty if there are none."""
         return ", ".join(f"{what} {count} of {len(self.rows)}" for what, count in self.failures.items())
 
     @property
     def printed(self) -> PrintedFlight | None:
-        """Figures printed in the paper."""
+        """Results printed in the paper for this group."""
         return None if is_ablation(self.preset) else printed(self.controller, self.payload_kg)
 
     def jsonable(self) -> dict[str, Any]:
@@ -110,7 +109,7 @@ class Group:
 
 
 def aggregate(rows: Iterable[Row]) -> list[Group]:
-    """Group the rows by controller, preset, payload and model error, in the order of their first appearance."""
+    """Group the rows by controller, preset, payload and model error, in order of first appearance."""
     groups: dict[tuple[str, str, float, float], list[Row]] = {}
     for row in rows:
         key = (row["controller"], row["preset"], row["payload_kg"], row["model_error"])
@@ -123,7 +122,7 @@ def _ended_early(row: Row) -> bool:
 
 
 def _percentile(values: Sequence[float], share: float) -> float | None:
-    """Return the smallest of the sorted values that has at least this share of them at or below it; None if it is infinite."""
+    """Return the percentile of sorted values by nearest rank, `share` from 0 to 1; None if it is infinite."""
     value = values[math.ceil(share * len(values)) - 1]
     return value if math.isfinite(value) else None
 
@@ -140,7 +139,7 @@ class Pairs:
 
     controller: str
     preset: str
-    """With the adaptation on."""
+    """Preset with the adaptation on."""
     payload_kg: float
     model_error: float
     off_on: Sequence[tuple[float, float]]
@@ -153,18 +152,20 @@ class Pairs:
 
     @property
     def p_value(self) -> float:
-        """Two-sided p-value of the sign test: how likely a count as uneven as `better` is if on and off are equally good."""
+        """Two-sided p-value of the sign test: the probability of a count at least as uneven as `better` if on and off were equally
+        good.
+        """
         n = sum(on != off for off, on in self.off_on)
         least = min(self.better, n - self.better)
         return min(1.0, sum(math.comb(n, k) for k in range(least + 1)) / math.exp2(n - 1))
 
     def p50(self, part: int) -> float | None:
-        """Return the median error with the adaptation off (0) or on (1); None if it is that of a failed flight."""
+        """Return the median error with the adaptation off (0) or on (1); None if the median flight failed."""
         return _percentile(sorted(pair[part] for pair in self.off_on), 0.5)
 
 
 def adaptation_pairs(groups: Sequence[Group]) -> list[Pairs]:
-    """Return the pairs of every variant that was flown with the adaptation on and off."""
+    """Return the pairs of every variant that was flown with the adaptation both on and off."""
     found = []
     by_key = {(g.controller, g.preset, g.payload_kg, g.model_error): g for g in groups}
     for (controller, preset, payload_kg, model_error), on in by_key.items():

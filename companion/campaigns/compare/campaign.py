@@ -17,11 +17,11 @@ from companion.campaigns.compare.tables import by_payload, compliance_table, pri
 from companion.campaigns.process import Message
 from companion.campaigns.runner import Campaign, Row
 
-STATISTIC = "RMS, p50 (p95) over seeds; a flight that failed counts as worse than every other, and – is such a flight"
+STATISTIC = "RMS, p50 (p95) over seeds; a failed flight counts as worse than all others and is shown as –"
 EXPLAINED = (
     f"{STATISTIC}. e_p and e_q are measured by motion capture, e_q against the attitude setpoint of the "
-    "control law. Impedance: RMS after the catch of M_d e'' + K_d e' + K_p e - e_tau, the deviation from one target for every law, the "
-    "paper's table. Torque activity: RMS change of the commanded joint torques from one tick to the next."
+    "control law. Impedance: RMS after the catch of M_d e'' + K_d e' + K_p e - e_tau, the deviation from one target (the "
+    "paper's table) for every law. Torque activity: RMS change of the commanded joint torques from one tick to the next."
 )
 
 
@@ -38,7 +38,7 @@ class Compare(Campaign):
     model_errors: Sequence[float] = (0.0,)
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings of the campaign, for the record."""
+        """Return the settings of the campaign for the results file."""
         return {
             **super().settings(),
             "payloads_kg": list(self.payloads_kg),
@@ -67,7 +67,7 @@ class Compare(Campaign):
         return {"aggregate": [group.jsonable() for group in aggregate(rows)]}
 
     def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
-        """Return both tables and the pictures."""
+        """Return the page with both tables and the pictures."""
         groups = by_payload(aggregate(rows))
         lead = f"{STATISTIC}. Grey: as printed in the paper ({SOURCE})."
         sections = [

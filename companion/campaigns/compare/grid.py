@@ -11,9 +11,9 @@ ABLATED = ("adaptive", "recommended")
 LESS = " - "
 ADAPTATION = ("on", "off")
 ADAPTATION_OFF = f"{LESS}adaptation off"
-"""Follows the name of a preset that is flown without its adaptation."""
+"""Suffix of the name of a preset that is flown without its adaptation."""
 ABLATIONS: dict[str, tuple[str, ...]] = {
-    # rho = min(H . b + zeta, rho_max): the first removes all that H and zeta learn, the others the adaptive loads.
+    # rho = min(H . b + zeta, rho_max): the first override removes all that H and zeta learn, the others remove the adaptive loads.
     "adaptation off": (
         "controller.rho_max=1.0e-9",
         "controller.load_rate_xyz=[0, 0, 0]",
@@ -23,7 +23,7 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "H3 uncapped": ("controller.acceleration_cap=1.0e9",),
     "S = I": ("controller.row_weights_s=[1, 1, 1, 0, 0, 0, 1, 1]",),
     "base feed-forward off": ("controller.force_feedforward_xyz=[0, 0, 0]",),
-    # The base does not comply with a force that it compensates by feed-forward.
+    # The base does not comply with a force that feed-forward compensates.
     "base rows on": ("controller.base_compliance_xyz=[1, 1, 1]", "controller.force_feedforward_xyz=[0, 0, 0]"),
     "F_d off": ("controller.desired_force_time_s=null",),
     "adaptive force off": ("controller.load_rate_xyz=[0, 0, 0]",),
@@ -69,19 +69,19 @@ def variants_of(
     ablation: bool,
     adaptation: Sequence[str] = ADAPTATION[:1],
 ) -> list[Variant]:
-    """Return the lines of the table.
-
-    A law flies those of the requested presets that it has, or all of its own if it has none of them.
+    """Return the lines of the table. Each law is flown with those requested presets that it has, or with all of its presets if it
+    has none of them.
 
     Args:
         available: presets of each law.
         controllers: requested laws; empty for all.
         presets: requested presets; empty for all.
         ablation: add variants of `ABLATED`, each with one part removed.
-        adaptation: of `ADAPTATION`: fly the presets of the adaptive law as they are, without their adaptation, or both.
+        adaptation: members of `ADAPTATION`: whether the presets of the adaptive law are flown with their adaptation, without it, or
+            both.
 
     Raises:
-        ValueError: there is no such law or preset, or nothing to ablate; one line.
+        ValueError: there is no such law or preset, or nothing to ablate. The text is one line.
     """
     for law in controllers:
         if law not in available:

@@ -1,4 +1,4 @@
-"""Results printed in the paper: its table "Tracking Performance Comparison in terms of RMS errors" (paper.tex, RMS_table)."""
+"""Results printed in the paper's table "Tracking Performance Comparison in terms of RMS errors" (paper.tex, RMS_table)."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ SOURCE = "paper.tex, RMS_table"
 
 @dataclass(frozen=True, slots=True)
 class Printed:
-    """Figures of one flight before or after the catch."""
+    """Results of one flight before or after the catch."""
 
     e_p_m: float
     """RMS of ||e_p||."""
     e_q_deg: float
-    """RMS of ||e_q||. The table names no unit; the figures of the same section are in degrees."""
+    """RMS of ||e_q||. The table states no unit; the plots in the same section use degrees."""
 
     def jsonable(self) -> dict[str, float]:
-        """Return the figures by key."""
+        """Return the results by key."""
         return asdict(self)
 
 
@@ -26,10 +26,10 @@ class PrintedFlight:
     """One controller with one payload."""
 
     title: str
-    """The controller's name in the head of the table."""
+    """The controller's name in the table's header."""
     pre: Printed
     post: Printed | None
-    """Figures after the catch; None where the paper prints "Crashed"."""
+    """Results after the catch; None where the paper prints "Crashed"."""
 
 
 _CSC, _PSC, _PROPOSED = "CSC, Cataldi et al.", "PSC, Wang et al.", "proposed"

@@ -1,5 +1,5 @@
-"""The plots of a comparison: the distributions of the position error, the error against the model error and against the adaptation;
-and, as in the paper's figures, ||e_p||, ||e_q|| and the joint angles over time, one figure per payload.
+"""The plots of a comparison: the distributions of the position error, the error over the model error, the error with and without
+adaptation; and, as in the paper's figures, ||e_p||, ||e_q|| and the joint angles over time, one figure per payload.
 
 Needs matplotlib (extra `analysis`).
 """
@@ -111,7 +111,7 @@ def _courses(title: str, messages: Sequence[Message], colours: dict[str, str]) -
 
 
 def _top(messages: Sequence[Message], key: str) -> float:
-    """Return the upper limit of an axis of errors; the errors of an incomplete flight are cut off if they would hide the others."""
+    """Return the upper limit of an error axis; it cuts off an incomplete flight whose errors would hide the others."""
     courses = [(_array(m["series"][key]), m["row"]["outcome"] == COMPLETED) for m in messages]
     peaks = [(float(np.nanmax(values)), completed) for values, completed in courses if np.isfinite(values).any()]
     if not peaks:
@@ -122,7 +122,7 @@ def _top(messages: Sequence[Message], key: str) -> float:
 
 
 def distributions(groups: Sequence[Group]) -> list[tuple[str, str, str, Figure]]:
-    """Return name, title, caption and figure of every plot of position errors that there is data for."""
+    """Return name, title, caption and figure of every plot of position errors for which there is data."""
     figures = []
     errors = sorted({group.model_error for group in groups})
     whole = [group for group in groups if not is_ablation(group.preset)]
@@ -138,8 +138,8 @@ def distributions(groups: Sequence[Group]) -> list[tuple[str, str, str, Figure]]
     ):
         if any(_finite(group, part) for group in shown for part in PARTS):
             caption = (
-                "RMS of ‖e_p‖ of every flight, logarithmic. Long mark: p50, short mark: p95; a failed flight counts as worse than "
-                "every other. Diamonds: printed in the paper."
+                "RMS of ‖e_p‖ of every flight, logarithmic. Long mark: p50, short mark: p95; a failed flight counts as worse "
+                "than all others. Diamonds: printed in the paper."
             )
             figures.append((name, title, caption, _strips(title, shown)))
     if len(errors) > 1 and any(_finite(group, "post") for group in whole):
@@ -201,7 +201,7 @@ def _strip(ax: Any, y: int, group: Group, part: str, colour: str) -> None:
     found = _finite(group, part)
     # Multiples of the golden ratio spread the points evenly, and every run draws the same picture.
     heights = [y + 0.56 * ((0.618034 * k) % 1.0 - 0.5) for k in range(len(found))]
-    # As pixels: as vectors, thousands of points would be the greater part of an SVG.
+    # Drawn as pixels: as vectors, thousands of points would make up most of an SVG.
     ax.plot(found, heights, "o", ms=3, mew=0, color=colour, alpha=0.6, zorder=3, rasterized=True)
     spread = group.spread(f"rms.{part}.e_p_m")
     if spread is not None:
@@ -301,7 +301,7 @@ def _paired(pairs: Sequence[Pairs]) -> Figure:
 
 
 def _log_metres(ax: Any, *names: str) -> None:
-    """Make the axes `x` or `y` logarithmic, with labels such as 0.02 at 1, 2 and 5 of each decade."""
+    """Make the axes `x` or `y` logarithmic, with labels at 1, 2 and 5 of each decade, such as 0.02."""
     for name in names:
         ax.set(**{f"{name}scale": "log"})
         axis = getattr(ax, f"{name}axis")

@@ -21,7 +21,7 @@ _COMPLIANCE = (
     ("final_abs_e_z_m", "final |e_z|", "m", 4),
     ("torque_activity_nm", "torque\nactivity", "N m", 4),
 )
-"""Figures of compliance beside the errors, because a stiff or chattering arm can have small errors."""
+"""Metrics of compliance, shown in addition to the errors because a stiff or chattering arm can have small errors."""
 
 
 def by_payload(groups: Sequence[Group]) -> list[Group]:
@@ -30,7 +30,7 @@ def by_payload(groups: Sequence[Group]) -> list[Group]:
 
 
 def print_tables(groups: Sequence[Group], console: Console) -> None:
-    """Print both tables, without the 95th percentiles where the terminal is too narrow. No figure is ever cut off."""
+    """Print both tables, without the 95th percentiles if the terminal is too narrow. No number is ever cut off."""
     groups, width = by_payload(groups), console.width
     unlimited = console.options.update(max_width=10_000)
     for make in (tracking_table, compliance_table):
@@ -43,12 +43,12 @@ def print_tables(groups: Sequence[Group], console: Console) -> None:
 
 
 def tracking_table(groups: Sequence[Group], *, p95: bool = True) -> Table:
-    """Return the paper's table, each figure beside the printed one."""
+    """Return the paper's table, with each result beside the printed one."""
     columns = []
     for part, word in _PARTS.items():
         for key, title, unit, digits in (_E_P, _E_Q):
             name = f"rms.{part}.{key}"
-            # A failure replaces the figures that it prevents.
+            # A failure is shown instead of the metrics that it prevents.
             ours = _ours(name, f"{word}\n{title}", unit, digits, p95, failures=(part, key) == ("post", "e_p_m"))
             columns += [ours, _paper(part, key, digits)]
     return _table("Tracking before and after the catch", columns, groups)
@@ -86,7 +86,7 @@ def _ours(name: str, title: str, unit: str, digits: int, p95: bool, *, failures:
 
 
 def spread_text(spread: Spread | None, digits: int, *, p95: bool = True) -> str:
-    """Return `p50 (p95)`, with – for the error of a flight that failed; only p50 of a single flight; empty for None."""
+    """Return `p50 (p95)`, with – for a failed flight; only p50 if there is a single flight; empty for None."""
     if spread is None:
         return ""
     shown = ["–" if value is None else f"{value:.{digits}f}" for value in (spread.p50, spread.p95)]

@@ -21,35 +21,35 @@ from companion.sitl_config.faults import KINDS, FlightPhase
 
 @dataclass(kw_only=True)
 class Faults(Campaign):
-    """Faults in the fast loop or over real wires."""
+    """A campaign of flights with injected faults, flown in the fast loop or with `companion fly --sitl` over the real protocols."""
 
     name = "faults"
     csv_name = "faults.csv"
 
     planned: Sequence[tuple[Variant, FlightPhase]]
     wires: Sequence[str] | None = None
-    """Arguments of `companion fly` to fly over real wires; None for the fast loop."""
+    """Arguments of `companion fly` for flights over the real protocols; None for the fast loop."""
 
     def start(self, out: Path) -> AbstractContextManager[Flights]:
-        """Start the flights; over wires each writes a folder into `out`."""
+        """Start the flights; a flight of `companion fly` writes a folder into `out`."""
         if self.wires is None:
             return super().start(out)
         return WireFlights(self.planned, self.wires, self.configs[0], out, self.jobs or default_jobs())
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings of the campaign, for the record."""
+        """Return the settings of the campaign for the results file."""
         return {**super().settings(), "controller": self.configs[0].sources.controller, "where": self._where}
 
     @property
     def _where(self) -> str:
-        return "in the fast closed loop" if self.wires is None else "over real wires"
+        return "in the fast closed loop" if self.wires is None else "over the real protocols"
 
     def label(self, row: Row) -> str:
         """Return the label that distinguishes a flight from the others."""
         return f"{row['fault']} {shown_size(row)}".strip() + f" in {row['phase']}"
 
     def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """Return outcomes and extremes."""
+        """Return outcomes and extreme values."""
         return {
             "summary": {
                 "flights": len(rows),
@@ -63,11 +63,12 @@ class Faults(Campaign):
         }
 
     def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
-        """Return the bad flights, followed by all flights."""
+        """Return the page: first the bad flights, then all flights."""
         bad = [row for row in rows if not good(row)]
         explained = (
-            "Times are in s from the start of the fault. Height: the least while the machine was meant to be up. Slack: the least of "
-            "the tether. Drift: from the abort to the place of landing, or the largest error of a mission that went on."
+            "Times are in s from the start of the fault. Height: minimum while the vehicle should have been airborne. Slack: "
+            "minimum tether slack. Drift: distance from the abort to the landing, or the largest error of a mission that "
+            "continued."
         )
         sections = [Section("All flights", tables=[flights_table(rows, details=True)], text=explained)]
         if bad:
@@ -103,7 +104,7 @@ def extreme(rows: Sequence[Row], key: str, pick: Callable[[list[float]], float])
 
 
 def shown_size(row: Row) -> str:
-    """Return the size with its unit, and the duration if it is a separate quantity."""
+    """Return the size with its unit, and the duration if the fault has both."""
     if row["size"] is None:
         return ""
     text = f"{row['size']:g} {row['unit']}".strip()

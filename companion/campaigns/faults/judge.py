@@ -1,4 +1,4 @@
-"""Judges a flight with a fault: its outcome, the time to detection, and violations of safety requirements.
+"""Evaluates a flight with a fault: its outcome, the time to detection, and violations of safety requirements.
 
 A row holds the results of one flight, as `companion faults --json` prints it; docs/faults.md describes its keys.
 """
@@ -26,7 +26,7 @@ TAUT_N = 0.5
 """Tension above which the tether is taut; smaller values are noise of the contact solver."""
 STOPPING_S = 1.0
 OUTWARD_M = 0.15
-"""Limit of the distance outward on a taut tether, counted from `STOPPING_S` after the reaction."""
+"""Limit of the outward motion on a taut tether, measured from `STOPPING_S` after the reaction."""
 HARD_M_S = 1.8
 """Sink rate at the floor above which a landing counts as a crash."""
 NEAR_FLOOR_M = 0.1
@@ -35,10 +35,10 @@ _PULLS_BY_ITSELF: frozenset[FaultKind] = frozenset({"tether_taut", "tether_snag"
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """The true state of the machine at one time."""
+    """The true state of the vehicle at one time."""
 
     t_s: float
-    """Time on the flight clock."""
+    """Flight clock."""
     position_world_m: Vec3
     tilt_rad: float
     slack_m: float
@@ -77,10 +77,10 @@ class FaultFlight:
     events: Sequence[Event]
     """Events of the core and of the guardian."""
     landed: bool
-    """Whether it ended on the floor with its rotors stopped."""
+    """Whether the vehicle ended on the floor with its rotors stopped."""
     caught: bool
     error: str | None = None
-    """The exception that ended the flight, if any."""
+    """The exception that ended the flight; None if there was none."""
 
 
 def row_of(variant: Variant, phase: FlightPhase, flown: FaultFlight, vehicle: Vehicle) -> Row:
@@ -141,7 +141,7 @@ def _impact_m_s(course: Sequence[Point], standing_m: float) -> float:
 
 
 def _over_s(ticks: Sequence[Tick]) -> float:
-    """Return the time of the touchdown after the flight; later events are not a reaction to the fault."""
+    """Return the time of the touchdown that ends the flight; later events are not a reaction to the fault."""
     flew = False
     for tick in ticks:
         flew = flew or tick.kind not in (PhaseKind.GROUND, PhaseKind.DONE)
@@ -166,7 +166,7 @@ def _min_height_m(flown: FaultFlight, course: Sequence[Point]) -> float | None:
 
 
 def _drift_m(flown: FaultFlight, course: Sequence[Point], abort: Event | None) -> float | None:
-    """Return the horizontal distance from the abort to the place of landing, or the largest error of a mission that went on."""
+    """Return the horizontal distance from the abort to the landing, or the largest error of a mission that continued."""
     if not course:
         return None
     if abort is not None:
@@ -195,7 +195,7 @@ def _problems(
     if not course and phase != "ground":
         found.append("the fault never began")
     if variant.kind not in _PULLS_BY_ITSELF and any(point.tension_n > TAUT_N for point in course):
-        found.append("tether made taut by its own motion")
+        found.append("pulled its tether taut by its own motion")
     elif variant.kind == "tether_taut" and abort is not None and _outward_m(course, abort) > OUTWARD_M:
         found.append("outward on a taut tether")
     if any(_outside(point.position_world_m, vehicle) for point in course):
@@ -204,7 +204,7 @@ def _problems(
 
 
 def _outward_m(course: Sequence[Point], abort: Event) -> float:
-    """Return the additional distance from the anchor after the time to stop, m."""
+    """Return by how much the distance from the anchor grows after the stopping time, m."""
     slack = [point.slack_m for point in course if point.t_s >= abort.t_s + STOPPING_S]
     return slack[0] - min(slack) if slack else 0.0
 

@@ -1,4 +1,6 @@
-"""Faults over real wires: one `companion fly --sitl` per fault, judged by its log and by the simulated world's own record."""
+"""Faults flown over the real protocols: one `companion fly --sitl` per fault, evaluated from its log and the simulated world's own
+record.
+"""
 
 from __future__ import annotations
 
@@ -26,23 +28,23 @@ from companion.sitl_config.loader import SitlConfig
 
 FLIGHT_TIMEOUT_S = 240.0
 LEAVE_TIMEOUT_S = 60.0
-"""Time from the request to land to the end of the process."""
+"""Timeout from the request to land to the end of the process."""
 WITNESS = "world.json"
-"""File in the flight's folder with the record of a simulated world that has faults."""
+"""File in the flight's folder in which a simulated world with faults writes its record."""
 NEAR_FRAMES = 3
-"""Number of frames that are compared: a tick sees only the newest one."""
+"""Number of frames that are compared: a tick sees only the newest frame."""
 _POLL_S = 0.5
 
 
 class WireFlights:
-    """Flights over real wires, `jobs` at a time.
+    """Flies with `companion fly --sitl`, `jobs` flights at a time.
 
     Args:
         flights: the faults.
         options: arguments of `companion fly` that all flights share, the mission first.
         config: effective configuration, for the evaluation.
         out: folder in which every flight gets a folder of its own.
-        jobs: number of flights at the same time.
+        jobs: number of simultaneous flights.
     """
 
     def __init__(
@@ -68,7 +70,7 @@ class WireFlights:
         self.ask_to_stop()
 
     def ask_to_stop(self) -> None:
-        """Land the vehicles in the air and start no further flight. Safe in a signal handler."""
+        """Land the flying vehicles and start no further flights. Safe in a signal handler."""
         self._stop_asked = True
         for process in tuple(self._running):
             process.send_signal(signal.SIGINT)
@@ -78,7 +80,7 @@ class WireFlights:
         with ThreadPoolExecutor(self._jobs) as pool:
             waiting = {pool.submit(self._fly, n, variant, phase) for n, (variant, phase) in enumerate(self._flights)}
             while waiting:
-                # With a timeout, so that a stop signal is handled meanwhile.
+                # With a timeout, so that a stop signal is handled in the meantime.
                 done, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
                 yield from (message for future in done if (message := future.result()) is not None)
 
@@ -160,7 +162,7 @@ def flown(folder: Path, config: FlightConfig) -> FaultFlight:
 
 
 def _offset_s(inputs: Sequence[Inputs], frames: Sequence[tuple[int, float]], begun_s: float) -> float:
-    """Return the flight clock minus the world's clock, by the motion-capture frame nearest to the fault in both records."""
+    """Return the flight clock minus the world's clock, from the motion-capture frame nearest to the fault in both records."""
     stamps = {i.mocap.frame_number: i.mocap.stamp_s for i in inputs if i.mocap is not None}
     for number, world_s in sorted(frames, key=lambda frame: abs(frame[1] - begun_s)):
         for near in range(number, number + NEAR_FRAMES):
@@ -170,7 +172,7 @@ def _offset_s(inputs: Sequence[Inputs], frames: Sequence[tuple[int, float]], beg
 
 
 def _events(log: FlightLog | None, summary: dict[str, Any]) -> list[Event]:
-    """Return the core's events from the log; those of the guardian, or of a core without its recorder, come from the summary."""
+    """Return the events: the core's from the log, the guardian's (and the core's if its recorder died) from the summary."""
     found = [event for o in log.outputs for event in o.events] if log is not None else []
     known = {event.id for event in found}
     for event in summary["events"]:
@@ -181,5 +183,5 @@ def _events(log: FlightLog | None, summary: dict[str, Any]) -> list[Event]:
 
 
 def default_jobs() -> int:
-    """Return the number of flights at the same time: each needs about two cores."""
+    """Return the number of simultaneous flights: each needs about two cores."""
     return max(1, (os.cpu_count() or 1) // 2)

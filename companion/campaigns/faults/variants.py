@@ -11,13 +11,13 @@ from companion.sitl_config.faults import KINDS, PHASES, FaultKind, FlightPhase
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One kind and size of fault, for any phase."""
+    """A fault of one kind and size, for any phase."""
 
     kind: FaultKind
     size: float | None = None
     """Size of the fault; None for a kind without a size."""
     duration_s: float | None = None
-    """Duration of the fault; None if it lasts to the end of the flight."""
+    """Duration of the fault; None if it lasts until the end of the flight."""
 
     @property
     def phases(self) -> tuple[FlightPhase, ...]:
@@ -26,7 +26,7 @@ class Variant:
 
     @property
     def shown(self) -> tuple[float | None, str]:
-        """The value of the column `size` and its unit: the size, or the duration of a kind without a size."""
+        """Value and unit in the column `size`: the size, or the duration if the kind has no size."""
         if KINDS[self.kind].size is not None:
             return self.size, KINDS[self.kind].unit
         return self.duration_s, "s"
@@ -123,7 +123,7 @@ WIRES: tuple[tuple[Variant, FlightPhase], ...] = (
     (Variant("stall_loop"), "return"),
     (Variant("pilot_takeover", 3.0), "line"),
 )
-"""Faults of `--wires`, over real wires."""
+"""Faults of `--wires`, flown over the real protocols."""
 
 
 def planned(kinds: Sequence[str], phases: Sequence[str], *, wires: bool = False) -> list[tuple[Variant, FlightPhase]]:
@@ -131,7 +131,8 @@ def planned(kinds: Sequence[str], phases: Sequence[str], *, wires: bool = False)
 
     Args:
         kinds: requested kinds; empty for all.
-        phases: requested phases; empty for all. A kind requested in a phase is flown there even if campaigns do not.
+        phases: requested phases; empty for all. A kind that is requested with a phase is flown in it even if campaigns leave that
+            phase out.
         wires: choose from `WIRES`.
     """
     if wires:

@@ -1,4 +1,4 @@
-"""`companion robustness` as a campaign: one mission in many worlds, drawn at random or kept as cases."""
+"""`companion robustness` as a campaign: one mission in many worlds, drawn at random or read from a file of cases."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from companion.model.types import Outcome
 
 @dataclass(kw_only=True)
 class Robustness(Campaign):
-    """Draws of worlds, or the cases of a file."""
+    """A campaign in randomly drawn worlds, or in the cases of a file."""
 
     name = "robustness"
     csv_name = "draws.csv"
@@ -47,7 +47,7 @@ class Robustness(Campaign):
         return {**super().job(), "seed": self.seed, "fixed": fixed}
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings of the campaign, for the record."""
+        """Return the settings of the campaign for the results file."""
         law, preset = self.law
         own = {"mission": self.mission, "controller": law, "preset": preset}
         return {**super().settings(), **own, "seed": None if self.cases else self.seed, "cases": self.cases_file}
@@ -71,12 +71,12 @@ class Robustness(Campaign):
         }
 
     def csv_row(self, row: Row) -> Mapping[str, Any]:
-        """Return the results, followed by the drawn values."""
+        """Return the results and the drawn values."""
         results = {key: value for key, value in row.items() if key not in ("world", "events")}
         return {**results, "events": " ".join(row["events"]), **drivers(row["world"])}
 
     def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
-        """Return the distribution, its plot and the hardest flights."""
+        """Return the page: the distribution, its plot and the worst flights."""
         law, preset = self.law
         unsafe = sum(row["outcome"] not in SAFE for row in rows)
         return Page(
@@ -91,22 +91,22 @@ class Robustness(Campaign):
         )
 
     def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:
-        """Write the distribution."""
+        """Write the plot of the distribution."""
         from companion.campaigns.robustness.plots import write_distribution
 
         rows, path, (law, preset) = [message["row"] for message in messages], out / "distribution.png", self.law
         title = f"{self.configs[0].mission.name}, {law}/{preset}: {len(rows)} worlds"
-        caption = "RMS of ‖e_p‖ after the catch of the flights that caught the payload and were completed."
+        caption = "RMS of ‖e_p‖ after the catch, over completed flights that caught the payload."
         return [Picture(path, title, caption)] if write_distribution(rows, title, path) else []
 
     def write_more(self, rows: Sequence[Row], out: Path) -> None:
-        """Write the worst flights, and those to keep, as cases."""
+        """Write the worst flights to `worst.yaml`, and the flights to keep to `--keep`, as cases."""
         self._write_cases(worst(rows), out / "worst.yaml")
         if self.keep is not None:
             self._write_cases(rows if self.cases else worst(rows), Path(self.keep))
 
     def show(self, rows: Sequence[Row], console: Console) -> None:
-        """Print the distribution, the hardest flights and the command that flies the worst one over real wires."""
+        """Print the distribution, the worst flights and the command that flies the worst one with `companion fly --sitl`."""
         law, preset = self.law
         console.print(f"{law}/{preset}, {self._result(rows)}", highlight=False)
         console.print(for_terminal(thirds_table(rows)), highlight=False)
@@ -119,7 +119,9 @@ class Robustness(Campaign):
         hardest = worst(rows)[0]["world"]
         keys = hardest if self.cases else {key: hardest[key] for key in DRAWN}
         line = fly_command(self.mission, law, preset, self.configs[0].laboratory.name, keys, self.overrides)
-        console.print(f"to fly the worst one over real wires:\n{line}", highlight=False, markup=False, soft_wrap=True)
+        console.print(
+            f"to fly the worst one with companion fly:\n{line}", highlight=False, markup=False, soft_wrap=True
+        )
 
     def good(self, rows: Sequence[Row]) -> bool:
         """Return whether every flight ended safely."""
@@ -146,7 +148,7 @@ class Robustness(Campaign):
     def _write_cases(self, rows: Sequence[Row], path: Path) -> None:
         law, preset = self.law
         remark = (
-            "The hardest worlds for this law in the fast loop, with the results.\n"
+            "The worst worlds for this law in the fast loop, with the results.\n"
             f"To fly them again: companion robustness --cases {path.name} (--case NAME for one; --keep FILE to keep the new results)."
         )
         if not self.cases:
@@ -182,7 +184,7 @@ def thirds_table(rows: Sequence[Row]) -> Table:
 
 
 def flights_table(rows: Sequence[Row], cases: Sequence[Case] = ()) -> Table:
-    """Return one line per flight: its result and the drawn values.
+    """Return one line per flight with its result and the drawn values.
 
     Args:
         rows: rows of the flights.

@@ -18,9 +18,9 @@ from companion.model.types import Outcome
 from companion.sitl_config.world import World
 
 WORSE_THAN_KEPT = 1.25
-"""Largest allowed ratio of a case's error to its kept error."""
+"""Largest allowed ratio of a case's error to its recorded error."""
 _HARD_FROM = 0.4
-"""Share of the distance from the middle of a range to its hard end from which on a name mentions the quantity."""
+"""Fraction of the distance from the middle of a range to its hard end above which a case's name mentions the quantity."""
 _WORDS = (
     # key, middle and hard end of its range, word
     ("setpoint_delay_s", 0.03, 0.06, "slow_setpoints"),
@@ -41,11 +41,11 @@ class Kept(Model):
     outcome: Outcome
     caught: bool
     e_p_m: NonNegative | None = None
-    """RMS error after the catch, or of the whole flight without a catch; absent if the mission was not completed."""
+    """RMS error after the catch, or of the whole flight if there was no catch; absent if the mission was not completed."""
 
 
 class Case(Model):
-    """A world that was difficult to fly in, with its earlier result."""
+    """A world in which it was difficult to fly, with its recorded result."""
 
     name: str
     world: World
@@ -66,7 +66,7 @@ class Cases(Model):
     cases: tuple[Case, ...]
 
     def named(self, names: Sequence[str]) -> tuple[Case, ...]:
-        """Return the cases of these names in the order of the file, or all cases without names.
+        """Return the named cases in the order of the file, or all cases if no names are given.
 
         Raises:
             ConfigError: there is no such case.
@@ -113,7 +113,7 @@ def write_cases(cases: Cases, path: Path, remark: str) -> None:
 def fly_command(
     mission: str, controller: str, preset: str, name: str, world: Mapping[str, Any], sets: Sequence[str] = ()
 ) -> str:
-    """Return the command that flies the same world over real wires.
+    """Return the `companion fly --sitl` command that flies the same world.
 
     Args:
         mission: mission file.
@@ -175,7 +175,7 @@ def as_cases(rows: Sequence[Row]) -> tuple[Case, ...]:
 
 
 def worse_than(row: Row, kept: Kept) -> str | None:
-    """Return the results that are worse than the recorded ones, or None."""
+    """Return what is worse than the recorded results, or None."""
     outcome, why = row["outcome"], row["why"] or row["error"] or "no event gives a reason"
     if outcome != kept.outcome.value and outcome != Outcome.COMPLETED.value:
         return f"{outcome} ({why}), kept as {kept.outcome.value}"

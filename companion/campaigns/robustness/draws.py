@@ -17,9 +17,9 @@ from companion.campaigns.runner import Row
 from companion.model.types import Outcome
 
 WORST = 10
-"""Number of the hardest flights that are kept."""
+"""Number of worst flights that are kept."""
 SAFE = (Outcome.COMPLETED.value, Outcome.ABORTED.value, Outcome.REFUSED.value)
-"""Outcomes that end with the machine on the floor in one piece."""
+"""Outcomes with the vehicle undamaged on the floor."""
 _SEVERITY = {Outcome.CRASHED.value: 4, Outcome.LOST.value: 3, Outcome.REFUSED.value: 2, Outcome.ABORTED.value: 1}
 DRIVERS: dict[str, str] = {
     "payload_kg": "payload, kg",
@@ -32,7 +32,7 @@ DRIVERS: dict[str, str] = {
     "link2_mass_error": "mass error of link 2",
     "setpoint_delay_s": "setpoint delay, s",
     "arm_delay_s": "arm delay, s",
-    "rotor_lag_s": "rotor lag, s",
+    "rotor_lag_s": "rotor time constant, s",
     "wind_speed_m_s": "wind, m/s",
     "force_bias_n": "bias of the force sensor, N",
     "force_lost_s": "force sensor lost at, s",
@@ -79,7 +79,7 @@ def sensor_of(row: Row) -> str:
 
 
 def graded(rows: Sequence[Row]) -> list[Row]:
-    """Return the completed flights with a catch, which alone count for the distribution of e_p."""
+    """Return the completed flights with a catch: only these are used for the distribution of e_p."""
     return [
         row for row in rows if row["outcome"] == Outcome.COMPLETED.value and row["caught"] and row["e_p_m"] is not None
     ]
@@ -137,7 +137,7 @@ def _ranks(values: Any) -> Any:
 
 
 def worst(rows: Sequence[Row], count: int = WORST) -> list[Row]:
-    """Return the hardest flights, the worst first: by outcome, then by error, then by number."""
+    """Return the worst flights, the worst first: by outcome, then by error, then by number."""
     return sorted(
         rows, key=lambda row: (-_SEVERITY.get(row["outcome"], 0), -(row["e_p_m"] or 0.0), row["number"] or 0)
     )[:count]

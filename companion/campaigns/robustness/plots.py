@@ -18,7 +18,7 @@ from companion.campaigns.runner import Row
 
 _COLOURS = dict(zip(("working", "lost after the catch", "missing at the catch"), COLOURS, strict=False))
 _AGAINST = ("payload_kg", "throw_speed_m_s", "setpoint_delay_s", "catch_x_m", "hover_thrust_error")
-"""The first four of these that the world drew are shown."""
+"""Quantities to plot: the first four that the world drew are shown."""
 BARS = 10
 
 
@@ -82,7 +82,7 @@ def _bars(ax: Any, found: Sequence[tuple[str, float]]) -> None:
         return
     shown = list(found[:BARS])[::-1]
     ax.barh(range(len(shown)), [value for _, value in shown], color=SOFT, height=0.7)
-    # Labels are placed beside zero, because left of the axis they would take half of the width.
+    # Labels are placed next to zero: left of the axis they would take half of the width.
     for at, (key, value) in enumerate(shown):
         left = value > 0
         ax.text(

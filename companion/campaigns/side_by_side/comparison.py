@@ -1,4 +1,4 @@
-"""Compares flights by logs and summaries: flown missions, differing settings, all figures, and the fairness of the comparison."""
+"""Compares flights from their logs and summaries: missions, differing settings, all metrics, and the fairness of the comparison."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ Align = Literal["catch", "takeoff", "start"]
 FLIGHTS_MAX = 6
 """Largest number of flights that can be distinguished in one plot."""
 MARKED_FROM = 0.05
-"""Share of the larger value below which a difference is not marked better or worse: single flights scatter."""
+"""Fraction of the larger value below which a difference is not marked better or worse: single flights scatter."""
 
 
 class NotAlignable(Exception):
-    """A flight lacks the requested event; one line for the user."""
+    """A flight lacks the requested event. The text is one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One figure of summary.json for every flight; None where it was not measured."""
+    """One metric of summary.json for every flight; None where it was not measured."""
 
     key: str
     """Dotted key of summary.json."""
@@ -35,7 +35,7 @@ class Figure:
     differences: tuple[float | None, ...]
     """Differences from the first flight."""
     verdicts: tuple[str | None, ...]
-    """`better` or `worse` than the first flight, for figures of which a smaller value is certainly better."""
+    """`better` or `worse` than the first flight, for metrics of which a smaller value is certainly better."""
 
 
 @dataclass(frozen=True)
@@ -45,18 +45,18 @@ class Comparison:
     flights: tuple[Flight, ...]
     align: Align
     zeros_s: tuple[float, ...]
-    """Zero of the common time axis on the flight clock of each flight."""
+    """Flight clock of each flight at the zero of the common time axis."""
     fair: str
     """One sentence on how the flights differ."""
     cautions: tuple[str, ...]
-    """Reasons to read the figures with care; empty if there are none."""
+    """Reasons to read the metrics with care; empty if there are none."""
     notes: tuple[str, ...]
     about: tuple[tuple[str, tuple[str, ...]], ...]
     """Facts about the flights: the name of each fact and its text for each flight."""
     settings: tuple[Setting, ...]
     """Settings that differ."""
     addresses: tuple[Setting, ...]
-    """Differing addresses of simulated devices, which the simulated world chooses anew for each flight."""
+    """Differing addresses of simulated devices, which the simulated world chooses for each flight."""
     figures: tuple[Figure, ...]
 
 
@@ -76,7 +76,7 @@ _KNOWN: tuple[tuple[str, str, int, str], ...] = (
     ("tether.min_slack_m", "minimum tether slack [m]", 3, ""),
     ("loop.rate_hz", "control loop [Hz]", 2, ""),
     ("loop.ticks", "ticks", 0, ""),
-    ("loop.missed", "ticks a period late", 0, "machine"),
+    ("loop.missed", "ticks one period late", 0, "machine"),
     *(
         (f"{key}.{part}", f"{label}, {part} [ms]", 2, "machine")
         for key, label in (
@@ -88,7 +88,7 @@ _KNOWN: tuple[tuple[str, str, int, str], ...] = (
     ),
     ("recorder.samples", "recorded ticks", 0, ""),
     ("recorder.dropped", "ticks lost by the recorder", 0, "machine"),
-    ("graded_every", "graded: one tick of", 0, ""),
+    ("graded_every", "evaluated: one tick of", 0, ""),
     ("events.info", "events: info", 0, ""),
     ("events.warning", "events: warning", 0, ""),
     ("events.critical", "events: critical", 0, ""),
@@ -114,7 +114,7 @@ def compare(flights: Sequence[Flight], align: Align | None = None) -> Comparison
             + ", ".join(
                 f"{f.letter} every {f.summary['graded_every']}th tick" for f in flights if f.summary["graded_every"] > 1
             )
-            + " is graded and drawn; the timing covers every tick."
+            + " is evaluated and drawn; the timing covers every tick."
         )
     zeros = [_zero_s(flight, chosen) for flight in flights]
     return Comparison(
@@ -132,7 +132,7 @@ def compare(flights: Sequence[Flight], align: Align | None = None) -> Comparison
 
 
 def jsonable(comparison: Comparison) -> dict[str, Any]:
-    """Return everything but the time series, for scripts. Unknown values are None; `absent` lists the flights that lack a key."""
+    """Return everything except the time series, for scripts. Unknown values are None; `absent` lists the flights that lack a key."""
 
     def rows(settings: Sequence[Setting]) -> list[dict[str, Any]]:
         letters = [flight.letter for flight in comparison.flights]

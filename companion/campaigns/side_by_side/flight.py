@@ -17,15 +17,15 @@ _FLYING = (PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING)
 
 @dataclass(frozen=True)
 class Course:
-    """Time series of a flight: one row per tick read, NaN where a value is unknown. World ENU; times on the flight clock."""
+    """Time series of a flight: one row per tick that was read, NaN where a value is unknown. World ENU; times on the flight clock."""
 
     t_s: Array
     flying: metrics.Mask
-    """From take-off to touchdown."""
+    """Ticks from take-off to touchdown."""
     graded: metrics.Mask
-    """The phases that the RMS figures cover."""
+    """Ticks that the RMS errors cover."""
     e_p_m: Array
-    """Norm of the position error, by motion capture."""
+    """Norm of the position error, measured by motion capture."""
     e_q_deg: Array
     e_alpha_deg: Array
     thrust_percent: Array
@@ -35,7 +35,7 @@ class Course:
     flown_world_m: Array
     reference_world_m: Array
     lateness_s: Array
-    """Lateness of every recorded tick, kept or not."""
+    """Lateness of every recorded tick, whether kept or not."""
     catch: int | None
     """Row of the first catch."""
     takeoff_s: float | None

@@ -1,4 +1,4 @@
-"""side_by_side.html: facts about the flights, differing settings, all figures, the plots and the events."""
+"""side_by_side.html: facts about the flights, differing settings, all metrics, the plots and the events."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from companion.campaigns.side_by_side.plots import LINES
 from companion.campaigns.side_by_side.settings import Setting, text_of
 
 _EVENTS_SHOWN = 40
-"""A longer table of events is folded."""
+"""Number of events above which the table of events is folded."""
 
 
 def write_html(comparison: Comparison, pictures: Sequence[Picture], path: Path) -> None:
@@ -21,10 +21,10 @@ def write_html(comparison: Comparison, pictures: Sequence[Picture], path: Path) 
     zero = {"catch": "the catch", "takeoff": "take-off", "start": "the first tick of the log"}[comparison.align]
     tables = [_settings(comparison, comparison.settings, "")] if comparison.settings else []
     if comparison.addresses:
-        title = "Addresses of the simulated devices, chosen anew for each flight"
+        title = "Addresses of the simulated devices, chosen for each flight"
         tables.append(_settings(comparison, comparison.addresses, title))
     marked = (
-        f"Below each value: its difference from A. A figure is marked if it differs from A's by more than {100 * MARKED_FROM:.0f} %, "
+        f"Below each value: its difference from A. A value is marked if it differs from A's by more than {100 * MARKED_FROM:.0f} %, "
         "and only where a smaller value is certainly better. Single flights have no statistical weight; companion compare flies many."
     )
     events = _events(comparison)
@@ -51,7 +51,7 @@ def write_html(comparison: Comparison, pictures: Sequence[Picture], path: Path) 
 
 
 def _columns(comparison: Comparison, show: Callable[[Any, int], Cell], *, left: bool = True) -> list[Column]:
-    """Return one column per flight; `show` takes the item and the position of the flight."""
+    """Return one column per flight; `show` receives the item and the position of the flight."""
     return [
         Column(f"{flight.letter} {flight.name}", lambda item, n=n: show(item, n), left=left, line=LINES[n])  # type: ignore[misc]
         for n, flight in enumerate(comparison.flights)
@@ -93,7 +93,7 @@ def _figure(figure: Figure, n: int) -> Cell:
         shown = "0" if difference == 0 else "≈ 0"
     elif first:
         ratio = (first + difference) / first
-        # A percentage above 900, or of a figure with changed sign, is useless.
+        # A percentage above 900, or of a value with a changed sign, is useless.
         if ratio >= 10:
             shown += f" ({ratio:.0f}\u00a0times)"
         elif ratio >= 0:

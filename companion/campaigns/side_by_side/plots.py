@@ -1,4 +1,4 @@
-"""Plots of several flights over each other: errors, actuation, path, lateness. Flights differ in colour and in dashes.
+"""Plots that overlay several flights: errors, actuation, path, lateness. Flights differ in colour and in dashes.
 
 Needs matplotlib (extra `analysis`).
 """
@@ -47,9 +47,9 @@ LINES = tuple(
 """Line styles of the flights, by position."""
 _EVENT_MARKS = {"info": ("|", 7.0), "warning": ("^", 6.0), "critical": ("X", 7.5)}
 _NAME_SHARE = 0.0074
-"""Width of one character of an event's name, as a share of the axis."""
+"""Width of one character of an event's name, as a fraction of the axis."""
 _CROWD_SHARE = 0.015
-"""Distance below which event marks overlap, as a share of the axis."""
+"""Distance below which event marks overlap, as a fraction of the axis."""
 _SEVERITY = {"warning": 1, "critical": 2}
 
 
@@ -58,16 +58,16 @@ def write_pictures(comparison: Comparison, out_dir: Path) -> list[Picture]:
     zero = {"catch": "the catch", "takeoff": "the take-off command", "start": "the first tick of the log"}[
         comparison.align
     ]
-    lane = f"Time counts from {zero}. Bottom: the events of each flight; bar info, triangle warning, cross critical."
+    lane = f"Time starts at {zero}. Bottom: the events of each flight (bar: info, triangle: warning, cross: critical)."
     ends = " Cross on a line: the end of a flight that was not completed."
     makers: tuple[tuple[str, str, str, Callable[[Comparison], Figure | None]], ...] = (
-        ("errors", "Errors", f"By motion capture against the reference; e_q against the attitude setpoint. {lane}{ends}", _errors),
+        ("errors", "Errors", f"e_p, e_q: measured by motion capture; e_q: relative to the attitude setpoint. {lane}{ends}", _errors),
         ("actuation", "Thrust, gain and tether", f"Commanded thrust, switching gain, tether slack. {lane}{ends}", _actuation),
-        ("path", "Path", "By motion capture, from above and from the side; grey: references; circles: catches.", _path),
+        ("path", "Path", "Measured by motion capture, from above and from the side; grey: references; circles: catches.", _path),
         (
             "lateness",
             "Lateness",
-            "Share of the ticks that started later than a given time; lower and further left is better.",
+            "Fraction of the ticks that started later than a given time; lower and further left is better.",
             _lateness,
         ),
     )  # fmt: skip
@@ -114,7 +114,7 @@ def _over_time(
     *,
     from_zero: bool,
 ) -> Figure | None:
-    """Draw axes over the common time with the events of every flight below; panes without data are left out."""
+    """Draw panes over the common time, with the events of every flight below; panes without data are left out."""
     flights = comparison.flights
     kept = [(label, of) for label, of in panes if any(np.isfinite(of(f)[f.course.flying]).any() for f in flights)]
     if not kept:
@@ -132,14 +132,14 @@ def _over_time(
         for n, (flight, zero_s) in enumerate(zip(flights, comparison.zeros_s, strict=True)):
             course, values = flight.course, of(flight)
             t, drawn = course.t_s - zero_s, np.where(course.flying, values, np.nan)
-            # The first flight is at the bottom: dashes over a solid line show both where they agree.
+            # The first flight is at the bottom: where they agree, dashes over a solid line show both.
             ax.plot(t, drawn, **_style(n), lw=1.25, zorder=3 + 0.1 * n)
             if not flight.completed:
                 mark_end(ax, t, drawn, LINES[n].colour)
             seen = values[course.graded if course.graded.any() else course.flying]
             graded.append(seen[np.isfinite(seen)])
         if from_zero:
-            # Scaled without the take-off, whose transient is larger than all errors in flight.
+            # The axis is scaled without the take-off, whose transient is larger than all errors in flight.
             most = max((float(seen.max()) for seen in graded if len(seen)), default=0.0)
             ax.set_ylim(0.0, 1.12 * max(most, 1e-3))
         else:
@@ -269,7 +269,7 @@ def _path(comparison: Comparison) -> Figure | None:
 
 
 def _lateness(comparison: Comparison) -> Figure | None:
-    """Draw the share of ticks later than a time over that time: unlike a histogram it shows the tail."""
+    """Draw the fraction of ticks later than a time over that time; unlike a histogram, it shows the tail."""
     lateness = [1e3 * f.course.lateness_s[np.isfinite(f.course.lateness_s)] for f in comparison.flights]
     if not any(len(values) for values in lateness):
         return None
@@ -284,7 +284,7 @@ def _lateness(comparison: Comparison) -> Figure | None:
     known = np.concatenate(lateness)
     typical, late, most = (float(np.percentile(known, percent)) for percent in (50, 99, 100))
     if typical > 0.0 and most > 10.0 * late:
-        # A linear axis would press everything but one stall against zero.
+        # A linear axis would show everything but one stall near zero.
         ax.set_xscale("log")
         ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         ax.set_xlim(left=typical / 3.0)

@@ -22,21 +22,21 @@ _ADDRESSES = frozenset(
         "force.port",
     )
 )
-"""Keys that the simulated world sets anew for each flight."""
+"""Keys that the simulated world sets for each flight."""
 _NOT_SETTINGS = ("sources.phases", "sources.overrides")
-"""Keys with the origin of values; the values have keys of their own."""
+"""Keys that hold the origin of values; the values have their own keys."""
 
 _NAMES = ("sources.", "mission.vehicle")
-"""Names of files; their content has keys of its own."""
+"""Keys that hold names of files; the files' contents have their own keys."""
 
 _SECTIONS = ("mission", "controller", "vehicle", "world", "sources")
 _KEYS_SHOWN = 4
-"""Number of keys that a sentence names; the table has all of them."""
+"""Maximum number of keys that a sentence names; the table has all of them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One key of the effective configurations, of every flight."""
+    """One configuration key and its value in each flight's effective configuration."""
 
     key: str
     values: tuple[Any, ...]
@@ -45,7 +45,7 @@ class Setting:
 
 
 def simulated(config: dict[str, Any]) -> bool:
-    """Return whether the flight was simulated: its arm is connected to a pseudo-terminal."""
+    """Return whether the flight was simulated: if so, its arm is on a pseudo-terminal."""
     devices = _part(_part(config, "vehicle"), "devices")
     return str(_part(devices, "arm").get("port", "")).startswith("/dev/pts/")
 
@@ -61,14 +61,14 @@ def payload_kg(flight: Flight) -> float | None:
 def settings_of(configs: Sequence[dict[str, Any]]) -> tuple[list[Setting], list[Setting]]:
     """Return the differing settings, and separately the differing addresses chosen by the simulated world.
 
-    The section `world` of a flight on the vehicle has no meaning and is left out.
+    The section `world` of a flight on hardware is meaningless and left out.
     """
     in_world = [simulated(config) for config in configs]
     flat = [_flat(config if real else _without_world(config)) for config, real in zip(configs, in_world, strict=True)]
     keys = list(dict.fromkeys(key for one in flat for key in one))
     settings: list[Setting] = []
     addresses: list[Setting] = []
-    # Sections keep their order; a key that only a later flight has goes to the end of its section.
+    # Sections keep their order; a key that only a later flight has is appended to its section.
     for key in sorted(keys, key=lambda key: _rank(key.partition(".")[0])):
         present = tuple(key in one for one in flat)
         values = tuple(one.get(key) for one in flat)
@@ -106,12 +106,12 @@ def fairness(flights: Sequence[Flight], settings: Sequence[Setting]) -> tuple[st
     elif not cautions:
         fair = f"Only the law or its gains differ ({_count(law)})."
     else:
-        fair = f"The law or its gains differ ({_count(law)}), and so do the settings below: the figures show the combined effect."
+        fair = f"The law or its gains differ ({_count(law)}), and so do the settings below: the metrics show the combined effect."
     failed = [f"{flight.letter} ({flight.summary['outcome']})" for flight in flights if not flight.completed]
     if failed:
-        cautions.append(f"Not completed: {', '.join(failed)}. RMS figures of an incomplete mission are not marked.")
+        cautions.append(f"Not completed: {', '.join(failed)}. RMS errors of an incomplete mission are not marked.")
     if not same_mission:
-        cautions.append("RMS figures of different missions are not marked better or worse.")
+        cautions.append("RMS errors of different missions are not marked better or worse.")
     return fair, cautions, same_mission
 
 
@@ -151,7 +151,7 @@ def _caution(flights: Sequence[Flight], kind: str, settings: Sequence[Setting]) 
 
 
 def _circumstances(flights: Sequence[Flight], payload_told: bool) -> list[str]:
-    """Return the differences outside the configurations."""
+    """Return the differences that are not in the configurations."""
     out: list[str] = []
 
     def differ(what: str, texts: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""A private certificate authority and the broker's certificate, by which a ground station identifies the broker."""
+"""A private certificate authority, and the broker's certificate by which clients identify the broker."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 AUTHORITY_DAYS = 3650
 _EARLY = datetime.timedelta(days=1)
-"""Certificates are valid from a day ago, because computers without a real-time clock may be late."""
+"""Certificates become valid one day before they are made, because the clock of a computer without an RTC may be behind."""
 
 
 class CertificateError(Exception):
-    """A certificate or key cannot be used; one line."""
+    """A certificate or key cannot be used. The text is one line."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -33,7 +33,7 @@ def make_authority(now: datetime.datetime) -> Pair:
     """Return a new authority, ECDSA P-256, valid for `AUTHORITY_DAYS`.
 
     Args:
-        now: present time with time zone.
+        now: current time with time zone.
     """
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name("companion broker authority")
@@ -52,7 +52,7 @@ def make_server(authority: Pair, hosts: Sequence[str], days: int, now: datetime.
         authority: the signing authority.
         hosts: names and addresses of the broker.
         days: validity, at most that of the authority.
-        now: present time with time zone.
+        now: current time with time zone.
 
     Raises:
         CertificateError: the authority is invalid, its key does not match, or it expires earlier.
@@ -62,7 +62,7 @@ def make_server(authority: Pair, hosts: Sequence[str], days: int, now: datetime.
     if until > issuer.not_valid_after_utc:
         ends = f"{issuer.not_valid_after_utc:%Y-%m-%d}"
         raise CertificateError(
-            f"the authority expires on {ends}, in less than {days} days; create a new folder, or use fewer days"
+            f"the authority expires on {ends}, in less than {days} days; create a new folder, or choose fewer days"
         )
     key = ec.generate_private_key(ec.SECP256R1())
     builder = (

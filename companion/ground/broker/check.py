@@ -1,4 +1,4 @@
-"""Permissions of a login at a broker, found by trial: connect, subscribe, publish an empty message, and receive."""
+"""Finds the permissions of a login at a broker by trying to subscribe, to publish an empty message, and to receive."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ANSWER_S = 5.0
 
 
 class CheckError(Exception):
-    """The broker is unreachable or refuses the connection; one line."""
+    """The broker is unreachable or refuses the connection. The text is one line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +50,8 @@ def check(access: BrokerAccess, vehicle: str | None = None) -> CheckResult:
 
     Args:
         access: broker, login, certificates.
-        vehicle: vehicle whose topics are tested; each of its readers, and the vehicle itself on ``command``, counts one rejected
-            message. None for a name that no vehicle has.
+        vehicle: vehicle whose topics are tested: each of its readers, and the vehicle itself on ``command``, counts one rejected
+            message. None to use a name that no vehicle has.
 
     Raises:
         CheckError: no connection, or no answer.
@@ -99,7 +99,7 @@ async def _try_topics(access: BrokerAccess, name: str) -> tuple[set[Topic], set[
             login = "without a login" if access.username is None else f"as {access.username}"
             text = f"the broker refuses the connection {login}: {error_text(error)}; see --login"
             if reason_code(error) is None:
-                text = f"the broker does not answer: {error_text(error)}; for a port with TLS use mqtts://"
+                text = f"the broker does not answer: {error_text(error)}; for a TLS port use mqtts://"
             raise CheckError(f"{access.address}: {text}") from None
         try:
             await until_first(client.wait_broken(), try_all())
@@ -111,7 +111,7 @@ async def _try_topics(access: BrokerAccess, name: str) -> tuple[set[Topic], set[
 
 
 def _probe(access: BrokerAccess) -> tuple[str | None, str | None]:
-    """Return the TLS version and the expiry of the broker's certificate, both None without TLS; uses a connection of its own.
+    """Return the TLS version and the expiry of the broker's certificate, both None without TLS; opens a separate connection.
 
     Raises:
         CheckError: no connection.

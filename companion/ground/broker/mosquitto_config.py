@@ -1,4 +1,4 @@
-"""Text of the mosquitto configuration for a broker that several computers use: mosquitto.conf(5) and its access list. Pure."""
+"""Text of mosquitto.conf(5) and of its access list, for a broker that several computers use. Pure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TLS_PORT = 8883
 PUBLISHED_TOPICS = tuple(topic for topic in Topic if topic is not Topic.COMMAND)
 """Topics that the vehicle publishes and ground stations read."""
 _PACKET_ROOM_BYTES = 62_144
-"""Topic, properties and a margin, which the packet limit includes."""
+"""Part of the packet limit for topic, properties and a margin."""
 
 
 def profile_text(folder: Path) -> str:
@@ -36,7 +36,7 @@ allow_anonymous false
 password_file {folder}/passwords
 acl_file {folder}/acl
 
-# Limits on memory, whatever clients do; no messages are kept over a restart.
+# Limits on memory, whatever clients send; no messages are kept over a restart.
 max_packet_size {MESSAGE_MAX_BYTES + _PACKET_ROOM_BYTES}
 max_queued_messages 1000
 max_queued_bytes 8000000
@@ -56,7 +56,7 @@ def acl_text(vehicles: Sequence[str], operators: Sequence[str], viewers: Sequenc
     """Return the access list, mosquitto.conf(5) `acl_file`: what is not listed is denied.
 
     Args:
-        vehicles: names in topics, which are also the vehicles' logins.
+        vehicles: vehicle names as used in topics, also their logins.
         operators: logins that may command every vehicle.
         viewers: logins that may only read.
     """

@@ -44,7 +44,7 @@ _HASH_DEADLINE_S = 60.0
 
 
 class SetupError(Exception):
-    """A tool is missing or fails; one line."""
+    """A tool is missing or fails. The text is one line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ def create(folder: Path, users: BrokerUsers, now: datetime.datetime) -> None:
     """
     _check_names(users)
     if not str(folder).isprintable():
-        raise ConfigError([f"{folder}: the folder's name has control characters; choose another"])
+        raise ConfigError([f"{folder}: the folder's name contains control characters; choose another"])
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(
             [f"{folder}: already exists, nothing was changed; choose another, or use --renew-certificates"]
@@ -132,7 +132,7 @@ def certificate_expiry(folder: Path) -> datetime.date:
 
 
 def _fill(folder: Path, later: Path, users: BrokerUsers, now: datetime.datetime) -> None:
-    """Write all files into `folder`, which will be renamed to `later`."""
+    """Write all files into `folder`, which is renamed to `later` afterwards."""
     authority = make_authority(now)
     try:
         server = make_server(authority, _all_hosts(users.hosts), users.days, now)
@@ -209,7 +209,7 @@ def _check_names(users: BrokerUsers) -> None:
         if names.count(name) > 1
     ]
     if not users.vehicles:
-        lines.append("--vehicle: expected the name of at least one")
+        lines.append("--vehicle: expected at least one vehicle name")
     if lines:
         raise ConfigError(lines)
     _check_hosts(users.hosts)
@@ -234,7 +234,7 @@ def _all_hosts(hosts: Sequence[str]) -> list[str]:
 
 
 def this_host() -> tuple[str, ...]:
-    """Return this computer's name if a certificate can hold it."""
+    """Return this computer's host name; empty if it is not valid in a certificate."""
     with contextlib.suppress(OSError):
         name = socket.gethostname()
         if _is_host(name):

@@ -34,7 +34,7 @@ class SettingNames:
     login_file: str
     ca_file: str
     ca_without_tls: bool
-    """Whether a CA file without TLS is allowed: a vehicle file names it once, and a flight may override only the URL."""
+    """Whether a CA file without TLS is allowed: a vehicle file names the CA file once, and a flight may override only the URL."""
 
 
 OPTIONS = SettingNames("--broker", "--login", "--ca", ca_without_tls=False)
@@ -47,7 +47,7 @@ def broker_access(url: str, login_file: str | None, ca_file: str | None, named: 
     Args:
         url: mqtt://HOST:PORT or mqtts://HOST:PORT.
         login_file: YAML file with `username` and `password`, readable by its owner alone.
-        ca_file: certificates (PEM) of the authority that signed the broker's; None for the system's authorities.
+        ca_file: CA certificates (PEM) to verify the broker's certificate; None for the system's authorities.
         named: names of the settings, for messages.
 
     Raises:
@@ -74,7 +74,7 @@ def _tls(ca_file: str | None, where: str) -> ssl.SSLContext:
     except FileNotFoundError:
         raise ConfigError([f"{where}: no such file"]) from None
     except ssl.SSLError:
-        raise ConfigError([f"{where}: is not a certificate in PEM form (-----BEGIN CERTIFICATE-----)"]) from None
+        raise ConfigError([f"{where}: not a certificate in PEM form (-----BEGIN CERTIFICATE-----)"]) from None
     except OSError as error:
         raise ConfigError([f"{where}: cannot be read: {error.strerror}"]) from None
     context.minimum_version = ssl.TLSVersion.TLSv1_2

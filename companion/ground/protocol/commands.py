@@ -1,13 +1,14 @@
 """Signed commands: created by the ground station, verified by the vehicle.
 
-A command is signed with its operator's key, end to end: even if everything between ground and vehicle (broker, logins, TLS) fails or
-is open, the vehicle accepts no command without a key. The signature is HMAC-SHA256 (RFC 2104) over `canonical`.
+A command is signed with its operator's key, end to end: even if everything between ground and vehicle (broker, logins, TLS) is
+compromised, the vehicle accepts no command without a key. The signature is HMAC-SHA256 (RFC 2104) over `canonical`.
 
-A signature does not prove that a command is current. So the vehicle also checks that the command names this flight (session), is recent
-by the vehicle's own flight clock (which the ground takes from proven `Stream` messages), is new (nonce) and within a rate limit. A
-message without a valid signature changes none of this state, so a sender without a key cannot cause a genuine command to be refused.
+A signature does not prove that a command is current. So the vehicle also checks that the command names this flight (session), is
+recent according to the vehicle's own flight clock (which the ground station reads from proven `Stream` messages), is new (nonce)
+and within a rate limit. A message without a valid signature changes none of this state, so a sender without a key cannot cause a
+genuine command to be refused.
 
-A command that was refused once is never accepted later, whatever the reason was.
+A refused command is never accepted later, whatever the reason for the refusal.
 """
 
 from __future__ import annotations
@@ -30,13 +31,15 @@ from companion.ground.protocol.strict_json import StrictJsonError, parse
 from companion.model.codec import RecordError, from_jsonable
 
 DOMAIN = "companion command 2"
-"""First line of every signed text; a signature made for another purpose is not valid for a command."""
+"""First line of every signed text; it makes a signature for any other purpose invalid for commands."""
 AHEAD_MAX_S = 0.5
 """Largest lead of a command's time over the vehicle's clock."""
 REFUSED_MAX = 512
-"""Nonces of refused commands kept per operator and command name; beyond it a range of times is kept (`_History.add_refused`)."""
+"""Maximum number of nonces of refused commands kept per operator and command name; after that, a range of times is kept
+(`_History.add_refused`).
+"""
 ACKS_PER_S = 20
-"""Limit of acks for refused commands, so that replayed commands cause no flood of acks."""
+"""Limit of acks for refused commands, so that replayed commands do not cause a flood of acks."""
 _NOTHING = (float("inf"), float("-inf"))
 """An empty range of times."""
 _T_MS_MAX = 2**53
@@ -62,7 +65,7 @@ LIMITS = {
     CommandName.RESUME: Limits(2.0, 1),
     CommandName.START: Limits(2.0, 1),
 }
-"""Each command name has its own rate limit: LAND gets through however many HOLDs there are."""
+"""Each command name has its own rate limit: a flood of HOLDs does not block LAND."""
 
 
 class Reason(StrEnum):
@@ -87,21 +90,21 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """The command is genuine, recent, new, of this flight, and its operator is allowed to give it."""
+    """The command is genuine, recent, new and for this flight, and its operator is allowed to give it."""
 
     command: Command
 
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """The command must not be carried out."""
+    """The command must not be executed."""
 
     reason: Reason
     text: str
     """One printable line for the operator; may quote the payload."""
     command: Command | None = None
-    """The command if it was well signed and an `Ack` is sent to its operator. None if the sender is unknown, the command is a copy of
-    one that was answered, or the limit `ACKS_PER_S` is reached.
+    """The command if its signature is valid and an `Ack` is to be sent. None if the sender is unknown, the command is a copy of an
+    answered one, or the limit `ACKS_PER_S` is reached.
     """
 
 
@@ -143,7 +146,7 @@ def make_command(
         session: `State.session` or `Stream.session` of the flight.
         operator: the operator's name.
         key: the operator's key, `Operators.key`.
-        t_ms: the vehicle's flight clock now, `FlightClock.now_ms`.
+        t_ms: current flight clock of the vehicle, `FlightClock.now_ms`.
         hold: number of the hold that a RESUME ends, `Stream.hold`; 0 for other commands.
 
     Raises:
@@ -194,10 +197,10 @@ class _History:
         self._accepted: dict[str, float] = {}
         """Nonces of accepted commands, with the flight clock at which each becomes stale. Bounded by the rate limit."""
         self._refused: dict[str, float] = {}
-        """Nonces of refused commands, at most `REFUSED_MAX`, with the same flight clock."""
+        """Nonces of refused commands, at most `REFUSED_MAX`, with the flight clock at which each becomes stale."""
         self._closed_range_t_s = {False: _NOTHING, True: _NOTHING}
-        """Oldest and newest time of refused commands whose nonces were not kept: no command from this range is accepted. Commands from
-        the future (True) have a range of their own, so that they do not block the time between now and then.
+        """Oldest and newest time of refused commands whose nonces were not kept: no command from this range is accepted. Commands
+        from the future (True) have a separate range, so that they do not block the time until then.
         """
 
     @property
@@ -206,7 +209,7 @@ class _History:
         return len(self._accepted) + len(self._refused)
 
     def contains(self, command: Command) -> bool:
-        """Whether the command was accepted or refused before, or may have been."""
+        """Whether the command was, or may have been, accepted or refused before."""
         nonce, t_s = command.nonce, command.t_ms / 1000.0
         closed = any(from_t_s <= t_s <= until_t_s for from_t_s, until_t_s in self._closed_range_t_s.values())
         return closed or nonce in self._accepted or nonce in self._refused
@@ -225,8 +228,8 @@ class _History:
             self._closed_range_t_s[future] = min(from_t_s, t_s), max(until_t_s, t_s)
 
     def forget_stale(self, now_t_s: float) -> None:
-        """Forget stale commands: the clock never goes back, so they stay stale."""
-        stale_t_s = now_t_s - self.limits.age_max_s - 1.0  # a margin well beyond rounding errors
+        """Forget stale commands; they stay stale because the clock never goes back."""
+        stale_t_s = now_t_s - self.limits.age_max_s - 1.0  # a margin well above rounding errors
         for future, (from_t_s, until_t_s) in self._closed_range_t_s.items():
             self._closed_range_t_s[future] = (
                 _NOTHING if until_t_s < stale_t_s else (max(from_t_s, stale_t_s), until_t_s)
@@ -264,11 +267,12 @@ class Verifier:
 
         Args:
             payload: received bytes.
-            retained: the broker had kept the message: its age is unknown, and later subscribers would receive it again.
-            now_t_s: flight clock, s; None before it starts. The time never goes back: the latest time of all calls counts.
+            retained: whether the broker had retained the message; if so its age is unknown, and later subscribers would receive it
+                again.
+            now_t_s: flight clock, s; None before it starts. The verifier uses the latest time of all calls.
         """
         if len(payload) > COMMAND_MAX_BYTES:
-            return Refused(Reason.OVERSIZED, f"{len(payload)} bytes, at most {COMMAND_MAX_BYTES} expected")
+            return Refused(Reason.OVERSIZED, f"{len(payload)} bytes, expected at most {COMMAND_MAX_BYTES}")
         try:
             command = _parsed(payload)
         except RecursionError:  # nested nearly as deep as the parser allows
@@ -291,14 +295,14 @@ class Verifier:
         return self._verify_signed(command, retained)
 
     def _verify_signed(self, command: Command, retained: bool) -> Verdict:
-        """Verify a well-signed command of any age. A command that could be sent again is remembered, whether accepted or not."""
+        """Verify a correctly signed command of any age. A command that could be sent again is remembered, whether accepted or not."""
         history = self._histories[command.operator, command.command]
         now_t_s, t_s = self._now_t_s, command.t_ms / 1000.0
         who = f"{command.command.value} of {command.operator}"
         if command.session != self._session:
             return self._refuse(Reason.WRONG_SESSION, f"{who} is for another flight", command)
         if now_t_s - t_s > history.limits.age_max_s:
-            text = f"{who} is {now_t_s - t_s:.1f} s old, at most {history.limits.age_max_s:.1f} s expected"
+            text = f"{who} is {now_t_s - t_s:.1f} s old, expected at most {history.limits.age_max_s:.1f} s"
             return self._refuse(Reason.STALE, text, command)
         if history.contains(command):
             return Refused(Reason.REPLAYED, f"{who} was received before")
@@ -320,7 +324,7 @@ class Verifier:
         if now_t_s == float("-inf"):
             return Reason.EARLY, "the flight has not started"
         if t_s - now_t_s > AHEAD_MAX_S:
-            text = f"{who} is {t_s - now_t_s:.1f} s ahead of the flight's clock, at most {AHEAD_MAX_S:.1f} s expected"
+            text = f"{who} is {t_s - now_t_s:.1f} s ahead of the flight clock, expected at most {AHEAD_MAX_S:.1f} s"
             return Reason.FROM_THE_FUTURE, text
         if not self.operators.is_allowed(command.operator, command.command):
             return (
@@ -365,5 +369,5 @@ def _parsed(payload: bytes) -> Command | Refused:
 
 
 def _shown(text: str) -> str:
-    """Return printable, short text, whatever is quoted in it."""
+    """Return the text shortened and without unprintable characters."""
     return text.encode("ascii", "backslashreplace").decode("ascii")[:_TEXT_MAX]

@@ -1,8 +1,6 @@
-"""One MQTT connection on aiomqtt, with reason codes, unqueued messages and a complete shutdown.
-
-It adds what `aiomqtt.Client` does not offer: the reason code of a publish (an ACL that forbids writing shows it only in PUBACK),
-messages passed on at once instead of queued (a flood creates no tasks), and a shutdown that closes the socket in every state of the
-connection.
+"""An MQTT connection on aiomqtt with reason codes, unqueued messages and a complete shutdown. It adds what `aiomqtt.Client` does
+not offer: the reason code of a publish (only PUBACK shows that an ACL forbids writing), messages passed on immediately instead of
+queued (a flood creates no tasks), and a shutdown that closes the socket in every state of the connection.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 from companion.ground.protocol.access import BrokerAccess
 
 KEEPALIVE_S = 5
-"""After 1.5 times this without a message the broker publishes the last will (MQTT 5, 3.1.2.10)."""
+"""Keep-alive: after 1.5 times this without a message the broker publishes the last will (MQTT 5, 3.1.2.10)."""
 OnMessage = Callable[[str, bytes, bool], None]
 """Called in the event loop with topic, payload and retained flag; must not raise."""
 _SSL_SOURCE = re.compile(r" \(_ssl\.c:\d+\)$")
@@ -40,7 +38,7 @@ class Connection(aiomqtt.Client):
         packet_max_bytes: Maximum Packet Size; the broker drops larger messages.
         answer_s: timeout for each answer of the broker.
         will: message that the broker publishes if the connection breaks.
-        send_buffer_bytes: size of the socket's send buffer; its content becomes stale if the broker is slow.
+        send_buffer_bytes: size of the socket's send buffer, whose content becomes stale if the broker is slow.
     """
 
     def __init__(
@@ -80,7 +78,7 @@ class Connection(aiomqtt.Client):
         self._pending: dict[int, asyncio.Future[ReasonCode]] = {}
 
     async def open(self) -> None:
-        """Connect. The blocking part runs in a thread that cannot be cancelled: a cancelled caller waits for its end.
+        """Connect. The blocking part runs in a thread, which cannot be cancelled: a cancelled caller waits for it to end.
 
         Raises:
             aiomqtt.MqttError: the broker is unreachable, does not answer, or refuses the connection.
@@ -111,7 +109,7 @@ class Connection(aiomqtt.Client):
 
     async def publish_message(self, topic: str, payload: bytes, *, qos: int, retain: bool = False) -> str | None:
         """Publish and wait until the broker has the message (QoS 1) or the socket has accepted it (QoS 0); return None, or why the
-        broker refuses.
+        broker refused it.
 
         Raises:
             aiomqtt.MqttError: the connection is lost, or there was no answer within `answer_s`.
@@ -156,7 +154,7 @@ class Connection(aiomqtt.Client):
         self._client._sock_close()  # paho leaves the socket open if it fails before CONNACK
         for future in (self._connected, self._disconnected):
             if future.done() and not future.cancelled():
-                future.exception()  # retrieved, because asyncio warns of exceptions that are not
+                future.exception()  # retrieved because asyncio warns of exceptions that are not
         if self._misc_task is not None:
             self._misc_task.cancel()
             await asyncio.wait((self._misc_task,))

@@ -1,4 +1,4 @@
-"""A ground station's estimate of a vehicle's flight clock, by which it dates commands. Pure."""
+"""A ground station's estimate of a vehicle's flight clock, used to date commands. Pure."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from collections import deque
 
 
 class FlightClock:
-    """Estimate of one session's flight clock on a ground station. A new session needs a new instance.
-
-    A message carries the clock at which it was sent, so the estimate is late, never early. Of the recent messages the one with the
-    largest difference to the local clock had the least delay; the others do not set the estimate back.
+    """Estimates the flight clock of one session on a ground station. A new session needs a new instance. A message carries the
+    flight clock at which it was sent, so the estimate is late, never early. Of the recent messages, the one with the largest
+    difference from the local clock had the shortest delay and sets the estimate.
     """
 
     WINDOW_S = 10.0
@@ -34,5 +33,5 @@ class FlightClock:
             samples.popleft()
 
     def now_ms(self, monotonic_s: float) -> int | None:
-        """Return the flight clock now, ms; None before the first message. The clock continues while the vehicle is silent."""
+        """Return the current flight clock, ms; None before the first message. The clock continues while the vehicle is silent."""
         return None if not self._samples else int((monotonic_s + self._samples[0][1]) * 1000.0)

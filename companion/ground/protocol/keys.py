@@ -1,4 +1,4 @@
-"""Files with secrets of the ground stations: operators with their keys, and a login at a broker. Readable by their owner alone.
+"""Files with secrets of the ground stations: operators with their keys, and a login at a broker. Only their owner may read them.
 
     version: 1
     operators:
@@ -7,7 +7,7 @@
         may: all        # or safer: hold, land and abort only
 
 The vehicle's file lists all operators who may command it; the file of a ground computer lists its own operators. If a user has no
-file, one is created at the first use; vehicle and ground station on one computer share it.
+file, one is created on first use; vehicle and ground station on one computer share it.
 """
 
 from __future__ import annotations
@@ -70,12 +70,12 @@ def _checked_key(text: str) -> str:
     except (binascii.Error, ValueError):
         raise ValueError(f"expected base64 of {KEY_BYTES} random bytes") from None
     if size != KEY_BYTES:
-        raise ValueError(f"expected base64 of {KEY_BYTES} random bytes; these are {size}")
+        raise ValueError(f"expected base64 of {KEY_BYTES} random bytes; found {size} bytes")
     return text
 
 
 class OperatorEntry(Model):
-    """One operator in the file."""
+    """An operator in the file."""
 
     name: Annotated[str, AfterValidator(_checked_name)]
     key: Annotated[str, AfterValidator(_checked_key), BeforeValidator(_checked_text), Field(repr=False)]
@@ -126,7 +126,7 @@ class Operator:
 
 
 class Operators:
-    """The operators of one file; immutable, and its repr shows no key."""
+    """The operators of one file. Immutable; its repr does not show keys."""
 
     def __init__(self, operators: Sequence[Operator], source: str) -> None:
         self._by_name = {operator.name: operator for operator in operators}
@@ -150,7 +150,7 @@ class Operators:
         """Return the 32 bytes of an operator's key.
 
         Raises:
-            ConfigError: the operator does not exist; the message lists those that do.
+            ConfigError: the operator does not exist; the message lists the existing ones.
         """
         operator = self._by_name.get(name)
         if operator is None:
@@ -232,7 +232,7 @@ def operators_text(operators: Sequence[Operator]) -> str:
 
 
 def write_private(path: Path, data: bytes) -> None:
-    """Write a new file of mode 0600; it appears whole or not at all.
+    """Write a new file of mode 0600; it appears complete or not at all.
 
     Raises:
         FileExistsError: the file exists; it is left unchanged.
@@ -242,7 +242,7 @@ def write_private(path: Path, data: bytes) -> None:
 
 
 def _create_default(path: Path) -> None:
-    """Create a file with one operator, named after the user. If several processes try at once, all use the file of the first."""
+    """Create a file with one operator, named after the user. If several processes try at once, they all use the first one's file."""
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):
@@ -264,7 +264,7 @@ def user_name() -> str:
 
 
 def _read(model: type[M], path: str | Path) -> M:
-    """Read a file that its owner alone may read, as a model."""
+    """Read a file as a model; reject a file that others may read."""
     shown = str(path)
     try:
         expanded = Path(path).expanduser()
@@ -277,7 +277,9 @@ def _read(model: type[M], path: str | Path) -> M:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise ConfigError([f"{shown}: not readable: {reason}"]) from None
     if mode & 0o077 and not expanded.is_dir():
-        raise ConfigError([f"{shown}: holds secrets and is open to others (mode {mode:04o}); run: chmod 600 {shown}"])
+        raise ConfigError(
+            [f"{shown}: contains secrets and is accessible to others (mode {mode:04o}); run: chmod 600 {shown}"]
+        )
     document = read_document(expanded, shown)
     built = validate(model, document)
     if built is None:

@@ -8,14 +8,14 @@ topic          record       QoS       content
 ``state``      `State`      1, ret.   presence and outcome; the broker publishes ``lost`` when the vehicle falls silent
 ``scene``      `Scene`      1, ret.   constants of the flight: geometry, limits, planned path
 ``preflight``  `Preflight`  1, ret.   rows of the last preflight
-``events``     `Events`     1, ret.   the newest events, all of them in each message, for late subscribers
+``events``     `Events`     1, ret.   the newest events, all in each message, for late subscribers
 ``stream``     `Stream`     0         20 Hz: pose, phase, health
 ``command``    `Command`    1         ground to vehicle: signed, recent, once
 ``ack``        `Ack`        1         result of a command
 =============  ===========  ========  ==========================================================================
 
 World ENU, body FLU, SI units, quaternions (w, x, y, z), as in `companion.model.types`. A field that is None is left out of the JSON.
-``t_s`` is the flight clock of the session; ``wall_s`` is seconds since 1970 by the vehicle's wall clock, for display only.
+``t_s`` is the flight clock of the session; ``wall_s`` is seconds since 1970 on the vehicle's wall clock, for display only.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from companion.model.types import Quat, Vec2, Vec3, Vec4
 VERSION = 2
 ROOT = "companion"
 MESSAGE_MAX_BYTES = 200_000
-"""Largest message on any topic; a receiver drops larger ones unread."""
+"""Largest message on any topic; receivers drop larger ones unread."""
 COMMAND_MAX_BYTES = 1024
 
 M = TypeVar("M")
 
 
 class MessageError(ValueError):
-    """The payload is not a valid message; one line."""
+    """The payload is not a valid message. The text is one line."""
 
 
 class Topic(Enum):
@@ -52,7 +52,7 @@ class Topic(Enum):
     ACK = "ack"
 
     def of(self, vehicle: str) -> str:
-        """Return the full name of a vehicle's topic; ``+`` stands for every vehicle."""
+        """Return the full name of a vehicle's topic; ``+`` matches every vehicle."""
         return f"{ROOT}/{vehicle}/{self.value}"
 
 
@@ -80,7 +80,7 @@ class State(Record, frozen=True, kw_only=True):
     v: int
     vehicle: str
     session: str
-    """Random id of the flight, which commands name."""
+    """Random id of the flight, which commands must name."""
     presence: Presence
     simulated: bool
     mission: str
@@ -93,11 +93,11 @@ class State(Record, frozen=True, kw_only=True):
     outcome: str | None = None
     """`companion.model.types.Outcome`, once known."""
     text: str | None = None
-    """For display: why the vehicle is silent, why it accepts no commands, ..."""
+    """Text for display: why the vehicle is silent, why it accepts no commands, ..."""
 
 
 class Scene(Record, frozen=True, kw_only=True):
-    """``scene``, retained: geometry and limits for drawing the machine in its room."""
+    """``scene``, retained: geometry and limits for drawing the vehicle in its room."""
 
     v: int
     session: str
@@ -121,7 +121,7 @@ class Scene(Record, frozen=True, kw_only=True):
     mission_s: float
     """Planned duration from take-off to touchdown."""
     path_world_m: tuple[Vec3, ...]
-    """Planned path at even time steps, at most 300 points; empty until it is planned."""
+    """Planned path at equal time steps, at most 300 points; empty until it is planned."""
     phases: tuple[str, ...]
 
 
@@ -164,7 +164,7 @@ class Events(Record, frozen=True, kw_only=True):
     v: int
     session: str
     count: int
-    """Number of events of the session, including those no longer kept."""
+    """Number of events in the session, including those no longer kept."""
     lines: tuple[EventLine, ...]
 
 
@@ -203,7 +203,7 @@ class ControlView(Record, frozen=True, kw_only=True):
 
 
 class Timing(Record, frozen=True, kw_only=True):
-    """Durations of the loop and the links: the worst of the ticks since the previous message."""
+    """Durations of the loop and the links: the largest of all ticks since the previous message."""
 
     lateness_ms: float
     mocap_age_ms: float | None = None
@@ -216,13 +216,13 @@ class Timing(Record, frozen=True, kw_only=True):
     dropped: int
     """Records of this session that the recorder lost."""
     whole_ms: float | None = None
-    """From the start of the tick to the last output, the later of `Sent.setpoint_sent_s` and `Sent.current_sent_s`."""
+    """Time from the start of the tick to the last output, the later of `Sent.setpoint_sent_s` and `Sent.current_sent_s`."""
     bus_read_ms: float | None = None
     """Duration of one read of all servos by the bus thread."""
 
 
 class Stream(Record, frozen=True, kw_only=True):
-    """``stream``, 20 Hz. Position and attitude are from motion capture, or from PX4 while motion capture is lost."""
+    """``stream``, 20 Hz. Position and attitude come from motion capture, or from PX4 while motion capture is lost."""
 
     v: int
     session: str
@@ -297,7 +297,7 @@ class Command(Record, frozen=True, kw_only=True):
 
 
 class Ack(Record, frozen=True, kw_only=True):
-    """``ack``: one for every well-signed command, and for no other."""
+    """``ack``: sent for every correctly signed command, and for no other."""
 
     v: int
     session: str
@@ -305,7 +305,7 @@ class Ack(Record, frozen=True, kw_only=True):
     operator: str
     command: CommandName
     accepted: bool
-    """The command took effect, or the requested state was reached before."""
+    """The command took effect, or the requested state had already been reached."""
     text: str
     """What was done, or why the command was refused."""
     t_s: float
@@ -336,11 +336,11 @@ def decode(cls: type[M], payload: bytes, *, max_bytes: int = MESSAGE_MAX_BYTES) 
     """Return the record of a payload.
 
     Raises:
-        MessageError: the payload is too large, is not strict JSON (`companion.ground.protocol.strict_json`), has another version,
-            or does not fit the record.
+        MessageError: the payload is too large, is not strict JSON (`companion.ground.protocol.strict_json`), has a different
+            version, or does not fit the record.
     """
     if len(payload) > max_bytes:
-        raise MessageError(f"{len(payload)} bytes, at most {max_bytes} expected")
+        raise MessageError(f"{len(payload)} bytes, expected at most {max_bytes}")
     try:
         data = parse(payload)
         if not isinstance(data, dict) or data.get("v") != VERSION:

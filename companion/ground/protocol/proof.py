@@ -1,7 +1,7 @@
-"""Proofs that a vehicle adds to its messages for each operator whose key it holds: HMAC-SHA256 (RFC 2104), cut to 128 bits.
+"""Proofs that a vehicle adds to its messages for each operator whose key it holds: HMAC-SHA256 (RFC 2104), truncated to 128 bits.
 
-The stream carries one proof per operator, an ack only the proof of the operator who sent the command. A ground station with a key dates
-its commands by proven messages only, so another sender at the broker cannot make it sign a command for a future time.
+The stream carries one proof per operator, an ack only the proof of the operator who sent the command. A ground station with a key
+uses only proven messages to date its commands, so no other sender at the broker can make it sign a command for a future time.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from companion.model.codec import to_jsonable
 
 _STREAM_DOMAIN = "companion stream 2"
 _ACK_DOMAIN = "companion ack 2"
-"""First line of every proven text, so that a proof is valid for nothing else, and is not a command's signature."""
+"""First line of every proven text, which makes a proof invalid for anything else, and invalid as a command's signature."""
 _PROOF_BYTES = 16
 
 
 @dataclass(frozen=True, slots=True)
 class Signer:
-    """The operator who commands from this ground station."""
+    """The operator who signs commands at this ground station."""
 
     operator: str
     key: bytes = field(repr=False)
@@ -56,7 +56,7 @@ def ack_proven(ack: Ack, vehicle: str, key: bytes) -> bool:
 
 
 def _text(domain: str, vehicle: str, record: Stream | Ack) -> bytes:
-    """Return the proven text. Its JSON, as `json.dumps` writes it, is part of the protocol, whatever codec carries the message."""
+    """Return the proven text. Its JSON as `json.dumps` writes it is part of the protocol, whatever codec encodes the message."""
     message = json.dumps(to_jsonable(record), allow_nan=False, separators=(",", ":"))
     return f"{domain}\n{vehicle}\n{message}\n".encode()
 

@@ -1,4 +1,4 @@
-"""Strict JSON from the network: rejects ambiguous data, which two parsers could read differently, and numbers out of range."""
+"""Strict JSON from the network: rejects ambiguous data, which two parsers may read differently, and numbers out of range."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import math
 from typing import Any
 
 NUMBER_MAX = 1e12
-"""Largest magnitude of a number in a message, far above wall clocks in seconds and flight clocks in milliseconds."""
+"""Largest magnitude of a number in a message, far above any wall clock in seconds or flight clock in milliseconds."""
 _NUMBER_CHARACTERS_MAX = 40
 
 
 class StrictJsonError(ValueError):
-    """The payload is not valid strict JSON; one line."""
+    """The payload is not valid strict JSON. The text is one line."""
 
 
 def parse(payload: bytes) -> Any:

@@ -18,7 +18,7 @@ from companion.ground.station.vehicles import Vehicle, VehicleTracker
 ANSWER_S = 1.5
 """Timeout for the vehicle's `Ack`."""
 ATTEMPTS = 3
-"""Attempts for a command that makes the flight safer, each with its own nonce. Other commands are sent once."""
+"""Attempts to send a command that makes the flight safer, each with its own nonce. Other commands are sent once."""
 REPEATED = frozenset({CommandName.HOLD, CommandName.LAND, CommandName.ABORT})
 FALLBACK_ADVICE = "use Ctrl-C or the pilot's switch"
 NO_ANSWER = f"no answer from the vehicle within {ANSWER_S:g} s: {FALLBACK_ADVICE}"
@@ -27,13 +27,13 @@ NO_ANSWER = f"no answer from the vehicle within {ANSWER_S:g} s: {FALLBACK_ADVICE
 def signer_of(
     access: BrokerAccess, operators_file: str | None, operator: str | None, *, view_only: bool = False
 ) -> Signer | str:
-    """Return the operator who commands from this station, or the reason why commands are not possible.
+    """Return the operator who signs commands at this station, or why commands are not possible.
 
     Args:
-        access: the broker; over an unencrypted connection to another computer the vehicle accepts no commands.
-        operators_file: file of operators and their keys; None for this user's own.
+        access: settings of the broker; a vehicle accepts no commands over an unencrypted connection to another computer.
+        operators_file: file of operators and their keys; None for this user's own file.
         operator: name in the file; None for the only one.
-        view_only: allow no commands.
+        view_only: whether commands are disabled.
 
     Raises:
         ConfigError: the file or the name is wrong.
@@ -49,7 +49,7 @@ def signer_of(
     operators = load_operators(operators_file)
     if operator is None:
         if len(operators.names) != 1:
-            return f"{operators.source} holds several operators ({', '.join(operators.names)}); choose one: --operator NAME"
+            return f"{operators.source} lists several operators ({', '.join(operators.names)}); choose one: --operator NAME"
         operator = operators.names[0]
     return Signer(operator, operators.key(operator))
 
@@ -76,7 +76,7 @@ Notify = Callable[["Sent | Failed"], None]
 
 
 def ack_text(ack: Ack) -> str:
-    """Return an ack for display: ``hold: holding``, ``resume refused: too little tether left``."""
+    """Return an ack for display, such as ``hold: holding`` or ``resume refused: too little tether left``."""
     name = ack.command.value
     if ack.accepted:
         return f"{name}: {ack.text}"
@@ -89,7 +89,7 @@ class CommandSender:
     Args:
         link: connection to the broker.
         tracker: session and clock of each vehicle.
-        signer: the operator, or the reason why there is none.
+        signer: the operator, or why there is none.
     """
 
     def __init__(self, link: Link, watch: VehicleTracker, signer: Signer | str) -> None:
@@ -101,7 +101,7 @@ class CommandSender:
 
     @property
     def operator(self) -> str | None:
-        """Name of the operator who commands from here, or None."""
+        """Name of the operator who signs commands here, or None."""
         return self._signer.operator if isinstance(self._signer, Signer) else None
 
     @property
@@ -110,15 +110,14 @@ class CommandSender:
         return self._signer if isinstance(self._signer, str) else None
 
     def on_ack(self, ack: Ack) -> None:
-        """Process an `Ack`; `VehicleTracker` has verified those for this operator."""
+        """Process an `Ack`; `VehicleTracker` has verified it if it is for this operator."""
         answer = self._waiting.get(ack.nonce)
         if answer is not None and not answer.done():
             answer.set_result(ack)
 
     async def send(self, vehicle: str, command: CommandName, notify: Notify, hold: int | None = None) -> Ack | None:
-        """Send a command; returns when the vehicle has answered or all attempts have failed.
-
-        A newer command for the same vehicle, or a new flight, ends the attempts of an older command.
+        """Send a command; return when the vehicle has answered or all attempts have failed. A newer command for the same vehicle,
+        or a new flight, ends the attempts.
 
         Args:
             vehicle: name of the vehicle.
@@ -166,7 +165,7 @@ class CommandSender:
         nonces: list[str],
         notify: Notify,
     ) -> str | None:
-        """Make one attempt of at most `ANSWER_S`; return None if the answer has arrived, else the failure."""
+        """Make one attempt of at most `ANSWER_S`; return None if the answer has arrived, else why the attempt failed."""
         known = self._tracker.vehicles.get(vehicle)
         proven = None if known is None else known.proven
         if proven is None or proven.session != session:  # the vehicle was known when the command was given
@@ -177,7 +176,7 @@ class CommandSender:
         try:
             signed = make_command(command, vehicle, session, signer.operator, signer.key, t_ms, ends)
         except ValueError as error:
-            return f"no command can be made for {vehicle}: {error}"
+            return f"no command can be created for {vehicle}: {error}"
         nonces.append(signed.nonce)
         self._waiting[signed.nonce] = answer
         notify(Sent(vehicle, command, signed.nonce))
@@ -188,15 +187,14 @@ class CommandSender:
                     await self._link.publish(Topic.COMMAND.of(vehicle), encode(signed))
                 except LinkError as error:
                     problem = f"{error}; {FALLBACK_ADVICE}"
-                await asyncio.shield(answer)  # an earlier try may still be answered
+                await asyncio.shield(answer)  # an earlier attempt may still be answered
         except TimeoutError:
             return problem
         return None
 
     def _problem(self, vehicle: str) -> str | None:
-        """Return why a command cannot be created or would be rejected, or None.
-
-        Unproven messages never block a command while proven ones arrive.
+        """Return why a command cannot be created or would be rejected, or None. While proven messages arrive, unproven ones never
+        block a command.
         """
         known = self._tracker.vehicles.get(vehicle)
         if known is None or (known.session is None and known.proven is None):
@@ -212,7 +210,7 @@ class CommandSender:
         if known.stream is None:
             return f"no message from {vehicle} has arrived, so a command cannot be dated; {FALLBACK_ADVICE}"
         text = "the vehicle does not have this key, or another program uses its name"
-        return f"no message from {vehicle} is proven for {self.operator}: {text}; {FALLBACK_ADVICE}"
+        return f"no message from {vehicle} is authenticated for {self.operator}: {text}; {FALLBACK_ADVICE}"
 
 
 def _session(known: Vehicle | None) -> str | None:

@@ -1,7 +1,6 @@
-"""Distributes messages of the vehicles to viewers. The JSON text of a message is built once for all viewers; no I/O here.
-
-Each viewer has a bounded outbox. Of the stream only the newest message of each vehicle is kept; all other messages are kept in
-order. A viewer that does not read them in time is disconnected: a lost event would otherwise go unnoticed.
+"""Distributes the vehicles' messages to viewers. The JSON text of a message is built once for all viewers; no I/O. Each viewer has
+a bounded outbox, which keeps only the newest stream message of each vehicle, and all other messages in order. A viewer that does
+not read them in time is disconnected, because a lost event would otherwise go unnoticed.
 """
 
 from __future__ import annotations
@@ -17,11 +16,11 @@ from companion.ground.station.vehicles import VEHICLES_MAX, ReceivedRecord, Vehi
 from companion.model.codec import to_json
 
 OUTBOX_MAX = 1000
-"""Limit of waiting messages per viewer, not counting the stream."""
+"""Maximum number of waiting messages per viewer, not counting the stream."""
 OUTBOX_MAX_CHARACTERS = 4_000_000
 VIEWERS_MAX = 100
 FRESH_S = 0.5
-"""An older stream message is not sent to a new viewer, because it would look live."""
+"""Max age of a stream message that is sent to a new viewer; an older one would look live."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +32,7 @@ class CloseReason:
     reason: str
 
 
-TOO_SLOW = CloseReason(1013, "too slow: messages were lost, connect again")
+TOO_SLOW = CloseReason(1013, "too slow: messages were lost; connect again")
 GOING_AWAY = CloseReason(1001, "the monitor has ended")
 
 
@@ -58,7 +57,7 @@ class Outbox:
         self._something.set()
 
     def put_stream(self, vehicle: str, text: str) -> None:
-        """Add a message that the next one of the same vehicle replaces."""
+        """Add a message that the vehicle's next one replaces."""
         if vehicle not in self._streams and len(self._streams) >= VEHICLES_MAX:
             del self._streams[next(iter(self._streams))]
         self._streams[vehicle] = text
@@ -74,7 +73,7 @@ class Outbox:
         self._closed.set()
 
     async def wait_closed(self) -> None:
-        """Wait for the request to disconnect the viewer."""
+        """Wait until the viewer is to be disconnected."""
         await self._closed.wait()
 
     async def take(self) -> list[str]:
@@ -93,7 +92,7 @@ class Hub:
 
     Args:
         tracker: state of the vehicles, for new viewers.
-        broker_text: state of the broker before it is known.
+        broker_text: text to show until the state of the broker connection is known.
     """
 
     def __init__(self, watch: VehicleTracker, broker_text: str) -> None:
@@ -103,7 +102,7 @@ class Hub:
         self._rejected_sent = 0
 
     def add(self, outbox: Outbox, now_s: float) -> None:
-        """Add a viewer and send it the known state."""
+        """Add a viewer and send it the current state."""
         self._viewers.add(outbox)
         outbox.put(json.dumps(self._broker))
         for known in self._tracker.vehicles.values():

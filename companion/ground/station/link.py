@@ -1,4 +1,4 @@
-"""The ground station's connection to its broker; it reconnects by itself and reports changes."""
+"""The ground station's connection to its broker; it reconnects automatically and reports changes."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ ANSWER_S = 2.0
 _PAUSE_MIN_S, _PAUSE_MAX_S = 0.2, 2.0
 _TOPIC_ROOM_BYTES = 1024
 _PERMANENT_REASON_CODES = frozenset({128, 132, 133, 134, 135, 138, 140, 144, 149, 156, 157})
-"""CONNACK reason codes (MQTT 5, 3.2.2.2) that do not change with time: bad login, not authorised, banned, ..."""
+"""CONNACK reason codes (MQTT 5, 3.2.2.2) that a retry does not change: bad login, not authorised, banned, ..."""
 
 
 class LinkError(Exception):
-    """A message could not be published; one line."""
+    """A message could not be published. The text is one line."""
 
 
 class BrokerRefused(Exception):
@@ -69,7 +69,7 @@ class Link:
                 for topic, qos in self._topics:  # one after another, so that retained messages arrive in this order
                     refusal = await client.subscribe_topic(topic, qos)
                     if refusal is not None:
-                        raise aiomqtt.MqttError(f"the broker does not permit to read {topic}: {refusal}")
+                        raise aiomqtt.MqttError(f"the broker does not permit reading {topic}: {refusal}")
                 self._client, pause_s, self._was_connected = client, _PAUSE_MIN_S, True
                 self._changed(True, f"connected to {self._access.address}")
                 await client.wait_broken()
@@ -95,7 +95,7 @@ class Link:
         except aiomqtt.MqttError as error:
             raise LinkError(f"the broker did not accept the command: {error_text(error)}") from None
         if refusal is not None:
-            raise LinkError(f"the broker refused it: {refusal}")
+            raise LinkError(f"the broker refused the command: {refusal}")
 
     def _new_connection(self) -> Connection:
         return Connection(
@@ -112,7 +112,7 @@ class Link:
             login = f"the login {self._access.username!r}" if self._access.username else "a connection without login"
             raise BrokerRefused(f"{self._access.address}: the broker refuses {login}: {code}; see --login") from None
         if "CERTIFICATE_VERIFY_FAILED" in str(error) and not self._was_connected:
-            text = f"the broker's certificate is not trusted ({error_text(error)}); give its authority: --ca FILE"
+            text = f"the broker's certificate is not trusted ({error_text(error)}); give its CA certificate: --ca FILE"
             raise BrokerRefused(f"{self._access.address}: {text}") from None
         return error_text(error)
 

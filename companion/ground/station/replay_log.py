@@ -42,13 +42,13 @@ def read_for_page(path: Path, number: int) -> ReplayLog:
         number: index of this log on the page.
 
     Raises:
-        LogError: one line: the log is missing, damaged, not of a flight, or of another version.
+        LogError: one line: the log is missing, damaged, not of a flight, or of a different version.
     """
     log = FlightLog.read(path, ticks_max=TICKS_MAX)
     if not log.inputs:
-        raise LogError(f"{path}: holds no ticks")
+        raise LogError(f"{path}: has no ticks")
     if log.config_json is None:
-        raise LogError(f"{path}: holds no configuration (metadata record 'config'), which the page needs")
+        raise LogError(f"{path}: has no configuration (metadata record 'config'), which the page needs")
     try:
         config = logged_flight(log.config_json)
     except ValidationError as error:
@@ -78,7 +78,7 @@ def _epoch_offset_s(log: FlightLog) -> float:
 
 
 def _reference_path(log: FlightLog) -> list[Vec3]:
-    """Return the reference path at even time steps, with about as many points as a scene holds."""
+    """Return the reference path at equal time steps, with about as many points as a scene holds."""
     path = [outputs.reference.position_world_m for outputs in log.outputs if outputs.reference is not None]
     return path[:: max(1, len(path) // PATH_POINTS_MAX)]
 

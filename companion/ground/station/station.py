@@ -22,12 +22,12 @@ class Station:
 
     Args:
         access: settings of the broker.
-        signer: the operator who commands from this station, or the reason why commands are not possible.
+        signer: the operator who signs commands at this station, or why commands are not possible.
         only: name of the one vehicle to track; None for all.
         on_record: called with every record.
         on_change: called when the connection changes, with one line for display.
         topics: topics to subscribe to, in this order.
-        in_order: subscribe to everything with QoS 0: no message overtakes another, and retained messages arrive first. Otherwise
+        in_order: subscribe to all topics with QoS 0: no message overtakes another, and retained messages arrive first. If false,
             retained messages and acks arrive at least once.
     """
 

@@ -1,4 +1,4 @@
-"""`companion monitor --text`: the vehicle in a terminal, also over SSH; without a terminal it prints one line per second."""
+"""`companion monitor --text`: shows the vehicle in a terminal, also over SSH; without a terminal it prints one line per second."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from companion.runtime.tasks import until_first
 PERIOD_S = 0.125
 LINE_PERIOD_S = 1.0
 CONFIRM_S = 3.0
-"""Time in which the key of a command that needs confirmation must be pressed again."""
+"""Time within which the key of a command that needs confirmation must be pressed again."""
 KEYS_MAX = 100
 IMMEDIATE_KEYS = {"h": CommandName.HOLD, "l": CommandName.LAND, "a": CommandName.ABORT}
 CONFIRMED_KEYS = {"r": CommandName.RESUME, "s": CommandName.START}
@@ -52,7 +52,7 @@ async def watch_in_terminal(access: BrokerAccess, signer: Signer | str, only: st
 
 
 class _Lines:
-    """Output as lines, for pipes."""
+    """Prints lines, for pipes."""
 
     def on_change(self, connected: bool, text: str) -> None:
         print(text, flush=True)
@@ -67,19 +67,19 @@ class _Lines:
 
 
 class _Screen:
-    """Full-screen output with keys."""
+    """Full-screen display with keys."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
         self._notices: deque[Notice] = deque(maxlen=10)
         self._chosen: str | None = None
         self._unconfirmed: tuple[CommandName, float, tuple[object, ...]] | None = None
-        """Command that waits for confirmation by a second key press, the start of the wait, and its target at that time (`_target`)."""
+        """Command that awaits a second key press, when the wait began, and its target at that time (`_target`)."""
         self._keys: deque[str] = deque(maxlen=KEYS_MAX)
         self._pressed = asyncio.Event()
 
     def on_record(self, received: ReceivedRecord) -> None:
-        """Show acks of all operators."""
+        """Show acks to all operators."""
         if received.topic is Topic.ACK:
             ack: Ack = received.record
             text = f"{received.vehicle}: {ack_text(ack)} ({ack.operator})"
@@ -106,7 +106,7 @@ class _Screen:
                     await self._key_or_period()
 
     def _vehicle(self, station: Station) -> Vehicle | None:
-        """Return the displayed vehicle: the chosen one, else the first one present."""
+        """Return the displayed vehicle: the selected one, else the first one present."""
         known = station.tracker.vehicles
         if self._chosen not in known:
             there = station.tracker.present(time.monotonic()) or sorted(known)

@@ -15,7 +15,7 @@ from companion.ground.station.vehicles import Vehicle
 from companion.model.types import LandedState, PhaseKind, SafetyAction
 
 STALE_S = 0.3
-"""The stream arrives 20 times a second; older data is shown as stale."""
+"""Age at which data is shown as stale; the stream arrives 20 times a second."""
 EVENTS_SHOWN = 8
 NOTICES_SHOWN = 3
 _KIND_WORD = {
@@ -39,7 +39,7 @@ _MODE_LANDED = {state.value: state.value.replace("_", " ") for state in LandedSt
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """One line about commands."""
+    """A line about commands."""
 
     text: str
     style: str = ""
@@ -60,12 +60,12 @@ class StationStatus:
 
 
 def printable(text: str) -> str:
-    """Return text without control characters, so that nothing from the network can control the terminal."""
+    """Return the text without control characters, so that no text from the network can control the terminal."""
     return text if text.isprintable() else "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 def status_word(vehicle: Vehicle, now_s: float) -> tuple[str, str]:
-    """Return the vehicle's status in a few words, and its style; ended and lost have precedence over older data."""
+    """Return the vehicle's status in a few words, and its style; `ended` and `lost` take precedence over stale data."""
     state, stream, age_s = vehicle.state, vehicle.stream, vehicle.stream_age_s(now_s)
     if state is not None and state.session == vehicle.session:
         match state.presence:
@@ -220,7 +220,7 @@ def _figures(stream: Stream) -> list[str]:
 
 
 def _timing(stream: Stream) -> str:
-    """Return delays in the first line, durations of a tick's parts in the second."""
+    """Return delays on the first line, durations of the parts of a tick on the second."""
     timing = stream.timing
     behind = {
         "late": timing.lateness_ms,

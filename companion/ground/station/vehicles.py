@@ -1,7 +1,8 @@
 """State of the vehicles in a ground station: the newest record of each kind and each flight's clock. No I/O.
 
 A ground station with an operator's key distinguishes stream messages with the vehicle's proof (`companion.ground.protocol.proof`)
-from messages that anyone may have sent. Only proven messages date commands; while they arrive, unproven ones are rejected.
+from messages that anyone may have sent. Only proven messages are used to date commands; while they arrive, unproven ones are
+rejected.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ from companion.ground.protocol.proof import Signer, ack_proven, stream_proven
 
 VEHICLE_TOPICS = (Topic.STATE, Topic.SCENE, Topic.PREFLIGHT, Topic.EVENTS, Topic.STREAM, Topic.ACK)
 VEHICLES_MAX = 64
-"""Limit of tracked vehicles; the one that was silent longest is forgotten first, those with proven messages last."""
+"""Maximum number of tracked vehicles; the longest silent one is forgotten first, those with proven messages last."""
 LIVE_S = 1.0
-"""A vehicle whose stream is younger is present."""
+"""Age of the newest stream message below which a vehicle is present."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +48,8 @@ class ReceivedRecord:
 
 @dataclass(slots=True)
 class ProvenState:
-    """State from stream messages with a valid proof: session, flight clock and hold for new commands. Only `VehicleTracker` changes
-    it.
+    """State from stream messages with a valid proof, used for new commands: session, flight clock and hold. Only `VehicleTracker`
+    changes it.
     """
 
     session: str
@@ -67,7 +68,7 @@ class ProvenState:
         return now_s - self.received_s < LIVE_S
 
     def now_ms(self, now_s: float) -> int:
-        """Return the flight clock now; never ahead of the vehicle's own."""
+        """Return the current flight clock; never ahead of the vehicle's own."""
         now_ms = self.clock.now_ms(now_s)
         assert now_ms is not None  # at least one message has arrived
         return now_ms
@@ -112,7 +113,7 @@ class VehicleTracker:
 
     Args:
         only: name of the one vehicle to track; None for all.
-        signer: the operator who commands from this station; None without one, and no proof can then be checked.
+        signer: the operator who signs commands at this station; without one (None) no proof can be checked.
     """
 
     def __init__(self, only: str | None = None, signer: Signer | None = None) -> None:
@@ -130,7 +131,7 @@ class VehicleTracker:
         Args:
             topic: full name.
             payload: received bytes.
-            retained: the broker had kept the message: its age is unknown.
+            retained: whether the broker had retained the message; if so its age is unknown.
             now_s: local monotonic clock.
         """
         try:
@@ -144,7 +145,7 @@ class VehicleTracker:
                 return None  # an empty retained message deletes the retained one
             record: Any = decode(RECORDS[kind], payload)
             if isinstance(record, State) and record.vehicle != name:
-                raise MessageError(f"is of vehicle {record.vehicle!r:.60}")
+                raise MessageError(f"is from vehicle {record.vehicle!r:.60}")
             if isinstance(record, Ack) and not self._is_genuine(record, name):
                 raise MessageError("has no valid proof of the vehicle")
             if isinstance(record, Stream) and not retained and not self._accept_stream(name, record, now_s):
@@ -183,8 +184,8 @@ class VehicleTracker:
     def _accept_stream(self, name: str, stream: Stream, now_s: float) -> bool:
         """Store the state that a proven stream message carries; return False if the message must not be displayed.
 
-        A message of another flight is accepted if that flight is the later one by the vehicle's wall clock, or if the earlier
-        flight no longer sends. So a recording of an earlier flight cannot replace a running one.
+        A message of a different flight is accepted if that flight is later on the vehicle's wall clock, or if the current flight no
+        longer sends. A recording of an earlier flight therefore cannot replace a running one.
         """
         known = self.vehicles.get(name)
         proven = known.proven if known is not None else None
@@ -200,7 +201,7 @@ class VehicleTracker:
             )
             self._vehicle(name, now_s).proven = proven
         elif stream.t_s <= proven.t_s:
-            return False  # a replayed message, because the vehicle sends only with a new tick
+            return False  # a replayed message: the vehicle sends only after a new tick
         proven.wall_s, proven.t_s, proven.hold, proven.received_s = stream.wall_s, stream.t_s, stream.hold or 0, now_s
         proven.clock.add(stream.t_s, now_s)
         return True

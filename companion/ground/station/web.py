@@ -52,7 +52,7 @@ from companion.runtime.tasks import until_first
 
 PAGE = Path(__file__).parent / "page"
 TOKEN_WAIT_S = 1.0
-"""Time for the page to send its token, so that one hello is enough."""
+"""Time for which the server waits for the page's token, so that one hello is enough."""
 HEARTBEAT_S = 6.0
 SEND_S = 10.0
 """Time without a read after which a viewer is disconnected."""
@@ -65,7 +65,7 @@ _VIEW_ONLY_TEXT = "commands from other computers need TLS (--cert and --key) or 
 
 
 class WebError(Exception):
-    """The server cannot run; one line for the user."""
+    """The server cannot run. The text is one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class ServerSettings:
 
 
 class Monitor:
-    """One web server.
+    """The web server.
 
     Args:
         serving: address and TLS settings.
@@ -110,7 +110,7 @@ class Monitor:
 
     @property
     def view_only_reason(self) -> str | None:
-        """Reason why no viewer can command through this server; None if viewers with the token can."""
+        """Why no viewer can send commands through this server; None if viewers with the token can."""
         if self._commands is None:
             return "this is the replay of a log"
         if self._commands.view_only_reason is not None:
@@ -185,7 +185,7 @@ class Monitor:
         if not origin_allowed(
             request.headers.get("Origin"), request.headers.get("Host"), tls=self._serving.tls is not None
         ):
-            raise web.HTTPForbidden(text="this WebSocket is only for pages of this server (Origin)\n")
+            raise web.HTTPForbidden(text="this WebSocket accepts only pages served by this server (Origin mismatch)\n")
         ws = web.WebSocketResponse(
             heartbeat=HEARTBEAT_S, timeout=CLOSE_S, max_msg_size=MESSAGE_MAX_BYTES, compress=False, writer_limit=1
         )
@@ -215,7 +215,7 @@ class Monitor:
         )
 
     def may_command(self, given: object) -> bool:
-        """Whether a viewer with this token may command."""
+        """Whether a viewer with this token may send commands."""
         return self.view_only_reason is None and same_token(given, self._token)
 
     def add_viewer(self, token: object) -> Outbox | None:
@@ -268,7 +268,7 @@ async def serve_live(
 
 
 async def serve_logs(serving: ServerSettings, logs: Sequence[ReplayLog], listening: Listening) -> None:
-    """Serve logs, until cancelled.
+    """Serve logs until cancelled.
 
     Raises:
         WebError: the server cannot listen.
@@ -297,7 +297,7 @@ class _Session:
                 return GOING_AWAY
             message = _parsed(first.data)
             if message is None or message.get("kind") != "token":
-                return CloseReason(1008, "expected the token as first message")
+                return CloseReason(1008, "expected the token as the first message")
             self._token = message.get("token")
         outbox = self._monitor.add_viewer(self._token)
         if outbox is None:
@@ -362,7 +362,7 @@ def _note(note: Sent | Failed) -> str:
 
 
 def _limit_send_buffer(request: web.Request) -> None:
-    """Limit the buffered data for a viewer, which would be stale when it arrives."""
+    """Limit the data buffered for a viewer: buffered data would be stale when it arrives."""
     transport = request.transport
     if isinstance(transport, asyncio.Transport):
         transport.set_write_buffer_limits(high=_SEND_BUFFER_BYTES // 2)

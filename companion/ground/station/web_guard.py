@@ -1,8 +1,8 @@
 """Access control of the monitor's web server. Pure; no data from a browser is trusted.
 
-Listening on loopback alone is no protection: any web page in the user's browser can reach http://127.0.0.1, through a host name of
-its own (DNS rebinding) or across origins (WebSockets have no same-origin policy). So the Host header must name this computer, the
-Origin of a WebSocket must be this server, and commands need a token that only the user who started the monitor has seen.
+Listening only on loopback does not protect the server: any web page in the user's browser can reach http://127.0.0.1, through its
+own host name (DNS rebinding) or across origins (WebSockets have no same-origin policy). So the Host header must name this computer,
+the Origin of a WebSocket must be this server, and commands need a token that only the user who started the monitor has seen.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ _HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(:\d{1,5})?")
 
 
 def new_token() -> str:
-    """Return 128 random bits as text."""
+    """Return a new token: 128 random bits as text."""
     return secrets.token_urlsafe(16)
 
 
 def same_token(given: object, token: str) -> bool:
-    """Compare in constant time."""
+    """Return whether the token is equal; compare in constant time."""
     return isinstance(given, str) and hmac.compare_digest(given.encode("utf-8", "replace"), token.encode())
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this computer reaches the name or address."""
+    """Whether only this computer can reach the name or address."""
     if host.lower() == "localhost":
         return True
     address = _address(host)
@@ -55,8 +55,8 @@ def host_allowed(host_header: str | None, listens_on: str) -> bool:
 
     Args:
         host_header: received Host header.
-        listens_on: value of --host. If it stands for every address (0.0.0.0, ::), any address and this computer's own name are
-            allowed: an attacker's page can only use a host name.
+        listens_on: value of --host. If it means every address (0.0.0.0, ::), any address and this computer's own name are allowed:
+            an attacker's page can only use its own host name.
     """
     match = None if host_header is None else _HOST.fullmatch(host_header)
     if match is None:
@@ -71,7 +71,7 @@ def host_allowed(host_header: str | None, listens_on: str) -> bool:
 
 
 def origin_allowed(origin: str | None, host_header: str | None, *, tls: bool) -> bool:
-    """Whether a WebSocket request comes from a page of this server. Other programs must send the same header."""
+    """Whether a WebSocket request comes from a page of this server. Programs other than browsers must send the same header."""
     if origin is None or host_header is None:
         return False
     try:
@@ -82,7 +82,7 @@ def origin_allowed(origin: str | None, host_header: str | None, *, tls: bool) ->
 
 
 class RateLimiter:
-    """Allows `MESSAGES_PER_S` on average and `MESSAGES_BURST` at once."""
+    """Limits messages to `MESSAGES_PER_S` on average and `MESSAGES_BURST` at once."""
 
     def __init__(self, now_s: float) -> None:
         self._full_s = now_s

@@ -1,4 +1,4 @@
-"""Health of each device by the limits of the vehicle file, with the value measured. Pure.
+"""Health of each device according to the limits in the vehicle file, with the measured value. Pure.
 
 The limits are those of the safety monitors (`companion.safety.rules`): a value that lands the vehicle or disables a device is BAD,
 one that causes a warning is WARN. The health is for display only; the monitors act on their own.
@@ -24,7 +24,7 @@ UNKNOWN_S = -math.inf
 
 @dataclass(slots=True)
 class WorstAges:
-    """The largest ages of some ticks, s; `UNKNOWN_S` without a measurement."""
+    """The largest ages in a group of ticks, s; `UNKNOWN_S` without a measurement."""
 
     vehicle_s: float = UNKNOWN_S
     """Age of the oldest of position, attitude and IMU sample from PX4."""
@@ -59,7 +59,7 @@ class WorstAges:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """Values that the health is evaluated from."""
+    """Values from which the health is evaluated."""
 
     inputs: Inputs
     """Inputs of the newest tick."""
@@ -70,12 +70,12 @@ class Snapshot:
     """Frames in the last second; None if unknown."""
     missed: int
     dropped: int
-    """Lost records of the whole session."""
+    """Number of lost records in the whole session."""
     recorder_error: str | None = None
 
 
 class HealthEvaluator:
-    """Evaluates the health of all devices by the limits of one vehicle file."""
+    """Evaluates the health of all devices against the limits in a vehicle file."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._s = vehicle.safety
@@ -132,10 +132,10 @@ class HealthEvaluator:
         if not snapshot.outputs.mocap_trusted:
             return HealthLevel.BAD, "rejected: poses jump or are frozen"
         if not late_s <= s.mocap_latency_max_s:
-            return HealthLevel.BAD, f"{late_s * 1e3:.0f} ms late by Motive's clock"
+            return HealthLevel.BAD, f"{late_s * 1e3:.0f} ms late on Motive's clock"
         light = _level_by_age(age_s, s.mocap_timeout_s)
         if light is HealthLevel.OK and late_s > s.mocap_latency_warn_s:
-            return HealthLevel.WARN, f"{late_s * 1e3:.0f} ms late by Motive's clock"
+            return HealthLevel.WARN, f"{late_s * 1e3:.0f} ms late on Motive's clock"
         if light is HealthLevel.OK and rate_hz is not None and rate_hz < s.mocap_rate_min_hz:
             return HealthLevel.WARN, text
         return light, text
@@ -152,7 +152,7 @@ class HealthEvaluator:
             return HealthLevel.BAD, text
         light = _level_by_age(age_s, s.arm_timeout_s)
         if light is HealthLevel.OK and any(arm.hardware_error):
-            return HealthLevel.WARN, "the bus watchdog had released torque; it is on again"
+            return HealthLevel.WARN, "the bus watchdog had switched torque off; it is on again"
         if light is HealthLevel.OK and arm.read_failures >= s.arm_read_failures_max:
             return HealthLevel.WARN, f"{arm.read_failures} bus cycles without an answer"
         return HealthLevel.WARN if light is HealthLevel.OK and hottest_c >= s.servo_warn_c else light, text
@@ -235,7 +235,7 @@ def _level_by_age(age_s: float, limit_s: float) -> HealthLevel:
 
 
 def _level_by_ratio(ratio: float) -> HealthLevel:
-    """Return the level for a ratio of value to limit: BAD beyond 1 or not finite, WARN beyond 0.5."""
+    """Return the level for a ratio of value to limit: BAD above 1 or if not finite, WARN above 0.5."""
     return HealthLevel.OK if ratio <= 0.5 else HealthLevel.WARN if ratio <= 1.0 else HealthLevel.BAD
 
 

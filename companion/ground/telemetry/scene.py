@@ -19,7 +19,7 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
     Args:
         config: effective configuration.
         session: session id of the flight.
-        path_world_m: planned path at even time steps; reduced evenly to `PATH_POINTS_MAX` points if it has more.
+        path_world_m: planned path at equal time steps; thinned to `PATH_POINTS_MAX` evenly spaced points if it has more.
         mission_s: planned duration; 0 before it is planned.
     """
     vehicle = config.vehicle
@@ -51,7 +51,7 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
 
 
 def thinned(path_world_m: Sequence[Vec3]) -> tuple[Vec3, ...]:
-    """Return at most `PATH_POINTS_MAX` points at even steps, including the first and the last."""
+    """Return at most `PATH_POINTS_MAX` evenly spaced points, including the first and the last."""
     count = len(path_world_m)
     if count <= PATH_POINTS_MAX:
         return tuple(path_world_m)

@@ -1,6 +1,6 @@
 """Stream and event messages built from the ticks of a flight. Pure: time is an argument.
 
-``e_p`` is defined as in `companion.analysis.metrics`: the pose against the reference of the time at which the pose was measured.
+``e_p`` is defined as in `companion.analysis.metrics`: the pose minus the reference at the time at which the pose was measured.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from companion.model.types import ControlLog, Inputs, Outputs, Quat, Reference, 
 STREAM_PERIOD_S = 0.05
 """Period of the stream messages over MQTT."""
 _TOUCHDOWN = Stage.TOUCHDOWN.value
-"""Phases on the ground, where the reference below the floor is not a tracking error."""
+"""Phases on the ground, in which a reference below the floor is not a tracking error."""
 WAITS_FOR_START = Stage.READY.value
 """`Outputs.phase` of a flight that is ready and waits for START."""
 TEXT_MAX = 300
-"""Characters of an event's text, so that `EVENTS_KEPT` of them always fit into one message."""
+"""Maximum number of characters in an event's text, so that `EVENTS_KEPT` events always fit into one message."""
 _TEXT_MAX_BYTES = 1600
-"""The same limit in JSON, where a character may take twelve bytes."""
+"""The same limit for the JSON text, in which a character may take twelve bytes."""
 _HEALTH_WINDOW_S = 1.0
-"""The health shows the worst values of this window, so that a problem of a single tick is visible."""
+"""Window whose worst values the health shows, so that a problem in a single tick is visible."""
 
 T = TypeVar("T", bound=tuple[float, ...])
 
 
 class StreamBuilder:
-    """Takes every tick, builds `Stream` messages on request, and keeps the newest events."""
+    """Processes every tick, builds `Stream` messages on request, and keeps the newest events."""
 
     def __init__(self, config: FlightConfig, session: str) -> None:
         self._session = session
@@ -232,13 +232,13 @@ def replay(
         rows: ticks in order, such as `companion.analysis.log.FlightLog.rows()` returns.
         config: configuration of the flight.
         session: any session id.
-        epoch_offset_s: wall clock at zero of the flight clock.
+        epoch_offset_s: wall clock when the flight clock was zero.
         rate_hz: rate of the messages; halved until a long flight fits into `max_records`.
         max_records: max number of messages, at least 2.
         max_events: number of newest events to keep.
 
     Returns:
-        Messages in order, including the first and the last tick; and the events of the flight.
+        Messages in order, including the first and the last tick, and the events of the flight.
     """
     maker = StreamBuilder(config, session)
     maker.events = deque(maxlen=max_events)
@@ -344,7 +344,7 @@ def _control(control: ControlLog | None) -> ControlView | None:
 
 
 def truncated(text: str) -> str:
-    """Return text cut to the size that a message allows."""
+    """Return the text cut to the size that a message allows."""
     text = text[:TEXT_MAX]
     return text if len(json.dumps(text)) <= _TEXT_MAX_BYTES else text[: _TEXT_MAX_BYTES // 12]
 

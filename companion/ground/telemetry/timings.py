@@ -1,4 +1,4 @@
-"""Worst durations of the loop and the links since the previous stream message. Pure."""
+"""Longest durations of the loop and the links since the previous stream message. Pure."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from companion.model.types import Inputs, Outputs, Sent
 
 
 class WorstTimings:
-    """The longest durations of some ticks, s."""
+    """The longest durations in a group of ticks, s."""
 
     def __init__(self) -> None:
         self._lateness_s = self._core_s = 0.0
