@@ -1,4 +1,4 @@
-"""The simulated world: MuJoCo physics, an autopilot, a servo bus, motion capture and a force sensor behind real wires."""
+"""The simulated world: MuJoCo physics, an autopilot, a servo bus, motion capture and a force sensor behind their real protocols."""
 
 import os
 

@@ -27,7 +27,7 @@ from sitl.server import Ports, Sitl, start_of
 _STANDARD = Ports(autopilot_local=14580, autopilot_remote=14540, mocap_command=1510, mocap_data=1511, multicast=True)
 
 TRUTH_FILE = "world.json"
-"""File with true course, modes and frames, written beside the configuration after a flight with faults or several throws."""
+"""File with the true course, modes and frames, written next to the configuration after a flight with faults or several throws."""
 
 
 def _send(message: dict[str, Any]) -> None:

@@ -19,11 +19,11 @@ TORQUE_CAPACITY_NM: Final = 4.0
 _ZERO: Final[Vec3] = (0.0, 0.0, 0.0)
 _FORCE_BITS = (Overload.FX, Overload.FY, Overload.FZ)
 _TORQUE_BITS = (Overload.TX, Overload.TY, Overload.TZ)
-_MAX_CATCH_UP = 8  # packets; after a longer jump of the world's time the rest is skipped
+_MAX_CATCH_UP = 8  # packets; if the world's time jumps further, the rest is skipped
 
 
 def quantised(force_n: Vec3, torque_nm: Vec3) -> tuple[Vec3, Vec3]:
-    """Return a reading as it arrives over the wire, rounded to the protocol's counts."""
+    """Return a reading as the companion receives it, rounded to the protocol's counts."""
     (fx, fy, fz), (tx, ty, tz) = force_n, torque_nm
     force, torque = rft.FORCE_PER_N, rft.TORQUE_PER_NM
     return (

@@ -1,7 +1,7 @@
 """An emulated NatNet server (Motive): multicast and unicast, bitstream 3.0 and 4.1.
 
 Layouts as in the NatNet SDK (`NatNetTypes.h`, packet client). It shares only the message ids with the companion's parser, so that an
-error in one of the two is visible. The caller adds latency and noise.
+error in either of them shows. The caller adds latency and noise.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LOOPBACK, LOOPBACK_BROADCAST = "127.0.0.1", "127.255.255.255"
 """A socket on the loopback address receives no broadcasts, so a second socket listens for them."""
 OTHER_BODY: Final = "wand"
 OTHER_PLACE_M: Final[Vec3] = (1.9, -1.5, 0.04)
-"""Position of another rigid body on the floor."""
+"""Position of the second rigid body, which lies on the floor."""
 _MARKER_SIZE_M: Final = 0.014
 _MARKER_OCCLUDED = 0x01
 _MARKER_POINT_CLOUD_SOLVED = 0x02
@@ -65,8 +65,8 @@ class NatNetServer:
     Args:
         version: NatNet bitstream version.
         interface: local address of both sockets, and the multicast interface.
-        command_port: command port; 0 takes any free one.
-        data_port: source port of every frame and destination of multicast frames; 0 takes any free one.
+        command_port: command port; 0 for any free one.
+        data_port: source port of every frame and destination of multicast frames; 0 for any free one.
         multicast_group: multicast address, or None to stream to unicast clients only.
         bodies: id and name of each rigid body.
         rate_hz: answer to the FrameRate request.
@@ -123,7 +123,7 @@ class NatNetServer:
         """Open both sockets.
 
         Raises:
-            OSError: a port is in use or the interface does not belong to this machine; the text names the cause.
+            OSError: a port is in use or the interface does not belong to this computer; the text names the cause.
         """
         try:
             self._command = self._bind(self._ports[0])
@@ -209,7 +209,7 @@ class NatNetServer:
                 datagram, address = opened.recvfrom(65535)
             except (BlockingIOError, InterruptedError):
                 return
-            except OSError:  # an ICMP error of an earlier answer
+            except OSError:  # an ICMP error from an earlier answer
                 continue
             self.requests += 1
             self._answer(datagram, (address[0], address[1]))

@@ -1,4 +1,4 @@
-"""The simulated world in real time: the plant, with every device behind its real wire.
+"""The simulated world in real time: the plant, with every device behind its real protocol.
 
 The world's clock follows the wall clock. If the process falls behind by more than `_CATCH_UP_S`, the world pauses instead of catching
 up; `slipped_s` counts the lost time.
@@ -45,11 +45,11 @@ OnMessage = Callable[[dict[str, Any]], None]
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """UDP ports of the standalone simulator; 0 takes any free port."""
+    """UDP ports of the standalone simulator; 0 for any free port."""
 
     autopilot_local: int = 0
     autopilot_remote: int = 0
-    """Port that PX4 sends to from the start; with 0 it waits for the first message of a partner."""
+    """Port to which PX4 sends from the start; if 0, it waits for the first message of a partner."""
     mocap_command: int = 0
     mocap_data: int = 0
     multicast: bool = False
@@ -65,7 +65,7 @@ class Start:
 
 
 class Sitl:
-    """The plant and its wires.
+    """The plant and the devices' links.
 
     Args:
         vehicle: vehicle file.
@@ -110,10 +110,10 @@ class Sitl:
         self._arm_handling = ArmHandling(vehicle.arm, pose[2]) if config.arm_hand else None
         self.flight = ProcessFaults()
         self.course: list[Sample] = []
-        """True position, tilt and tether of the vehicle, sampled from the first fault on."""
+        """True position, tilt and tether of the vehicle, sampled from the first fault."""
         self._course_due_s = 0.0
         self.frames: list[tuple[int, float]] = []
-        """(number, world time) of some motion-capture frames as they were sent; they relate a log's clock to the world's."""
+        """(number, world time) of some of the motion-capture frames, from which a log's clock is related to the world's."""
         self.modes: list[tuple[float, str | None, bool]] = []
         """(world time, mode, armed) at every change of the autopilot's state."""
         self._injected: set[FaultKind] = set()
@@ -131,7 +131,7 @@ class Sitl:
 
     @contextlib.asynccontextmanager
     async def wires(self) -> AsyncIterator[dict[str, dict[str, Any]]]:
-        """Open every wire and yield the addresses, as `devices` settings of a vehicle file."""
+        """Open every link and yield the addresses, as `devices` settings of a vehicle file."""
         device = self._vehicle.devices
         async with contextlib.AsyncExitStack() as stack:
             self.bus = await stack.enter_async_context(ServoBus(self._on_bus))

@@ -24,12 +24,12 @@ class UdpEndpoint(asyncio.DatagramProtocol):
         self._transport = cast(asyncio.DatagramTransport, transport)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Note that the socket is closed."""
+        """Record that the socket is closed."""
         self._transport = None
         self._closed.set()
 
     def error_received(self, exc: Exception) -> None:
-        """Ignore an ICMP error, because the other end does not listen yet."""
+        """Ignore an ICMP error, which means that the other end does not listen yet."""
 
     @property
     def port(self) -> int:
@@ -42,7 +42,7 @@ class UdpEndpoint(asyncio.DatagramProtocol):
             self._transport.sendto(data, address)
 
     async def close(self) -> None:
-        """Close the socket and wait until it is closed, `CLOSE_DEADLINE_S` at most."""
+        """Close the socket and wait at most `CLOSE_DEADLINE_S` until it is closed."""
         if self._transport is not None:
             self._transport.close()
             with contextlib.suppress(TimeoutError):

@@ -1,7 +1,8 @@
 """The compiled build: a copy of `companion` and `sitl` in build/compiled, in which mypyc has compiled the modules that compute.
 
-`python -m tools.compiled` makes it. It computes the same bits as the source and runs instead of it when it comes first on the module
-path: `PYTHONSAFEPATH=1 PYTHONPATH=$PWD/build/compiled .venv/bin/companion ...`. The source tree stays as it is.
+`python -m tools.compiled` makes it. Its results are identical to the bit with those of the source, and it runs instead of the source
+when it comes first on the module path: `PYTHONSAFEPATH=1 PYTHONPATH=$PWD/build/compiled .venv/bin/companion ...`. The source tree does
+not change.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ INTERPRETED = frozenset(
         "companion/model/observations.py",
         "companion/model/packets.py",
         "companion/model/types.py",
-        # Wires, which the fast loop does not have; mypyc has no asynchronous generators.
+        # I/O, which the fast loop does not have; mypyc does not support asynchronous generators.
         "sitl/autopilot/backend.py",
         "sitl/autopilot/mavlink.py",
         "sitl/autopilot/receive.py",
@@ -53,9 +54,9 @@ INTERPRETED = frozenset(
         "sitl/servo/protocol.py",
     }
 )
-"""Files that match `COMPILED` and stay plain Python."""
+"""Files that match `COMPILED` but stay plain Python."""
 FLAGS = "-O2 -ffp-contract=off"
-"""A contracted multiplication and addition would change the last bits on processors that have it (aarch64)."""
+"""Fused multiply-add would change the last bits on processors that have it (aarch64)."""
 
 
 def sources() -> list[Path]:
@@ -101,7 +102,7 @@ def build() -> None:
 
 
 def main() -> int:
-    """Build, and say how to use it. Return the exit code."""
+    """Build, print how to use the result, and return the exit code."""
     compiler = str(sysconfig.get_config_var("CC")).split()[0]
     if shutil.which(compiler) is None:
         print(f"no C compiler ({compiler}): on Debian, apt install gcc python3-dev", file=sys.stderr)

@@ -30,7 +30,9 @@ _COMMANDER_PERIOD_S = 0.01
 _POSITION_PERIOD_S = 0.004
 _EARTH_RADIUS_M = 6371000.0
 _EV_POSITION_AND_YAW = 1 | 2 | 8
-"""Bits of EKF2_EV_CTRL for horizontal position, vertical position and yaw. Without magnetometer, barometer and GPS PX4 needs all."""
+"""Bits of EKF2_EV_CTRL for horizontal position, vertical position and yaw. Without magnetometer, barometer and GPS PX4 needs all of
+them.
+"""
 _TIME_EPSILON_S = 1e-9
 # Looking up an Enum member costs as much as ten comparisons; these two are used at 250 Hz.
 _OFFBOARD, _TERMINATION = NavState.OFFBOARD, NavState.TERMINATION
@@ -101,8 +103,8 @@ class Px4Stub:
         params: parameter store; changes take effect at once.
         estimator: substitute for EKF2.
         cascade: attitude loop, rate loop and mixer.
-        setpoint_delay_s: delay from the arrival of a setpoint to its effect in the attitude loop.
-        learned: biases that PX4 learned before the world begins; None for an IMU without bias.
+        setpoint_delay_s: delay from the arrival of a setpoint to its effect in the attitude loop. learned: biases that PX4 has learned
+        before the world starts; None for an IMU without bias.
     """
 
     def __init__(
@@ -137,11 +139,11 @@ class Px4Stub:
         self._setpoint_delay_s = setpoint_delay_s
         self._learned = learned
         self.refuses_offboard = False
-        """Fault: PX4 refuses OFFBOARD, and leaves it."""
+        """Fault: PX4 leaves OFFBOARD and refuses to enter it."""
         self.refuses_arming = False
         """Fault: PX4 refuses to arm."""
         self.booted_at_s = 0.0
-        """World time of the last boot: zero of PX4's own clock; PX4 does not run before it."""
+        """World time of the last boot, at which PX4's own clock is zero and before which PX4 does not run."""
         self.clock_ahead_s = 0.0
         """Sum of the pauses of the world, during which PX4's own clock continues."""
         self.since_sample_s = 0.0
@@ -266,7 +268,7 @@ class Px4Stub:
         return None
 
     def reboot(self, for_s: float) -> None:
-        """Restart with the loss of everything but the parameters; PX4 runs again `for_s` later."""
+        """Restart and lose everything but the parameters; PX4 runs again `for_s` later."""
         self.booted_at_s = self.t_s + for_s
         self.commander, self.navigator = Commander(self.params), Navigator(self.params)
         self.land, self._estimator = LandDetector(self.params), Estimator()
@@ -278,7 +280,7 @@ class Px4Stub:
         self._climb_rate_controlled = False
 
     def pilot_sets_mode(self, state: NavState) -> None:
-        """Change the mode by the switch of a pilot's radio, with a home position set before."""
+        """Change the mode as the switch of a pilot's radio does, after setting a home position."""
         estimate = self.estimate
         if estimate is None:
             return
@@ -289,7 +291,7 @@ class Px4Stub:
         self.commander.change_mode(state, self._health(self.t_s))
 
     def set_origin(self, origin: Origin) -> None:
-        """Set the global origin (SET_GPS_GLOBAL_ORIGIN), which makes the local position a global one too."""
+        """Set the global origin (SET_GPS_GLOBAL_ORIGIN), with which the local position also gives a global one."""
         self.origin = origin
 
     def arming_problem(self) -> str | None:

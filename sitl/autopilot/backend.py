@@ -1,4 +1,4 @@
-"""Interface between the simulated world and its autopilot, and its implementation by the stub; `sitl.px4.backend` has a real PX4."""
+"""Interface between the simulated world and its autopilot, and its implementation with the stub; `sitl.px4.backend` runs a real PX4."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STUB_VERSION = "1.16"
 
 
 class Observation(NamedTuple):
-    """What the world can observe of an autopilot; a field is None if this autopilot does not show it."""
+    """What the world can observe of an autopilot; a field is None if this autopilot does not reveal it."""
 
     setpoint_at_s: float | None
     """World time at which the newest setpoint arrived."""
@@ -39,7 +39,7 @@ class AutopilotBackend(Protocol):
     """An autopilot of the simulated world. The plant steps it with IMU samples."""
 
     lockstep: bool
-    """Whether it answers over a wire, so that the world calls `sense` and awaits `answered` before each `step`."""
+    """Whether it answers over a network link, so that the world calls `sense` and awaits `answered` before each `step`."""
 
     @property
     def armed(self) -> bool:
@@ -47,20 +47,20 @@ class AutopilotBackend(Protocol):
 
     @property
     def fault_target(self) -> FaultyAutopilot:
-        """Where faults of the autopilot are injected."""
+        """The object through which autopilot faults are injected."""
 
     @property
     def down(self) -> bool:
         """Whether it is booting and does not communicate."""
 
     def attach(self, world: World) -> None:
-        """Set the world that it flies in; call it before everything else."""
+        """Set the world in which it flies; call this before everything else."""
 
     def wires(self) -> AbstractAsyncContextManager[str]:
         """Open its links and yield the companion's `devices.autopilot.address`."""
 
     async def prepare(self) -> None:
-        """Make it ready to fly; the world is stepped meanwhile."""
+        """Make it ready to fly while the world is being stepped."""
 
     def sense(self, imu: ImuSample) -> None:
         """Send the IMU sample of the next `step` as soon as it is known."""
@@ -69,10 +69,10 @@ class AutopilotBackend(Protocol):
         """Wait until it has answered that sample."""
 
     def step(self, imu: ImuSample) -> Vec4:
-        """Take one IMU sample and return normalised rotor commands; all are zero while disarmed."""
+        """Process one IMU sample and return normalised rotor commands, which are zero while disarmed."""
 
     def pump(self, t_s: float, battery: Battery) -> None:
-        """Stream telemetry; called after every step of the physics."""
+        """Stream telemetry; call it after every step of the physics."""
 
     def set_link(self, down: bool, delay_s: float) -> None:
         """Inject link faults: nothing arrives, or everything arrives `delay_s` late, in both directions."""
@@ -91,8 +91,8 @@ def stub_of(config: WorldConfig, link_delay_s: float = 0.0) -> Px4Stub:
     """Return the stub with the parameters of this world, gains included; `set_hover_thrust` sets its hover thrust.
 
     Args:
-        config: `setpoint_delay_s`, `px4_params` and the biases of `imu`.
-        link_delay_s: added to the setpoint delay, for a loop without a wire.
+        config: `setpoint_delay_s`, `px4_params` and the biases of `imu`. link_delay_s: added to the setpoint delay, for a loop without
+        a real link.
     """
     params = Params()
     params.set("THR_MDL_FAC", config.thr_mdl_fac)
@@ -104,15 +104,15 @@ def stub_of(config: WorldConfig, link_delay_s: float = 0.0) -> Px4Stub:
 
 
 def _learned(imu: Imu) -> LearnedBias | None:
-    """Return the biases that EKF2 learns while the vehicle stands on the floor, limited by EKF2_GYR_B_LIM and EKF2_ABL_LIM.
+    """Return the biases that EKF2 learns while the vehicle is on the floor, limited by EKF2_GYR_B_LIM and EKF2_ABL_LIM.
 
-    The world begins seconds before take-off; PX4 has run for longer. At rest it observes the bias of the gyroscopes directly
-    (ZeroGyroUpdate, and the module gyro_calibration), and that of the vertical accelerometer by the height. It does not observe the
-    bias of a horizontal accelerometer, which position cannot distinguish from a tilt, at rest and in every flight at constant
-    yaw. EKF2 starts with a tilt from the accelerometers, which is wrong by bias / g, and no innovation corrects it. In flight its
-    gains would learn little (Kalman filter with EKF2's parameters and vision at 125 Hz: 0.01 m/s^2 per s and m of innovation,
-    against 1.7 rad/s per m on the tilt). Measured on 1.16.1: a bias of 0.1 and 0.08 m/s^2 (0.58 and 0.47 deg) tilts it by 0.60 to
-    0.69 and 0.45 to 0.54 deg, before take-off, in flight and after the catch; a gyroscope bias of 0.3 deg/s by less than 0.03 deg.
+    The world starts seconds before take-off; a real PX4 has run for longer. At rest it observes the bias of the gyroscopes directly
+    (ZeroGyroUpdate, and the module gyro_calibration), and that of the vertical accelerometer from the height. It does not observe the
+    bias of a horizontal accelerometer, which position cannot distinguish from a tilt, at rest and in every flight at constant yaw. EKF2
+    starts with a tilt from the accelerometers, which is wrong by bias / g, and no innovation corrects it. In flight its gains would
+    learn little (Kalman filter with EKF2's parameters and vision at 125 Hz: 0.01 m/s^2 per s and m of innovation, against 1.7 rad/s per
+    m on the tilt). Measured on 1.16.1: a bias of 0.1 and 0.08 m/s^2 (0.58 and 0.47 deg) tilts it by 0.60 to 0.69 and 0.45 to 0.54 deg,
+    before take-off, in flight and after the catch; a gyroscope bias of 0.3 deg/s by less than 0.03 deg.
     """
     if not imu.on:
         return None

@@ -31,8 +31,9 @@ class CascadeGains:
 
 
 def motor_signal(command: float, factor: float) -> float:
-    """Return the motor signal for a normalised thrust command, 0 to 1, by THR_MDL_FAC (FunctionMotors::updateValues): PX4 assumes that
-    thrust is factor signal^2 + (1 - factor) signal."""
+    """Return the motor signal for a normalised thrust command, 0 to 1, according to THR_MDL_FAC (FunctionMotors::updateValues): PX4
+    assumes that thrust is factor signal^2 + (1 - factor) signal.
+    """
     if factor <= 0.0 or command <= 0.0:
         return command
     half = (1.0 - factor) / (2.0 * factor)
@@ -81,7 +82,7 @@ class Cascade:
             ax = rw * x + rx * w + ry * z - rz * y
             ay = rw * y - rx * z + ry * w + rz * x
             az = rw * z + rx * y - ry * x + rz * w
-        # The rest is a turn about the body's z axis, of which a share is commanded: a* (.) = target.
+        # The rest is a turn about the body's z axis, of which a fraction is commanded: a* (.) = target.
         left_w = aw * wd + ax * xd + ay * yd + az * zd
         left_z = aw * zd - ax * yd + ay * xd - az * wd
         (p_roll, p_pitch, p_yaw), (most_roll, most_pitch, most_yaw) = self._gains.attitude_p, self._gains.rate_max_rad_s

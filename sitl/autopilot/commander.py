@@ -1,7 +1,7 @@
 """PX4's commander without I/O and clock: arming state, user intention, failsafe fallbacks, automatic disarm.
 
-Sources: PX4 1.16 Commander.cpp, UserModeIntention.cpp, failsafe.cpp, HealthAndArmingChecks. While disarmed any mode can be chosen, and
-arming may be refused instead. In flight a mode is refused if it cannot run. `nav_state` is the active mode: the user intention, or a
+Sources: PX4 1.16 Commander.cpp, UserModeIntention.cpp, failsafe.cpp, HealthAndArmingChecks. While disarmed any mode can be chosen, but
+arming may then be refused. In flight a mode is refused if it cannot run. `nav_state` is the active mode: the user intention, or a
 failsafe mode while the intended one cannot run.
 """
 
@@ -104,7 +104,7 @@ class Commander:
             case Command.RUN_PREARM_CHECKS:
                 return Result.ACCEPTED
             case Command.PREFLIGHT_REBOOT_SHUTDOWN:
-                return Result.DENIED  # armed: never; disarmed: the stub does not restart its process
+                return Result.DENIED  # never while armed; while disarmed, the stub does not restart its process
             case _:
                 return Result.UNSUPPORTED
 

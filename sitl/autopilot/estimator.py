@@ -1,8 +1,8 @@
 """The PX4 stub's substitute for EKF2: IMU prediction and delayed vision fusion.
 
 A fixed-gain observer with the couplings that matter in EKF2: position innovations correct velocity and, through gravity, tilt; vision
-corrects yaw; without vision the state is dead reckoning on the IMU and drifts. Vision is fused at the time of its exposure, against the
-state of that time, as EKF2 does on its delayed horizon; the output is predicted to the present.
+corrects yaw; without vision the state is dead-reckoned from the IMU and drifts. Vision is fused at the time of its exposure, against
+the state at that time, as EKF2 does on its delayed horizon; the output is predicted forward to the present.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ _HISTORY_S = 0.3
 _GATE_M = 0.5
 _GATE_RESET_S = 1.0
 
-# What EKF2's gains settle to with vision at 100 Hz, EKF2_EVP_NOISE 0.01, EKF2_EVA_NOISE 0.05, EKF2_ACC_NOISE 0.35 and EKF2_GYR_NOISE
-# 0.015 (steady Kalman filter over position, velocity and g times tilt): poles 5.9 rad/s, damped by 0.7, and 0.42 rad/s on the tilt. A
-# tilt of 0.1 deg, which EKF2 has too, is 4 mm of position error to this control law. The vertical accelerometer bias is slower: with
-# EKF2_ABIAS_INIT 0.2 and EKF2_ACC_B_NOISE 0.003 its gain is 1.8, 1.2 and 0.7 m/s^3 per m after 20, 30 and 50 s.
+# What EKF2's gains settle to with vision at 100 Hz, EKF2_EVP_NOISE 0.01, EKF2_EVA_NOISE 0.05, EKF2_ACC_NOISE 0.35 and
+# EKF2_GYR_NOISE 0.015 (steady Kalman filter over position, velocity and g times tilt): poles 5.9 rad/s, damped by 0.7,
+# and 0.42 rad/s on the tilt. A tilt error of 0.1 deg, which EKF2 has too, causes 4 mm of position error with this
+# control law. The vertical accelerometer bias is slower: with EKF2_ABIAS_INIT 0.2 and EKF2_ACC_B_NOISE 0.003 its gain
+# is 1.8, 1.2 and 0.7 m/s^3 per m after 20, 30 and 50 s.
 _L_POSITION = 8.8
 _L_VELOCITY = 38.5
 _L_ACCELERATION = 14.7
@@ -33,8 +34,9 @@ _L_YAW = 0.3
 _BIAS_MAX_M_S2 = 0.4
 """EKF2_ABL_LIM."""
 
-# EKF2's defaults: gate in standard deviations (EKF2_EVP_GATE), accelerometer noise (EKF2_ACC_NOISE). The rest as measured on 1.16.1: a
-# filtered ratio falls by e in 1 s, is 2 at most, and the position is good to 4 mm with vision at 100 Hz and EKF2_EVP_NOISE 0.01.
+# EKF2's defaults: gate in standard deviations (EKF2_EVP_GATE), accelerometer noise (EKF2_ACC_NOISE). The rest was
+# measured on 1.16.1: a filtered ratio falls by e in 1 s, is 2 at most, and the position is good to 4 mm with vision at
+# 100 Hz and EKF2_EVP_NOISE 0.01.
 _VISION_NOISE_M = 0.01
 _TEST_GATE = 5.0
 _TEST_FILTER_S = 0.5

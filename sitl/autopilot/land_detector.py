@@ -25,7 +25,7 @@ class _Settings(NamedTuple):
 
 
 class LandDetector:
-    """Three conditions in sequence, each held for a third of LNDMC_TRIG_TIME; each is lost at once."""
+    """Three conditions in sequence, each held for a third of LNDMC_TRIG_TIME and reset at once."""
 
     def __init__(self, params: Params) -> None:
         self._params = params
@@ -111,7 +111,7 @@ class LandDetector:
 
 
 def _held(t_s: float, now: bool, since_s: float | None, hold_s: float) -> tuple[float | None, bool]:
-    """Return since when a condition holds, and whether it has held for `hold_s`."""
+    """Return the time since when a condition has held, and whether it has held for `hold_s`."""
     if not now:
         return None, False
     if since_s is None:

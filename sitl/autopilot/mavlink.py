@@ -1,8 +1,8 @@
 """The PX4 stub's MAVLink 2 over UDP on 127.0.0.1: an onboard link and optionally one to a ground station.
 
-As in PX4 SITL, a link sends to its remote port from the start, then to the first sender, for as long as PX4 runs; messages of other
-senders are handled too. A link without a remote port sends to the newest sender. Streams run on world time, driven by `pump`; messages
-are handled when they arrive.
+As in PX4 SITL, a link sends to its remote port until a message arrives, and then to the first sender for as long as PX4 runs; messages
+from other senders are handled too. A link without a remote port sends to the newest sender. Streams run on world time, driven by
+`pump`; messages are handled when they arrive.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class Ports:
     """UDP ports of one link."""
 
     local: int
-    """Local port; 0 takes any free port."""
+    """Local port; 0 for any free port."""
     remote: int
-    """Port to send to; with 0 the link is silent until a datagram arrives."""
+    """Port to send to; if 0, the link is silent until a datagram arrives."""
 
 
 ONBOARD_PORTS = Ports(14580, 14540)
@@ -103,7 +103,7 @@ class Link(UdpEndpoint):
             return 0.0
         wall_s, t_s = self._pumped
         since_s = t_s - self._stub.t_s + asyncio.get_running_loop().time() - wall_s
-        return min(_STEP_MAX_S, max(0.0, since_s))  # after a longer time the world is paused
+        return min(_STEP_MAX_S, max(0.0, since_s))  # after a longer gap the world counts as paused
 
     def send(self, message: Message) -> None:
         """Send one message to the partner, if one is known."""
@@ -135,7 +135,7 @@ class Link(UdpEndpoint):
         self._send_texts()
 
     def _send_texts(self) -> None:
-        """Send queued texts as MavlinkStreamStatustext::send does: ids count from 0, for texts of one chunk too."""
+        """Send queued texts as MavlinkStreamStatustext::send does: ids count from 0, even for texts of one chunk."""
         seen_s, now_s = self._ground_station_at_s, self._stub.t_s
         if seen_s is None or now_s - seen_s > _GROUND_STATION_TIMEOUT_S:
             return
@@ -231,7 +231,7 @@ class MavlinkServer:
                 await self._close()
                 found = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be opened ({error.strerror})"
                 raise LinkError(
-                    f"PX4 stub: UDP port {self._host}:{ports.local} {found}; end the program that holds it or choose another port"
+                    f"PX4 stub: UDP port {self._host}:{ports.local} {found}; end the program that uses it or choose another port"
                 ) from error
             self._links.append(link)
         return self

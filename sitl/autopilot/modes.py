@@ -83,7 +83,7 @@ PREVENT_ARMING = frozenset({NavState.RTL, NavState.LAND, NavState.DESCEND, NavSt
 
 
 class OffboardKind(Enum):
-    """Which fields of offboard_control_mode the setpoint stream sets."""
+    """The fields of offboard_control_mode that the setpoint stream sets."""
 
     ATTITUDE = auto()  # attitude or body rates: no position needed
     POSITION = auto()
@@ -98,11 +98,11 @@ class Health:
     attitude_valid: bool
     position_valid: bool
     origin_set: bool
-    """Whether SET_GPS_GLOBAL_ORIGIN was received, so that the local position is a global one too."""
+    """Whether SET_GPS_GLOBAL_ORIGIN was received, so that the local position also gives a global one."""
     home_set: bool
     landed: bool
     maybe_landed: bool
-    """Last stage of the land detector before `landed`; it suffices for a disarm command."""
+    """Last stage of the land detector before `landed`; it is sufficient for a disarm command."""
     setpoint_age_s: float | None
     """Time since the newest offboard setpoint arrived, or None."""
     setpoint_kind: OffboardKind = OffboardKind.ATTITUDE

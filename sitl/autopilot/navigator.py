@@ -49,7 +49,7 @@ class Navigator:
         self._ramp_since_s = 0.0
         self._hold_ned_m: Vec3 = (0.0, 0.0, 0.0)
         self._way = Smoothing((0.0, 0.0), (0.0, 0.0))
-        """Trajectory to the point that the mode holds."""
+        """Trajectory to the position that the mode holds."""
         self._yaw_rad = 0.0
         self._descent_m_s = 0.0
         self._descending = False
@@ -181,7 +181,9 @@ class Navigator:
         return (vz is not None and vz < 0.0) or (az is not None and az < 0.0)
 
     def _climb_limit(self, t_s: float) -> float | None:
-        """Return the upward speed limit; in the take-off ramp it rises from the value that gives no thrust (Takeoff::updateRamp)."""
+        """Return the upward speed limit; during the take-off ramp it rises from the value that commands zero thrust
+        (Takeoff::updateRamp).
+        """
         real = self._params.real
         speed = real("MPC_TKO_SPEED")
         if self.phase is Phase.RAMPUP:

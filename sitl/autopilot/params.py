@@ -31,17 +31,17 @@ VEHICLE_DEFAULTS: Mapping[str, Value] = {
 
 
 class Params:
-    """The autopilot's parameters; as in PX4, their index is alphabetic."""
+    """The autopilot's parameters; as in PX4, they are indexed in alphabetical order."""
 
     def __init__(self, overrides: Mapping[str, Value] | None = None) -> None:
         """Set the defaults of this vehicle, then `overrides`.
 
         Raises:
-            KeyError: if an override names no known parameter.
-            ValueError: if an override is not finite, or not whole where PX4 has an INT32.
+            KeyError: an override names an unknown parameter. ValueError: an override is not finite, or is not a whole number although
+            PX4 has an INT32.
         """
         self.revision = 0
-        """Counter that grows with every change, for comparison by a cache."""
+        """Counter that grows with every change, so that a cache can detect changes."""
         self._integer = {name: isinstance(default, int) for name, default in PX4_DEFAULTS.items()}
         self._values: dict[str, Value] = {name: PX4_DEFAULTS[name] for name in sorted(PX4_DEFAULTS)}
         self._names = tuple(self._values)
@@ -65,7 +65,7 @@ class Params:
         """Return a value as float.
 
         Raises:
-            KeyError: unknown name.
+            KeyError: the name is unknown.
         """
         return float(self._values[name])
 
@@ -73,7 +73,7 @@ class Params:
         """Return a value as int.
 
         Raises:
-            KeyError: unknown name.
+            KeyError: the name is unknown.
         """
         return int(self._values[name])
 
@@ -81,8 +81,7 @@ class Params:
         """Store a value and return the stored value.
 
         Raises:
-            KeyError: unknown name.
-            ValueError: not finite, or not whole where PX4 has an INT32.
+            KeyError: the name is unknown. ValueError: the value is not finite, or is not a whole number although PX4 has an INT32.
         """
         integer = self._integer[name]
         if not math.isfinite(value):
@@ -100,7 +99,7 @@ class Params:
         """Return the index of a parameter in the protocol.
 
         Raises:
-            KeyError: unknown name.
+            KeyError: the name is unknown.
         """
         return self._index[name]
 
@@ -112,7 +111,7 @@ class Params:
         """Return the MAV_PARAM_TYPE of a parameter.
 
         Raises:
-            KeyError: unknown name.
+            KeyError: the name is unknown.
         """
         return MAV_PARAM_TYPE_INT32 if self._integer[name] else MAV_PARAM_TYPE_REAL32
 
@@ -120,7 +119,7 @@ class Params:
         """Return PARAM_VALUE.param_value; integers are bit-cast into the float (MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE).
 
         Raises:
-            KeyError: unknown name.
+            KeyError: the name is unknown.
         """
         return encode_bytewise(self._values[name])
 
@@ -128,7 +127,7 @@ class Params:
         """Store the value of PARAM_SET; PX4 rejects a message whose type differs from its own table.
 
         Raises:
-            KeyError: unknown name.
+            KeyError: the name is unknown.
             ValueError: the type differs or the value is not finite.
         """
         if mav_type != self.mav_type(name):

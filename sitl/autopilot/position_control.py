@@ -52,7 +52,9 @@ class PositionControl:
     def step(
         self, dt_s: float, estimate: Estimate, target: PositionTarget, climb_limit_m_s: float | None = None
     ) -> AttitudeTarget:
-        """Run one control period; `climb_limit_m_s` lowers the upward speed limit in the take-off ramp (negative: only descent)."""
+        """Run one control period; `climb_limit_m_s` lowers the upward speed limit during the take-off ramp (if negative, only descent
+        is possible).
+        """
         if self._revision != self._params.revision:
             self._gains = self._read()
         gains = self._gains

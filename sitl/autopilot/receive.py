@@ -44,7 +44,7 @@ class Reply(Protocol):
 
 
 class Receiver:
-    """Dispatch by message id."""
+    """Dispatches messages by their id."""
 
     def __init__(self, stub: Px4Stub) -> None:
         self._stub = stub

@@ -19,7 +19,7 @@ class RateTarget:
 
     rates_frd_rad_s: Vec3
     thrust: float
-    """Collective, 0 to 1."""
+    """Collective thrust, 0 to 1."""
 
 
 @dataclass(frozen=True, slots=True)

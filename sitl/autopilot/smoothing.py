@@ -53,6 +53,6 @@ class Smoothing:
 
 
 def max_speed_m_s(distance_m: float, acceleration_m_s2: float, jerk_m_s3: float) -> float:
-    """Return the speed from which it can stop within a distance (TrajMath: computeMaxSpeedFromDistance, final speed 0)."""
+    """Return the speed from which the vehicle can stop within a distance (TrajMath: computeMaxSpeedFromDistance, final speed 0)."""
     b = 4.0 * acceleration_m_s2 * acceleration_m_s2 / jerk_m_s3
     return 0.5 * (math.sqrt(b * b + 8.0 * acceleration_m_s2 * distance_m) - b)

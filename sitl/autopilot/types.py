@@ -57,7 +57,7 @@ class AttitudeTarget(NamedTuple):
 
     attitude_ned_frd: Quat
     thrust: float
-    """Collective, 0 to 1."""
+    """Collective thrust, 0 to 1."""
     yaw_rate_rad_s: float = 0.0
 
 

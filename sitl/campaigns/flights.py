@@ -1,4 +1,4 @@
-"""Fast flights of campaigns: fly, convert to a log, grade."""
+"""Flies a campaign's flights in the fast loop, converts them to logs and grades them."""
 
 from __future__ import annotations
 
@@ -43,8 +43,7 @@ def with_world(config: SitlConfig, changes: Data) -> SitlConfig:
     """Return the configuration with keys of its world changed; another seed draws another laboratory.
 
     Args:
-        config: configuration of a flight.
-        changes: plain data by key of the world. A given key is not drawn.
+        config: configuration of a flight. changes: plain data by key of the world. A key given here is not drawn.
     """
     laboratory = config.laboratory.without(list(changes))
     data = config.world.model_dump(mode="json") | changes
@@ -86,7 +85,7 @@ def row_of(
     index = metrics.catch_index(log)
     caught = index is not None
     pre, post = metrics.flight_masks(log) if log.inputs else (np.zeros(0, np.bool_), np.zeros(0, np.bool_))
-    # A part that was not flown to its end is not graded.
+    # A part of the mission that was not flown to its end is not graded.
     nothing = metrics.TrackingRms(None, None, None)
     before = metrics.tracking_rms(log, pre) if completed or caught else nothing
     after = metrics.tracking_rms(log, post) if completed and caught else nothing

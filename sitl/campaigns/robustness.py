@@ -1,6 +1,6 @@
 """Flights of `companion robustness`: {name, number, world}; a flight without a `world` is drawn at random by its number.
 
-Payload, throw and catch point are drawn here, because they depend on the mission; the rest is drawn by the world's file. The job
+Payload, throw and catch point are drawn here, because they depend on the mission; the rest is drawn as the world's file says. The job
 also has `seed` (seed of the random draws) and `fixed` (names of world keys that keep their configured values).
 """
 
@@ -37,10 +37,10 @@ ALONG_MIN_M_S = 0.08
 END_MARGIN_M = 0.08
 """Distance of the catch points from the ends of the line: a vehicle displaced by the wind may not pass a point closer to them."""
 HAND_HEIGHT_M = 0.1
-"""Smallest height above the floor at which the payload leaves the hand."""
+"""Smallest height above the floor at which the payload is released."""
 ROTORS_ABOVE_BODY_M = 0.03
 FELT_S = 0.05
-"""Time after the catch by which the force sensor must have sent a sample taken after it."""
+"""Time after the catch within which the force sensor must have sent a sample taken after the catch."""
 _STEP_S = 0.01
 
 
@@ -50,7 +50,7 @@ class Throw:
 
     at_m: tuple[float, float]
     descent_m_s: tuple[float, float]
-    """Range of the descent speed: a throw from `HAND_HEIGHT_M` is the slowest; the fastest still passes clear of the rotors."""
+    """Range of the descent speed: the slowest throw is from `HAND_HEIGHT_M`; the fastest still clears the rotors."""
 
 
 def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
@@ -87,7 +87,7 @@ def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
         found.append(Throw((x_m, later.position_world_m[1]), (slowest, fastest)))
     if not found:
         raise CampaignError(
-            f"mission '{mission.name}' never flies in the direction of +x, so that no payload can be thrown at it",
+            f"mission '{mission.name}' never flies in the direction of +x, so no payload can be thrown to it",
             bad_input=True,
         )
     return found
@@ -124,7 +124,7 @@ def prepare(job: Data, configs: Sequence[SitlConfig]) -> list[Data]:
     """Return the flights of the job, each with the keys of its world that differ from the configuration.
 
     Raises:
-        CampaignError: no payload can be thrown at the vehicle in this mission.
+        CampaignError: no payload can be thrown to the vehicle in this mission.
     """
     (config,), flights = configs, job["flights"]
     draws = any(flight["world"] is None for flight in flights)

@@ -1,4 +1,4 @@
-"""Flies the flights of a campaign over the cores of this machine (joblib) or over the workers of a Dask cluster."""
+"""Flies the flights of a campaign on the cores of this computer (joblib) or on the workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ WORKERS_TIMEOUT_S = 30.0
 
 Data = dict[str, Any]
 Fly = Callable[[SitlConfig, Data], Data]
-"""Flies one flight of a job and returns its `row`, and a `series` if it has one; a function of a module, so that workers find it."""
+"""Flies one flight of a job and returns its `row`, and a `series` if it has one; must be a module-level function, so that workers find
+it.
+"""
 
 
 def fly_all(

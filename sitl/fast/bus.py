@@ -23,7 +23,7 @@ _READ_LIMIT = bytes((Instruction.READ, *_LIMIT.address.to_bytes(2, "little"), *_
 
 
 def scales_of(vehicle: Vehicle, servos: Sequence[ServoModel]) -> tuple[JointScale, JointScale] | None:
-    """Return the scale of each joint, or None where the companion's set-up of the bus fails.
+    """Return the scale of each joint, or None if the companion's set-up of the bus fails.
 
     Args:
         vehicle: vehicle file with the assumed ids, baud rate and torques.
@@ -61,8 +61,7 @@ class FastBus:
     Args:
         drives: motors of the servos, in current mode from now on.
         scales: scale of each joint; None if the set-up of the bus failed, and then the arm never answers.
-        watchdog_s: timeout of the servos' bus watchdog.
-        faults: of the world; None if it has none.
+        watchdog_s: timeout of the servos' bus watchdog. faults: faults of the world; None if it has none.
     """
 
     def __init__(
@@ -89,14 +88,14 @@ class FastBus:
         return self._arm
 
     def keep_alive(self, t_s: float) -> None:
-        """Perform the actions of the bus thread while the flight process stalls: feed the watchdogs, withdraw stale currents."""
+        """Do what the bus thread does while the flight process stalls: feed the watchdogs and withdraw stale currents."""
         for drive in self._drives:
             drive.heard_instruction()
             if t_s - self._goal_s > self._watchdog_s:
                 drive.set_goal_current(0)
 
     def write(self, t_s: float, torque_nm: Vec2 | None) -> None:
-        """Write the currents of these torques; None to write none, and then stale currents are withdrawn."""
+        """Write the currents for these torques; if None, write nothing and withdraw stale currents."""
         faults = self._faults
         if torque_nm is not None and self._scales is not None:
             self._goal_s = t_s
@@ -118,7 +117,7 @@ class FastBus:
                 drive.set_goal_current(goal)
 
     def _read_fails(self, faults: Faults) -> bool:
-        """Return whether this read fails. Servos that are not lost still receive the instruction, unless noise damaged it."""
+        """Return whether this read fails. Servos that are not lost still receive the instruction, unless noise corrupted it."""
         lost = faults.active.get("servo_loss")
         damaged = faults.packet_lost()
         if lost is None:
@@ -138,7 +137,7 @@ class FastBus:
             (e1, e2), (c1, c2) = self._faults.errors, self._faults.temperatures_c
             errors, temperatures_c = (e1, e2), (c1, c2)
         if drive1.watchdog_tripped or drive2.watchdog_tripped:
-            # As the driver does: reported in one state, then restarted with zero current.
+            # As in the driver, a tripped watchdog is reported in one state and then restarted with zero current.
             tripped = (drive1.watchdog_tripped * WATCHDOG_ERROR, drive2.watchdog_tripped * WATCHDOG_ERROR)
             errors = (errors[0] | tripped[0], errors[1] | tripped[1])
             drive1.start_watchdog(self._watchdog_s)

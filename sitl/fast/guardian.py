@@ -1,6 +1,6 @@
-"""The guardian in the fast closed loop: its own monitoring and landing code on simulated time, over a link in memory.
+"""The guardian in the fast closed loop: its real monitoring and landing code on simulated time, over an in-memory link.
 
-Killing the flight process and taking over its port are modelled by the time they take.
+Killing the flight process and taking over its port are modelled only by the time that they take.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class MemoryWire:
 
     @property
     def ready(self) -> bool:
-        """Whether PX4 was found; always true."""
+        """Return whether PX4 was found; always True."""
         return True
 
     def send(self, data: bytes) -> None:
@@ -105,7 +105,7 @@ class FastGuardian:
     """The guardian of one fast flight.
 
     Args:
-        vehicle: vehicle file; it has the timeout and the height of the vehicle on the floor.
+        vehicle: vehicle file; provides the timeout and the height of the vehicle on the floor.
         px4: the stub that it connects to.
     """
 
@@ -131,8 +131,7 @@ class FastGuardian:
 
         Args:
             t_s: world time.
-            heard: a heartbeat arrived in this tick.
-            dead: the flight process has ended.
+            heard: whether a heartbeat arrived in this tick. dead: whether the flight process has ended.
         """
         if not self.alive or self._beat is None or not self._beat.lifting or t_s - self._round_s < PERIOD_S - 1e-9:
             return False

@@ -13,7 +13,7 @@ from sitl.faults.injector import Faults
 from sitl.world.world import World
 
 MEMORY = 400
-"""Longest delay of received states, in control ticks."""
+"""Longest possible delay of received states, in control ticks."""
 
 
 class FastLink:

@@ -1,6 +1,6 @@
 """The fast closed loop: flight core, PX4 stub, servos and world on simulated time, without sockets.
 
-It keeps the sensor rates, quantisation, noise and delays of the wires and leaves out only their bytes.
+It keeps the sensor rates, quantisation, noise and delays of the real protocols and leaves out only their bytes.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ _NO_COMMAND, _LAND = OperatorCommand.NONE, OperatorCommand.LAND
 _ON_GROUND, _IN_AIR = LandedState.ON_GROUND, LandedState.IN_AIR
 _NO_REQUEST = AutopilotRequest.NONE
 SETTLE_S = 30.0
-"""Longest time for which the world continues after a flight that ends armed."""
+"""Longest time for which the world continues after a flight that ends while armed."""
 FLIGHT_PROCESS_FAULTS: frozenset[FaultKind] = frozenset({"stall_loop", "hold_gil", "stop_flight", "kill_flight"})
 """Faults that stop the flight process."""
 _MODES = {NavState.OFFBOARD: FlightMode.OFFBOARD, NavState.LAND: FlightMode.LAND, NavState.LOITER: FlightMode.HOLD}
@@ -136,8 +136,8 @@ class FastFlight:
     """One flight in the fast closed loop.
 
     Args:
-        config: effective configuration; the hover thrust is the stub's MPC_THR_HOVER if the vehicle file has none.
-        land_at_s: flight time at which the operator commands a landing; None means never.
+        config: effective configuration; the hover thrust is the stub's MPC_THR_HOVER if the vehicle file has none. land_at_s: time on
+        the flight clock at which the operator commands a landing; None for never.
     """
 
     def __init__(self, config: SitlConfig, land_at_s: float | None = None) -> None:
@@ -232,7 +232,7 @@ class FastFlight:
                 result.after.append(world.snapshot())
 
     def _flight_process_stalled(self, guardian: FastGuardian) -> bool:
-        """Return whether a fault keeps the flight process from its tick, and perform the actions of its bus thread."""
+        """Return whether a fault keeps the flight process from its tick, and then do what its bus thread does."""
         active, t_s = self.faults.active, self.plant.world.t_s
         guardian.alive = "kill_guardian" not in active
         if "stall_loop" in active:

@@ -1,7 +1,7 @@
-"""Faults of the simulated world: schedule, and effect on physics, sensors and PX4.
+"""Injects the faults of the simulated world: their schedule, and their effect on physics, sensors and PX4.
 
-The plant calls `Faults.step` in every step. The wires and the fast closed loop read faults of the
-link, the servo bus and the processes from `active`.
+The plant calls `Faults.step` in every step. `sitl.server` and the fast closed loop read faults of the link, the servo bus and the
+processes from `active`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ OVERLOAD, OVERHEATING = 0x20, 0x04
 COOL_C = 35.0
 _FOREVER_M = 1000.0
 LATE_S = 0.01
-"""A fault that is due for longer than this when its origin becomes known begins at that moment."""
+"""A fault that has been due for longer than this when its origin becomes known begins at that moment."""
 _OTHER_BODY_Z_M = 0.05
 _OTHER_BODY_YAW_RAD = math.radians(120.0)
 _BESIDE = (0.6, 0.8)
@@ -47,7 +47,7 @@ class Servo(Protocol):
 
 
 class Autopilot(Protocol):
-    """An autopilot that faults act on (`sitl.autopilot.autopilot.Px4Stub`)."""
+    """An autopilot on which faults act (`sitl.autopilot.autopilot.Px4Stub`)."""
 
     refuses_offboard: bool
     refuses_arming: bool
@@ -93,7 +93,7 @@ class Faults:
         self.begun_s: float | None = None
         """World time at which the first fault began, or None."""
         self.sag_v = 0.0
-        """Voltage drop of the battery by a fault."""
+        """Voltage drop of the battery caused by a fault."""
         self.errors = [0, 0]
         """Register 70 of each servo without a control table."""
         self.temperatures_c = [COOL_C, COOL_C]
@@ -120,7 +120,8 @@ class Faults:
             origin_s = origins[fault.after]
             assert fault.t_s is not None
             if origin_s is not None and self._begins_s[index] is None and t_s - origin_s >= fault.t_s:
-                # A catch is known only when the payload has come to rest: the fault then begins late and lasts as long as it should.
+                # A catch is known only when the payload has come to rest: the fault then begins late but lasts for its
+                # full duration.
                 due_s = origin_s + fault.t_s
                 self._begins_s[index] = due_s if t_s - due_s < LATE_S else t_s
             begins_s = self._begins_s[index]
@@ -218,7 +219,7 @@ class Faults:
         self._world.wind_m_s = (wx + speed_m_s * x / away_m, wy + speed_m_s * y / away_m, wz)
 
     def _shut_down_servo(self, index: int, error: int) -> None:
-        """Shut a servo down, as its own protection does."""
+        """Shut a servo down as its own protection does."""
         if self._servos and error == OVERLOAD:
             self._servos[index].trip_overload()
         elif not self._servos:

@@ -33,8 +33,7 @@ def environment(kinds: set[str], stall_s: float | None = None) -> dict[str, str]
     """Return the environment variables of the flight process for these kinds of faults.
 
     Args:
-        kinds: fault kinds.
-        stall_s: duration of the event loop's stall; None for no end.
+        kinds: fault kinds. stall_s: duration of the event loop's stall; None for ever.
     """
     if not kinds & {"hold_gil", "stall_loop"}:
         return {}
@@ -47,8 +46,8 @@ def inject_process_fault(kind: FaultKind, flight_pid: int) -> bool:
     """Inject a fault of the recorder or the guardian; return False if that process does not exist yet.
 
     Args:
-        kind: kill_recorder, kill_guardian or disk_full.
-        flight_pid: pid of the flight process, the recorder's parent and the guardian's sibling.
+        kind: kill_recorder, kill_guardian or disk_full. flight_pid: pid of the flight process, which is the recorder's parent and the
+        guardian's sibling.
     """
     module = "companion.guardian" if kind == "kill_guardian" else "companion.recorder.main"
     parent = os.getppid() if kind == "kill_guardian" else flight_pid
@@ -57,7 +56,7 @@ def inject_process_fault(kind: FaultKind, flight_pid: int) -> bool:
         return False
     with contextlib.suppress(ProcessLookupError):
         if kind == "disk_full":
-            # Its files cannot grow any more, so that its writes fail as on a full disk. Other processes are not affected.
+            # Its files can no longer grow, so its writes fail as on a full disk. Other processes are not affected.
             _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
             resource.prlimit(pid, resource.RLIMIT_FSIZE, (1, hard))
         else:
@@ -68,7 +67,7 @@ def inject_process_fault(kind: FaultKind, flight_pid: int) -> bool:
 def _children(parent: int) -> Iterator[int]:
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError, ValueError, IndexError):
-            # The name, in brackets, may hold anything.
+            # The name, in brackets, may contain any character.
             if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) == parent:
                 yield int(entry.name)
 
@@ -101,7 +100,7 @@ class ProcessFaults:
         self._due_s = -math.inf
 
     def inject(self, kind: FlightFaultKind, t_s: float, position_m: Vec3, vision_count: int | None) -> bool:
-        """Signal the flight process; return False if a fault was injected before or its pid is not known.
+        """Signal the flight process; return False if a fault was already injected or the pid is not known.
 
         Args:
             kind: kind of the fault.

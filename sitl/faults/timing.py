@@ -1,4 +1,4 @@
-"""Times of faults: a fault with a phase gets the time at which this mission reaches that phase."""
+"""Resolves the phase of a fault to the time at which the mission reaches that phase."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ _FROM_START: frozenset[FaultKind] = frozenset({"payload_missed", "payload_heavy"
 
 
 class FaultError(Exception):
-    """The mission lacks the phase that a fault names; the text is one line for the user."""
+    """The mission has no phase of the kind that a fault names; the text is one line for the user."""
 
 
 def with_fault_times(config: SitlConfig) -> SitlConfig:
-    """Return the configuration with a time in place of each fault's phase, and with the heavy payload of a fault as the payload.
+    """Return the configuration with each fault's phase resolved to a time, and with `payload_kg` taken from a `payload_heavy` fault, if
+    there is one.
 
     Raises:
-        FaultError: the mission lacks the phase.
+        FaultError: the mission has no such phase.
     """
     faults = config.world.faults
     if not faults:

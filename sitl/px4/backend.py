@@ -1,4 +1,6 @@
-"""A real PX4 as the autopilot of the simulated world: start, configuration over MAVLink, restart, lockstep flight, end."""
+"""A real PX4 as the autopilot of the simulated world: starts it, configures it over MAVLink, restarts it, flies it in lockstep and
+stops it.
+"""
 
 from __future__ import annotations
 
@@ -96,7 +98,7 @@ class RealPx4:
         self._imu: ImuSample | None = None
         self._next_battery_s = 0.0
         self._flies = False
-        """Whether preparation is over, so that a PX4 that disconnects is an error."""
+        """Whether preparation is over, after which it is an error if PX4 disconnects."""
 
     @property
     def number(self) -> int:
@@ -105,7 +107,7 @@ class RealPx4:
 
     @property
     def armed(self) -> bool:
-        """Whether PX4 is armed, by the newest HIL_ACTUATOR_CONTROLS."""
+        """Whether PX4 is armed, according to the newest HIL_ACTUATOR_CONTROLS."""
         return self._link.armed
 
     @property
@@ -115,7 +117,7 @@ class RealPx4:
 
     @property
     def fault_target(self) -> FaultyAutopilot:
-        """Where faults are injected that a real PX4 can have."""
+        """The object through which the faults that a real PX4 can have are injected."""
         return _Faulty(self._control)
 
     def attach(self, world: World) -> None:
@@ -124,7 +126,7 @@ class RealPx4:
 
     @contextlib.asynccontextmanager
     async def wires(self) -> AsyncIterator[str]:
-        """Open the simulator link and the control link, start PX4 if there is one to start, and end it on leaving."""
+        """Open the simulator and control links, start PX4 if an installation was found, and stop it on exit."""
         async with contextlib.AsyncExitStack() as stack:
             stack.callback(self._instance.close)
             await stack.enter_async_context(self._link)
@@ -161,7 +163,7 @@ class RealPx4:
             await self._restart(changed)
             left = await self._write_parameters(wanted)
             if left:
-                fix = f"see {self._folder}" if self._process is not None else "start it both times in the same folder"
+                fix = f"see {self._folder}" if self._process is not None else "start it in the same folder both times"
                 raise Px4Error(
                     f"PX4: expected its parameters to survive a restart, found {', '.join(left)} changed; {fix}"
                 )
@@ -215,15 +217,15 @@ class RealPx4:
         """Restart PX4 in the same folder, or ask the user to restart it."""
         if self._process is None:
             self._progress(
-                "the vehicle's parameters are set and need a restart of PX4: end it and start it again in the same folder, "
-                "where it stores them"
+                "the vehicle's parameters are set and need a restart of PX4: stop it "
+                "and start it again in the same folder, where it stores them"
             )
             if not await self._link.await_disconnect(USER_DEADLINE_S):
                 raise Px4Error(f"PX4: expected it to be restarted within {USER_DEADLINE_S:g} s, found it still running")
         else:
             store = await stored(self._folder, changed)
             self._process.terminate()
-            await self._process.await_end(END_DEADLINE_S)  # meanwhile the world is stepped, and PX4's clock with it
+            await self._process.await_end(END_DEADLINE_S)  # the world and PX4's clock are stepped during the wait
             self._process.kill()
             restore(self._folder, store)
             await self._link.await_disconnect(1.0)
@@ -249,7 +251,8 @@ class RealPx4:
 
     async def _exit_summary(self) -> str:
         if self._process is None:
-            return "PX4: expected it to stay until the flight is over, found that it has closed its simulator link"
+            return "PX4: expected it to run until the flight is over, "
+            "found that it has closed its simulator link"
         await self._process.await_end(1.0)
         return self._process.exit_summary()
 
@@ -259,7 +262,7 @@ class RealPx4:
         return self._link.rotors
 
     def pump(self, t_s: float, battery: Battery) -> None:
-        """Send the battery if its effect is on; else PX4 simulates its own. PX4 streams by itself."""
+        """Send the battery's state if its effect is on; otherwise PX4 simulates its own. PX4 streams telemetry by itself."""
         if self._config.battery.on and t_s >= self._next_battery_s:
             self._next_battery_s = t_s + BATTERY_PERIOD_S
             self._control.send_battery(battery)
@@ -289,7 +292,7 @@ class RealPx4:
         }
 
     async def _end(self) -> None:
-        """End the PX4 that was started here; it needs samples until its end, because they drive its clock."""
+        """Stop the PX4 that was started here; it needs samples until it has ended, because they drive its clock."""
         self._flies = False
         process, imu = self._process, self._imu
         if process is None:

@@ -27,7 +27,7 @@ PARAMS_DEADLINE_S = 20.0
 COMMAND_DEADLINE_S = 5.0
 HEARTBEAT_DEADLINE_S = 20.0
 MODE_PERIOD_S = 0.02
-"""Period of CURRENT_MODE on this link; heartbeats come once a second, too rarely to time a change of mode."""
+"""Period of CURRENT_MODE on this link; heartbeats come once a second, too rarely to show when a mode changes."""
 _CELLS = 4
 _AT_ONCE = 20
 """Parameters requested at a time; more would overflow PX4's receive buffer."""
@@ -72,7 +72,7 @@ class ControlLink(UdpEndpoint):
         await self.close()
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
-        """Decode PX4's messages, note its mode and pass each message to the requests that wait."""
+        """Decode PX4's messages, store its mode and pass each message to the waiting requests."""
         for message in self._decoder.parse_buffer(data) or ():
             if message.get_srcSystem() != self._system or message.get_srcComponent() != _AUTOPILOT:
                 continue
@@ -187,7 +187,7 @@ class ControlLink(UdpEndpoint):
             )
 
     async def save(self) -> None:
-        """Make PX4 store its parameters now instead of some seconds later.
+        """Make PX4 store its parameters now instead of a few seconds later.
 
         Raises:
             Px4Error: PX4 refused or did not answer.
@@ -214,8 +214,9 @@ class ControlLink(UdpEndpoint):
         self._command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, _FORCE_DISARM)
 
     def send_battery(self, battery: Battery) -> None:
-        """Send BATTERY_STATUS as a battery of PX4's own system does, which PX4 takes in place of its power module
-        (MavlinkReceiver::handle_message_battery_status)."""
+        """Send BATTERY_STATUS as a battery of PX4's own system does, which PX4 uses in place of its power module
+        (MavlinkReceiver::handle_message_battery_status).
+        """
         cells = [round(battery.voltage_v / _CELLS * 1e3)] * _CELLS + [0xFFFF] * (10 - _CELLS)
         message = mavlink.MAVLink_battery_status_message(
             0, mavlink.MAV_BATTERY_FUNCTION_ALL, mavlink.MAV_BATTERY_TYPE_LIPO, 2500, cells, round(battery.current_a * 1e2),

@@ -20,10 +20,11 @@ from companion.model.types import Quat, Vec3
 from sitl.autopilot.types import ImuSample, RotorCommands
 
 CLOCK_ORIGIN_S = 1.0
-"""PX4's clock at its first sample, at any world time. It must not start at zero; if it starts at some minutes, EKF2's first estimate is
-late (PX4 1.16.1: by about 10 s at 300 s, by more than the preflight waits at 1000 s)."""
+"""PX4's clock at its first sample, at any world time. It must not start at zero; if it starts at several minutes, EKF2's first estimate
+is late (PX4 1.16.1: by about 10 s at 300 s, by more than the preflight waits at 1000 s).
+"""
 ANSWER_PATIENCE_S = 2.0
-"""Timeout of the answer to one sample, after which the next one is sent."""
+"""Timeout for the answer to one sample, after which the next sample is sent."""
 ANSWER_DEADLINE_S = 10.0
 """Time without any answer after which PX4 counts as hung."""
 FIELD_EVERY, BARO_OFFSET = 5, 2
@@ -187,7 +188,7 @@ class SimulatorLink:
 
     @property
     def pending(self) -> bool:
-        """Whether the newest sample waits for its answer."""
+        """Whether the newest sample is still unanswered."""
         return self._awaited_us is not None
 
     async def answered(self) -> None:
@@ -210,7 +211,7 @@ class SimulatorLink:
                 if self._silent_s >= ANSWER_DEADLINE_S:
                     raise Px4Error(
                         f"PX4: expected an answer to every HIL_SENSOR (lockstep), found none for {ANSWER_DEADLINE_S:g} s; "
-                        "PX4 hangs, or the machine is too slow for it"
+                        "PX4 hangs, or the computer is too slow for it"
                     ) from None
 
     # -- called by the peer --------------------------------------------------------------------------------------

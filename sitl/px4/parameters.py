@@ -19,12 +19,14 @@ BEFORE_BOOT: Mapping[str, Value] = {
 }
 """Logging from boot until disarming, at a high rate and with the estimator's inputs; one IMU."""
 ROLL_PITCH_SHARE = 1.0 / math.sqrt(2.0)
-"""Share of a roll or pitch command that reaches each rotor of a quad-x, by the scale of PX4's allocation matrix
-(ControlAllocationPseudoInverse::updateControlAllocationMatrixScale)."""
+"""Fraction of a roll or pitch command that reaches each rotor of a quad-x, given by the scale of PX4's allocation matrix
+(ControlAllocationPseudoInverse::updateControlAllocationMatrixScale).
+"""
 
 SIMULATED_MOCAP: Mapping[str, Value] = {"EKF2_EV_DELAY": 10.0}
-"""In ms, measured on 1.16.1: from exposure to fusion it takes 5 ms of latency, the wires, and half a period each of lockstep and EKF2.
-The stub has the latency alone, for which the 5 ms of configs/px4/indoor_mocap.params are right."""
+"""Delay from exposure to fusion in ms, measured on 1.16.1: 5 ms of latency, the links, and half a period each of lockstep and EKF2. The
+stub has only the latency, for which the 5 ms of configs/px4/indoor_mocap.params are correct.
+"""
 
 VERSION_DEPENDENT = frozenset(wanted.name for wanted in WANTED if wanted.only)
 """Parameters that not every PX4 version has."""
@@ -69,7 +71,7 @@ def parameters(airframe: Airframe, config: WorldConfig, hover_command: float) ->
         **rotor_geometry(airframe),
         "THR_MDL_FAC": config.thr_mdl_fac,
         "MPC_THR_HOVER": hover_command * (1.0 + config.hover_thrust_error),
-        "SIM_BAT_ENABLE": int(not config.battery.on),  # with the effect the world sends its battery
+        "SIM_BAT_ENABLE": int(not config.battery.on),  # with this effect the world sends the battery's state
         "SIM_BAT_DRAIN": config.battery_life_s,
         "SIM_BAT_MIN_PCT": 0.0,
         "BAT1_N_CELLS": 4,

@@ -1,4 +1,4 @@
-"""A real `px4` (SITL) as a child process: finds it, claims a free instance number, starts it in its own folder and ends it.
+"""A real `px4` (SITL) as a child process: finds it, claims a free instance number, starts it in its own folder and stops it.
 
 PX4 writes its parameters, its logs (`log/*.ulg`) and its output (`px4.log`) to that folder. Outside of it, it writes only
 `/tmp/px4_lock-N` and `/tmp/px4-sock-N`.
@@ -28,7 +28,7 @@ VARIABLE = "PX4_SITL"
 MODEL = "none_iris"
 """Model: a quad-x with an external simulator, configured by parameters."""
 INSTANCES = range(10)
-"""Usable instance numbers; from 10 on every PX4 sends to the same port, UDP 14549."""
+"""Usable instance numbers; every PX4 with number 10 or above sends to the same port, UDP 14549."""
 HOST = "127.0.0.1"
 HOW_TO_GET_IT = (
     "set PX4_SITL to its build folder (make px4_sitl_default none in PX4-Autopilot), or install the px4 package"
@@ -83,7 +83,7 @@ def _with_etc(binary: Path, origin: str) -> Installation:
             if (etc / "init.d-posix" / "rcS").is_file():
                 return Installation(real, etc.resolve())
     raise Px4Error(
-        f"{origin}: expected PX4's start scripts (etc/init.d-posix/rcS) beside the binary, found none; {HOW_TO_GET_IT}"
+        f"{origin}: expected PX4's start scripts (etc/init.d-posix/rcS) next to the binary, found none; {HOW_TO_GET_IT}"
     )
 
 
@@ -253,7 +253,7 @@ class Px4Process:
 
 
 def _before_exec() -> None:
-    """Prepare the child: end with the parent, because PX4 would wait for a simulator for ever, and drop real-time priority."""
+    """Prepare the child: it ends with the parent, because PX4 would wait for a simulator for ever, and gives up real-time priority."""
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 

@@ -12,7 +12,7 @@ from sitl.udp import Address, UdpEndpoint
 
 
 class Relay:
-    """Relays between the port that PX4 sends to and one for the companion.
+    """Relays between the port to which PX4 sends and one for the companion.
 
     Args:
         instance: claimed instance.

@@ -29,7 +29,7 @@ from sitl.servo.registers import BAUDS
 _BITS_PER_BYTE = 10
 _CLEAR_TURNS = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
 _PARTIAL_TIMEOUT_S = 0.02
-"""Byte-to-byte timeout; the servo's own is 1.5 ms, but a pty under load may be slower."""
+"""Byte-to-byte timeout; the servo's own is 1.5 ms, but a pty on a busy computer may be slower."""
 _BAUD_OF_SPEED = {getattr(termios, f"B{baud}"): baud for baud in BAUDS if hasattr(termios, f"B{baud}")}
 
 
@@ -55,8 +55,7 @@ class ServoLine:
         """Process bytes from the master and return the servos' answer. Never raises.
 
         Args:
-            data: any bytes.
-            baud_bps: baud rate of the bytes; with None every servo receives them.
+            data: any bytes. baud_bps: baud rate of the bytes; if None, every servo receives them.
         """
         return self.exchange(data, baud_bps)[0]
 
@@ -113,7 +112,7 @@ class ServoLine:
     def _answer_of(self, servo: ServoModel, packet: Packet) -> bytes:
         if packet.instruction == Instruction.PING:
             return self._ping(servo)
-        # A write to register 68 or 7 counts from the next packet on.
+        # A write to register 68 or 7 takes effect with the next packet.
         level, servo_id = servo.status_return_level, servo.servo_id
         error, data = self._carry_out(servo, packet)
         if level == 0 or (level == 1 and packet.instruction != Instruction.READ):
@@ -143,7 +142,7 @@ class ServoLine:
                         raise ServoRefusal(StatusError.DATA_RANGE)
                     servo.clear_turns()
                 case Instruction.FACTORY_RESET:
-                    # It would change ids and baud rates under a world that addresses the servos by them.
+                    # It would change ids and baud rates, by which the world addresses the servos.
                     raise ServoRefusal(StatusError.RESULT_FAIL)
                 case _:
                     raise ServoRefusal(StatusError.INSTRUCTION)
@@ -277,7 +276,7 @@ class ServoBus:
         self.dropped_bytes = 0
         """Bytes of answers that were dropped because the line was not read."""
         self.damaged: Callable[[], bool] = lambda: False
-        """Fault: called at every instruction; returns whether noise damages it."""
+        """Fault: called at every instruction; returns whether noise corrupts it."""
         self._wire_time = wire_time
         self._pty = PtyLine(self._on_bytes)
         self._last_byte_s = 0.0
@@ -323,7 +322,7 @@ class ServoBus:
         self._pty.write(noise)
 
     def answer_to(self, data: bytes, baud_bps: int) -> tuple[bytes, float]:
-        """Return the servos' answer to bytes sent at a baud rate, and their return delay in s; noise may damage the bytes."""
+        """Return the servos' answer to a request sent at a given baud rate, and their return delay, s; noise may corrupt it."""
         if self.damaged():
             middle = len(data) // 2
             data = data[:middle] + bytes((data[middle] ^ 0x5A,)) + data[middle + 1 :]

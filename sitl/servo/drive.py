@@ -49,7 +49,7 @@ class ServoDrive:
         self.goal_delay_s = 0.0
         """Delay from setting a goal current to its effect."""
         self.current_loop_s = 0.0
-        """Time constant of the current loop; 0 if the current is the goal at once."""
+        """Time constant of the current loop; 0 if the current reaches its goal at once."""
         self._current = 0.0
         """Present current in counts, unrounded, if there is a time constant."""
         self.now_s = 0.0
@@ -57,9 +57,9 @@ class ServoDrive:
         self.angle_rad = shaft_angle_rad
         self.velocity_rad_s = 0.0
         self.slip_counts = 0
-        """Fault: offset of the encoder by a slipped horn."""
+        """Fault: offset of the encoder caused by a slipped horn."""
         self.turn_counts = 0
-        """Whole turns that the encoder has lost, see `forget_turns`."""
+        """Whole turns that the encoder has lost; see `forget_turns`."""
         self._goal_current_counts = 0
         self._pending_goals: deque[tuple[float, int]] = deque()
         self._watchdog_s = math.inf
@@ -148,7 +148,7 @@ class ServoDrive:
         return self._current_counts, velocity, position
 
     def forget_turns(self) -> None:
-        """Reduce the position to one turn: the encoder is absolute within one turn only."""
+        """Reduce the position to one turn: the encoder is absolute only within one turn."""
         counts = self.direction * round(self.angle_rad / RAD_PER_COUNT)
         self.turn_counts = counts - counts % COUNTS_PER_TURN
         self.show_no_current()
@@ -158,7 +158,7 @@ class ServoDrive:
         self._current_counts = 0
 
     def _receive(self, t_s: float) -> None:
-        """Apply pending goals that are due; the delay of goals set since the last step begins now."""
+        """Apply pending goals that are due; the delay of goals set since the previous step begins now."""
         goals = self._pending_goals
         for i, (due_s, counts) in enumerate(goals):
             if due_s == math.inf:

@@ -1,4 +1,4 @@
-"""Servos as configured in `world.servos`, for the wires and the fast closed loop."""
+"""Makes the servos configured in `world.servos`, for real time and for the fast closed loop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An emulated XM430-W210-T without I/O: control table towards the bus, motor towards the world.
+"""An emulated XM430-W210-T without I/O: a control table for the bus and a motor for the world.
 
 The motor is a `ServoDrive`. Writes are copied to it, and its present values are copied into the table before each read. The watchdog
 runs on the world time of `update`.
@@ -80,7 +80,7 @@ class ServoModel:
         self.drive = ServoDrive(shaft_angle_rad)
         """The motor."""
         self.lights = 0
-        """Number of times that the LED was switched on."""
+        """Number of times that the LED has been switched on."""
         self._shutdown = False
         self._silent = False
         self._registered: tuple[int, bytes] | None = None
@@ -92,7 +92,7 @@ class ServoModel:
         """Process the shaft's state and return the motor current.
 
         Args:
-            t_s: world time; must not run backwards.
+            t_s: world time; must not decrease.
             shaft_angle_rad: continuous shaft angle in the servo's own convention (counts = angle / 2 pi * 4096).
             shaft_velocity_rad_s: shaft velocity, same convention.
 
@@ -273,7 +273,7 @@ class ServoModel:
         if pointer is not None:
             address = self._memory[pointer] | self._memory[pointer + 1] << 8
             if address in reg.INDIRECT_POINTER:
-                return address  # points at a window, by default its own: plain memory
+                return address  # an indirect address, which by default points at itself: plain memory
         if address not in reg.REGISTER_AT:
             raise ServoRefusal(refusal)
         return address

@@ -84,7 +84,7 @@ def unstuff(body: bytes) -> bytes:
 
 
 def packet(packet_id: int, body: bytes) -> bytes:
-    """Return the packet of an unstuffed body (instruction byte and parameters)."""
+    """Return the packet for an unstuffed body (instruction byte and parameters)."""
     body = stuff(body)
     head = HEADER + bytes((packet_id,)) + (len(body) + 2).to_bytes(2, "little") + body
     return head + crc16(head).to_bytes(2, "little")
@@ -132,7 +132,7 @@ class PacketParser:
 
     @property
     def pending(self) -> bool:
-        """Whether a packet has begun and is incomplete."""
+        """Whether a packet has begun but is incomplete."""
         return bool(self._buffer)
 
     def drop_partial(self) -> None:
@@ -165,7 +165,7 @@ class PacketParser:
                 packets.append(Packet(buffer[4], body[0], body[1:], True))
                 del buffer[:end]
             else:
-                # A wrong length may have swallowed the packet behind this one: look for a header inside as well.
+                # A wrong length may have swallowed the next packet: look for a header inside this one as well.
                 packets.append(Packet(buffer[4], buffer[_PREFIX], b"", False))
                 del buffer[0]
 

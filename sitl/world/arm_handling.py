@@ -10,7 +10,7 @@ from companion.model.types import Vec2
 
 MOVE_S: Final = 2.0
 FORGET_S: Final = 1.5
-"""Time without a lit LED after which the next LED starts with the first pose again."""
+"""Time without a lit LED after which the poses start again from the first."""
 
 
 class ArmHandling:

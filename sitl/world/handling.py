@@ -1,7 +1,7 @@
-"""Handling of the vehicle on the ground: carrying it through the guided hand test, tapping it, hanging a weight on its net.
+"""Handling of the vehicle on the ground: carrying it through the guided hand test, tapping it, and hanging a weight on its net.
 
-The operator's hand is a spring and a damper on the base, and sways. It repeats one round (lift, forward, turn left, back) with a rest
-in between, or lifts and holds the vehicle while a second hand taps it. It acts only while the vehicle is disarmed.
+The operator's hand is modelled as a spring and a damper on the base, and sways. It repeats one round (lift, forward, turn left, back)
+with a pause in between, or lifts and holds the vehicle while a second hand taps it. It acts only while the vehicle is disarmed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ STIFFNESS_N_M, DAMPING_NS_M = 900.0, 95.0
 TURN_STIFFNESS_NM, TURN_DAMPING_NMS = 40.0, 4.0
 LIFT_M, FORWARD_M, TURN_DEG = 0.30, 0.30, 45.0
 REST_S = 6.0
-"""Rest on the floor between two rounds."""
+"""Time on the floor between two rounds."""
 _GRIP_S = 0.4
 """Time to take the weight, and to release it."""
 SWAY_DEG, SWAY_M = 2.0, 0.004
@@ -37,7 +37,7 @@ class _Leg(NamedTuple):
     forward_m: float
     up_m: float
     turn_deg: float
-    """Turn of the goal, from the yaw at the start of the round."""
+    """Target yaw relative to the yaw at the start of the round."""
 
 
 _LEGS: Final = (
@@ -150,7 +150,7 @@ class Handling:
         return (x * size_n, y * size_n, z * size_n)
 
     def _goal(self, t_s: float) -> tuple[float, float, float]:
-        """Return the goal: forward and up in m, turn in rad."""
+        """Return the target pose: forward and up in m, turn in rad."""
         before = _Leg(0.0, 0.0, 0.0, 0.0)
         for leg in self._legs:
             if t_s < leg.duration_s:

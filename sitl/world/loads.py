@@ -1,4 +1,4 @@
-"""External forces and torques on the bodies of the world, by cause."""
+"""Collects external forces and torques on the bodies of the world, by cause."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 
 class Loads:
-    """External forces and torques on bodies; each acts until its cause sets it again.
+    """The external forces and torques on bodies; each acts until its cause sets it again.
 
     Args:
         data: MuJoCo's data, whose `xfrc_applied` is written only here.
@@ -29,7 +29,7 @@ class Loads:
         self._changed.add(body)
 
     def write(self) -> None:
-        """Write the sums on the bodies whose loads have changed to MuJoCo."""
+        """Write to MuJoCo the sums for the bodies whose loads have changed."""
         for body in self._changed:
             fx = fy = fz = tx = ty = tz = 0.0
             for (ax, ay, az), (bx, by, bz) in self._loads[body].values():

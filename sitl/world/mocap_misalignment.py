@@ -1,7 +1,7 @@
-"""Poses of a wrongly configured motion-capture server.
+"""Simulates the poses of an incorrectly configured motion-capture server.
 
 A rigid body's rotation is zero in the attitude that the vehicle had when the body was created, and it is streamed in the axes of the
-stream. It is assumed that the nose pointed along the stream's x axis then, if that axis is level, else along the true x axis.
+stream. At that time the nose is assumed to have pointed along the stream's x axis if that axis is level, else along the true x axis.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _PLACE = {"x": 0, "y": 1, "z": 2}
 
 
 class MocapMisalignment:
-    """Converts true poses to streamed ones: `p' = A p`, `R' = A R Z A'`, with A of `world.mocap_axes` and Z the body's wrong zero."""
+    """Converts true poses to streamed ones: `p' = A p`, `R' = A R Z A'`, with A from `world.mocap_axes` and Z the body's zero error."""
 
     def __init__(self, config: World) -> None:
         names = config.mocap_axes

@@ -37,7 +37,7 @@ def link_masses_kg(vehicle: Vehicle, world: World) -> tuple[float, float]:
 
 
 def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
-    """Return the model of the built machine as MJCF."""
+    """Return the model of the real vehicle as MJCF."""
     vehicle = machine.as_built(vehicle, world.machine)
     airframe, arm, tool = vehicle.airframe, vehicle.arm, vehicle.tool
     l1, l2 = arm.link_lengths_m

@@ -12,7 +12,7 @@ _BLOCK = 4096
 
 
 def noise(seed: int, source: int) -> Iterator[Vec3]:
-    """Yield triples of standard normal numbers, drawn in blocks for speed (well under a microsecond each)."""
+    """Yield triples of standard normal numbers, drawn in blocks for speed."""
     rng = np.random.default_rng((seed, source))
     while True:
         values = iter(rng.standard_normal(_BLOCK).tolist()[::-1])

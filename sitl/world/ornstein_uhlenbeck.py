@@ -26,7 +26,7 @@ class OrnsteinUhlenbeck:
         self._values = [next(self._noise) for _ in range(count)]
 
     def step(self) -> list[Vec3]:
-        """Advance by one period and return the triples."""
+        """Advance by one period and return one 3-vector per triple of processes."""
         keep, new, draw = self._keep, self._new, self._noise
         values: list[Vec3] = []
         for x, y, z in self._values:

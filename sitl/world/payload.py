@@ -1,4 +1,4 @@
-"""Throwing and catching: a payload that meets the net with the configured velocity, stays in it, and is thrown again."""
+"""Throws a payload that meets the net with the configured velocity, stays in it and is thrown again."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 THROW_LEAD_S = 0.45
 """Time from the throw to the catch."""
 _THROW_BESIDE_M = 0.5
-"""Largest lateral distance at which the vehicle passes `catch_at_m` and a payload is thrown."""
+"""Largest lateral distance from `catch_at_m` at which a passing vehicle is thrown a payload."""
 
 
 class Ball(NamedTuple):
@@ -41,7 +41,7 @@ class Ball(NamedTuple):
 
 
 class Payload:
-    """The payload and the net that catches it; `step` once per physics step."""
+    """The payload and the net that catches it; call `step` once per physics step."""
 
     def __init__(self, world: World, vehicle: Vehicle, config: WorldConfig) -> None:
         self._world, self._config = world, config
@@ -71,7 +71,7 @@ class Payload:
         self._last_x = 0.0
 
     def step(self, airborne: bool) -> None:
-        """Throw, catch or take out the payload if it is time to.
+        """Throw, catch or remove the payload when it is due.
 
         Args:
             airborne: whether a payload may be thrown.
@@ -154,7 +154,7 @@ class Payload:
             self.bag.watch(ball.body, ball.q, ball.v)
 
     def catch(self, ball: Ball) -> bool:
-        """Return whether the ball is caught: it touches the net, which then holds it, or has settled in the bag."""
+        """Return whether the ball is caught: it touches the net, which then holds it, or it has settled in the bag."""
         return self._caught_s(ball) is not None
 
     def _caught_s(self, ball: Ball) -> float | None:

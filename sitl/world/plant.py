@@ -1,6 +1,6 @@
-"""The vehicle with its sensors, motors and autopilot, without wires.
+"""The vehicle with its sensors, motors and autopilot, without the devices' protocols.
 
-`Plant.step` advances everything by one physics step. The server adds real wires; the fast closed loop uses the plant directly.
+`Plant.step` advances everything by one physics step. The server adds the real protocols; the fast closed loop uses the plant directly.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class JointDrive(Protocol):
     """Delay from writing a goal current to its effect."""
 
     def update(self, t_s: float, shaft_angle_rad: float, shaft_velocity_rad_s: float) -> float:
-        """Take the shaft's state and return the motor current in A."""
+        """Process the shaft's state and return the motor current in A."""
 
 
 class MocapFrame(NamedTuple):
@@ -84,8 +84,8 @@ class Plant:
         config: configuration of the world.
         px4: the autopilot.
         drives: motors of both joints.
-        start: position, yaw and joint angles, m and rad.
-        between_steps: the cameras expose at the exact time and not at the end of the physics step.
+        start: position, yaw and joint angles, m and rad. between_steps: whether the cameras expose at the exact time instead of at the
+        end of the physics step.
     """
 
     def __init__(
@@ -143,7 +143,8 @@ class Plant:
 
     def _seed_noise(self) -> None:
         """Start one noise sequence per sensor. It restarts at arming, so that the noise in flight depends only on the seed, not on the
-        time before arming or the reads of another sensor."""
+        time before arming or on reads of another sensor.
+        """
         self._mocap_noise, self._imu_noise, self._force_noise = (
             noise(self._config.seed, sensor) for sensor in (_MOCAP, _IMU, _FORCE)
         )

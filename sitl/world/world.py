@@ -25,7 +25,7 @@ from sitl.world.payload import Payload
 PHYSICS_DT_S = 0.002
 DRAG_N_PER_M_S = 0.25
 FALL_M_S = 2.5
-"""Speed at which the legs break on the floor: a fall from 0.3 m. PX4 descends at 0.7 m/s at most."""
+"""Speed at which the legs break on the floor, that of a fall from 0.3 m. PX4 descends at 0.7 m/s at most."""
 _EFFECT_STEPS = round(EFFECT_PERIOD_S / PHYSICS_DT_S)
 SNAG_STIFFNESS_N_M, SNAG_DAMPING_NS_M = 400.0, 30.0
 """Stiffness and damping of a snagged tether."""
@@ -130,7 +130,7 @@ class World:
         self._net = m.body("net").id
         self._park = [m.equality(name).id for name in ("park1", "park2")]
         self.parked = True
-        """Whether a stand holds the arm."""
+        """Whether a support holds the arm."""
         self._rotor_max_n = vehicle.airframe.thrust_max_n / 4.0
         self._rotors: Rotors | LinearRotors = Rotors.of(
             config.rotors, vehicle.airframe.rotor_arm_m, PHYSICS_DT_S
@@ -140,7 +140,7 @@ class World:
         self._standing_m = vehicle.airframe.ground_clearance_m
         self.wind_m_s = config.wind_m_s
         self.rotor_share: Vec4 | None = None
-        """Share of each rotor's thrust that a fault leaves; None without a fault."""
+        """Fraction of each rotor's thrust that remains during a fault; None without a fault."""
         self.snag: tuple[Vec3, float] | None = None
         """Point where the tether is snagged, and its free length from there; None if it is free."""
         self._tether = m.tendon("tether").id
@@ -198,7 +198,7 @@ class World:
         self.loads.set(self._net, "push", force_world_n)
 
     def hold(self, wrench: Wrench | None) -> None:
-        """Set force and torque of a hand on the base; None releases the base."""
+        """Set the force and torque of handling on the base; None releases the base."""
         self.loads.set(self._base, "hold", *(wrench or (ZERO, ZERO)))
 
     def restart_noise(self) -> None:
@@ -220,7 +220,7 @@ class World:
 
     @property
     def thrust_n(self) -> Vec4:
-        """Thrust of each rotor, without ground effect and a fault's share, in PX4's quad-x order."""
+        """Thrust of each rotor, without ground effect and faults, in PX4's quad-x order."""
         return self._thrust
 
     @property
@@ -282,7 +282,7 @@ class World:
         return force_n
 
     def release_arm(self) -> None:
-        """Release the arm from its stand."""
+        """Release the arm from its support."""
         self.parked = False
         self.data.eq_active[self._park] = 0
 
@@ -333,7 +333,7 @@ class World:
             self.report("crashed")
 
     def report(self, kind: str) -> None:
-        """Note an event of this moment."""
+        """Record an event at the present time."""
         self._events.append(WorldEvent(self.t_s, kind))
 
     def take_events(self) -> list[WorldEvent]:

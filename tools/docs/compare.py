@@ -36,7 +36,7 @@ PICTURES = {
     "model_error": ("model error", "Position error after the catch against model error, one panel per law"),
     "adaptation": ("adaptation", "Position error with the adaptation on against the same flight with it off"),
 }
-"""Of the plots that the page shows: the table below which it stands, and its alternative text."""
+"""For each plot on the page, the table below which it is placed and its alternative text."""
 _E_P = "rms.{}.e_p_m"
 _FIGURES = (
     ("e_p before, m", _E_P.format("pre"), 3),
@@ -69,7 +69,7 @@ def merged(files: Sequence[Results]) -> list[Row]:
 
 
 def laws_markdown(groups: Sequence[Group]) -> str:
-    """Return one line per payload and preset, with the paper's figures where it prints any."""
+    """Return one line per payload and preset, with the paper's figures where there are any."""
     head = ["payload", "law/preset", "completed", *(title for title, _, _ in _FIGURES), "e_q, deg"]
     rows = [
         [f"{group.payload_kg:g} kg", group.label, _completed(group), *_spreads(group, _FIGURES), _attitude(group)]
@@ -276,7 +276,7 @@ def tables(files: Sequence[Results]) -> dict[str, str]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Write the tables into a page, and its plots into `pictures/` beside it."""
+    """Write the tables into a page, and its plots into `pictures/` next to it."""
     parser = argparse.ArgumentParser(prog="tools.docs.compare")
     parser.add_argument("page", type=Path)
     parser.add_argument("results", type=Path, nargs="+", help="compare.json of companion compare")

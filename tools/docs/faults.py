@@ -31,7 +31,7 @@ def kinds_markdown() -> str:
 
 
 def outcomes_markdown(rows: Sequence[Row]) -> str:
-    """Return one line per fault and size: outcome by phase with the time to its detection, and the worst of all phases."""
+    """Return one line per fault and size: outcome by phase with the time until detection, and the worst of all phases."""
     phases = [phase for phase in PHASES if any(row["phase"] == phase for row in rows)]
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:

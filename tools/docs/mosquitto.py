@@ -1,4 +1,4 @@
-"""Example files of the mosquitto broker: `python -m tools.docs.mosquitto configs/mosquitto` writes them."""
+"""Writes the example files for the mosquitto broker: `python -m tools.docs.mosquitto configs/mosquitto`."""
 
 from __future__ import annotations
 

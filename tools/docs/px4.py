@@ -1,4 +1,4 @@
-"""The files of configs/px4/ and the table of docs/px4.md, made from `companion.px4.required`.
+"""Generates the files of configs/px4/ and the table of docs/px4.md from `companion.px4.required`.
 
 `python -m tools.docs.px4 .` writes them below the repository's root.
 """

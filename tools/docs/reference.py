@@ -1,4 +1,4 @@
-"""The pages of docs/reference/, from the JSON Schemas of the models that check the files.
+"""Generates the pages of docs/reference/ from the JSON Schemas of the models that check the files.
 
 `python -m tools.docs.reference docs/reference` writes them.
 """
@@ -18,7 +18,7 @@ Schema = dict[str, Any]
 _INTRO = {
     "mission": "One flight: start pose of the vehicle, motion limits, and phases in order. [Mission files](../missions.md) explains "
     "the phases.",
-    "vehicle": "One machine: masses and dimensions, devices, tether, room and limits. [Safety](../safety.md) explains the limits of "
+    "vehicle": "One vehicle: masses and dimensions, devices, tether, room and limits. [Safety](../safety.md) explains the limits of "
     "`safety`.",
     "controller": "One control law with its gains; `law` selects one of three. [The control law](../control-law.md) describes the "
     "implementation.",
@@ -33,7 +33,7 @@ _UNITS = {
     "counts": "counts", "count": "counts",
 }  # fmt: skip
 _NO_UNIT = {"row_weights_s"}
-"""Key names whose ending is not a unit although it looks like one."""
+"""Keys whose names end as if with a unit but have none."""
 
 
 def unit(key: str) -> str:
@@ -74,7 +74,7 @@ def page(kind: str) -> str:
         ]
         lines += ["", *_section(path, model, definitions)]
         queue[:0] = inner
-    made = "Made by `python -m tools.docs.reference docs/reference`; a test holds page and models together."
+    made = "Made by `python -m tools.docs.reference docs/reference`; a test checks that page and models agree."
     return "\n".join([*lines, "", made, ""])
 
 
@@ -200,14 +200,14 @@ def write(folder: Path) -> None:
     """Write every page into the folder.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: a page cannot be written.
     """
     for kind in KINDS:
         (folder / f"{kind}.md").write_text(page(kind), encoding="utf-8")
 
 
 def main(arguments: list[str]) -> int:
-    """Write the pages and return the exit code; print the reason of a failure on standard error."""
+    """Write the pages and return the exit code; print the reason for a failure on standard error."""
     if len(arguments) != 1:
         print("expected one folder: python -m tools.docs.reference docs/reference", file=sys.stderr)
         return 2

@@ -33,7 +33,7 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def write_page(page: Path, tables: Mapping[str, str]) -> int:
-    """Write the tables into the page; return an exit code and print the reason of a failure on standard error."""
+    """Write the tables into the page; return an exit code and print the reason for a failure on standard error."""
     try:
         page.write_text(written(page.read_text(encoding="utf-8"), tables), encoding="utf-8")
     except (OSError, ValueError) as error:
@@ -43,7 +43,7 @@ def write_page(page: Path, tables: Mapping[str, str]) -> int:
 
 
 def flown_by(results: Mapping[str, Any]) -> str:
-    """Return the line below a table that names the command and the commit that its figures come from.
+    """Return the line below a table that names the command and the commit from which its figures come.
 
     Args:
         results: the JSON file of `companion compare`, `robustness` or `faults`.
@@ -66,7 +66,7 @@ def write_results(page: Path, file: Path, tables_of: Callable[[dict[str, Any]], 
         tables_of: returns the tables by name; may raise KeyError or ValueError.
 
     Returns:
-        An exit code. The reason of a failure is printed on standard error.
+        An exit code. The reason for a failure is printed on standard error.
     """
     try:
         tables = tables_of(json.loads(file.read_text(encoding="utf-8")))

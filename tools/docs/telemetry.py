@@ -1,4 +1,4 @@
-"""JSON Schemas of the telemetry messages: `python -m tools.docs.telemetry` writes one file per topic to docs/telemetry."""
+"""Writes the JSON Schemas of the telemetry messages: `python -m tools.docs.telemetry` writes one file per topic to docs/telemetry."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def schema_file(topic: Topic, folder: Path = FOLDER) -> Path:
 
 
 def main() -> int:
-    """Write all schema files; returns the exit code."""
+    """Write all schema files; return the exit code."""
     try:
         FOLDER.mkdir(exist_ok=True)
         for topic in Topic:

@@ -1,1 +1,1 @@
-"""Folder on the flight process's PYTHONPATH, so that Python imports `sitecustomize` at its start."""
+"""Folder for the flight process's PYTHONPATH, from which Python imports `sitecustomize` when it starts."""

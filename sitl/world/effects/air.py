@@ -39,7 +39,7 @@ class Air:
         self._gust = OrnsteinUhlenbeck(2, self._config.correlation_time_s, EFFECT_PERIOD_S, self._seed, _NOISE)
 
     def apply(self, world: World) -> None:
-        """Set the force and torque."""
+        """Set the force and torque on the base."""
         (x, y, z), (roll, pitch, _) = self._gust.step()
         strength = self.strength(sum(world.rotor_thrust_n), world.q[2])
         force, torque = strength * self._config.force_rms_n, strength * self._config.torque_rms_nm

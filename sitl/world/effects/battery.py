@@ -1,8 +1,8 @@
-"""The true battery: open-circuit voltage over charge, internal resistance, current by the rotors' power.
+"""The true battery: open-circuit voltage as a function of charge, internal resistance, and the current that the rotors' power draws.
 
-Sources: open-circuit voltage of a lithium-polymer cell (Chen and Rincon-Mora, IEEE Trans. Energy Conversion 2006, eq. 2; without its
-RC elements); power of a rotor with thrust^1.5 (momentum theory at a constant figure of merit); thrust at a given motor signal with the
-square of the voltage (ESCs without voltage compensation).
+Sources: open-circuit voltage of a lithium-polymer cell (Chen and Rincon-Mora, IEEE Trans. Energy Conversion 2006, eq. 2; without its RC
+elements); power of a rotor proportional to thrust^1.5 (momentum theory with a constant figure of merit); thrust at a given motor signal
+proportional to the square of the voltage (ESCs without voltage compensation).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def open_circuit_v(charge: float) -> float:
 
 
 class BatteryPack:
-    """The battery; `step` once per physics step.
+    """The battery; call `step` once per physics step.
 
     Args:
         config: section `battery`.
@@ -72,7 +72,7 @@ class BatteryPack:
         return ratio * ratio
 
     def step(self, dt_s: float, thrust_n: Vec4) -> None:
-        """Draw current for one physics step with these thrusts of the rotors."""
+        """Draw current for one physics step with these rotor thrusts."""
         a, b, c, d = thrust_n
         root = math.sqrt
         rotors_n15 = a * root(a) + b * root(b) + c * root(c) + d * root(d)

@@ -1,11 +1,11 @@
 """Force of the rotors' wakes on the links of the arm, the net and the payload.
 
-A wake develops and contracts as momentum theory gives it: at a depth of z rotor radii below the disk the velocity is the induced
-velocity in hover sqrt(T / (2 rho A)) times 1 + z / sqrt(1 + z^2), and the area shrinks by continuity. Turbulence smears its edge and
-keeps its momentum; the momenta of the four wakes add (Reichardt's hypothesis for free turbulence). The cross-section is taken as a
-square of the same area, of which the smeared profile is a product of error functions. All dynamic pressures are proportional to
-thrust, and the density of the air cancels. The flow turns aside above the floor. The flow across its axis loads a link (cross-flow
-principle, Hoerner 1965) at its middle; the whole flow loads net and payload at their centres of mass.
+A wake develops and contracts according to momentum theory: at a depth of z rotor radii below the disk the velocity is the induced
+velocity in hover sqrt(T / (2 rho A)) times 1 + z / sqrt(1 + z^2), and the area shrinks by continuity. Turbulence smears its edge but
+conserves its momentum; the momenta of the four wakes add (Reichardt's hypothesis for free turbulence). The cross-section is
+approximated by a square of the same area, whose smeared profile is a product of error functions. All dynamic pressures are proportional
+to thrust, and the density of the air cancels. The flow turns aside above the floor. The flow across a link's axis loads the link
+(cross-flow principle, Hoerner 1965) at its middle; the whole flow loads net and payload at their centres of mass.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Errors of the force-torque sensor: mounting, cross-talk, drift, its own low-pass and its resolution.
 
-The readings pass mounting and cross-talk (one 6x6 matrix), the drift of the zero, and the low-pass; `Plant` adds noise and bias, faults
-and scale, and `rounded` is last.
+Mounting and cross-talk (one 6x6 matrix), the drift of the zero and the low-pass act on the readings in this order; then `Plant` adds
+noise, bias, faults and scale, and `rounded` comes last.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from companion.sitl_config.effects.force_sensor import ForceSensor as Config
 from sitl.force_torque import FORCE_CAPACITY_N, TORQUE_CAPACITY_NM
 
 _STREAM = 19
-"""Number of the random draw of this effect."""
+"""Number of this effect's random sequence."""
 _TORQUE_PER_FORCE_M = TORQUE_CAPACITY_NM / FORCE_CAPACITY_N
 
 
@@ -24,8 +24,7 @@ class ForceSensor:
     """The sensor's errors.
 
     Args:
-        config: the section `force_sensor`.
-        seed: seed of the world; it draws the cross-talk.
+        config: the section `force_sensor`. seed: seed of the world; determines the cross-talk.
     """
 
     def __init__(self, config: Config, seed: int) -> None:

@@ -1,9 +1,9 @@
 """Errors of the autopilot's IMU: bias, drift, mounting, and the rotors' vibration averaged over a sample.
 
 A sample of PX4 is the mean of raw samples since the last one (vehicle_imu's delta velocity and delta angle). The mean of a vibration is
-integrated exactly; its remainder and its alias are in the sample. An unbalanced rotor shakes the body in the rotor's
-plane with its own frequency and a force proportional to the square of its speed, hence to its thrust. A rotor of two blades shakes the
-body along its axis with twice its frequency, and therefore also turns it.
+integrated exactly, so that the sample contains its remainder and its alias. An unbalanced rotor shakes the body in the rotor's plane
+with its own frequency and a force proportional to the square of its speed, hence to its thrust. A rotor of two blades shakes the body
+along its axis with twice its frequency, and therefore also turns it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from companion.sitl_config.effects.imu import Imu
 from sitl.world.model import ROTORS
 
 _DRIFT_EVERY = 25
-"""Samples from one update of the drifts to the next."""
+"""Number of samples between two updates of the drifts."""
 _STANDS = 0.01
-"""Share of the hover thrust below which a rotor does not shake."""
+"""Fraction of the hover thrust below which a rotor does not vibrate."""
 _APART = (-1.0, 1.0 / 3.0, -1.0 / 3.0, 1.0)
 """Relative speed difference of each rotor, in units of `rotor_spread`."""
 
@@ -70,7 +70,7 @@ class ImuErrors:
         return cls(config, interval_s, hover_n) if config.on else None
 
     def drift(self, noise: Iterator[Vec3]) -> None:
-        """Let the biases drift from now on, starting from zero drift; `noise` yields standard normal numbers."""
+        """Let the biases drift, starting from zero drift now; `noise` yields standard normal numbers."""
         self._noise, self._tick = noise, 0
         self._accel_drift = self._gyro_drift = (0.0, 0.0, 0.0)
 

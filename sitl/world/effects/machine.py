@@ -1,4 +1,4 @@
-"""The built machine, which differs from its vehicle file."""
+"""The real vehicle, which differs from its vehicle file."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from companion.model.types import Quat, Vec3
 from companion.sitl_config.effects.mocap import Mocap
 
 _STREAM = 12
-"""Second half of the seed of this effect's random numbers."""
+"""Second part of the seed of this effect's random numbers."""
 
 
 class MocapErrors:

@@ -2,10 +2,10 @@
 
 The hoop lies in the x-y plane of link 2 about the net's centre and opens towards +z, which points up in the catch pose. The mesh is a
 membrane in the hoop, slack up to the bag's depth: a payload that crosses the plane inside the hoop from above is in the bag; one that
-crosses it from below lifts the mesh and falls back. The taut mesh acts as a one-sided spring between the payload and a point of the
-plane, the pocket, about which the payload swings. It presses with the full stiffness while it is stretched and with
-restitution^2 of it while it relaxes, which returns the payload with `restitution` times its speed whatever its mass (Walton and Braun
-1986, J. Rheology 30: 949). The hoop is a ring with the same law.
+crosses it from below lifts the mesh and falls back. The taut mesh acts as a unilateral spring between the payload and a point in the
+plane, the pocket, about which the payload swings. It acts with full stiffness while being stretched and with restitution^2 times that
+stiffness while relaxing, which returns the payload with `restitution` times its speed whatever its mass (Walton and Braun 1986, J.
+Rheology 30: 949). The hoop is a ring with the same contact law.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ RIM_STIFFNESS_N_M = 3000.0
 SETTLED_S = 0.4
 """A payload is caught when it has been in the bag for this time; one that bounces out leaves within 0.2 s."""
 _TURN_M_S = 0.1
-"""The stiffness changes between stretching and relaxing over this speed, which damps a payload at rest."""
+"""The stiffness changes from stretching to relaxing over this range of speed, which damps a payload at rest."""
 _NEAR_M2 = 1.0
 """Square of the distance from the vehicle's origin within which contact is computed; the arm with the bag reaches 0.65 m."""
 
@@ -36,7 +36,8 @@ class Bag:
         self._depth_m, self._stiffness_n_m, self._pocket = config.bag_depth_m, config.bag_stiffness_n_m, config.pocket
         returned = config.restitution**2
         self._mean, self._half = 0.5 * (1.0 + returned), 0.5 * (1.0 - returned)
-        # Friction over normal force and speed; at rest, with the weight as normal force, it gives the damping ratio.
+        # Friction divided by normal force and speed; at rest, with the weight as normal force, it gives the damping
+        # ratio.
         self._friction_s_m = 2.0 * config.swing_damping_ratio / math.sqrt(GRAVITY_M_S2 * config.bag_depth_m)
         self.side = 0
         """1 if the payload is in the bag, -1 if it lifts the mesh from below, 0 if it is outside."""
@@ -98,7 +99,7 @@ class Bag:
 
     def _cross(self, x: float, y: float, above: bool, t_s: float) -> None:
         if x * x + y * y >= self._hoop_m * self._hoop_m:
-            if self.side == 0:  # beside the hoop; in the mesh it would still be held
+            if self.side == 0:  # next to the hoop; in the mesh it would still be held
                 self._above = above
             return
         self._above = above
@@ -206,7 +207,7 @@ class Net:
         return any(bag.bounced for _, (bag, _, _) in near)
 
     def _press(self, body: int, bag: Bag, position_m: list[float], velocity_m_s: list[float], t_s: float) -> None:
-        """Load the payload at this position, with this velocity in the world, and the net against it."""
+        """Load the payload at this position and velocity (world frame), and the net with the opposite force."""
         px, py, pz = position_m
         vx, vy, vz = velocity_m_s
         cx, cy, cz = self._centre.tolist()

@@ -19,12 +19,12 @@ LOWEST_RADII = 0.5
 
 
 def curve(signal: float, factor: float) -> float:
-    """Return the share of the full thrust at a motor signal of 0 to 1."""
+    """Return thrust / full thrust at a motor signal of 0 to 1."""
     return signal * (factor * signal + 1.0 - factor)
 
 
 class LinearRotors:
-    """Rotors whose thrust is linear in the signal, with one lag: those of a world in which the effect is off.
+    """Rotors whose thrust is linear in the signal, with one lag: the rotors of a world in which the effect is off.
 
     Args:
         lag_s: time constant of the thrust.
@@ -36,7 +36,7 @@ class LinearRotors:
         self._thrust: Vec4 = (0.0, 0.0, 0.0, 0.0)
 
     def step(self, signals: Vec4, full_n: float) -> Vec4:
-        """Advance by one physics step, as `Rotors.step`."""
+        """Advance by one physics step, like `Rotors.step`."""
         k, (a, b, c, d), (to_a, to_b, to_c, to_d) = self._gain, self._thrust, signals
         self._thrust = thrust = (
             a + k * (to_a * full_n - a),
@@ -47,11 +47,11 @@ class LinearRotors:
         return thrust
 
     def hover_command(self, each_n: float, full_n: float, thr_mdl_fac: float) -> float:
-        """Return the thrust setpoint as `Rotors.hover_command`."""
+        """Return the thrust setpoint, like `Rotors.hover_command`."""
         return each_n / full_n
 
     def ground_effect(self, height_m: float) -> float:
-        """Return 1: there is none."""
+        """Return 1, because there is no ground effect."""
         return 1.0
 
     def drag_n(self, thrust_n: float, airspeed_m_s: Vec3, q: Sequence[float]) -> Vec3:
@@ -60,7 +60,7 @@ class LinearRotors:
 
 
 class Rotors:
-    """The four rotors, in PX4's quad-x order; `step` once per physics step.
+    """The four rotors, in PX4's quad-x order; call `step` once per physics step.
 
     Args:
         config: section `rotors`.
@@ -105,7 +105,7 @@ class Rotors:
         return (a * a, b * b, c * c, d * d)
 
     def hover_command(self, each_n: float, full_n: float, thr_mdl_fac: float) -> float:
-        """Return PX4's collective thrust setpoint, 0 to 1, at which each rotor gives `each_n`, far from the ground.
+        """Return PX4's collective thrust setpoint, 0 to 1, at which each rotor produces `each_n` far from the ground.
 
         Args:
             each_n: thrust of each rotor; PX4's attitude loop evens out the spread of the rotors.

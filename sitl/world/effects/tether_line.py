@@ -1,8 +1,8 @@
 """Pull of the slack tether on the vehicle: the weight of the hanging part, a catenary when little slack is left, friction on the floor.
 
-The taut line remains MuJoCo's tendon limit, and `Truth.tether_tension_n` is only the limit's tension, without this pull. The
-catenary's tension grows without bound towards no slack, so it is computed with at least `SLACK_MIN_SHARE` of the distance as slack.
-Air drag of the line is left out: at 0.5 m/s a hanging metre of 5 mm rope has less than 1 mN.
+The taut line remains MuJoCo's tendon limit, and `Truth.tether_tension_n` is only the limit's tension, without this pull. The catenary's
+tension grows without bound towards no slack, so the slack is taken to be at least `SLACK_MIN_SHARE` of the distance. Air drag of the
+line is left out: at 0.5 m/s a hanging metre of 5 mm rope has less than 1 mN.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def hanging(level_m: float, height_m: float, length_m: float, weight_n_m: float)
     Args:
         level_m: horizontal distance from the anchor to the upper end.
         height_m: height of the upper end above the anchor.
-        length_m: length of the line, longer than the distance of its ends.
+        length_m: length of the line, longer than the distance between its ends.
         weight_n_m: weight per length.
     """
     h = max(height_m, 0.0)

@@ -1,8 +1,8 @@
 """Motor, gear and flexible mount of a joint: the effects `servo_mechanics` and `compliance`.
 
-The angle of the joint in MuJoCo is the true angle of the link. The rotor is integrated here, one degree of freedom per joint:
-the motor's torque and the friction act on it, and a spring with backlash connects it to the link. The stiffness of that spring is the
-series of gear and mount (or link), whose masses between are negligible. Springs and rotors inside MuJoCo would need bodies for these
+The angle of the joint in MuJoCo is the true angle of the link. The rotor is integrated here, one degree of freedom per joint: the
+motor's torque and the friction act on it, and a spring with backlash connects it to the link. The stiffness of that spring is that of
+gear and mount (or link) in series; the masses between them are negligible. Springs and rotors inside MuJoCo would need bodies for these
 masses, and a step of 2 ms does not represent their frequencies of several hundred hertz.
 
 Friction: Duclusaud et al., "Extended Friction Models for the Physics Simulation of Servo Actuators", ICRA 2025 (arXiv 2410.08650),
@@ -23,7 +23,7 @@ from companion.sitl_config.effects.servo_mechanics import ServoMechanics
 from companion.sitl_config.world import World
 
 ARMATURE_MIN_KG_M2 = 4e-3
-"""Least inertia of a rotor, felt at the joint, so that its oscillation against the gear is slow enough for the physics step."""
+"""Smallest inertia of a rotor, as felt at the joint, so that its oscillation against the gear is slow enough for the physics step."""
 _WARM_UP_STEPS = 500
 
 
@@ -68,7 +68,7 @@ class Transmission:
         self._torque_share = self._friction_share = 1.0
 
     def encoder(self, link_rad: float, link_rad_s: float) -> tuple[float, float]:
-        """Take angle and velocity of the link, and return those of the servo's output shaft."""
+        """Update with the link's angle and velocity, and return those of the servo's output shaft."""
         stretch, half = self._rotor_rad - link_rad, self._half_play_rad
         if stretch > half:
             stretch -= half
@@ -83,7 +83,7 @@ class Transmission:
         return link_rad + share * stretch, link_rad_s + share * rate
 
     def friction_nm(self, motor_nm: float, external_nm: float, speed_rad_s: float) -> float:
-        """Return the greatest friction torque at a speed of at least 0 and under a load."""
+        """Return the largest friction torque under a load at a speed, which must not be negative."""
         friction, stiction, load_friction, load_stiction = self._friction
         load = abs(motor_nm - external_nm)
         rest = math.exp(-((speed_rad_s / self._stribeck_rad_s) ** self._exponent))
@@ -92,7 +92,9 @@ class Transmission:
         )
 
     def step(self, motor_nm: float) -> float:
-        """Advance the rotor by one physics step under the torque of the cold motor; return the torque on the link in that step."""
+        """Advance the rotor by one physics step under the torque that the motor would have when cold; return the torque on the link in
+        that step.
+        """
         if self._step % _WARM_UP_STEPS == 0:
             self._warm_up(self._step * self._dt_s)
         self._step += 1
