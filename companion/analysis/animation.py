@@ -24,7 +24,7 @@ from companion.model.types import PhaseKind, Vec3
 
 WIDTH, HEIGHT = 960, 440
 FRAMES_PER_S = 12.5
-"""The delay of a GIF frame is a whole number of hundredths of a second."""
+"""100 divided by this is a whole number, because a GIF stores the delay of a frame in hundredths of a second."""
 _SPLIT_PX = 600
 """The scene is on the left of this column, the plots are on the right."""
 _PLOT_X = (650.0, 946.0)

@@ -76,7 +76,7 @@ def _confirmed_catch_index(log: FlightLog) -> int | None:
 
 
 def flight_masks(log: FlightLog) -> tuple[Mask, Mask]:
-    """Return the ticks of kind FLIGHT before the catch, and from the catch on; without a catch the second is empty."""
+    """Return the ticks of kind FLIGHT before the catch, and those from the catch; without a catch the second mask is empty."""
     flight = np.array([o.phase_kind is PhaseKind.FLIGHT for o in log.outputs], dtype=np.bool_)
     caught = catch_index(log)
     after = np.arange(len(flight)) >= (len(flight) if caught is None else caught)
@@ -86,7 +86,7 @@ def flight_masks(log: FlightLog) -> tuple[Mask, Mask]:
 def position_error_m(log: FlightLog) -> Array:
     """Return motion capture minus reference, world frame, (ticks, 3).
 
-    A frame shows the vehicle at its exposure, some milliseconds before the tick, and is compared with the reference of that moment.
+    A frame shows the vehicle at its exposure, a few milliseconds before the tick, and is compared with the reference of that moment.
     Otherwise a frame that is 10 ms old would count as an error of 5 mm at 0.5 m/s.
     """
     c = log.columns

@@ -115,7 +115,7 @@ class Campaign(ABC):
     def show(self, rows: Sequence[Row], console: Console) -> None:
         """Print the results."""
 
-    def write_more(self, rows: Sequence[Row], out: Path) -> None:  # noqa: B027 (most campaigns have no more files)
+    def write_extra_files(self, rows: Sequence[Row], out: Path) -> None:  # noqa: B027 (most campaigns have no more files)
         """Write the files that only this campaign has."""
 
     def good(self, rows: Sequence[Row]) -> bool:
@@ -241,7 +241,7 @@ def _write(campaign: Campaign, flown: Flown, table: dict[str, Any], out: Path) -
     }
     sections = [*page.sections, Section("Record", folded=record)]
     write_page(replace(page, sections=sections, notes=flown.notes), out / f"{campaign.name}.html")
-    campaign.write_more(rows, out)
+    campaign.write_extra_files(rows, out)
     wall_s = [message["wall_s"] for message in flown.messages]
     # This file is written last: if it exists, all the others exist.
     whole = {**table, "settings": settings, "versions": used, "notes": flown.notes, "wall_s": wall_s}

@@ -37,7 +37,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--kinds", type=kinds, default=(), metavar="KIND,...", help="default: all; see --list")
     parser.add_argument(
         "--phases", type=_known(PHASES, "phase"), default=(), metavar="PHASE,...",
-        help=f"of {', '.join(PHASES)}; default: all",
+        help=f"phases from {', '.join(PHASES)}; default: all",
     )  # fmt: skip
     parser.add_argument(
         "--wires",

@@ -26,7 +26,7 @@ def add_parser(commands: Any) -> None:
         description="Fit the hover thrust without payload to the steady parts of a flight, and print the lines for the vehicle file.",
     )
     fit.add_argument("log", type=Path, help="flight.mcap")
-    fit.add_argument("--json", action="store_true", help="print only JSON: the result")
+    fit.add_argument("--json", action="store_true", help="print only the result, as JSON")
     fit.set_defaults(run=run)
 
 
@@ -92,7 +92,7 @@ def _battery(fit: HoverFit) -> str:
         return "voltage not always known; no slope was fitted"
     about = f"{fit.voltage_mean_v:.2f} V on average, changed by {fit.voltage_span_v:.2f} V"
     if fit.slope is None:
-        return f"{about}; {SLOPE_MIN_V:g} V or more are needed for a slope"
+        return f"{about}; {SLOPE_MIN_V:g} V or more needed to fit a slope"
     per_v, error = fit.slope.per_v, fit.slope.standard_error_per_v
     return f"{about}; slope {per_v:+.{_DIGITS}f} ± {error:.{_DIGITS}f} per V"
 

@@ -147,7 +147,7 @@ def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
         help="check the simulated world's devices, with the PX4 stub or a real PX4",
     )
     check.add_argument("--hand", action="store_true", help="then run the guided hand test, required for a new set-up")
-    check.add_argument("--json", action="store_true", help="print only JSON: the rows")
+    check.add_argument("--json", action="store_true", help="print only the rows, as JSON")
     check.add_argument("--plan-only", action="store_true", help="check only the mission, without devices")
     check.set_defaults(run=_check)
 

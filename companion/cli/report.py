@@ -57,7 +57,7 @@ def add_parser(commands: Any) -> None:
     report.add_argument(
         "--json",
         action="store_true",
-        help="print only JSON: the summary or comparison; write files only with --out",
+        help="print only the summary or comparison, as JSON; write files only with --out",
     )
     report.set_defaults(run=run)
 

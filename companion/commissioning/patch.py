@@ -154,7 +154,7 @@ def _check(shown: str, text: str, changes: tuple[Change, ...]) -> None:
 
 
 def _lines(open_steps: Location, change: Change, shown: str) -> list[tuple[str, str]]:
-    """Return the line of the change and of the blocks that it opens."""
+    """Return the changed line with a remark on the old value, below the lines of any blocks that the change opens."""
     *way, last = change.location
     common = 0
     while common < min(len(open_steps), len(way)) and open_steps[common] == way[common]:

@@ -222,7 +222,7 @@ def _patch_lines(patch: Patch | None, written: str | None) -> list[str]:
         "",
         patch.text,
         "",
-        f"written; the old file is kept as {written}" if written else "not written; add --write to write it",
+        f"written; the old file is kept as {written}" if written else "not written; add --write to write",
     ]
 
 

@@ -87,7 +87,7 @@ def _replaced(text: str, node: yaml.Node, value: Data, location: Location) -> li
     if isinstance(node, yaml.SequenceNode) and isinstance(value, list) and len(value) == len(node.value):
         pairs = [(item, value[index], (*location, index)) for index, item in enumerate(node.value)]
         return [edit for item, new, at in pairs for edit in _replaced(text, item, new, at)]
-    raise EditError(f"{key_path(location)}: the value in the file has another structure; edit it by hand")
+    raise EditError(f"{key_path(location)}: the value in the file has a different structure; edit it by hand")
 
 
 def _aligned(text: str, end: int, longer: int) -> str:

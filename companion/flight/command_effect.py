@@ -34,7 +34,7 @@ def effect_of(command: OperatorCommand, before: Outputs | None, after: Outputs) 
 
 def _land(before: Outputs | None, after: Outputs) -> Effect:
     if after.phase_kind is PhaseKind.DONE:
-        return True, "not taking off: standing down"
+        return True, "not taking off: the start is cancelled"
     if before is not None and before.phase == Stage.SPOOL.value:
         return True, "not taking off: the rotors spool down"
     landed_already = before is not None and before.action.rank >= SafetyAction.LAND.rank
@@ -48,7 +48,7 @@ def _abort(before: Outputs | None, after: Outputs) -> Effect:
 
 def _hold(before: Outputs | None, after: Outputs) -> Effect:
     if after.phase_kind is PhaseKind.DONE:
-        return True, "not taking off: standing down"
+        return True, "not taking off: the start is cancelled"
     if after.phase_kind is PhaseKind.GROUND:
         return True, "the vehicle stays on the ground until start is commanded"
     if before is not None and before.phase == Stage.SPOOL.value:

@@ -56,7 +56,7 @@ JOINT_READ_TIMEOUT_S = 0.002
 """Timeout of the joint read, from the start of the tick; the read begins before that."""
 JOINT_LEAD_MAX_S = 0.003
 JOINT_MARGIN_S = 0.0001
-"""The joint read is timed so that its answer arrives this long before the tick, neither late nor stale."""
+"""Time by which the answer of the joint read is planned to precede the tick, so that it is neither late nor stale."""
 
 
 class Flight:

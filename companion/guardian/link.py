@@ -84,11 +84,13 @@ class UdpWire(_ChannelWire):
     Args:
         local: address to bind; None for any.
         remote: PX4's address; None to use the sender of the first valid HEARTBEAT of an autopilot.
-        beside: the killed flight process still holds the port, but reads nothing: of several sockets connected to PX4, the newest
+        share_port: the killed flight process still holds the port, but reads nothing: of several sockets connected to PX4, the newest
             receives the datagrams (measured, Linux 6.18).
     """
 
-    def __init__(self, local: tuple[str, int] | None, remote: tuple[str, int] | None, *, beside: bool = False) -> None:
+    def __init__(
+        self, local: tuple[str, int] | None, remote: tuple[str, int] | None, *, share_port: bool = False
+    ) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         super().__init__(self._socket)
         self._remote: tuple[str, int] | None = None
@@ -101,7 +103,7 @@ class UdpWire(_ChannelWire):
         """PX4's address is known."""
         try:
             self._socket.setblocking(False)
-            if beside:
+            if share_port:
                 self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             if local is not None:
                 self._socket.bind(local)
@@ -222,14 +224,14 @@ def is_udp(address: str) -> bool:
     return net is not None and net[1] in ("udpin", "udpout")
 
 
-def open_wire(address: str, local_port: int, peer: tuple[str, int] | None = None, *, beside: bool = False) -> Wire:
+def open_wire(address: str, local_port: int, peer: tuple[str, int] | None = None, *, share_port: bool = False) -> Wire:
     """Open the link that the flight process has released.
 
     Args:
         address: value of `devices.autopilot.address`.
         local_port: UDP port of the flight process; 0 if unknown.
         peer: PX4's UDP address as the flight process confirmed it; None if unknown.
-        beside: the killed flight process still holds the link; only for UDP links (`is_udp`).
+        share_port: the killed flight process still holds the link; only for UDP links (`is_udp`).
 
     Raises:
         OSError: the link does not exist, or another process holds it.
@@ -238,10 +240,10 @@ def open_wire(address: str, local_port: int, peer: tuple[str, int] | None = None
     if net is not None:
         kind, host, port = net[1], net[2], int(net[3])
         if kind == "udpin":
-            return UdpWire((host, port), peer, beside=beside)
+            return UdpWire((host, port), peer, share_port=share_port)
         if kind == "udpout":
             remote = peer or (socket.gethostbyname(host), port)
-            return UdpWire(("", local_port) if local_port else None, remote, beside=beside)
+            return UdpWire(("", local_port) if local_port else None, remote, share_port=share_port)
         return TcpWire((host, port))
     port_of = _SERIAL.fullmatch(address)
     if port_of is None:

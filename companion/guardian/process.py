@@ -34,7 +34,7 @@ from companion.runtime.realtime import GUARDIAN_PRIORITY, claim_realtime
 PERIOD_S = 0.01
 MOCAP_FRESH_S = 0.5
 KILL_TIMEOUT_S = 0.5
-"""A killed process ends within milliseconds unless a thread is in uninterruptible sleep (state D)."""
+"""Timeout for a killed process to end; it takes milliseconds unless a thread is in uninterruptible sleep (state D)."""
 LINK_TIMEOUT_S = 30.0
 """Time after which the guardian gives up opening the link; the vehicle is then lost."""
 REOPEN_PERIOD_S = 0.5
@@ -231,10 +231,10 @@ class Guardian:
         """
         address = self._settings.autopilot_address
         try:
-            beside = not self._flight.wait(0.0)
-            if beside and not is_udp(address):
+            share_port = not self._flight.wait(0.0)
+            if share_port and not is_udp(address):
                 raise OSError(errno.EBUSY, "the killed flight process still holds the link")
-            wire = open_wire(address, last.local_port, last.peer, beside=beside)
+            wire = open_wire(address, last.local_port, last.peer, share_port=share_port)
         except OSError as error:
             self._report_no_link(last, error.strerror or str(error))
             return None

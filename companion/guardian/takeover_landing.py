@@ -32,7 +32,7 @@ HEARTBEAT_PERIOD_S = 1.0
 ASK_PERIOD_S = 0.1
 """PX4 sends its mode once a second on its own; the guardian requests it more often."""
 LINK_TIMEOUT_S = 1.0
-"""On a `udpin` link PX4's address is unknown before its first message; after this timeout the landing starts without it."""
+"""Timeout for PX4's first message, which reveals its address on a `udpin` link; after it the landing starts without a message."""
 MODE_TIMEOUT_S = 0.15
 """PX4's mode is requested first, because a pilot may be flying. After this long without an answer PX4 is commanded to land."""
 REPEAT_S = 0.25
@@ -42,7 +42,7 @@ LINK_FRESH_S = 2.5
 TOUCH_DOWN = "touchdown"
 """Text of `LandingStep` at touchdown."""
 DISARMED_AFTER_S = 1.5
-"""PX4 reports once a second whether it is armed; a status from before the takeover is ignored for this long."""
+"""Time after the takeover for which `disarmed` is ignored: PX4 reports it once a second, so it may be older than the takeover."""
 ATTEMPTS_MAX = 4
 """Number of landing attempts of 30 s each, while PX4 sends messages, after which the vehicle counts as lost."""
 _STREAMS = (

@@ -24,7 +24,7 @@ from companion.install.templates import STATE_DIRECTORY
 GROUP = "dialout"
 COMMAND_TIMEOUT_S = 60.0
 HOME = f"/var/lib/{STATE_DIRECTORY}"
-"""Home of the service's user: flight logs, and in .config the operator keys that the vehicle created."""
+"""Home of the service's user. It holds flight logs and, in .config, the operator keys that the vehicle created."""
 _TOOLS = "/usr/sbin:/sbin:/usr/bin:/bin"
 
 Report = Callable[[str], None]

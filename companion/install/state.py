@@ -96,10 +96,10 @@ def write_state(path: Path, state: PathState) -> None:
         OSError: the change failed; the path is unchanged.
     """
     if state.link is not None:
-        beside = path.with_name(f".{path.name}.companion-new")
-        beside.unlink(missing_ok=True)
-        beside.symlink_to(state.link)
-        beside.replace(path)
+        new_path = path.with_name(f".{path.name}.companion-new")
+        new_path.unlink(missing_ok=True)
+        new_path.symlink_to(state.link)
+        new_path.replace(path)
     elif state.content is not None:
         owner = None if state.owner == (os.geteuid(), os.getegid()) else state.owner
         write_whole(path, state.content, mode=state.mode, owner=owner, durable=True)

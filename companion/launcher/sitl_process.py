@@ -57,7 +57,7 @@ class SitlProcess:
         self.final: dict[str, Any] = {}
         self.at_rest = False
         self.flight_environment: dict[str, str] = {}
-        """Environment variables of the flight process for faults that the world injects into it."""
+        """Environment variables of the flight process with which the world injects faults into it."""
 
     def devices(
         self,

@@ -75,7 +75,7 @@ ANGLES = Check(
     "within the limits of both joints",
     "beyond a limit the links touch the airframe, or zero_count or sign is wrong",
 )
-STILL = Check("arm.still", "arm at rest", "moves less than 3 deg", "motion of the arm falsifies the tare")
+STILL = Check("arm.still", "arm at rest", "moves less than 3 deg", "motion of the arm makes the tare wrong")
 READS = Check(
     "arm.reads",
     "bus cycles without an answer",
@@ -140,7 +140,11 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
     )
     delays_us = [servo.return_delay_us for servo in servos]
     yield _equal(
-        RETURN_DELAY, delays_us, 0, "{} us".format, "another program has changed it: close that program, start again"
+        RETURN_DELAY,
+        delays_us,
+        0,
+        "{} us".format,
+        "another program has changed it: close that program, then start again",
     )
     watchdogs_ms = [servo.watchdog_ms for servo in servos]
     wanted_ms = vehicle.devices.arm.watchdog_ms

@@ -132,7 +132,7 @@ class Wanted:
 
 
 def rows(observations: Observations, mission: Mission, vehicle: Vehicle) -> Iterator[Row]:
-    """Return the rows that can be evaluated at rest; only the first ones if the data is insufficient or the vehicle moved."""
+    """Return the rows that can be evaluated at rest; only the first of them if data is missing or the vehicle moved."""
     if observations.hand_test is not None:
         yield _hand_test(observations.hand_test, observations.hand_test_changed)
     poses = [pose for pose in observations.mocap if pose.tracking_valid]
@@ -178,7 +178,7 @@ def standing(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> Iterat
         level = "calibration square level on the floor"
         yield GRAVITY.bad(read, text, fix or f"set the ground plane again in Motive ({level}), then {_RESET}")
 
-    read, text = f"z = {z:.3f} m", f"{wz:.2f} m (airframe.ground_clearance_m) within {HEIGHT_GOOD_M:g} m"
+    read, text = f"z = {z:.3f} m", f"{wz:.2f} ± {HEIGHT_GOOD_M:g} m (airframe.ground_clearance_m)"
     pivot = (
         "in Motive, set the rigid body's pivot to the body's origin and the ground plane to the floor, "
         "or correct airframe.ground_clearance_m"
@@ -190,14 +190,14 @@ def standing(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> Iterat
     else:
         yield HEIGHT.bad(read, text, fix or pivot)
 
-    read, text = f"({x:.2f}, {y:.2f}) m, {away_m:.2f} m away", f"({wx:g}, {wy:g}) m within {wanted.tolerance_m:g} m"
+    read, text = f"({x:.2f}, {y:.2f}) m, {away_m:.2f} m away", f"({wx:g}, {wy:g}) m, within {wanted.tolerance_m:g} m"
     if away_m <= wanted.tolerance_m:
         yield PLACE.good(read, text)
     else:
         yield PLACE.bad(read, text, fix or "carry it there or change the mission's start.position_m")
 
     read = f"{math.degrees(yaw_from_quat(at.attitude)):.0f} deg"
-    text = f"{math.degrees(wanted.yaw_rad):g} deg within {wanted.yaw_tolerance_deg:g} deg"
+    text = f"{math.degrees(wanted.yaw_rad):g} ± {wanted.yaw_tolerance_deg:g} deg"
     if abs(yaw_off_deg) <= wanted.yaw_tolerance_deg:
         yield YAW.good(read, text)
     else:
@@ -279,9 +279,7 @@ def _or_so(axes: AxisMap) -> str:
 def _plane(axes: AxisMap) -> str:
     if axes.vector(_UP) == _UP:
         return "set the ground plane in Motive with the calibration square's x along the room's x"
-    return (
-        "set devices.mocap.up_axis as Motive streams (Settings > Streaming > Up Axis), and the ground plane with z up"
-    )
+    return "set devices.mocap.up_axis to match Motive's stream (Settings > Streaming > Up Axis), and the ground plane with z up"
 
 
 def _hand_test(passed: str, changed: str) -> Row:
@@ -334,7 +332,7 @@ def _noise(poses: list[MocapPose], at: Pose) -> Iterator[Row]:
 
 def _accelerometer(force_m_s2: Vec3) -> Row:
     size = norm(force_m_s2)
-    read, wanted = f"{size:.2f} m/s2", f"{GRAVITY_M_S2:g} within {GRAVITY_TOLERANCE_M_S2:g} m/s2"
+    read, wanted = f"{size:.2f} m/s2", f"{GRAVITY_M_S2:g} ± {GRAVITY_TOLERANCE_M_S2:g} m/s2"
     if abs(size - GRAVITY_M_S2) <= GRAVITY_TOLERANCE_M_S2:
         return ACCELEROMETER.good(read, wanted)
     return ACCELEROMETER.bad(read, wanted, "calibrate PX4's accelerometer")

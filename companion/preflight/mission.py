@@ -22,7 +22,7 @@ PLAN = Check(
 ARM = Check(
     "mission.arm",
     "arm at the start",
-    "`start.arm_deg` of the mission within `start.arm_tolerance_deg`",
+    "the mission's `start.arm_deg` ± `start.arm_tolerance_deg`",
     "the arm's first motion is planned from this pose",
 )
 ROOM = Check(
@@ -56,7 +56,7 @@ def _arm(angle_rad: Vec2, start: Start) -> Row:
     first, second = (math.degrees(angle) for angle in angle_rad)
     off_deg = max(abs(first - start.arm_deg[0]), abs(second - start.arm_deg[1]))
     read = f"({first:.0f}, {second:.0f}) deg"
-    wanted = f"({start.arm_deg[0]:g}, {start.arm_deg[1]:g}) deg within {start.arm_tolerance_deg:g} deg"
+    wanted = f"({start.arm_deg[0]:g}, {start.arm_deg[1]:g}) ± {start.arm_tolerance_deg:g} deg"
     if off_deg <= start.arm_tolerance_deg:
         return ARM.good(read, wanted)
     return ARM.bad(read, wanted, "move it there by hand, or change the mission's start.arm_deg")

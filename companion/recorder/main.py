@@ -75,7 +75,7 @@ class Recorder:
                 self._log_file.sync()
         self._flush()
         if self.telemetry is not None:
-            self.telemetry.end(in_order=self._closed)
+            self.telemetry.end(normally=self._closed)
         if self._log_file.error is None:
             counts = self.telemetry.counts if self.telemetry is not None else {}
             self._writer.metadata("recorder", {"samples": str(self.samples), "dropped": str(self.dropped), **counts})

@@ -79,13 +79,13 @@ class TelemetryThread:
         else:
             self.dropped += 1
 
-    def end(self, *, in_order: bool) -> None:
+    def end(self, *, normally: bool) -> None:
         """End the session after the last packet, without waiting.
 
         Args:
-            in_order: True if the flight ended normally, False if its process died.
+            normally: True if the flight ended normally, False if its process died.
         """
-        self._ending = in_order
+        self._ending = normally
 
     def join(self, within_s: float) -> bool:
         """Wait until the last message is sent or no broker is connected; return False if that takes longer."""

@@ -88,7 +88,7 @@ class Outbox:
 
     def __init__(self) -> None:
         self.stream: bytes | None = None
-        self.stream_there = asyncio.Event()
+        self.stream_available = asyncio.Event()
         self.kept: dict[Topic, bytes] = {}
         """Newest payload of each retained topic."""
         self.due: dict[Topic, None] = {}
@@ -112,7 +112,7 @@ class Outbox:
     def begin(self) -> None:
         """Start a new connection: the broker may have lost everything."""
         self.stream = None
-        self.stream_there.clear()
+        self.stream_available.clear()
         self.due = dict.fromkeys(sorted(self.kept, key=lambda topic: topic is not Topic.STATE))
         self.sent.clear()
         self.wake.set()
@@ -162,7 +162,7 @@ class Uplink:
                     self._session.take_packet(*self._recorder.packets.popleft())
                 await asyncio.sleep(0)
             if ending is not None:
-                self._session.end(in_order=ending)
+                self._session.end(normally=ending)
             dropped, error = self._recorder.state()
             self._queue(self._session.collect(time.monotonic(), time.time(), dropped=dropped, recorder_error=error))
             if ending is not None:
@@ -180,7 +180,7 @@ class Uplink:
         if out.stream is not None and self._connected:
             self._counts.stream_dropped += outbox.stream is not None
             outbox.stream = out.stream
-            outbox.stream_there.set()
+            outbox.stream_available.set()
 
     async def _stay_connected(self) -> None:
         pause_s = PAUSE_MIN_S
@@ -233,9 +233,9 @@ class Uplink:
         """Send one stream message at a time; while the socket is full the newest replaces the one that waits."""
         outbox, topic = self._outbox, Topic.STREAM.of(self._session.vehicle)
         while True:
-            await outbox.stream_there.wait()
+            await outbox.stream_available.wait()
             payload, outbox.stream = outbox.stream, None
-            outbox.stream_there.clear()
+            outbox.stream_available.clear()
             if payload is not None:
                 await client.publish_message(topic, payload, qos=0, retain=False)
                 self._counts.stream_sent += 1

@@ -161,7 +161,7 @@ class TelemetrySession:
                 case Metadata():
                     self._metadata(packet.name, packet.values)
                 case Close():
-                    self.end(in_order=True)
+                    self.end(normally=True)
         except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
             self._packet_error = self._packet_error or f"telemetry: malformed packet: {type(error).__name__}: {error}"
 
@@ -209,17 +209,17 @@ class TelemetrySession:
             )
         )
 
-    def end(self, *, in_order: bool) -> None:
+    def end(self, *, normally: bool) -> None:
         """End the session after the last tick.
 
         Args:
-            in_order: True if the flight ended normally, False if its process died.
+            normally: True if the flight ended normally, False if its process died.
         """
         if self._over:
             return
         self._over = True
         outcome = self._outcome.value if self._outcome is not None else None
-        if in_order:
+        if normally:
             self._set_state(presence=Presence.ENDED, commands=False, outcome=outcome, text=None)
         else:
             self._set_state(presence=Presence.LOST, commands=False, outcome=outcome, text=_LOST)

@@ -49,7 +49,7 @@ def test_it_prints_the_truth_and_what_to_write_into_the_vehicle_file(
     began = re.search(r"^value at the start 0\.\d{4}, \+(\d\.\d\d) % of the fitted value$", out, re.M)
     assert began is not None, out
     assert float(began[1]) == pytest.approx(100 * ERROR, abs=0.5)
-    assert "V or more are needed for a slope" in out
+    assert "V or more needed to fit a slope" in out
     patch = tmp_path / "patch.yaml"
     patch.write_text(out[out.index("#") :], encoding="utf-8")
     assert patch.read_text(encoding="utf-8").startswith("# configs/vehicles/tarot650_2r.yaml\n")

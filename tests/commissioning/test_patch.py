@@ -74,7 +74,7 @@ def test_a_list_keeps_its_comment(mine: Path) -> None:
         (("arm", "joints", 1, "servo_id"), 1, "both servos have the id 1"),
         (("arm", "jonits"), 1, "unknown key"),
         (("arm", "joints", 2, "sign"), 1, "there is no such key"),
-        (("arm", "joints"), [], "another structure"),
+        (("arm", "joints"), [], "a different structure"),
     ],
 )
 def test_what_would_be_no_vehicle_file_is_refused(

@@ -232,12 +232,12 @@ def times_of(flown: Commanded) -> dict[str, float]:
 @pytest.mark.parametrize(
     ("phase", "command", "text"),
     [
-        ("wait", HOLD, "not taking off: standing down"),
-        ("offboard", HOLD, "not taking off: standing down"),
-        ("arm", HOLD, "not taking off: standing down"),
+        ("wait", HOLD, "not taking off: the start is cancelled"),
+        ("offboard", HOLD, "not taking off: the start is cancelled"),
+        ("arm", HOLD, "not taking off: the start is cancelled"),
         ("spool up", HOLD, "not taking off: the rotors spool down"),
-        ("wait", LAND, "not taking off: standing down"),
-        ("arm", ABORT, "not taking off: standing down"),
+        ("wait", LAND, "not taking off: the start is cancelled"),
+        ("arm", ABORT, "not taking off: the start is cancelled"),
         ("spool up", LAND, "not taking off: the rotors spool down"),
     ],
 )
@@ -278,7 +278,7 @@ def test_it_waits_for_start_with_nothing_sent_and_then_flies() -> None:
 @pytest.mark.parametrize("command", [LAND, ABORT])
 def test_it_waits_for_start_and_stands_down_on_command(command: OperatorCommand) -> None:
     flown = commanded((5.0, command), sets=WAITS)
-    assert flown.effects == [(True, "not taking off: standing down")]
+    assert flown.effects == [(True, "not taking off: the start is cancelled")]
     assert flown.outcome is Outcome.ABORTED
     assert flown.outputs[-1].t_s < 5.1
 

@@ -99,7 +99,7 @@ class Robustness(Campaign):
         caption = "RMS of ‖e_p‖ after the catch, over completed flights that caught the payload."
         return [Picture(path, title, caption)] if write_distribution(rows, title, path) else []
 
-    def write_more(self, rows: Sequence[Row], out: Path) -> None:
+    def write_extra_files(self, rows: Sequence[Row], out: Path) -> None:
         """Write the worst flights to `worst.yaml`, and the flights to keep to `--keep`, as cases."""
         self._write_cases(worst(rows), out / "worst.yaml")
         if self.keep is not None:

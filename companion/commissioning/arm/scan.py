@@ -22,7 +22,7 @@ from companion.preflight.checks import Check
 
 SYSFS: Final = Path("/sys/class/tty")
 SEARCHED: tuple[int, ...] = tuple(reversed(bus.BAUDS))
-"""Baud rates of a full scan, in this order after the vehicle file's."""
+"""Baud rates of a full scan, in this order, after the vehicle file's rate."""
 
 IDS = Check("arm.scan.ids", "servo ids", why=preflight.DEVICE.why)
 BAUD = Check("arm.scan.baud", "baud rate", why="servos at a different rate receive nothing")

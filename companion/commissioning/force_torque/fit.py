@@ -112,7 +112,7 @@ def rows(fit: WeightFit) -> Iterator[Row]:
     )
     if changes(fit):
         rpy = ", ".join(f"{angle:g}" for angle in fit.rpy_deg)
-        fix = f"the sensor is turned: set tool.sensor_rpy_deg: [{rpy}], which leaves {fit.rest_deg:.0f} deg"
+        fix = f"the sensor is turned: set tool.sensor_rpy_deg: [{rpy}] (remaining error {fit.rest_deg:.0f} deg)"
     yield DIRECTION.row(fit.off_deg <= DIRECTION_MAX_DEG, read, f"within {DIRECTION_MAX_DEG:g} deg", fix)
     read = f"{len(fit.others) or 'no'} other right-angle turns explain it as well"
     yield POSE.row(not fit.others, read, "none", "repeat with link 2 about 20 to 35 deg below level, not straight down")

@@ -111,7 +111,9 @@ def judge(seen: Watched, vehicle: Vehicle) -> Report:
     if seen.problem:
         return Report([*rows, preflight.DEVICE.bad(seen.problem, "", "")], data)
     if seen.weight_kg is None:
-        return Report(rows, data, advice=["a known weight shows scale and direction: companion ft check --weight KG"])
+        return Report(
+            rows, data, advice=["to check scale and direction with a known weight: companion ft check --weight KG"]
+        )
     if not seen.loaded:
         fix = (
             "hang it on the net itself; if the sensor does not measure it, its cable is broken or its mount bypasses it"

@@ -29,9 +29,9 @@ Floats = NDArray[np.float64]
 DELAY_SPAN_S: Final = (-0.020, 0.150)
 TAPS_MIN: Final = 5
 STRENGTH_MIN_M_S2: Final = 1.5
-"""Least peak of the specific force without its slow part."""
+"""Minimum peak of the specific force without its slow part."""
 NOISE_FACTOR: Final = 7.0
-"""Least ratio of a tap to the IMU's noise."""
+"""Minimum ratio of a tap to the IMU's noise."""
 CORRELATION_MIN: Final = 0.5
 TAP_ERROR_MAX_S: Final = 0.004
 """Largest standard error of one tap's delay."""

@@ -126,7 +126,7 @@ class LatencyLink(MavsdkAutopilot):
             await asyncio.sleep(SYNC_PERIOD_S)
 
     def _on_message(self, message: Any, _: Any) -> None:
-        """Stamp and keep a message; runs in a thread of MAVSDK."""
+        """Time-stamp and store a message; runs in an MAVSDK thread."""
         self._heard.append((self._now(), message.message_name, message.fields_json))
 
     def _read(self) -> None:

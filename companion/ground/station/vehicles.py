@@ -89,7 +89,7 @@ class Vehicle:
     """Local monotonic clock at which the newest stream message arrived."""
     received_s: float = 0.0
     clock: FlightClock = field(default_factory=FlightClock)
-    """Estimate of the flight clock, for the age of the displayed data."""
+    """Estimate of the flight clock, used for the age of the displayed data."""
     proven: ProvenState | None = None
     """None if no stream message had a proof for this ground station's operator."""
 

@@ -40,7 +40,7 @@ WAITS_FOR_START = Stage.READY.value
 TEXT_MAX = 300
 """Maximum number of characters in an event's text, so that `EVENTS_KEPT` events always fit into one message."""
 _TEXT_MAX_BYTES = 1600
-"""The same limit for the JSON text, in which a character may take twelve bytes."""
+"""`TEXT_MAX` as a limit on the JSON text, in which a character may take twelve bytes."""
 _HEALTH_WINDOW_S = 1.0
 """Window whose worst values the health shows, so that a problem in a single tick is visible."""
 

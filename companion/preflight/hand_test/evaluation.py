@@ -191,7 +191,7 @@ def _explain(result: HandResult, up_axis: str) -> str:
         return f"the rigid body's zero was set while the vehicle was tilted, or the ground plane is not level; {_RESET}"
     exchanged = f"axes are exchanged (its x, y, z look like the vehicle's {', '.join(axes.names)})"
     if level:
-        return f"the stream's {exchanged}: set devices.mocap.up_axis as Motive streams, and Motive's ground plane with z up"
+        return f"the stream's {exchanged}: set devices.mocap.up_axis to match Motive's stream, and Motive's ground plane with z up"
     return f"the rigid body's {exchanged}; {_RESET}"
 
 

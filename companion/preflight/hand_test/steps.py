@@ -1,6 +1,6 @@
 """The guided hand test: the operator carries the vehicle, rotors off, and every axis of motion capture is compared with the IMU. Pure.
 
-The steps are: stand still, lift, forward, turn left. Each step is recognised by the distance that motion capture measures, in any
+The steps are: rest on the floor, lift, forward, turn left. Each step is recognised by the distance that motion capture measures, in any
 direction, because the directions are under test. Directions are evaluated at the end (`companion.preflight.hand_test.evaluation`).
 """
 
@@ -227,7 +227,7 @@ class HandTest:
         rest = self._still(t_s, STAND_S, STAND_M, STAND_DEG)
         stood_s = 0.0 if self._still_since_s is None else t_s - max(self._still_since_s, self._step_s)
         self._progress = min(1.0, stood_s / STAND_S)
-        self._seen = "it stands" if self._still_since_s is not None else "the vehicle moves, or is not tracked"
+        self._seen = "it is at rest" if self._still_since_s is not None else "the vehicle moves, or is not tracked"
         felt = self._imu[bisect_left(self._imu, t_s - STAND_S, key=lambda sample: sample.t_s) :]
         if rest is None or len(felt) < _POSES_MIN:
             return

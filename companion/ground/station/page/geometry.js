@@ -1,4 +1,4 @@
-// Geometry of the machine's parts. World: z up, m. Body: x forward, y left, z up. Quaternions (w, x, y, z) turn body vectors into the world.
+// Geometry of the vehicle's parts. World: z up, m. Body: x forward, y left, z up. Quaternions (w, x, y, z) turn body vectors into the world.
 
 export const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
 export const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];

@@ -3,7 +3,7 @@
 import { colours } from "./colours.js";
 import { add, armBody, circle, rotate, scale, yawOnly } from "./geometry.js";
 
-// Distance of the rotor hubs as a share of the horizontal reach; the four disks nearly touch.
+// Distance of the rotor hubs as a fraction of the horizontal reach; the four disks nearly touch.
 const HUB = 0.6;
 const DISK = 1 - HUB;
 const HUBS = [[1, 1], [1, -1], [-1, 1], [-1, -1]].map(([x, y]) => [x * Math.SQRT1_2 * HUB, y * Math.SQRT1_2 * HUB]);

@@ -1,4 +1,4 @@
-// The 3D scene: room, tether, planned and flown path, and the machine.
+// The 3D scene: room, tether, planned and flown path, and the vehicle.
 
 import { Camera, steer } from "./camera.js";
 import { colours, levelColour } from "./colours.js";
@@ -86,7 +86,7 @@ function drawRoom(renderer, { min, max }) {
   for (const [x, y] of [[x0, y0], [x1, y0], [x1, y1], [x0, y1]]) renderer.line([[x, y, z0], [x, y, z1]], colours.room, { width: 1.2 });
 }
 
-/** Draw the reach of the tether less its margin: the sphere's circles on the floor and at the machine's height, inside the room. */
+/** Draw the reach of the tether minus its margin: the sphere's circles on the floor and at the vehicle's height, inside the room. */
 function drawReach(renderer, scene, stream, position) {
   const [ax, ay, az] = scene.anchor_world_m;
   const reach = scene.tether_length_m - scene.tether_margin_m;
