@@ -138,7 +138,7 @@ def logged_flight(config_json: str) -> FlightConfig:
     """Return the configuration in a log. Older logs also contain that of the simulated world, which is left out.
 
     Raises:
-        ValueError: not JSON, or not a configuration of this version.
+        ValueError: the text is not JSON, or not a configuration of this version.
     """
     data = json.loads(config_json)
     if isinstance(data, dict):
@@ -166,7 +166,7 @@ def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:
     location = ("devices", "mocap", "interface")
     text = (
         f'{key_path(location)}: expected the address of this computer on the camera network, got "{interface}" (every network); '
-        "`ip -4 address` shows it, `companion mocap check` proposes it; only a flight with --sitl does not need it"
+        "`ip -4 address` shows it, `companion mocap check` proposes it; flights with --sitl do not need it"
     )
     return problem_lines([Problem(RANK_VALUE, document.origin(location), text)])
 

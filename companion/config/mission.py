@@ -66,7 +66,7 @@ class Line(Model):
                 end_s > self.duration_s or (self.arm_delay_s or 0.0) >= self.duration_s
             ):
                 key = "arm_delay_s" if self.arm_duration_s is None else "arm_duration_s"
-                text = f"the arm's move would end {end_s:g} s into a line of {self.duration_s:g} s; it must end within"
+                text = f"the arm's move would end {end_s:g} s into a line of {self.duration_s:g} s; it must end within the line"
                 problems.append(((key,), text))
         refuse("line", problems)
         return self

@@ -356,7 +356,7 @@ class Vehicle(Model):
             )
         for index, (com_m, length_m) in enumerate(zip(self.arm.link_com_m, self.arm.link_lengths_m, strict=True)):
             if com_m > length_m:
-                text = f"the centre of mass lies beyond the link's end: {com_m:g} m on {length_m:g} m"
+                text = f"the centre of mass lies beyond the link's end: at {com_m:g} m on a link of {length_m:g} m"
                 problems.append((("arm", "link_com_m", index), text))
         for index, (joint, angle_deg) in enumerate(zip(self.arm.joints, self.safety.fold_arm_deg, strict=True)):
             low_deg, high_deg = joint.angle_deg

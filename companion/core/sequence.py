@@ -287,7 +287,7 @@ def _left_to_pilot(t: Transition) -> bool:
     if not seq.flown_by_pilot(t.i.status):
         return False
     if not any(event.id == PILOT_TOOK_OVER for event in t.events):
-        text = "a pilot took over before PX4 was disarmed; nothing is sent any more"
+        text = "a pilot took over before PX4 was disarmed; the companion sends nothing from now on"
         t.report_rule(PILOT_TOOK_OVER, SafetyAction.AUTOPILOT_LAND, text)
     t.finish(Outcome.ABORTED)
     t.enter(Stage.AUTOPILOT_LAND, pilot_flies=True)

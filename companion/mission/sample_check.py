@@ -98,9 +98,9 @@ class SampleCheck:
         """Return the violations at one instant. Instants must be passed in chronological order.
 
         Args:
-            t_s: time of the plan.
+            t_s: time on the plan's clock.
             reference: the plan's reference at that time.
-            jerks: of the vehicle, world frame, m/s^3, and of the joints, rad/s^3.
+            jerks: jerk of the vehicle, world frame, m/s^3, and of the joints, rad/s^3.
             kind: kind of the phase.
         """
         clearance_m = self._vehicle.airframe.ground_clearance_m

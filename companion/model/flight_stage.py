@@ -76,7 +76,7 @@ def on_ground(status: AutopilotStatus | None) -> bool:
 
 
 def failsafe_chose(status: AutopilotStatus) -> bool:
-    """Return whether a failsafe of PX4 is active and has chosen the mode. In MANUAL a pilot has control, failsafe or not."""
+    """Return whether a failsafe of PX4 is active and has chosen the mode. In MANUAL a pilot has control even during a failsafe."""
     return status.system_status in FAILSAFE_STATES and status.mode is not FlightMode.MANUAL
 
 

@@ -97,7 +97,7 @@ def joint_jump(a: ArmTracker, thresholds: Vec2) -> Values | None:
 
 
 def servo_warm(a: ArmTracker, thresholds: Vec2) -> Values | None:
-    """The hotter servo's temperature has reached the first threshold, and not the second."""
+    """The hotter servo's temperature has reached the first threshold but not the second."""
     return (a.hottest_c, thresholds[0]) if thresholds[0] <= a.hottest_c < thresholds[1] else None
 
 

@@ -121,7 +121,7 @@ class Gate:
             most = self._slew_max_per_s * max(0.0, t_s - last[0])
             if not last[1] - most <= thrust <= last[1] + most:
                 slow = max(last[1] - most, min(last[1] + most, thrust))
-                text = f"thrust {last[1]:.2f} to {thrust:.2f} in one step is limited to {slow:.2f}"
+                text = f"thrust step from {last[1]:.2f} to {thrust:.2f} is limited to {slow:.2f}"
                 refused.append(Refusal("thrust slew", text))
                 setpoint, thrust = AttitudeSetpoint(setpoint.attitude_wxyz, slow), slow
         self._last = (t_s, thrust)

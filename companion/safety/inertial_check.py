@@ -1,12 +1,12 @@
 """Checks that motion-capture poses move as the IMU measures. Pure.
 
-PX4 fuses the poses of motion capture, so its position agrees with them even when an attacker drags them away. The accelerometer does
-not agree then: an observer of position, velocity and accelerometer bias integrates it, and each pose corrects the observer. The
+PX4 fuses the poses of motion capture, so its position agrees with them even when an attacker drags them away. The accelerometer then
+disagrees. An observer of position, velocity and accelerometer bias integrates its readings, and each pose corrects the observer. The
 innovation, pose minus predicted position, stays near zero while both measure the same motion. A drag that begins at v m/s raises it to
 0.08 s x v after 0.2 s; then the observer follows the drag, as it follows a constant acceleration error. A drag that begins slowly is
-not found.
+not detected.
 
-The attitude that turns the specific force into the world is PX4's. PX4 corrects its tilt with the same poses, but slowly (0.4 rad/s).
+PX4's attitude transforms the specific force to the world frame. PX4 corrects its tilt with the same poses, but slowly (0.4 rad/s).
 
 The observer gets the integral of the specific force over every sample that PX4 sent (`companion.io.px4.delta_velocity`). One sample for
 each tick would alias vibration of 5 to 10 m/s2 into the velocity. Times are those of exposure and sample, on the clocks of motion

@@ -267,7 +267,7 @@ def mocap_slow(m: MocapTracker, thresholds: Vec2) -> Values | None:
 
 
 def mocap_late(m: MocapTracker, thresholds: Vec2) -> Values | None:
-    """The latency exceeds the first threshold, and not the second."""
+    """The latency exceeds the first threshold but not the second."""
     latency_s = m.pose.latency_s if m.pose is not None else None
     if latency_s is None or not thresholds[0] < latency_s <= thresholds[1]:
         return None

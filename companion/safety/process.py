@@ -28,7 +28,7 @@ class ProcessTracker:
 
 
 def loop_late(p: ProcessTracker, thresholds: tuple[float, float]) -> Values | None:
-    """The tick is late by more than the first threshold, and not the second."""
+    """The tick is late by more than the first threshold but not the second."""
     return (p.gap_s * 1e3, thresholds[0] * 1e3) if thresholds[0] < p.gap_s <= thresholds[1] else None
 
 

@@ -136,7 +136,7 @@ def offboard_left(p: Px4Tracker, _: None) -> Values | None:
 
 
 def px4_disarmed(p: Px4Tracker, _: None) -> Values | None:
-    """PX4 reports disarmed in the air while the companion commands."""
+    """PX4 reports disarmed in the air while the companion controls the vehicle."""
     status, vehicle = p.status, p.vehicle
     if status is None or status.armed or vehicle is None:
         return None

@@ -13,8 +13,8 @@ There are three cases:
 
 A normal flight is never mistaken for a vehicle that is tipped over. The controller's setpoints stay within `airframe.tilt_max_deg`,
 PX4's own landing within `MPC_TILTMAX_AIR` (25 deg) and `MPC_TILTMAX_LND` (12 deg). Beyond 40 deg a free vehicle accelerates sideways by
-more than 8 m/s^2, and PX4, commanded to land after 0.1 s (`tilt`), either levels it within 0.5 s or it is on the floor. Only a tether
-that pulls the vehicle over can hold it at this tilt so low; when its rotors stop it falls by `LOW_WITHIN_M` at most.
+more than 8 m/s^2, and PX4, which is commanded to land after 0.1 s (`tilt`), levels it within 0.5 s unless it hits the floor first. Only
+a tether that pulls the vehicle over can hold it at this tilt and this low; when its rotors stop it falls by `LOW_WITHIN_M` at most.
 """
 
 from __future__ import annotations

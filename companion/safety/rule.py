@@ -30,7 +30,7 @@ class Subject(Enum):
 class Repeat(Enum):
     """When a rule that has raised its event may raise it again."""
 
-    AFTER_QUIET = "after it has not held for a second"
+    AFTER_QUIET = "after the condition has been false for a second"
     NEVER = "once in a flight"
     AT_ONCE = "each time"
 

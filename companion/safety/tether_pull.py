@@ -3,8 +3,8 @@
 The residual is the disturbance of the whole vehicle minus the force at the net: a caught payload is in both and cancels. The rest is
 wind, errors of the thrust model, and the tether. Errors of the thrust lie along the rotors' axis, nearly vertical, so the vertical part
 of the residual has less weight than the horizontal: the pull is the weighted least-squares fit of a force along the line. For the same
-reason a payload is not mistaken for the tether when the force sensor is lost: it pulls down only, and a pull along the line has a
-horizontal part too.
+reason a payload is not mistaken for the tether when the force sensor is lost: it only pulls down, whereas a pull along the line also
+has a horizontal part.
 """
 
 from __future__ import annotations

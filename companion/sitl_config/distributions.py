@@ -123,7 +123,7 @@ def draw(data: dict[str, Any], ranges: Sequence[Range], seed: int) -> dict[str, 
 
 
 def with_model_error(world: World) -> World:
-    """Return the world whose errors of base mass, inertia, link masses and torque constants include its `model_error`."""
+    """Return the world with its `model_error` applied to the errors of base mass, inertia, link masses and torque constants."""
     if world.model_error == 0.0:
         return world
 

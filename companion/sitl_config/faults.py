@@ -178,7 +178,7 @@ KINDS: dict[FaultKind, Kind] = {
         what="a rotor loses thrust", size="fraction lost", unit="", default=0.15, named_by=(*_WEAK, "crashed")
     ),
     "battery_sag": Kind(
-        what="the battery's voltage drops, thrust with its square",
+        what="the battery's voltage drops, and thrust with its square",
         size="drop",
         unit="V",
         default=2.0,
@@ -226,7 +226,7 @@ KINDS: dict[FaultKind, Kind] = {
         named_by=("catch", "servo_overload", *_WEAK),
         phases=("catch",),
     ),
-    "disk_full": Kind("the log cannot be written any more", named_by=("recorder_drops",), process=True),
+    "disk_full": Kind("the log can no longer be written", named_by=("recorder_drops",), process=True),
     "clock_step": Kind(
         what="the clock of the motion-capture computer jumps",
         size="step",

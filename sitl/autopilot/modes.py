@@ -93,7 +93,7 @@ class OffboardKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """State of the rest of the autopilot that the commander checks, at one moment."""
+    """State of the rest of the autopilot, as the commander checks it at one moment."""
 
     attitude_valid: bool
     position_valid: bool

@@ -144,7 +144,7 @@ class Params:
 
 
 def encode_bytewise(value: Value) -> float:
-    """Return the float with the bytes of an int32, or a float unchanged."""
+    """Return the float that has the bytes of an int32; return a float unchanged."""
     if isinstance(value, int):
         return float(struct.unpack("<f", struct.pack("<i", value))[0])
     return value

@@ -103,7 +103,9 @@ def row_of(
 
 
 def torque_activity_nm(log: FlightLog, mask: metrics.Mask) -> float | None:
-    """Return the RMS change of the commanded joint torques (norm of both) from one tick to the next, over the ticks of the mask."""
+    """Return the RMS change of the commanded joint torques (norm of both) from one tick to the next, over the ticks that `mask`
+    selects.
+    """
     torque = log.column(lambda i, o, s: o.arm_torque_nm, 2)
     return metrics.rms_norm(np.diff(torque, axis=0)[mask[1:] & mask[:-1]])
 

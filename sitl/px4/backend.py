@@ -151,7 +151,7 @@ class RealPx4:
         """
         if self._process is None:
             self._progress(
-                f"px4 was not found: looking for {BY_HAND_DEADLINE_S:g} s for one that was started by hand, on TCP "
+                f"px4 was not found: waiting up to {BY_HAND_DEADLINE_S:g} s for one that was started by hand, on TCP "
                 f"{self._link.port}: {self._by_hand()}"
             )
         await self._boot(BOOT_DEADLINE_S if self._process is not None else BY_HAND_DEADLINE_S)

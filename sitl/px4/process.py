@@ -102,12 +102,12 @@ class Instance:
 
     @property
     def onboard_port(self) -> int:
-        """UDP port that PX4 sends its onboard link to: 14540 of instance 0."""
+        """UDP port to which PX4 sends its onboard link: 14540 for instance 0."""
         return _ONBOARD + self.number
 
     @property
     def ground_port(self) -> int:
-        """UDP port that PX4's ground station link sends from; every instance sends to 14550."""
+        """UDP port from which PX4's ground station link sends; every instance sends to 14550."""
         return _GROUND_OWN + self.number
 
     @property

@@ -112,7 +112,7 @@ BAD_MISSION = [
         "arm_duration_s: 7",
         [
             f"{CATCH}:40:21: phases[2].arm_duration_s: the arm's move would end 7 s into a line of 6 s; "
-            "it must end within"
+            "it must end within the line"
         ],
     ),
     (
@@ -160,7 +160,7 @@ BAD_MISSION = [
 def test_motion_capture_from_every_network_is_refused_unless_the_world_is_simulated(project: Path) -> None:
     line = (
         f'{VEHICLE}:63:16: devices.mocap.interface: expected the address of this computer on the camera network, got "0.0.0.0" (every network); '
-        "`ip -4 address` shows it, `companion mocap check` proposes it; only a flight with --sitl does not need it"
+        "`ip -4 address` shows it, `companion mocap check` proposes it; flights with --sitl do not need it"
     )
     assert lines_of(lambda: load_sitl(CATCH, hardware=True)) == [line]
     assert load_sitl(CATCH).vehicle.devices.mocap.interface == "0.0.0.0"
@@ -186,7 +186,7 @@ BAD_VEHICLE = [
     ("baud: 3000000", "baud: 9600", ["baud: expected one of 57600, 115200, 1000000, 2000000, 3000000, 4000000, got 9600"]),
     ("rate_hz: 200.0", "rate_hz: 200.0\n    natnet_version: 3.0", ['expected one of "3.0", "4.1", got 3.0 (put it in quotes)']),
     ("x_m: [-2.2, 2.2]", "x_m: [2.2, -2.2]", ["room.x_m: the first must be below the second, got [2.2, -2.2]"]),
-    ("link_com_m: [0.16, 0.08]", "link_com_m: [0.26, 0.08]", ["the centre of mass lies beyond the link's end: 0.26 m on 0.2 m"]),
+    ("link_com_m: [0.16, 0.08]", "link_com_m: [0.26, 0.08]", ["the centre of mass lies beyond the link's end: at 0.26 m on a link of 0.2 m"]),
     ("fold_arm_deg: [165.0, 140.0]", "fold_arm_deg: [165.0, 151.0]", ["fold_arm_deg[1]: 151 deg is outside the joint limits, -10 to 150 deg"]),
     ("mass_kg: 3.0 ", "mass_kg: 0.4 ", ["mass_kg: 0.4 kg is the whole vehicle, but arm and tool alone weigh 0.45 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 20.0", ["thrust_max_n: 20 N do not lift 3 kg"]),
@@ -216,7 +216,7 @@ BAD_OVERRIDES = [
     ("x.y=1", "--set x.y: unknown section 'x'; known are mission, vehicle, controller, world"),
     ("world.payload_kg", "--set world.payload_kg: no '='; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("world.payload_kg=", "--set world.payload_kg: no value; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
-    ("world=1", "--set world: names a whole document; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
+    ("world=1", "--set world: the key names a whole document; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("world..a=1", "--set world..a: cannot read the key from column 6; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("[0]=1", "--set [0]: unknown section '0'; known are mission, vehicle, controller, world"),
     ("world.payload_kg=3", "--set world.payload_kg: expected a number from 0 to 2, got 3"),

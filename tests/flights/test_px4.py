@@ -262,7 +262,7 @@ def test_without_a_px4_the_flight_is_refused_within_seconds_with_how_to_get_one(
     with sandbox_in(tmp_path / "sandbox", nowhere) as sandbox:
         ended = sandbox.run("fly", HOVER, "--sitl=px4", "--out", "out")
         sandbox.assert_nobody_left()
-    assert "looking for 10 s for one that was started by hand, on TCP 456" in ended.out
+    assert "waiting up to 10 s for one that was started by hand, on TCP 456" in ended.out
     waiting = ended.out.partition("started by hand")[2]
     assert "same folder, where it keeps its parameters" in waiting
     assert "make px4_sitl_default none" in waiting

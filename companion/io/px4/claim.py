@@ -144,7 +144,7 @@ class LinkClaim:
             raise device_error(self._address, f"PX4 (system {self._system}) at one address", found, fix)
 
     def take_rival(self, silent_s: float) -> str | None:
-        """Read one datagram of another sender, or all while PX4 is silent. Never waits.
+        """Read one datagram from another sender, or all of them while PX4 is silent. Never waits.
 
         Args:
             silent_s: time since the newest message of PX4.

@@ -145,7 +145,7 @@ def add_connection(mavsdk: Mavsdk, address: str, forwarding: bool = False) -> An
     except MavsdkConnectionError as error:
         found = str(error).removeprefix("Connection failed: ").lower().replace("_", " ")
         if ConnectionResult.BAUDRATE_UNKNOWN.name in str(error):
-            fix = "use a baud rate that the port knows, 921600 for PX4's TELEM2"
+            fix = "use a baud rate that the port supports, 921600 for PX4's TELEM2"
         else:
             fix = "check cable, address and that no other program holds it"
         raise device_error(address, "to open the connection", found, fix) from None

@@ -161,13 +161,13 @@ def attitude_target_ned(setpoint: AttitudeSetpoint) -> Quat:
 
 
 def attitude_target_deg(setpoint: AttitudeSetpoint) -> Vec3:
-    """Return roll, pitch, yaw (ZYX, FRD -> NED) of a valid setpoint, deg; raises as `attitude_target_ned` does."""
+    """Return roll, pitch, yaw (ZYX, FRD -> NED) of a valid setpoint, deg; raises the errors of `attitude_target_ned`."""
     roll_rad, pitch_rad, yaw_rad = euler_zyx_from_quat(quat_normalize(attitude_target_ned(setpoint)))
     return math.degrees(roll_rad), math.degrees(pitch_rad), math.degrees(yaw_rad)
 
 
 def attitude_target_json(setpoint: AttitudeSetpoint, time_boot_ms: int, target_system: int) -> str:
-    """Return SET_ATTITUDE_TARGET: quaternion FRD -> NED and thrust, body rates ignored; raises as `attitude_target_ned` does."""
+    """Return SET_ATTITUDE_TARGET: quaternion FRD -> NED and thrust, body rates ignored; raises the errors of `attitude_target_ned`."""
     q = attitude_target_ned(setpoint)
     return (
         f'{{"time_boot_ms":{time_boot_ms & 0xFFFFFFFF},"target_system":{target_system},'
@@ -193,13 +193,13 @@ def command(request: AutopilotRequest) -> tuple[int, float, float]:
     """Return MAV_CMD and its first two parameters, the others are 0: DO_SET_MODE (176), COMPONENT_ARM_DISARM (400) or NAV_LAND (21).
 
     Raises:
-        KeyError: for `AutopilotRequest.NONE`, which is no command.
+        KeyError: for `AutopilotRequest.NONE`, which is not a command.
     """
     return _COMMANDS[request]
 
 
 def command_json(request: AutopilotRequest, target_system: int) -> str:
-    """Return COMMAND_LONG for a request with the fields of `command`; raises as `command` does."""
+    """Return COMMAND_LONG for a request with the fields of `command`; raises the errors of `command`."""
     return _command_json(*command(request), target_system)
 
 

@@ -195,7 +195,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--system", type=int, required=True, help="MAVLink system id of the vehicle")
     parser.add_argument("--own", type=int, nargs=2, required=True, help="system and component id of MAVSDK")
     parser.add_argument("--name", required=True, help="the ground station's address for display")
-    parser.add_argument("--while-armed", action="store_true", help="pass everything while PX4 is armed too")
+    parser.add_argument("--while-armed", action="store_true", help="pass everything even while PX4 is armed")
     parser.add_argument("--console", action="store_true", help="pass SERIAL_CONTROL while PX4 is not armed")
     a = parser.parse_args(argv)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

@@ -82,7 +82,7 @@ class ArmedState:
         self._arming_s = now_s
 
     def armed(self, now_s: float) -> bool:
-        """Return whether PX4 is armed, may be armed, or sends no heartbeat."""
+        """Return True unless fresh heartbeats show that PX4 is disarmed."""
         if self._disarmed_s is None or now_s - self._disarmed_s > HEARTBEAT_MAX_AGE_S:
             return True
         return now_s - self._arming_s <= HEARTBEAT_MAX_AGE_S
@@ -152,7 +152,7 @@ def refusal_while_armed(frame: Frame) -> str | None:
     if frame.message_id == mavlink.MAVLINK_MSG_ID_SET_MODE:
         custom_mode, _, base_mode = struct.unpack("<IBB", _padded(frame, _SET_MODE_BYTES))
         allowed = _mode_allowed(float(base_mode), float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24))
-        return None if allowed else "this mode while PX4 is armed"
+        return None if allowed else "a request for this mode while PX4 is armed"
     if frame.message_id in COMMANDS and not _command_allowed(frame):
         return f"command {command_of(frame.payload)} while PX4 is armed"
     return None

@@ -1,9 +1,9 @@
 """Errors of the autopilot's IMU: bias, drift, mounting, and the rotors' vibration averaged over a sample.
 
-A sample of PX4 is the mean of raw samples since the last one (vehicle_imu's delta velocity and delta angle). The mean of a vibration is
-integrated exactly, so that the sample contains its remainder and its alias. An unbalanced rotor shakes the body in the rotor's plane
-with its own frequency and a force proportional to the square of its speed, hence to its thrust. A rotor of two blades shakes the body
-along its axis with twice its frequency, and therefore also turns it.
+A sample of PX4 is the mean of the raw samples since the previous one (vehicle_imu's delta velocity and delta angle). The vibration is
+averaged exactly over each sample, so that the samples contain what remains of it and its alias. An unbalanced rotor shakes the body in
+the rotor's plane with its own frequency and a force proportional to the square of its speed, hence to its thrust. A rotor of two blades
+shakes the body along its axis with twice its frequency, and therefore also turns it.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ class Transmission:
         return link_rad + share * stretch, link_rad_s + share * rate
 
     def friction_nm(self, motor_nm: float, external_nm: float, speed_rad_s: float) -> float:
-        """Return the largest friction torque under a load at a speed, which must not be negative."""
+        """Return the largest friction torque under a load at a speed of 0 or more."""
         friction, stiction, load_friction, load_stiction = self._friction
         load = abs(motor_nm - external_nm)
         rest = math.exp(-((speed_rad_s / self._stribeck_rad_s) ** self._exponent))
