@@ -24,9 +24,9 @@ from companion.model.types import PhaseKind, Vec3
 
 WIDTH, HEIGHT = 960, 440
 FRAMES_PER_S = 12.5
-"""100 divided by this is a whole number, because a GIF stores the delay of a frame in hundredths of a second."""
+"""Frame rate; its period is a multiple of 0.01 s, because a GIF stores the delay of a frame in hundredths of a second."""
 _SPLIT_PX = 600
-"""The scene is on the left of this column, the plots are on the right."""
+"""Column that separates the scene (left) from the plots (right)."""
 _PLOT_X = (650.0, 946.0)
 _PLOTS_Y = ((50.0, 205.0), (262.0, 405.0))
 _SOFT, _AXIS, _GRID = "#5b6b79", "#aab4bd", "#e6eaee"

@@ -22,7 +22,7 @@ TARGET = tuple(np.array(row) for row in ([1.0] * 3 + [0.1] * 2, [40.0] * 3 + [0.
 """The impedance (M_d, K_d, K_p of x, y, z and both joints) that every law is graded against: the paper's (tab:control_parameters)."""
 _TARGET_ROWS = [0, 1, 2, 6, 7]
 DESIRED_FORCE_TIME_S = 0.5
-"""Time constant of that target's desired force, with which a lasting load is carried instead of yielded to."""
+"""Time constant of the desired force of `TARGET`, by which a lasting load is carried instead of yielded to."""
 
 
 @dataclass(frozen=True, slots=True)

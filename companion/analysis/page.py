@@ -39,7 +39,7 @@ class Section:
     folded: Mapping[str, str] = field(default_factory=dict)
     """Long texts by title, shown when the reader opens them."""
     cards: Sequence[Table] = ()
-    """Small tables beside each other, above everything else."""
+    """Small tables, side by side at the top of the section."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class Page:
 
 
 def write_page(page: Page, path: Path) -> None:
-    """Write a page; raises OSError if the file cannot be written."""
+    """Write a page; raise OSError if the file cannot be written."""
     path.write_text(_environment().get_template("page.html").render(page=page), encoding="utf-8")
 
 

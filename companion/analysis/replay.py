@@ -44,7 +44,7 @@ class ReplayResult:
 
 
 def replay(log: FlightLog, make_core: Callable[[str], Core]) -> ReplayResult:
-    """Step a new core through the logged inputs; stops at the first difference.
+    """Step a new core through the logged inputs; stop at the first difference.
 
     Args:
         log: a log without gaps from its first tick on.

@@ -53,7 +53,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Send the command; returns the exit code."""
+    """Send the command; return the exit code."""
     only = vehicle_option(arguments)
     access = broker_access(arguments.broker, arguments.login, arguments.ca)
     signer = signer_of(access, arguments.operators, arguments.operator)

@@ -31,7 +31,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fit and print; returns the exit code."""
+    """Fit and print; return the exit code."""
     try:
         log = FlightLog.read(arguments.log)
         fit = fit_hover_thrust(log)

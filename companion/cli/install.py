@@ -85,7 +85,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Plan, show, ask and apply; returns the exit code."""
+    """Plan, show, ask and apply; return the exit code."""
     root = Path(os.path.abspath(arguments.root))
     if not root.is_dir():
         print_error(f"companion install: --root {arguments.root}: expected a folder that holds a system")

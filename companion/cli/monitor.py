@@ -84,7 +84,7 @@ def vehicle_option(arguments: argparse.Namespace) -> str | None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run until Ctrl-C; returns the exit code."""
+    """Run until Ctrl-C; return the exit code."""
     _check(arguments)
     try:
         if arguments.text:

@@ -59,7 +59,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compare, write if requested, and print; returns the exit code.
+    """Compare, write if requested, and print; return the exit code.
 
     Raises:
         ConfigError: the parameter or the vehicle file is wrong.
@@ -168,7 +168,7 @@ def lines(comparison: Comparison, result: WriteResult | None) -> list[str]:
         f"{d.name:16}  {value_text(d.px4):>12} -> {value_text(d.file)}{'  (after a reboot)' if d.reboot else ''}"
         for d in (comparison.differences if result is None else result.written)
     ]
-    shown += [f"{name:16}  PX4 does not have it" for name in comparison.absent]
+    shown += [f"{name:16}  PX4 does not have this parameter" for name in comparison.absent]
     differ = len(shown)
     shown += [f"{name:16}  this PX4 has no such serial port; skipped" for name in comparison.absent_port]
     shown += [
@@ -185,5 +185,5 @@ def lines(comparison: Comparison, result: WriteResult | None) -> list[str]:
     if reboot:
         shown.append(f"reboot PX4: {', '.join(reboot)}")
     if any(difference.reboot is None for difference in result.written):
-        shown.append("whether parameters other than this project's need a reboot is unknown")
+        shown.append("it is not known whether parameters other than this project's need a reboot")
     return shown

@@ -131,7 +131,7 @@ def _last_line_of_plain_values(parent: yaml.MappingNode) -> int:
 
 
 def _is_flow(node: yaml.Node) -> bool:
-    """Return whether the node's end mark is its end; the end mark of a block comes after the comments that follow it."""
+    """Return whether the node ends at its end mark; a block's end mark comes after the comments that follow the block."""
     return isinstance(node, yaml.ScalarNode) or (isinstance(node, yaml.CollectionNode) and bool(node.flow_style))
 
 

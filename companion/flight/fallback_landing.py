@@ -16,7 +16,7 @@ from companion.runtime.clock import Clock
 
 LANDING_TIMEOUT_S = 30.0
 STATUS_MIN_AGE_S = 1.5
-"""PX4 reports once a second whether it is armed; an older report is ignored."""
+"""Time after the start of the landing for which `disarmed` is ignored: PX4 reports it once a second, so it may be older."""
 UNFLOWN_HOVER_THRUST = 0.5
 """Hover thrust for a vehicle that was found in the air: the core requires a value, but its controller never runs."""
 
@@ -68,7 +68,7 @@ async def land_without_core(
 
 
 def unflown(config: FlightConfig) -> FlightConfig:
-    """Return the effective configuration of a vehicle that was found in the air, whose hover thrust is not read."""
+    """Return the effective configuration for a vehicle that was found in the air: its hover thrust is not read from PX4."""
     airframe = config.vehicle.airframe
     if airframe.hover_thrust is not None:
         return config

@@ -30,11 +30,11 @@ from companion.safety.autopilot_landing import TIMEOUT_S, AutopilotLanding, Land
 
 HEARTBEAT_PERIOD_S = 1.0
 ASK_PERIOD_S = 0.1
-"""PX4 sends its mode once a second on its own; the guardian requests it more often."""
+"""Period at which the guardian requests PX4's mode, which PX4 otherwise sends once a second."""
 LINK_TIMEOUT_S = 1.0
 """Timeout for PX4's first message, which reveals its address on a `udpin` link; after it the landing starts without a message."""
 MODE_TIMEOUT_S = 0.15
-"""PX4's mode is requested first, because a pilot may be flying. After this long without an answer PX4 is commanded to land."""
+"""Timeout for PX4's mode, which is requested first because a pilot may be flying; after it PX4 is commanded to land."""
 REPEAT_S = 0.25
 """Period at which a command is repeated until the status shows its effect."""
 ZERO_THRUST_PERIOD_S = 0.02

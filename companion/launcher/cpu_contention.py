@@ -19,7 +19,7 @@ from companion.model.types import SafetyAction, Severity
 WAIT_MAX = 0.15
 """Fraction of the time that a process may wait for a core before it responds too late."""
 WAIT_LATE_MAX, LATE_S = 0.05, 0.005
-"""The same limit when ticks are late by `LATE_S` or more."""
+"""`WAIT_MAX` for ticks that are late by `LATE_S` or more."""
 WINDOW_S, SAMPLE_S = 3.0, 0.5
 CAUSED_BY_LATENESS = frozenset({
     "mocap_lost", "mocap_too_late", "vehicle_state_lost", "heartbeat_lost", "offboard_left", "arm_lost",

@@ -43,7 +43,7 @@ WATCHDOG = Check(
     "arm.watchdog",
     "bus watchdog",
     "`devices.arm.watchdog_ms` (register 98)",
-    "the arm would keep its torque after the companion has died",
+    "the arm would keep its torque if the companion died",
 )
 CURRENT_LIMIT = Check(
     "arm.current_limit",

@@ -85,7 +85,7 @@ class AxisMap:
 
 IDENTITY: Final = AxisMap((0, 1, 2), (1, 1, 1))
 Y_UP: Final = AxisMap.of(("x", "z", "-y"))
-"""The map of a stream with y up to a world with z up (Motive's other setting)."""
+"""Axis map of a stream with y up, Motive's other setting, to a world with z up."""
 ALL: Final = tuple(
     AxisMap((i, j, k), (a, b, c))
     for i, j, k in itertools.permutations(range(3))

@@ -99,9 +99,9 @@ NOISE_GOOD_MM, NOISE_MAX_MM, JUMP_MAX_MM = 2.0, 10.0, 30.0
 NOISE_GOOD_DEG, NOISE_MAX_DEG, JUMP_MAX_DEG = 0.3, 2.0, 10.0
 """Limits of the standard deviation of all axes together, and of a single frame's deviation."""
 MOVED_MAX_M, MOVED_MAX_DEG = 0.01, 2.0
-"""Largest motion between the first and the last quarter."""
+"""Largest motion between the first and the last quarter of the observation."""
 RATE_MAX_DEG_S: Final = 3.0
-"""Largest mean of the gyro at rest."""
+"""Largest mean gyro rate at rest."""
 _EXPLAINED_DEG: Final = 10.0
 _UP: Vec3 = (0.0, 0.0, 1.0)
 _RESET = "place the vehicle level with its nose along the stream's +x and reset the rigid body's orientation in Motive"

@@ -22,7 +22,7 @@ from companion.recorder.viewer_channels import ViewerChannels, timestamp
 
 _LEVELS = {"info": LogLevel.Info, "warning": LogLevel.Warning, "critical": LogLevel.Error}
 _STAMP_MAX_NS = 2**32 * 1_000_000_000 - 1
-"""The seconds of a header's time stamp have 32 bits."""
+"""Largest time stamp of a header, whose seconds have 32 bits."""
 
 
 class LogWriter:

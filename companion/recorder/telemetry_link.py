@@ -34,7 +34,7 @@ ANSWER_S = 4.0
 COMMAND_PACKET_MAX_BYTES = 16_384
 """Maximum Packet Size given to the broker: sixteen times a command, so that a somewhat oversized command is received and reported."""
 SEND_BUFFER_BYTES = 65_536
-"""Maximum number of unsent stream messages, about one second; if a slow broker takes longer, the data is stale."""
+"""Size of the socket's send buffer: about one second of the stream. Data that a slow broker accepts later is stale."""
 PAUSE_MIN_S, PAUSE_MAX_S = 0.2, 2.0
 """Pause between two connection attempts."""
 END_TIMEOUT_S = 1.0

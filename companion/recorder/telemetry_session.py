@@ -36,7 +36,7 @@ from companion.model.types import Outcome
 SILENT_S = 0.5
 """Time without a tick after which the vehicle is reported as silent."""
 STATE_PERIOD_S = 2.0
-"""Period at which the retained state is published again, which replaces any state from another client or an old last will."""
+"""Period at which the retained state is published again, to replace a state from another client or an old last will."""
 REFUSAL_PERIOD_S = 1.0
 """Period in which refused commands with the same reason are reported only once."""
 WARNING, INFO = "warning", "info"

@@ -23,7 +23,7 @@ _PACKAGES = (
     "mujoco",
 )
 REVISION_FILE = "revision"
-"""File beside the packages of a compiled build: the commit that it was built from."""
+"""File beside the packages of a compiled build that names the commit from which it was built."""
 
 
 def versions() -> dict[str, str]:

@@ -55,7 +55,7 @@ PERIOD_S = 0.02
 SCENE_PERIOD_S = 0.05
 PATH_PERIOD_S = 2.0
 _EARLY_S = 0.0025
-"""A message may be sent this much (half a tick) before it is due."""
+"""Time by which a message may be sent before it is due: half a tick."""
 _LIFETIME = Duration(0, 500_000_000)
 """Lifetime of moving entities: they disappear half a second after their last update."""
 _FRESH_S = 0.1

@@ -106,7 +106,7 @@ def test_a_name_that_px4_does_not_have_is_not_all_written(tmp_path: Path, capsys
     port = free_udp_port()
     with Px4Peer(port) as peer:
         assert params(port, "--write", str(path), "--backup", str(tmp_path / "old.params")) == EXIT_REFUSED
-        assert "NO_SUCH_ONE       PX4 does not have it" in capsys.readouterr().out
+        assert "NO_SUCH_ONE       PX4 does not have this parameter" in capsys.readouterr().out
         assert peer.params["COM_RC_IN_MODE"] == 3
 
 

@@ -31,7 +31,7 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "lead off": ("controller.feedforward_lead_s=0",),
     "arm inertia and friction off": ("controller.arm_inertia_nominal=false", "controller.arm_friction_share=0"),
 }
-"""Overrides of each ablation of `ABLATED`. The attitude rows stay masked: PX4 closes that loop."""
+"""Overrides of each ablation of `ABLATED`. The attitude rows remain masked, because PX4 closes that loop."""
 
 
 def is_ablation(preset: str) -> bool:

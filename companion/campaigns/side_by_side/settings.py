@@ -209,7 +209,7 @@ def _without_world(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
-    """Return values by dotted key; a list of plain values is one value."""
+    """Return the values of nested data by dotted key; a list of plain values counts as one value."""
     if isinstance(tree, dict) and tree:
         parts = [(f"{prefix}.{key}" if prefix else key, value) for key, value in tree.items()]
     elif isinstance(tree, list) and any(isinstance(value, dict) for value in tree):

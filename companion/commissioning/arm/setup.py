@@ -94,7 +94,7 @@ def plan(found: Scan, arm: Arm, device: ArmDevice, joint: int | None = None) -> 
     strange = [servo for servo in found.servos if not servo.is_xm430]
     if strange:
         servo = strange[0]
-        text = f"servo {servo.servo_id} at {servo.baud} baud is not an answering XM430-W210 (model {servo.model})"
+        text = f"servo {servo.servo_id} at {servo.baud} baud: expected a readable XM430-W210, found model {servo.model}"
         return SetupPlan(refusal=f"{text}; remove it from the bus, or cycle its power")
     if not found.servos:
         return SetupPlan(refusal="no servo answers at any baud rate; check their power and the plugs of the cable")

@@ -21,9 +21,9 @@ STILL_DEG: Final = 1.5
 BEGUN_DEG: Final = 5.0
 """Motion that begins a step."""
 NEAR_SHARE: Final = 0.35
-"""Largest error of an exact turn, as a fraction of the turn."""
+"""Largest accepted error of an exact turn, as a fraction of the turn."""
 ALONE_SHARE: Final = 0.35
-"""Largest motion of the other joint, as a fraction of the turn."""
+"""Largest accepted motion of the other joint, as a fraction of the turn."""
 HAND_DEG: Final = 2.0
 """Accuracy of a link held level or plumb; a zero in the vehicle file is kept if its error is smaller."""
 DISAGREE_DEG: Final = 8.0

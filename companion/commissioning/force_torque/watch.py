@@ -26,7 +26,7 @@ _STILL_N: Final = 0.3
 """Largest difference between means over `_LOOK_S` once the weight has stopped swinging."""
 _CHANGE_MIN_N: Final = 0.5
 _CHANGE_SHARE: Final = 0.15
-"""Fraction of the weight at which it is detected; small enough for a sensor that reads too little."""
+"""Fraction of the weight that counts as the weight, low enough for a sensor that reads too little."""
 
 
 class FtSensor(RobotousForceTorque):

@@ -34,9 +34,9 @@ NOISE_FACTOR: Final = 7.0
 """Minimum ratio of a tap to the IMU's noise."""
 CORRELATION_MIN: Final = 0.5
 TAP_ERROR_MAX_S: Final = 0.004
-"""Largest standard error of one tap's delay."""
+"""Largest standard error of a usable tap's delay."""
 ERROR_MAX_S: Final = 0.0015
-"""Largest standard error of the result."""
+"""Largest accepted standard error of the result."""
 BEFORE_S, AFTER_S = 0.08, 0.16
 """Window around a tap in which motion capture is compared."""
 SETTLE_S: Final = 0.35

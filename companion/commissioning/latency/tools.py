@@ -41,7 +41,7 @@ _LOOK_S: Final = 0.5
 _WINDOW_S: Final = 3.0
 _HISTORY_POSES_MIN: Final = 50
 _DIGITS: Final = 1
-"""Decimals of a delay in ms."""
+"""Decimal places of a delay in ms."""
 
 DEVICES = Check("latency.devices", "PX4 and motion capture", why="both are needed for the comparison")
 TAPS = Check("latency.taps", "taps", why="the delay remains unknown")

@@ -65,7 +65,7 @@ LIMITS = {
     CommandName.RESUME: Limits(2.0, 1),
     CommandName.START: Limits(2.0, 1),
 }
-"""Each command name has its own rate limit: a flood of HOLDs does not block LAND."""
+"""Limits of each command name, kept separately: a flood of HOLDs does not block LAND."""
 
 
 class Reason(StrEnum):

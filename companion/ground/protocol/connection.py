@@ -24,7 +24,7 @@ from companion.ground.protocol.access import BrokerAccess
 KEEPALIVE_S = 5
 """Keep-alive: after 1.5 times this without a message the broker publishes the last will (MQTT 5, 3.1.2.10)."""
 OnMessage = Callable[[str, bytes, bool], None]
-"""Called in the event loop with topic, payload and retained flag; must not raise."""
+"""Callback for a message, called in the event loop with topic, payload and retained flag; must not raise."""
 _SSL_SOURCE = re.compile(r" \(_ssl\.c:\d+\)$")
 
 

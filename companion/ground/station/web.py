@@ -242,7 +242,7 @@ class Monitor:
 
 
 Listening = Callable[[Monitor], None]
-"""Called once, when the page can be opened."""
+"""Callback, called once when the page can be opened."""
 
 
 async def serve_live(

@@ -39,7 +39,7 @@ STAND_M, STAND_DEG = 0.004, 1.0
 MOVE_MAX_S: Final = 8.0
 """Longest motion that is evaluated, because the IMU's integration drifts."""
 SILENCE_MAX_S: Final = 3.0
-"""Longest time without a report from PX4 on whether it is armed."""
+"""Timeout for PX4's report on whether it is armed."""
 _PERIOD_S: Final = 0.05
 _POSES_MIN: Final = 10
 _SPARSE_S: Final = 0.12
