@@ -47,9 +47,9 @@ PATIENT: dict[str, object] = {
     "vehicle.devices.arm.watchdog_ms": 300,
     "vehicle.ground.mqtt": None,
 }
-"""Of every flight of the tests that does not set them itself. A shared machine, or one of its cores, is held up now and then, by more than the
-vehicle file allows; what these limits are for is tested where time is simulated, and the preflight has tests of its own. And no flight
-of a test speaks to whatever broker this computer may have.
+"""Of every flight of the tests that does not set them itself. A shared machine, or one of its cores, is held up now and then by more
+than the vehicle file allows; what these limits are for is tested where time is simulated, and the preflight has tests of its own. And
+no flight of a test speaks to whatever broker this computer may have.
 """
 
 LOW_HOVER: dict[str, object] = {
