@@ -146,13 +146,13 @@ def _instructions(folder: Path, users: BrokerUsers, ends: str) -> list[str]:
         ]
     for name in users.operators:
         lines += [
-            f"Operator {name}: copy {folder}/operators/{name} to the computer of {name}. In it:",
+            f"Operator {name}: copy {folder}/operators/{name} to the computer of {name}. In that folder run:",
             f"  companion monitor --broker {url} --login login.yaml --ca ca.pem --operator {name} --operators operators.yaml",
             "",
         ]
     for name in users.viewers:
         lines += [
-            f"Viewer {name}: copy {folder}/viewers/{name}. In it:",
+            f"Viewer {name}: copy {folder}/viewers/{name} to the viewer's computer. In that folder run:",
             f"  companion monitor --broker {url} --login login.yaml --ca ca.pem --view-only",
             "",
         ]

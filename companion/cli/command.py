@@ -109,7 +109,7 @@ class _Commander:
             self._end(EXIT_REFUSED, f"{vehicle}: {ack_text(ack)}")
 
     async def _found(self, station: Station) -> str | None:
-        """Return the vehicle to command; None if several are possible, which has been reported.
+        """Return the vehicle to command; None if there are several, which has then been reported.
 
         Retained messages arrive before the link reports that it is connected (`Station`, in_order): until then no vehicle is
         reported as missing.

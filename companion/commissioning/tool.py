@@ -34,7 +34,7 @@ WRITE_HELP: Final = "write the proposed change into the vehicle file; the old fi
 _T = TypeVar("_T")
 
 
-class GivenUp(Exception):
+class Cancelled(Exception):
     """The user ended the tool or answered no; the message states what was not done."""
 
 
@@ -150,7 +150,7 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
             print_error(error)
             return EXIT_REFUSED
         report = Report([tool.device.bad(str(error), "", "")], tool.no_data)
-    except GivenUp as end:
+    except Cancelled as end:
         print_error(f"companion {tool.name}: {end}")
         return EXIT_ABORTED
     patch = propose(arguments.vehicle, report.changes) if report.changes else None

@@ -16,7 +16,7 @@ def effect_of(command: OperatorCommand, before: Outputs | None, after: Outputs) 
     """Return the effect of a command.
 
     Args:
-        command: as in `Inputs.command`, or as it would have been if a landing had not been requested already.
+        command: the operator's command, even if an earlier request to land has taken its place in `Inputs.command`.
         before: outputs of the tick before the command; None if there was none.
         after: outputs of the tick with it.
     """

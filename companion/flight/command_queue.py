@@ -50,7 +50,7 @@ class Turn(NamedTuple):
     """Why the command is refused before it reaches the core; None if the core decides."""
 
 
-class GivenUp(Exception):
+class StartCancelled(Exception):
     """A landing was requested before the flight began."""
 
 
@@ -138,7 +138,7 @@ class Operator:
         """Return the result of `opening`, which is cancelled when a landing is requested.
 
         Raises:
-            GivenUp: a landing was requested first.
+            StartCancelled: a landing was requested first.
         """
         task = asyncio.ensure_future(opening)
         land = asyncio.ensure_future(self._land.wait())
@@ -149,7 +149,7 @@ class Operator:
             task.cancel()  # has no effect on a finished task
             await asyncio.wait((task, land))  # a device that is opening closes itself again within its own deadline
         if task.cancelled():
-            raise GivenUp
+            raise StartCancelled
         return task.result()
 
     def _listen(self) -> None:

@@ -21,7 +21,7 @@ from pathlib import Path
 from companion.config.loader import FlightConfig
 from companion.core.flight_core import FlightCore
 from companion.flight.command_effect import effect_of
-from companion.flight.command_queue import GivenUp, Operator
+from companion.flight.command_queue import Operator, StartCancelled
 from companion.flight.fallback_landing import land_without_core, unflown
 from companion.flight.heartbeat import FlightGuard
 from companion.flight.startup import Checked, Refused, check_before_flight, with_hover_thrust
@@ -281,7 +281,7 @@ async def fly(
     Raises:
         DeviceError: a device is missing or not as required; nothing was armed.
         Refused: the preflight refuses; nothing was armed.
-        GivenUp: a landing was requested before the first tick; nothing was armed.
+        StartCancelled: a landing was requested before the first tick; nothing was armed.
     """
     origin_s = time.monotonic()
     clock = flight_clock(origin_s)
@@ -359,7 +359,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--channel", type=int, required=True, help="socket to the launcher")
     parser.add_argument("--guardian", type=int, required=True, help="socket to the guardian")
-    parser.add_argument("--sitl", action="store_true", help="the devices are those of the simulated world")
+    parser.add_argument("--sitl", action="store_true", help="the devices are simulated")
     arguments = parser.parse_args(argv)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher handles Ctrl-C and requests a landing
     config = FlightConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
@@ -374,7 +374,7 @@ def main(argv: list[str] | None = None) -> int:
     except Refused as refused:
         ipc.send(channel, {"type": "refused", "lines": refused.lines})
         return EXIT_REFUSED
-    except GivenUp:
+    except StartCancelled:
         outcome = Outcome.ABORTED
         ipc.send(channel, {"type": "result", "outcome": outcome.value, "recorder": None})
     return EXIT_CODES[outcome]

@@ -196,7 +196,7 @@ class RecorderProcess:
         config_json: effective configuration, stored unchanged.
         epoch_offset_ns: wall clock (ns since 1970) when the flight clock was zero; see `epoch_offset_ns`.
         metadata: further key-value pairs of the log's `flight` metadata record (controller, mission, ...).
-        simulated: the devices are those of the simulated world; ground stations show that.
+        simulated: whether the devices are those of the simulated world, which ground stations show.
     """
 
     def __init__(self, process: subprocess.Popen[bytes], client: RecorderClient, path: Path) -> None:

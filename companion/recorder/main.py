@@ -164,7 +164,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--metadata", type=json.loads, default={}, help="metadata record `flight`: a JSON object of strings"
     )
-    parser.add_argument("--simulated", action="store_true", help="the devices are those of the simulated world")
+    parser.add_argument("--simulated", action="store_true", help="the devices are simulated")
     parser.add_argument("--chunk-bytes", type=int, default=2**19, help="largest size of an MCAP chunk")
     return parser.parse_args(argv)
 

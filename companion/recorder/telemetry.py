@@ -39,7 +39,7 @@ class TelemetryThread:
 
     Args:
         config_json: effective configuration of the flight.
-        simulated: the devices are those of the simulated world.
+        simulated: whether the devices are those of the simulated world.
         flight: connection to the flight process and to the log.
         recorder_state: returns the number of lost records, and why recording stopped; called from the thread.
     """
@@ -88,7 +88,9 @@ class TelemetryThread:
         self._ending = normally
 
     def join(self, within_s: float) -> bool:
-        """Wait until the last message is sent or no broker is connected; return False if that takes longer."""
+        """Wait up to `within_s` for the thread to end: when the last message is sent, or no broker is connected. Return whether it
+        ended.
+        """
         self._thread.join(within_s)
         return not self._thread.is_alive()
 

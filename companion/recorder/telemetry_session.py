@@ -72,7 +72,7 @@ class TelemetrySession:
     Args:
         config: effective configuration.
         session: random id of this flight.
-        simulated: the devices are those of the simulated world.
+        simulated: whether the devices are those of the simulated world.
         verifier: verifies commands; None if commands are not accepted.
         no_commands: why commands are not accepted.
     """

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from companion.flight.command_queue import WAITING_MAX, GivenUp, Operator, Turn
+from companion.flight.command_queue import WAITING_MAX, Operator, StartCancelled, Turn
 from companion.model.types import AutopilotRequest, GroundCommand, OperatorCommand, Outputs, PhaseKind, SafetyAction
 from companion.runtime import ipc
 from tests.support import DEADLINE_S
@@ -164,7 +164,7 @@ def test_the_launchers_landing_stays_and_commands_are_still_answered(
             else:
                 ipc.send(launcher, {"type": "land"})
             async with asyncio.timeout(DEADLINE_S):
-                with pytest.raises(GivenUp):
+                with pytest.raises(StartCancelled):
                     await operator.unless_land(never())
             operator.ask(asked(RESUME, START))
             return given(operator, 5)

@@ -159,7 +159,7 @@ class Robustness(Campaign):
 
 
 def world_key(override: str) -> str:
-    """Return `wind_m_s` for `world.wind_m_s[0]=1`; empty for another section."""
+    """Return the world's key that an override sets, such as `wind_m_s` for `world.wind_m_s[0]=1`; empty for any other section."""
     section, _, key = override.partition("=")[0].strip().partition(".")
     return key.partition("[")[0].partition(".")[0] if section == "world" else ""
 

@@ -178,7 +178,7 @@ def worse_than(row: Row, kept: Kept) -> str | None:
     """Return what is worse than the recorded results, or None."""
     outcome, why = row["outcome"], row["why"] or row["error"] or "no event gives a reason"
     if outcome != kept.outcome.value and outcome != Outcome.COMPLETED.value:
-        return f"{outcome} ({why}), kept as {kept.outcome.value}"
+        return f"{outcome} ({why}), recorded as {kept.outcome.value}"
     if outcome not in SAFE:
         return f"{outcome} ({why})"
     if kept.caught and not row["caught"]:

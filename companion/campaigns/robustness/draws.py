@@ -35,7 +35,7 @@ DRIVERS: dict[str, str] = {
     "rotor_lag_s": "rotor time constant, s",
     "wind_speed_m_s": "wind, m/s",
     "force_bias_n": "bias of the force sensor, N",
-    "force_lost_s": "force sensor lost at, s",
+    "force_lost_s": "time of the force sensor's loss, s",
 }
 """The drawn quantities as single numbers, each with its label."""
 

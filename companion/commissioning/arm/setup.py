@@ -17,7 +17,7 @@ from companion.commissioning.arm import bus
 from companion.commissioning.arm.bus import ServoTalk
 from companion.commissioning.arm.scan import scan, scan_for
 from companion.commissioning.arm.servo import FoundServo, Scan, Setting, assign, baud_text, settings
-from companion.commissioning.tool import GivenUp, Report, Session
+from companion.commissioning.tool import Cancelled, Report, Session
 from companion.config.vehicle import Arm, ArmDevice, Vehicle
 from companion.io.dynamixel import registers as dxl
 from companion.io.protocols import DeviceError
@@ -179,7 +179,7 @@ def set_up(session: Session) -> Done:
 
     Raises:
         DeviceError: a servo no longer answers; scan again.
-        GivenUp: the user declined to write.
+        Cancelled: the user declined to write.
     """
     joint, arguments = session.arguments.joint, session.arguments
     session.say("setup: torque stays off; the changes are shown before they are written", "bold")
@@ -195,7 +195,7 @@ def set_up(session: Session) -> Done:
     ):
         session.say(f"connect {which}, then press Enter", "bold")
         if not sys.stdin.readline():
-            raise GivenUp("ended before both servos were set up")
+            raise Cancelled("ended before both servos were set up")
         done = _set_up(session, _plan(session, joint))
         if not done.right:
             break
@@ -222,7 +222,7 @@ def _set_up(session: Session, wanted: SetupPlan) -> Done:
     if answer is None:
         return Done(wanted, "not written", ("nothing was written; --yes writes without asking",), right=False)
     if not answer:
-        raise GivenUp("nothing was written")
+        raise Cancelled("nothing was written")
     carry_out(vehicle.devices.arm.port, needed, lambda text: session.say(f"  {text}"))
     session.say("reading back")
     lines = _left(vehicle, wanted)

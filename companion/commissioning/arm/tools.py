@@ -18,7 +18,7 @@ from companion.commissioning.arm.servo import Scan
 from companion.commissioning.arm.sweep import Leg, Sample, Sweeper, duration_s, legs_of
 from companion.commissioning.arm.zero import ZeroGuide, ZeroResult
 from companion.commissioning.arm.zero_session import hold
-from companion.commissioning.tool import ARM, GivenUp, Report, Session, Tool
+from companion.commissioning.tool import ARM, Cancelled, Report, Session, Tool
 from companion.config.document import ConfigError
 from companion.config.vehicle import Vehicle
 from companion.model.check_row import Level
@@ -103,7 +103,7 @@ async def _drive(session: Session, leader: Leader, what: str) -> Driven:
     if answer is None:
         raise ConfigError([f"companion arm {part}: there is no terminal to ask whether the arm may move; add --yes"])
     if not answer:
-        raise GivenUp("the arm was not moved")
+        raise Cancelled("the arm was not moved")
     with Bars(session.console, _NAMES) as bars:
         return await drive(session.vehicle, leader, bars)
 

@@ -74,7 +74,7 @@ class ZeroResult:
 
 @dataclass(frozen=True, slots=True)
 class ZeroView:
-    """The state of the guide, for display."""
+    """State of the guided measurement, for display."""
 
     step: Step | None
     """The step under way; None at the end."""

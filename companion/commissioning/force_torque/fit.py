@@ -36,7 +36,7 @@ POSE = Check(
 SCALE_TOLERANCE: Final = 0.05
 DIRECTION_MAX_DEG: Final = 8.0
 EXPLAINED_MAX_DEG: Final = 20.0
-"""Largest remaining angle at which a right-angle turn counts as the explanation of a direction."""
+"""Largest remaining angle at which a right-angle turn is accepted as the explanation of a direction."""
 APART_MIN_DEG: Final = 12.0
 """Smallest difference in angle between the best and the next explanation."""
 

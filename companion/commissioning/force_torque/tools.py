@@ -13,7 +13,7 @@ import msgspec
 
 from companion.commissioning.force_torque import fit as ft_fit
 from companion.commissioning.force_torque.watch import FtSensor, arm_angles, pose_rad, until_loaded
-from companion.commissioning.tool import SENSORS, GivenUp, Report, Session, Tool
+from companion.commissioning.tool import SENSORS, Cancelled, Report, Session, Tool
 from companion.config.vehicle import Vehicle
 from companion.io.dynamixel.registers import usb_latency_ms
 from companion.io.protocols import DeviceError
@@ -138,8 +138,8 @@ def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
     samples = seen.empty
     duration_s = samples[-1].stamp_s - samples[0].stamp_s
     bias_fix = (
-        "free the net; if it is free, correct tool.net_mass_kg or loosen the sensor's mount; set the sensor's own zero to the "
-        "remaining force with companion ft tare --sensor"
+        "free the net; if it is free, correct tool.net_mass_kg or loosen the sensor's mount, then remove the remaining force "
+        "with companion ft tare --sensor"
     )
     return [
         *(
@@ -172,7 +172,7 @@ async def watch_drift(session: Session) -> Tared:
         (arguments.clear, "clear the sensor's own zero?"),
     ):
         if wanted and not session.confirm(question):
-            raise GivenUp("nothing was written to the sensor")
+            raise Cancelled("nothing was written to the sensor")
     clock, device = flight_clock(), vehicle.devices.force
     async with FtSensor(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
         if arguments.clear:

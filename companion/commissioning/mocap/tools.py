@@ -13,7 +13,7 @@ from companion.commissioning.mocap import align as mocap_align
 from companion.commissioning.mocap import judge as mocap_judge
 from companion.commissioning.mocap.judge import FrameSeen, Watched
 from companion.commissioning.mocap.watch import discover, path_to, watcher
-from companion.commissioning.tool import SENSORS, GivenUp, Report, Session, Tool
+from companion.commissioning.tool import SENSORS, Cancelled, Report, Session, Tool
 from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.loader import load_flight
@@ -122,7 +122,7 @@ class Carried:
     start: Start
 
 
-async def carry(session: Session) -> Carried:
+async def guide_hand_test(session: Session) -> Carried:
     """Guide the user through the hand test, with poses forwarded to PX4."""
     from companion.io.devices import AvailableDevices, VisionFilter  # imports MAVSDK
     from companion.io.mocap.driver import NatNetMocap
@@ -149,7 +149,7 @@ async def carry(session: Session) -> Carried:
     except DeviceError as error:
         outcome = str(error)
     if outcome == ENDED_BY_HAND:
-        raise GivenUp("cancelled; nothing was changed")
+        raise Cancelled("cancelled; nothing was changed")
     return Carried(outcome, config.mission.start)
 
 
@@ -167,5 +167,5 @@ def judge_axes(carried: Carried, vehicle: Vehicle) -> Report:
 
 TOOLS: Final[Mapping[str, Tool[Any]]] = {
     "check": Tool("mocap check", SENSORS, watch, judge),
-    "align": Tool("mocap align", SENSORS, carry, judge_axes),
+    "align": Tool("mocap align", SENSORS, guide_hand_test, judge_axes),
 }

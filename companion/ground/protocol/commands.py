@@ -33,7 +33,7 @@ from companion.model.codec import RecordError, from_jsonable
 DOMAIN = "companion command 2"
 """First line of every signed text; it makes a signature for any other purpose invalid for commands."""
 AHEAD_MAX_S = 0.5
-"""Largest lead of a command's time over the vehicle's clock."""
+"""Largest time by which a command may be ahead of the vehicle's clock."""
 REFUSED_MAX = 512
 """Maximum number of nonces of refused commands kept per operator and command name; after that, a range of times is kept
 (`_History.add_refused`).
