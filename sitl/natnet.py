@@ -90,7 +90,6 @@ class NatNetServer:
         self.dropped = 0
         """Number of datagrams that could not be sent."""
         self.requests = 0
-        """Number of datagrams received from clients."""
         self._ports = (command_port, data_port)
         self._command: socket.socket | None = None
         self._data: socket.socket | None = None

@@ -46,7 +46,6 @@ class LoadAdaptation:
         self.moments_kg_m: Vec2 = (0.0, 0.0)
         """Estimated first moments of the links about their joints, in addition to the nominal ones."""
         self.friction_nm: Vec2 = (0.0, 0.0)
-        """Estimated dry friction of the joints."""
         self._levers: Vec2 = (0.0, 0.0)
         self._turning: Vec2 = (0.0, 0.0)
         self._wanted_rate_rad_s: Vec2 = (0.0, 0.0)

@@ -35,7 +35,6 @@ class Waiting:
     was_ready: bool = False
     """Whether everything has been ready once: a lost input may then return as long as the operator waits."""
     unready: str = "the inputs have not been checked yet"
-    """Why the vehicle is not ready."""
     looked_s: float = 0.0
     """Time of the last check of the estimate and the position."""
     settled: SettledEstimate = field(default_factory=SettledEstimate)
@@ -63,12 +62,10 @@ class FlightState:
     armed_by_others: bool = False
     """PX4 was armed without a request from the companion: no setpoint is sent."""
     arm_requested_s: float = -math.inf
-    """Time of the last request to arm."""
     zero_thrust: bool = False
     """The landing by PX4 needs level setpoints with zero thrust."""
     waiting: Waiting = Waiting()
     landing: AutopilotLanding | None = None
-    """Landing by PX4, once it has begun."""
 
     @property
     def pilot_flies(self) -> bool:
@@ -114,7 +111,6 @@ class Observation(Record, frozen=True):
     """The input of a transition in addition to state and events."""
 
     inputs: Inputs
-    """Validated inputs of this tick."""
     airborne: bool
     """The rotors may lift, or PX4 was found armed and flying."""
     armed_by_others: bool

@@ -145,7 +145,6 @@ class ForceTorque(Device, Protocol):
     """The force-torque sensor."""
 
     product_name: str
-    """Product name that the sensor reports."""
     firmware: str
     """Version of the sensor's firmware; empty if it does not report one."""
 

@@ -1,4 +1,4 @@
-"""Jerk-limited motion of the arm by ruckig: from rest to rest, both joints synchronised.
+"""Plans jerk-limited motion of the arm with Ruckig, from rest to rest and with both joints synchronised.
 
 Both joints follow the same normalised profile, so the arm moves on a straight line in joint space and the more limited joint sets the
 duration.

@@ -1,4 +1,4 @@
-"""Minimum-snap motion of the vehicle: the shortest duration of a straight line, and paths through several points without a stop.
+"""Plans minimum-snap motion of the vehicle: straight lines of the shortest duration, and paths through several points without a stop.
 
 Mellinger and Kumar 2011, Richter et al. 2016. A line from rest to rest is the septic `reference.minimum_snap`. A path is solved by
 minsnap-trajectories, which needs the time of every waypoint; this module finds those times.
@@ -61,7 +61,6 @@ class Route:
     """A path through points in normalised time, in which a piece takes 1 on average."""
 
     knots: tuple[float, ...]
-    """Time at each point, from 0."""
     pieces: tuple[tuple[Septic, Septic, Septic], ...]
     """Polynomials of x, y, z of each piece, m, in the time since its first knot."""
     least_scale_s: float

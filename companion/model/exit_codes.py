@@ -12,7 +12,6 @@ EXIT_REFUSED = 3
 EXIT_ABORTED = 4
 """The mission was aborted and the vehicle landed safely."""
 EXIT_LOST = 5
-"""The vehicle crashed or was lost."""
 EXIT_INTERNAL = 70
 """Exit code of the flight process only, never of `companion`: an internal error in the air; the guardian lands."""
 

@@ -110,7 +110,6 @@ class MocapStream(Record, frozen=True, kw_only=True):
     lost: int
     """Frames missing in the sequence of frame numbers."""
     application: str
-    """Name and version of the server."""
     other_bodies: tuple[int, ...] = ()
     """Ids of the other rigid bodies in the stream."""
     body_name: str = ""
@@ -170,7 +169,6 @@ class Observations(Record, frozen=True, kw_only=True):
     arm_reads: tuple[int, int] | None = None
     """Number of bus cycles, and of cycles without an answer."""
     mission_s: float | None = None
-    """Duration of the planned mission."""
     plan: tuple[str, ...] | None = None
     """Reasons why the mission cannot be flown, one line each; None if this was already checked."""
     recorder: str | None = None

@@ -22,7 +22,6 @@ class LogLine(Record, frozen=True, kw_only=True, tag=True):
     number: int | None = None
     """As in `Tick`; None from processes other than the flight process, which do not count packets."""
     t_s: float
-    """Flight clock."""
     severity: Severity
     source: str
     text: str

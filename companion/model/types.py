@@ -287,7 +287,6 @@ class ControlLog(Record, frozen=True, kw_only=True):
     moment_estimate_kg_m: Vec2 | None = None
     """Adapted first moments of link 1 and 2 about their joints, in addition to the nominal ones."""
     friction_estimate_nm: Vec2 | None = None
-    """Adapted dry friction of both joints."""
 
 
 class TetherState(Record, frozen=True, kw_only=True):

@@ -22,7 +22,6 @@ _HOVER_OFF_MAX = 0.35
 _ROOM_MARGIN_M = 0.3
 _FAILURE_MARGIN_DEG = 10.0
 _RELATIVE = 1e-6
-"""Relative tolerance for comparing a REAL32."""
 
 Value = float | int
 Limits = Callable[[Vehicle], tuple[float, float]]

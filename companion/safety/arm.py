@@ -36,7 +36,6 @@ class ArmTracker:
         self._age = Age()
         self._newest: ArmState | None = None
         self.arm: ArmState | None = None
-        """Joint state of this tick."""
         self.before: ArmState | None = None
         """Previous joint state; None if this tick has no new one."""
         self.age_s = 0.0
@@ -151,7 +150,6 @@ class ForceTracker:
         self._same_since_s: float | None = None
         self._moved = False
         self.force: ForceSample | None = None
-        """Sample of this tick."""
         self.age_s = 0.0
         self.stuck = False
         """Whether samples repeat themselves although the vehicle moves."""

@@ -59,7 +59,6 @@ class LandingStep:
 
     request: AutopilotRequest
     zero_thrust: bool
-    """Whether to send a level, zero-thrust setpoint."""
     ended: bool
     """Whether the vehicle is disarmed on the ground, or nothing more can be done."""
     landed: bool

@@ -122,10 +122,8 @@ class Governor:
     def __init__(self, vehicle: Vehicle, limits: Limits) -> None:
         self._set = SafeSet(vehicle)
         self.stop_deceleration_m_s2 = vehicle.tether.stop_deceleration_m_s2
-        """Deceleration of braking."""
         self._stop = StopModel(vehicle.tether)
         self.acceleration_max_m_s2 = max(limits.acceleration_max_m_s2, self.stop_deceleration_m_s2)
-        """Largest acceleration of the governed reference."""
         self.speed_max_m_s = max(limits.speed_max_m_s, vehicle.safety.land_speed_m_s)
         self._half_per_a = 0.5 / self.stop_deceleration_m_s2
         self._p: Vec3 | None = None

@@ -73,7 +73,6 @@ class MocapTracker:
         self._window_awake_s: float | None = None
         self._window_frames = 0
         self.pose: MocapPose | None = None
-        """Pose of this tick."""
         self.frame: MocapPose | None = None
         """The newest frame, valid or not."""
         self.frame_age_s = self.trusted_age_s = math.inf

@@ -16,7 +16,6 @@ class ProcessTracker:
         self.command = OperatorCommand.NONE
         """The command that begins in this tick; one that lasts for several ticks counts once."""
         self.gap_s = 0.0
-        """Time since the previous tick."""
         self.recorder_dropped = 0
         self.guardian_ready: bool | None = None
 

@@ -112,7 +112,7 @@ def estimate_frozen(p: Px4Tracker, _: None) -> Values | None:
 
 
 def vehicle_state_lost(p: Px4Tracker, timeout_s: float) -> Values | None:
-    """Position, attitude or IMU sample is older than the timeout."""
+    """PX4's position, attitude or IMU sample is older than the timeout."""
     return (timeout_s,) if p.state_age_s > timeout_s else None
 
 

@@ -105,7 +105,6 @@ class RotorStop:
     flipped_since_s: float | None = None
     tipped_since_s: float | None = None
     may_disarm: bool = False
-    """Whether DISARM may be requested now."""
     may_force: bool = False
     """Whether FORCE_DISARM of a vehicle on the ground may be requested now."""
     flipped: bool = False

@@ -42,7 +42,6 @@ class Rule:
     id: str
     subject: Subject
     what: str
-    """Description of the condition."""
     predicate: Callable[[Any, Any], Values | None]
     """Pure function of the subject's tracker and the thresholds (see `thresholds_of`). It returns the values for the message if the
     condition holds in this tick, else None.

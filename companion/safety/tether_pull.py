@@ -25,7 +25,6 @@ RELEASE = 0.6
 SIDEWAYS_N = 6.0
 """A horizontal residual of this size in any direction means that something other than the anchor holds the vehicle."""
 _FLAT, _STEEP = 1.0 / HORIZONTAL_N**2, 1.0 / VERTICAL_N**2
-"""Weights of the fit."""
 GROWTH_S = 0.3
 GROWTH_N_PER_M = 10.0
 """Slope of the pull over the range at which the line counts as tightening."""

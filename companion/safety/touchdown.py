@@ -100,7 +100,6 @@ class Touchdown:
     relief: float = 1.0
     """Fraction of its thrust that the controller may command."""
     certain: bool = False
-    """Whether touchdown is certain."""
 
     @classmethod
     def begin(cls, clearance_m: float) -> Touchdown:

@@ -141,7 +141,6 @@ class Px4Stub:
         self.refuses_offboard = False
         """Fault: PX4 leaves OFFBOARD and refuses to enter it."""
         self.refuses_arming = False
-        """Fault: PX4 refuses to arm."""
         self.booted_at_s = 0.0
         """World time of the last boot, at which PX4's own clock is zero and before which PX4 does not run."""
         self.clock_ahead_s = 0.0

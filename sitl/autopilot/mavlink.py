@@ -59,7 +59,6 @@ class Link(UdpEndpoint):
         self.schedule = Schedule(ground)
         self.down = False
         self.delay_s = 0.0
-        """Fault: delay in each direction."""
         self.messages_in = 0
         self._stub = stub
         self._receiver = receiver

@@ -26,7 +26,6 @@ class Flown:
     """A fast flight that has ended, perhaps by an exception."""
 
     config: SitlConfig
-    """Configuration of the flight."""
     fast: FastFlight | None
     """Result of the flight; None if an exception ended it."""
     result: FastResult
@@ -70,7 +69,7 @@ def fly_to_end(config: SitlConfig, limit_s: float = 90.0) -> Flown:
 def row_of(
     config: FlightConfig, result: FastResult, caught_t_s: float | None, error: str | None = None
 ) -> tuple[Data, FlightLog]:
-    """Grade a flight: return its row (see `companion.campaigns.compare.aggregate`) without the flight's identification, and its log.
+    """Return a flight's row of graded results (see `companion.campaigns.compare.aggregate`), without its identification, and its log.
 
     Args:
         config: configuration of the flight.

@@ -65,7 +65,6 @@ _NO_REQUEST = AutopilotRequest.NONE
 SETTLE_S = 30.0
 """Longest time for which the world continues after a flight that ends while armed."""
 FLIGHT_PROCESS_FAULTS: frozenset[FaultKind] = frozenset({"stall_loop", "hold_gil", "stop_flight", "kill_flight"})
-"""Faults that stop the flight process."""
 _MODES = {NavState.OFFBOARD: FlightMode.OFFBOARD, NavState.LAND: FlightMode.LAND, NavState.LOITER: FlightMode.HOLD}
 _OFFBOARD_MODE: Command7 = (1.0, 6.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _NOTHING: Command7 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -124,7 +123,7 @@ class _RecordedImu:
         self.total = DeltaVelocity()
 
     def step(self, imu: ImuSample) -> Vec4:
-        """Step PX4 by one IMU sample and add it to `total`, which restarts when PX4 reboots."""
+        """Step PX4 by one IMU sample and add it to `total`, which starts again when PX4 reboots."""
         rotors = self._px4.step(imu)
         boot_s = imu.t_s - self._px4.booted_at_s
         if boot_s >= 0.0 and self._px4.imu is not None:

@@ -89,7 +89,6 @@ class Faults:
         self._tether_m = world.tether_length_m
         self._chance = np.random.default_rng([config.seed, len(config.faults)])
         self.active: dict[FaultKind, Fault] = {}
-        """Active fault of each kind."""
         self.begun_s: float | None = None
         """World time at which the first fault began, or None."""
         self.sag_v = 0.0

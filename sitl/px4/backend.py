@@ -34,7 +34,6 @@ END_DEADLINE_S = 6.0
 BY_HAND_DEADLINE_S = 10.0
 """Deadline for a PX4 that was started by hand; it tries to connect twice per millisecond."""
 USER_DEADLINE_S = 300.0
-"""Deadline for the user to restart PX4."""
 SAMPLE_S = 0.004
 BATTERY_PERIOD_S = 0.1
 STUB_ONLY_FAULTS: Mapping[FaultKind, str] = {

@@ -21,7 +21,6 @@ class Relay:
     def __init__(self, instance: Instance) -> None:
         self.down = False
         self.delay_s = 0.0
-        """Delay in each direction."""
         self.datagrams = 0
         """Datagrams received from both sides."""
         self._instance = instance

@@ -53,7 +53,6 @@ class ServoDrive:
         self._current = 0.0
         """Present current in counts, unrounded, if there is a time constant."""
         self.now_s = 0.0
-        """Time of the last `update`."""
         self.angle_rad = shaft_angle_rad
         self.velocity_rad_s = 0.0
         self.slip_counts = 0

@@ -78,7 +78,6 @@ class ServoModel:
         self._set(reg.BAUD, reg.BAUDS.index(baud_bps))
         self._set(reg.FIRMWARE, firmware)
         self.drive = ServoDrive(shaft_angle_rad)
-        """The motor."""
         self.lights = 0
         """Number of times that the LED has been switched on."""
         self._shutdown = False

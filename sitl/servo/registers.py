@@ -170,7 +170,6 @@ REGISTERS = _PLAIN + _INDIRECT_ADDRESSES
 REGISTER_AT: dict[int, Register] = {
     register.address + i: register for register in REGISTERS for i in range(register.size)
 }
-"""Register at each byte address."""
 
 INDIRECT_POINTER: dict[int, int] = {
     data + i: first + 2 * i for first, data, count in INDIRECT_BLOCKS for i in range(count)

@@ -67,7 +67,6 @@ _TAPS_WORLD: Final[tuple[Vec3, ...]] = (
     (0.0, -0.8, 0.6),
     (-0.6, -0.6, 0.5),
 )
-"""Directions of successive taps."""
 
 
 class Wrench(NamedTuple):

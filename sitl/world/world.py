@@ -28,7 +28,6 @@ FALL_M_S = 2.5
 """Speed at which the legs break on the floor, that of a fall from 0.3 m. PX4 descends at 0.7 m/s at most."""
 _EFFECT_STEPS = round(EFFECT_PERIOD_S / PHYSICS_DT_S)
 SNAG_STIFFNESS_N_M, SNAG_DAMPING_NS_M = 400.0, 30.0
-"""Stiffness and damping of a snagged tether."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,11 +153,9 @@ class World:
         self.loads = Loads(d)
         self.payload = Payload(self, vehicle, config)
         self.effects = self._effects_on()
-        """Active effects that load bodies."""
         self._step = 0
         """Steps since the noise of the effects began."""
         self.t_s = 0.0
-        """World time."""
         self.q: list[float] = []
         self.v: list[float] = []
         """qpos and qvel after the last step; see `layout`."""

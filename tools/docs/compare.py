@@ -30,7 +30,6 @@ AS_PUBLISHED = ("paper", "paper_slow_leakage", "tuned")
 IN_PAPER = {"adaptive/paper": "proposed", "psc/tuned": "PSC", "csc/tuned": "CSC"}
 """Variants with figures in the paper, by the paper's name of the law."""
 ABLATION_KG = 0.2
-"""Payload of the table of ablations."""
 PICTURES = {
     "errors": ("extras", "Position error of every flight before and after the catch, by payload and law"),
     "model_error": ("model error", "Position error after the catch against model error, one panel per law"),

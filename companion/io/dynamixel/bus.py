@@ -70,7 +70,7 @@ class ArmBus:
                 "servos", self._ids, "answered individually but not to a sync read; check for a loose cable"
             )
         scales = tuple(
-            self._within_walls(joint, scale, block)
+            self._within_limits(joint, scale, block)
             for joint, scale, block in zip(self._joints, scales, blocks, strict=True)
         )
         for joint in self._joints:
@@ -213,7 +213,7 @@ class ArmBus:
         self._write(joint, dxl.BUS_WATCHDOG, self._watchdog)
         return scale
 
-    def _within_walls(self, joint: Joint, scale: JointScale, block: Block) -> JointScale:
+    def _within_limits(self, joint: Joint, scale: JointScale, block: Block) -> JointScale:
         zero_count = joint.zero_count + dxl.turn_offset_counts(joint, block.position_count)
         scale = JointScale(scale.sign, zero_count, scale.torque_nm_per_count, scale.current_max_counts)
         angle_deg = scale.angle_rad(block.position_count) * 360.0 / (dxl.COUNTS_PER_TURN * dxl.RAD_PER_COUNT)

@@ -132,7 +132,6 @@ class PacketScanner:
         self._tail = b""
         self.packets = 0
         self.skipped_bytes = 0
-        """Bytes that belong to no packet."""
         self.bad_sums = 0
         """Candidates framed by SOP and EOP whose checksum is wrong."""
 

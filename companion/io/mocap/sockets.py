@@ -21,7 +21,6 @@ class Datagram(NamedTuple):
 
     data: bytes
     ancillary: list[tuple[int, int, bytes]]
-    """Ancillary data for `companion.io.arrival.arrived_s`."""
     sender_ip: str
 
 

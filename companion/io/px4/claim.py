@@ -131,11 +131,11 @@ class LinkClaim:
             raise device_error(self._address, "MAVSDK's socket in /proc", found, "mount /proc") from None
 
     def refuse_rivals(self) -> None:
-        """Check what other senders have sent so far. If PX4 was found armed it may be in the air; then do nothing, and `take_rival`
-        handles other senders.
+        """Reject a second sender that has claimed to be PX4. If PX4 was found armed, and so may be in the air, `take_rival` handles
+        such senders instead.
 
         Raises:
-            DeviceError: one of them claims to be PX4, which was found disarmed.
+            DeviceError: there is such a sender, and PX4 was found disarmed.
         """
         self._drain(silent=False)
         if self._rivals and not self._armed:

@@ -302,7 +302,7 @@ class MavsdkAutopilot:
     async def ensure_origin(self) -> bool:
         """Set PX4's global origin (`companion.io.px4.origin`) unless it has one or is armed. Return whether PX4 reports an origin.
 
-        PX4 reports one only while its position is valid, so False right after boot has no meaning.
+        PX4 reports one only while its position is valid, so False means nothing right after boot.
 
         Raises:
             DeviceError: PX4 does not answer, or sends no heartbeat.

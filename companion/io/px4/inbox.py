@@ -28,16 +28,13 @@ POSITION_RATE_HZ = 200.0
 ATTITUDE_RATE_HZ = 250.0
 """Requested rate of ATTITUDE_QUATERNION, which also carries the angular rates."""
 IMU_RATE_HZ = 250.0
-"""Requested rate of HIGHRES_IMU."""
 LANDED_RATE_HZ = 10.0
-"""Requested rate of EXTENDED_SYS_STATE."""
 ESTIMATOR_RATE_HZ = 5.0
-"""Requested rate of ESTIMATOR_STATUS."""
 
 
 class Inbox:
-    """Store written by MAVSDK's threads, one assignment each. A tuple is replaced as a whole, so a reader never sees a partial
-    update.
+    """Store for PX4's messages. MAVSDK's threads write it, one assignment per message. A tuple is replaced as a whole, so a reader
+    never sees a partial update.
     """
 
     def __init__(self, clock: Clock, requests: RequestQueue, after_heartbeat: Callable[[], None]) -> None:

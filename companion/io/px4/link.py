@@ -187,7 +187,6 @@ class UdpSocket:
 
     descriptor: int
     port: int
-    """Local port."""
 
 
 def udp_sockets() -> dict[int, UdpSocket]:

@@ -99,9 +99,7 @@ class UplinkFilter:
 
     def __init__(self, vehicle_system: int, *, while_armed: bool = False, console: bool = False) -> None:
         self.state = ArmedState(vehicle_system)
-        """Whether PX4 is armed."""
         self.refused: Counter[str] = Counter()
-        """Number of refused messages by reason."""
         self._vehicle_system = vehicle_system
         self._while_armed, self._console = while_armed, console
         self._systems: set[int] = set()

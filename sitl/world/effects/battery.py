@@ -39,7 +39,6 @@ class BatteryPack:
         self._start = start
         hover_w = config.electronics_w + config.power_w_n15 * weight_n * math.sqrt(weight_n / 4.0)
         self.hover_v = self._loaded_v(open_circuit_v(start), hover_w)
-        """Voltage in hover at the start."""
         self.capacity_as = hover_w / self._loaded_v(open_circuit_v(0.5), hover_w) * life_s
         """Charge of the full battery, A s: hover current at half charge times life."""
         self.restart()
@@ -54,7 +53,6 @@ class BatteryPack:
         self.drawn_as = 0.0
         """Charge drawn since arming, A s."""
         self.voltage_v = self._loaded_v(open_circuit_v(self._start), self._electronics_w)
-        """Voltage at the terminals."""
         self.current_a = self._electronics_w / self.voltage_v
 
     def _loaded_v(self, open_v: float, power_w: float) -> float:

@@ -32,7 +32,6 @@ class Hanging(NamedTuple):
     down_n: float
     """Vertical pull on the upper end."""
     on_floor_m: float
-    """Length that lies on the floor."""
 
 
 def hanging(level_m: float, height_m: float, length_m: float, weight_n_m: float) -> Hanging:
