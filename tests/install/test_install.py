@@ -214,7 +214,7 @@ def test_a_file_that_somebody_changed_is_not_overwritten(root: Path, capsys: pyt
         assert tree(root) == changed
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2
-    assert all(f"/{UNIT}: was changed after" in line for line in lines)
+    assert all(f"/{UNIT}: was modified after" in line for line in lines)
 
 
 def test_a_folder_that_others_use_by_now_is_kept(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
