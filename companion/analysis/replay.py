@@ -86,8 +86,8 @@ def check_replayable(log: FlightLog) -> str:
         )
     if about.get("records") != fingerprint(Inputs, Outputs, Sent):
         raise LogError(
-            f"{log.path}: its records have different fields from this version's; it was written by "
-            f"{writer(log.metadata)}, replay it with that version"
+            f"{log.path}: the fields of its records differ from those of this version; it was written by "
+            f"{writer(log.metadata)}; replay it with that version"
         )
     config_json = log.config_json
     if config_json is None:

@@ -49,8 +49,8 @@ def add_parser(commands: Any) -> None:
     add_tool(
         parts, "friction", _TOOLS,
         help="measure torque constant and friction of both joints",
-        description="Sweep each joint slowly in both directions about the hanging pose, and fit torque constant, dry and "
-        "viscous friction against gravity. The arm must hang freely.",
+        description="Sweep each joint slowly in both directions about the hanging pose, and fit its torque constant and "
+        "its dry and viscous friction, with gravity as the reference torque. The arm must hang freely.",
     )  # fmt: skip
 
 

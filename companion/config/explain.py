@@ -116,7 +116,7 @@ def _value_problem(
 
 
 def problem(rank: int, origin: Origin, at: Location, text: str) -> Problem:
-    """Return a problem of the value at a location; its text omits the key if the command-line option already names it."""
+    """Return a problem with the value at a location; its text omits the key if the command-line option already names it."""
     key = key_path(at)
     if not key or (not origin.line and origin.source.endswith(f".{key}")):
         return Problem(rank, origin, text)

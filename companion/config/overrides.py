@@ -111,7 +111,7 @@ def _make_way(document: Document, override: Override) -> None:
             if not isinstance(value, dict):
                 raise ConfigError(
                     [
-                        f"{override.origin}: {here} has no keys, it is {'a list' if isinstance(value, list) else 'a single value'}"
+                        f"{override.origin}: {here} has no keys; it is {'a list' if isinstance(value, list) else 'a single value'}"
                     ]
                 )
             if last:

@@ -231,7 +231,7 @@ class Safety(Model):
     mocap_rate_min_hz: Positive = 50.0
     """Rate of poses below which a warning is raised."""
     mocap_latency_warn_s: Positive = 0.05
-    """Time from mid-exposure to transmission on Motive's clock above which a warning is raised."""
+    """Time from mid-exposure to transmission, by Motive's clock, above which a warning is raised."""
     mocap_latency_max_s: Positive = 0.12
     """Latency above which PX4 lands: PX4 fuses a pose at its arrival minus EKF2_EV_DELAY, so at 1 m/s a pose that is 0.12 s late is
     0.11 m off, as far as `mocap_jump_m` allows."""
@@ -319,6 +319,7 @@ class Safety(Model):
     # Reactions
     guardian_timeout_s: Positive = 0.1
     """Time without a heartbeat from the flight process, with turning rotors, after which the guardian kills it, takes over and lands.
+    If the guardian takes over, this time is part of `tether.react_time_s`, which must grow with it.
     """
     hold_max_s: Positive = 20.0
     """Longest HOLD; then the vehicle lands."""

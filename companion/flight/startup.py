@@ -41,7 +41,7 @@ class Checked:
     rows: tuple[Row, ...]
 
     def log_to(self, recorder: RecorderClient) -> None:
-        """Send planned path and preflight to log and ground stations."""
+        """Send the planned path and the preflight to the log and the ground stations."""
         path = [[round(value, 4) for value in point] for point in path_of(self.plan)]
         recorder.metadata("plan", {"json": json.dumps(path), "mission_s": repr(self.plan.duration_s)})
         rows = [{"id": row.id, "level": "ok" if row.ok else row.level.value, "text": row.line()} for row in self.rows]
@@ -49,7 +49,7 @@ class Checked:
 
 
 def path_of(plan: Plan) -> list[Vec3]:
-    """Return planned positions, world frame, m, evenly spaced in time; at most `PATH_POINTS_MAX`."""
+    """Return `PATH_POINTS_MAX` planned positions, world frame, m, evenly spaced in time from the plan's start to its end."""
     steps = PATH_POINTS_MAX - 1
     return [plan.reference(plan.duration_s * step / steps).position_world_m for step in range(PATH_POINTS_MAX)]
 

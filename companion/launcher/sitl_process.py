@@ -113,7 +113,7 @@ class SitlProcess:
 
     @property
     def ended(self) -> bool:
-        """Whether the world has closed its end of the pipe; it has then exited or is about to."""
+        """Whether the world has closed its end of the pipe, which means that it has exited or is about to."""
         return self._lines.ended
 
     def _update(self, message: dict[str, Any]) -> None:

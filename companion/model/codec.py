@@ -47,7 +47,7 @@ def to_packet(record: Any) -> bytes:
     """Return the record as MessagePack.
 
     Raises:
-        ValueError, TypeError, OverflowError: a record cannot hold one of the values.
+        ValueError, TypeError, OverflowError: the record contains a value that a record may not hold.
     """
     try:
         return _PACKETS.encode(record)
@@ -68,10 +68,10 @@ def from_packet(cls: Any, packet: bytes) -> Any:
 
 
 def to_json(record: Any) -> bytes:
-    """Return the record as JSON text in UTF-8, without blanks, with its fields in their declared order.
+    """Return the record as compact JSON text in UTF-8, with its fields in declaration order.
 
     Raises:
-        ValueError, TypeError: a record cannot hold one of the values.
+        ValueError, TypeError: the record contains a value that a record may not hold.
     """
     try:
         text = _JSON.encode(record)

@@ -88,8 +88,8 @@ class TelemetryThread:
         self._ending = normally
 
     def join(self, within_s: float) -> bool:
-        """Wait up to `within_s` for the thread to end: when the last message is sent, or no broker is connected. Return whether it
-        ended.
+        """Wait up to `within_s` for the thread to end, which it does once the last message is sent or if no broker is connected.
+        Return whether it ended.
         """
         self._thread.join(within_s)
         return not self._thread.is_alive()

@@ -110,7 +110,9 @@ class Outbox:
             self.wake.set()
 
     def begin(self) -> None:
-        """Start a new connection: the broker may have lost everything."""
+        """Prepare for a new connection: queue every retained message again, because the broker may have lost it, and drop the pending
+        stream message.
+        """
         self.stream = None
         self.stream_available.clear()
         self.due = dict.fromkeys(sorted(self.kept, key=lambda topic: topic is not Topic.STATE))

@@ -1,4 +1,7 @@
-"""The arm's servos and the force sensor at its end: trackers of their state, and the predicates of their rules."""
+"""The arm's servos and the force sensor at its end: trackers of their state, and the predicates of their rules.
+
+The rows of these rules, with the actions and the texts for the operator, are in `companion.safety.rules`.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
 """Tracker and predicates of the vehicle in the air: tilt, tracking, thrust, speed, room and tether. Only the limited thrust is tracked
 over time.
+
+The rows of these rules, with the actions and the texts for the operator, are in `companion.safety.rules`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""Motion capture: decides which poses are trusted; the predicates of its rules.
+"""Motion capture: decides which poses are trusted, and has the predicates of its rules.
 
 A pose is trusted if it is near the one that PX4's velocity and rates predict. A pose that is not trusted counts as not received and is
 not passed on to PX4: an estimator that has fused another body's pose is useless for a landing. Thresholds are keys of `safety:` in the
-vehicle file (`companion.config.vehicle.Safety`); `companion.safety.rules` lists them per rule and contains the texts for the operator.
+vehicle file (`companion.config.vehicle.Safety`). The rows of these rules, with their thresholds, actions and the texts for the
+operator, are in `companion.safety.rules`.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ CALLED_OFF = Notice(
 )  # fmt: skip
 RESUME_REFUSED = Notice(
     "resume_refused", _WARNING, _NOMINAL,
-    "RESUME was commanded while the cause of the hold persists; the text names it",
+    "RESUME was commanded while the cause of the hold persisted; the text names the cause",
 )  # fmt: skip
 TAKEOFF = Notice("takeoff", _INFO, _NOMINAL, "the plan begins")
 CATCH = Notice("catch", _INFO, _NOMINAL, "a payload was caught")

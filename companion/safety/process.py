@@ -1,4 +1,7 @@
-"""Tracker of the companion's own processes and of the operator's commands, and the predicates of their rules."""
+"""Tracker of the companion's own processes and of the operator's commands, and the predicates of their rules.
+
+The rows of these rules, with the actions and the texts for the operator, are in `companion.safety.rules`.
+"""
 
 from __future__ import annotations
 

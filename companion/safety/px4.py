@@ -1,4 +1,7 @@
-"""Tracker of PX4's state, clock and status, and the predicates of its rules."""
+"""Tracker of PX4's state, clock and status, and the predicates of its rules.
+
+The rows of these rules, with the actions and the texts for the operator, are in `companion.safety.rules`.
+"""
 
 from __future__ import annotations
 

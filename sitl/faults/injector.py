@@ -1,5 +1,7 @@
 """Injects the faults of the simulated world: their schedule, and their effect on physics, sensors and PX4.
 
+The kinds of fault are in companion/sitl_config/faults.py (`FaultKind` and `KINDS`); a new kind begins there.
+
 The plant calls `Faults.step` in every step. `sitl.server` and the fast closed loop read faults of the link, the servo bus and the
 processes from `active`.
 """

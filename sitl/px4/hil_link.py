@@ -57,7 +57,8 @@ def field_frd_gauss(attitude_wxyz: Quat) -> Vec3:
 class HilSensors:
     """Builds the HIL_SENSOR messages of one flight.
 
-    PX4 does not boot without magnetometer and barometer, even if it does not fuse them, so both have plausible, noisy values.
+    PX4 does not boot without a magnetometer and a barometer, even if it does not fuse them, so both are given plausible, noisy
+    values.
     """
 
     def __init__(self, seed: int) -> None:

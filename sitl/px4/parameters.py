@@ -1,4 +1,6 @@
-"""Parameters that a real PX4 needs to fly the simulated vehicle: those of the world, and the user's overrides."""
+"""Parameters set on a real PX4 so that it can fly the simulated vehicle: those that the simulation requires, then the user's
+overrides.
+"""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ class Relay:
 
     @contextlib.asynccontextmanager
     async def opened(self) -> AsyncIterator[str]:
-        """Relay inside the context, and yield the address for the companion."""
+        """Relay while the context is open, and yield the address to which the companion connects."""
         loop = asyncio.get_running_loop()
         self._px4.other, self._companion.other = self._companion, self._px4
         await loop.create_datagram_endpoint(lambda: self._px4, local_addr=(HOST, self._instance.onboard_port))

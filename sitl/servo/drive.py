@@ -126,8 +126,8 @@ class ServoDrive:
         self._silent_until_s = self.now_s + self._watchdog_s
 
     def start_watchdog(self, period_s: float | None) -> None:
-        """Set and clear the watchdog (register 98): without an instruction for `period_s` the motor is switched off and the goal
-        current becomes 0. None disables it. The time counts from the last instruction, not from this call.
+        """Set the bus watchdog (register 98) and clear its trip: if no instruction arrives for `period_s`, the motor is switched off
+        and the goal current becomes 0. None disables it. The time is counted from the last instruction, not from this call.
         """
         self.watchdog_tripped = False
         self._watchdog_s = math.inf if period_s is None else period_s

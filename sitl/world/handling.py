@@ -163,7 +163,7 @@ class Handling:
 
 
 class HungWeight:
-    """A known weight that is hung on the net while the force sensor is read.
+    """A known weight that is hung on the net while the force sensor is being read.
 
     Args:
         config: `net_weight_kg`, `net_weight_t_s`.
@@ -178,7 +178,7 @@ class HungWeight:
 
         Args:
             t_s: world time.
-            read: whether the force sensor is read.
+            read: whether the force sensor is being read; the weight hangs on the net once reading has lasted `net_weight_t_s`.
         """
         if not read:
             self._read_since_s = None

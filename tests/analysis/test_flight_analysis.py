@@ -429,7 +429,8 @@ def test_a_log_from_before_a_field_that_may_be_none_opens_but_is_not_replayed(
     log = FlightLog.read(rewritten(flight.path, tmp_path / "older.mcap", same, "0" * 16))
     assert log.outputs == flight.outputs
     with pytest.raises(
-        LogError, match=r"^[^\n]*records have different fields from this version[^\n]*replay it with that version$"
+        LogError,
+        match=r"^[^\n]*the fields of its records differ from those of this version[^\n]*replay it with that version$",
     ):
         replay(log, lambda _: Recited(log.outputs))
 

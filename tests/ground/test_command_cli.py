@@ -83,7 +83,10 @@ async def test_an_unknown_operator_is_informed_that_the_vehicle_does_not_have_th
     async with played_vehicle(broker.port, OPERATORS) as vehicle:
         ended = await command(capsys, "start", broker, str(keys))
         assert ended.code == EXIT_REFUSED
-        assert "start: no message from rig is authenticated for anna: the vehicle does not have this key" in ended.err
+        assert (
+            "start: no message from rig could be verified with anna's key: the vehicle does not have that key"
+            in ended.err
+        )
         assert not vehicle.commands_heard
 
 

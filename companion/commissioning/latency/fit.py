@@ -192,8 +192,10 @@ def combine(taps: Sequence[TapDelay]) -> Delay | str:
 
 
 def mocap_noise(poses: Sequence[PoseAt]) -> tuple[float, float]:
-    """Return the noise of one axis (one sigma, m and rad) from third differences of at least 20 poses, on which motion has little
-    effect.
+    """Return the noise per axis (one sigma, m and rad), estimated from third differences, which motion hardly affects.
+
+    Args:
+        poses: at least 20 consecutive poses.
     """
     p = np.array([pose.position_m for pose in poses])
     turns = np.array(

@@ -38,14 +38,14 @@ def parse(payload: bytes) -> Any:
 def _int(text: str) -> int:
     value = int(text) if len(text) <= _NUMBER_CHARACTERS_MAX else math.inf
     if not -NUMBER_MAX <= value <= NUMBER_MAX:
-        raise StrictJsonError(f"a number is beyond {NUMBER_MAX:g}")
+        raise StrictJsonError(f"a number exceeds {NUMBER_MAX:g} in magnitude")
     return int(value)
 
 
 def _float(text: str) -> float:
     value = float(text)
     if not -NUMBER_MAX <= value <= NUMBER_MAX:
-        raise StrictJsonError(f"a number is beyond {NUMBER_MAX:g}")
+        raise StrictJsonError(f"a number exceeds {NUMBER_MAX:g} in magnitude")
     return value
 
 

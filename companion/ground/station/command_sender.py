@@ -209,8 +209,8 @@ class CommandSender:
             return None
         if known.stream is None:
             return f"no message from {vehicle} has arrived, so a command cannot be dated; {FALLBACK_ADVICE}"
-        text = "the vehicle does not have this key, or another program uses its name"
-        return f"no message from {vehicle} is authenticated for {self.operator}: {text}; {FALLBACK_ADVICE}"
+        text = "the vehicle does not have that key, or another program uses its name"
+        return f"no message from {vehicle} could be verified with {self.operator}'s key: {text}; {FALLBACK_ADVICE}"
 
 
 def _session(known: Vehicle | None) -> str | None:

@@ -162,7 +162,7 @@ class VehicleTracker:
         self.rejected_text = f"{topic!r:.80}: {type(error).__name__}: {str(error)!r:.80}"
 
     def present(self, now_s: float) -> list[str]:
-        """Return the names of vehicles that report a flight or whose stream arrives."""
+        """Return the names of the vehicles that report a flight or whose stream is arriving."""
         return sorted(
             name
             for name, known in self.vehicles.items()

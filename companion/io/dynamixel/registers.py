@@ -1,6 +1,6 @@
 """XM430-W210-T: control table, units, and the SDK's serial port adapted to a control loop. The SDK implements the protocol.
 
-Source: ROBOTIS e-manual, XM430-W210 control table. The supported baud rates are those of `companion.config.vehicle.ArmDevice.baud`.
+Source: ROBOTIS e-manual, XM430-W210 control table. The supported baud rates are those of `companion.config.vehicle.ServoBaud`.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Source: Robotous RFT series manual 1.8, section 3, and the vendor's packet definitions. 115200 8N1. A command has 11 bytes `55 | data 8
 | sum | AA`, a response 19 bytes `55 | data 16 | sum | AA`; sum is the sum of the data modulo 256, data byte 0 is the command id. Fx..Tz
-are big-endian int16 in data bytes 1-12 (50 counts per N, 2000 counts per N m), data byte 13 holds overload bits. While streaming the
-sensor executes STOP and SET_BIAS only and answers neither.
+are big-endian int16 in data bytes 1-12 (50 counts per N, 2000 counts per N m), data byte 13 holds overload bits. While streaming, the
+sensor executes only STOP and SET_BIAS and answers neither.
 """
 
 from __future__ import annotations

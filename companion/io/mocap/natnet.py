@@ -181,7 +181,7 @@ def is_newer(number: int, last_number: int | None, silence_s: float) -> bool:
 
 
 def z_up_from_y_up(position_m: Vec3, quat_wxyz: Quat) -> tuple[Vec3, Quat]:
-    """Turn Motive's y-up axes (world and body alike) by +90 deg about x: (x, y, z) -> (x, -z, y)."""
+    """Rotate from Motive's y-up axes (world and body alike) to z-up, by +90 deg about x: (x, y, z) -> (x, -z, y)."""
     x, y, z = position_m
     qw, qx, qy, qz = quat_wxyz
     return (x, -z, y), (qw, qx, -qz, qy)

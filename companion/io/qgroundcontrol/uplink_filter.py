@@ -78,7 +78,7 @@ class ArmedState:
             self._disarmed_s = None if heard.armed else now_s
 
     def expect_arming(self, now_s: float) -> None:
-        """Report that the companion requests arming; the HEARTBEAT that shows it arrives up to a second later."""
+        """Note that the companion is requesting arming; the HEARTBEAT that confirms it arrives up to a second later."""
         self._arming_s = now_s
 
     def armed(self, now_s: float) -> bool:

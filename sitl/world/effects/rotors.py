@@ -116,7 +116,7 @@ class Rotors:
         return sum(curve(signal, thr_mdl_fac) for signal in signals) / 4.0
 
     def ground_effect(self, height_m: float) -> float:
-        """Return the factor on the thrust of all rotors at this height of the rotors above the floor."""
+        """Return the ground-effect factor by which the thrust of all rotors is multiplied when they are this high above the floor."""
         radius_m, diagonal_m = self._radius_m, self._diagonal_m
         z = max(height_m, LOWEST_RADII * radius_m)
         r2, b2, z4 = radius_m * radius_m, diagonal_m * diagonal_m, 4.0 * z * z

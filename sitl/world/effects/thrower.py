@@ -34,7 +34,7 @@ class Thrower:
         return cls(config, seed) if config.on else None
 
     def prediction_error_s(self) -> float:
-        """Draw the error of the time over which this throw extrapolates the vehicle's motion."""
+        """Draw the error of the lead time, s, over which the thrower extrapolates the vehicle's motion for this throw."""
         return self._config.prediction_error_s * float(self._rng.standard_normal())
 
     def release(self, point_m: Vec3, velocity_m_s: Vec3, flight_s: float) -> tuple[Vec3, Vec3]:
