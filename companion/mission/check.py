@@ -48,8 +48,8 @@ def check_mission(
         start_position_world_m: measured position of the body's origin; None for the mission's start, on the floor.
         start_yaw_rad: measured yaw; None for the mission's value.
         start_arm_rad: measured joint angles as in the paper; None for the mission's values.
-        phase_origins: file:line:col of each phase (`FlightConfig.sources.phases`). progress: called with the completed fraction of the
-        planning, 0 to 1, while paths are solved.
+        phase_origins: file:line:col of each phase (`FlightConfig.sources.phases`).
+        progress: called with the completed fraction of the planning, 0 to 1, while paths are solved.
     """
     start = mission.start
     position = start_position_world_m or (*start.position_m, vehicle.airframe.ground_clearance_m)

@@ -65,8 +65,8 @@ class Plan:
             vehicle: provides the height of the body's origin on the ground and the speed of the joints.
             start_position_world_m: measured position of the body's origin; None for the mission's start, on the floor.
             start_yaw_rad: measured yaw; None for the mission's value.
-            start_arm_rad: measured joint angles as in the paper; None for the mission's values. progress: called with the completed
-            fraction of the planning, 0 to 1, while paths are solved.
+            start_arm_rad: measured joint angles as in the paper; None for the mission's values.
+            progress: called with the completed fraction of the planning, 0 to 1, while paths are solved.
         """
         start = mission.start
         arm_start = _radians(start.arm_deg)
@@ -199,7 +199,8 @@ def landing_from(
         yaw_rad: kept constant.
         arm_rad: joint angles at the start, at rest.
         arm_fold_rad: joint angles at the end.
-        speed_m_s: speed of the descent. vehicle: provides the height of the floor and the reach of the arm.
+        speed_m_s: speed of the descent.
+        vehicle: provides the height of the floor and the reach of the arm.
     """
     builder = PlanBuilder(position_world_m, yaw_rad, arm_rad)
     fold_rad = max(abs(arm_fold_rad[0] - arm_rad[0]), abs(arm_fold_rad[1] - arm_rad[1]))

@@ -50,7 +50,8 @@ def retract_from(
         velocity_world_m_s: initial velocity; its components outward and up are removed, the rest is limited to `STOP_SPEED_MAX_M_S`.
         yaw_rad: kept constant.
         arm_rad: joint angles at the start, at rest.
-        arm_fold_rad: joint angles at the end. vehicle: provides tether, room, airframe and the speed of the return.
+        arm_fold_rad: joint angles at the end.
+        vehicle: provides tether, room, airframe and the speed of the return.
     """
     tether, safety, anchor = vehicle.tether, vehicle.safety, vehicle.tether.anchor_world_m
     builder = PlanBuilder(position_world_m, yaw_rad, arm_rad)

@@ -20,7 +20,8 @@ class Bars:
     """Live progress bars, each followed by a text; without a terminal only the lines of `say` are printed.
 
     Args:
-        console: where they are shown. names: the bars' names.
+        console: where they are shown.
+        names: the bars' names.
     """
 
     def __init__(self, console: Console, names: Sequence[str]) -> None:

@@ -72,7 +72,8 @@ class Gate:
             arm_rad: joint angles now; None if unknown.
             arm_fresh: the joint state is fresh enough for closed-loop control.
             t_s: flight clock.
-            state_age_s: age of the attitude that the setpoint was computed from. arm_rate_rad_s: joint speeds now, rad/s.
+            state_age_s: age of the attitude that the setpoint was computed from.
+            arm_rate_rad_s: joint speeds now, rad/s.
         """
         refused: list[Refusal] = []
         if attitude is not None:

@@ -46,7 +46,8 @@ class RemoteClock:
         """Convert `remote_s` to the flight clock. The result is late by the smallest transport delay seen.
 
         Args:
-            remote_s: time on the device's clock at which it sent a message. arrived_s: arrival of that message on the flight clock.
+            remote_s: time on the device's clock at which it sent a message.
+            arrived_s: arrival of that message on the flight clock.
         """
         offset_s = arrived_s - remote_s
         grown_s = self._offset_s + CLOCK_GROWTH * max(0.0, arrived_s - self._arrived_s)

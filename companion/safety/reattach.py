@@ -18,7 +18,8 @@ def found_armed(i: Inputs, clearance_m: float) -> tuple[bool, str]:
     OFFBOARD nor LAND, or if motion capture does not measure its height.
 
     Args:
-        i: inputs with PX4 armed. clearance_m: height of the body's origin when the vehicle is on the ground.
+        i: inputs with PX4 armed.
+        clearance_m: height of the body's origin when the vehicle is on the ground.
     """
     pose, vehicle = fresh_pose(i), i.vehicle
     height_m = pose.position_world_m[2] if pose is not None else None

@@ -48,8 +48,8 @@ def update(
         state: state before the tick.
         events: events of this tick.
         t_s: flight clock.
-        times: maximum durations of a HOLD and of a RETRACT. standing: message of the active rule that requires a HOLD or more; the
-        operator may end a HOLD only if it is None.
+        times: maximum durations of a HOLD and of a RETRACT.
+        standing: message of the active rule that requires a HOLD or more; the operator may end a HOLD only if it is None.
     """
     held = state.action is SafetyAction.HOLD  # a RESUME does not end a HOLD that begins in the same tick
     for event in events:

@@ -26,7 +26,8 @@ def steepest_slope(level_m: float, drop_m: float, chord_m: float, slack_m: float
     Args:
         level_m: horizontal distance to the anchor, h.
         drop_m: height of the anchor above the attachment (negative: below).
-        chord_m: straight distance, c. slack_m: length minus chord, not negative.
+        chord_m: straight distance, c.
+        slack_m: length minus chord, not negative.
     """
     along = level_m * level_m
     up = drop_m * level_m - 4.0 * chord_m * math.sqrt(0.375 * slack_m * chord_m)
@@ -63,8 +64,8 @@ class Clearance:
 
         Args:
             straight_body: unit direction from the attachment to the anchor.
-            hanging_body: unit direction in which the line leaves when it hangs deepest; None if it is straight. arm_rad: the paper's
-            angles; if None, the arm is assumed to be anywhere within its reach.
+            hanging_body: unit direction in which the line leaves when it hangs deepest; None if it is straight.
+            arm_rad: the paper's angles; if None, the arm is assumed to be anywhere within its reach.
         """
         # A line tied below the rotors comes nearest when it is straight, one tied above them when it hangs deepest.
         nearest = straight_body if self._below or hanging_body is None else hanging_body

@@ -103,8 +103,8 @@ class Px4Stub:
         params: parameter store; changes take effect at once.
         estimator: substitute for EKF2.
         cascade: attitude loop, rate loop and mixer.
-        setpoint_delay_s: delay from the arrival of a setpoint to its effect in the attitude loop. learned: biases that PX4 has learned
-        before the world starts; None for an IMU without bias.
+        setpoint_delay_s: delay from the arrival of a setpoint to its effect in the attitude loop.
+        learned: biases that PX4 has learned before the world starts; None for an IMU without bias.
     """
 
     def __init__(

@@ -91,8 +91,8 @@ def stub_of(config: WorldConfig, link_delay_s: float = 0.0) -> Px4Stub:
     """Return the stub with the parameters of this world, gains included; `set_hover_thrust` sets its hover thrust.
 
     Args:
-        config: `setpoint_delay_s`, `px4_params` and the biases of `imu`. link_delay_s: added to the setpoint delay, for a loop without
-        a real link.
+        config: `setpoint_delay_s`, `px4_params` and the biases of `imu`.
+        link_delay_s: added to the setpoint delay, for a loop without a real link.
     """
     params = Params()
     params.set("THR_MDL_FAC", config.thr_mdl_fac)

@@ -42,7 +42,8 @@ def with_world(config: SitlConfig, changes: Data) -> SitlConfig:
     """Return the configuration with keys of its world changed; another seed draws another laboratory.
 
     Args:
-        config: configuration of a flight. changes: plain data by key of the world. A key given here is not drawn.
+        config: configuration of a flight.
+        changes: plain data by key of the world. A key given here is not drawn.
     """
     laboratory = config.laboratory.without(list(changes))
     data = config.world.model_dump(mode="json") | changes

@@ -61,7 +61,8 @@ class FastBus:
     Args:
         drives: motors of the servos, in current mode from now on.
         scales: scale of each joint; None if the set-up of the bus failed, and then the arm never answers.
-        watchdog_s: timeout of the servos' bus watchdog. faults: faults of the world; None if it has none.
+        watchdog_s: timeout of the servos' bus watchdog.
+        faults: faults of the world; None if it has none.
     """
 
     def __init__(

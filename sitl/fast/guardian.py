@@ -131,7 +131,8 @@ class FastGuardian:
 
         Args:
             t_s: world time.
-            heard: whether a heartbeat arrived in this tick. dead: whether the flight process has ended.
+            heard: whether a heartbeat arrived in this tick.
+            dead: whether the flight process has ended.
         """
         if not self.alive or self._beat is None or not self._beat.lifting or t_s - self._round_s < PERIOD_S - 1e-9:
             return False

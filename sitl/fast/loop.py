@@ -135,8 +135,8 @@ class FastFlight:
     """One flight in the fast closed loop.
 
     Args:
-        config: effective configuration; the hover thrust is the stub's MPC_THR_HOVER if the vehicle file has none. land_at_s: time on
-        the flight clock at which the operator commands a landing; None for never.
+        config: effective configuration; the hover thrust is the stub's MPC_THR_HOVER if the vehicle file has none.
+        land_at_s: time on the flight clock at which the operator commands a landing; None for never.
     """
 
     def __init__(self, config: SitlConfig, land_at_s: float | None = None) -> None:

@@ -33,7 +33,8 @@ def environment(kinds: set[str], stall_s: float | None = None) -> dict[str, str]
     """Return the environment variables of the flight process for these kinds of faults.
 
     Args:
-        kinds: fault kinds. stall_s: duration of the event loop's stall; None for ever.
+        kinds: fault kinds.
+        stall_s: duration of the event loop's stall; None for ever.
     """
     if not kinds & {"hold_gil", "stall_loop"}:
         return {}
@@ -46,8 +47,8 @@ def inject_process_fault(kind: FaultKind, flight_pid: int) -> bool:
     """Inject a fault of the recorder or the guardian; return False if that process does not exist yet.
 
     Args:
-        kind: kill_recorder, kill_guardian or disk_full. flight_pid: pid of the flight process, which is the recorder's parent and the
-        guardian's sibling.
+        kind: kill_recorder, kill_guardian or disk_full.
+        flight_pid: pid of the flight process, which is the recorder's parent and the guardian's sibling.
     """
     module = "companion.guardian" if kind == "kill_guardian" else "companion.recorder.main"
     parent = os.getppid() if kind == "kill_guardian" else flight_pid

@@ -55,7 +55,8 @@ class ServoLine:
         """Process bytes from the master and return the servos' answer. Never raises.
 
         Args:
-            data: any bytes. baud_bps: baud rate of the bytes; if None, every servo receives them.
+            data: any bytes.
+            baud_bps: baud rate of the bytes; if None, every servo receives them.
         """
         return self.exchange(data, baud_bps)[0]
 

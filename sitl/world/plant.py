@@ -84,8 +84,8 @@ class Plant:
         config: configuration of the world.
         px4: the autopilot.
         drives: motors of both joints.
-        start: position, yaw and joint angles, m and rad. between_steps: whether the cameras expose at the exact time instead of at the
-        end of the physics step.
+        start: position, yaw and joint angles, m and rad.
+        between_steps: whether the cameras expose at the exact time instead of at the end of the physics step.
     """
 
     def __init__(

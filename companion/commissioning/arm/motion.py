@@ -66,7 +66,8 @@ class Motion:
     """Controls both joints, one of which moves.
 
     Args:
-        vehicle: arm, tool and limits. state: current state of the arm.
+        vehicle: arm, tool and limits.
+        state: current state of the arm.
     """
 
     def __init__(self, vehicle: Vehicle, state: ArmState) -> None:

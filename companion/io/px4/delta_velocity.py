@@ -38,7 +38,8 @@ class DeltaVelocity:
         """Add a sample. A repeated, late or non-finite one is ignored.
 
         Args:
-            boot_s: end of its interval on PX4's clock. specific_force_m_s2: mean over the interval, in body axes.
+            boot_s: end of its interval on PX4's clock.
+            specific_force_m_s2: mean over the interval, in body axes.
         """
         x, y, z = specific_force_m_s2
         if not math.isfinite(boot_s + x + y + z):

@@ -24,7 +24,8 @@ class ForceSensor:
     """The sensor's errors.
 
     Args:
-        config: the section `force_sensor`. seed: seed of the world; determines the cross-talk.
+        config: the section `force_sensor`.
+        seed: seed of the world; determines the cross-talk.
     """
 
     def __init__(self, config: Config, seed: int) -> None:
