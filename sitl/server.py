@@ -291,7 +291,7 @@ class Sitl:
             self._lost_servo = None
 
     def _inject_process_faults(self) -> None:
-        """Inject faults of the recorder and the guardian, once each, and end a SIGSTOP that is over."""
+        """Inject faults of the recorder and the guardian, once each, and resume the flight process after a limited SIGSTOP."""
         active, plant = self.faults.active, self.plant
         due = [kind for kind in OTHER_PROCESS_FAULTS if kind in active and kind not in self._injected]
         if due and self.flight.pid is not None and plant.t_s >= self._inject_due_s:

@@ -262,7 +262,8 @@ def _timing(log: FlightLog) -> Figure | None:
 def _stack(
     log: FlightLog, title: str, heights: tuple[float, ...], height_in: float = 6.8
 ) -> tuple[Figure, list[Any], Array]:
-    """Return axes above each other over the mission clock, with phases shaded and named and the catch marked, and the clock itself."""
+    """Return the figure, its axes stacked over a common time axis with the phases and the catch marked, and the mission clock, s: NaN
+    outside the phases."""
     figure = new_figure(height_in)
     grid = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)
     axes = [row[0] for row in grid]

@@ -82,7 +82,7 @@ def check_replayable(log: FlightLog) -> str:
     if version != __version__:
         found = f"companion {version}" if version else "a companion of unknown version"
         raise LogError(
-            f"{log.path}: was recorded by {found}, this is {__version__}; replay it with the version that flew"
+            f"{log.path}: was recorded by {found}, but this is {__version__}; replay it with the version that flew"
         )
     if about.get("records") != fingerprint(Inputs, Outputs, Sent):
         raise LogError(

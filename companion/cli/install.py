@@ -65,12 +65,12 @@ def add_parser(commands: Any) -> None:
     install.add_argument(
         "--arm-serial",
         metavar="SERIAL",
-        help="serial number of the arm's U2D2 (default: of the one that is plugged in)",
+        help="serial number of the arm's U2D2 (default: that of the U2D2 that is plugged in)",
     )
     install.add_argument(
         "--force-serial",
         metavar="SERIAL",
-        help="serial number of the force sensor's USB adapter (default: of the one that is plugged in)",
+        help="serial number of the force sensor's USB adapter (default: that of the adapter that is plugged in)",
     )
     install.add_argument("--at-boot", action="store_true", help="start the service at boot; it waits on the ground")
     install.add_argument("--program", metavar="FILE", help="companion executable of the service (default: this one)")
@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
         return EXIT_BAD_INPUT
     if root == Path("/") and os.geteuid() != 0 and not arguments.dry_run:
         print_error(
-            f"companion install: needs root: sudo {os.path.abspath(sys.argv[0])} install ...; only --dry-run works without"
+            f"companion install: needs root: sudo {os.path.abspath(sys.argv[0])} install ...; only --dry-run works without root"
         )
         return EXIT_REFUSED
     try:

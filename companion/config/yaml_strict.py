@@ -127,7 +127,7 @@ def parse_value(text: str, origin: Origin) -> Data:
 
 
 def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
-    """Convert text to plain data. `fixed` is the origin of all values (an override) in place of lines in a file."""
+    """Convert text to plain data. If `fixed` is given (for an override), it is the origin of all values instead of their lines."""
 
     def origin(mark: yaml.Mark | None) -> Origin:
         if fixed is not None or mark is None:

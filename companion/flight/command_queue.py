@@ -124,7 +124,7 @@ class Operator:
 
     @contextlib.contextmanager
     def attention(self) -> Iterator[None]:
-        """Receive from the channel and handle signals while inside this context."""
+        """Receive from the channel and handle signals while this context is open."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGHUP):
             loop.add_signal_handler(number, self._land.set)

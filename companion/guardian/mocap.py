@@ -71,7 +71,7 @@ class MocapClient:
         return [pose for datagram in self._datagrams() if (pose := self._pose(datagram, now_s, origin_s)) is not None]
 
     def poll_newest(self, now_s: float) -> None:
-        """Read all waiting datagrams and parse only the newest frame (standby)."""
+        """Read all waiting datagrams and parse only the newest frame; used in standby."""
         newest = None
         for datagram in self._datagrams():
             if natnet.message_id(datagram) == Message.FRAME:

@@ -146,5 +146,5 @@ def modules() -> str:
 
 
 def sysusers(user: str) -> str:
-    """Return the service's user, without a login, in the group of the serial ports."""
+    """Return the sysusers.d file that creates the service's user, without a login, in the group of the serial ports."""
     return f'{_HEAD}\nu {user} - "companion flight service" /var/lib/{STATE_DIRECTORY}\nm {user} dialout\n'

@@ -14,7 +14,7 @@ _SO_TIMESTAMPNS: Final = 35  # from <asm-generic/socket.h>, valid on x86 and ARM
 _TIMESPEC: Final = struct.Struct("=qq")
 STAMP_ROOM_BYTES: Final = socket.CMSG_SPACE(_TIMESPEC.size)
 _WAITED_MAX_S = 0.1
-"""A longer wait is not believed: the wall clock may have been set in between, and that must not make a valid frame stale."""
+"""A longer wait is ignored: the wall clock may have been set in between, and that must not make a valid frame stale."""
 
 
 def stamp_arrivals(opened: socket.socket) -> None:

@@ -191,7 +191,8 @@ def landing_from(
 ) -> Plan:
     """Plan an immediate landing from any state: come to rest, then descend in place while the arm folds.
 
-    The descent is delayed until the arm is folded before the net could touch the floor. Two segments, both PhaseKind.LANDING.
+    The descent is delayed if necessary, so that the arm is folded before the net can touch the floor. The plan has two segments, both
+    PhaseKind.LANDING.
 
     Args:
         position_world_m: start of the reference: the measured position, or the last reference.

@@ -149,7 +149,7 @@ class SampleCheck:
                         limit=f"room {name} {edge}",
                         excess=excess,
                         what="leaves the room",
-                        detail=f"rotors, arm and net reach {name} = {reach:.2f} m, "
+                        detail=f"rotors, arm and net reach {name} = {reach:.2f} m; "
                         f"the room is {span[0]:g} to {span[1]:g} m minus {why}",
                         advice="move the waypoint inwards",
                     )

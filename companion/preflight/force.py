@@ -31,7 +31,7 @@ CHECKSUMS = Check(
     "force.checksums",
     "force sensor packets",
     "none with an invalid checksum",
-    "interference causes losses of samples, and of more in flight",
+    "interference causes samples to be lost, and more of them in flight",
     warns=True,
 )
 NOISE = Check(

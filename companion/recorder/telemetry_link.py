@@ -142,7 +142,7 @@ class Uplink:
         self._command_topic = Topic.COMMAND.of(session.vehicle)
 
     async def run(self) -> None:
-        """Run until the end of the flight is published, or has come while no broker is connected."""
+        """Run until the end of the flight has been published or, if no broker is connected then, until the flight ends."""
         async with asyncio.TaskGroup() as group:
             staying = group.create_task(self._stay_connected())
             await self._pump()

@@ -6,7 +6,7 @@ import ctypes
 import threading
 
 _own = threading.local()
-"""Its values exist as long as the calling thread's interpreter state."""
+"""Its values exist for as long as the calling thread's interpreter state does."""
 
 
 def keep_interpreter_state() -> None:

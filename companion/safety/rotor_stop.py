@@ -125,8 +125,8 @@ class RotorStop:
         return cls(clearance_m + LOW_WITHIN_M, tilt_max_rad, pose_s, flipped_since_s=-math.inf if flipped else None)
 
     def update(self, i: Inputs) -> RotorStop:
-        """Return the evidence after one more tick. Call it in every tick of the stage, because the conditions must hold without a
-        break.
+        """Return the evidence after one more tick. Call it in every tick of the stage, because the conditions must hold
+        without interruption.
         """
         pose, t_s = fresh_pose(i), i.t_s
         sinking = self.sinking.update(t_s, pose)

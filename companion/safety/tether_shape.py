@@ -1,9 +1,9 @@
-"""Clearance between the hanging tether and rotors and arm.
+"""Clearance between the hanging tether and the vehicle's rotors and arm.
 
 A line that hangs still lies in the vertical plane through its two ends, below their chord, and above its own tangent at the vehicle: a
 hanging line is convex. It is therefore bounded by two rays from the attachment, the chord and the steepest tangent that its slack
 allows; its shape beyond a metre from the vehicle is irrelevant for rotors and arm. The tangent is that of the parabola of the same
-length, which for much slack goes straight down, as the line does. `clearance_min_m` covers wind and rotor wash on the line.
+length, which with much slack goes straight down, as the line does. `clearance_min_m` covers wind and rotor wash on the line.
 """
 
 from __future__ import annotations

@@ -119,13 +119,13 @@ class World(Model):
     force_scale: Positive = 1.0
     """Factor between the force sensor's readings and the true force."""
     net_weight_kg: Annotated[float, Field(ge=0, le=5)] = 0.0
-    """Mass that hangs from the centre of the net while the force sensor is read, for its calibration."""
+    """Mass that hangs from the centre of the net while the force sensor is being read, for its calibration."""
     net_weight_t_s: NonNegative = 8.0
     """Time from the first reading until the mass is attached."""
     joint_friction_nm: NonNegative = 0.04
     """Constant friction of each joint; with `servo_mechanics` that section's friction acts instead."""
     joint_damping_nms: NonNegative = 0.02
-    """Viscous friction of each joint, N m s/rad; `servo_mechanics` replaces it too."""
+    """Viscous friction of each joint, N m s/rad; with `servo_mechanics` that section's friction acts instead."""
     servos: tuple[Servo, Servo] | None = None
     """null for the defaults of `Servo`."""
     arm_hand: bool = False

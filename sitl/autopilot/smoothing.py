@@ -12,7 +12,7 @@ from companion.model.types import Vec2
 from sitl.autopilot.params import Params
 
 _SETTLE_S = 0.1
-"""The acceleration falls below the jerk limit's profile within the last 0.1 s, so that it does not chatter."""
+"""Time constant with which the velocity approaches the wanted one once they are close, so that the acceleration does not chatter."""
 
 
 class Smoothing:

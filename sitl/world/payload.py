@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 THROW_LEAD_S = 0.45
 """Time from the throw to the catch."""
 _THROW_BESIDE_M = 0.5
-"""Largest lateral distance from `catch_at_m` at which a passing vehicle is thrown a payload."""
+"""Largest lateral distance from `catch_at_m` at which a payload is thrown to a passing vehicle."""
 
 
 class Ball(NamedTuple):

@@ -98,9 +98,9 @@ def test_committed_missions_are_flyable(mission: str) -> None:
 
 REFUSED = [
     (["mission.phases[2].to_m=[1, 0, 1.9]", "vehicle.tether.length_m=2.5"], "phase 'catch' leaves the tether sphere at t = 8.6 s, (0.97, 0.00, 1.89) m: 2.44 m from the anchor, 2.05 m (length minus margin and 0.2 m for the catch) allowed; shorten the line or move the anchor (also in 'stabilise', 'return')"),
-    (["mission.phases[2].to_m=[1.9, 0, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.90, 0.00, 1.00) m: rotors, arm and net reach x = 2.35 m, the room is -2.2 to 2.2 m minus 0.1 m for tracking; move the waypoint inwards (also in 'stabilise', 'return')"),
-    (["mission.phases[2].to_m=[1, -1.5, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.00, -1.50, 1.00) m: rotors, arm and net reach y = -1.95 m, the room is -1.8 to 1.8 m minus 0.1 m for tracking; move the waypoint inwards"),
-    (["mission.phases[2].to_m=[1, 0, 2.1]"], "rotors, arm and net reach z = 2.23 m, the room is 0 to 2.2 m minus 0.2 m for the catch"),
+    (["mission.phases[2].to_m=[1.9, 0, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.90, 0.00, 1.00) m: rotors, arm and net reach x = 2.35 m; the room is -2.2 to 2.2 m minus 0.1 m for tracking; move the waypoint inwards (also in 'stabilise', 'return')"),
+    (["mission.phases[2].to_m=[1, -1.5, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.00, -1.50, 1.00) m: rotors, arm and net reach y = -1.95 m; the room is -1.8 to 1.8 m minus 0.1 m for tracking; move the waypoint inwards"),
+    (["mission.phases[2].to_m=[1, 0, 2.1]"], "rotors, arm and net reach z = 2.23 m; the room is 0 to 2.2 m minus 0.2 m for the catch"),
     (["mission.phases[2].to_m=[1, 0, 0.2]"], "phase 'catch' flies into the floor at t = 9.5 s, (1.00, 0.00, 0.20) m: the body's origin at 0.20 m, 0.30 m is the minimum; raise the waypoint"),
     (["mission.phases[2].to_m=[1, 0, 0.4]"], "phase 'catch' drags the net over the floor at t = 9.5 s, (1.00, 0.00, 0.40) m: its lowest point is -0.07 m high, 0.01 m is the minimum; fly higher or fold the arm first"),
     (["mission.phases[4].arm_deg=[100, 60]"], "phase 'land' drags the net over the floor"),
@@ -119,7 +119,7 @@ REFUSED = [
     (["mission.catch.payload_max_kg=2"], "phase 'take-off' needs too much thrust at t = 0.8 s"),
     (["mission.phases[2].duration_s=2.2", "mission.phases[2].arm_duration_s=2", "vehicle.airframe.tilt_max_deg=10"], "phase 'catch' tilts too far"),
     (["mission.phases[0].height_m=0.4"], "phase 'take-off' ends at 0.4 m, but the body's origin is 0.3 m above the floor when the vehicle is on the ground; set height_m to 0.5 or more"),
-    (["mission.catch.expected_at_m=[1, 0]", "vehicle.room.x_m=[-1.6, 1.6]"], "phase 'catch' leaves the room at t = 9.5 s, (1.00, 0.00, 1.00) m: rotors, arm and net reach x = 1.45 m, the room is -1.6 to 1.6 m minus 0.2 m for the catch"),
+    (["mission.catch.expected_at_m=[1, 0]", "vehicle.room.x_m=[-1.6, 1.6]"], "phase 'catch' leaves the room at t = 9.5 s, (1.00, 0.00, 1.00) m: rotors, arm and net reach x = 1.45 m; the room is -1.6 to 1.6 m minus 0.2 m for the catch"),
     (["vehicle.tether.stop_deceleration_m_s2=0.3", "vehicle.room.x_m=[-1.7, 1.7]", "vehicle.tether.react_time_s=0.3"], "phase 'catch' could not stop within the room at t = 7.1 s, (0.41, 0.00, 1.00) m: 0.65 m/s needs 0.96 m to stop, 0.31 m too far with 0.2 m for the catch; fly more slowly towards its edge or turn back earlier"),
     (["vehicle.tether.stop_deceleration_m_s2=0.2", "vehicle.tether.length_m=2.4"], "could not stop within the tether sphere"),
     (["mission.phases[1]={type: line, to_m: [-1, 0, 0.32], duration_s: 2}", "mission.phases[2]={type: line, to_m: [1, 0, 1]}"], "could not stop within the height above the floor"),

@@ -32,7 +32,7 @@ LEAVE_TIMEOUT_S = 60.0
 WITNESS = "world.json"
 """File in the flight's folder in which a simulated world with faults writes its record."""
 NEAR_FRAMES = 3
-"""Number of consecutive frames that are searched for one in the log: a tick logs only its newest frame."""
+"""Number of consecutive frame numbers of which the first that is in the log is used: a tick logs only its newest frame."""
 _POLL_S = 0.5
 
 

@@ -184,5 +184,5 @@ def worse_than(row: Row, kept: Kept) -> str | None:
     if kept.caught and not row["caught"]:
         return "the payload was no longer caught"
     if kept.e_p_m is not None and row["e_p_m"] is not None and row["e_p_m"] > WORSE_THAN_KEPT * kept.e_p_m:
-        return f"e_p {row['e_p_m']:.4f} m, more than {WORSE_THAN_KEPT:g} times the kept {kept.e_p_m:.4f} m"
+        return f"e_p {row['e_p_m']:.4f} m, more than {WORSE_THAN_KEPT:g} times the kept value of {kept.e_p_m:.4f} m"
     return None

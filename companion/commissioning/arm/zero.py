@@ -159,7 +159,7 @@ class ZeroGuide:
         if least > ALONE_SHARE * max(most, SWING_MIN_DEG):
             return "both joints have moved; turn only the requested one and move the other one back"
         if step.exact and abs(most - abs(step.by_deg)) > NEAR_SHARE * abs(step.by_deg):
-            return f"requested {abs(step.by_deg):.0f} deg, it has turned by {most:.0f}"
+            return f"requested {abs(step.by_deg):.0f} deg, but it has turned by {most:.0f}"
         if most < SWING_MIN_DEG:
             return f"turn it further, {SWING_MIN_DEG:.0f} deg at least; it has turned by {most:.0f}"
         return ""

@@ -280,7 +280,7 @@ class Verifier:
         if isinstance(command, Refused):
             return command
         if command.vehicle != self._vehicle:
-            return Refused(Reason.WRONG_VEHICLE, f"for {command.vehicle}, this is {self._vehicle}")
+            return Refused(Reason.WRONG_VEHICLE, f"for {command.vehicle}; this is {self._vehicle}")
         key = self.operators.find_key(command.operator)
         if key is None:
             return Refused(Reason.UNKNOWN_OPERATOR, f"{command.operator} is not an operator of this vehicle")

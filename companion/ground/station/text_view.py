@@ -15,7 +15,7 @@ from companion.ground.station.vehicles import Vehicle
 from companion.model.types import LandedState, PhaseKind, SafetyAction
 
 STALE_S = 0.3
-"""Age at which data is shown as stale; the stream arrives 20 times a second."""
+"""Age at which data is shown as stale; a stream message arrives 20 times a second."""
 EVENTS_SHOWN = 8
 NOTICES_SHOWN = 3
 _KIND_WORD = {

@@ -98,7 +98,7 @@ class Vehicle:
         return None if self.stream_received_s is None else now_s - self.stream_received_s
 
     def live(self, now_s: float) -> bool:
-        """Whether its stream arrives."""
+        """Whether its stream is arriving."""
         age_s = self.stream_age_s(now_s)
         return age_s is not None and age_s < LIVE_S
 

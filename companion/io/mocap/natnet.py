@@ -248,7 +248,7 @@ def parse_model_definitions(datagram: Buffer, version: NatNetVersion) -> tuple[B
 
 def _payload(datagram: Buffer, expected: Message) -> bytes | Malformed:
     if len(datagram) < _HEADER.size:
-        return Malformed(f"datagram of {len(datagram)} bytes, a header has {_HEADER.size}")
+        return Malformed(f"datagram of {len(datagram)} bytes; a header has {_HEADER.size}")
     message, size = _HEADER.unpack_from(datagram)
     if message != expected:
         return Malformed(f"message id {message}, expected {expected.value}")

@@ -166,7 +166,7 @@ class LinkClaim:
         return f"{newest} claims to be PX4 (system {self._system}), which is at {_text(self.peer)}; ignored"
 
     def close(self) -> None:
-        """Release the port. MAVSDK's descriptor must be closed before."""
+        """Release the port. MAVSDK's descriptor must be closed first."""
         if self._mavsdk is not None:
             self._mavsdk.close()
             self._mavsdk = None

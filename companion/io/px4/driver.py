@@ -69,7 +69,7 @@ class MavsdkAutopilot:
     Args:
         device: address and setpoint path.
         clock: the flight clock.
-        forwarding: whether a second connection is needed, see `forward_to`.
+        forwarding: whether a second connection is needed; see `forward_to`.
     """
 
     def __init__(self, device: AutopilotDevice, clock: Clock, *, forwarding: bool = False) -> None:
@@ -295,7 +295,7 @@ class MavsdkAutopilot:
         """Write one PX4 parameter, read it back and return the value that PX4 now holds, a float in single precision.
 
         Raises:
-            DeviceError: no such name, a value that PX4's type cannot hold, PX4 refuses the value, or afterwards holds a different one.
+            DeviceError: PX4 has no such parameter, its type cannot hold the value, or PX4 refuses the value or keeps a different one.
         """
         return await self._transfer().write(name, value)
 
@@ -353,7 +353,8 @@ class MavsdkAutopilot:
             self._loop.call_soon_threadsafe(self._show_ground_station)
 
     def _show_ground_station(self) -> None:
-        """Answer the heartbeat of a disarmed PX4 with that of a ground station, because PX4 reports why it refuses arming only to one.
+        """Answer the heartbeat of a disarmed PX4 with that of a ground station, because PX4 reports the
+        reasons why it refuses to arm only to a ground station.
 
         While PX4 is armed nothing is sent, because PX4 must notice the loss of the real ground station, whatever NAV_DLL_ACT
         is set to.

@@ -169,7 +169,7 @@ class ParamTransfer:
         """Write one value, read it back and return the value that PX4 now holds.
 
         Raises:
-            DeviceError: no such name, a value that the type cannot hold, PX4 refuses the value, or afterwards holds a different one.
+            DeviceError: PX4 has no such parameter, its type cannot hold the value, or PX4 refuses the value or keeps a different one.
         """
         before = (await self.read([name])).get(name)
         if before is None:

@@ -106,7 +106,7 @@ def _is_measured(difference: Difference) -> bool:
 
 
 async def write(link: ParamLink, differences: Iterable[Difference]) -> WriteResult:
-    """Write each value and verify it by reading back; stops at the first failure, and as soon as PX4 is armed."""
+    """Write each value and verify it by reading it back; stop at the first failure, or as soon as PX4 is armed."""
     written: list[Difference] = []
     for difference in differences:
         status = link.status()

@@ -82,7 +82,8 @@ async def perform(
     if json and console.file is sys.stdout:
         console = Console(stderr=True)
     console.print(
-        "[bold]hand test[/]  battery in, motors disarmed, propellers off; the operator carries the vehicle (any key ends the test)"
+        "[bold]hand test[/]  battery connected, motors disarmed, propellers off; the operator carries the vehicle "
+        "(any key ends the test)"
     )
     with _interrupted(stop), raw_keys() as keys, Bars(console, ["hand test"]) as bars:
         while True:

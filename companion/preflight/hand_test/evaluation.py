@@ -104,7 +104,7 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
         row(
             FORWARD,
             abs(yaw_deg) <= YAW_MAX_DEG and slant_deg <= AXIS_MAX_DEG,
-            f"IMU {_way(forward.felt_m)}, motion capture {_way(forward.seen_m)}, the body's yaw is off by {yaw_deg:+.0f} deg",
+            f"IMU {_way(forward.felt_m)}, motion capture {_way(forward.seen_m)}; the body's yaw is off by {yaw_deg:+.0f} deg",
             f"within {YAW_MAX_DEG:g} deg",
         ),
         row(

@@ -60,7 +60,7 @@ class Step(Enum):
 _NEXT: Final = {Step.STAND: Step.LIFT, Step.LIFT: Step.FORWARD, Step.FORWARD: Step.TURN, Step.TURN: Step.DONE}
 INSTRUCTIONS: Final = {
     Step.STAND: "place the vehicle on the floor and let go of it",
-    Step.LIFT: "hold it by its legs, lift it straight up by 30 cm in about two seconds, hold it still",
+    Step.LIFT: "hold it by its legs, lift it straight up by 30 cm in about two seconds, and hold it still",
     Step.FORWARD: "move it 30 cm forward, where its nose points, without turning it; hold it still",
     Step.TURN: "turn it to the left, seen from above, by 45 deg; hold it still",
     Step.DONE: "done; put it back in its place",

@@ -31,4 +31,5 @@ class ForceSensor(Model):
     warm_up_s: Positive = 300.0
     """Time constant of that rise. (e)"""
     filter_hz: Positive = 100.0
-    """Cut-off frequency of the sensor's first-order low-pass. (m) The sensor offers 1 to 500 Hz and none. (e) The choice of 100."""
+    """Cut-off frequency of the sensor's first-order low-pass. (m) The sensor offers 1 to 500 Hz, or no filter. (e) The
+    choice of 100 Hz."""

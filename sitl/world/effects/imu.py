@@ -2,8 +2,8 @@
 
 A sample of PX4 is the mean of the raw samples since the previous one (vehicle_imu's delta velocity and delta angle). The vibration is
 averaged exactly over each sample, so that the samples contain what remains of it and its alias. An unbalanced rotor shakes the body in
-the rotor's plane with its own frequency and a force proportional to the square of its speed, hence to its thrust. A rotor of two blades
-shakes the body along its axis with twice its frequency, and therefore also turns it.
+the rotor's plane at its own frequency, with a force proportional to the square of its speed, hence to its thrust. A rotor with
+two blades shakes the body along its axis at twice its frequency, and therefore also turns it.
 """
 
 from __future__ import annotations

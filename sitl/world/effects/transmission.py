@@ -132,7 +132,7 @@ def acts(world: World) -> bool:
 def transmissions_of(
     vehicle: Vehicle, world: World, start_rad: Vec2, dt_s: float
 ) -> tuple[Transmission, Transmission] | None:
-    """Return the transmission of each joint for the joint angles at the start, or None if neither effect acts.
+    """Return the transmission of each joint for the joint angles at the start, or None if neither effect is on.
 
     With `compliance` alone the servo has the plain world's constant friction and no backlash.
     """
