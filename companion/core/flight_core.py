@@ -75,7 +75,6 @@ class FlightCore:
         state, request = transition(self._parameters, self._state, observed, observation)
         self._state = state
         self._carry_out(request, i)
-        self._limited_by = ()
         reference, command = self._command(dt_s, i)
         self._log = command.log
         phase, kind = state.phase(t_s)
@@ -195,6 +194,7 @@ class FlightCore:
     # -- command ---------------------------------------------------------------------------------------------------
 
     def _command(self, dt_s: float, i: Inputs) -> tuple[Reference | None, Command]:
+        self._limited_by = ()
         state, stage = self._state, self._state.stage
         if stage in (Stage.WAIT, Stage.READY, Stage.DONE):
             return None, Command()
