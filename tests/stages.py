@@ -20,7 +20,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.at_a_time import AT_A_TIME
+from tests.at_a_time import AT_A_TIME, BUSY_CORES, busy_cores
 from tests.marked import TESTS, files_of
 
 _BIN = Path(sys.executable).parent
@@ -224,6 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     unknown = [name for name in wanted if name not in names]
     if unknown:
         parser.error(f"no stage {unknown[0]!r}; there are {', '.join(names)}")
+    os.environ.setdefault(BUSY_CORES, f"{busy_cores():.1f}")
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored if a shell started us in the background
     return run_all([stage for stage in STAGES if stage.name in wanted])
 

@@ -141,3 +141,12 @@ def test_the_worlds_weight_hangs_while_somebody_reads_the_sensor() -> None:
     reads = ((0.0, False), (1.0, True), (2.9, True), (3.0, True), (9.0, True), (9.1, False), (9.2, True))
     pulls_n = [hung.pull_n(t_s, read) for t_s, read in reads]
     assert pulls_n == pytest.approx([0.0, 0.0, 0.0, 4.905, 4.905, 0.0, 0.0])
+
+
+def test_drift_is_told_from_samples_that_came_in_one_burst() -> None:
+    """A computer that was held up delivers most samples of a second at once; the line is defined all the same."""
+    t = np.arange(0.0, 1.21, 0.01)
+    samples = stream(np.outer(t, (1.0, 0.0, 0.0)) + (30.0, 0.0, 0.0), rate_hz=100.0)
+    x, y, _ = ft_fit.drift([*samples[:30], samples[120]])
+    assert x.per_minute_n == pytest.approx(60.0, rel=1e-6)
+    assert y.per_minute_n == 0.0 and math.isfinite(x.standard_error_n)

@@ -153,27 +153,29 @@ class Drift:
     """Standard deviation about the drift line."""
     per_minute_n: float
     standard_error_n: float
-    """Standard error of `per_minute_n`, from the scatter of means over a second."""
+    """Standard error of `per_minute_n`, from the scatter of means over a second or less."""
 
 
 def drift(samples: Sequence[ForceSample]) -> list[Drift]:
-    """Fit a straight line to each axis x, y, z; requires at least 4 s of samples."""
+    """Fit a straight line to each axis x, y, z of at least four samples."""
     return [_drift([(s.stamp_s, s.force_sensor_n[axis]) for s in samples]) for axis in range(3)]
 
 
 def _drift(points: Sequence[tuple[float, float]]) -> Drift:
-    blocks: dict[int, list[float]] = {}
-    for t_s, value in points:
-        blocks.setdefault(int(t_s - points[0][0]), []).append(value)
-    full = max(len(block) for block in blocks.values())
-    means = [(t, sum(block) / len(block)) for t, block in blocks.items() if 2 * len(block) >= full]
-    count = len(means)
-    mean_t, mean = sum(t for t, _ in means) / count, sum(v for _, v in means) / count
-    spread = sum((t - mean_t) ** 2 for t, _ in means)
-    slope = sum((t - mean_t) * (v - mean) for t, v in means) / spread
-    rest = sum((v - mean - slope * (t - mean_t)) ** 2 for t, v in means) / max(1, count - 2)
     start_s = points[0][0]
-    off = [value - mean - slope * (t_s - start_s - mean_t - 0.5) for t_s, value in points]
+    width_s = min(1.0, (points[-1][0] - start_s) / 4)
+    blocks: dict[int, list[tuple[float, float]]] = {}
+    for t_s, value in points:
+        blocks.setdefault(int((t_s - start_s) / width_s), []).append((t_s - start_s, value))
+    means = [
+        (len(block), sum(t for t, _ in block) / len(block), sum(v for _, v in block) / len(block))
+        for block in blocks.values()
+    ]
+    mean_t, mean = sum(n * t for n, t, _ in means) / len(points), sum(n * v for n, _, v in means) / len(points)
+    spread = sum(n * (t - mean_t) ** 2 for n, t, _ in means)
+    slope = sum(n * (t - mean_t) * (v - mean) for n, t, v in means) / spread
+    rest = sum(n * (v - mean - slope * (t - mean_t)) ** 2 for n, t, v in means) / max(1, len(means) - 2)
+    off = [value - mean - slope * (t_s - start_s - mean_t) for t_s, value in points]
     noise = math.sqrt(sum(value * value for value in off) / len(off))
     return Drift(mean, noise, 60.0 * slope, 60.0 * math.sqrt(rest / spread))
 
