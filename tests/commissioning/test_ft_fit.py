@@ -146,7 +146,7 @@ def test_the_worlds_weight_hangs_while_somebody_reads_the_sensor() -> None:
 def test_drift_is_told_from_samples_that_came_in_one_burst() -> None:
     """A computer that was held up delivers most samples of a second at once; the line is defined all the same."""
     t = np.arange(0.0, 1.21, 0.01)
-    samples = stream(np.outer(t, (1.0, 0.0, 0.0)) + (30.0, 0.0, 0.0), rate_hz=100.0)
+    samples = stream(np.column_stack((30.0 + t, 0.0 * t, 0.0 * t)), rate_hz=100.0)
     x, y, _ = ft_fit.drift([*samples[:30], samples[120]])
     assert x.per_minute_n == pytest.approx(60.0, rel=1e-6)
     assert y.per_minute_n == 0.0 and math.isfinite(x.standard_error_n)
