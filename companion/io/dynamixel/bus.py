@@ -79,6 +79,7 @@ class ArmBus:
         for joint in self._joints:
             self._write(joint, dxl.TORQUE_ENABLE, 1)
         self._port.reply_timeout_ms = _FLIGHT_REPLY_TIMEOUT_MS
+        self._port.late_reply_ms = 0.0
         return scales[0], scales[1]
 
     def read(self) -> tuple[Block, Block] | None:
@@ -133,6 +134,7 @@ class ArmBus:
     def close(self) -> None:
         """Set goal current 0, switch off torque and watchdog as far as the bus still works, and close the port. Never raises."""
         self._port.reply_timeout_ms = _FLIGHT_REPLY_TIMEOUT_MS
+        self._port.late_reply_ms = 0.0
         try:
             if self._touched and self._port.is_open:
                 self.write_currents((0, 0))

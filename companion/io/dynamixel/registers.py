@@ -182,8 +182,12 @@ class ServoPort(PortHandler):  # type: ignore[misc]
     is_open: bool
     _waited_ms = 0.0
     _taken_bytes = 0
+    _reply_missing = False
     reply_timeout_ms = 100.0
     """Longest wait for a reply, in addition to the transmission time of its bytes."""
+    late_reply_ms = 100.0
+    """Pause after a timeout, in which a late reply is discarded. A reply does not name its register: without the pause it
+    would be taken for the reply to the next request. 0 where all requests are the same."""
 
     def setupPort(self, cflag_baud: int) -> bool:
         """Open the port at `self.baudrate` (called by the SDK).
@@ -232,6 +236,19 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         self._waited_ms = 0.0
         self._taken_bytes = 0
 
+    def clearPort(self) -> None:
+        """Discard what has arrived (called by the SDK before each request), after a timeout also what arrives late.
+
+        Raises:
+            OSError: the port is gone.
+        """
+        if self._reply_missing:
+            self._reply_missing = False
+            end_ms = self.getCurrentTime() + self.late_reply_ms
+            while self.getCurrentTime() < end_ms:
+                self.ser.read(_NOISE_BYTES)
+        self.ser.reset_input_buffer()
+
     def readPort(self, length: int) -> bytes:
         """Return up to `length` bytes, after at most 1 ms.
 
@@ -250,9 +267,10 @@ class ServoPort(PortHandler):  # type: ignore[misc]
     def isPacketTimeout(self) -> bool:
         """Return whether the reply has timed out."""
         elapsed_ms = self.getTimeSinceStart()
-        if elapsed_ms > _NOISE_PATIENCE * self.packet_timeout or self._taken_bytes > _NOISE_BYTES:
-            return True  # a line with endless noise
-        return elapsed_ms > self.packet_timeout and self._waited_ms > 0.5 * self.packet_timeout
+        noise = elapsed_ms > _NOISE_PATIENCE * self.packet_timeout or self._taken_bytes > _NOISE_BYTES
+        silence = elapsed_ms > self.packet_timeout and self._waited_ms > 0.5 * self.packet_timeout
+        self._reply_missing = noise or silence
+        return self._reply_missing
 
 
 def _open_failure(port: str, error: Exception) -> str:
