@@ -116,7 +116,7 @@ def _results(summary: dict[str, Any], stride: int) -> list[Table]:
         _pairs("RMS error", rms, "before catch", "after catch"),
         _pairs("Flight", flight),
         _pairs("Timing [ms]", timing, "p50", "p99", "max"),
-        _pairs("Machinery", processes),
+        _pairs("Loop and log", processes),
     ]
 
 

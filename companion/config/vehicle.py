@@ -278,8 +278,8 @@ class Safety(Model):
     """Largest change between two reads beyond what the joint's largest speed explains."""
     joint_rate_max_deg_s: Positive = 700.0
     """Largest plausible joint rate: no servo of this type reaches it, even if an external force drives it."""
-    joint_wall_warn_deg: Positive = 3.0
-    joint_wall_max_deg: Positive = 10.0
+    joint_limit_warn_deg: Positive = 3.0
+    joint_limit_max_deg: Positive = 10.0
     """Largest angle by which a joint may exceed its limits; beyond it the vehicle lands."""
     servo_current_max_a: Positive = 2.3
     """Largest commanded current: the stall current."""

@@ -213,10 +213,10 @@ def _states(states: Sequence[ArmState], vehicle: Vehicle) -> Iterator[Row]:
 
 def _angles(last: ArmState, vehicle: Vehicle) -> Row:
     degrees = [math.degrees(angle) for angle in last.angle_rad]
-    walls = [joint.angle_deg for joint in vehicle.arm.joints]
+    limits = [joint.angle_deg for joint in vehicle.arm.joints]
     read = f"({degrees[0]:.0f}, {degrees[1]:.0f}) deg"
-    wanted = " and ".join(f"{low:g} to {high:g} deg" for low, high in walls)
-    if all(low <= angle <= high for angle, (low, high) in zip(degrees, walls, strict=True)):
+    wanted = " and ".join(f"{low:g} to {high:g} deg" for low, high in limits)
+    if all(low <= angle <= high for angle, (low, high) in zip(degrees, limits, strict=True)):
         return ANGLES.good(read, wanted)
     return ANGLES.bad(read, wanted, "move the arm by hand, or correct zero_count and sign of the joint")
 

@@ -244,13 +244,13 @@ RULES: tuple[Rule, ...] = (
         message="joint speeds {:.0f} and {:.0f} deg/s (limit {:.0f} deg/s)",
     ),
     Rule(
-        id="joint_wall", subject=Subject.ARM, what="a joint beyond its limit", predicate=arm.joint_beyond_limit,
-        thresholds=("joint_wall_warn_deg", "arm.joints.angle_deg"), hold_time=0.1, ground=_WARN, air=_WARN,
+        id="joint_beyond_limit", subject=Subject.ARM, what="a joint beyond its limit", predicate=arm.joint_beyond_limit,
+        thresholds=("joint_limit_warn_deg", "arm.joints.angle_deg"), hold_time=0.1, ground=_WARN, air=_WARN,
         message="joints at {:.0f}, {:.0f} deg: {:.0f} deg beyond a joint limit",
     ),
     Rule(
-        id="joint_far_past_wall", subject=Subject.ARM, what="a joint far beyond its limit",
-        predicate=arm.joint_beyond_limit, thresholds=("joint_wall_max_deg", "arm.joints.angle_deg"), hold_time=0.3,
+        id="joint_far_beyond_limit", subject=Subject.ARM, what="a joint far beyond its limit",
+        predicate=arm.joint_beyond_limit, thresholds=("joint_limit_max_deg", "arm.joints.angle_deg"), hold_time=0.3,
         ground=_LAND, air=_LAND, message="joints at {:.0f}, {:.0f} deg: {:.0f} deg beyond a joint limit",
     ),
 

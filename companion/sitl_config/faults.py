@@ -156,7 +156,7 @@ KINDS: dict[FaultKind, Kind] = {
         size="offset",
         unit="deg",
         default=30.0,
-        named_by=("joint_jump", "joint_wall", "joint_far_past_wall", "joint_rate", "servo_overload"),
+        named_by=("joint_jump", "joint_beyond_limit", "joint_far_beyond_limit", "joint_rate", "servo_overload"),
     ),
     "bus_noise": Kind(
         what="packets on the servo bus are corrupt",

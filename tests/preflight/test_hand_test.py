@@ -172,7 +172,7 @@ def test_axis_maps_are_what_they_say() -> None:
 def test_px4_mounted_the_wrong_way_round_is_distinguished_from_wrong_motion_capture() -> None:
     course = felt_otherwise(samples(), lambda v: (v[1], -v[0], v[2]))
     refused = failed(hand_test_evaluation.rows(result(course), "z"))
-    assert "hand.told" in refused
+    assert "hand.instructed" in refused
     assert "SENS_BOARD_ROT" in refused["hand.forward"]
 
 

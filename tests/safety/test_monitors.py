@@ -183,9 +183,9 @@ FAULTS: dict[str, Fault] = {
     "servo_overload": Fault(put("arm", torque_nm=(-2.5, 0.1))),
     "joint_jump": Fault(put("arm", angle_rad=(2.0, 1.5))),
     "joint_rate": Fault(put("arm", velocity_rad_s=(0.0, 13.0))),
-    "joint_wall": Fault(put("arm", angle_rad=(math.radians(180.0), 1.0)), sound=0),
-    "joint_far_past_wall": Fault(
-        put("arm", angle_rad=(2.0, math.radians(-25.0))), sound=0, also=frozenset({"joint_wall"})
+    "joint_beyond_limit": Fault(put("arm", angle_rad=(math.radians(180.0), 1.0)), sound=0),
+    "joint_far_beyond_limit": Fault(
+        put("arm", angle_rad=(2.0, math.radians(-25.0))), sound=0, also=frozenset({"joint_beyond_limit"})
     ),
     "force_lost": Fault(lambda i: replace(i, force=None)),
     "force_overload": Fault(put("force", overload=True)),

@@ -19,7 +19,7 @@ from companion.preflight.hand_test.steps import HandResult
 _ASTRAY = "the controller would push in the wrong directions"
 DONE = Check("hand.done", "hand test", "every step is recognised", "the axes are not known")
 AS_REQUESTED = Check(
-    "hand.told",
+    "hand.instructed",
     "hand test: as instructed",
     "the IMU measured up, forward and a turn to the left",
     "the vehicle was moved differently, or PX4's own axes are wrong",
