@@ -19,7 +19,8 @@ from mkdocs.structure.pages import Page
 
 OUTSIDE = "repository"
 FLIGHT_CODE = (
-    "companion/config/presets",
+    "companion/config/files/controllers",
+    "companion/config/files/worlds",
     "companion/control",
     "companion/core",
     "companion/safety",

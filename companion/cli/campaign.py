@@ -19,7 +19,6 @@ from companion.mission.check import check_mission
 from companion.runtime.console import terminal_console
 from companion.sitl_config.loader import COMMAND_LINE_WORLD, SitlConfig, load_sitl
 
-DEFAULT_MISSION = "configs/missions/catch.yaml"
 PIPED_WIDTH = 132
 """Width of a table in columns if standard output is not a terminal."""
 CAMPAIGN_WIDTH = 168

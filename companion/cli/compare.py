@@ -8,9 +8,11 @@ from typing import Any
 
 from companion.campaigns.compare.campaign import Compare
 from companion.campaigns.compare.grid import ADAPTATION, flights_of, variants_of
-from companion.cli.campaign import DEFAULT_MISSION, add_options, checked, common, count, fly, names
+from companion.cli.campaign import add_options, checked, common, count, fly, names
+from companion.cli.options import MISSION_OR_DEFAULT_HELP
 from companion.config.controller import PRESETS
 from companion.config.document import ConfigError
+from companion.config.shipped import DEFAULT_MISSION
 from companion.sitl_config.loader import SitlConfig, load_sitl
 
 _OPTIONS = {"world.payload_kg": "--payloads", "world.seed": "--seeds", "world.model_error": "--model-error"}
@@ -48,7 +50,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--ablation", action="store_true", help="also fly adaptive/recommended with one part removed at a time"
     )
-    parser.add_argument("--mission", default=DEFAULT_MISSION, metavar="FILE")
+    parser.add_argument("--mission", default=DEFAULT_MISSION, metavar="FILE", help=MISSION_OR_DEFAULT_HELP)
     add_options(parser, one_law=False)
     parser.set_defaults(run=run)
 

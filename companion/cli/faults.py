@@ -10,10 +10,11 @@ from typing import Any
 from companion.analysis.table import for_terminal
 from companion.campaigns.faults.campaign import Faults, kinds_list, kinds_table
 from companion.campaigns.faults.variants import WIRES, planned
-from companion.cli.campaign import DEFAULT_MISSION, add_options, checked, common, fly, names, wide_console
-from companion.cli.options import add_seed
+from companion.cli.campaign import add_options, checked, common, fly, names, wide_console
+from companion.cli.options import MISSION_OR_DEFAULT_HELP, add_seed
 from companion.config.document import ConfigError
 from companion.config.explain import nearest
+from companion.config.shipped import DEFAULT_MISSION
 from companion.model.exit_codes import EXIT_OK
 from companion.sitl_config.faults import KINDS, PHASES
 
@@ -27,9 +28,7 @@ def add_parser(commands: Any) -> None:
         "per flight, in every phase. Exit code 0 only if every flight was completed or landed, no "
         "vehicle pulled its tether taut by its own motion and none left the room; otherwise 5.",
     )
-    parser.add_argument(
-        "mission", nargs="?", default=DEFAULT_MISSION, help=f"mission file, YAML (default: {DEFAULT_MISSION})"
-    )
+    parser.add_argument("mission", nargs="?", default=DEFAULT_MISSION, help=MISSION_OR_DEFAULT_HELP)
     parser.add_argument(
         "--list", action="store_true", help="print the kinds of faults and the meaning of their sizes; fly nothing"
     )

@@ -12,11 +12,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from companion.cli.options import add_law, add_seed, add_world
+from companion.cli.options import MISSION_HELP, MISSION_OR_DEFAULT_HELP, add_law, add_seed, add_world
 from companion.cli.planning_progress import PlanningProgress
 from companion.cli.schema import schema_json
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig
+from companion.config.shipped import DEFAULT_MISSION
 from companion.install.extras import missing_extra
 from companion.mission.check import check_mission
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
@@ -39,7 +40,7 @@ _WITH_MODULES = (
         "monitor",
         "command",
     ),
-    *("broker", "report"),
+    *("broker", "report", "init"),
 )
 """Commands whose parser is in `companion.cli.NAME`."""
 
@@ -175,9 +176,9 @@ def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
 
 def _add_flight_options(parser: argparse.ArgumentParser, mission_default: bool = False) -> None:
     if mission_default:
-        parser.add_argument("mission", nargs="?", default="configs/missions/catch.yaml")
+        parser.add_argument("mission", nargs="?", default=DEFAULT_MISSION, help=MISSION_OR_DEFAULT_HELP)
     else:
-        parser.add_argument("mission", help="mission file, YAML")
+        parser.add_argument("mission", help=MISSION_HELP)
     parser.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
     add_law(parser)
     parser.add_argument(

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from companion.commissioning.tool import add_tool, number
+from companion.config.shipped import DEFAULT_MISSION
 
 _TOOLS = "companion.commissioning.mocap.tools"
-MISSION = "configs/missions/catch.yaml"
 
 
 def add_parser(commands: Any) -> None:
@@ -33,5 +33,8 @@ def add_parser(commands: Any) -> None:
         "disarmed, propellers off. Exit 0: the axes are right; 3: they are not; 4: cancelled.",
     )  # fmt: skip
     align.add_argument(
-        "mission", nargs="?", default=MISSION, help=f"mission whose start defines the yaw (default: {MISSION})"
+        "mission",
+        nargs="?",
+        default=DEFAULT_MISSION,
+        help=f"mission whose start defines the yaw (default: {DEFAULT_MISSION})",
     )

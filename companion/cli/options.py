@@ -5,7 +5,11 @@ from __future__ import annotations
 import argparse
 
 from companion.config.controller import PRESETS
+from companion.config.shipped import DEFAULT_MISSION, names
 from companion.sitl_config.loader import COMMAND_LINE_WORLD, WORLDS
+
+MISSION_HELP = f"mission: a built-in name ({', '.join(names('missions'))}) or a file"
+MISSION_OR_DEFAULT_HELP = f"{MISSION_HELP} (default: {DEFAULT_MISSION})"
 
 
 def add_law(parser: argparse.ArgumentParser) -> None:

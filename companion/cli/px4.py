@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
+from companion.config.shipped import DEFAULT_VEHICLE
 from companion.config.vehicle import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4.transfer import Comparison, Difference, WriteResult, compare, write
@@ -26,7 +27,6 @@ from companion.runtime.console import print_error
 if TYPE_CHECKING:
     from companion.io.px4.driver import MavsdkAutopilot
 
-VEHICLE = "configs/vehicles/tarot650_2r.yaml"
 _HEARTBEAT_DEADLINE_S = 5.0
 
 
@@ -48,7 +48,10 @@ def add_parser(commands: Any) -> None:
     )
     where = params.add_mutually_exclusive_group()
     where.add_argument(
-        "--vehicle", metavar="FILE", default=VEHICLE, help=f"vehicle file with PX4's address (default: {VEHICLE})"
+        "--vehicle",
+        metavar="FILE",
+        default=DEFAULT_VEHICLE,
+        help=f"vehicle file with PX4's address (default: {DEFAULT_VEHICLE})",
     )
     where.add_argument("--address", help="address in MAVSDK's notation, e.g. udpin://0.0.0.0:14540")
     params.add_argument(

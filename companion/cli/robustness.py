@@ -8,8 +8,10 @@ from typing import Any
 
 from companion.campaigns.robustness.campaign import Robustness
 from companion.campaigns.robustness.cases import Case, Cases, read_cases
-from companion.cli.campaign import DEFAULT_MISSION, add_options, checked, common, count, fly
+from companion.cli.campaign import add_options, checked, common, count, fly
+from companion.cli.options import MISSION_OR_DEFAULT_HELP
 from companion.config.document import ConfigError
+from companion.config.shipped import DEFAULT_MISSION
 
 
 def add_parser(commands: Any) -> None:
@@ -21,7 +23,7 @@ def add_parser(commands: Any) -> None:
         "and everything that the world's seed determines. A key of the section world that --set sets is "
         "not drawn. Exit code 5 if any flight crashed or was lost.",
     )
-    parser.add_argument("mission", nargs="?", help=f"mission file, YAML (default: {DEFAULT_MISSION})")
+    parser.add_argument("mission", nargs="?", help=MISSION_OR_DEFAULT_HELP)
     parser.add_argument("--draws", type=count, default=500, metavar="N", help="number of flights (default: 500)")
     parser.add_argument("--seed", type=count, default=1, metavar="N", help="seed of the draws (default: 1)")
     parser.add_argument("--first", type=_number, default=0, metavar="N", help="number of the first draw (default: 0)")

@@ -20,6 +20,7 @@ from companion.commissioning.patch import Patch, propose
 from companion.config.base import Location
 from companion.config.document import ConfigError, Data
 from companion.config.loader import load_vehicle
+from companion.config.shipped import DEFAULT_VEHICLE, named_file, names
 from companion.config.vehicle import Vehicle
 from companion.io.protocols import DeviceError
 from companion.model.check_row import Level, Row, refusals
@@ -29,7 +30,6 @@ from companion.runtime.console import console_on, print_error
 from companion.runtime.event_loop import run_until_interrupted
 
 SCHEMA_VERSION: Final = 1
-VEHICLE: Final = "configs/vehicles/tarot650_2r.yaml"
 WRITE_HELP: Final = "write the proposed change into the vehicle file; the old file is kept beside it"
 _T = TypeVar("_T")
 
@@ -88,6 +88,13 @@ class Session:
         if not str(arguments.vehicle).strip():
             raise ConfigError(
                 [f"companion {arguments.command}: --vehicle: expected the name of a file, got an empty one"]
+            )
+        if getattr(arguments, "write", False) and arguments.vehicle in names("vehicles"):
+            raise ConfigError(
+                [
+                    f"companion {arguments.command}: --write: {arguments.vehicle} is part of the installation; name your own vehicle "
+                    "file with --vehicle (companion init DIR writes copies of all files)"
+                ]
             )
         self.arguments = arguments
         self.vehicle = load_vehicle(arguments.vehicle, arguments.overrides)
@@ -153,7 +160,8 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
     except Cancelled as end:
         print_error(f"companion {tool.name}: {end}")
         return EXIT_ABORTED
-    patch = propose(arguments.vehicle, report.changes) if report.changes else None
+    vehicle_path = named_file("vehicles", arguments.vehicle, "--vehicle")
+    patch = propose(vehicle_path, report.changes) if report.changes else None
     written = str(patch.write()) if patch and _may_write(session, tool.family, patch) else None
     settled = not patch or (written is not None and tool.family.ok_when_written)
     ok = settled and (not refusals(report.rows) if report.ok is None else report.ok)
@@ -241,7 +249,9 @@ def add_tool(
         yes: whether the tool has `--yes`.
     """
     parser: argparse.ArgumentParser = parts.add_parser(name, help=help, description=description)
-    parser.add_argument("--vehicle", metavar="FILE", default=VEHICLE, help=f"vehicle file (default: {VEHICLE})")
+    parser.add_argument(
+        "--vehicle", metavar="FILE", default=DEFAULT_VEHICLE, help=f"vehicle file (default: {DEFAULT_VEHICLE})"
+    )
     parser.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
         help="override a value, e.g. vehicle.devices.arm.port=/dev/ttyUSB0",

@@ -26,13 +26,11 @@ from companion.config.document import (
 from companion.config.explain import nearest, validate
 from companion.config.mission import ControllerChoice, Mission
 from companion.config.overrides import Override, Section, apply_overrides, parse_overrides
+from companion.config.shipped import named_file, shipped_file
 from companion.config.vehicle import ANY_INTERFACE, Vehicle
 from companion.config.yaml_strict import read_document
 
 M = TypeVar("M", bound=Model)
-
-PRESET_DIRECTORY = Path(__file__).parent / "presets"
-"""Folder of the built-in controller files: package data, so that every installation finds them."""
 
 
 class Sources(Model):
@@ -68,8 +66,8 @@ def load_flight(
     """Read, override and check everything.
 
     Args:
-        mission_path: mission file.
-        vehicle_path: vehicle file in place of the mission's.
+        mission_path: mission file, or the name of a shipped one (`companion.config.shipped`).
+        vehicle_path: vehicle file in place of the mission's, or the name of a shipped one.
         controller_law: control law in place of the mission's (a key of `PRESETS`).
         preset: built-in preset of that law in place of the mission's.
         overrides: `--set` options, `section.key[index].key=value`, applied before anything is checked. Those of the section `world`
@@ -81,7 +79,7 @@ def load_flight(
     """
     parsed = parse_overrides(overrides)
     lines: list[str] = []
-    mission_file = read_document(mission_path)
+    mission_file = read_document(named_file("missions", mission_path, "mission"))
     mission = check_document(Mission, mission_file, "mission", parsed, lines)
 
     vehicle: Vehicle | None = None
@@ -122,13 +120,14 @@ def load_flight(
 
 
 def load_vehicle(path: str | Path, overrides: Sequence[str] = ()) -> Vehicle:
-    """Read and check a vehicle file alone, with the `vehicle.` overrides.
+    """Read and check a vehicle file, or the shipped one of that name, alone, with the `vehicle.` overrides.
 
     Raises:
         ConfigError: one message per problem.
     """
     lines: list[str] = []
-    vehicle = check_document(Vehicle, read_document(path), "vehicle", parse_overrides(overrides), lines)
+    document = read_document(named_file("vehicles", path, "--vehicle"))
+    vehicle = check_document(Vehicle, document, "vehicle", parse_overrides(overrides), lines)
     if vehicle is None:
         raise ConfigError(lines)
     return vehicle
@@ -206,18 +205,17 @@ def _open_named(
     mission_file: Document, location: Location, given: str | Path | None, lines: list[str]
 ) -> Document | None:
     """Read the file `given`, or else the one that the mission names, relative to the mission file."""
-    if given is not None:
-        path, shown, where = Path(given), str(given), ""
-    else:
+    where = ""
+    try:
+        if given is not None:
+            return read_document(named_file("vehicles", given, "--vehicle"))
         named = _value(mission_file, location)
         if not isinstance(named, str):
             return None  # missing or not text: the check of the mission reports it
         origin = mission_file.origin(location)
         base = Path(mission_file.source).parent if origin.line else Path()
-        shown = os.path.normpath(base / named)
-        path, where = Path(shown), f"{origin}: {key_path(location)}: "
-    try:
-        return read_document(path, shown)
+        where = f"{origin}: {key_path(location)}: "
+        return read_document(os.path.normpath(base / named))
     except ConfigError as error:
         lines += [where + line for line in error.lines]
         return None
@@ -238,9 +236,7 @@ def _open_preset(law: str | None, preset: str | None) -> Document:
     preset = preset or PRESETS[law][-1]
     if preset not in PRESETS[law]:
         raise ConfigError([f"--preset {preset}: no such preset of '{law}'; available: {', '.join(PRESETS[law])}"])
-    path = PRESET_DIRECTORY / f"{law}_{preset}.yaml"
-    here = Path.cwd()
-    return read_document(path, str(path.relative_to(here)) if path.is_relative_to(here) else str(path))
+    return read_document(shipped_file("controllers", f"{law}_{preset}"))
 
 
 def _value(document: Document, location: Location) -> Data:

@@ -15,9 +15,10 @@ from decimal import Decimal
 from pathlib import Path
 
 from companion.config.document import ConfigError
+from companion.config.shipped import FILES
 
-PACKAGED = Path(__file__).parent / "indoor_mocap.params"
-"""The project's parameter file as package data, so that every installation finds it; configs/px4/ contains a copy."""
+PACKAGED = FILES / "px4/indoor_mocap.params"
+"""The project's parameter file."""
 INT32, REAL32 = 6, 9
 COLUMNS = "# Vehicle-Id\tComponent-Id\tName\tValue\tType"
 VEHICLE_ID = COMPONENT_ID = 1

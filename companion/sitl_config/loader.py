@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from companion.config.document import ConfigError, Data, Document
-from companion.config.explain import nearest
+from companion.config.document import ConfigError, Data
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.overrides import apply_overrides, parse_overrides
+from companion.config.shipped import named_file, names
 from companion.config.yaml_strict import read_document
 from companion.sitl_config.distributions import Laboratory, check_world, take_ranges
 from companion.sitl_config.world import World
 
-WORLD_DIRECTORY = Path(__file__).parent / "worlds"
-"""Folder of the built-in worlds: package data, so that every installation finds them."""
-WORLDS = tuple(sorted(path.stem for path in WORLD_DIRECTORY.glob("*.yaml")))
+WORLDS = names("worlds")
 """Names of the built-in worlds."""
 DEFAULT_WORLD = "ideal"
 """The world of a configuration for which none is named."""
@@ -82,22 +80,10 @@ def load_world(overrides: Sequence[str] = (), world: str = DEFAULT_WORLD) -> tup
     Raises:
         ConfigError: one message per problem.
     """
-    document = _open_world(world)
+    document = read_document(named_file("worlds", world, "--world"))
     apply_overrides(document, "world", parse_overrides(overrides))
     ranges = take_ranges(document)
     return check_world(document, ranges, _seed_of(document.data)), Laboratory(name=world, ranges=ranges)
-
-
-def _open_world(world: str) -> Document:
-    if world in WORLDS:
-        path = WORLD_DIRECTORY / f"{world}.yaml"
-        here = Path.cwd()
-        return read_document(path, str(path.relative_to(here)) if path.is_relative_to(here) else str(path))
-    if not Path(world).suffix and not Path(world).exists():
-        close = nearest(world, list(WORLDS))
-        hint = f" (did you mean {close}?)" if close else ""
-        raise ConfigError([f"--world {world}: expected {', '.join(WORLDS)} or a file, found neither{hint}"])
-    return read_document(world)
 
 
 def _seed_of(data: dict[str, Data]) -> int:

@@ -83,6 +83,19 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "abbreviated option": ((*FLY, "--pres", "paper"), (r"^companion fly: .*--pres",)),
     "two missions": ((*FLY, "other.yaml"), (r"^companion fly: .*other\.yaml",)),
     "missing mission": (("fly", "nofile.yaml", "--sitl"), (r"^nofile\.yaml: no such file$",)),
+    "no such built-in mission": (
+        ("fly", "cath", "--sitl"),
+        (r"^mission cath: expected catch, circuit, .* or a file, found neither \(did you mean catch\?\)$",),
+    ),
+    "no such built-in vehicle": (
+        (*FLY, "--vehicle", "tarot"),
+        (r"^--vehicle tarot: expected tarot650_2r or a file, found neither",),
+    ),
+    "the shipped vehicle file is not written": (
+        ("arm", "scan", "--write"),
+        (r"^companion arm: --write: tarot650_2r is part of the installation; .*companion init",),
+    ),
+    "copies over existing files": (("init", "."), (r"^companion init: \. exists; .*nothing was written$",)),
     "mission is a directory": (("fly", ".", "--sitl"), (r"^\.: is a directory, expected a YAML file",)),
     "mission is binary": (("fly", "/bin/sh", "--sitl"), (r"^/bin/sh:1: not UTF-8",)),
     "missing vehicle": ((*FLY, "--vehicle", "nofile.yaml"), (r"^nofile\.yaml: no such file$",)),

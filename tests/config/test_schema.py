@@ -10,9 +10,10 @@ import jsonschema
 import pytest
 
 from companion.cli.schema import KINDS, schema_json
-from companion.config.loader import PRESET_DIRECTORY, PRESETS
+from companion.config.loader import PRESETS
+from companion.config.shipped import names
 from companion.config.yaml_strict import read_document
-from companion.sitl_config.loader import WORLD_DIRECTORY
+from companion.sitl_config.loader import WORLDS
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 FOLDERS = {"missions": "mission", "vehicles": "vehicle", "controllers": "controller", "worlds": "world"}
@@ -57,14 +58,10 @@ def test_schema_refuses_what_the_model_refuses() -> None:
         schema.validate(document)
 
 
-def test_every_preset_is_there_once_and_shown_beside_the_other_configurations() -> None:
-    names = {f"{law}_{preset}.yaml" for law, presets in PRESETS.items() for preset in presets}
-    assert {path.name for path in PRESET_DIRECTORY.glob("*.yaml")} == names
-    for name in names:
-        assert (CONFIGS / "controllers" / name).resolve() == (PRESET_DIRECTORY / name).resolve()
+def test_every_preset_is_shipped() -> None:
+    presets = {f"{law}_{preset}" for law, presets in PRESETS.items() for preset in presets}
+    assert set(names("controllers")) == presets
 
 
-def test_every_world_is_there_once_and_shown_beside_the_other_configurations() -> None:
-    assert {path.name for path in WORLD_DIRECTORY.glob("*.yaml")} == {"ideal.yaml", "lab.yaml", "robustness.yaml"}
-    for path in WORLD_DIRECTORY.glob("*.yaml"):
-        assert (CONFIGS / "worlds" / path.name).resolve() == path.resolve()
+def test_every_world_is_shipped() -> None:
+    assert WORLDS == ("ideal", "lab", "robustness")

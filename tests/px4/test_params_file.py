@@ -121,7 +121,6 @@ def test_the_published_file_is_the_table() -> None:
     """Made by `python -m tools.docs.px4 .`."""
     text = published.indoor_mocap_text()
     assert (CONFIGS / "indoor_mocap.params").read_text(encoding="utf-8") == text
-    assert params_file.PACKAGED.read_text(encoding="utf-8") == text
     assert params_file.read(CONFIGS / "indoor_mocap.params") == pytest.approx(file_values())
     for wanted in WANTED:
         assert (wanted.name in file_values()) is (wanted.file and wanted.value is not None)

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from companion.preflight.px4 import text_of
 from companion.px4 import params_file
-from companion.px4.params_file import PACKAGED
 from companion.px4.required import GROUPS, NO_RADIO, RADIO, file_values
 from tools.docs.tables import written
 
@@ -76,9 +75,7 @@ def table_markdown() -> str:
 
 def main(root: Path) -> None:
     """Write all files below `root`."""
-    text = indoor_mocap_text()
-    PACKAGED.write_text(text, encoding="utf-8")
-    (root / "configs/px4/indoor_mocap.params").write_text(text, encoding="utf-8")
+    (root / "configs/px4/indoor_mocap.params").write_text(indoor_mocap_text(), encoding="utf-8")
     (root / "configs/px4" / NO_RADIO_FILE).write_text(no_radio_text(), encoding="utf-8")
     page = root / "docs/px4.md"
     page.write_text(written(page.read_text(encoding="utf-8"), {DOCS_MARK: table_markdown()}), encoding="utf-8")

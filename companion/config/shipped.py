@@ -1,0 +1,46 @@
+"""The configuration files that every installation contains: package data, in the repository also reached as `configs/`."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+from companion.config.document import ConfigError
+from companion.config.explain import nearest
+
+FILES = Path(str(resources.files("companion.config"))) / "files"
+"""Folder of the files, with a folder for each kind."""
+DEFAULT_MISSION = "catch"
+DEFAULT_VEHICLE = "tarot650_2r"
+
+
+def names(folder: str) -> tuple[str, ...]:
+    """Return the names of the shipped YAML files in a folder of `FILES`."""
+    return tuple(sorted(path.stem for path in (FILES / folder).glob("*.yaml")))
+
+
+def shipped_file(folder: str, name: str) -> Path:
+    """Return the path of a shipped YAML file, relative to the current directory if it is below it."""
+    path, here = FILES / folder / f"{name}.yaml", Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path
+
+
+def named_file(folder: str, given: str | Path, option: str) -> Path:
+    """Return the path of the shipped file with a name, or else the user's path.
+
+    Args:
+        folder: folder of `FILES`.
+        given: name of a shipped file, or a path.
+        option: the command-line option that names it, for messages.
+
+    Raises:
+        ConfigError: a word without a suffix is neither the name of a shipped file nor a file.
+    """
+    known = names(folder)
+    if str(given) in known:
+        return shipped_file(folder, str(given))
+    if str(given) and not Path(given).suffix and not Path(given).exists():
+        close = nearest(str(given), list(known))
+        hint = f" (did you mean {close}?)" if close else ""
+        raise ConfigError([f"{option} {given}: expected {', '.join(known)} or a file, found neither{hint}"])
+    return Path(given)

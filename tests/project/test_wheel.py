@@ -1,0 +1,67 @@
+"""The wheel contains every file that the program reads, and flies from an empty folder without the repository."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from tests.support import ROOT
+
+PACKAGES = ("companion", "sitl")
+FLIGHT = """
+import companion
+from companion.cli.main import main
+from companion.sitl_config.loader import load_sitl
+from sitl.fast.loop import FastFlight
+assert main(["check", "--plan-only"]) == 0
+assert main(["init"]) == 0
+assert main(["check", "configs/missions/hover.yaml", "--plan-only"]) == 0
+flown = FastFlight(load_sitl("hover", world="lab")).run(limit_s=0.5)
+print(companion.__file__, len(flown.outputs))
+"""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, unpacked."""
+    source, built = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("built")
+    for name in PACKAGES:
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", str(built)]
+    subprocess.run([*command, str(source)], check=True, env={**os.environ, "PIP_NO_INDEX": "1"})
+    (file,) = built.glob("*.whl")
+    with zipfile.ZipFile(file) as archive:
+        archive.extractall(built / "files")
+    return built / "files"
+
+
+def test_the_wheel_contains_every_file_of_the_packages(wheel: Path) -> None:
+    def files(root: Path) -> set[str]:
+        found = (path for name in PACKAGES for path in (root / name).rglob("*"))
+        return {str(path.relative_to(root)) for path in found if path.is_file() and path.parent.name != "__pycache__"}
+
+    assert files(wheel) == files(ROOT)
+    assert "companion/config/files/missions/catch.yaml" in files(wheel)
+
+
+def test_the_installed_program_needs_no_repository(wheel: Path, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", FLIGHT],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(wheel)},
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    path, ticks = done.stdout.split()[-2:]
+    assert Path(path).is_relative_to(wheel)
+    assert int(ticks) >= 100
+    assert {path.name for path in tmp_path.iterdir()} == {"configs"}
