@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import os
 import socket
+import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TextIO
 
 import pytest
 
-from companion.config.loader import load_flight
+from companion.config.loader import FlightConfig, load_flight
 from companion.core.flight_core import FlightCore
 from companion.flight import main as app
 from companion.launcher.launcher import replace_device_settings
 from companion.model.types import Inputs, Outcome, Outputs
-from companion.preflight import run as before_arming
-from tests.support import HOVER, LOW_HOVER, PATIENT, World, sandbox_in, set_options
+from tests.support import DEADLINE_S, HOVER, LOW_HOVER, PATIENT, World, sandbox_in, set_options
 
 BREAKS_AFTER_S = 2.5
 
@@ -33,34 +31,39 @@ class BreakingCore(FlightCore):
         return outputs
 
 
-@contextlib.contextmanager
-def full_disk() -> Iterator[TextIO]:
-    """A file that cannot be written, not even when it is closed."""
-    full = open("/dev/full", "w", buffering=1, encoding="utf-8")  # noqa: SIM115 - closed below
-    try:
-        yield full
-    finally:
-        with contextlib.suppress(OSError):
-            full.close()
+def fly_with_a_bug() -> None:
+    """The flight process: configuration from stdin, folder and socket as arguments, the outcome to stdout."""
+    app.FlightCore = BreakingCore  # type: ignore[attr-defined]
+    config = FlightConfig.model_validate_json(sys.stdin.read())
+    with socket.socket(fileno=int(sys.argv[2])) as channel:
+        print(asyncio.run(app.fly(config, Path(sys.argv[1]), channel)).value)
 
 
 @pytest.mark.flight
-def test_an_internal_error_in_the_air_lands_by_px4(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_an_internal_error_in_the_air_lands_by_px4(tmp_path: Path) -> None:
     """A full disk under flight.log costs the traceback, not the landing. With room on it, it is there: test_guardian.py."""
-    monkeypatch.setattr(app, "FlightCore", BreakingCore)
-    for room in (app, before_arming):
-        monkeypatch.setattr(room, "claim_realtime", lambda priority, **_: "not for the test's own process")
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     theirs.setblocking(False)
     options = [word for word in set_options(**PATIENT, **LOW_HOVER) if word != "--set"]
-    with sandbox_in(tmp_path) as sandbox, World(sandbox, HOVER) as world, ours, theirs, full_disk() as full:
-        monkeypatch.setattr(sys, "stderr", full)
+    with sandbox_in(tmp_path) as sandbox, World(sandbox, HOVER) as world, ours, theirs, open("/dev/full", "wb") as full:
         config = replace_device_settings(load_flight(HOVER, overrides=options), world.devices)
-        outcome = asyncio.run(app.fly(config, tmp_path, theirs))
-        assert outcome is Outcome.ABORTED
+        flown = subprocess.run(
+            [sys.executable, "-m", __name__, str(tmp_path), str(theirs.fileno())],
+            input=config.model_dump_json(),
+            stdout=subprocess.PIPE,
+            stderr=full,
+            pass_fds=(theirs.fileno(),),
+            env={**sandbox.environment, "PYTHONPATH": os.getcwd()},
+            start_new_session=True,
+            text=True,
+            timeout=DEADLINE_S,
+            check=False,
+        )
+        assert flown.stdout.strip() == Outcome.ABORTED.value
         rest = [message["at_rest"] for message in world.messages if message["type"] == "at_rest"]
         assert rest[-2:] == [False, True], "it armed, and stands disarmed"
         assert not world.crashes
-    assert "ZeroDivisionError: a bug" not in capfd.readouterr().err, "it went to the disk that is full"
+
+
+if __name__ == "__main__":
+    fly_with_a_bug()
