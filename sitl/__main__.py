@@ -108,7 +108,7 @@ def _print_addresses(devices: dict[str, dict[str, Any]], px4: RealPx4 | None) ->
         f"  mocap         NatNet on 127.0.0.1, command port {mocap['command_port']}, multicast, data port "
         f"{mocap.get('data_port')}\n"
         f"  arm bus       {devices['arm']['port']}\n"
-        f"  force sensor  {devices['force']['port']}",
+        f"  force sensor  {devices['force']['port'] if 'force' in devices else 'none on this vehicle'}",
         flush=True,
     )
 

@@ -105,6 +105,8 @@ class Sitl:
         )
         if config.faults:
             self.plant.faults = self.faults
+        self.force: ForceTorqueServer | None = None
+        """None if the vehicle has no force sensor, and before the links are open."""
         other = config.mocap_other_id
         self._others = () if other is None else ((other, OTHER_BODY),)
         self._arm_handling = ArmHandling(vehicle.arm, pose[2]) if config.arm_hand else None
@@ -135,7 +137,8 @@ class Sitl:
         device = self._vehicle.devices
         async with contextlib.AsyncExitStack() as stack:
             self.bus = await stack.enter_async_context(ServoBus(self._on_bus))
-            self.force = await stack.enter_async_context(ForceTorqueServer())
+            if device.force is not None:
+                self.force = await stack.enter_async_context(ForceTorqueServer())
             self.mocap = await stack.enter_async_context(
                 NatNetServer(
                     version=self._config.natnet_version,
@@ -157,12 +160,14 @@ class Sitl:
             }
             if self._ports.multicast:
                 mocap["data_port"] = self.mocap.data_port
-            yield {
+            addresses: dict[str, dict[str, Any]] = {
                 "autopilot": {"address": address},
                 "mocap": mocap,
                 "arm": {"port": self.bus.path},
-                "force": {"port": self.force.port},
             }
+            if self.force is not None:
+                addresses["force"] = {"port": self.force.port}
+            yield addresses
 
     def flight_environment(self) -> dict[str, str]:
         """Return the environment variables that the flight process needs for faults that hang it."""
@@ -233,9 +238,10 @@ class Sitl:
             else:
                 loop = asyncio.get_running_loop()
                 self._next_frame = loop.call_at(self._origin_s + leaves_s, self._publish, frame, leaves_s)
-        plant.force_is_read = self.force.streaming
-        self.force.set_wrench(*plant.force_torque())
-        self.force.tick(plant.t_s)
+        if self.force is not None:
+            plant.force_is_read = self.force.streaming
+            self.force.set_wrench(*plant.force_torque())
+            self.force.tick(plant.t_s)
         autopilot.pump(plant.t_s, plant.battery())
         observed, armed = autopilot.observe(), autopilot.armed
         mode = None if observed.nav_state is None else observed.nav_state.name
@@ -281,7 +287,8 @@ class Sitl:
         down = plant.fault("link_loss") is not None or self.autopilot.down
         self.autopilot.set_link(down, self.faults.size("link_delay"))
         self.bus.damaged = self.faults.packet_lost
-        self.force.silent = plant.fault("force_loss") is not None
+        if self.force is not None:
+            self.force.silent = plant.fault("force_loss") is not None
         fault = plant.fault("servo_loss")
         if fault is not None:
             self._lost_servo = self.servos[fault.servo - 1]

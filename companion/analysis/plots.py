@@ -173,7 +173,8 @@ def _load(log: FlightLog) -> Figure | None:
 
 def _force(log: FlightLog) -> Figure | None:
     force = log.column(lambda i, o, s: o.control.force_ext_world_n if o.control else None, 3)
-    if not np.isfinite(force).any():
+    devices = (log.config.get("vehicle") or {}).get("devices") or {}
+    if devices.get("force", {}) is None or not np.isfinite(force).any():
         return None
     figure, axes, t = _stack(log, "Contact force, world frame", (1.0,), height_in=3.2)
     for j, name in enumerate("xyz"):

@@ -214,7 +214,8 @@ class Devices(Model):
     autopilot: AutopilotDevice
     mocap: MocapDevice
     arm: ArmDevice
-    force: ForceDevice
+    force: ForceDevice | None = None
+    """Force-torque sensor. If it is absent, the control law runs without a measured force and no catch is detected (docs/parts.md)."""
 
 
 class Safety(Model):

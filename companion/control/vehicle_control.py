@@ -80,10 +80,12 @@ class VehicleControl:
         self._sensing.begin_tare()
 
     def collect_tare(self, i: Inputs) -> None:
-        """Add this tick's force sample, taken at rest, to the tare, and return the command that holds the arm."""
-        if i.vehicle is not None and i.arm is not None and i.force is not None:
+        """Add this tick's force sample, taken at rest, to the tare, and make the present joint angles those that hold the arm."""
+        if i.vehicle is None or i.arm is None:
+            return
+        self._arm_target_rad = i.arm.angle_rad
+        if i.force is not None:
             self._sensing.collect(i.force, i.vehicle.attitude_wxyz, i.arm.angle_rad)
-            self._arm_target_rad = i.arm.angle_rad
 
     def finish_tare(self) -> None:
         """Set the force sensor's bias from the collected samples."""

@@ -135,7 +135,7 @@ class FlightCore:
             situation.found_armed = None
         situation.tracking_error_m = self._control.tracking_error_m if stage is _PLAN else None
         situation.control = self._log
-        situation.waiting = stage is Stage.WAIT and bool(missing_inputs(inputs))
+        situation.waiting = stage is Stage.WAIT and bool(missing_inputs(inputs, self._vehicle))
         armed_by_others = stage in seq.BEFORE_ARMING and seq.is_armed(inputs.status)
         if armed_by_others:
             situation.airborne, situation.found_armed = found_armed(inputs, self._parameters.clearance_m)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from companion.config.vehicle import Vehicle
 from companion.core.flight_state import Tare
 from companion.core.transition import Transition
 from companion.mission.active_plan import Course
@@ -47,10 +48,10 @@ def _wait(t: Transition, elapsed_s: float) -> AutopilotRequest:
 
 
 def _wait_for_readiness(t: Transition, elapsed_s: float) -> None:
-    """Wait until every input has arrived and PX4 has followed motion capture for the duration of the tare."""
+    """Wait until every input of the vehicle has arrived and PX4 has followed motion capture for the duration of the tare."""
     i, was_ready = t.i, t.state.waiting.was_ready
     overdue = elapsed_s > seq.WAIT_TIMEOUT_S and not was_ready
-    missing = missing_inputs(i)
+    missing = missing_inputs(i, t.parameters.vehicle)
     problem = _nothing_from(missing) if missing else unfused(i)
     if problem is not None:
         t.change_waiting(unready=problem, tare_start_s=None, settled=SettledEstimate())
@@ -97,7 +98,7 @@ def _is_ready(t: Transition) -> None:
 def _ready(t: Transition, _: float) -> AutopilotRequest:
     """Wait until the operator starts the take-off or a required input is lost."""
     i, waiting = t.i, t.state.waiting
-    missing = missing_inputs(i)
+    missing = missing_inputs(i, t.parameters.vehicle)
     problem = _nothing_from(missing) if missing else unfused(i)
     if problem is None:
         assert waiting.tare_start_s is not None
@@ -301,15 +302,16 @@ def _crash(t: Transition, text: str) -> None:
         t.finish(Outcome.CRASHED)
 
 
-def missing_inputs(i: Inputs) -> list[str]:
-    """Return the devices that have delivered nothing."""
-    devices = {
+def missing_inputs(i: Inputs, vehicle: Vehicle) -> list[str]:
+    """Return the devices of the vehicle that have delivered nothing."""
+    devices: dict[str, object] = {
         "PX4 state": i.vehicle,
         "PX4": i.status,
         "motion capture": i.mocap,
         "arm": i.arm,
-        "force sensor": i.force,
     }
+    if vehicle.devices.force is not None:
+        devices["force sensor"] = i.force
     return [name for name, value in devices.items() if value is None]
 
 

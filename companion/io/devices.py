@@ -37,7 +37,7 @@ class VisionFilter:
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """All open devices of a flight. A device is None only if PX4 was found armed and the device could not be opened."""
+    """All open devices of a flight. A device is None if the vehicle has none, or if PX4 was found armed and it could not be opened."""
 
     vision: VisionFilter
     autopilot: Autopilot
@@ -116,7 +116,9 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
             return
         if problem is not None:
             raise problem
-        force = await stack.enter_async_context(_force(config, clock))
+        force = None
+        if (sensor := _force(config, clock)) is not None:
+            force = await stack.enter_async_context(sensor)
         ground = None
         if ground_address is not None:
             ground = await stack.enter_async_context(_ground(config, ground_address, autopilot))
@@ -146,8 +148,9 @@ async def open_available(
             except DeviceError as error:
                 available.failures[device] = str(error)
 
-        with noted("force", "force sensor"):
-            available.force = await stack.enter_async_context(_force(config, clock))
+        if (sensor := _force(config, clock)) is not None:
+            with noted("force", "force sensor"):
+                available.force = await stack.enter_async_context(sensor)
         with noted("mocap", "motion capture"):
             available.mocap = await stack.enter_async_context(_mocap(config, clock, available))
         with noted("autopilot", "PX4"):
@@ -166,8 +169,10 @@ async def _is_armed(autopilot: Autopilot) -> bool:
     return is_armed(autopilot.status())
 
 
-def _force(config: FlightConfig, clock: Clock) -> RobotousForceTorque:
-    return RobotousForceTorque(config.vehicle.devices.force, clock)
+def _force(config: FlightConfig, clock: Clock) -> RobotousForceTorque | None:
+    """Return the driver of the force sensor, or None if the vehicle has none."""
+    device = config.vehicle.devices.force
+    return RobotousForceTorque(device, clock) if device is not None else None
 
 
 def _mocap(config: FlightConfig, clock: Clock, available: AvailableDevices) -> NatNetMocap:

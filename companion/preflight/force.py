@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 
-from companion.config.vehicle import Vehicle
+from companion.config.vehicle import ForceDevice, Tool, Vehicle
 from companion.control.manipulator import Manipulator
 from companion.control.sensing import ForceSensing
 from companion.model.check_row import Row
@@ -18,7 +18,7 @@ from companion.preflight.checks import Check
 DEVICE = Check(
     "force.device",
     "force sensor",
-    "the port opens, an RFT60 answers and streams",
+    "the port opens, an RFT60 answers and streams; a vehicle without `devices.force` only warns",
     "the controller needs the payload's force",
 )
 RATE = Check(
@@ -70,7 +70,11 @@ TARE_GOOD, TARE_MAX = 0.05, 0.10
 
 
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
-    """Return the rows of the force sensor."""
+    """Return the rows of the force sensor, or one warning if the vehicle has none."""
+    if vehicle.devices.force is None:
+        fix = "add devices.force to the vehicle file if the sensor is mounted; without it the controller flies without force"
+        yield DEVICE.doubtful("none: a catch, a lost payload and a force on the empty net are not detected", "", fix)
+        return
     failure, stream = o.failures.get("force"), o.force_stream
     if failure is not None:
         yield DEVICE.bad(failure, "", "")
@@ -79,7 +83,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         yield DEVICE.bad("not checked", "", "")
         return
     pose = (o.vehicle[-1].attitude_wxyz, o.arm[-1].angle_rad) if o.vehicle and o.arm else None
-    yield from stream_rows(stream, o.force, o.duration_s, vehicle, pose)
+    yield from stream_rows(stream, o.force, o.duration_s, vehicle, vehicle.devices.force, pose)
     if o.machine is not None and stream.lost is None:
         yield usb_latency(USB, o.machine.force_latency_ms)
 
@@ -89,6 +93,7 @@ def stream_rows(
     samples: Sequence[ForceSample],
     duration_s: float,
     vehicle: Vehicle,
+    device: ForceDevice,
     pose: tuple[Quat, Vec2] | None,
 ) -> Iterator[Row]:
     """Return the rows of a sensor that was recorded at rest.
@@ -98,25 +103,26 @@ def stream_rows(
         samples: in order of time.
         duration_s: duration of the observation.
         vehicle: limits, and the tool whose weight the tare accounts for.
+        device: expected rate and range of the sensor.
         pose: attitude of the body and joint angles, rad; None if unknown; the row of the tare is then left out.
     """
     if stream.lost is not None:
         yield DEVICE.bad(stream.lost, "the sensor keeps streaming", "check plug and cable")
         return
     yield DEVICE.good(stream.product or "answers")
-    yield _rate(stream.samples / duration_s, vehicle)
+    yield _rate(stream.samples / duration_s, device)
     fix = "use a shielded cable, away from motors and their wires"
     yield CHECKSUMS.row(not stream.bad_sums, f"{stream.bad_sums or 'none'} wrong", "none", fix)
     if len(samples) >= 10:
         yield _noise(samples)
-        yield _overload(samples, vehicle)
+        yield _overload(samples, device)
         if pose is not None:
-            yield _tare(tare_bias_n(samples, vehicle, *pose), vehicle)
+            yield _tare(tare_bias_n(samples, vehicle, *pose), vehicle.tool, device)
         yield _still(samples, vehicle)
 
 
-def _rate(rate_hz: float, vehicle: Vehicle) -> Row:
-    expected_hz = vehicle.devices.force.rate_hz
+def _rate(rate_hz: float, device: ForceDevice) -> Row:
+    expected_hz = device.rate_hz
     read, wanted = f"{rate_hz:.0f} Hz", f"{expected_hz} Hz"
     if rate_hz >= RATE_GOOD * expected_hz:
         return RATE.good(read, wanted)
@@ -138,19 +144,19 @@ def _noise(samples: Sequence[ForceSample]) -> Row:
     return (NOISE.doubtful if noise_n <= NOISE_MAX_N else NOISE.bad)(read, wanted, fix)
 
 
-def _overload(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
+def _overload(samples: Sequence[ForceSample], device: ForceDevice) -> Row:
     count = sum(sample.overload for sample in samples)
     if not count:
         return OVERLOAD.good("none", "none")
-    limit_n = vehicle.devices.force.force_max_n
+    limit_n = device.force_max_n
     fix = f"remove the load; if there is none, the sensor or its mount is damaged (devices.force.force_max_n is {limit_n:g} N)"
     return OVERLOAD.bad(f"{count} of {len(samples)} samples", "none", fix)
 
 
-def _tare(bias_n: Vec3, vehicle: Vehicle) -> Row:
-    size_n, full_n = math.hypot(*bias_n), vehicle.devices.force.force_max_n
+def _tare(bias_n: Vec3, tool: Tool, device: ForceDevice) -> Row:
+    size_n, full_n = math.hypot(*bias_n), device.force_max_n
     x, y, z = bias_n
-    read = f"({x:.1f}, {y:.1f}, {z:.1f}) N beyond the net's {vehicle.tool.net_mass_kg:g} kg"
+    read = f"({x:.1f}, {y:.1f}, {z:.1f}) N beyond the net's {tool.net_mass_kg:g} kg"
     wanted = f"{TARE_GOOD * full_n:g} N"
     if size_n <= TARE_GOOD * full_n:
         return TARE.good(read, wanted)

@@ -304,5 +304,5 @@ def machine_of(config: FlightConfig, out: Path) -> Machine:
         memory_lock=memory_lock_refused(),
         cpus=usable_cpus(),
         arm_latency_ms=usb_latency_ms(devices.arm.port),
-        force_latency_ms=usb_latency_ms(devices.force.port),
+        force_latency_ms=usb_latency_ms(devices.force.port) if devices.force is not None else None,
     )

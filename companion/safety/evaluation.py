@@ -24,11 +24,16 @@ class Evaluation:
 
     Args:
         vehicle: vehicle file with thresholds and hold times.
-        trackers: tracker of each subject, which is the first argument of the predicates of its rules.
+        trackers: tracker of each subject, which is the first argument of the predicates of its rules. Rules of a subject that the
+            vehicle does not have, and that therefore has no tracker, are off.
     """
 
     def __init__(self, vehicle: Vehicle, trackers: Mapping[Subject, object]) -> None:
-        bound = [(rule, rule.predicate, trackers[rule.subject], thresholds_of(rule, vehicle)) for rule in RULES]
+        bound = [
+            (rule, rule.predicate, trackers[rule.subject], thresholds_of(rule, vehicle))
+            for rule in RULES
+            if rule.subject in trackers
+        ]
         self._air: list[_Bound] = [row for row in bound if row[0].air is not None]
         self._ground: list[_Bound] = [row for row in bound if row[0].ground is not None]
         self._air_waiting = [row for row in self._air if row[0].while_waiting]

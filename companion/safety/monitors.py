@@ -40,20 +40,19 @@ class Monitors:
         self._force = ForceTracker(vehicle.safety.force_stuck_s)
         self._process = ProcessTracker()
         self._flight = FlightTracker(vehicle)
-        self._evaluation = Evaluation(
-            vehicle,
-            {
-                Subject.INPUTS: self._filter,
-                Subject.MOCAP: self._mocap,
-                Subject.PX4: self._px4,
-                Subject.ARM: self._arm,
-                Subject.FORCE: self._force,
-                Subject.PROCESS: self._process,
-                Subject.FLIGHT: self._flight,
-                Subject.TETHER: self._flight,
-                Subject.OPERATOR: self._process,
-            },
-        )
+        trackers: dict[Subject, object] = {
+            Subject.INPUTS: self._filter,
+            Subject.MOCAP: self._mocap,
+            Subject.PX4: self._px4,
+            Subject.ARM: self._arm,
+            Subject.PROCESS: self._process,
+            Subject.FLIGHT: self._flight,
+            Subject.TETHER: self._flight,
+            Subject.OPERATOR: self._process,
+        }
+        if vehicle.devices.force is not None:
+            trackers[Subject.FORCE] = self._force
+        self._evaluation = Evaluation(vehicle, trackers)
         self._awake_s = 0.0
         self._last_t_s: float | None = None
         self._airborne = False

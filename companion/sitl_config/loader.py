@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from companion.config.document import ConfigError, Data
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.overrides import apply_overrides, parse_overrides
 from companion.config.shipped import named_file, names
+from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import read_document
 from companion.sitl_config.distributions import Laboratory, check_world, take_ranges
 from companion.sitl_config.world import World
@@ -65,9 +66,20 @@ def load_sitl(
     if flight is None or simulated is None:
         raise ConfigError(lines)
     truth, laboratory = simulated
+    if lines := list(_faults_of_absent_parts(truth, flight.vehicle)):
+        raise ConfigError(lines)
     return SitlConfig(
         **{name: getattr(flight, name) for name in FlightConfig.model_fields}, world=truth, laboratory=laboratory
     )
+
+
+def _faults_of_absent_parts(world: World, vehicle: Vehicle) -> Iterator[str]:
+    """Yield one line for each fault of a part that the vehicle does not have."""
+    parts = {"force": ("devices.force", vehicle.devices.force)}
+    for number, fault in enumerate(world.faults):
+        key, part = parts.get(fault.kind.partition("_")[0], ("", vehicle))
+        if part is None:
+            yield f"world.faults[{number}].kind: {fault.kind} needs {key}, which the vehicle file of '{vehicle.name}' does not have"
 
 
 def load_world(overrides: Sequence[str] = (), world: str = DEFAULT_WORLD) -> tuple[World, Laboratory]:

@@ -166,6 +166,7 @@ class FastFlight:
             drives, scales, vehicle.devices.arm.watchdog_ms * 1e-3, self.faults if world.faults else None
         )
         self._mocap: MocapPose | None = None
+        self._has_force = vehicle.devices.force is not None
         self._force: ForceSample | None = None
         self._position = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
         self._trusted = True
@@ -299,7 +300,7 @@ class FastFlight:
             if "kill_recorder" in active or "disk_full" in active:
                 self._dropped += 1
             dropped = self._dropped
-        if plant.fault("force_loss") is None:
+        if self._has_force and plant.fault("force_loss") is None:
             load = plant.force_torque()
             force, torque = quantised(*load)
             self._force = ForceSample(

@@ -83,6 +83,14 @@ def test_a_sensor_that_is_not_there_is_one_line() -> None:
         assert "Traceback" not in ended.err
 
 
+def test_a_vehicle_without_a_force_sensor_is_one_line() -> None:
+    for part in ("check", "tare"):
+        ended = run_here("ft", part, "--vehicle", VEHICLE, "--arm-pose", "90,0", "--set", "vehicle.devices.force=null")
+        assert ended.code == EXIT_REFUSED
+        assert "vehicle 'tarot650-2r' has none; add devices.force" in ended.out
+        assert "Traceback" not in ended.err
+
+
 @pytest.mark.parametrize(
     "options",
     [

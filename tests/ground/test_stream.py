@@ -281,6 +281,17 @@ def old(device: str, limit_s: float) -> Callable[[float], dict[str, Any]]:
     return lambda share: {f"{device}__{stamp}": IN_FLIGHT[0].t_s - share * limit_s for stamp in stamps}
 
 
+def test_an_absent_force_sensor_is_shown_as_absent_and_no_force_is_shown() -> None:
+    config = load_flight(CATCH, overrides=["vehicle.devices.force=null"])
+    maker = StreamBuilder(config, "s")
+    maker.add_tick(*changed(IN_FLIGHT, force=None))
+    stream = maker.build(1.7e9)
+    assert light_of(stream, "force sensor") == (HealthLevel.OFF, "none on this vehicle")
+    assert stream.control is not None
+    assert stream.control.force_ext_world_n is None
+    assert stream_of(IN_FLIGHT).control.force_ext_world_n is not None  # type: ignore[union-attr]
+
+
 AGES = [
     ("PX4", old("vehicle", SAFETY.vehicle_timeout_s)),
     ("PX4", old("status", 2.0 * SAFETY.heartbeat_timeout_s)),

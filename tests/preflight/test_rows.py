@@ -172,6 +172,10 @@ CASES = {
     "dead bus": Case("arm.reads", "0 of 0", "loose cable", {"arm_reads": (0, 0)}),
     "arm's latency timer": Case("arm.usb_latency", "16 ms", "udev", {"machine": r.machine(arm_latency_ms=16)}, WARN),
     "no force sensor": Case("force.device", "expected it", "", failure("force")),
+    "vehicle without a force sensor": Case(
+        "force.device", "a catch, a lost payload and a force on the empty net are not detected", "add devices.force",
+        {"force": (), "force_stream": None}, WARN, vehicle={"devices.force": None},
+    ),
     "force port lost": Case("force.device", "was lost", "plug", force_stream(samples=9, lost="was lost")),
     "slow force": Case("force.rate", "150 Hz", "cable", force_stream(samples=750), WARN),
     "very slow force": Case("force.rate", "50 Hz", "cable", force_stream(samples=250)),

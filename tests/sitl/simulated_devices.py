@@ -152,7 +152,9 @@ class Partner:
     async def all_hear(self) -> None:
         """Start the force sensor's stream, and let every device read what was sent so far."""
         os.write(self._tty, rft.pack(bytes((rft.Command.START,)), rft.COMMAND_BYTES))
-        await turns_until(lambda: self._sensor.streaming)
+        sensor = self._sensor
+        assert sensor is not None
+        await turns_until(lambda: sensor.streaming)
         for _ in range(20):  # the event loop takes a datagram in a turn
             await asyncio.sleep(0)
 

@@ -12,7 +12,7 @@ from typing import Final
 import msgspec
 
 from companion.commissioning.force_torque import fit as ft_fit
-from companion.commissioning.force_torque.watch import FtSensor, arm_angles, pose_rad, until_loaded
+from companion.commissioning.force_torque.watch import FtSensor, arm_angles, force_device, pose_rad, until_loaded
 from companion.commissioning.tool import SENSORS, Cancelled, Report, Session, Tool
 from companion.config.vehicle import Vehicle
 from companion.io.dynamixel.registers import usb_latency_ms
@@ -64,7 +64,7 @@ class Watched:
 async def watch(session: Session) -> Watched:
     """Measure the sensor at rest, then under the weight."""
     vehicle, weight_kg = session.vehicle, session.arguments.weight
-    clock, device = flight_clock(), vehicle.devices.force
+    clock, device = flight_clock(), force_device(vehicle)
     given_rad = pose_rad(session.arguments.arm_pose, vehicle)
     async with FtSensor(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
         session.say(f"force sensor: {device.port}; {_EMPTY} for {WATCH_S:g} s")
@@ -144,7 +144,9 @@ def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
     return [
         *(
             msgspec.structs.replace(row, fix=bias_fix) if row.id == preflight.TARE.id and not row.ok else row
-            for row in preflight.stream_rows(seen.stream, samples, duration_s, vehicle, (IDENTITY_QUAT, seen.arm_rad))
+            for row in preflight.stream_rows(
+                seen.stream, samples, duration_s, vehicle, force_device(vehicle), (IDENTITY_QUAT, seen.arm_rad)
+            )
         ),
         ft_fit.stuck_row(samples, vehicle),
         usb_latency(preflight.USB, seen.usb_latency_ms),
@@ -173,7 +175,7 @@ async def watch_drift(session: Session) -> Tared:
     ):
         if wanted and not session.confirm(question):
             raise Cancelled("nothing was written to the sensor")
-    clock, device = flight_clock(), vehicle.devices.force
+    clock, device = flight_clock(), force_device(vehicle)
     async with FtSensor(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
         if arguments.clear:
             await sensor.set_bias(False)

@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Final
 
 from companion.config.document import ConfigError
-from companion.config.vehicle import Vehicle
+from companion.config.vehicle import ForceDevice, Vehicle
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.force_torque.driver import RobotousForceTorque
 from companion.io.force_torque.rft import Command
@@ -42,6 +42,17 @@ class FtSensor(RobotousForceTorque):
         """
         self._send(Command.SET_BIAS, int(on))
         await self.tare_samples(_ON_THEIR_WAY_S)
+
+
+def force_device(vehicle: Vehicle) -> ForceDevice:
+    """Return the settings of the force sensor.
+
+    Raises:
+        DeviceError: the vehicle has no force sensor.
+    """
+    if vehicle.devices.force is None:
+        raise DeviceError(f"force sensor: vehicle '{vehicle.name}' has none; add devices.force to the vehicle file")
+    return vehicle.devices.force
 
 
 def pose_rad(text: str | None, vehicle: Vehicle) -> Vec2 | None:

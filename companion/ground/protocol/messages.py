@@ -196,7 +196,8 @@ class ControlView(Record, frozen=True, kw_only=True):
     tau: Vec3
     """Force on the vehicle, world, N."""
     arm_torque_nm: Vec2
-    force_ext_world_n: Vec3
+    force_ext_world_n: Vec3 | None
+    """None without a force sensor."""
     hover_thrust: float
     saturated: bool
     payload_estimate_kg: float | None = None

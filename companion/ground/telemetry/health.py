@@ -80,7 +80,7 @@ class HealthEvaluator:
     def __init__(self, vehicle: Vehicle) -> None:
         self._s = vehicle.safety
         self._tether = vehicle.tether
-        self._force_max_n = vehicle.devices.force.force_max_n
+        self._force_device = vehicle.devices.force
 
     def evaluate(self, snapshot: Snapshot) -> tuple[DeviceHealth, ...]:
         """Return the health of all devices, in the order of `DEVICE_NAMES`."""
@@ -158,12 +158,14 @@ class HealthEvaluator:
         return HealthLevel.WARN if light is HealthLevel.OK and hottest_c >= s.servo_warn_c else light, text
 
     def _force(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
-        force, age_s = snapshot.inputs.force, snapshot.ages.force_s
+        force, age_s, device = snapshot.inputs.force, snapshot.ages.force_s, self._force_device
+        if device is None:
+            return HealthLevel.OFF, "none on this vehicle"
         if force is None:
             return HealthLevel.OFF, "no sample yet"
         size_n = math.hypot(*force.force_sensor_n)
         light = _level_by_age(age_s, self._s.force_timeout_s)
-        if light is HealthLevel.OK and (force.overload or not size_n <= self._force_max_n):
+        if light is HealthLevel.OK and (force.overload or not size_n <= device.force_max_n):
             return HealthLevel.WARN, f"overloaded: {size_n:.0f} N"
         return light, f"{_age_text(age_s)}, {size_n:.1f} N"
 

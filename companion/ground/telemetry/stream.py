@@ -53,6 +53,7 @@ class StreamBuilder:
     def __init__(self, config: FlightConfig, session: str) -> None:
         self._session = session
         self._health = HealthEvaluator(config.vehicle)
+        self._has_force = config.vehicle.devices.force is not None
         self._newest: tuple[Inputs, Outputs, Sent] | None = None
         self._ages = WorstAges()
         self._worst = WorstTimings()
@@ -188,7 +189,7 @@ class StreamBuilder:
             battery_v=_number(status.battery_voltage_v, 3) if status is not None else None,
             battery_remaining=_number(status.battery_remaining, 4) if status is not None else None,
             tether=_tether(o.tether),
-            control=_control(o.control),
+            control=_control(o.control, self._has_force),
             timing=timing,
             lights=self._health.evaluate(snapshot),
             limited_by=o.limited_by,
@@ -323,7 +324,7 @@ def _tether(state: TetherState | None) -> TetherView | None:
     )
 
 
-def _control(control: ControlLog | None) -> ControlView | None:
+def _control(control: ControlLog | None, has_force: bool) -> ControlView | None:
     if control is None:
         return None
     h_hat, tau = _rounded(control.h_hat, 5), _rounded(control.tau, 4)
@@ -336,7 +337,7 @@ def _control(control: ControlLog | None) -> ControlView | None:
         h_hat=h_hat,
         tau=tau[0:3],
         arm_torque_nm=tau[6:8],
-        force_ext_world_n=force,
+        force_ext_world_n=force if has_force else None,
         hover_thrust=single[1],
         saturated=any(control.saturated),
         payload_estimate_kg=_number(control.payload_estimate_kg, 4),

@@ -1,0 +1,50 @@
+"""A vehicle without an optional part flies, and nothing that watches that part reports anything."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from companion.config.document import ConfigError
+from companion.config.loader import logged_flight
+from companion.core.flight_core import FlightCore
+from companion.model.types import Outcome, PhaseKind
+from companion.sitl_config.loader import load_sitl
+from sitl.fast.loop import FastFlight
+from tests.support import SHORT_CATCH
+
+NO_FORCE = "vehicle.devices.force=null"
+
+
+@pytest.mark.parametrize("absent", [NO_FORCE])
+def test_the_catch_is_flown_without_the_part(absent: str) -> None:
+    flight = FastFlight(load_sitl(SHORT_CATCH, overrides=[absent]))
+    result = flight.run()
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert result.caught, "the payload hangs in the net"
+    assert [event.id for o in result.outputs for event in o.events if event.id != "catch"] == ["takeoff", "touchdown"]
+    worst_m = max(
+        math.dist(truth.position_world_m, o.reference.position_world_m)
+        for truth, o in zip(result.truth, result.outputs, strict=True)
+        if o.phase_kind is PhaseKind.FLIGHT and o.reference is not None
+    )
+    assert worst_m < 0.06
+    again = FlightCore(logged_flight(flight.config.flight.model_dump_json()))
+    assert all(again.step(i) == o for i, o in zip(result.inputs[:1500], result.outputs, strict=False)), "replay"
+
+
+def test_without_a_force_sensor_no_catch_is_reported() -> None:
+    result = FastFlight(load_sitl(SHORT_CATCH, overrides=[NO_FORCE])).run(limit_s=6.5)
+    assert result.caught
+    assert all(i.force is None for i in result.inputs)
+    assert [event.id for o in result.outputs for event in o.events] == ["takeoff"]
+
+
+@pytest.mark.parametrize(("absent", "fault", "key"), [(NO_FORCE, "force_loss", "devices.force")])
+def test_a_fault_of_an_absent_part_is_refused(absent: str, fault: str, key: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        load_sitl(SHORT_CATCH, overrides=[absent, f"world.faults=[{{kind: {fault}, t_s: 5.0}}]"])
+    (line,) = refused.value.lines
+    assert fault in line
+    assert f"needs {key}" in line
