@@ -13,7 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Self
 
-from companion.io.mocap.natnet import Descriptor, Message, NatNetVersion
+from companion.io.mocap.definitions import Descriptor
+from companion.io.mocap.natnet import Message, NatNetVersion
 from companion.model.frames import quat_rotate
 from companion.model.types import Quat, Vec3
 

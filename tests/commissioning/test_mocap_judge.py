@@ -12,7 +12,8 @@ from companion.commissioning.mocap.judge import FrameSeen, Route, Timing, Watche
 from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.loader import load_vehicle
-from companion.io.mocap.natnet import RigidBody, ServerInfo
+from companion.io.mocap.frames import RigidBody
+from companion.io.mocap.natnet import ServerInfo
 from companion.model.check_row import Row
 from companion.model.types import IDENTITY_QUAT, Vec3
 from tests.support import ROOT

@@ -13,7 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.io.mocap import natnet
-from companion.io.mocap.natnet import Frame, Malformed, Message, NatNetVersion
+from companion.io.mocap.definitions import BodyDefinition, parse_model_definitions
+from companion.io.mocap.frames import Frame, parse_frame
+from companion.io.mocap.natnet import Malformed, Message, NatNetVersion
 from companion.model.types import Quat
 from sitl.natnet import CLOCK_FREQUENCY_HZ, BodyPose, NatNetServer, encode_frame, encode_model_definitions
 
@@ -32,7 +34,7 @@ def frame_of(version: NatNetVersion, poses: Sequence[BodyPose] = POSES, exposure
 
 
 def parse(datagram: bytes, version: NatNetVersion, body_id: int = 1) -> Frame | Malformed:
-    return natnet.parse_frame(datagram, version, body_id, CLOCK_FREQUENCY_HZ)
+    return parse_frame(datagram, version, body_id, CLOCK_FREQUENCY_HZ)
 
 
 def good(result: Frame | Malformed) -> Frame:
@@ -70,7 +72,7 @@ def test_other_body_untracked_and_missing_body(version: NatNetVersion) -> None:
 @versions
 def test_no_exposure_stamp_or_clock_means_no_latency(version: NatNetVersion) -> None:
     assert good(parse(frame_of(version, exposure_t_s=None), version)).latency_s is None
-    assert good(natnet.parse_frame(frame_of(version), version, 1, None)).latency_s is None
+    assert good(parse_frame(frame_of(version), version, 1, None)).latency_s is None
 
 
 def rich_frame(version: NatNetVersion) -> bytes:
@@ -106,7 +108,7 @@ def rich_frame(version: NatNetVersion) -> bytes:
 
 @versions
 def test_every_section_is_skipped(version: NatNetVersion) -> None:
-    frame = good(natnet.parse_frame(rich_frame(version), version, 1, 1000))
+    frame = good(parse_frame(rich_frame(version), version, 1, 1000))
     assert (frame.number, frame.timestamp_s, frame.latency_s) == (4242, 12.5, 2.0)
     assert frame.body_ids == (3, 1)
     assert frame.body is not None
@@ -136,8 +138,8 @@ def test_position_that_is_not_finite() -> None:
 @versions
 def test_model_definitions(version: NatNetVersion) -> None:
     payload = encode_model_definitions(version, [(1, "quad"), (12, "Bälle")])
-    found = natnet.parse_model_definitions(natnet.encode_message(Message.MODELDEF, payload), version)
-    assert found == (natnet.BodyDefinition(1, "quad"), natnet.BodyDefinition(12, "Bälle"))
+    found = parse_model_definitions(natnet.encode_message(Message.MODELDEF, payload), version)
+    assert found == (BodyDefinition(1, "quad"), BodyDefinition(12, "Bälle"))
 
 
 def test_model_definitions_with_every_description_3_0() -> None:
@@ -154,9 +156,9 @@ def test_model_definitions_with_every_description_3_0() -> None:
     payload = struct.pack("<I", len(descriptions))
     payload += b"".join(struct.pack("<I", kind) + content for kind, content in descriptions)
     datagram = natnet.encode_message(Message.MODELDEF, payload)
-    assert natnet.parse_model_definitions(datagram, "3.0") == (natnet.BodyDefinition(1, "quad"),)
+    assert parse_model_definitions(datagram, "3.0") == (BodyDefinition(1, "quad"),)
     unknown = natnet.encode_message(Message.MODELDEF, struct.pack("<II", 1, 66) + b"whatever")
-    assert isinstance(natnet.parse_model_definitions(unknown, "3.0"), Malformed)
+    assert isinstance(parse_model_definitions(unknown, "3.0"), Malformed)
 
 
 def test_numbers_follow_wrap_and_restart() -> None:
@@ -208,7 +210,7 @@ def test_random_payloads(version: NatNetVersion, payload: bytes, lead: int) -> N
     believable(parse(payload, version))
     believable(parse(natnet.encode_message(Message.FRAME, frame_of(version)[4 : 4 + lead] + payload), version))
     for message, parser in (
-        (Message.MODELDEF, lambda datagram: natnet.parse_model_definitions(datagram, version)),
+        (Message.MODELDEF, lambda datagram: parse_model_definitions(datagram, version)),
         (Message.SERVER_INFO, natnet.parse_server_info),
     ):
         parser(payload)
@@ -265,8 +267,8 @@ def test_server_answers(version: NatNetVersion) -> None:
                 assert (info.data_port, info.multicast) == (server.data_port, False)
 
                 client.send(natnet.encode_request(Message.REQUEST_MODELDEF))
-                definitions = natnet.parse_model_definitions(await client.receive(Message.MODELDEF), version)
-                assert definitions == (natnet.BodyDefinition(1, "quad"),)
+                definitions = parse_model_definitions(await client.receive(Message.MODELDEF), version)
+                assert definitions == (BodyDefinition(1, "quad"),)
 
                 assert struct.unpack("<f", await client.request("FrameRate")) == (180.0,)
                 assert await client.request("Bitstream") == f"Bitstream,{version}\0".encode()

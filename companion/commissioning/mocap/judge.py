@@ -14,7 +14,8 @@ from typing import Any, Final
 from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.vehicle import Vehicle
-from companion.io.mocap.natnet import RigidBody, ServerInfo, z_up_from_y_up
+from companion.io.mocap.frames import RigidBody
+from companion.io.mocap.natnet import ServerInfo, z_up_from_y_up
 from companion.model.check_row import Row
 from companion.model.observations import MocapStream, Observations
 from companion.model.types import MocapPose

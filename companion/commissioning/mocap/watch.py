@@ -16,7 +16,8 @@ from companion.commissioning.mocap.judge import FrameSeen, Route
 from companion.config.vehicle import MocapDevice
 from companion.io.mocap import natnet
 from companion.io.mocap.driver import NatNetMocap
-from companion.io.mocap.natnet import Frame, Message, ServerInfo
+from companion.io.mocap.frames import Frame
+from companion.io.mocap.natnet import Message, ServerInfo
 from companion.runtime.clock import Clock
 
 _SIOCGIFADDR, _SIOCGIFNETMASK = 0x8915, 0x891B

@@ -9,7 +9,9 @@ import math
 from typing import Final
 
 from companion.io.mocap import natnet
-from companion.io.mocap.natnet import Frame, Malformed, Message, NatNetVersion, RigidBody, ServerInfo
+from companion.io.mocap.definitions import parse_model_definitions
+from companion.io.mocap.frames import Frame, RigidBody, parse_frame
+from companion.io.mocap.natnet import Malformed, Message, NatNetVersion, ServerInfo
 from companion.model.types import MocapPose
 from companion.safety.stream_watch import StreamWatch
 
@@ -89,7 +91,7 @@ class NatNetClient:
         if message == Message.SERVER_INFO:
             self._receive_info(datagram, arrived_s)
         elif message == Message.MODELDEF and self.version is not None:
-            definitions = natnet.parse_model_definitions(datagram, self.version)
+            definitions = parse_model_definitions(datagram, self.version)
             if isinstance(definitions, Malformed):
                 self._reject(definitions)
             else:
@@ -99,7 +101,7 @@ class NatNetClient:
     def other_body(self, datagram: bytes, body_id: int) -> RigidBody | None:
         """Return a body other than the vehicle's from a frame that `receive` has returned, or None if its pose is malformed."""
         assert self.version is not None and self.info is not None
-        frame = natnet.parse_frame(datagram, self.version, body_id, self.info.clock_frequency_hz)
+        frame = parse_frame(datagram, self.version, body_id, self.info.clock_frequency_hz)
         return frame.body if isinstance(frame, Frame) else None
 
     def pose(self, frame: Frame, stamp_s: float) -> MocapPose | None:
@@ -141,7 +143,7 @@ class NatNetClient:
     def _receive_frame(self, datagram: bytes, arrived_s: float) -> Frame | None:
         if self.version is None or self.info is None:
             return None
-        frame = natnet.parse_frame(datagram, self.version, self._body_id, self.info.clock_frequency_hz)
+        frame = parse_frame(datagram, self.version, self._body_id, self.info.clock_frequency_hz)
         if isinstance(frame, Malformed):
             self._reject(frame)
             return None

@@ -15,7 +15,8 @@ from companion.config.vehicle import MocapDevice
 from companion.io.arrival import arrived_s
 from companion.io.mocap import natnet, sockets
 from companion.io.mocap.client import CONNECT_PERIOD_S, VERSIONS, NatNetClient
-from companion.io.mocap.natnet import Frame, Message, ServerInfo
+from companion.io.mocap.frames import Frame
+from companion.io.mocap.natnet import Message, ServerInfo
 from companion.io.protocols import DeviceError
 from companion.model.observations import MocapCounts, MocapServer
 from companion.model.types import MocapPose

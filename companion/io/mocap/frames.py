@@ -1,0 +1,182 @@
+"""NatNet frames of data (NAT_FRAMEOFDATA) of versions 3.0 and 4.1; sources, units and axes as in `companion.io.mocap.natnet`.
+
+A section of a frame starts with `u32 count`, since 4.1 followed by `u32 bytes`.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from typing import Final
+
+from companion.io.mocap.natnet import (
+    COUNT_BYTES,
+    U32,
+    VEC3_BYTES,
+    Buffer,
+    Malformed,
+    Message,
+    NatNetVersion,
+    payload_of,
+    skip_string,
+)
+from companion.model.types import IDENTITY_QUAT, Quat, Vec3
+
+RIGID_BODY_BYTES: Final = 38
+LABELLED_MARKER_BYTES: Final = 26
+_RIGID_BODY = struct.Struct("<I7ffH")
+_SUFFIX = struct.Struct("<IIdQQQ")
+_PARAM_TRACKING_VALID = 0x01
+_QUAT_NORM_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class RigidBody:
+    """One rigid body of a frame, in the axes that the server streams."""
+
+    id: int
+    position_m: Vec3
+    quat_wxyz: Quat
+    error_m: float
+    tracking_valid: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """The data of one frame that the companion uses."""
+
+    number: int
+    timestamp_s: float
+    """Time of the frame on the server's own time base."""
+    latency_s: float | None
+    """Time from mid-exposure to transmission; None if the server has no exposure stamp or no clock frequency."""
+    exposure_s: float | None
+    """Time of mid-exposure on the server's own clock; None in the same cases."""
+    body: RigidBody | None
+    """The requested rigid body; None if it is not in this frame."""
+    body_ids: tuple[int, ...]
+
+
+def parse_frame(
+    datagram: Buffer, version: NatNetVersion, body_id: int, clock_frequency_hz: int | None
+) -> Frame | Malformed:
+    """Parse the requested rigid body and the suffix of a NAT_FRAMEOFDATA datagram; all other sections are skipped.
+
+    Args:
+        datagram: the datagram including its header.
+        version: the server's NatNet version.
+        body_id: streaming id of the requested rigid body.
+        clock_frequency_hz: from `ServerInfo`, for the latency.
+    """
+    payload = payload_of(datagram, Message.FRAME)
+    if isinstance(payload, Malformed):
+        return payload
+    try:
+        return _frame(payload, version == "4.1", body_id, clock_frequency_hz)
+    except (struct.error, ValueError) as error:
+        # Every read past the end and every missing terminator ends up here, so no field needs a check of its own.
+        return Malformed(f"frame of {len(payload)} bytes ends early or has wrong section sizes ({error})")
+
+
+def _frame(data: bytes, sized: bool, body_id: int, clock_frequency_hz: int | None) -> Frame | Malformed:
+    number: int = U32.unpack_from(data)[0]
+    offset = _skip_marker_sets(data, 4, sized)
+    offset = _skip_fixed(data, offset, sized, VEC3_BYTES)  # other (unlabelled) markers
+
+    count, start = _section(data, offset, sized)
+    offset = start + RIGID_BODY_BYTES * count
+    if offset > len(data):
+        return Malformed(f"{count} rigid bodies do not fit into {len(data)} bytes")
+    if sized and U32.unpack_from(data, start - 4)[0] != RIGID_BODY_BYTES * count:
+        return Malformed(f"{count} rigid bodies are not {RIGID_BODY_BYTES} bytes each: a different bitstream version")
+    ids = tuple(U32.unpack_from(data, start + RIGID_BODY_BYTES * i)[0] for i in range(count))
+    body: RigidBody | None = None
+    if body_id in ids:
+        found = _rigid_body(data, start + RIGID_BODY_BYTES * ids.index(body_id))
+        if isinstance(found, Malformed):
+            return found
+        body = found
+
+    if sized:
+        for _ in range(5):  # skeletons, assets, labelled markers, force plates, devices
+            _, size = COUNT_BYTES.unpack_from(data, offset)
+            offset += 8 + size
+    else:
+        offset = _skip_skeletons(data, offset)
+        offset = _skip_fixed(data, offset, sized, LABELLED_MARKER_BYTES)
+        offset = _skip_channels(data, offset)  # force plates
+        offset = _skip_channels(data, offset)  # devices
+    _, _, timestamp_s, exposure, _, transmit = _SUFFIX.unpack_from(data, offset)
+    latency_s: float | None = None
+    exposure_s: float | None = None
+    if clock_frequency_hz and exposure and transmit >= exposure:
+        latency_s = (transmit - exposure) / clock_frequency_hz
+        exposure_s = exposure / clock_frequency_hz
+    return Frame(
+        number=number, timestamp_s=timestamp_s, latency_s=latency_s, exposure_s=exposure_s, body=body, body_ids=ids
+    )
+
+
+def _rigid_body(data: bytes, offset: int) -> RigidBody | Malformed:
+    number, x, y, z, qx, qy, qz, qw, error_m, params = _RIGID_BODY.unpack_from(data, offset)
+    valid = bool(params & _PARAM_TRACKING_VALID)
+    norm = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
+    pose_ok = math.isfinite(x + y + z + error_m) and abs(norm - 1.0) < _QUAT_NORM_TOLERANCE
+    if pose_ok:
+        return RigidBody(
+            id=number,
+            position_m=(x, y, z),
+            quat_wxyz=(qw / norm, qx / norm, qy / norm, qz / norm),
+            error_m=error_m,
+            tracking_valid=valid,
+        )
+    if valid:
+        return Malformed(
+            f"rigid body {number}: tracked, but its pose is not finite or its quaternion's norm is {norm:g}"
+        )
+    # Motive fills an untracked body with arbitrary values, zeros included.
+    return RigidBody(id=number, position_m=(0.0, 0.0, 0.0), quat_wxyz=IDENTITY_QUAT, error_m=0.0, tracking_valid=False)
+
+
+def _section(data: bytes, offset: int, sized: bool) -> tuple[int, int]:
+    """Return the count of a section and the offset of its first element."""
+    count: int = U32.unpack_from(data, offset)[0]
+    return count, offset + (8 if sized else 4)
+
+
+def _skip_marker_sets(data: bytes, offset: int, sized: bool) -> int:
+    count, start = _section(data, offset, sized)
+    if sized:
+        size: int = U32.unpack_from(data, offset + 4)[0]
+        return start + size
+    for _ in range(count):
+        start = skip_string(data, start)
+        markers: int = U32.unpack_from(data, start)[0]
+        start += 4 + VEC3_BYTES * markers
+    return start
+
+
+def _skip_fixed(data: bytes, offset: int, sized: bool, element_bytes: int) -> int:
+    count, start = _section(data, offset, sized)
+    return start + element_bytes * count
+
+
+def _skip_skeletons(data: bytes, offset: int) -> int:
+    count, offset = _section(data, offset, sized=False)
+    for _ in range(count):
+        _, bones = COUNT_BYTES.unpack_from(data, offset)
+        offset += 8 + RIGID_BODY_BYTES * bones
+    return offset
+
+
+def _skip_channels(data: bytes, offset: int) -> int:
+    """Skip force plates or devices: an id and channels, each with its own number of floats."""
+    count, offset = _section(data, offset, sized=False)
+    for _ in range(count):
+        _, channels = COUNT_BYTES.unpack_from(data, offset)
+        offset += 8
+        for _ in range(channels):
+            values: int = U32.unpack_from(data, offset)[0]
+            offset += 4 + 4 * values
+    return offset
