@@ -1,4 +1,4 @@
-"""An emulated NatNet server (Motive): multicast and unicast, bitstream 3.0 and 4.1.
+"""An emulated NatNet server (Motive): multicast and unicast, any bitstream version since 3.0.
 
 Layouts as in the NatNet SDK (`NatNetTypes.h`, packet client). It shares only the message ids with the companion's parser, so that an
 error in either of them shows. The caller adds latency and noise.
@@ -14,16 +14,16 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 from companion.io.mocap.definitions import Descriptor
-from companion.io.mocap.natnet import Message, NatNetVersion
+from companion.io.mocap.natnet import Message
 from companion.model.frames import quat_rotate
 from companion.model.types import Quat, Vec3
 
 CLOCK_FREQUENCY_HZ: Final = 10_000_000
 """Windows' performance counter, as Motive reports it."""
 _CLOCK_ORIGIN_S: Final = 1000.0  # the server has been running; tick 0 means "no stamp"
-_VERSION_BYTES: Final[dict[str, bytes]] = {"3.0": bytes((3, 0, 0, 0)), "4.1": bytes((4, 1, 0, 0))}
 _APPLICATION = b"Motive"
-_APPLICATION_VERSION: Final[dict[str, bytes]] = {"3.0": bytes((2, 0, 0, 0)), "4.1": bytes((3, 0, 0, 0))}
+_OLDEST, _SELECTABLE, _MARKER_NAMES, _SIZES, _PIVOT_ROTATION, _NEWEST = (3, 0), (4, 0), (4, 0), (4, 1), (4, 2), (4, 4)
+"""Versions since which a server has a property, and the newest that the SDK describes."""
 _CLIENT_TIMEOUT_S: Final = 5.0
 _MARKERS_BODY_M: Final[tuple[Vec3, ...]] = (
     (0.16, 0.0, 0.05),
@@ -60,11 +60,11 @@ class BodyPose:
 class NatNetServer:
     """Streams frames of data and answers clients; an async context manager on the running event loop.
 
-    A client becomes a unicast client when it connects or, with a multicast group, when it sends a keep-alive. A unicast client of a 4.1
-    server may choose its bitstream ("Bitstream,3.0").
+    A client becomes a unicast client when it connects or, with a multicast group, when it sends a keep-alive. A unicast client of a
+    server since 4.0 may choose an older bitstream ("Bitstream,3.0").
 
     Args:
-        version: NatNet bitstream version.
+        version: NatNet bitstream version, such as "4.1". One later than 4.4 has an additional section of unknown content.
         interface: local address of both sockets, and the multicast interface.
         command_port: command port; 0 for any free one.
         data_port: source port of every frame and destination of multicast frames; 0 for any free one.
@@ -75,7 +75,7 @@ class NatNetServer:
 
     def __init__(
         self,
-        version: NatNetVersion = "4.1",
+        version: str = "4.1",
         interface: str = "127.0.0.1",
         command_port: int = 0,
         data_port: int = 0,
@@ -95,7 +95,7 @@ class NatNetServer:
         self._command: socket.socket | None = None
         self._data: socket.socket | None = None
         self._broadcast: socket.socket | None = None
-        self._clients: dict[tuple[str, int], tuple[float, NatNetVersion]] = {}
+        self._clients: dict[tuple[str, int], tuple[float, str]] = {}
         self._number = 0
         self._last: tuple[float, tuple[BodyPose, ...], float | None] = (0.0, (), None)
 
@@ -173,7 +173,7 @@ class NatNetServer:
                 encoded[version] = self._encode_last(version)
             self._send(self._data, encoded[version], address)
 
-    def _encode_last(self, version: NatNetVersion) -> bytes:
+    def _encode_last(self, version: str) -> bytes:
         t_s, poses, exposure_t_s = self._last
         return encode_frame(version, self._number, t_s, poses, exposure_t_s, dict(self.bodies))
 
@@ -251,9 +251,10 @@ class NatNetServer:
         elif name == "Bitstream" and not argument:
             self._reply(Message.RESPONSE, f"Bitstream,{known[1] if known else self.version}\0".encode(), address)
         elif name == "Bitstream":
-            accepted = self.version == "4.1" and known is not None and argument in _VERSION_BYTES
+            own, asked = _numbers(self.version), _numbers(argument)
+            accepted = own >= _SELECTABLE and _OLDEST <= asked <= own and known is not None
             if accepted and known is not None:
-                self._clients[address] = (known[0], "3.0" if argument == "3.0" else "4.1")
+                self._clients[address] = (known[0], argument)
             self._reply(Message.RESPONSE, struct.pack("<i", 0 if accepted else 1), address)
         else:
             self._reply(Message.UNRECOGNIZED_REQUEST, b"", address)
@@ -263,16 +264,16 @@ class NatNetServer:
 
     def _server_info(self) -> bytes:
         group = socket.inet_aton(self.multicast_group or "0.0.0.0")
-        sender = struct.pack(
-            "<256s4s4s", _APPLICATION, _APPLICATION_VERSION[self.version], _VERSION_BYTES[self.version]
-        )
+        major, minor = _numbers(self.version)
+        motive = bytes((max(1, major - 1), minor, 0, 0))
+        sender = struct.pack("<256s4s4s", _APPLICATION, motive, bytes((major, minor, 0, 0)))
         return (
             sender + struct.pack("<QH?", CLOCK_FREQUENCY_HZ, self.data_port, self.multicast_group is not None) + group
         )
 
 
 def encode_frame(
-    version: NatNetVersion,
+    version: str,
     number: int,
     t_s: float,
     poses: Sequence[BodyPose],
@@ -282,6 +283,7 @@ def encode_frame(
     """Return one NAT_FRAMEOFDATA datagram with all sections that this NatNet version defines; arguments as for
     `NatNetServer.publish`.
     """
+    sizes = _numbers(version) >= _SIZES
     markers = {
         pose.id: [_add(pose.position_m, quat_rotate(pose.quat_wxyz, offset)) for offset in _MARKERS_BODY_M]
         for pose in poses
@@ -305,12 +307,12 @@ def encode_frame(
     labelled += struct.pack("<I3ffHf", 900001, *_STRAY_MARKER_M, _MARKER_SIZE_M, stray_params, 0.0004)
 
     def section(count: int, content: bytes) -> bytes:
-        sized = struct.pack("<I", len(content)) if version == "4.1" else b""
+        sized = struct.pack("<I", len(content)) if sizes else b""
         return struct.pack("<I", count) + sized + content
 
     exposure = 0 if exposure_t_s is None else _ticks(exposure_t_s)
     suffix = struct.pack("<IIdQQQ", 0, 0, t_s, exposure, exposure, _ticks(t_s))
-    if version == "4.1":
+    if sizes:
         whole_s = int(t_s)
         suffix += struct.pack("<II", whole_s, int((t_s - whole_s) * 0xFFFFFFFF))
     payload = b"".join(
@@ -320,10 +322,11 @@ def encode_frame(
             section(1, struct.pack("<3f", *_STRAY_MARKER_M)),
             section(len(poses), bodies),
             section(0, b""),  # skeletons
-            section(0, b"") if version == "4.1" else b"",  # assets
+            section(0, b"") if sizes else b"",  # assets
             section(len(_MARKERS_BODY_M) * len(poses) + 1, labelled),
             section(0, b""),  # force plates
             section(0, b""),  # devices
+            section(1, b"unknown\0") if _numbers(version) > _NEWEST else b"",
             suffix,
             struct.pack("<H", 0),
             _END_OF_DATA,
@@ -332,7 +335,7 @@ def encode_frame(
     return struct.pack("<HH", Message.FRAME, len(payload)) + payload
 
 
-def encode_model_definitions(version: NatNetVersion, bodies: Sequence[tuple[int, str]]) -> bytes:
+def encode_model_definitions(version: str, bodies: Sequence[tuple[int, str]]) -> bytes:
     """Return the payload of NAT_MODELDEF: marker sets, rigid bodies and one camera."""
     descriptions: list[tuple[Descriptor, bytes]] = []
     count = len(_MARKERS_BODY_M)
@@ -340,9 +343,12 @@ def encode_model_definitions(version: NatNetVersion, bodies: Sequence[tuple[int,
     for number, name in bodies:
         text = name.encode() + b"\0"
         descriptions.append((Descriptor.MARKER_SET, text + struct.pack("<I", count) + b"".join(labels)))
-        body = text + struct.pack("<Ii3fI", number, -1, 0.0, 0.0, 0.0, count)
+        pivot = struct.pack("<Ii3f", number, -1, 0.0, 0.0, 0.0)
+        if _numbers(version) >= _PIVOT_ROTATION:
+            pivot += struct.pack("<4f", 0.0, 0.0, 0.0, 1.0)
+        body = text + pivot + struct.pack("<I", count)
         body += b"".join(struct.pack("<3f", *offset) for offset in _MARKERS_BODY_M) + struct.pack("<I", 0) * count
-        if version == "4.1":
+        if _numbers(version) >= _MARKER_NAMES:
             body += b"".join(labels)
         descriptions.append((Descriptor.RIGID_BODY, body))
     camera = b"Prime 13 #1\0" + struct.pack("<7f", 3.0, 3.0, 2.8, 0.0, 0.0, 0.0, 1.0)
@@ -350,10 +356,16 @@ def encode_model_definitions(version: NatNetVersion, bodies: Sequence[tuple[int,
     parts = [struct.pack("<I", len(descriptions))]
     for kind, content in descriptions:
         parts.append(struct.pack("<I", kind))
-        if version == "4.1":
+        if _numbers(version) >= _SIZES:
             parts.append(struct.pack("<I", len(content)))
         parts.append(content)
     return b"".join(parts)
+
+
+def _numbers(version: str) -> tuple[int, int]:
+    """Return major and minor number, or zeros if the text is no version."""
+    major, _, minor = version.partition(".")
+    return (int(major), int(minor)) if major.isdecimal() and minor.isdecimal() else (0, 0)
 
 
 def _rigid_body(pose: BodyPose) -> bytes:

@@ -156,6 +156,10 @@ class AutopilotDevice(Model):
 ANY_INTERFACE = "0.0.0.0"
 
 
+NatNetVersion = Literal["3.0", "3.1", "4.0", "4.1", "4.2", "4.3", "4.4"]
+"""Versions of the NatNet bitstream that its SDK describes: those of Motive 2.0, 2.1, 3.0, 3.1, 3.2, 3.3 and 3.4."""
+
+
 class MocapDevice(Model):
     """OptiTrack Motive over NatNet."""
 
@@ -167,8 +171,8 @@ class MocapDevice(Model):
     multicast_group: str = "239.255.42.99"
     command_port: Annotated[int, Field(gt=0, le=65535)] = 1510
     data_port: Annotated[int, Field(gt=0, le=65535)] = 1511
-    natnet_version: Literal["3.0", "4.1"] | None = None
-    """Version that the server must speak. If it is absent, both are accepted."""
+    natnet_version: NatNetVersion | None = None
+    """Version that the server must speak. If it is absent, all of them are accepted, and later ones too."""
     rigid_body_id: Annotated[int, Field(ge=0)]
     up_axis: Literal["y", "z"] = "z"
     """Up axis in Motive's streaming settings."""

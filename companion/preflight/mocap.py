@@ -121,7 +121,7 @@ def _latency(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
     latency_s = sorted(pose.latency_s for pose in poses if pose.latency_s is not None)
     if not latency_s:
         return LATENCY.doubtful(
-            "the server does not report it", wanted, "use NatNet 3.0 or 4.1 with cameras that stamp exposure"
+            "the server does not report it", wanted, "use cameras that stamp exposure, and NatNet 3.0 to 4.4"
         )
     high_s = latency_s[int(0.99 * (len(latency_s) - 1))]
     read = f"{latency_s[len(latency_s) // 2] * 1e3:.1f} ms, {high_s * 1e3:.1f} ms at the 99th percentile"

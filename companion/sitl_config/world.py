@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field
 
 from companion.config.base import Fraction, Model, NonNegative, Positive, RelativeError, Vector2, Vector3
 from companion.config.explain import nearest
-from companion.config.vehicle import ServoBaud
+from companion.config.vehicle import NatNetVersion, ServoBaud
 from companion.px4.defaults import PX4_DEFAULTS
 from companion.sitl_config.effects.air import Air
 from companion.sitl_config.effects.battery import Battery
@@ -146,7 +146,8 @@ class World(Model):
     """Time from arming until a full battery is empty; with `battery.on`, the time in hover."""
     push: Push | None = None
     """A push on the net, for tests of the impedance."""
-    natnet_version: Literal["3.0", "4.1"] = "4.1"
+    natnet_version: NatNetVersion = "4.1"
+    """NatNet version that the simulated Motive streams."""
     mocap_axes: SignedAxes = ("x", "y", "z")
     """True axes of the streamed x, y and z, such as "-y". A left-handed set represents a misconfigured server."""
     mocap_body_yaw_deg: float = 0.0

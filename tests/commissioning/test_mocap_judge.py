@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import pytest
 
@@ -14,7 +15,7 @@ from companion.config.document import Data
 from companion.config.loader import load_vehicle
 from companion.io.mocap.frames import RigidBody
 from companion.io.mocap.natnet import ServerInfo
-from companion.model.check_row import Row
+from companion.model.check_row import Level, Row
 from companion.model.types import IDENTITY_QUAT, Vec3
 from tests.support import ROOT
 
@@ -72,9 +73,9 @@ def frames(
     return found
 
 
-def judged(seen: Sequence[FrameSeen], *, moving: bool = False, route: Route = CABLE) -> Judged:
+def judged(seen: Sequence[FrameSeen], *, moving: bool = False, route: Route = CABLE, info: ServerInfo = INFO) -> Judged:
     return mocap_judge.judge(
-        Watched(frames=seen, names=NAMES, info=INFO, route=route, duration_s=4.0, moving=moving), VEHICLE
+        Watched(frames=seen, names=NAMES, info=info, route=route, duration_s=4.0, moving=moving), VEHICLE
     )
 
 
@@ -92,6 +93,12 @@ def test_a_sound_stream_is_fine() -> None:
     found = judged(frames())
     assert bad(found) == set()
     assert found[1] == {}
+
+
+def test_a_version_that_no_sdk_describes_is_reported() -> None:
+    later = judged(frames(), info=replace(INFO, natnet_version=(4, 9, 0, 0)))
+    assert bad(later) == {"mocap.server"} and "NatNet 4.4" in later[0][0].wanted
+    assert later[0][0].level is Level.WARN
 
 
 def test_lost_frames_are_counted_by_their_numbers() -> None:

@@ -184,7 +184,7 @@ BAD_VEHICLE = [
     ("watchdog_ms: 100", "watchdog_ms: 90", ["watchdog_ms: must be a multiple of 20 (the register's unit), got 90"]),
     ("sign: -1", "sign: 0", ["sign: expected one of -1, 1, got 0"]),
     ("baud: 3000000", "baud: 9600", ["baud: expected one of 57600, 115200, 1000000, 2000000, 3000000, 4000000, got 9600"]),
-    ("rate_hz: 200.0", "rate_hz: 200.0\n    natnet_version: 3.0", ['expected one of "3.0", "4.1", got 3.0 (put it in quotes)']),
+    ("rate_hz: 200.0", "rate_hz: 200.0\n    natnet_version: 3.0", ['expected one of "3.0", "3.1", "4.0", "4.1", "4.2", "4.3", "4.4", got 3.0 (put it in quotes)']),
     ("x_m: [-2.2, 2.2]", "x_m: [2.2, -2.2]", ["room.x_m: the first must be below the second, got [2.2, -2.2]"]),
     ("link_com_m: [0.16, 0.08]", "link_com_m: [0.26, 0.08]", ["the centre of mass lies beyond the link's end: at 0.26 m on a link of 0.2 m"]),
     ("fold_arm_deg: [165.0, 140.0]", "fold_arm_deg: [165.0, 151.0]", ["fold_arm_deg[1]: 151 deg is outside the joint limits, -10 to 150 deg"]),

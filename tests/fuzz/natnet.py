@@ -13,15 +13,17 @@ from typing import ClassVar, Self
 from companion.config.vehicle import MocapDevice
 from companion.io.mocap import natnet
 from companion.io.mocap.driver import NatNetMocap
-from companion.io.mocap.natnet import Message, NatNetVersion
+from companion.io.mocap.natnet import Message
 from companion.io.protocols import DeviceError
 from companion.io.px4.messages import vision_ned
 from companion.model.types import MocapPose
 from sitl.natnet import BodyPose, NatNetServer, encode_frame, encode_model_definitions
 from tests.fuzz.mutate import mutated
 from tests.fuzz.target import Target, Wrong, one_line
+from tests.io.natnet_bytes import LATER, all_definitions, full_frame, numbers
 
-VERSIONS: tuple[NatNetVersion, NatNetVersion] = ("3.0", "4.1")
+VERSIONS = ("3.0", "4.1", "4.0", "4.2", LATER)
+"""One version of each layout. Kept inputs name them by their place."""
 _BODY_ID = 1
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 _DATAGRAM_MAX_BYTES = 60_000
@@ -30,13 +32,17 @@ _FRESH = 0x80
 """Bit of an input's first byte: the driver knows no server yet. The lower bits select the version."""
 
 
+def _version(mode: int) -> str:
+    return VERSIONS[(mode & ~_FRESH) % len(VERSIONS)]
+
+
 class NatNetTarget(Target):
     """The first byte of an input is the version and the state of the driver; the rest is the datagram."""
 
     name: ClassVar[str] = "natnet"
 
     def __init__(self) -> None:
-        self._rigs: dict[NatNetVersion, _Rig] = {}
+        self._rigs: dict[str, _Rig] = {}
         self._corpus = {version: _corpus(version) for version in VERSIONS}
 
     def __enter__(self) -> Self:
@@ -51,21 +57,21 @@ class NatNetTarget(Target):
         self._loop.close()
 
     def make(self, rng: Random) -> bytes:
-        mode = rng.randrange(2) | (_FRESH if rng.random() < 0.1 else 0)
-        data = mutated(rng, self._corpus[VERSIONS[mode & 1]], _DATAGRAM_MAX_BYTES)
+        mode = rng.randrange(len(VERSIONS)) | (_FRESH if rng.random() < 0.1 else 0)
+        data = mutated(rng, self._corpus[_version(mode)], _DATAGRAM_MAX_BYTES)
         if len(data) >= 4 and rng.random() < 0.7:  # else the header's size gives most of them away
             data = data[:2] + struct.pack("<H", len(data) - 4) + data[4:]
         return bytes((mode,)) + data
 
     def feed(self, data: bytes) -> None:
         if data:
-            self._rigs[VERSIONS[data[0] & 1]].feed(data[1:], fresh=bool(data[0] & _FRESH))
+            self._rigs[_version(data[0])].feed(data[1:], fresh=bool(data[0] & _FRESH))
 
 
 class _Rig:
     """A driver, and a socket in place of its server's."""
 
-    def __init__(self, version: NatNetVersion) -> None:
+    def __init__(self, version: str) -> None:
         self.version = version
         self.server = NatNetServer(version)
         self.t_s = 0.0
@@ -73,7 +79,7 @@ class _Rig:
         self.sender.bind(("127.0.0.1", 0))
 
     @classmethod
-    async def opened(cls, version: NatNetVersion) -> _Rig:
+    async def opened(cls, version: str) -> _Rig:
         rig = cls(version)
         await rig.server.__aenter__()
         fields = {
@@ -154,7 +160,7 @@ class _Rig:
     def _check_that_it_goes_on(self) -> None:
         edge = self.edge
         client = edge.client
-        client.info, client.version, client.names = self.info, self.version, {}
+        client.info, client.version, client.names = self.info, numbers(self.version), {}
         self.t_s += 1.0  # as after the loss of some frames
         number = ((client._last_number or 0) + 1) & 0xFFFFFFFF
         x_m = float(number & 0xFFFF)
@@ -182,7 +188,7 @@ class _Rig:
     info: natnet.ServerInfo | None
 
 
-def _corpus(version: NatNetVersion) -> list[bytes]:
+def _corpus(version: str) -> list[bytes]:
     """Return every kind of datagram of a server and of a client."""
     names = {1: "quad", 7: "net"}
     bodies = [BodyPose(7, (3.0, 2.0, 0.1), (0.5, 0.5, 0.5, 0.5)), BodyPose(_BODY_ID, (1.0, -2.0, 1.5), _UPRIGHT)]
@@ -193,7 +199,7 @@ def _corpus(version: NatNetVersion) -> list[bytes]:
         for number, poses, exposure_t_s in ((900, bodies, 12.49), (901, lost, None), (902, [], 1.0), (903, crowd, 12.4))
     ]
     definitions = encode_model_definitions(version, list(names.items()))
-    sender = struct.pack("<256s4s4s", b"Motive", bytes((3, 1, 0, 0)), bytes((int(version[0]), int(version[2]), 0, 0)))
+    sender = struct.pack("<256s4s4s", b"Motive", bytes((3, 1, 0, 0)), bytes((*numbers(version), 0, 0)))
     connection = struct.pack("<QH?4s", 10_000_000, 1511, True, bytes((239, 255, 42, 99)))
     server_info = natnet.encode_message(Message.SERVER_INFO, sender + connection)
     others = [
@@ -201,52 +207,14 @@ def _corpus(version: NatNetVersion) -> list[bytes]:
     ]
     return [
         *frames * 4,
-        _full_frame(version),
-        _full_frame(version),
+        full_frame(version),
+        full_frame(version),
+        full_frame(version, (b"unknown", b"another")),
         *[natnet.encode_message(Message.MODELDEF, definitions)] * 3,
-        natnet.encode_message(Message.MODELDEF, _all_definitions(version)),
+        all_definitions(version),
         *[server_info] * 3,
         natnet.encode_message(Message.SERVER_INFO, sender),
         natnet.encode_connect(),
         b"",
         *others,
     ]
-
-
-def _full_frame(version: NatNetVersion) -> bytes:
-    """Return a frame with two elements in every section."""
-
-    def section(parts: list[bytes]) -> bytes:
-        content = b"".join(parts)
-        return struct.pack("<I", len(parts)) + (struct.pack("<I", len(content)) if version == "4.1" else b"") + content
-
-    body = struct.pack("<IffffffffH", _BODY_ID, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, 0.001, 1)
-    channels = struct.pack("<II", 5, 2) + struct.pack("<I2f", 2, 1.0, 2.0) + struct.pack("<If", 1, 3.0)
-    payload = struct.pack("<I", 77)
-    payload += section([name + struct.pack("<I3f", 1, 7.0, 7.0, 7.0) for name in (b"a longer name\0", b"\0")])
-    payload += section([struct.pack("<3f", 1.0, 1.0, 1.0)] * 2) + section([body] * 2)
-    payload += section([struct.pack("<II", 1, 2) + body * 2] * 2)
-    payload += section([struct.pack("<II", 1, 1) + body + bytes(38)] * 2) if version == "4.1" else b""
-    payload += section([struct.pack("<IffffHf", 65537, 1.0, 2.0, 3.0, 0.014, 2, 0.0)] * 2)
-    payload += section([channels] * 2) + section([channels] * 2)
-    payload += struct.pack("<IIdQQQ", 1, 2, 12.5, 1000, 1500, 3000) + bytes(8 if version == "4.1" else 0) + bytes(6)
-    return natnet.encode_message(Message.FRAME, payload)
-
-
-def _all_definitions(version: NatNetVersion) -> bytes:
-    """Return a NAT_MODELDEF payload with one description of every type."""
-    body = b"quad\0" + struct.pack("<Ii3fI", 1, -1, 0.0, 0.0, 0.0, 1) + struct.pack("<3fI", 0.0, 0.0, 0.0, 0)
-    names = struct.pack("<I", 2) + b"Fx\0Fy\0"
-    descriptions = [
-        (0, b"set\0" + struct.pack("<I", 1) + b"m1\0"),
-        (2, b"skeleton\0" + struct.pack("<II", 1, 2) + body * 2),
-        (3, struct.pack("<I", 1) + b"serial\0" + bytes(4 * 161) + struct.pack("<II", 1, 0) + names),
-        (4, struct.pack("<I", 1) + b"daq\0serial\0" + struct.pack("<II", 1, 0) + names),
-        (5, b"camera\0" + struct.pack("<7f", *range(7))),
-        (1, body),
-    ]
-    sized = version == "4.1"
-    return struct.pack("<I", len(descriptions)) + b"".join(
-        struct.pack("<I", kind) + (struct.pack("<I", len(content)) if sized else b"") + content
-        for kind, content in descriptions
-    )

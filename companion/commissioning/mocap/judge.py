@@ -15,7 +15,7 @@ from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.vehicle import Vehicle
 from companion.io.mocap.frames import RigidBody
-from companion.io.mocap.natnet import ServerInfo, z_up_from_y_up
+from companion.io.mocap.natnet import NEWEST_DESCRIBED_VERSION, ServerInfo, z_up_from_y_up
 from companion.model.check_row import Row
 from companion.model.observations import MocapStream, Observations
 from companion.model.types import MocapPose
@@ -197,7 +197,7 @@ def judge(watched: Watched, vehicle: Vehicle) -> tuple[list[Row], dict[Location,
     version = ".".join(map(str, info.application_version))
     seen = bodies(frames, watched.names)
     rows = [
-        SERVER.good(f"{info.application} {version}, NatNet {info.version}, {watched.route.transport}"),
+        _server(info, f"{info.application} {version}, NatNet {info.version}, {watched.route.transport}"),
         _network(watched.route),
         _own(seen, device.rigid_body_id, watched.moving, changes),
     ]
@@ -222,6 +222,14 @@ def judge(watched: Watched, vehicle: Vehicle) -> tuple[list[Row], dict[Location,
         if row.id not in (preflight.DEVICE.id, preflight.CLOCK.id)
     ]
     return [*rows, _steady(t), *([_delay(t)] if t.latency_s else [])], changes
+
+
+def _server(info: ServerInfo, read: str) -> Row:
+    if info.natnet_version[:2] <= NEWEST_DESCRIBED_VERSION:
+        return SERVER.good(read)
+    newest = ".".join(map(str, NEWEST_DESCRIBED_VERSION))
+    fix = "compare the poses with those that Motive shows; a latency that is not reported means an unknown suffix"
+    return SERVER.doubtful(read, f"NatNet {newest} or older", fix)
 
 
 def _poses(frames: Sequence[FrameSeen], own_id: int, up_axis: str) -> list[MocapPose]:

@@ -7,7 +7,7 @@ import contextlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 from companion.commissioning.mocap import align as mocap_align
 from companion.commissioning.mocap import judge as mocap_judge
@@ -18,7 +18,7 @@ from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.loader import load_flight
 from companion.config.mission import Start
-from companion.config.vehicle import MocapDevice, Vehicle
+from companion.config.vehicle import MocapDevice, NatNetVersion, Vehicle
 from companion.io.mocap.natnet import ServerInfo
 from companion.io.protocols import DeviceError
 from companion.model.check_row import refusals
@@ -108,7 +108,7 @@ def _streaming(info: ServerInfo, device: MocapDevice) -> dict[Location, Data]:
     found: dict[str, Data] = {"transport": "multicast" if info.multicast else "unicast"}
     if info.multicast:
         found |= {"multicast_group": info.multicast_group, "data_port": info.data_port}
-    if device.natnet_version is not None and info.version in ("3.0", "4.1"):
+    if device.natnet_version is not None and info.version in get_args(NatNetVersion):
         found["natnet_version"] = info.version
     return {("devices", "mocap", key): new for key, new in found.items() if new and new != getattr(device, key)}
 

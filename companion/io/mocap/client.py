@@ -11,12 +11,11 @@ from typing import Final
 from companion.io.mocap import natnet
 from companion.io.mocap.definitions import parse_model_definitions
 from companion.io.mocap.frames import Frame, RigidBody, parse_frame
-from companion.io.mocap.natnet import Malformed, Message, NatNetVersion, ServerInfo
+from companion.io.mocap.natnet import OLDEST_VERSION, Malformed, Message, ServerInfo, Version
 from companion.model.types import MocapPose
 from companion.safety.stream_watch import StreamWatch
 
-VERSIONS: Final[dict[str, NatNetVersion]] = {"3.0": "3.0", "4.1": "4.1"}
-"""Supported NatNet versions, as in `ServerInfo.version`."""
+SUPPORTED_VERSIONS: Final = "{}.{} or later".format(*OLDEST_VERSION)
 CONNECT_PERIOD_S: Final = 0.25
 KEEP_ALIVE_PERIOD_S: Final = 0.5
 RECONNECT_SILENCE_S: Final = 1.0
@@ -45,7 +44,7 @@ class NatNetClient:
         """Arrival of the newest frame or server info."""
         self.info: ServerInfo | None = None
         """The server's description; None before it has answered."""
-        self.version: NatNetVersion | None = None
+        self.version: Version | None = None
         """NatNet version of the frames; None before the server has answered, or if its version is not supported."""
         self.body_ids: tuple[int, ...] | None = None
         """Rigid bodies of the newest frame by streaming id; None before the first frame."""
@@ -133,12 +132,15 @@ class NatNetClient:
         if isinstance(info, Malformed):
             self._reject(info)
             return
-        if self.version is not None and info.version != self.version:
-            self.problem = f"the server was restarted with NatNet {info.version} instead of {self.version}"
+        version = info.natnet_version[:2]
+        if self.version is not None and version != self.version:
+            before = ".".join(map(str, self.version))
+            self.problem = f"the server was restarted with NatNet {info.version} instead of {before}"
             return
-        self.info, self.version, self._heard_s = info, VERSIONS.get(info.version), arrived_s
+        self.info, self._heard_s = info, arrived_s
+        self.version = version if version >= OLDEST_VERSION else None
         if self.version is None:
-            self.problem = f"the server speaks NatNet {info.version}, expected {' or '.join(VERSIONS)}"
+            self.problem = f"the server speaks NatNet {info.version}, expected {SUPPORTED_VERSIONS}"
 
     def _receive_frame(self, datagram: bytes, arrived_s: float) -> Frame | None:
         if self.version is None or self.info is None:

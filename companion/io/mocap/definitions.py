@@ -1,4 +1,8 @@
-"""NatNet model definitions (NAT_MODELDEF) of versions 3.0 and 4.1; sources as in `companion.io.mocap.natnet`."""
+"""NatNet model definitions (NAT_MODELDEF) since version 3.0; sources as in `companion.io.mocap.natnet`.
+
+A rigid body has its markers' names since 4.0 and the rotation of its pivot since 4.2. A definition states its size since 4.1, so that
+only the start of a rigid body, its name and id, is read; before, every type has to be known.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +13,19 @@ from typing import Final
 
 from companion.io.mocap.natnet import (
     COUNT_BYTES,
+    SECTION_SIZES_SINCE,
     U32,
     VEC3_BYTES,
     Buffer,
     Malformed,
     Message,
-    NatNetVersion,
+    Version,
     payload_of,
     printable,
     skip_string,
 )
+
+_MARKER_NAMES_SINCE: Final[Version] = (4, 0)
 
 
 class Descriptor(IntEnum):
@@ -41,25 +48,25 @@ class BodyDefinition:
     name: str
 
 
-def parse_model_definitions(datagram: Buffer, version: NatNetVersion) -> tuple[BodyDefinition, ...] | Malformed:
+def parse_model_definitions(datagram: Buffer, version: Version) -> tuple[BodyDefinition, ...] | Malformed:
     """Parse NAT_MODELDEF: ids and names of the rigid bodies, without those of skeletons and assets."""
     payload = payload_of(datagram, Message.MODELDEF)
     if isinstance(payload, Malformed):
         return payload
     try:
-        return _model_definitions(payload, version == "4.1")
+        return _model_definitions(payload, version)
     except (struct.error, ValueError) as error:
         return Malformed(f"model definitions of {len(payload)} bytes end early or have wrong sizes ({error})")
 
 
-def _model_definitions(data: bytes, sized: bool) -> tuple[BodyDefinition, ...]:
+def _model_definitions(data: bytes, version: Version) -> tuple[BodyDefinition, ...]:
     bodies: list[BodyDefinition] = []
     count: int = U32.unpack_from(data)[0]
     offset = 4
     for _ in range(count):
         kind: int = U32.unpack_from(data, offset)[0]
         offset += 4
-        if sized:
+        if version >= SECTION_SIZES_SINCE:
             size: int = U32.unpack_from(data, offset)[0]
             offset += 4
             if kind == Descriptor.RIGID_BODY:
@@ -68,9 +75,7 @@ def _model_definitions(data: bytes, sized: bool) -> tuple[BodyDefinition, ...]:
             continue
         if kind == Descriptor.RIGID_BODY:
             bodies.append(_body_definition(data, offset))
-        elif kind not in _SKIP_DESCRIPTION:
-            raise ValueError(f"description of unknown type {kind}")
-        offset = _SKIP_DESCRIPTION[kind](data, offset)
+        offset = _skip_description(kind, data, offset, named_markers=version >= _MARKER_NAMES_SINCE)
     if offset > len(data):
         raise ValueError("the last description is cut off")
     return tuple(bodies)
@@ -81,52 +86,42 @@ def _body_definition(data: bytes, offset: int) -> BodyDefinition:
     return BodyDefinition(U32.unpack_from(data, end)[0], printable(data[offset : end - 1]))
 
 
+def _skip_description(kind: int, data: bytes, offset: int, *, named_markers: bool) -> int:
+    if kind == Descriptor.RIGID_BODY:
+        return _skip_body(data, offset, named_markers)
+    if kind == Descriptor.SKELETON:
+        offset = skip_string(data, offset)
+        _, bones = COUNT_BYTES.unpack_from(data, offset)
+        offset += COUNT_BYTES.size
+        for _ in range(bones):
+            offset = _skip_body(data, offset, named_markers)
+        return offset
+    if kind == Descriptor.MARKER_SET:
+        return _skip_strings(data, skip_string(data, offset))
+    if kind == Descriptor.FORCE_PLATE:
+        # id, serial; width, length, origin, 12x12 calibration, 4 corners as floats; plate type, channel type; channel names
+        return _skip_strings(data, skip_string(data, offset + 4) + 4 * (2 + 3 + 144 + 12) + 8)
+    if kind == Descriptor.DEVICE:  # id, name, serial; device type, channel type; channel names
+        return _skip_strings(data, skip_string(data, skip_string(data, offset + 4)) + 8)
+    if kind == Descriptor.CAMERA:  # name, position, attitude
+        return skip_string(data, offset) + 4 * 7
+    raise ValueError(f"description of unknown type {kind}")
+
+
+def _skip_body(data: bytes, offset: int, named_markers: bool) -> int:
+    """Skip name, id, parent and offset, then position, active label and name of each marker (before 4.1)."""
+    offset = skip_string(data, offset) + 8 + VEC3_BYTES
+    markers: int = U32.unpack_from(data, offset)[0]
+    offset += 4 + (VEC3_BYTES + 4) * markers
+    return _skip_each_string(data, offset, markers) if named_markers else offset
+
+
 def _skip_strings(data: bytes, offset: int) -> int:
     count: int = U32.unpack_from(data, offset)[0]
-    offset += 4
+    return _skip_each_string(data, offset + 4, count)
+
+
+def _skip_each_string(data: bytes, offset: int, count: int) -> int:
     for _ in range(count):
         offset = skip_string(data, offset)
     return offset
-
-
-def _skip_body(data: bytes, offset: int) -> int:
-    """Skip name, id, parent and offset, then position and active label of each marker (3.0)."""
-    offset = skip_string(data, offset) + 8 + VEC3_BYTES
-    markers: int = U32.unpack_from(data, offset)[0]
-    return offset + 4 + (VEC3_BYTES + 4) * markers
-
-
-def _skip_marker_set_description(data: bytes, offset: int) -> int:
-    return _skip_strings(data, skip_string(data, offset))
-
-
-def _skip_skeleton_description(data: bytes, offset: int) -> int:
-    offset = skip_string(data, offset)
-    _, bones = COUNT_BYTES.unpack_from(data, offset)
-    offset += 8
-    for _ in range(bones):
-        offset = _skip_body(data, offset)
-    return offset
-
-
-def _skip_force_plate(data: bytes, offset: int) -> int:
-    # id, serial; width, length, origin, 12x12 calibration, 4 corners as floats; plate type, channel type; channel names
-    return _skip_strings(data, skip_string(data, offset + 4) + 4 * (2 + 3 + 144 + 12) + 8)
-
-
-def _skip_device(data: bytes, offset: int) -> int:
-    return _skip_strings(data, skip_string(data, skip_string(data, offset + 4)) + 8)
-
-
-def _skip_camera(data: bytes, offset: int) -> int:
-    return skip_string(data, offset) + 4 * 7
-
-
-_SKIP_DESCRIPTION: Final = {
-    int(Descriptor.MARKER_SET): _skip_marker_set_description,
-    int(Descriptor.RIGID_BODY): _skip_body,
-    int(Descriptor.SKELETON): _skip_skeleton_description,
-    int(Descriptor.FORCE_PLATE): _skip_force_plate,
-    int(Descriptor.DEVICE): _skip_device,
-    int(Descriptor.CAMERA): _skip_camera,
-}

@@ -1,4 +1,4 @@
-"""The motion-capture driver: OptiTrack Motive over NatNet 3.0 / 4.1, multicast or unicast."""
+"""The motion-capture driver: OptiTrack Motive over NatNet, multicast or unicast."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Final, Self
 from companion.config.vehicle import MocapDevice
 from companion.io.arrival import arrived_s
 from companion.io.mocap import natnet, sockets
-from companion.io.mocap.client import CONNECT_PERIOD_S, VERSIONS, NatNetClient
+from companion.io.mocap.client import CONNECT_PERIOD_S, SUPPORTED_VERSIONS, NatNetClient
 from companion.io.mocap.frames import Frame
 from companion.io.mocap.natnet import Message, ServerInfo
 from companion.io.protocols import DeviceError
@@ -211,13 +211,20 @@ class NatNetMocap:
 
     def _check_server(self, info: ServerInfo) -> None:
         device = self._device
-        version = VERSIONS.get(info.version)
         wanted = device.natnet_version
-        if version is None or (wanted is not None and version != wanted):
-            expected = wanted or " or ".join(VERSIONS)
+        if self._client.version is None or (wanted is not None and info.version != wanted):
+            expected = wanted or SUPPORTED_VERSIONS
             raise DeviceError(
                 f"{self._where}: {info.application or 'the server'} speaks NatNet {info.version}, expected {expected}; "
                 "set the bitstream version in Motive's streaming pane or devices.mocap.natnet_version"
+            )
+        if self._client.version > natnet.NEWEST_DESCRIBED_VERSION:
+            newest = ".".join(map(str, natnet.NEWEST_DESCRIBED_VERSION))
+            _LOG.warning(
+                "%s: NatNet %s is later than %s; sections that are not known are skipped",
+                self._where,
+                info.version,
+                newest,
             )
         if device.transport == "multicast" and info.multicast is not None:
             if not info.multicast:

@@ -1,6 +1,8 @@
-"""NatNet frames of data (NAT_FRAMEOFDATA) of versions 3.0 and 4.1; sources, units and axes as in `companion.io.mocap.natnet`.
+"""NatNet frames of data (NAT_FRAMEOFDATA) since version 3.0; sources, units and axes as in `companion.io.mocap.natnet`.
 
-A section of a frame starts with `u32 count`, since 4.1 followed by `u32 bytes`.
+A frame is its number, sections and a suffix with the time stamps. The sections are marker sets, other markers, rigid bodies, skeletons,
+assets (since 4.1), labelled markers, force plates and devices. Each starts with `u32 count`, since 4.1 followed by `u32 bytes`, so that
+its content need not be known. 3.0, 3.1 and 4.0 have the same frame; 4.1 to 4.4 have the same frame.
 """
 
 from __future__ import annotations
@@ -12,12 +14,14 @@ from typing import Final
 
 from companion.io.mocap.natnet import (
     COUNT_BYTES,
+    NEWEST_DESCRIBED_VERSION,
+    SECTION_SIZES_SINCE,
     U32,
     VEC3_BYTES,
     Buffer,
     Malformed,
     Message,
-    NatNetVersion,
+    Version,
     payload_of,
     skip_string,
 )
@@ -25,6 +29,10 @@ from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 
 RIGID_BODY_BYTES: Final = 38
 LABELLED_MARKER_BYTES: Final = 26
+SUFFIX_BYTES: Final = 54
+"""Size of the whole suffix since 4.1: stamps, precision time stamp, parameters and end-of-data tag."""
+LATER_LATENCY_MAX_S: Final = 1.0
+"""A longer latency in a version later than the newest described one means that its suffix is another."""
 _RIGID_BODY = struct.Struct("<I7ffH")
 _SUFFIX = struct.Struct("<IIdQQQ")
 _PARAM_TRACKING_VALID = 0x01
@@ -50,7 +58,8 @@ class Frame:
     timestamp_s: float
     """Time of the frame on the server's own time base."""
     latency_s: float | None
-    """Time from mid-exposure to transmission; None if the server has no exposure stamp or no clock frequency."""
+    """Time from mid-exposure to transmission; None if the server has no exposure stamp or no clock frequency, or if the suffix of a
+    version later than the newest described one is not understood."""
     exposure_s: float | None
     """Time of mid-exposure on the server's own clock; None in the same cases."""
     body: RigidBody | None
@@ -58,9 +67,7 @@ class Frame:
     body_ids: tuple[int, ...]
 
 
-def parse_frame(
-    datagram: Buffer, version: NatNetVersion, body_id: int, clock_frequency_hz: int | None
-) -> Frame | Malformed:
+def parse_frame(datagram: Buffer, version: Version, body_id: int, clock_frequency_hz: int | None) -> Frame | Malformed:
     """Parse the requested rigid body and the suffix of a NAT_FRAMEOFDATA datagram; all other sections are skipped.
 
     Args:
@@ -73,13 +80,14 @@ def parse_frame(
     if isinstance(payload, Malformed):
         return payload
     try:
-        return _frame(payload, version == "4.1", body_id, clock_frequency_hz)
+        return _frame(payload, version, body_id, clock_frequency_hz)
     except (struct.error, ValueError) as error:
         # Every read past the end and every missing terminator ends up here, so no field needs a check of its own.
         return Malformed(f"frame of {len(payload)} bytes ends early or has wrong section sizes ({error})")
 
 
-def _frame(data: bytes, sized: bool, body_id: int, clock_frequency_hz: int | None) -> Frame | Malformed:
+def _frame(data: bytes, version: Version, body_id: int, clock_frequency_hz: int | None) -> Frame | Malformed:
+    sized = version >= SECTION_SIZES_SINCE
     number: int = U32.unpack_from(data)[0]
     offset = _skip_marker_sets(data, 4, sized)
     offset = _skip_fixed(data, offset, sized, VEC3_BYTES)  # other (unlabelled) markers
@@ -100,8 +108,9 @@ def _frame(data: bytes, sized: bool, body_id: int, clock_frequency_hz: int | Non
 
     if sized:
         for _ in range(5):  # skeletons, assets, labelled markers, force plates, devices
-            _, size = COUNT_BYTES.unpack_from(data, offset)
-            offset += 8 + size
+            offset = _skip_sized(data, offset)
+        if version > NEWEST_DESCRIBED_VERSION:
+            offset = _skip_unknown(data, offset)
     else:
         offset = _skip_skeletons(data, offset)
         offset = _skip_fixed(data, offset, sized, LABELLED_MARKER_BYTES)
@@ -113,6 +122,8 @@ def _frame(data: bytes, sized: bool, body_id: int, clock_frequency_hz: int | Non
     if clock_frequency_hz and exposure and transmit >= exposure:
         latency_s = (transmit - exposure) / clock_frequency_hz
         exposure_s = exposure / clock_frequency_hz
+        if version > NEWEST_DESCRIBED_VERSION and latency_s > LATER_LATENCY_MAX_S:
+            latency_s = exposure_s = None
     return Frame(
         number=number, timestamp_s=timestamp_s, latency_s=latency_s, exposure_s=exposure_s, body=body, body_ids=ids
     )
@@ -145,11 +156,26 @@ def _section(data: bytes, offset: int, sized: bool) -> tuple[int, int]:
     return count, offset + (8 if sized else 4)
 
 
+def _skip_sized(data: bytes, offset: int) -> int:
+    _, size = COUNT_BYTES.unpack_from(data, offset)
+    return offset + COUNT_BYTES.size + int(size)
+
+
+def _skip_unknown(data: bytes, offset: int) -> int:
+    """Skip the sections that lie between the known ones and the suffix.
+
+    If the rest is not whole sections and a suffix of the known size, the suffix has grown and starts at `offset`.
+    """
+    end = offset
+    while len(data) - end > SUFFIX_BYTES:
+        end = _skip_sized(data, end)
+    return end if len(data) - end == SUFFIX_BYTES else offset
+
+
 def _skip_marker_sets(data: bytes, offset: int, sized: bool) -> int:
-    count, start = _section(data, offset, sized)
     if sized:
-        size: int = U32.unpack_from(data, offset + 4)[0]
-        return start + size
+        return _skip_sized(data, offset)
+    count, start = _section(data, offset, sized=False)
     for _ in range(count):
         start = skip_string(data, start)
         markers: int = U32.unpack_from(data, start)[0]

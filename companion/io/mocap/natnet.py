@@ -13,11 +13,12 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final, Literal
+from typing import Final
 
 from companion.model.types import Quat, Vec3
 
-NatNetVersion = Literal["3.0", "4.1"]
+Version = tuple[int, int]
+"""Major and minor number of a bitstream."""
 Buffer = bytes | bytearray | memoryview
 
 
@@ -38,6 +39,11 @@ class Message(IntEnum):
     UNRECOGNIZED_REQUEST = 100
 
 
+OLDEST_VERSION: Final[Version] = (3, 0)
+NEWEST_DESCRIBED_VERSION: Final[Version] = (4, 4)
+"""The newest version whose bytes the SDK's packet clients describe. A later one is read as far as its section sizes allow."""
+SECTION_SIZES_SINCE: Final[Version] = (4, 1)
+"""First version in which each section of a frame and each model definition states its size in bytes."""
 MAX_NAME_BYTES: Final = 256
 RESTART_GAP_FRAMES: Final = 200
 """UDP does not reorder over a second of frames: a jump back this far means that the server was restarted."""
