@@ -91,9 +91,7 @@ class Px4Log:
         try:
             ulog = importlib.import_module("pyulog")  # in the tests' extra, because a flight does not need it
         except ImportError:
-            raise Px4Error(
-                "PX4's log: expected the package pyulog, found none; pip install 'companion[test]'"
-            ) from None
+            raise Px4Error("PX4's log: expected the package pyulog, found none; pip install '.[test]'") from None
         try:
             with open(path, "rb") as file:  # given a name, pyulog would leave a damaged file open
                 log = ulog.ULog(file, _TOPICS)

@@ -1,3 +1,6 @@
 """companion: flies an aerial manipulator on PX4 with adaptive impedance control."""
 
 __version__ = "0.1.0"
+
+DISTRIBUTION = "companion-aerial-manipulation"
+"""Name for pip: on the package index, companion is another project."""

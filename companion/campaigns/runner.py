@@ -19,6 +19,7 @@ from typing import Any, ClassVar, Protocol
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from companion import DISTRIBUTION
 from companion.analysis.page import Page, Picture, Section, write_page
 from companion.campaigns.process import CampaignError, CampaignProcess, Message
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK
@@ -231,7 +232,7 @@ def _write(campaign: Campaign, flown: Flown, table: dict[str, Any], out: Path) -
     try:
         pictures = campaign.draw(flown.messages, out)
     except ImportError:
-        print_error(f"companion {campaign.name}: plots need matplotlib: pip install 'companion[analysis]'")
+        print_error(f"companion {campaign.name}: plots need matplotlib: pip install '{DISTRIBUTION}[analysis]'")
         pictures = []
     page = campaign.page(rows, pictures)
     record = {

@@ -9,6 +9,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from companion import DISTRIBUTION
 from companion.config.document import ConfigError
 from companion.ground.protocol.keys import user_name
 from companion.ground.protocol.messages import Topic
@@ -80,7 +81,7 @@ def _init(arguments: argparse.Namespace) -> int:
     except ImportError as error:
         if (error.name or "").partition(".")[0] != "cryptography":
             raise
-        print_error("companion broker init: certificates need cryptography: pip install 'companion[ground]'")
+        print_error(f"companion broker init: certificates need cryptography: pip install '{DISTRIBUTION}[ground]'")
         return EXIT_REFUSED
     if not arguments.folder.strip():
         print_error("companion broker init: DIR: expected the name of a folder, got an empty name")

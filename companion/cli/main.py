@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from companion import __version__
 from companion.cli.options import MISSION_HELP, MISSION_OR_DEFAULT_HELP, add_law, add_seed, add_world
 from companion.cli.planning_progress import PlanningProgress
 from companion.cli.schema import schema_json
@@ -60,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `companion`."""
     use_default_signals()
     words = _normalised(list(sys.argv[1:] if argv is None else argv))
-    arguments, unknown = _parser(words[:1]).parse_known_args(words)
+    arguments, unknown = make_parser(words[:1]).parse_known_args(words)
     if unknown:
         print_error(
             f"companion {arguments.command}: unknown arguments: {' '.join(unknown)}; see companion {arguments.command} --help"
@@ -105,11 +106,12 @@ def _normalised(argv: list[str]) -> list[str]:
     return out
 
 
-def _parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
+def make_parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
     """Return the parser of the command that a command line names first, else of all commands, which take half a second to load."""
     parser = _Parser(
         prog="companion", description="Flies an aerial manipulator on PX4 with adaptive impedance control."
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
 
     fly = commands.add_parser("fly", help="fly a mission", description="Fly a mission, on the vehicle or in SITL.")

@@ -13,6 +13,7 @@ from collections.abc import Coroutine, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from companion import DISTRIBUTION
 from companion.analysis.log import LogError
 from companion.config.document import ConfigError
 from companion.config.ground import VEHICLE_NAME, Mqtt
@@ -142,7 +143,7 @@ def _serve(arguments: argparse.Namespace) -> None:
     except ModuleNotFoundError as error:
         if error.name != "aiohttp":
             raise
-        raise _Refusal("the page needs aiohttp: pip install 'companion[ground]'; --text does not") from None
+        raise _Refusal(f"the page needs aiohttp: pip install '{DISTRIBUTION}[ground]'; --text does not") from None
     serving = web.ServerSettings(arguments.host, arguments.port, _tls(arguments.cert, arguments.key))
 
     def listening(monitor: web.Monitor) -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from companion import DISTRIBUTION
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.summary import summarise, write_summary
 from companion.campaigns.runner import to_json
@@ -179,7 +180,7 @@ def _write_gif(flight: Graded, path: Path) -> None:
     try:
         from companion.analysis.animation import movie_of, write_gif
     except ImportError:
-        raise _refusal("--gif needs matplotlib: pip install 'companion[analysis]'") from None
+        raise _refusal(f"--gif needs matplotlib: pip install '{DISTRIBUTION}[analysis]'") from None
     movie = movie_of(flight.log, flight.summary)
     if movie is None:
         raise _refusal(
@@ -287,5 +288,5 @@ def _unwritable(out: Path, error: OSError) -> ConfigError:
 
 
 def _no_pictures() -> int:
-    print_error("companion report: plots need matplotlib: pip install 'companion[analysis]'")
+    print_error(f"companion report: plots need matplotlib: pip install '{DISTRIBUTION}[analysis]'")
     return EXIT_REFUSED

@@ -6,6 +6,8 @@ import argparse
 import importlib.util
 from collections.abc import Callable
 
+from companion import DISTRIBUTION
+
 _WORLD = ("mujoco", "sitl")
 _NEEDS = {"sitl": _WORLD, "compare": _WORLD, "robustness": _WORLD, "faults": _WORLD}
 """The package that a command needs and the extra that installs it, by command. `monitor` and `broker init` check their own."""
@@ -28,4 +30,4 @@ def missing_extra(arguments: argparse.Namespace, here: Callable[[str], bool] = _
     if needs is None or getattr(arguments, "list", False) or here(needs[0]):
         return None
     package, extra = needs
-    return f"{what}: the simulated world needs {package}: pip install 'companion[{extra}]'"
+    return f"{what}: the simulated world needs {package}: pip install '{DISTRIBUTION}[{extra}]'"

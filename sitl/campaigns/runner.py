@@ -8,6 +8,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from typing import Any
 
+from companion import DISTRIBUTION
 from companion.campaigns.process import CampaignError
 from companion.sitl_config.loader import SitlConfig
 
@@ -64,7 +65,7 @@ def _over_machines(tasks: Sequence[tuple[Fly, int, str, Data]], scheduler: str) 
         from distributed import Client, as_completed
         from distributed.scheduler import KilledWorker
     except ImportError:
-        raise CampaignError("--scheduler needs Dask: pip install 'companion[cluster]'", bad_input=True) from None
+        raise CampaignError(f"--scheduler needs Dask: pip install '{DISTRIBUTION}[cluster]'", bad_input=True) from None
     try:
         client = Client(scheduler, timeout=SCHEDULER_TIMEOUT_S)
     except (OSError, ValueError) as error:
@@ -86,7 +87,7 @@ def _over_machines(tasks: Sequence[tuple[Fly, int, str, Data]], scheduler: str) 
             raise CampaignError(f"--scheduler {scheduler}: its workers die repeatedly; see their logs") from None
         except ImportError as error:
             raise CampaignError(
-                f"--scheduler {scheduler}: a worker lacks the program ({error}); install companion[sitl,cluster] there"
+                f"--scheduler {scheduler}: a worker lacks the program ({error}); install {DISTRIBUTION}[sitl,cluster] there"
             ) from None
 
 

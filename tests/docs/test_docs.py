@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from companion.analysis.summary import empty_summary
-from companion.cli.main import _normalised, _parser
+from companion.cli.main import _normalised, make_parser
 from companion.config.base import Model
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import PRESETS, load_flight
@@ -129,7 +129,7 @@ def test_commands_parse_and_their_overrides_are_accepted(monkeypatch: pytest.Mon
     seen = set()
     for page, words in commands():
         seen.add(words[0])
-        arguments, unknown = _parser().parse_known_args(_normalised(words))
+        arguments, unknown = make_parser().parse_known_args(_normalised(words))
         assert unknown == [], f"{page}: companion {shlex.join(words)}"
         mission = getattr(arguments, "mission", None)
         # MISSION stands for any; a vehicle file that the user is to write is not there.
@@ -141,7 +141,7 @@ def test_commands_parse_and_their_overrides_are_accepted(monkeypatch: pytest.Mon
 
 
 def test_every_command_is_shown() -> None:
-    action = next(action for action in _parser()._actions if action.dest == "command")
+    action = next(action for action in make_parser()._actions if action.dest == "command")
     shown = {words[0] for page, words in commands() if page == "commands.md"} | set(
         re.findall(r"^companion (\w+)", text_of(COMMANDS), flags=re.M)
     )

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from companion.cli.main import _parser, main
+from companion.cli.main import main, make_parser
 from companion.config.ground import Ground
 from companion.ground.broker import setup as broker_setup
 from companion.ground.broker.certificates import certificate_hosts, make_authority, make_server
@@ -53,7 +53,7 @@ def test_init_says_what_to_copy_where(tmp_path: Path, capsys: pytest.CaptureFixt
     monitors = [line.split()[1:] for line in told.splitlines() if line.startswith("  companion monitor")]
     assert len(monitors) == 2
     for monitor in monitors:
-        assert _parser().parse_known_args(monitor)[1] == []
+        assert make_parser().parse_known_args(monitor)[1] == []
     assert set(certificate_hosts((folder / "server.pem").read_bytes())) == {
         "gcs.lab",
         "10.0.0.2",
@@ -172,7 +172,7 @@ def test_missing_cryptography_is_one_line(
     monkeypatch.setitem(sys.modules, "cryptography", None)
     assert main(["broker", "init", str(tmp_path / "site")]) == 3
     assert capsys.readouterr().err == (
-        "companion broker init: certificates need cryptography: pip install 'companion[ground]'\n"
+        "companion broker init: certificates need cryptography: pip install 'companion-aerial-manipulation[ground]'\n"
     )
 
 

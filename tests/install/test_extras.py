@@ -7,7 +7,8 @@ import sys
 
 import pytest
 
-from companion.cli.main import _normalised, _parser
+from companion import DISTRIBUTION
+from companion.cli.main import _normalised, make_parser
 from companion.install.extras import missing_extra
 
 EXTRAS = ("mujoco", "joblib", "dask", "distributed", "matplotlib", "aiohttp", "cryptography")
@@ -30,10 +31,10 @@ EXTRAS = ("mujoco", "joblib", "dask", "distributed", "matplotlib", "aiohttp", "c
     ],
 )
 def test_what_lacks_the_world_says_so(words: str, what: str | None) -> None:
-    arguments = _parser().parse_args(_normalised(words.split()))
+    arguments = make_parser().parse_args(_normalised(words.split()))
     said = missing_extra(arguments, here=lambda package: False)
     assert said == (
-        None if what is None else f"{what}: the simulated world needs mujoco: pip install 'companion[sitl]'"
+        None if what is None else f"{what}: the simulated world needs mujoco: pip install '{DISTRIBUTION}[sitl]'"
     )
     assert missing_extra(arguments, here=lambda package: True) is None
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.cli.main import _normalised, _parser
+from companion.cli.main import _normalised, make_parser
 from companion.install import templates
 from companion.install.adapters import adapters, choose_adapters
 from companion.runtime.realtime import FLIGHT_PRIORITY, GUARDIAN_PRIORITY
@@ -66,7 +66,7 @@ def test_the_service_starts_a_flight_that_waits_on_the_ground() -> None:
     unit = templates.service("companion", "/opt/companion/bin/companion", "/etc/m.yaml", "/etc/v.yaml")
     program, *words = value(unit, "ExecStart").split()
     assert program == "/opt/companion/bin/companion"
-    arguments, unknown = _parser().parse_known_args(_normalised(words))
+    arguments, unknown = make_parser().parse_known_args(_normalised(words))
     assert unknown == []
     assert (arguments.command, arguments.mission, arguments.vehicle) == ("fly", "/etc/m.yaml", "/etc/v.yaml")
     assert arguments.wait_for_start

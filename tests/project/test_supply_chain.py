@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from companion import DISTRIBUTION
+
 ROOT = Path(__file__).parents[2]
 PIN = re.compile(r"^([a-z0-9.-]+)==(\S+)", re.MULTILINE)
 
@@ -30,7 +32,7 @@ def wanted(extras: bool) -> set[str]:
     if extras:
         lines += [line for lines_of in project["optional-dependencies"].values() for line in lines_of]
     names = {normal(re.split(r"[\[<>=;! ]", line)[0]) for line in lines}
-    return names - {"companion"}
+    return names - {DISTRIBUTION}
 
 
 @pytest.mark.parametrize(("what", "extras"), [("flight", False), ("all", True)])
