@@ -99,6 +99,9 @@ def build() -> None:
     )
     folders = [f"--build-lib={WORK / 'lib'}", f"--build-temp={WORK / 'objects'}"]
     setup(name="compiled", packages=[], ext_modules=extensions, script_args=["-q", "build_ext", "--inplace", *folders])
+    shutil.copy(
+        ROOT / "pyproject.toml", BUILD
+    )  # it announces the control laws; not earlier, because setup() would read it
 
 
 def main() -> int:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from companion import __version__
-from companion.cli.options import MISSION_HELP, MISSION_OR_DEFAULT_HELP, add_law, add_seed, add_world
+from companion.cli.options import MISSION_HELP, MISSION_OR_DEFAULT_HELP, add_law, add_seed, add_world, preset_help
 from companion.cli.planning_progress import PlanningProgress
 from companion.cli.schema import schema_json
 from companion.config.document import ConfigError
@@ -22,6 +22,7 @@ from companion.config.shipped import DEFAULT_MISSION
 from companion.install.extras import missing_extra
 from companion.mission.check import check_mission
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.plugins import PluginError
 from companion.runtime.console import print_error, terminal_console
 from companion.runtime.subprocesses import use_default_signals
 from companion.sitl_config.loader import COMMAND_LINE_WORLD, DEFAULT_WORLD, SitlConfig, load_sitl
@@ -52,6 +53,12 @@ class _Parser(argparse.ArgumentParser):
     def __init__(self, **settings: Any) -> None:
         super().__init__(allow_abbrev=False, **settings)
 
+    def format_help(self) -> str:
+        for action in self._actions:
+            if action.dest == "preset":
+                action.help = preset_help()
+        return super().format_help()
+
     def error(self, message: str) -> None:  # type: ignore[override]
         sys.stderr.write(f"{self.prog}: {message}; see {self.prog} --help\n")
         sys.exit(EXIT_BAD_INPUT)
@@ -77,6 +84,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         for line in error.lines:
             print_error(line)
+        return EXIT_BAD_INPUT
+    except PluginError as error:
+        print_error(error)
         return EXIT_BAD_INPUT
     except BrokenPipeError:
         return EXIT_OK

@@ -6,6 +6,7 @@ import argparse
 
 from companion.config.controller import PRESETS
 from companion.config.shipped import DEFAULT_MISSION, names
+from companion.plugins import PluginError
 from companion.sitl_config.loader import COMMAND_LINE_WORLD, WORLDS
 
 MISSION_HELP = f"mission: a built-in name ({', '.join(names('missions'))}) or a file"
@@ -15,8 +16,18 @@ MISSION_OR_DEFAULT_HELP = f"{MISSION_HELP} (default: {DEFAULT_MISSION})"
 def add_law(parser: argparse.ArgumentParser) -> None:
     """Add `--controller` and `--preset`."""
     parser.add_argument("--controller", metavar="LAW", help=f"control law: {', '.join(PRESETS)}")
-    gains = "; ".join(f"{law}: {', '.join(reversed(presets))}" for law, presets in PRESETS.items())
-    parser.add_argument("--preset", metavar="NAME", help=f"gains, the default first ({gains})")
+    parser.add_argument("--preset", metavar="NAME", help="gains")
+
+
+def preset_help() -> str:
+    """Return the help of `--preset`. Every installed law is imported for it, so that it is made only when it is shown."""
+    gains = []
+    for law in PRESETS:
+        try:
+            gains.append(f"{law}: {', '.join(reversed(PRESETS[law]))}")
+        except PluginError:
+            gains.append(f"{law}: see companion plugins")
+    return f"gains, the default first ({'; '.join(gains)})"
 
 
 def add_world(parser: argparse.ArgumentParser, default: str | None = COMMAND_LINE_WORLD) -> None:

@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from collections.abc import Callable
+from functools import reduce
+from operator import or_
+from typing import Annotated, Any
 
-from pydantic import TypeAdapter
+from pydantic import Field, TypeAdapter
 from pydantic.json_schema import GenerateJsonSchema
 
-from companion.config.controller import ControllerConfig
+from companion.config.controller import LAWS
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
 from companion.sitl_config.distributions import Normal, Uniform
 from companion.sitl_config.world import World
 
-KINDS: dict[str, TypeAdapter[Any]] = {
-    "mission": TypeAdapter(Mission),
-    "vehicle": TypeAdapter(Vehicle),
-    "controller": TypeAdapter(ControllerConfig),
-    "world": TypeAdapter(World),
+
+def _controller() -> TypeAdapter[Any]:
+    union: Any = reduce(or_, LAWS.values())
+    return TypeAdapter(Annotated[union, Field(discriminator="law")])
+
+
+KINDS: dict[str, Callable[[], TypeAdapter[Any]]] = {
+    "mission": lambda: TypeAdapter(Mission),
+    "vehicle": lambda: TypeAdapter(Vehicle),
+    "controller": _controller,
+    "world": lambda: TypeAdapter(World),
 }
+"""Type of each kind of file. That of the controller file depends on the installed control laws."""
 
 
 class _Brief(GenerateJsonSchema):
@@ -45,7 +55,7 @@ def schema_json(kind: str) -> str:
         KeyError: the kind is not one of `KINDS`.
     """
     schema: dict[str, Any] = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    schema |= KINDS[kind].json_schema(schema_generator=_Brief)
+    schema |= KINDS[kind]().json_schema(schema_generator=_Brief)
     if kind == "world":
         schema = _with_distributions(schema)
         distributions = TypeAdapter(Uniform | Normal).json_schema(schema_generator=_Brief)

@@ -1,11 +1,20 @@
-"""The controller file: a control law and its gains. `companion.control` implements the laws and the estimates that they start with."""
+"""The controller file: a control law and its gains. `companion.control` implements the laws and the estimates that they start with.
+
+Control laws are plug-ins (`companion.plugins.CONTROL_LAWS`). An entry point names the class of a law, as `companion.control.types.Law`
+describes it, and the class names its settings: a subclass of `ControllerConfig`.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self, TypeAlias
+import functools
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
+from companion import plugins
 from companion.config.base import Location, Model, NonNegative, Positive, Positive2, Positive3, refuse
 
 Positive8 = tuple[Positive, Positive, Positive, Positive, Positive, Positive, Positive, Positive]
@@ -16,8 +25,19 @@ NonNegative3 = tuple[NonNegative, NonNegative, NonNegative]
 Positive4 = tuple[Positive, Positive, Positive, Positive]
 
 
-class LawConfig(Model):
-    """Settings that every law has: the measured force, additional compensation, and the limits of its commands."""
+class ControllerConfig(Model):
+    """Settings of any control law. A subclass narrows `law` to `Literal[NAME]`, names its presets and adds the law's own settings."""
+
+    presets: ClassVar[tuple[str, ...]] = ()
+    """Names of the built-in presets, the default last. They are files/controllers/LAW_PRESET.yaml beside the module of the class."""
+
+    schema_version: Literal[1]
+    law: str
+    preset: str
+
+
+class LawConfig(ControllerConfig):
+    """Settings that the companion's own laws share: measured force, additional compensation, and the limits of their commands."""
 
     force_lowpass_hz: Positive
     desired_force_time_s: Positive | None = None
@@ -47,9 +67,9 @@ class AdaptiveConfig(LawConfig):
     Rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. All matrices are diagonal.
     """
 
-    schema_version: Literal[1]
+    presets = ("paper", "paper_slow_leakage", "model_free", "recommended")
+
     law: Literal["adaptive"]
-    preset: str
     inertia_md: Positive8
     """M_d: kg and kg m^2."""
     lambda_gain: Positive8
@@ -122,9 +142,9 @@ class CscConfig(LawConfig):
     Rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. All matrices are diagonal.
     """
 
-    schema_version: Literal[1]
+    presets = ("tuned_extras", "tuned")
+
     law: Literal["csc"]
-    preset: str
     inertia_md: Positive8
     """M_d: kg and kg m^2."""
     damping_kd: Positive8
@@ -142,9 +162,9 @@ class CscConfig(LawConfig):
 class PscConfig(LawConfig):
     """Partitioned compliance (after Wang et al., RA-L 2024): impedance of the arm alone, position control of the vehicle alone."""
 
-    schema_version: Literal[1]
+    presets = ("tuned_extras", "tuned")
+
     law: Literal["psc"]
-    preset: str
     position_kp_xyz: Positive3
     """Position gain per world axis, 1/s^2."""
     position_kd_xyz: Positive3
@@ -165,18 +185,71 @@ class PscConfig(LawConfig):
     """Lag from the commanded to the actual thrust that the estimate assumes."""
 
 
-ControllerConfig: TypeAlias = Annotated[AdaptiveConfig | CscConfig | PscConfig, Field(discriminator="law")]
-"""Any law's configuration."""
-LawName = Literal["adaptive", "csc", "psc"]
-PresetName = Literal["paper", "paper_slow_leakage", "model_free", "recommended", "tuned_extras", "tuned"]
-LAWS: dict[str, type[AdaptiveConfig] | type[CscConfig] | type[PscConfig]] = {
-    "adaptive": AdaptiveConfig,
-    "csc": CscConfig,
-    "psc": PscConfig,
-}
-PRESETS: dict[str, tuple[str, ...]] = {
-    "adaptive": ("paper", "paper_slow_leakage", "model_free", "recommended"),
-    "csc": ("tuned_extras", "tuned"),
-    "psc": ("tuned_extras", "tuned"),
-}
-"""Built-in presets of each law, the default last."""
+@functools.cache
+def law_class(law: str) -> Any:
+    """Return the class of an installed control law; `companion.control.types.Law` describes its instances.
+
+    Raises:
+        PluginError: the law is not installed, cannot be imported, or its settings do not fit.
+    """
+    plugin = plugins.find(plugins.CONTROL_LAWS, law)
+    found = plugin.load()
+    settings = getattr(found, "settings", None)
+    if not (isinstance(settings, type) and issubclass(settings, ControllerConfig)):
+        raise plugin.error("its attribute 'settings' is not a subclass of companion.config.controller.ControllerConfig")
+    if get_args(settings.model_fields["law"].annotation) != (law,):
+        raise plugin.error(f"the field 'law' of {settings.__name__} is not Literal[\"{law}\"]")
+    if not settings.presets:
+        raise plugin.error(f"{settings.__name__} names no presets")
+    for path in (_preset_file(settings, law, preset) for preset in settings.presets):
+        if not path.exists():
+            raise plugin.error(f"the preset file {path} does not exist")
+    return found
+
+
+def preset_file(law: str, preset: str) -> Path:
+    """Return the path of a preset, one of `PRESETS[law]`."""
+    return _preset_file(LAWS[law], law, preset)
+
+
+def _preset_file(settings: type[ControllerConfig], law: str, preset: str) -> Path:
+    module = Path(str(sys.modules[settings.__module__].__file__))
+    return module.parent / "files" / "controllers" / f"{law}_{preset}.yaml"
+
+
+T = TypeVar("T")
+
+
+class _OfLaws(Mapping[str, T]):
+    """A value for each installed law, read from its class when it is asked for; raises PluginError if the law cannot be used."""
+
+    def __init__(self, read: Callable[[Any], T]) -> None:
+        self._read = read
+
+    def __getitem__(self, law: str) -> T:
+        if law not in self:
+            raise KeyError(law)
+        return self._read(law_class(law))
+
+    def __contains__(self, law: object) -> bool:
+        return law in plugins.installed(plugins.CONTROL_LAWS)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(plugins.installed(plugins.CONTROL_LAWS))
+
+    def __len__(self) -> int:
+        return len(plugins.installed(plugins.CONTROL_LAWS))
+
+
+LAWS: Mapping[str, type[ControllerConfig]] = _OfLaws(lambda law: law.settings)
+"""Settings of each installed law."""
+PRESETS: Mapping[str, tuple[str, ...]] = _OfLaws(lambda law: law.settings.presets)
+"""Built-in presets of each installed law, the default last."""
+
+
+def _of_its_law(value: Any) -> Any:
+    return law_class(str(value.get("law"))).settings.model_validate(value) if isinstance(value, dict) else value
+
+
+AnyControllerConfig = Annotated[SerializeAsAny[ControllerConfig], BeforeValidator(_of_its_law)]
+"""Settings of the law that their key `law` names, as the field of another model."""

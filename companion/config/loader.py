@@ -11,7 +11,7 @@ from typing import TypeVar
 from pydantic import ValidationError
 
 from companion.config.base import Location, Model
-from companion.config.controller import LAWS, ControllerConfig
+from companion.config.controller import LAWS, AnyControllerConfig, ControllerConfig, preset_file
 from companion.config.controller import PRESETS as PRESETS
 from companion.config.document import (
     RANK_MISSING,
@@ -26,7 +26,7 @@ from companion.config.document import (
 from companion.config.explain import nearest, validate
 from companion.config.mission import ControllerChoice, Mission
 from companion.config.overrides import Override, Section, apply_overrides, parse_overrides
-from companion.config.shipped import named_file, shipped_file
+from companion.config.shipped import named_file, near
 from companion.config.vehicle import ANY_INTERFACE, Vehicle
 from companion.config.yaml_strict import read_document
 
@@ -50,7 +50,7 @@ class FlightConfig(Model):
 
     mission: Mission
     vehicle: Vehicle
-    controller: ControllerConfig
+    controller: AnyControllerConfig
     sources: Sources
 
 
@@ -236,7 +236,7 @@ def _open_preset(law: str | None, preset: str | None) -> Document:
     preset = preset or PRESETS[law][-1]
     if preset not in PRESETS[law]:
         raise ConfigError([f"--preset {preset}: no such preset of '{law}'; available: {', '.join(PRESETS[law])}"])
-    return read_document(shipped_file("controllers", f"{law}_{preset}"))
+    return read_document(near(preset_file(law, preset)))
 
 
 def _value(document: Document, location: Location) -> Data:

@@ -6,12 +6,13 @@ Positions are those of the body's origin in the world frame (z up, 0 on the floo
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from companion.config.base import Location, Model, NonNegative, Positive, Vector2, Vector3, refuse
-from companion.config.controller import PRESETS, LawName, PresetName
+from companion.config.controller import PRESETS
 
 Duration = Annotated[float, Field(gt=0, le=600)]
 Delay = Annotated[float, Field(ge=0, le=600)]
@@ -140,11 +141,21 @@ class Catch(Model):
     payload_max_kg: NonNegative
 
 
+def _installed(law: str) -> str:
+    if law not in PRESETS:
+        raise PydanticCustomError("enum", "not an installed law")
+    return law
+
+
+def _laws(schema: dict[str, Any]) -> None:
+    schema["enum"] = list(PRESETS)
+
+
 class ControllerChoice(Model):
     """A controller file, or a law and one of its presets."""
 
-    law: LawName = "adaptive"
-    preset: PresetName | None = None
+    law: Annotated[str, AfterValidator(_installed), Field(json_schema_extra=_laws)] = "adaptive"
+    preset: str | None = None
     """Built-in preset. If neither preset nor file is given, the law's default: recommended or tuned."""
     file: str | None = None
     """Path of a controller file, relative to the mission file."""

@@ -20,8 +20,13 @@ def names(folder: str) -> tuple[str, ...]:
 
 
 def shipped_file(folder: str, name: str) -> Path:
-    """Return the path of a shipped YAML file, relative to the current directory if it is below it."""
-    path, here = FILES / folder / f"{name}.yaml", Path.cwd()
+    """Return the path of a shipped YAML file as `near` does."""
+    return near(FILES / folder / f"{name}.yaml")
+
+
+def near(path: Path) -> Path:
+    """Return an absolute path relative to the current directory if it is below it."""
+    here = Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path
 
 

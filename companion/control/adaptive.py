@@ -11,6 +11,7 @@ because this is several times as fast as loops or arrays.
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 from companion.config.controller import AdaptiveConfig
 from companion.config.vehicle import Vehicle
@@ -109,6 +110,8 @@ class AccelerationFilter:
 
 class AdaptiveController:
     """The adaptive impedance control law for vehicle and arm."""
+
+    settings: ClassVar = AdaptiveConfig
 
     def __init__(self, config: AdaptiveConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         self._manipulator = Manipulator(vehicle.arm, vehicle.tool)

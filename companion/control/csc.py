@@ -13,6 +13,8 @@ last attitude setpoint and enters through the coupling only.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from companion.config.controller import CscConfig
 from companion.config.vehicle import Vehicle
 from companion.control.common import tracking_errors
@@ -25,6 +27,8 @@ from companion.model.types import Reference, Vec3, Vec8
 
 class CscController(ModelBasedLaw):
     """The CSC law for vehicle and arm."""
+
+    settings: ClassVar = CscConfig
 
     def __init__(self, config: CscConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         super().__init__(config, vehicle, hover_thrust, config.external_xyz, config.model_mass_scale)

@@ -12,6 +12,7 @@ is estimated from the commanded thrust and the acceleration measured by the IMU.
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 from companion.config.controller import PscConfig
 from companion.config.vehicle import Vehicle
@@ -27,6 +28,8 @@ from companion.model.types import Reference, Vec2, Vec3, Vec8
 
 class PscController(ModelBasedLaw):
     """The PSC law: the arm's impedance and the vehicle's PID."""
+
+    settings: ClassVar = PscConfig
 
     def __init__(self, config: PscConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         super().__init__(config, vehicle, hover_thrust)

@@ -42,7 +42,11 @@ class Controller(Protocol):
 
 
 class Law(Controller, Protocol):
-    """Protocol of a controller as `VehicleControl` uses it."""
+    """Protocol of a control law as `VehicleControl` uses it.
+
+    The class of a law is called with its settings, the vehicle and the normalised thrust that carries the vehicle without payload. Its
+    attribute `settings` is the class of the settings, a subclass of `companion.config.controller.ControllerConfig`.
+    """
 
     hover_thrust: float
     """Normalised thrust that carries the vehicle without payload, for the log; set before every step."""

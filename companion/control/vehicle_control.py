@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 
+from companion.config.controller import law_class
 from companion.config.loader import FlightConfig
 from companion.control.arm_hold import hold_torque_nm
 from companion.control.disturbance import DisturbanceObserver
-from companion.control.factory import build_controller
 from companion.control.hover_thrust import HoverThrust, off_the_ground
 from companion.control.manipulator import Manipulator
 from companion.control.sensing import CatchDetector, ForceSensing, MeanAcceleration
-from companion.control.types import Controller, PlantState
+from companion.control.types import Controller, Law, PlantState
 from companion.model.codec import Record
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_from_euler_zyx, quat_rotate
@@ -57,7 +57,7 @@ class VehicleControl:
         self._catch = CatchDetector()
         self._state: PlantState | None = None
         """State in the last tick in which the law ran."""
-        self._law = build_controller(config.controller, vehicle, hover_thrust)
+        self._law: Law = law_class(config.controller.law)(config.controller, vehicle, hover_thrust)
         self._controller: Controller = self._law
         fold = vehicle.safety.fold_arm_deg
         self.fold_rad: Vec2 = (math.radians(fold[0]), math.radians(fold[1]))

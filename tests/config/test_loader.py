@@ -124,8 +124,8 @@ BAD_MISSION = [
         "preset: recommended",
         "preset: recomended",
         [
-            f'{CATCH}:9:37: controller.preset: expected one of "paper", "paper_slow_leakage", "model_free", "recommended", "tuned_extras", "tuned", got "recomended" '
-            "(did you mean recommended?)"
+            f"{CATCH}:9:37: controller.preset: no such preset of 'adaptive', got \"recomended\"; available: paper, "
+            "paper_slow_leakage, model_free, recommended"
         ],
     ),
     ("schema_version: 1", "schema_version: 2", [f"{CATCH}:6:17: schema_version: expected 1, got 2"]),

@@ -8,11 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from companion.config.controller import AdaptiveConfig, CscConfig
+from companion.config.controller import CscConfig
 from companion.config.loader import FlightConfig
 from companion.control.csc import CscController
 from companion.control.dynamics import Dynamics, rotation_matrix
-from companion.control.factory import build_controller
 from companion.control.types import PlantState, Wrench
 from companion.core.flight_core import FlightCore
 from companion.model.frames import quat_rotate
@@ -162,14 +161,6 @@ def test_a_core_built_from_the_recorded_configuration_flies_the_same() -> None:
     again = FlightCore(FlightConfig.model_validate_json(flight.config.flight.model_dump_json()))
     result = flown("world.payload_kg=0.2")
     assert [again.step(inputs) for inputs in result.inputs[:1500]] == result.outputs[:1500]
-
-
-def test_the_factory_builds_the_law_that_is_asked_for() -> None:
-    config = configured()
-    assert isinstance(build_controller(config.controller, config.vehicle, 0.49), CscController)
-    adaptive = load_sitl(MISSION)
-    assert isinstance(adaptive.controller, AdaptiveConfig)
-    assert type(build_controller(adaptive.controller, adaptive.vehicle, 0.49)).__name__ == "AdaptiveController"
 
 
 def test_the_net_force_is_felt_in_the_body_frame() -> None:

@@ -17,7 +17,7 @@ from companion.campaigns.compare.paper_results import Printed
 from companion.campaigns.compare.plots import distributions
 from companion.campaigns.compare.tables import by_payload, spread_text
 from companion.campaigns.runner import Row
-from companion.config.controller import PRESETS, AdaptiveConfig, ControllerConfig, CscConfig, PscConfig
+from companion.config.controller import PRESETS, AdaptiveConfig, CscConfig, LawConfig, PscConfig
 from companion.config.loader import load_flight
 from tools.docs.tables import flown_by, markdown, write_page
 
@@ -151,17 +151,18 @@ def differences_markdown(groups: Sequence[Group]) -> str:
 def knowledge_markdown() -> str:
     """Return the vehicle parameters that each built-in preset uses, and those that it estimates in flight."""
     named = [(law, preset) for law, presets in PRESETS.items() for preset in presets]
-    configs = [load_flight(MISSION, controller_law=law, preset=preset).controller for law, preset in named]
+    loaded = [load_flight(MISSION, controller_law=law, preset=preset).controller for law, preset in named]
+    configs = [controller for controller in loaded if isinstance(controller, LawConfig)]
     head = ("law/preset", *(title for title, _ in _TOLD), "adapted or estimated in flight")
     rows = [(f"{c.law}/{c.preset}", *("yes" if uses(c) else "–" for _, uses in _TOLD), _estimated(c)) for c in configs]
     return markdown(head, rows)
 
 
-def _observer(c: ControllerConfig) -> bool:
+def _observer(c: LawConfig) -> bool:
     return any(c.disturbance_time_xyz_s)
 
 
-_TOLD: tuple[tuple[str, Callable[[ControllerConfig], bool]], ...] = (
+_TOLD: tuple[tuple[str, Callable[[LawConfig], bool]], ...] = (
     ("gravity of the arm", lambda c: not isinstance(c, AdaptiveConfig) or c.arm_gravity_nominal),
     ("inertia of the arm", lambda c: not isinstance(c, AdaptiveConfig) or c.arm_inertia_nominal),
     ("inertia of the base, coupling", lambda c: isinstance(c, CscConfig)),
@@ -170,7 +171,7 @@ _TOLD: tuple[tuple[str, Callable[[ControllerConfig], bool]], ...] = (
 )  # fmt: skip
 
 
-def _estimated(c: ControllerConfig) -> str:
+def _estimated(c: LawConfig) -> str:
     found = ["disturbance force"] if _observer(c) else []
     if isinstance(c, AdaptiveConfig):
         found += ["H, zeta"]

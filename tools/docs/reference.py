@@ -52,7 +52,7 @@ def page(kind: str) -> str:
     Raises:
         KeyError: the kind is not one of `KINDS`.
     """
-    schema = KINDS[kind].json_schema()
+    schema = KINDS[kind]().json_schema()
     lines = [
         f"# The {kind} file: every key" if kind != "world" else "# The simulated world: every key",
         "",

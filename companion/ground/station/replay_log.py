@@ -17,6 +17,7 @@ from companion.ground.telemetry.scene import PATH_POINTS_MAX, scene_of
 from companion.ground.telemetry.stream import replay
 from companion.model.codec import to_json
 from companion.model.types import Vec3
+from companion.plugins import PluginError
 
 STREAMS_MAX = 12_000
 """Max number of stream messages: ten minutes at 20 Hz; longer logs are shown at a lower rate."""
@@ -57,6 +58,8 @@ def read_for_page(path: Path, number: int) -> ReplayLog:
         raise LogError(
             f"{path}: its configuration does not fit this version ({where}: {first['msg']}); it was written by {writer(log.metadata)}"
         ) from None
+    except PluginError as error:
+        raise LogError(f"{path}: {error}") from None
     session = f"log-{number}"
     streams, events = replay(log.rows(), config, session, _epoch_offset_s(log), max_records=STREAMS_MAX)
     parts = {

@@ -1,0 +1,110 @@
+"""Plug-ins: parts of the companion that any installed distribution may provide. Entry points (`importlib.metadata`) announce them.
+
+The companion announces its own parts in the same way, in pyproject.toml.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.metadata
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+from companion import DISTRIBUTION, __version__
+
+CONTROL_LAWS = "companion.control_laws"
+KINDS = {CONTROL_LAWS: "control law"}
+"""Kind of part that each group of entry points announces."""
+_SOURCE_TREE = Path(__file__).parents[1]
+
+
+class PluginError(Exception):
+    """A plug-in cannot be used. The text is one line that names the plug-in and the reason."""
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """An announced part. Its module is not imported before `load`."""
+
+    entry: EntryPoint
+    distribution: str
+    version: str
+    others: list[Plugin] = field(default_factory=list)
+    """Parts of other distributions with the same name; then none of them can be used."""
+
+    def __str__(self) -> str:
+        return f"{KINDS[self.entry.group]} '{self.entry.name}' ({self.distribution} {self.version})"
+
+    def load(self) -> Any:
+        """Import the module and return the announced object.
+
+        Raises:
+            PluginError: another distribution announces the same name, or the object cannot be imported.
+        """
+        if self.others:
+            raise self.error(f"{' and '.join(map(str, self.others))} has the same name; uninstall one of them")
+        try:
+            return self.entry.load()
+        except (Exception, SystemExit) as error:
+            raise self.error(f"{self.entry.value} cannot be imported: {one_line(error)}") from error
+
+    def error(self, reason: str) -> PluginError:
+        """Return the error that this plug-in cannot be used for a reason."""
+        return PluginError(f"{self}: {reason}")
+
+
+def one_line(error: BaseException) -> str:
+    """Return type and text of an exception as one line."""
+    return ": ".join([type(error).__name__, *str(error).splitlines()[:1]])
+
+
+@functools.cache
+def installed(group: str) -> dict[str, Plugin]:
+    """Return the installed plug-ins of a group by name: the companion's own first, then those of other distributions by name."""
+    found: dict[str, Plugin] = {}
+    for plugin in [*_own(group), *sorted(_of_others(group), key=lambda plugin: plugin.entry.name)]:
+        first = found.setdefault(plugin.entry.name, plugin)
+        if first is not plugin:
+            first.others.append(plugin)
+    return found
+
+
+def find(group: str, name: str) -> Plugin:
+    """Return an installed plug-in.
+
+    Raises:
+        PluginError: it is not installed.
+    """
+    plugins = installed(group)
+    if name not in plugins:
+        raise PluginError(f"{KINDS[group]} '{name}' is not installed; installed: {', '.join(plugins) or 'none'}")
+    return plugins[name]
+
+
+def _own(group: str) -> Iterator[Plugin]:
+    """Yield the companion's own parts: in a source tree those of pyproject.toml, because an editable installation keeps the entry
+    points of the day on which it was made.
+    """
+    path = _SOURCE_TREE / "pyproject.toml"
+    source = tomllib.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    announced = source.get("project", {}).get("entry-points", {}).get(group)
+    if announced is not None:
+        entries = [EntryPoint(name, target, group) for name, target in announced.items()]
+    else:
+        entries = [entry for entry in importlib.metadata.entry_points(group=group) if _is_own(entry)]
+    for entry in entries:
+        yield Plugin(entry, DISTRIBUTION, __version__)
+
+
+def _of_others(group: str) -> Iterator[Plugin]:
+    for entry in importlib.metadata.entry_points(group=group):
+        if entry.dist is not None and not _is_own(entry):
+            yield Plugin(entry, entry.dist.name, entry.dist.version)
+
+
+def _is_own(entry: EntryPoint) -> bool:
+    return entry.module.split(".")[0] == "companion"

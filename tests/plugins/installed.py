@@ -1,0 +1,41 @@
+"""Distributions that tests install: a folder on sys.path with packages and the metadata that pip would write."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from companion import plugins
+from companion.config.controller import law_class
+
+
+def write_distribution(site: Path, name: str, version: str, entry_points: Mapping[str, str]) -> None:
+    """Write the metadata of a distribution with these control laws, NAME: MODULE:ATTRIBUTE."""
+    info = site / f"{name.replace('-', '_')}-{version}.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    lines = [f"[{plugins.CONTROL_LAWS}]", *(f"{law} = {target}" for law, target in entry_points.items())]
+    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+
+
+@contextmanager
+def on_path(site: Path) -> Iterator[None]:
+    """Install the distributions of a folder in this process."""
+    modules = set(sys.modules)
+    sys.path.insert(0, str(site))
+    _forget()
+    try:
+        yield
+    finally:
+        sys.path.remove(str(site))
+        for name in set(sys.modules) - modules:
+            if str(getattr(sys.modules[name], "__file__", "")).startswith(str(site)):
+                del sys.modules[name]
+        _forget()
+
+
+def _forget() -> None:
+    plugins.installed.cache_clear()
+    law_class.cache_clear()
