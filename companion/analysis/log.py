@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError
@@ -17,6 +18,7 @@ from mcap.records import Channel, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader
 from zstandard import ZstdError
 
+from companion import DISTRIBUTION
 from companion.analysis.timing import Stopwatch, Timing, timing_of
 from companion.model.codec import RecordError, from_json
 from companion.model.constants import GRADED_POSE_MAX_AGE_S
@@ -139,10 +141,61 @@ class FlightLog:
         values = [blank if (v := value(*row)) is None else v for row in self.rows()]
         return np.array(values, dtype=np.float64).reshape((len(values), width) if width else (len(values),))
 
+    def to_pandas(self) -> dict[str, Any]:
+        """Return a pandas DataFrame for each of `/inputs`, `/outputs`, `/sent` and `/events`, indexed by `t_s` (s, flight clock).
+
+        A column is named by the path of its field, which contains unit and frame, with an element in brackets:
+        `mocap.position_world_m[0]`. NaN where a tick lacks the field. `/events` has a row per event, the others a row per tick.
+
+        Raises:
+            LogError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise LogError(f"to_pandas: needs pandas: pip install '{DISTRIBUTION}[pandas]'") from None
+        ticks_s = [inputs.t_s for inputs in self.inputs]
+        events = [(event, outputs.mission_t_s) for outputs in self.outputs for event in outputs.events]
+        tables = {
+            "/inputs": (ticks_s, map(_cells, self.inputs)),
+            "/outputs": (ticks_s, map(_cells, self.outputs)),
+            "/sent": (ticks_s, map(_cells, self.sent)),
+            "/events": (
+                [event.t_s for event, _ in events],
+                ({**_cells(event), "mission_t_s": t} for event, t in events),
+            ),
+        }
+        return {
+            topic: pandas.DataFrame(list(rows), index=pandas.Index(times_s, name="t_s", dtype=float))
+            for topic, (times_s, rows) in tables.items()
+        }
+
     @cached_property
     def columns(self) -> Columns:
         """Return the quantities that metrics and plots share, as arrays."""
         return _columns(self)
+
+
+def _cells(record: Any) -> dict[str, Any]:
+    """Return the fields of a record, also those of the records in it, without `t_s` and `events`, by the names of their columns."""
+    cells: dict[str, Any] = {}
+
+    def take(name: str, value: Any) -> None:
+        if isinstance(value, dict):
+            for key, part in value.items():
+                take(f"{name}.{key}", part)
+        elif isinstance(value, list | tuple) and all(isinstance(part, str) for part in value):
+            cells[name] = ", ".join(value)
+        elif isinstance(value, list | tuple):
+            for index, part in enumerate(value):
+                take(f"{name}[{index}]", part)
+        else:
+            cells[name] = value
+
+    for key, value in msgspec.to_builtins(record).items():
+        if key not in ("t_s", "events"):
+            take(key, value)
+    return cells
 
 
 class _Rows:

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import re
+import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -24,6 +25,7 @@ from companion.analysis.summary import empty_summary, summarise, write_summary
 from companion.model.codec import differences
 from companion.model.types import Inputs, Outputs, PhaseKind, Sent
 from tests.analysis.synthetic_flight import CATCH_S, CONFIG, record_flight, synthetic_flight
+from tests.support import ROOT
 
 Row = tuple[Inputs, Outputs, Sent]
 
@@ -60,6 +62,37 @@ def test_a_log_gives_back_every_record_bit_for_bit(flight: FlightLog) -> None:
     assert flight.closed
     assert flight.config == CONFIG
     assert flight.missing_ticks() == 0
+
+
+def test_a_log_as_data_frames_holds_every_field_of_every_tick(flight: FlightLog) -> None:
+    pytest.importorskip("pandas")
+    frames = flight.to_pandas()
+    for number in (0, len(flight.inputs) // 2, -1):
+        inputs, outputs, sent = flight.inputs[number], flight.outputs[number], flight.sent[number]
+        assert inputs.mocap is not None
+        row = frames["/inputs"].iloc[number]
+        assert row.name == inputs.t_s
+        assert tuple(row[f"mocap.position_world_m[{axis}]"] for axis in range(3)) == inputs.mocap.position_world_m
+        assert frames["/outputs"].iloc[number]["mission_t_s"] == outputs.mission_t_s
+        assert frames["/sent"].iloc[number]["lateness_s"] == sent.lateness_s
+    absent = [outputs.reference is None for outputs in flight.outputs]
+    assert frames["/outputs"]["reference.position_world_m[2]"].isna().tolist() == absent
+    events = [event for outputs in flight.outputs for event in outputs.events]
+    assert frames["/events"].index.tolist() == [event.t_s for event in events]
+    assert frames["/events"]["severity"].tolist() == [event.severity.value for event in events]
+
+
+def test_the_example_of_the_page_on_logs_runs(flight: FlightLog, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pandas")
+    (example,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs/log.md").read_text(encoding="utf-8"), re.M | re.S)
+    exec(example.replace("flights/A/flight.mcap", str(flight.path)), {})
+    assert re.match(r"largest height error \d\.\d{4} m\n", capsys.readouterr().out)
+
+
+def test_without_pandas_one_line_says_what_to_install(flight: FlightLog, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(LogError, match=r"^to_pandas: needs pandas: pip install '.*\[pandas\]'$"):
+        flight.to_pandas()
 
 
 def test_a_log_cut_anywhere_is_read_up_to_its_last_whole_chunk(flight: FlightLog, tmp_path: Path) -> None:
