@@ -29,7 +29,7 @@ from companion.model.types import ControlLog, Reference, Vec2, Vec3, Vec4, Vec8
 
 
 def active(rows: tuple[float, ...]) -> Rows:
-    """Return the five active rows of eight."""
+    """Return the five active rows out of all eight."""
     x, y, z, _, _, _, a1, a2 = rows
     return (x, y, z, a1, a2)
 

@@ -17,8 +17,8 @@ class DisturbanceObserver:
 
     Args:
         mass_kg: mass of the whole vehicle.
-        time_xyz_s: time constant per axis; an axis with 0 stays 0.
-        lag_s: time constant from the commanded to the actual force.
+        time_xyz_s: time constant per axis; 0 disables the estimate of that axis.
+        lag_s: time constant of the lag between commanded and actual force.
         max_n: bound of the estimate per axis.
     """
 
@@ -38,8 +38,8 @@ class DisturbanceObserver:
         Args:
             dt_s: time since the last tick.
             known_n: sum of all known forces commanded in the last tick, weight included.
-            acceleration_world_m_s2: measured acceleration. learn: if False the estimate does not change (on the ground, or while the
-            actuators are saturated).
+            acceleration_world_m_s2: measured acceleration.
+            learn: if False, the estimate does not change (on the ground, or while the actuators are saturated).
         """
         if not self._on:
             return self.force_n

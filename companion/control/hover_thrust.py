@@ -65,8 +65,8 @@ class HoverThrust:
     """Estimator of the hover thrust.
 
     Args:
-        start: initial hover thrust (PX4's MPC_THR_HOVER or the vehicle file), 0 to 1. mass_kg: nominal mass of the whole vehicle
-        without payload.
+        start: initial hover thrust (PX4's MPC_THR_HOVER or the vehicle file), 0 to 1.
+        mass_kg: nominal mass of the whole vehicle without payload.
     """
 
     def __init__(self, start: float, mass_kg: float) -> None:

@@ -77,13 +77,13 @@ class Manipulator:
     def joint_terms(
         self, angle_rad: Vec2, up_x_m_s2: float, up_z_m_s2: float
     ) -> tuple[float, float, float, float, float, float]:
-        """Return rows x and z of the Jacobian (m/rad) and the gravity torques (N m): `jacobian_body_m` and `gravity_torque_nm` in one
-        call.
+        """Return rows x and z of the Jacobian (m/rad) and the gravity torques (N m): `jacobian_body_m` and `gravity_torque_nm` in
+        one call.
 
         Args:
             angle_rad: both joint angles.
             up_x_m_s2: body x component of the reaction to gravity, which is 9.81 m/s^2 upwards.
-            up_z_m_s2: its body z component.
+            up_z_m_s2: body z component of that reaction.
         """
         a1, a2 = angle_rad
         b = a1 - a2

@@ -19,7 +19,7 @@ class ModelBasedLaw:
     Args:
         config: configuration of the law.
         vehicle: the nominal vehicle without payload.
-        hover_thrust: normalised thrust that carries it, 0 to 1.
+        hover_thrust: normalised thrust that carries the vehicle, 0 to 1.
         answered_xyz: fraction of the measured force, per world axis, that the law itself compensates.
         model_mass_scale: ratio of the model's masses to the nominal ones.
     """

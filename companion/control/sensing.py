@@ -129,7 +129,7 @@ class CatchDetector:
         """Time of the impact of the payload in the net, or None if the net is empty."""
 
     def update(self, t_s: float, force_world_n: Vec3 | None) -> bool:
-        """Return True in the one tick in which a catch is confirmed. `caught_s` is then the time of the impact."""
+        """Return True only in the tick that confirms a catch. `caught_s` is then the time of the impact."""
         if self.caught_s is not None or force_world_n is None:
             return False
         x, y, z = force_world_n
@@ -157,7 +157,7 @@ class CatchDetector:
         return self._blow_s
 
     def left(self, t_s: float, force_world_n: Vec3 | None, acceleration_z_m_s2: float) -> bool:
-        """Return True in the one tick in which it is confirmed that the payload has left the net. The next catch can then be detected.
+        """Return True only in the tick that confirms that the payload has left the net. The next catch can then be detected.
 
         Args:
             t_s: flight clock.

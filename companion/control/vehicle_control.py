@@ -172,11 +172,11 @@ class VehicleControl:
         self.disturbance_world_n = self._pull.step(dt_s, known, state.acceleration_world_m_s2, learn=True)
 
     def catch_s(self, t_s: float, log: ControlLog) -> float | None:
-        """Return the time of the impact in the one tick in which a catch is confirmed, else None."""
+        """Return the time of the impact in the tick that confirms a catch, and None in every other tick."""
         return self._catch.caught_s if self._catch.update(t_s, log.force_ext_world_n) else None
 
     def payload_left(self, t_s: float) -> bool:
-        """Return True in the one tick in which it is confirmed that a caught payload has left the net. Call it after `fly`."""
+        """Return True only in the tick that confirms that a caught payload has left the net. Call it after `fly`."""
         state = self._state
         if self._catch.caught_s is None or state is None:
             return False

@@ -1,4 +1,4 @@
-"""Frozen records: the state of one flight, and the input and the requests of a transition."""
+"""Frozen records: the state of one flight, and the inputs and requests of a transition."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ class Waiting:
 
     tare_start_s: float | None = None
     was_ready: bool = False
-    """Whether everything has been ready once: a lost input may then return as long as the operator waits."""
+    """Whether everything has been ready at least once. If an input is lost after that, the vehicle waits without a timeout until it
+    returns.
+    """
     unready: str = "the inputs have not been checked yet"
     looked_s: float = 0.0
     """Time of the last check of the estimate and the position."""
@@ -69,7 +71,7 @@ class FlightState:
 
     @property
     def pilot_flies(self) -> bool:
-        """Return whether a pilot flies the vehicle, so that nothing is sent."""
+        """Return whether a pilot is flying the vehicle; nothing is sent then."""
         return self.stage is Stage.AUTOPILOT_LAND and self.landing is not None and self.landing.pilot
 
     @property
@@ -108,13 +110,13 @@ class FlightState:
 
 
 class Observation(Record, frozen=True):
-    """The input of a transition in addition to state and events."""
+    """Inputs to a transition other than the state and the events."""
 
     inputs: Inputs
     airborne: bool
-    """The rotors may lift, or PX4 was found armed and flying."""
+    """The rotors may be lifting the vehicle, or PX4 was found armed and flying."""
     armed_by_others: bool
-    """PX4 is armed before the companion has requested it."""
+    """PX4 is armed although the companion has not requested it."""
     standing: str | None
     """Message of the active rule that still requires a hold and therefore forbids resuming; None if there is none."""
     reference: Reference | None

@@ -29,7 +29,7 @@ _NONE = AutopilotRequest.NONE
 
 
 def advance(t: Transition) -> AutopilotRequest:
-    """Advance the sequence and return the request of the present stage."""
+    """Advance the sequence and return the request of the current stage."""
     i, state = t.i, t.state
     assert state.entered_s is not None
     if i.mocap is not None and i.mocap.tracking_valid:
@@ -192,7 +192,7 @@ def _stand_down(t: Transition, elapsed_s: float) -> AutopilotRequest:
     if not seq.is_armed(i.status) and i.t_s - t.state.arm_requested_s > ARMED_SHOWN_S:
         t.enter(Stage.DONE)
     elif not _left_to_pilot(t) and elapsed_s > seq.DISARM_TIMEOUT_S:
-        text = "PX4 did not disarm: its rotors may turn; disarm it by the pilot's switch or from a ground station"
+        text = "PX4 did not disarm: its rotors may be turning; disarm it by the pilot's switch or from a ground station"
         t.report(notices.DISARM_REFUSED, text)
         t.enter(Stage.DONE)
     elif t.state.stage is Stage.STAND_DOWN:

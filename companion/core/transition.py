@@ -115,7 +115,9 @@ class Transition:
         )
 
     def enter(self, stage: Stage, *, pilot_flies: bool = False, flipped: bool = False) -> None:
-        """Enter a stage. For a landing by PX4, `pilot_flies` means that it is only monitored, `flipped` that the vehicle flipped."""
+        """Enter a stage. For a landing by PX4, `pilot_flies` means that it is only monitored, and `flipped` that the vehicle has
+        flipped.
+        """
         p, t_s = self.parameters, self.i.t_s
         if stage is Stage.AUTOPILOT_LAND:
             self.enter_landing(pilot_flies, self.pose_s, flipped)

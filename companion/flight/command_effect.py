@@ -1,4 +1,6 @@
-"""Describes the effect of an operator's command, derived from the outputs of its tick and of the tick before. Pure."""
+"""Describes the effect of an operator's command, derived from the outputs of the tick that executes it and of the tick before.
+Pure.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +19,14 @@ def effect_of(command: OperatorCommand, before: Outputs | None, after: Outputs) 
 
     Args:
         command: the operator's command, even if an earlier request to land has taken its place in `Inputs.command`.
-        before: outputs of the tick before the command; None if there was none.
-        after: outputs of the tick with it.
+        before: outputs of the tick before the command; None if there was no such tick.
+        after: outputs of the tick that executes the command.
     """
     if after.phase == PILOT_FLIES:
         return False, "a pilot has control: nothing is sent"
     stood = before is None or before.phase_kind is PhaseKind.GROUND
     if after.phase_kind is PhaseKind.DONE and not stood:
-        return command in _DOWN, "down already" if command in _DOWN else f"{_NOTHING[command]}: the flight is over"
+        return command in _DOWN, "already down" if command in _DOWN else f"{_NOTHING[command]}: the flight is over"
     if after.phase == Stage.AUTOPILOT_LAND.value:
         if command in _DOWN:
             return True, "recorded; PX4's own landing continues"
@@ -36,14 +38,14 @@ def _land(before: Outputs | None, after: Outputs) -> Effect:
     if after.phase_kind is PhaseKind.DONE:
         return True, "not taking off: the start is cancelled"
     if before is not None and before.phase == Stage.SPOOL.value:
-        return True, "not taking off: the rotors spool down"
+        return True, "not taking off: the rotors are spooling down"
     landed_already = before is not None and before.action.rank >= SafetyAction.LAND.rank
     return True, "already landing" if landed_already else "landing"
 
 
 def _abort(before: Outputs | None, after: Outputs) -> Effect:
     accepted, text = _land(before, after)
-    return accepted, "aborted: landing, the arm folds" if text == "landing" else text
+    return accepted, "aborted: landing and folding the arm" if text == "landing" else text
 
 
 def _hold(before: Outputs | None, after: Outputs) -> Effect:
@@ -52,7 +54,7 @@ def _hold(before: Outputs | None, after: Outputs) -> Effect:
     if after.phase_kind is PhaseKind.GROUND:
         return True, "the vehicle stays on the ground until start is commanded"
     if before is not None and before.phase == Stage.SPOOL.value:
-        return True, "not taking off: the rotors spool down"
+        return True, "not taking off: the rotors are spooling down"
     if "no_room_to_stay" in _events(after):
         return True, "too low to hold: landing"
     action = after.action
@@ -82,7 +84,7 @@ def _start(before: Outputs | None, after: Outputs) -> Effect:
     if declined is not None:
         return False, f"start refused: {declined}"
     if before is not None and before.phase in _RISING:
-        return (True, "taking off already") if after.phase_kind is PhaseKind.GROUND else (False, _NOT_GROUNDED)
+        return (True, "already taking off") if after.phase_kind is PhaseKind.GROUND else (False, _NOT_GROUNDED)
     if after.phase in _RISING:
         return True, "taking off"
     if after.phase_kind is PhaseKind.DONE:
@@ -91,11 +93,11 @@ def _start(before: Outputs | None, after: Outputs) -> Effect:
 
 
 def _instead(after: Outputs) -> str:
-    """Return what a vehicle that is not holding is doing."""
+    """Return what the vehicle is doing instead of holding."""
     if after.phase_kind is PhaseKind.GROUND:
         return "on the ground"
     if after.action is SafetyAction.RETRACT:
-        return "the vehicle returns along the tether and lands"
+        return "the vehicle is returning along the tether and will land"
     if after.action.rank > SafetyAction.HOLD.rank or after.phase_kind is PhaseKind.LANDING:
         return "the vehicle is landing"
     return "not holding"

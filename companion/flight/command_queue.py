@@ -87,11 +87,11 @@ class Operator:
         return dropped
 
     def next(self) -> Turn:
-        """Return the commands of this tick.
+        """Return the command of this tick.
 
-        A landing requested by the launcher or a signal stays requested. A command from the ground station lasts one tick. A
-        repeated one is delayed by a tick, because the core counts rising edges. A RESUME that names a hold other than the active
-        one is refused.
+        A landing requested by the launcher or a signal stays requested. A command from the ground station lasts one tick. If it
+        repeats the previous one, it is delayed by a tick, because the core counts rising edges. A RESUME that names a hold other
+        than the active one is refused.
         """
         waiting = self._waiting
         if self._land.is_set():
@@ -109,7 +109,8 @@ class Operator:
         return Turn(asked.command, asked)
 
     def judged(self, command: OperatorCommand, outputs: Outputs) -> int | None:
-        """Number the holds and return `hold`. A new hold begins with `SafetyAction.HOLD`, and with every hold command during it.
+        """Update `hold`, the number of the active hold, and return it. A new hold begins with `SafetyAction.HOLD`, and with every
+        hold command during it.
 
         Args:
             command: command of the tick.
@@ -135,7 +136,7 @@ class Operator:
             loop.remove_reader(self._channel)
 
     async def unless_land(self, opening: Coroutine[Any, Any, _T]) -> _T:
-        """Return the result of `opening`, which is cancelled when a landing is requested.
+        """Await `opening` and return its result; cancel it if a landing is requested.
 
         Raises:
             StartCancelled: a landing was requested first.

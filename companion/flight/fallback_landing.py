@@ -16,7 +16,9 @@ from companion.runtime.clock import Clock
 
 LANDING_TIMEOUT_S = 30.0
 STATUS_MIN_AGE_S = 1.5
-"""Time after the start of the landing for which `disarmed` is ignored: PX4 reports it once a second, so it may be older."""
+"""Time after the start of the landing for which `disarmed` is ignored: PX4 reports it once a second, so the report may predate the
+landing.
+"""
 UNFLOWN_HOVER_THRUST = 0.5
 """Hover thrust for a vehicle that was found in the air: the core requires a value, but its controller never runs."""
 

@@ -28,7 +28,9 @@ class Heartbeats:
         self._origin_s = origin_s
         self._pilot = False
         self._lands_without_mocap = False
-        """Whether an event of `_REFUSALS` has occurred. From then on, rejected poses are more than a single invalid one."""
+        """Whether an event of `_REFUSALS` has occurred. From then on, an untrusted pose means that motion capture is rejected, not
+        merely that a single pose is invalid.
+        """
         self._pose_stamp_s = float("-inf")
         self._position_world_m = (0.0, 0.0, 0.0)
 
@@ -41,7 +43,7 @@ class Heartbeats:
         if mocap is not None and mocap.tracking_valid and outputs.mocap_trusted:
             self._pose_stamp_s, self._position_world_m = mocap.stamp_s, mocap.position_world_m
         armed = inputs.status is not None and inputs.status.armed
-        # PX4 reports once a second that it is armed: it may be as soon as arming is requested.
+        # PX4 reports only once a second whether it is armed, so it may be armed as soon as arming is requested.
         may_lift = armed or outputs.request is AutopilotRequest.ARM or outputs.phase_kind in _IN_THE_AIR
         link = self._identity
         return Heartbeat(
@@ -99,8 +101,8 @@ class FlightGuard:
             self._client.send_heartbeat(self._last)
 
     def goodbye(self, now: AutopilotStatus | None) -> None:
-        """Send the guardian the last heartbeat. Send nothing while PX4 is armed: the guardian then takes over once this process has
-        ended.
+        """Send the guardian a final heartbeat marked as goodbye, unless PX4 is armed: then send nothing, so that the guardian takes
+        over once this process has ended.
 
         Args:
             now: PX4's newest status; None if none was received.

@@ -53,10 +53,10 @@ from companion.safety.rules import REATTACHED
 
 STATUS_EVERY = 20
 JOINT_READ_TIMEOUT_S = 0.002
-"""Timeout of the joint read, from the start of the tick; the read begins before that."""
+"""Timeout for the joint read, measured from the start of the tick; the read begins earlier."""
 JOINT_LEAD_MAX_S = 0.003
 JOINT_MARGIN_S = 0.0001
-"""Time by which the answer of the joint read is planned to precede the tick, so that it is neither late nor stale."""
+"""Planned time between the arrival of the joint state and the start of the tick, so that the state is neither late nor stale."""
 
 
 class Flight:
@@ -85,7 +85,7 @@ class Flight:
         self._phase = ""
         """The phase last reported to the launcher."""
         self._ground: str | None = None
-        """The state of the link to ground stations last reported to the launcher."""
+        """State of the link to ground stations that was last reported to the launcher."""
 
     async def run(self) -> Outcome:
         """Run ticks until the core reports the end."""
@@ -177,7 +177,9 @@ class Flight:
         ipc.send(self._channel, {"type": "command", "t_s": after.mission_t_s, **message})
 
     def _goes_on(self, outputs: Outputs) -> bool:
-        """Return whether a PX4 that was found armed is still armed. If it is not, the flight ends."""
+        """Report how a flight with a PX4 that was found armed goes on. Return False if PX4 has disarmed since, which ends the
+        flight.
+        """
         goes_on = any(event.id == REATTACHED for event in outputs.events)
         lines = [f"landing without this device: {line}" for line in self._devices.failures]
         if not goes_on:
@@ -279,8 +281,8 @@ async def fly(
         sitl: whether the devices are those of the simulated world.
 
     Raises:
-        DeviceError: a device is missing or not as required; nothing was armed.
-        Refused: the preflight refuses; nothing was armed.
+        DeviceError: a device is missing or does not meet the requirements; nothing was armed.
+        Refused: the preflight refuses the flight; nothing was armed.
         StartCancelled: a landing was requested before the first tick; nothing was armed.
     """
     origin_s = time.monotonic()

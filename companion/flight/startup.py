@@ -61,7 +61,7 @@ async def check_before_flight(
 
     Raises:
         DeviceError: `preflight.json` cannot be written.
-        Refused: a row refuses.
+        Refused: a check refuses the flight.
     """
 
     def report(text: str, share: float) -> None:

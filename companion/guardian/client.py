@@ -79,7 +79,7 @@ class GuardianClient:
             if self._gone:
                 raise DeviceError("guardian: its process ended before it was ready; see guardian.log")
             if self._clock() > deadline_s:
-                found = self._problem or "it sends no message; see guardian.log"
+                found = self._problem or "it has sent no message; see guardian.log"
                 raise DeviceError(f"guardian: not ready within {timeout_s:g} s: {found}")
             await asyncio.sleep(_LISTEN_PERIOD_S)
 

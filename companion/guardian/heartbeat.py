@@ -37,7 +37,7 @@ class Heartbeat(Record, frozen=True, kw_only=True):
     mission_t_s: float
     """Time since take-off was commanded; 0 before that."""
     lifting: bool
-    """The rotors turn, or may be about to."""
+    """The rotors are turning or may be about to turn."""
     pilot: bool
     """A pilot has taken over."""
     goodbye: bool
@@ -54,7 +54,7 @@ class Heartbeat(Record, frozen=True, kw_only=True):
     pose_stamp_s: float
     """Flight clock of the newest accepted motion-capture pose; -inf if there was none."""
     position_world_m: Vec3
-    """Position of that pose."""
+    """Position of the newest accepted pose."""
     peer: tuple[_Ipv4, _Port] | None = None
     """IPv4 address and UDP port of PX4, confirmed by the flight process; None if the link is not UDP."""
 
@@ -65,7 +65,7 @@ def pack(heartbeat: Heartbeat) -> bytes:
 
 
 def unpack(datagram: bytes) -> Heartbeat | None:
-    """Decode a heartbeat; None if the datagram is not a heartbeat, is malformed, or holds a value out of range or not finite."""
+    """Decode a heartbeat; None if the datagram is not a heartbeat, is malformed, or contains a non-finite or out-of-range value."""
     if datagram[:1] != HEARTBEAT:
         return None
     try:

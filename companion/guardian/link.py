@@ -1,4 +1,4 @@
-"""The guardian's MAVLink link, on the address that the flight process used; encoded with pymavlink. No call waits."""
+"""The guardian's MAVLink link, on the address that the flight process used. Messages are encoded with pymavlink. No call waits."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MAX_BYTES = 65535
 _ROUND_DATAGRAMS = 1000
 _CONNECT_TIMEOUT_S = 0.5
 _TYPE_MASK_IGNORE_RATES = 7
-# One NaN: PX4 takes EKF2_EVP_NOISE and EKF2_EVA_NOISE instead of a covariance.
+# One NaN: PX4 uses EKF2_EVP_NOISE and EKF2_EVA_NOISE instead of a covariance.
 _COVARIANCE_FROM_PARAMS = [math.nan] + [0.0] * 20
 
 
@@ -76,16 +76,16 @@ class _ChannelWire:
 
 class UdpWire(_ChannelWire):
     """UDP transport: bound to the port that PX4 sends to (`udpin`), or sending to PX4 from the flight process's port (`udpout`).
-    PX4 only talks to the first partner of a UDP link, so the port must stay the same. Once PX4's address is known the socket is
+    PX4 only sends to the first peer of a UDP link, so the port must stay the same. Once PX4's address is known the socket is
     connected to it and the kernel drops datagrams of all other senders. After REPIN_SILENCE_S without a datagram the socket is
-    disconnected, then connected to the next sender at the same IPv4 address of a HEARTBEAT with PX4's system id: a restarted router
-    sends from a new port.
+    disconnected, then connected to the next sender at the same IPv4 address that sends a HEARTBEAT with PX4's system id: a
+    restarted router sends from a new port.
 
     Args:
         local: address to bind; None for any.
         remote: PX4's address; None to use the sender of the first valid HEARTBEAT of an autopilot.
-        share_port: the killed flight process still holds the port, but reads nothing: of several sockets connected to PX4, the newest
-            receives the datagrams (measured, Linux 6.18).
+        share_port: the killed flight process still holds the port, but reads nothing: of several sockets connected to PX4, the
+            newest receives the datagrams (measured, Linux 6.18).
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class UdpWire(_ChannelWire):
                 self._socket.sendto(data, self._remote)
 
     def receive(self) -> list[bytes]:
-        """Return datagrams from PX4's address; while that is unknown, only the HEARTBEAT that reveals it."""
+        """Return datagrams from PX4's address; while the address is unknown, only the HEARTBEAT that reveals it."""
         # Disconnecting would take an unbound socket's port away from it.
         if self._connected and self._bound and time.monotonic() - self._heard_s > REPIN_SILENCE_S:
             disconnect_udp(self._socket)

@@ -16,7 +16,7 @@ from companion.model.types import MocapPose
 
 
 class MocapProblem(Exception):
-    """Motion-capture data cannot be received. The text is one line for the user."""
+    """Motion-capture data cannot be received. The exception's text is one line for the user."""
 
 
 class MocapClient:

@@ -7,7 +7,9 @@ import math
 from companion.model.types import Vec3
 
 AWAKE_STEP_MAX_S = 0.02
-"""Most silence that one pass of the guardian's loop (10 ms) may add: time in which the guardian was not scheduled proves nothing."""
+"""Maximum silence that one pass of the guardian's loop (10 ms) may add: time in which the guardian itself was not running proves
+nothing.
+"""
 JUMP_M = 0.5
 SPEED_MAX_M_S = 4.0
 
@@ -16,7 +18,7 @@ class StallWatch:
     """Measures the flight process's silence, counting only time in which the guardian itself was running.
 
     Args:
-        timeout_s: silence that means a stall.
+        timeout_s: silence after which the flight process counts as stalled.
     """
 
     def __init__(self, timeout_s: float) -> None:
@@ -35,7 +37,7 @@ class StallWatch:
 class PoseFilter:
     """Rejects poses that the vehicle cannot have reached: another body, or a mirrored solution.
 
-    The allowed distance grows with the time since the last accepted pose, so no position stays rejected for good.
+    The allowed distance grows with the time since the last accepted pose, so no position is rejected permanently.
     """
 
     def __init__(self, stamp_s: float, position_world_m: Vec3) -> None:
@@ -44,7 +46,7 @@ class PoseFilter:
         self._position_world_m = position_world_m
 
     def check(self, stamp_s: float, position_world_m: Vec3) -> bool:
-        """Whether a tracked pose is plausible; an accepted pose becomes the new origin of the check."""
+        """Whether a tracked pose is plausible; an accepted pose becomes the reference for the next check."""
         allowed_m = JUMP_M + SPEED_MAX_M_S * (stamp_s - self._stamp_s)
         if not math.dist(position_world_m, self._position_world_m) <= allowed_m:
             return False

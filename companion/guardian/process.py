@@ -175,10 +175,10 @@ class Guardian:
                 self._heartbeats.send_status(self._readiness_problem(now_s, last))
 
     def _readiness_problem(self, now_s: float, last: Heartbeat | None) -> str | None:
-        """Return why the guardian could not land the vehicle now as well as the flight process could, or None if it could.
+        """Return why a landing by the guardian would now be worse than one by the flight process, or None if it would be as good.
 
-        In the air, missing motion capture does not make the guardian unready while the flight process receives none either: both would
-        land without it.
+        In the air, missing motion capture does not make the guardian unready while the flight process receives none either: both
+        would land without it.
         """
         if self._problem is not None or self._mocap is None:
             return self._problem
@@ -212,7 +212,7 @@ class Guardian:
             link.wire.close()
 
     def _open_link(self, last: Heartbeat) -> Link | None:
-        """Open the flight process's link, repeatedly while another process holds it. Return None if that fails for LINK_TIMEOUT_S."""
+        """Open the flight process's link; try again while another process holds it. Return None after LINK_TIMEOUT_S."""
         deadline_s = time.monotonic() + LINK_TIMEOUT_S
         while True:
             wire = self._try_wire(last)
@@ -227,7 +227,8 @@ class Guardian:
         """Open the wire, or return None and report the first failure.
 
         A killed flight process that has not ended runs no code: it neither sends nor reads, so a UDP port is opened although it is
-        still bound. A serial port is not: if the process resumed, two readers would share the bytes. Nor is a TCP link.
+        still bound. A serial port or TCP link is opened only after the process has ended: if it resumed, two readers would share
+        the bytes of a serial port.
         """
         address = self._settings.autopilot_address
         try:
@@ -249,7 +250,7 @@ class Guardian:
             self._publish(last, Notice(now_s, "guardian_no_link", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
 
     def _restore_link(self, last: Heartbeat, link: Link, landing: TakeoverLanding, waiting: select.poll) -> None:
-        """Close a lost link, so that it ends no further waits, and try to reopen it every REOPEN_PERIOD_S."""
+        """Close a lost link, because it would end every wait at once, and try to reopen it every REOPEN_PERIOD_S."""
         now_s = time.monotonic()
         if not link.wire.lost or now_s < self._reopen_s:
             return

@@ -61,7 +61,7 @@ class Px4State:
 
     def vehicle(self) -> VehicleState | None:
         """Return the vehicle's state, or None before the first attitude. Attitude alone shows whether the vehicle is flipped, so
-        the others are not awaited: a position or IMU sample that has not arrived has the stamp -inf.
+        the state does not depend on the other messages: a position or IMU sample that has not arrived has the stamp -inf.
         """
         if self._attitude is None:
             return None

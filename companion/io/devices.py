@@ -1,4 +1,4 @@
-"""Opens the vehicle's devices: for a flight all of them, for a check those that can be opened."""
+"""Opens the vehicle's devices: all of them for a flight, those that can be opened for a check."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from companion.model.types import MocapPose
 from companion.runtime.clock import Clock
 
 STATUS_TIMEOUT_S = 2.5
-"""PX4 sends a heartbeat once a second."""
+"""Timeout for PX4's status, which needs a heartbeat; PX4 sends one per second."""
 ARM_TIMEOUT_S = 1.5
-"""Timeout of the arm when PX4 was found armed and has to land."""
+"""Timeout for opening the arm if PX4 was found armed and has to land."""
 
 
 @dataclass(slots=True)
@@ -67,7 +67,8 @@ class AvailableDevices:
 
 @contextlib.asynccontextmanager
 async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devices]:
-    """Open all devices, the arm last because it gets torque. Poses are forwarded to PX4 as soon as its link is open.
+    """Open all devices, the arm last because its torque is then switched on. Poses are forwarded to PX4 as soon as its link is
+    open.
 
     If PX4 is armed the vehicle may be flying: devices that fail are listed in `failures`, and the force sensor is left closed.
 

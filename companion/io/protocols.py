@@ -34,7 +34,9 @@ from companion.model.types import (
 
 
 class DeviceError(Exception):
-    """A device is missing or is not as expected. The text is one line: device, address, expected, found, and how to fix it."""
+    """A device is missing or is not as expected. The exception's text is one line: device, address, expected, found, and how to fix
+    it.
+    """
 
 
 class Device(Protocol):
@@ -48,7 +50,7 @@ class Device(Protocol):
 
 
 class Autopilot(Device, Protocol):
-    """PX4."""
+    """The link to PX4."""
 
     def vehicle(self) -> VehicleState | None:
         """Return the latest fused state in world ENU / body FLU, or None before the first complete state."""

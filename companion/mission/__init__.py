@@ -1,8 +1,8 @@
 """From a mission file to the reference at every instant. Pure.
 
-Durations, positions and speed limits of the phases are in the mission file (configs/missions), also for the flight after a catch: the
-plan is made before take-off, and no phase reacts to a catch. A new type of phase, or a new key, begins in `companion.config.mission`,
-then `plan`; `plan_builder` builds the tracks and chooses the profile of each move. `reference` has the shape of a motion over
-time, `minsnap` that of paths and `arm_motion` that of the arm. `active_plan` stops and resumes the plan, and `retract` and
-`plan.landing_from` replace it. `sample_check` has the limits that a plan must keep.
+Durations, positions and speed limits of the phases are in the mission file (configs/missions), also for the flight after a catch:
+the plan is made before take-off, and no phase reacts to a catch. To add a type of phase or a key, begin in
+`companion.config.mission`, then extend `plan`; `plan_builder` builds the tracks and chooses the profile of each move. `reference`
+has the shape of a motion over time, `minsnap` that of paths and `arm_motion` that of the arm. `active_plan` stops and resumes the
+plan, and `retract` and `plan.landing_from` replace it. `sample_check` has the limits that a plan must respect.
 """

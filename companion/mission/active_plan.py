@@ -23,7 +23,7 @@ class Change:
     """A change of the rate at which the plan's time runs."""
 
     begin_s: float
-    """Begin of the change on the flight clock."""
+    """Start of the change on the flight clock."""
     plan_s: float
     """Plan time when the change begins."""
     duration_s: float
@@ -48,8 +48,8 @@ class Course:
         return self.change is not None and self.change.after == 0.0
 
     def pace(self, t_s: float) -> tuple[float, float, float, float]:
-        """Return, at `t_s` on the flight clock, plan time, its rate (1: as the flight clock, 0: held), and the rate's first and second
-        derivatives.
+        """Return the plan time at `t_s` on the flight clock, its rate (1: as the flight clock, 0: held), and the first and second
+        derivatives of the rate.
         """
         change = self.change
         if change is None:
@@ -96,7 +96,7 @@ class Course:
         return self.plan.segment(self.pace(t_s)[0])
 
     def left_s(self, t_s: float) -> float:
-        """Return the plan time that is left; negative after its end."""
+        """Return the plan time that is left; negative after the plan's end."""
         return self.plan.duration_s - self.pace(t_s)[0]
 
     def progress(self, t_s: float) -> float:

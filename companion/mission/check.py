@@ -22,8 +22,8 @@ SAMPLE_S = 0.02
 SAMPLES_PER_SEGMENT_MAX = 3000
 TAKEOFF_RISE_MIN_M = 0.2
 SPEED_SHARE_MAX = 0.8
-"""Largest planned speed as a fraction of the speed at which the flight is stopped. The rest is for a caught payload, gusts and tracking
-errors.
+"""Largest planned speed as a fraction of the speed at which the flight is stopped. The rest is a margin for a caught payload, gusts
+and tracking errors.
 """
 
 
@@ -37,10 +37,12 @@ def check_mission(
     phase_origins: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> list[str]:
-    """Return every reason not to fly this mission, one line each: what, where, when, and how to fix it. Empty if there is none.
+    """Return every reason not to fly this mission, one line each: what, where, when, and how to fix it. The list is empty if there
+    is none.
 
-    For each limit the worst violation in the first phase that exceeds it is reported, with the names of the other phases that do. Two
-    repetitions of a repeated mission are checked: later ones differ from the second only in the winding of the tether, which adds up.
+    For each limit the worst violation in the first phase that exceeds it is reported, with the names of the other phases that
+    exceed it. Two repetitions of a repeated mission are checked: later ones differ from the second only in the winding of the
+    tether, which adds up.
 
     Args:
         mission: the mission to check.
@@ -97,7 +99,7 @@ def check_mission(
     if "turns" not in told and turns > vehicle.tether.turns_max:
         problems.append(
             f"mission '{mission.name}': its {mission.repeat} repetitions wind up the tether: {turns:.2f} turns about anchor or vehicle "
-            f"in the end, tether.turns_max is {vehicle.tether.turns_max:g}; fly back the way it came, or lower repeat"
+            f"at the end (tether.turns_max is {vehicle.tether.turns_max:g}); fly back the way it came, or lower repeat"
         )
     return problems
 
@@ -134,7 +136,9 @@ def _samples(segment: Segment) -> Iterator[float]:
 def check_start(
     mission: Mission, vehicle: Vehicle, position_world_m: Vec3, yaw_rad: float, arm_rad: Vec2 | None
 ) -> list[str]:
-    """Check only what depends on the measured start; fast enough for a control tick. The arguments are those of `check_mission`."""
+    """Return only the reasons that depend on the measured start; fast enough for a control tick. The arguments are those of
+    `check_mission`.
+    """
     found = _start(mission, vehicle, position_world_m, yaw_rad, arm_rad)
     return [f"mission '{mission.name}': {text}" for text in found]
 
@@ -147,7 +151,7 @@ def _start(mission: Mission, vehicle: Vehicle, position: Vec3, yaw_rad: float, a
     if away_m > start.tolerance_m:
         yield (
             f"starts at ({x_m:g}, {y_m:g}) m, but the vehicle is at ({position[0]:.2f}, {position[1]:.2f}) m, "
-            f"{away_m:.2f} m away, {start.tolerance_m:g} m allowed; carry it there or change start.position_m"
+            f"{away_m:.2f} m away (tolerance {start.tolerance_m:g} m); carry it there or change start.position_m"
         )
     clearance_m = vehicle.airframe.ground_clearance_m
     if abs(position[2] - clearance_m) > start.tolerance_m:
@@ -158,8 +162,8 @@ def _start(mission: Mission, vehicle: Vehicle, position: Vec3, yaw_rad: float, a
     turned_deg = abs(math.degrees(wrap_rad(yaw_rad - math.radians(start.yaw_deg))))
     if turned_deg > start.yaw_tolerance_deg:
         yield (
-            f"starts at a yaw of {start.yaw_deg:g} deg, but the vehicle is at {math.degrees(wrap_rad(yaw_rad)):.0f} deg, "
-            f"{start.yaw_tolerance_deg:g} deg of difference allowed; turn it or change start.yaw_deg"
+            f"starts at a yaw of {start.yaw_deg:g} deg, but the vehicle's yaw is {math.degrees(wrap_rad(yaw_rad)):.0f} deg "
+            f"(tolerance {start.yaw_tolerance_deg:g} deg); turn the vehicle or change start.yaw_deg"
         )
     if arm_rad is not None:
         measured_deg = [math.degrees(angle) for angle in arm_rad]
@@ -167,7 +171,7 @@ def _start(mission: Mission, vehicle: Vehicle, position: Vec3, yaw_rad: float, a
         if off_deg > start.arm_tolerance_deg:
             yield (
                 f"starts with the arm at ({start.arm_deg[0]:g}, {start.arm_deg[1]:g}) deg, but it is at ({measured_deg[0]:.0f}, "
-                f"{measured_deg[1]:.0f}) deg, {start.arm_tolerance_deg:g} deg of difference allowed; move it there by hand"
+                f"{measured_deg[1]:.0f}) deg (tolerance {start.arm_tolerance_deg:g} deg); move it there by hand"
             )
 
 

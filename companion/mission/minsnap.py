@@ -58,7 +58,7 @@ class VehicleLimits:
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """A path through points in normalised time, in which a piece takes 1 on average."""
+    """A path through points in normalised time, in which a piece takes one unit on average."""
 
     knots: tuple[float, ...]
     pieces: tuple[tuple[Septic, Septic, Septic], ...]
@@ -206,7 +206,7 @@ def library_coefficients(points_m: tuple[Vec3, ...], shares: tuple[float, ...]) 
 
 
 def _needed_s(shares: tuple[float, ...], coefficients: NDArray[np.float64], limits: VehicleLimits) -> float:
-    """Return the number of seconds that a unit of time must last."""
+    """Return the number of seconds that one unit of normalised time must last so that no limit is exceeded."""
     import numpy as np
 
     allowed = (limits.speed_max_m_s, limits.acceleration_max_m_s2, limits.jerk_max_m_s3)

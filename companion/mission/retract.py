@@ -84,8 +84,8 @@ def retract_from(
 
 
 def _never_outward(velocity_m_s: Vec3, duration_s: float, position_m: Vec3, anchor_m: Vec3) -> Vec3:
-    """Return the velocity turned inward just so far that the straight path to the point of rest never leads away from the anchor's
-    vertical.
+    """Return the velocity turned inward just far enough that the straight path to the point of rest never leads away from the
+    anchor's vertical.
 
     With the distance r at the start, a path of n inward and t sideways never leads outward if n (r - n) >= t^2.
     """

@@ -112,7 +112,7 @@ class SampleCheck:
                 limit="floor",
                 excess=clearance_m - z_m,
                 what="flies into the floor",
-                detail=f"the body's origin at {z_m:.2f} m, {clearance_m:.2f} m is the minimum",
+                detail=f"the body's origin at {z_m:.2f} m (minimum {clearance_m:.2f} m)",
                 advice="raise the waypoint",
             )
         position = (x_m, y_m, max(z_m, clearance_m)) if kind is PhaseKind.TAKEOFF else reference.position_world_m
@@ -150,7 +150,7 @@ class SampleCheck:
                         excess=excess,
                         what="leaves the room",
                         detail=f"rotors, arm and net reach {name} = {reach:.2f} m; "
-                        f"the room is {span[0]:g} to {span[1]:g} m minus {why}",
+                        f"the room is {span[0]:g} to {span[1]:g} m, reduced at each end by {why}",
                         advice="move the waypoint inwards",
                     )
         beyond_m = self._safe.breach_tether_m(position) + off_m
@@ -160,7 +160,7 @@ class SampleCheck:
                 limit="tether",
                 excess=beyond_m,
                 what="leaves the tether sphere",
-                detail=f"{limit_m + beyond_m:.2f} m from the anchor, {limit_m:.2f} m (length minus margin and {why}) allowed",
+                detail=f"{limit_m + beyond_m:.2f} m from the anchor (limit {limit_m:.2f} m: length minus margin and {why})",
                 advice="shorten the line or move the anchor",
             )
 
@@ -202,7 +202,7 @@ class SampleCheck:
         if self._repetition == 2:
             self._windings.append(self._watch.windings)
         if abs(state.turns) > tether.turns_max:
-            detail = f"{abs(state.turns):.2f} turns about anchor or vehicle, tether.turns_max is {tether.turns_max:g}"
+            detail = f"{abs(state.turns):.2f} turns about anchor or vehicle (tether.turns_max is {tether.turns_max:g})"
             yield Violation(
                 limit="turns",
                 excess=abs(state.turns),
@@ -212,10 +212,10 @@ class SampleCheck:
             )
         if state.clearance_m < tether.clearance_min_m:
             detail = (
-                f"{state.clearance_m:.3f} m between line and rotors or arm, tether.clearance_min_m is {tether.clearance_min_m:g} "
-                f"(the anchor is seen {math.degrees(state.elevation_rad):.0f} deg below the horizon)"
+                f"{state.clearance_m:.3f} m between line and rotors or arm (tether.clearance_min_m is {tether.clearance_min_m:g}; "
+                f"the anchor is seen {math.degrees(state.elevation_rad):.0f} deg below the horizon)"
             )
-            advice = "fly higher or nearer to the anchor, accelerate less, or tie it elsewhere"
+            advice = "fly higher or nearer to the anchor, accelerate less, or tie the tether elsewhere"
             yield Violation(
                 limit="line",
                 excess=tether.clearance_min_m - state.clearance_m,
@@ -232,7 +232,7 @@ class SampleCheck:
             excess = max(low_deg - angle_deg, angle_deg - high_deg)
             if excess > TOLERANCE:
                 what = f"drives joint {number} beyond its limit"
-                detail = f"{angle_deg:.1f} deg, {low_deg:g} to {high_deg:g} deg allowed"
+                detail = f"{angle_deg:.1f} deg (limits {low_deg:g} and {high_deg:g} deg)"
                 yield Violation(
                     limit=f"joint {number}", excess=excess, what=what, detail=detail, advice="change arm_deg"
                 )
@@ -241,7 +241,7 @@ class SampleCheck:
         for part, lowest_m in (("net", net_z_m), ("elbow", elbow_z_m)):
             if lowest_m < FLOOR_GAP_M:
                 what = f"drags the {part} over the floor"
-                detail = f"its lowest point is {lowest_m:.2f} m high, {FLOOR_GAP_M:g} m is the minimum"
+                detail = f"its lowest point is {lowest_m:.2f} m high (minimum {FLOOR_GAP_M:g} m)"
                 yield Violation(
                     limit=f"floor {part}",
                     excess=FLOOR_GAP_M - lowest_m,
@@ -274,7 +274,7 @@ class SampleCheck:
         )
         for key, value, limit, unit, what in checked:
             if value > limit * (1.0 + TOLERANCE):
-                detail = f"{value:.3g} {unit}, limits.{key} is {limit:g}"
+                detail = f"{value:.3g} {unit} (limits.{key} is {limit:g})"
                 yield Violation(
                     limit=key,
                     excess=value / limit,
@@ -286,7 +286,7 @@ class SampleCheck:
             rate = abs(math.degrees(reference.arm_rate_rad_s[number - 1]))
             if rate > joint.velocity_max_deg_s * (1.0 + TOLERANCE):
                 what = f"turns joint {number} faster than it can"
-                detail = f"{rate:.3g} deg/s, the joint's velocity_max_deg_s is {joint.velocity_max_deg_s:g}"
+                detail = f"{rate:.3g} deg/s (the joint's velocity_max_deg_s is {joint.velocity_max_deg_s:g})"
                 yield Violation(
                     limit=f"velocity {number}",
                     excess=rate,
@@ -304,8 +304,8 @@ class SampleCheck:
         allowed_n = share * airframe.thrust_max_n
         if thrust_n > allowed_n * (1.0 + TOLERANCE):
             detail = (
-                f"{thrust_n:.1f} N with {self._payload_kg:g} kg of payload and the tether's weight, {allowed_n:.1f} N allowed "
-                f"({share:g} of {airframe.thrust_max_n:g} N)"
+                f"{thrust_n:.1f} N with {self._payload_kg:g} kg of payload and the tether's weight (limit {allowed_n:.1f} N: "
+                f"{share:g} of {airframe.thrust_max_n:g} N)"
             )
             yield Violation(
                 limit="thrust",
@@ -316,7 +316,7 @@ class SampleCheck:
             )
         tilt_deg = math.degrees(math.atan2(math.hypot(ax, ay), az + GRAVITY_M_S2))
         if tilt_deg > airframe.tilt_max_deg * (1.0 + TOLERANCE):
-            detail = f"{tilt_deg:.1f} deg, airframe.tilt_max_deg is {airframe.tilt_max_deg:g}"
+            detail = f"{tilt_deg:.1f} deg (airframe.tilt_max_deg is {airframe.tilt_max_deg:g})"
             yield Violation(
                 limit="tilt",
                 excess=tilt_deg,

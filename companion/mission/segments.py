@@ -48,7 +48,7 @@ class Repeats:
         return self.begin_s + self.period_s + self.left_out_s
 
     def before(self, t_s: float) -> int:
-        """Return how many of the repetitions that the second one stands in for are complete at a time."""
+        """Return how many of the repetitions that the second one stands in for are complete at this time."""
         whole = int((t_s - self.begin_s) / self.period_s)
         return 0 if whole < 1 else min(whole, self.count - 2)
 

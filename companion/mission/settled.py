@@ -1,8 +1,8 @@
-"""Checks that PX4's estimate has converged to motion capture, as the core's last check before it requests OFFBOARD. Pure; time is an
-argument.
+"""Checks that PX4's estimate has converged to motion capture, as the core's last check before it requests OFFBOARD. Pure; time is
+an argument.
 
-An estimate that has only begun to follow is close for a moment; one that has converged stays close. PX4's position and yaw are compared
-with motion capture's while the vehicle is on the ground.
+An estimate that has only begun to follow is close for a moment; one that has converged stays close. PX4's position and yaw are
+compared with those of motion capture while the vehicle is on the ground.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class SettledEstimate:
         wrong = []
         if off_m > OFF_MAX_M or spread_m > SPREAD_MAX_M:
             wrong.append(
-                f"its position is {off_m * 1e3:.0f} mm from motion capture's and drifts by {spread_m * 1e3:.0f} mm "
+                f"its position is {off_m * 1e3:.0f} mm from that of motion capture and drifts by {spread_m * 1e3:.0f} mm "
                 f"(allowed: {OFF_MAX_M * 1e3:.0f} and {SPREAD_MAX_M * 1e3:.0f} mm)"
             )
         if abs(yaw_rad) > YAW_OFF_MAX_RAD or yaw_spread_rad > YAW_SPREAD_MAX_RAD:

@@ -1,6 +1,6 @@
 """The flight process's side of the recorder: a bounded channel that never waits, and the recorder process's life cycle.
 
-The recorder answers on the same channel: a full disk, commands from the ground, the state of its telemetry.
+The recorder uses the same channel to report a full disk, commands from the ground and the state of its telemetry.
 
 The channel is a Unix SOCK_SEQPACKET pair; its packets are `companion.model.packets`. If the channel is
 full the packet is dropped and counted. If the recorder is dead every packet is counted as dropped and the flight continues. If the
@@ -41,7 +41,7 @@ class RecorderClient:
     Attributes:
         samples: ticks sent.
         dropped: packets that did not fit into the channel, or found no recorder.
-        error: why recording stopped (a full disk, a dead recorder), or None.
+        error: why recording stopped (a full disk or a dead recorder), or None.
         telemetry_status: state of the telemetry (`connected to mqtt://...`), or None if the recorder has not reported it.
     """
 
@@ -151,7 +151,7 @@ class RecorderClient:
         return False
 
     def _read_messages(self, data: bytes) -> None:
-        """Handle a message and those waiting behind it; empty bytes mean the end of the channel."""
+        """Handle a message and all that wait behind it; empty bytes mean that the channel has ended."""
         left = _MESSAGES_PER_TICK
         with contextlib.suppress(OSError):
             while data:
@@ -196,7 +196,7 @@ class RecorderProcess:
         config_json: effective configuration, stored unchanged.
         epoch_offset_ns: wall clock (ns since 1970) when the flight clock was zero; see `epoch_offset_ns`.
         metadata: further key-value pairs of the log's `flight` metadata record (controller, mission, ...).
-        simulated: whether the devices are those of the simulated world, which ground stations show.
+        simulated: whether the devices are simulated; ground stations show this.
     """
 
     def __init__(self, process: subprocess.Popen[bytes], client: RecorderClient, path: Path) -> None:
@@ -260,8 +260,8 @@ class RecorderProcess:
         return recorder
 
     def finish(self, deadline_s: float = 10.0) -> RecorderReport:
-        """Close the channel and wait for the log to be closed. Blocks: call in a thread from asyncio. Never raises; a second call
-        returns the same report.
+        """Close the channel and wait for the log to be closed. Blocks: from asyncio, call it in a thread. Never raises; a second
+        call returns the same report.
 
         A recorder that has not finished at the deadline is killed; the log then lacks only its summary.
         """

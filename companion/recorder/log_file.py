@@ -36,7 +36,7 @@ class LogFile:
         """Return the position; the writer is configured not to seek.
 
         Raises:
-            OSError: a seek to any other position was requested.
+            OSError: a seek to a position other than the current one was requested.
         """
         if (offset, whence) not in ((0, os.SEEK_CUR), (self._position_bytes, os.SEEK_SET)):
             raise OSError(f"cannot seek to {offset} ({whence})")

@@ -11,8 +11,8 @@
 ================  ==========================  =========================================================================
 
 A viewer that jumps in time requests only the newest message of each topic. Data with different rates, and data sent once, therefore
-have topics of their own. Vehicle, arm and net are drawn once and locked to their frames; the frames move. A message with a value
-that is not finite is left out.
+have topics of their own. Vehicle, arm and net are drawn once and locked to their frames; the frames move. A message with a
+non-finite value is left out.
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ def _log_pose(
 
 
 def _due(t_s: float, last_s: float, period_s: float) -> bool:
-    """Whether a period has passed; also true if the clock went back or was not finite."""
+    """Whether a period has passed; also true if the clock has gone back or is not finite."""
     return not 0.0 <= t_s - last_s < period_s - _EARLY_S
 
 
@@ -265,7 +265,9 @@ def timestamp(stamp_ns: int) -> Timestamp:
 
 
 def _vehicle_pose(inputs: Inputs) -> tuple[Vec3, Quat] | None:
-    """Return position and attitude from motion capture, or from PX4 if that is stale, untracked or not finite; None if both are."""
+    """Return position and attitude from motion capture, or from PX4 if motion capture is stale, untracked or not finite. None if
+    neither is usable.
+    """
     mocap, vehicle = inputs.mocap, inputs.vehicle
     if mocap is not None and mocap.tracking_valid and inputs.t_s - mocap.stamp_s <= _FRESH_S:
         if _usable(mocap.position_world_m, mocap.attitude_wxyz):

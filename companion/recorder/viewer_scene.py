@@ -1,7 +1,7 @@
 """Scene of a 3D viewer: geometry from the configuration, shapes of the vehicle and its room, the slack tether. No I/O.
 
 World ENU, body FLU, metres. The arm's frames are those of `companion.control.manipulator`: x of ``link1`` points from the shoulder
-to the elbow, x of ``link2`` from the elbow to the net's centre, y of both is the body's.
+to the elbow, and x of ``link2`` from the elbow to the net's centre; both share the body's y axis.
 """
 
 from __future__ import annotations

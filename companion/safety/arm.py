@@ -59,18 +59,18 @@ class ArmTracker:
 
 
 def arm_lost(a: ArmTracker, timeout_s: float) -> Values | None:
-    """No joint state has arrived for longer than the timeout."""
+    """Fires if no joint state has arrived for longer than the timeout."""
     return (timeout_s,) if a.age_s > timeout_s else None
 
 
 def arm_read_failures(a: ArmTracker, failures_max: int) -> Values | None:
-    """Consecutive bus cycles without an answer have reached the limit."""
+    """Fires if consecutive bus cycles without an answer have reached the limit."""
     arm = a.arm
     return (arm.read_failures,) if arm is not None and arm.read_failures >= failures_max else None
 
 
 def servo_error(a: ArmTracker, _: None) -> Values | None:
-    """A servo reports a hardware error."""
+    """Fires if a servo reports a hardware error."""
     arm = a.arm
     if arm is None:
         return None
@@ -79,13 +79,13 @@ def servo_error(a: ArmTracker, _: None) -> Values | None:
 
 
 def arm_let_go(a: ArmTracker, _: None) -> Values | None:
-    """A servo's bus watchdog had switched its torque off."""
+    """Fires if a servo's bus watchdog had switched its torque off."""
     arm = a.arm
     return HOLDS if arm is not None and (arm.hardware_error[0] | arm.hardware_error[1]) & WATCHDOG_RESTARTED else None
 
 
 def joint_jump(a: ArmTracker, thresholds: Vec2) -> Values | None:
-    """A joint has turned further between two reads than the thresholds allow: an angle plus a rate times the interval."""
+    """Fires if a joint has turned further between two reads than the thresholds allow: an angle plus a rate times the interval."""
     before, arm = a.before, a.arm
     if before is None or arm is None:
         return None
@@ -99,19 +99,19 @@ def joint_jump(a: ArmTracker, thresholds: Vec2) -> Values | None:
 
 
 def servo_warm(a: ArmTracker, thresholds: Vec2) -> Values | None:
-    """The hotter servo's temperature has reached the first threshold but not the second."""
+    """Fires if the hotter servo's temperature has reached the first threshold but not the second."""
     return (a.hottest_c, thresholds[0]) if thresholds[0] <= a.hottest_c < thresholds[1] else None
 
 
 def servo_hot(a: ArmTracker, thresholds: Vec2) -> Values | None:
-    """The hotter servo's temperature has reached both thresholds."""
+    """Fires if the hotter servo's temperature has reached both thresholds."""
     if not (a.hottest_c >= thresholds[0] and a.hottest_c >= thresholds[1]):
         return None
     return (a.hottest_c, max(thresholds))
 
 
 def servo_overload(a: ArmTracker, torque_max_nm: Vec2) -> Values | None:
-    """A joint is at its torque limit."""
+    """Fires if a joint is at its torque limit."""
     if a.arm is None:
         return None
     t1, t2 = a.arm.torque_nm
@@ -120,7 +120,7 @@ def servo_overload(a: ArmTracker, torque_max_nm: Vec2) -> Values | None:
 
 
 def joint_rate(a: ArmTracker, rate_max_rad_s: float) -> Values | None:
-    """The speed of a joint exceeds the threshold."""
+    """Fires if the speed of a joint exceeds the threshold."""
     if a.arm is None:
         return None
     w1, w2 = a.arm.velocity_rad_s
@@ -129,7 +129,7 @@ def joint_rate(a: ArmTracker, rate_max_rad_s: float) -> Values | None:
 
 
 def joint_beyond_limit(a: ArmTracker, thresholds: tuple[float, tuple[Vec2, Vec2]]) -> Values | None:
-    """A joint is further beyond its limits than the first threshold; the second is each joint's lower and upper limit."""
+    """Fires if a joint is further beyond its limits than the first threshold; the second is each joint's lower and upper limit."""
     if a.arm is None:
         return None
     (a1, a2), (beyond_max_rad, ((low1, high1), (low2, high2))) = a.arm.angle_rad, thresholds
@@ -195,12 +195,12 @@ class ForceTracker:
 
 
 def force_lost(f: ForceTracker, timeout_s: float) -> Values | None:
-    """No sample has arrived for longer than the timeout."""
+    """Fires if no sample has arrived for longer than the timeout."""
     return (timeout_s,) if f.age_s > timeout_s else None
 
 
 def force_overload(f: ForceTracker, force_max_n: float) -> Values | None:
-    """The sensor reports an overload, or a force beyond its range."""
+    """Fires if the sensor reports an overload, or a force beyond its range."""
     if f.force is None:
         return None
     x, y, z = f.force.force_sensor_n
@@ -208,11 +208,11 @@ def force_overload(f: ForceTracker, force_max_n: float) -> Values | None:
 
 
 def force_stuck(f: ForceTracker, _: None) -> Values | None:
-    """Samples repeat themselves although the vehicle moves."""
+    """Fires if samples repeat themselves although the vehicle moves."""
     return HOLDS if f.stuck else None
 
 
 def force_drift(f: ForceTracker, drift_n: float) -> Values | None:
-    """The mean force on an empty net exceeds the threshold."""
+    """Fires if the mean force on an empty net exceeds the threshold."""
     x, y, z = f.mean_n
     return (x, y, z, drift_n) if x * x + y * y + z * z > drift_n**2 else None

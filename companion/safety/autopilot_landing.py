@@ -35,12 +35,14 @@ from companion.safety.touchdown import (
 ZERO_THRUST_STREAM_S = 0.6
 """Zero-thrust setpoints are streamed for this time before OFFBOARD is requested, so that no older setpoint takes effect."""
 BEGUN_S = 1.0
-"""Time from LAND to the start of PX4's descent. Before that a vehicle that does not sink is not evidence of touchdown."""
+"""Time from LAND to the start of PX4's descent. Before that, a vehicle that does not sink is no evidence of touchdown."""
 DESCENT_M_S = 0.25
-"""PX4 descends when its estimate sinks faster; a third of MPC_LAND_SPEED."""
+"""PX4 counts as descending if its estimate sinks faster than this, a third of MPC_LAND_SPEED."""
 DESCENT_HOLD_S = 0.3
 DESCENT_COUNTED_M_S = 0.7
-"""MPC_LAND_SPEED. A faster descent counts as this one: PX4 brakes a vehicle that falls to this speed, in the air."""
+"""MPC_LAND_SPEED. A faster descent counts as this one, because PX4 slows a falling vehicle to this speed while it is still in the
+air.
+"""
 ARRESTED_SHARE = 0.5
 """Fraction of the fastest descent. PX4 controls its estimated speed, so an estimate that slows down to less than this was stopped by
 the floor.
@@ -62,17 +64,17 @@ class LandingStep:
     ended: bool
     """Whether the vehicle is disarmed on the ground, or nothing more can be done."""
     landed: bool
-    """Whether the vehicle has landed. Valid with `ended`."""
+    """Whether the vehicle has landed. Valid only if `ended` is True."""
     text: str | None = None
     """Event to report and its text, if any."""
 
 
 @dataclass(frozen=True, slots=True)
 class Arrest:
-    """Evidence of touchdown for an estimate that drifts: according to PX4's own estimate its descent was stopped and not resumed.
+    """Evidence of touchdown for an estimate that drifts: according to that estimate, PX4's descent stopped and did not resume.
 
-    Dead reckoning from an accelerometer with an error of 0.2 m/s^2 is wrong by 0.4 m/s and 0.4 m after 2 s, so speed and height do not
-    show rest, but the change of speed at the floor does.
+    Dead reckoning from an accelerometer with an error of 0.2 m/s^2 is wrong by 0.4 m/s and 0.4 m after 2 s, so speed and height do
+    not show rest, but the change of speed at the floor does.
     """
 
     descends_since_s: float | None = None
@@ -215,7 +217,9 @@ class AutopilotLanding:
         return now, mode is FlightMode.MANUAL or (now.was_landing and chosen)
 
     def _watch_touchdown(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
-        """Handle a touchdown: PX4 is landing, its height shows a vehicle on the ground, and motion capture does not contradict it."""
+        """Detect and handle a touchdown: PX4 is landing, its height shows a vehicle on the ground, and motion capture does not
+        contradict it.
+        """
         pose, vehicle, t_s = fresh_pose(i), i.vehicle, i.t_s
         pose_s = pose.stamp_s if pose is not None else self.pose_s
         sinking = self.sinking.update(t_s, i.mocap)

@@ -20,7 +20,7 @@ _Bound = tuple[Rule, Any, Any, Any]
 
 
 class Evaluation:
-    """Evaluates the rules in every tick. Its state is the time since when each rule has held, and the active rules.
+    """Evaluates the rules in every tick. Its state is the time since which each rule has held, and the active rules.
 
     Args:
         vehicle: vehicle file with thresholds and hold times.

@@ -27,7 +27,7 @@ class FlightTracker:
 
     def __init__(self, vehicle: Vehicle) -> None:
         tilt_max_rad = math.radians(vehicle.safety.tilt_abort_deg)
-        # Of a quaternion, x^2 + y^2 = sin^2(tilt / 2): most ticks need no angle.
+        # For a quaternion, x^2 + y^2 = sin^2(tilt / 2): most ticks need no angle.
         self._upright_max = math.sin(0.5 * min(tilt_max_rad, FLIPPED_TILT_RAD)) ** 2
         self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
         self._radius_m = vehicle.airframe.radius_m
@@ -87,17 +87,17 @@ class FlightTracker:
 
 
 def tilt(f: FlightTracker, tilt_max_rad: float) -> Values | None:
-    """PX4's tilt exceeds the threshold."""
+    """Fires if PX4's tilt exceeds the threshold."""
     return (math.degrees(f.tilt_rad), math.degrees(tilt_max_rad)) if f.tilt_rad > tilt_max_rad else None
 
 
 def crashed(f: FlightTracker, _: None) -> Values | None:
-    """The vehicle is flipped."""
+    """Fires if the vehicle is flipped."""
     return (math.degrees(f.tilt_rad),) if f.tilt_rad > 0.0 and f.flipped else None
 
 
 def too_fast(f: FlightTracker, speed_max_m_s: float) -> Values | None:
-    """The horizontal speed exceeds the threshold."""
+    """Fires if the horizontal speed exceeds the threshold."""
     if f.vehicle is None:
         return None
     vx, vy, _ = f.vehicle.velocity_world_m_s
@@ -106,19 +106,19 @@ def too_fast(f: FlightTracker, speed_max_m_s: float) -> Values | None:
 
 
 def climbs_too_fast(f: FlightTracker, climb_max_m_s: float) -> Values | None:
-    """The vertical speed upward exceeds the threshold."""
+    """Fires if the vertical speed upward exceeds the threshold."""
     up_m_s = f.vehicle.velocity_world_m_s[2] if f.vehicle is not None else 0.0
     return (up_m_s, climb_max_m_s) if up_m_s > climb_max_m_s else None
 
 
 def sinks_too_fast(f: FlightTracker, sink_max_m_s: float) -> Values | None:
-    """The vertical speed downward exceeds the threshold."""
+    """Fires if the vertical speed downward exceeds the threshold."""
     up_m_s = f.vehicle.velocity_world_m_s[2] if f.vehicle is not None else 0.0
     return (-up_m_s, sink_max_m_s) if up_m_s < -sink_max_m_s else None
 
 
 def geofence_left(f: FlightTracker, tolerance_m: float) -> Values | None:
-    """The rotors are outside the room by more than the tolerance."""
+    """Fires if the rotors are outside the room by more than the tolerance."""
     if f.vehicle is None:
         return None
     x, y, z = f.vehicle.position_world_m
@@ -126,7 +126,7 @@ def geofence_left(f: FlightTracker, tolerance_m: float) -> Values | None:
 
 
 def geofence_near(f: FlightTracker, tolerance_m: float) -> Values | None:
-    """At the predicted stop after a fault the rotors would be outside the room by more than the tolerance."""
+    """Fires if at the predicted stop after a fault the rotors would be outside the room by more than the tolerance."""
     if f.vehicle is None:
         return None
     (x, y, z), (vx, vy, vz), stop_s = f.vehicle.position_world_m, f.vehicle.velocity_world_m_s, f.stop_s(f.vehicle)
@@ -135,7 +135,7 @@ def geofence_near(f: FlightTracker, tolerance_m: float) -> Values | None:
 
 
 def tracking_error(f: FlightTracker, thresholds: tuple[float, float]) -> Values | None:
-    """The tracking error exceeds both thresholds."""
+    """Fires if the tracking error exceeds both thresholds."""
     error_m = f.tracking_error_m
     if error_m is None or not (error_m > thresholds[0] and error_m > thresholds[1]):
         return None
@@ -143,48 +143,48 @@ def tracking_error(f: FlightTracker, thresholds: tuple[float, float]) -> Values 
 
 
 def tracking_warn(f: FlightTracker, threshold_m: float) -> Values | None:
-    """The tracking error exceeds the threshold."""
+    """Fires if the tracking error exceeds the threshold."""
     error_m = f.tracking_error_m
     return (error_m, threshold_m) if error_m is not None and error_m > threshold_m else None
 
 
 def thrust_saturated(f: FlightTracker, saturated_max_s: float) -> Values | None:
-    """The vertical force has been limited for longer than the threshold."""
+    """Fires if the vertical force has been limited for longer than the threshold."""
     found = f.vertical_n is not None and f.saturated_s > saturated_max_s
     return (f.vertical_n, saturated_max_s) if found else None
 
 
 def tether_short(f: FlightTracker, slack_min_m: float) -> Values | None:
-    """Less tether than the threshold would be left at the predicted stop after a fault."""
+    """Fires if less tether than the threshold would be left at the predicted stop after a fault."""
     t = f.tether
     return (t.stop_slack_m, slack_min_m) if t is not None and t.stop_slack_m < slack_min_m else None
 
 
 def tether_taut(f: FlightTracker, _: None) -> Values | None:
-    """The tether is taut."""
+    """Fires if the tether is taut."""
     t = f.tether
     return (t.slack_m, t.pull_n) if t is not None and t.taut else None
 
 
 def tether_snagged(f: FlightTracker, _: None) -> Values | None:
-    """The tether pulls although there is slack."""
+    """Fires if the tether pulls although there is slack."""
     t = f.tether
     return (t.pull_n, t.slack_m) if t is not None and t.snagged else None
 
 
 def tether_near(f: FlightTracker, clearance_min_m: float) -> Values | None:
-    """The tether is nearer to rotors or arm than the threshold."""
+    """Fires if the tether is nearer to rotors or arm than the threshold."""
     t = f.tether
     return (t.clearance_m, clearance_min_m) if t is not None and t.clearance_m < clearance_min_m else None
 
 
 def tether_wound(f: FlightTracker, turns_max: float) -> Values | None:
-    """The tether is wound by more turns than the threshold."""
+    """Fires if the tether is wound by more turns than the threshold."""
     t = f.tether
     return (abs(t.turns), turns_max) if t is not None and abs(t.turns) > turns_max else None
 
 
 def tether_separated(f: FlightTracker, _: None) -> Values | None:
-    """The distance to the anchor exceeds the tether's length, without a pull."""
+    """Fires if the distance to the anchor exceeds the tether's length, without a pull."""
     t = f.tether
     return (t.range_m,) if t is not None and t.separated else None

@@ -30,7 +30,7 @@ IMU_GAP_MAX_S = 0.05
 CLOCK_GROWTH = 1e-3
 """Largest drift between two clocks, s/s."""
 CLOCK_RESTART_S = 0.5
-"""A message later than this shows a different clock: its device restarted."""
+"""A message that is later than this shows that the device has restarted and its clock with it."""
 
 
 class RemoteClock:

@@ -1,9 +1,9 @@
-"""Motion capture: decides which poses are trusted, and has the predicates of its rules.
+"""Motion capture: decides which poses are trusted, and contains the predicates of its rules.
 
-A pose is trusted if it is near the one that PX4's velocity and rates predict. A pose that is not trusted counts as not received and is
-not passed on to PX4: an estimator that has fused another body's pose is useless for a landing. Thresholds are keys of `safety:` in the
-vehicle file (`companion.config.vehicle.Safety`). The rows of these rules, with their thresholds, actions and the texts for the
-operator, are in `companion.safety.rules`.
+A pose is trusted if it is near the one that PX4's velocity and rates predict. A pose that is not trusted counts as not received and
+is not passed on to PX4: an estimator that has fused another body's pose is useless for a landing. Thresholds are keys of `safety:`
+in the vehicle file (`companion.config.vehicle.Safety`). The rows of these rules, with their thresholds, actions and the texts for
+the operator, are in `companion.safety.rules`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ CONTINUOUS_S = 0.1
 FORGET_S = 1.0
 """After a gap this long the next frame is trusted: `mocap_lost` has reported the gap."""
 DRIFT_M_S = 0.3
-"""Drift that PX4's position may have without a trusted pose, m/s."""
+"""Permitted drift of PX4's position while no pose is trusted, m/s."""
 RATE_WINDOW_S = 1.0
 
 
@@ -129,7 +129,7 @@ class MocapTracker:
         return self._inertial.innovation_m
 
     def untrusted(self, timeout_s: float) -> bool:
-        """Return whether frames arrive but none was trusted for longer than the timeout."""
+        """Return whether frames are arriving but the last trusted one is older than the timeout."""
         return self.trusted_age_s > timeout_s and not self.frame_age_s > timeout_s
 
     def _predict(self, vehicle: VehicleState, boot_s: float) -> None:
@@ -225,49 +225,49 @@ class MocapTracker:
 
 
 def mocap_lost(m: MocapTracker, timeout_s: float) -> Values | None:
-    """No frame has arrived for longer than the timeout."""
+    """Fires if no frame has arrived for longer than the timeout."""
     return (timeout_s,) if m.frame_age_s > timeout_s else None
 
 
 def mocap_invalid(m: MocapTracker, timeout_s: float) -> Values | None:
-    """Frames arrive, but none was trusted for longer than the timeout, and the newest has no valid pose."""
+    """Fires if frames are arriving, but the last trusted one is older than the timeout, and the newest has no valid pose."""
     return (timeout_s,) if m.untrusted(timeout_s) and m.frame is not None and not m.frame.tracking_valid else None
 
 
 def mocap_swapped(m: MocapTracker, timeout_s: float) -> Values | None:
-    """Poses arrive, but none was trusted for longer than the timeout."""
+    """Fires if poses are arriving, but the last trusted one is older than the timeout."""
     return m.off if m.untrusted(timeout_s) and m.frame is not None and m.frame.tracking_valid else None
 
 
 def mocap_jump(m: MocapTracker, timeout_s: float) -> Values | None:
-    """The newest pose is rejected, but one within the timeout was trusted."""
+    """Fires if the newest pose is rejected, but the last trusted one is not older than the timeout."""
     return m.off if not m.plausible and m.trusted_age_s <= timeout_s else None
 
 
 def mocap_two_streams(m: MocapTracker, _: None) -> Values | None:
-    """Frame numbers step back repeatedly."""
+    """Fires if frame numbers step back repeatedly."""
     return HOLDS if m.two_streams else None
 
 
 def mocap_dragged(m: MocapTracker, limit_m: float) -> Values | None:
-    """Poses do not move as the IMU measures."""
+    """Fires if poses do not move as the IMU measures."""
     return (m.innovation_m * 1e3, limit_m * 1e3) if m.dragged else None
 
 
 def mocap_frozen(m: MocapTracker, _: None) -> Values | None:
-    """New frames repeat the same pose although the vehicle moves."""
+    """Fires if new frames repeat the same pose although the vehicle moves."""
     return HOLDS if m.frozen else None
 
 
 def mocap_slow(m: MocapTracker, thresholds: Vec2) -> Values | None:
-    """The rate is below the first threshold; the second is the timeout after which the stream is lost instead."""
+    """Fires if the rate is below the first threshold; the second is the timeout after which the stream is lost instead."""
     rate_hz = m.rate_hz
     slow = rate_hz is not None and rate_hz < thresholds[0] and not m.frame_age_s > thresholds[1]
     return (rate_hz, thresholds[0]) if slow else None
 
 
 def mocap_late(m: MocapTracker, thresholds: Vec2) -> Values | None:
-    """The latency exceeds the first threshold but not the second."""
+    """Fires if the latency exceeds the first threshold but not the second."""
     latency_s = m.pose.latency_s if m.pose is not None else None
     if latency_s is None or not thresholds[0] < latency_s <= thresholds[1]:
         return None
@@ -275,7 +275,7 @@ def mocap_late(m: MocapTracker, thresholds: Vec2) -> Values | None:
 
 
 def mocap_too_late(m: MocapTracker, thresholds: Vec2) -> Values | None:
-    """The latency exceeds both thresholds."""
+    """Fires if the latency exceeds both thresholds."""
     latency_s = m.pose.latency_s if m.pose is not None else None
     if latency_s is None or not (latency_s > thresholds[0] and latency_s > thresholds[1]):
         return None
@@ -283,7 +283,7 @@ def mocap_too_late(m: MocapTracker, thresholds: Vec2) -> Values | None:
 
 
 def estimate_disagrees(m: MocapTracker, disagreement_m: float) -> Values | None:
-    """PX4's position and the pose are further apart than the threshold."""
+    """Fires if PX4's position and the pose are further apart than the threshold."""
     if m.compared is None:
         return None
     apart_m = math.dist(m.compared[1].position_world_m, m.compared[0].position_world_m)
@@ -291,7 +291,7 @@ def estimate_disagrees(m: MocapTracker, disagreement_m: float) -> Values | None:
 
 
 def yaw_disagrees(m: MocapTracker, disagreement_rad: float) -> Values | None:
-    """PX4's yaw and the pose's differ by more than the threshold."""
+    """Fires if PX4's yaw and the pose's differ by more than the threshold."""
     if m.compared is None:
         return None
     pose, vehicle = m.compared[0].attitude_wxyz, m.compared[1].attitude_wxyz

@@ -1,6 +1,6 @@
 """All monitors of one flight: the trackers are updated with each tick's inputs, then the event table is evaluated. Pure.
 
-`companion.safety` says where a new rule begins.
+See `companion.safety` for how to add a rule.
 """
 
 from __future__ import annotations

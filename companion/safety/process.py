@@ -30,24 +30,24 @@ class ProcessTracker:
 
 
 def loop_late(p: ProcessTracker, thresholds: tuple[float, float]) -> Values | None:
-    """The tick is late by more than the first threshold but not the second."""
+    """Fires if the tick is late by more than the first threshold but not the second."""
     return (p.gap_s * 1e3, thresholds[0] * 1e3) if thresholds[0] < p.gap_s <= thresholds[1] else None
 
 
 def loop_stalled(p: ProcessTracker, thresholds: tuple[float, float]) -> Values | None:
-    """The tick is late by more than both thresholds."""
+    """Fires if the tick is late by more than both thresholds."""
     if not (p.gap_s > thresholds[0] and p.gap_s > thresholds[1]):
         return None
     return (p.gap_s * 1e3, max(thresholds) * 1e3)
 
 
 def recorder_drops(p: ProcessTracker, _: None) -> Values | None:
-    """The recorder has dropped samples."""
+    """Fires if the recorder has dropped samples."""
     return HOLDS if p.recorder_dropped else None
 
 
 def guardian_lost(p: ProcessTracker, _: None) -> Values | None:
-    """A guardian is configured but not ready."""
+    """Fires if a guardian is configured but not ready."""
     return HOLDS if p.guardian_ready is False else None
 
 

@@ -94,44 +94,44 @@ class Px4Tracker:
 
 
 def reattached(p: Px4Tracker, _: None) -> Values | None:
-    """PX4 is armed without a request from the companion."""
+    """Fires if PX4 is armed although the companion has not requested it."""
     found = p.situation.found_armed
     return None if found is None else (found,)
 
 
 def px4_rebooted(p: Px4Tracker, _: None) -> Values | None:
-    """PX4's clock has stepped back."""
+    """Fires if PX4's clock has stepped back."""
     return None if p.rebooted_s is None else (p.rebooted_s,)
 
 
 def link_late(p: Px4Tracker, lag_max_s: float) -> Values | None:
-    """The lag of PX4's state exceeds the threshold."""
+    """Fires if the lag of PX4's state exceeds the threshold."""
     return (p.lag_s * 1e3, lag_max_s * 1e3) if p.lag_s > lag_max_s else None
 
 
 def estimate_frozen(p: Px4Tracker, _: None) -> Values | None:
-    """PX4 sends new positions with the same values although the vehicle moves."""
+    """Fires if PX4 sends new positions with the same values although the vehicle moves."""
     return HOLDS if p.repeats else None
 
 
 def vehicle_state_lost(p: Px4Tracker, timeout_s: float) -> Values | None:
-    """PX4's position, attitude or IMU sample is older than the timeout."""
+    """Fires if PX4's position, attitude or IMU sample is older than the timeout."""
     return (timeout_s,) if p.state_age_s > timeout_s else None
 
 
 def heartbeat_lost(p: Px4Tracker, timeout_s: float) -> Values | None:
-    """No heartbeat has arrived for longer than the timeout."""
+    """Fires if no heartbeat has arrived for longer than the timeout."""
     return (timeout_s,) if p.heartbeat_age_s > timeout_s else None
 
 
 def pilot_took_over(p: Px4Tracker, _: None) -> Values | None:
-    """PX4 is in a mode that a pilot has chosen."""
+    """Fires if PX4 is in a mode that a pilot has chosen."""
     status = p.left_offboard
     return (status.mode.value.upper(), "") if status is not None and chosen_by_pilot(status) else None
 
 
 def offboard_left(p: Px4Tracker, _: None) -> Values | None:
-    """PX4 has itself changed to a mode other than OFFBOARD."""
+    """Fires if PX4 has changed on its own to a mode other than OFFBOARD."""
     status = p.left_offboard
     if status is None or chosen_by_pilot(status):
         return None
@@ -139,7 +139,7 @@ def offboard_left(p: Px4Tracker, _: None) -> Values | None:
 
 
 def px4_disarmed(p: Px4Tracker, _: None) -> Values | None:
-    """PX4 reports disarmed in the air while the companion controls the vehicle."""
+    """Fires if PX4 reports in the air that it is disarmed, while the companion controls the vehicle."""
     status, vehicle = p.status, p.vehicle
     if status is None or status.armed or vehicle is None:
         return None
@@ -149,13 +149,13 @@ def px4_disarmed(p: Px4Tracker, _: None) -> Values | None:
 
 
 def battery_below(p: Px4Tracker, remaining_min: float) -> Values | None:
-    """The remaining charge, 0 to 1, is below the threshold."""
+    """Fires if the remaining charge, 0 to 1, is below the threshold."""
     remaining = p.status.battery_remaining if p.status is not None else None
     return (remaining, remaining_min) if remaining is not None and remaining < remaining_min else None
 
 
 def battery_voltage(p: Px4Tracker, voltage_min_v: float | None) -> Values | None:
-    """The voltage is below the threshold, if there is one."""
+    """Fires if the voltage is below the threshold, if there is one."""
     voltage_v = p.status.battery_voltage_v if p.status is not None else None
     below = voltage_v is not None and voltage_min_v is not None and voltage_v < voltage_min_v
     return (voltage_v, voltage_min_v) if below else None

@@ -2,19 +2,21 @@
 
 There are three cases:
 
-* **The vehicle is on the ground.** PX4 is in OFFBOARD or LAND, so no pilot flies; every fresh height is near standing height; and the
-  vehicle has not moved. All of this must hold without a break: for `DISARM_STILL_S` before DISARM, which PX4 itself refuses in the air,
-  and for `FORCE_DISARM_S`, measured by motion capture, before FORCE_DISARM, which PX4 does not refuse. * **The vehicle is flipped.**
-  PX4's attitude is beyond `FLIPPED_TILT_RAD`, confirmed by motion capture, or by the accelerometer if motion capture does not see the
-  body, for `FLIPPED_HOLD_S`. PX4's LAND would drive it into the floor, so FORCE_DISARM follows at once and at any height, unless a
-  pilot flies. * **The vehicle is tipped over.** For `TIPPED_HOLD_S`, in OFFBOARD or LAND, PX4 and motion capture both show a tilt above
-  `safety.tilt_abort_deg`, and motion capture shows less than `LOW_WITHIN_M` above standing height. The vehicle lies on its rotors, and
-  PX4's LAND continues to drive them. Without a fresh pose this is not evaluated.
+* **The vehicle is on the ground.** PX4 is in OFFBOARD or LAND, so no pilot is flying; every fresh height is near standing height;
+  and the vehicle has not moved. All of this must hold without a break: for `DISARM_STILL_S` before DISARM, which PX4 itself refuses
+  in the air, and for `FORCE_DISARM_S`, measured by motion capture, before FORCE_DISARM, which PX4 does not refuse.
+* **The vehicle is flipped.** For `FLIPPED_HOLD_S`, PX4's attitude is beyond `FLIPPED_TILT_RAD`, confirmed by motion capture, or by
+  the accelerometer if motion capture does not see the body. PX4's LAND would drive it into the floor, so FORCE_DISARM follows at
+  once and at any height, unless a pilot is flying.
+* **The vehicle is tipped over.** For `TIPPED_HOLD_S`, in OFFBOARD or LAND, PX4 and motion capture both show a tilt above
+  `safety.tilt_abort_deg`, and motion capture shows less than `LOW_WITHIN_M` above standing height. The vehicle lies on its rotors,
+  and PX4's LAND continues to drive them. Without a fresh pose this is not evaluated.
 
 A normal flight is never mistaken for a vehicle that is tipped over. The controller's setpoints stay within `airframe.tilt_max_deg`,
-PX4's own landing within `MPC_TILTMAX_AIR` (25 deg) and `MPC_TILTMAX_LND` (12 deg). Beyond 40 deg a free vehicle accelerates sideways by
-more than 8 m/s^2, and PX4, which is commanded to land after 0.1 s (`tilt`), levels it within 0.5 s unless it hits the floor first. Only
-a tether that pulls the vehicle over can hold it at this tilt and this low; when its rotors stop it falls by `LOW_WITHIN_M` at most.
+PX4's own landing within `MPC_TILTMAX_AIR` (25 deg) and `MPC_TILTMAX_LND` (12 deg). Beyond 40 deg a free vehicle accelerates
+sideways by more than 8 m/s^2, and PX4, which is commanded to land after 0.1 s (`tilt`), levels it within 0.5 s unless it hits the
+floor first. Only a tether that pulls the vehicle over can hold it at this tilt and this low; when its rotors stop it falls by
+`LOW_WITHIN_M` at most.
 """
 
 from __future__ import annotations
@@ -101,7 +103,7 @@ class RotorStop:
     """Time on the flight clock of the newest pose that PX4 received; -inf if unknown."""
     sinking: Sinking = field(default_factory=Sinking)
     rest: tuple[float, Places] | None = None
-    """Time since when the vehicle has been at rest, and its position from each source; None if it is not at rest."""
+    """Time since which the vehicle has been at rest, and its position from each source; None if it is not at rest."""
     flipped_since_s: float | None = None
     tipped_since_s: float | None = None
     may_disarm: bool = False
@@ -169,7 +171,7 @@ class RotorStop:
 
 
 def _since(before_s: float | None, t_s: float, holds: bool) -> float | None:
-    """Return the time since when a condition has held, or None if it does not hold."""
+    """Return the time since which a condition has held, or None if it does not hold."""
     return (t_s if before_s is None else before_s) if holds else None
 
 

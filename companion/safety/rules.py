@@ -42,23 +42,23 @@ def _operator(
 
 RULES: tuple[Rule, ...] = (
     _invalid(
-        "vehicle_not_finite", "vehicle", "PX4's state with a value that is not finite or out of range, or an invalid attitude",
+        "vehicle_not_finite", "vehicle", "PX4's state has a non-finite or out-of-range value, or an invalid attitude",
         "PX4's state is invalid and is ignored: {}",
     ),
     _invalid(
-        "mocap_not_finite", "mocap", "a pose with a value that is not finite or out of range, or an invalid attitude",
+        "mocap_not_finite", "mocap", "a pose has a non-finite or out-of-range value, or an invalid attitude",
         "the motion-capture pose is invalid and is ignored: {}",
     ),
     _invalid(
-        "arm_not_finite", "arm", "a joint state with a value that is not finite or out of range",
+        "arm_not_finite", "arm", "a joint state has a non-finite or out-of-range value",
         "the joint state is invalid and is ignored: {}",
     ),
     _invalid(
-        "force_not_finite", "force", "a force sample with a value that is not finite or out of range",
+        "force_not_finite", "force", "a force sample has a non-finite or out-of-range value",
         "the force sample is invalid and is ignored: {}",
     ),
     _invalid(
-        "status_not_finite", "status", "PX4's status with a value that is not finite or out of range",
+        "status_not_finite", "status", "PX4's status has a non-finite or out-of-range value",
         "PX4's status is invalid and is ignored: {}",
     ),
 
@@ -180,9 +180,9 @@ RULES: tuple[Rule, ...] = (
         predicate=px4.offboard_left, ground=_PX4_LANDS, air=_PX4_LANDS, message="PX4 left OFFBOARD for {}{}",
     ),
     Rule(
-        id="px4_disarmed", subject=Subject.PX4, what="PX4 reports disarmed, well above the floor",
+        id="px4_disarmed", subject=Subject.PX4, what="PX4 reports that it is disarmed, although the vehicle is well above the floor",
         predicate=px4.px4_disarmed, ground=None, air=_PX4_LANDS, repeat=Repeat.NEVER,
-        message="PX4 reports disarmed at a height of {:.2f} m",
+        message="PX4 reports that it is disarmed, at a height of {:.2f} m",
     ),
     Rule(
         id="battery_warn", subject=Subject.PX4, what="remaining charge low", predicate=px4.battery_below,

@@ -15,7 +15,7 @@ HOLDS: Values = ()
 
 @dataclass(slots=True)
 class Situation:
-    """Activity of the core, as far as rules depend on it. The core updates one object."""
+    """The part of the core's activity on which rules depend. The core keeps one object and updates it in every tick."""
 
     airborne: bool
     """The rotors may lift: from arming to touchdown."""
@@ -29,7 +29,7 @@ class Situation:
     """A payload is on board."""
     tether: TetherState | None = None
     found_armed: str | None = None
-    """Event text if PX4 was armed without a request from the companion; `airborne` then shows whether it flies."""
+    """Event text if PX4 was armed without a request from the companion; `airborne` then shows whether the vehicle is flying."""
     waiting: bool = False
     """Inputs are still missing on the ground: only rules with `while_waiting` are evaluated."""
 

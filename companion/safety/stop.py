@@ -1,10 +1,10 @@
 """Stopping distance of the vehicle after a fault, stopped by PX4 or by the governor. Pure.
 
 PX4's LAND, requested by the flight process or by the guardian, first sets a stop point `v (0.6 s + v / (2 MPC_ACC_HOR))` ahead
-(Navigator::preproject_stop_point and computeBrakingDistanceFromVelocity of PX4 1.16; the 0.6 s is a constant there) and flies to it.
-The governor brakes the reference at `tether.stop_deceleration_m_s2`. At every speed the model assumes the slower of the two
-decelerations: its distance D(v) is never shorter than either, and because dD/dv >= v / a, braking at `stop_deceleration_m_s2` never
-moves the predicted stop outward. Mission check, governor, tether watch and geofence monitor use it.
+(Navigator::preproject_stop_point and computeBrakingDistanceFromVelocity of PX4 1.16; the 0.6 s is a constant there) and flies to
+it. The governor brakes the reference at `tether.stop_deceleration_m_s2`. At every speed the model assumes the slower of the two
+decelerations: its stopping distance D(v) is never shorter than that of either, and because dD/dv >= v / a, braking at
+`stop_deceleration_m_s2` never moves the predicted stop outward. Mission check, governor, tether watch and geofence monitor use it.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
 """Touchdown detection: two of three independent sources must agree that the vehicle is on the ground. Pure; time is an argument.
 
-* **Height**: PX4's estimate is near standing height and does not sink, although the reference is below it. * **Thrust**: the command is
-much less than hover thrust, and motion capture sees no descent: the floor carries the vehicle. * **PX4**: its land detector
-(EXTENDED_SYS_STATE). In attitude control it waits for almost zero thrust, which no control law commands by itself. When one of the
-other sources is alone, thrust is therefore reduced gradually (`relief`) as long as the vehicle does not sink.
+* **Height**: PX4's estimate is near standing height and does not sink, although the reference is below it.
+* **Thrust**: the command is much less than hover thrust, and motion capture sees no descent: the floor carries the vehicle.
+* **PX4**: its land detector (EXTENDED_SYS_STATE) reports a landing.
+
+In attitude control the land detector waits for almost zero thrust, which no control law commands by itself. When one of the other
+sources is the only one, thrust is therefore reduced gradually (`relief`) as long as the vehicle does not sink.
 """
 
 from __future__ import annotations
@@ -23,9 +25,9 @@ THRUST_HOLD_S = 0.2
 NEVER_ABOVE_M = 0.5
 """Margin over standing height. If motion capture is above it, thrust and PX4 are not evidence: the tether may carry the vehicle."""
 ALONE_S = 0.4
-"""Time for which one source may be alone before thrust is reduced."""
+"""Time for which a single source may report touchdown before thrust is reduced."""
 RELIEF_S = 1.0
-"""Time from full thrust to zero."""
+"""Time in which thrust is reduced from full to zero."""
 RELIEF_SINK_MAX_M_S = 0.15
 """A vehicle that sinks faster while thrust is reduced is flying."""
 SINK_WINDOW_S = 0.15
@@ -39,7 +41,7 @@ class HeightEvidence:
     low_m: float
     """Height below which the vehicle may be on the ground, from `low_below_m`."""
     since_s: float | None = None
-    """Time on the flight clock since when it has been low and still."""
+    """Time on the flight clock since which the vehicle has been low and still; None if it is not."""
 
     def update(self, t_s: float, height_m: float, vertical_m_s: float, reference_height_m: float) -> HeightEvidence:
         """Return the evidence after one more tick."""
@@ -54,7 +56,7 @@ class HeightEvidence:
 
 
 def low_below_m(clearance_m: float) -> float:
-    """Return the height below which a vehicle may be on the ground; `clearance_m` is that of its origin when it is."""
+    """Return the height below which a vehicle may be on the ground; `clearance_m` is the height of the body's origin when it is."""
     return clearance_m + HEIGHT_MARGIN_M
 
 

@@ -1,6 +1,4 @@
-"""Removes records with a value that is not finite or out of range: they count as not received, and the rules `*_not_finite` report
-them.
-"""
+"""Removes records with a non-finite or out-of-range value: they count as not received, and the `*_not_finite` rules report them."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ from companion.model.types import ArmState, AutopilotStatus, ForceSample, Inputs
 from companion.safety.situation import Values
 
 OUT_OF_RANGE = 1.0e4
-"""Largest permitted value; no valid quantity reaches it, in whatever unit."""
+"""Largest permitted value; no valid quantity reaches it in any unit."""
 _STAMP_MAX_S = 1.0e9
 
 

@@ -138,7 +138,7 @@ def test_hold_resume_hold_resume_land() -> None:
 
 def test_the_same_commands_again_give_the_same_flight_bit_for_bit() -> None:
     flown = commanded((2.0, START), (7.0, HOLD), (7.5, RESUME), (8.5, ABORT), sets=WAITS, until_s=10.0)
-    assert flown.effects[-1] == (True, "aborted: landing, the arm folds")
+    assert flown.effects[-1] == (True, "aborted: landing and folding the arm")
     core = FlightCore(flown.flight.config)
     for i, o in zip(flown.inputs, flown.outputs, strict=True):
         assert differences(o, core.step(i)) is None
@@ -183,7 +183,7 @@ def test_commands_while_it_goes_back_along_the_tether() -> None:
     )
     assert flown.effects[:2] == [
         (False, "HOLD rejected: the vehicle is in RETRACT and will land"),
-        (False, "nothing to resume: the vehicle returns along the tether and lands"),
+        (False, "nothing to resume: the vehicle is returning along the tether and will land"),
     ]
     assert flown.effects[2] == (True, "landing")
 
@@ -235,10 +235,10 @@ def times_of(flown: Commanded) -> dict[str, float]:
         ("wait", HOLD, "not taking off: the start is cancelled"),
         ("offboard", HOLD, "not taking off: the start is cancelled"),
         ("arm", HOLD, "not taking off: the start is cancelled"),
-        ("spool up", HOLD, "not taking off: the rotors spool down"),
+        ("spool up", HOLD, "not taking off: the rotors are spooling down"),
         ("wait", LAND, "not taking off: the start is cancelled"),
         ("arm", ABORT, "not taking off: the start is cancelled"),
-        ("spool up", LAND, "not taking off: the rotors spool down"),
+        ("spool up", LAND, "not taking off: the rotors are spooling down"),
     ],
 )
 def test_called_off_before_it_lifts(phase: str, command: OperatorCommand, text: str) -> None:
@@ -259,7 +259,7 @@ def test_a_flight_that_takes_off_by_itself_needs_no_start() -> None:
     )
     assert flown.effects[0::2] == [
         (False, "start refused: this flight takes off by itself as soon as it is ready"),
-        *[(True, "taking off already")] * 3,
+        *[(True, "already taking off")] * 3,
     ]
     assert flown.effects[1::2] == [(False, "nothing to resume: on the ground")] * 4
     assert flown.outcome is Outcome.COMPLETED
@@ -315,7 +315,7 @@ def test_a_start_that_comes_before_it_is_ready_is_refused_and_not_remembered() -
     assert flown.effects[0][0] is False
     assert flown.effects[0][1].startswith("start refused: ")
     assert flown.at(4.0).phase == "waits for start"
-    assert flown.effects[1:] == [(True, "taking off"), (True, "taking off already")]
+    assert flown.effects[1:] == [(True, "taking off"), (True, "already taking off")]
 
 
 def test_the_net_is_weighed_right_before_the_start() -> None:
@@ -365,7 +365,7 @@ def test_armed_by_somebody_else_while_it_waits_it_is_not_flown() -> None:
 def test_after_the_flight_nothing_is_to_be_done() -> None:
     over = ordinary().outputs[-1]
     assert [effect_of(command, over, over) for command in (LAND, HOLD, RESUME, START)] == [
-        (True, "down already"),
+        (True, "already down"),
         (False, "hold rejected: the flight is over"),
         (False, "nothing to resume: the flight is over"),
         (False, "start refused: the flight is over"),

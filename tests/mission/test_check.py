@@ -97,36 +97,36 @@ def test_committed_missions_are_flyable(mission: str) -> None:
 
 
 REFUSED = [
-    (["mission.phases[2].to_m=[1, 0, 1.9]", "vehicle.tether.length_m=2.5"], "phase 'catch' leaves the tether sphere at t = 8.6 s, (0.97, 0.00, 1.89) m: 2.44 m from the anchor, 2.05 m (length minus margin and 0.2 m for the catch) allowed; shorten the line or move the anchor (also in 'stabilise', 'return')"),
-    (["mission.phases[2].to_m=[1.9, 0, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.90, 0.00, 1.00) m: rotors, arm and net reach x = 2.35 m; the room is -2.2 to 2.2 m minus 0.1 m for tracking; move the waypoint inwards (also in 'stabilise', 'return')"),
-    (["mission.phases[2].to_m=[1, -1.5, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.00, -1.50, 1.00) m: rotors, arm and net reach y = -1.95 m; the room is -1.8 to 1.8 m minus 0.1 m for tracking; move the waypoint inwards"),
-    (["mission.phases[2].to_m=[1, 0, 2.1]"], "rotors, arm and net reach z = 2.23 m; the room is 0 to 2.2 m minus 0.2 m for the catch"),
-    (["mission.phases[2].to_m=[1, 0, 0.2]"], "phase 'catch' flies into the floor at t = 9.5 s, (1.00, 0.00, 0.20) m: the body's origin at 0.20 m, 0.30 m is the minimum; raise the waypoint"),
-    (["mission.phases[2].to_m=[1, 0, 0.4]"], "phase 'catch' drags the net over the floor at t = 9.5 s, (1.00, 0.00, 0.40) m: its lowest point is -0.07 m high, 0.01 m is the minimum; fly higher or fold the arm first"),
+    (["mission.phases[2].to_m=[1, 0, 1.9]", "vehicle.tether.length_m=2.5"], "phase 'catch' leaves the tether sphere at t = 8.6 s, (0.97, 0.00, 1.89) m: 2.44 m from the anchor (limit 2.05 m: length minus margin and 0.2 m for the catch); shorten the line or move the anchor (also in 'stabilise', 'return')"),
+    (["mission.phases[2].to_m=[1.9, 0, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.90, 0.00, 1.00) m: rotors, arm and net reach x = 2.35 m; the room is -2.2 to 2.2 m, reduced at each end by 0.1 m for tracking; move the waypoint inwards (also in 'stabilise', 'return')"),
+    (["mission.phases[2].to_m=[1, -1.5, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.00, -1.50, 1.00) m: rotors, arm and net reach y = -1.95 m; the room is -1.8 to 1.8 m, reduced at each end by 0.1 m for tracking; move the waypoint inwards"),
+    (["mission.phases[2].to_m=[1, 0, 2.1]"], "rotors, arm and net reach z = 2.23 m; the room is 0 to 2.2 m, reduced at each end by 0.2 m for the catch"),
+    (["mission.phases[2].to_m=[1, 0, 0.2]"], "phase 'catch' flies into the floor at t = 9.5 s, (1.00, 0.00, 0.20) m: the body's origin at 0.20 m (minimum 0.30 m); raise the waypoint"),
+    (["mission.phases[2].to_m=[1, 0, 0.4]"], "phase 'catch' drags the net over the floor at t = 9.5 s, (1.00, 0.00, 0.40) m: its lowest point is -0.07 m high (minimum 0.01 m); fly higher or fold the arm first"),
     (["mission.phases[4].arm_deg=[100, 60]"], "phase 'land' drags the net over the floor"),
-    (["mission.phases[4].arm_deg=[50, 140]"], "phase 'return' drives joint 1 beyond its limit at t = 17.0 s, (-1.00, 0.00, 1.00) m: 50.0 deg, 60 to 175 deg allowed; change arm_deg (also in 'above the start', 'land')"),
+    (["mission.phases[4].arm_deg=[50, 140]"], "phase 'return' drives joint 1 beyond its limit at t = 17.0 s, (-1.00, 0.00, 1.00) m: 50.0 deg (limits 60 and 175 deg); change arm_deg (also in 'above the start', 'land')"),
     (["mission.phases[2].arm_deg=[100, -20]"], "phase 'catch' drives joint 2 beyond its limit"),
-    (["mission.phases[2].duration_s=4"], "phase 'catch' flies too fast at t = 5.5 s, (0.00, 0.00, 1.00) m: 1.09 m/s, limits.speed_max_m_s is 0.8; allow more time or shorten the move"),
+    (["mission.phases[2].duration_s=4"], "phase 'catch' flies too fast at t = 5.5 s, (0.00, 0.00, 1.00) m: 1.09 m/s (limits.speed_max_m_s is 0.8); allow more time or shorten the move"),
     (["mission.limits.speed_max_m_s=1.61"], "mission 'catch': limits.speed_max_m_s is 1.61 m/s, but the flight is stopped at 2 m/s (safety.speed_max_m_s) and needs a margin of one fifth; lower it to 1.60 m/s or less"),
     (["mission.limits.speed_max_m_s=3"], "limits.speed_max_m_s is 3 m/s, but the flight is stopped at 2 m/s"),
     (["vehicle.safety.speed_max_m_s=0.9"], "limits.speed_max_m_s is 0.8 m/s, but the flight is stopped at 0.9 m/s"),
-    (["mission.phases[2].duration_s=3"], "phase 'catch' accelerates too hard at t = 5.7 s, (0.81, 0.00, 1.00) m: 1.67 m/s^2, limits.acceleration_max_m_s2 is 1; allow more time or shorten the move"),
-    (["mission.phases[2].duration_s=2.2", "mission.phases[2].arm_duration_s=2"], "phase 'catch' starts or stops too abruptly at t = 4.6 s, (0.00, 0.00, 1.00) m: 9.86 m/s^3, limits.jerk_max_m_s3 is 4"),
-    (["mission.phases[2].arm_duration_s=1"], "phase 'catch' turns a joint too fast at t = 4.0 s, (-1.00, 0.00, 1.00) m: 152 deg/s, limits.arm_speed_max_deg_s is 90"),
+    (["mission.phases[2].duration_s=3"], "phase 'catch' accelerates too hard at t = 5.7 s, (0.81, 0.00, 1.00) m: 1.67 m/s^2 (limits.acceleration_max_m_s2 is 1); allow more time or shorten the move"),
+    (["mission.phases[2].duration_s=2.2", "mission.phases[2].arm_duration_s=2"], "phase 'catch' starts or stops too abruptly at t = 4.6 s, (0.00, 0.00, 1.00) m: 9.86 m/s^3 (limits.jerk_max_m_s3 is 4)"),
+    (["mission.phases[2].arm_duration_s=1"], "phase 'catch' turns a joint too fast at t = 4.0 s, (-1.00, 0.00, 1.00) m: 152 deg/s (limits.arm_speed_max_deg_s is 90)"),
     (["mission.phases[2].arm_duration_s=1"], "phase 'catch' accelerates a joint too hard"),
     (["mission.phases[2].arm_duration_s=1"], "phase 'catch' jerks a joint at t = 3.5 s"),
     (["vehicle.arm.joints[1].velocity_max_deg_s=30"], "phase 'catch' turns joint 2 faster than it can"),
     (["mission.catch.payload_max_kg=2"], "phase 'take-off' needs too much thrust at t = 0.8 s"),
     (["mission.phases[2].duration_s=2.2", "mission.phases[2].arm_duration_s=2", "vehicle.airframe.tilt_max_deg=10"], "phase 'catch' tilts too far"),
     (["mission.phases[0].height_m=0.4"], "phase 'take-off' ends at 0.4 m, but the body's origin is 0.3 m above the floor when the vehicle is on the ground; set height_m to 0.5 or more"),
-    (["mission.catch.expected_at_m=[1, 0]", "vehicle.room.x_m=[-1.6, 1.6]"], "phase 'catch' leaves the room at t = 9.5 s, (1.00, 0.00, 1.00) m: rotors, arm and net reach x = 1.45 m; the room is -1.6 to 1.6 m minus 0.2 m for the catch"),
+    (["mission.catch.expected_at_m=[1, 0]", "vehicle.room.x_m=[-1.6, 1.6]"], "phase 'catch' leaves the room at t = 9.5 s, (1.00, 0.00, 1.00) m: rotors, arm and net reach x = 1.45 m; the room is -1.6 to 1.6 m, reduced at each end by 0.2 m for the catch"),
     (["vehicle.tether.stop_deceleration_m_s2=0.3", "vehicle.room.x_m=[-1.7, 1.7]", "vehicle.tether.react_time_s=0.3"], "phase 'catch' could not stop within the room at t = 7.1 s, (0.41, 0.00, 1.00) m: 0.65 m/s needs 0.96 m to stop, 0.31 m too far with 0.2 m for the catch; fly more slowly towards its edge or turn back earlier"),
     (["vehicle.tether.stop_deceleration_m_s2=0.2", "vehicle.tether.length_m=2.4"], "could not stop within the tether sphere"),
     (["mission.phases[1]={type: line, to_m: [-1, 0, 0.32], duration_s: 2}", "mission.phases[2]={type: line, to_m: [1, 0, 1]}"], "could not stop within the height above the floor"),
     (["mission.phases[2]={type: path, through_m: [[1, -1.2, 1.2], [0, -2.2, 1.2], [-1, -1.2, 1.2], [0, -0.2, 1.2], [1, -1.2, 1.2], [0, -2.2, 1.2], [-1, -1.2, 1.2], [-1, 0, 1]]}", "vehicle.room.y_m=[-3, 2]"], "winds up the tether at t = "),
-    (["vehicle.tether.anchor_world_m=[0, -1.2, 0.95]"], "phase 'take-off' brings the tether too close to the rotors or the arm at t = 0.0 s, (-1.00, 0.00, 0.30) m: -0.173 m between line and rotors or arm, tether.clearance_min_m is 0.01 (the anchor is seen -23 deg below the horizon); fly higher"),
-    (["mission.catch=null", "vehicle.airframe.thrust_max_n=42"], "needs too much thrust at t = 0.8 s, (-1.00, 0.00, 0.37) m: 35.6 N with 0.4 kg of payload and the tether's weight, 33.6 N allowed (0.8 of 42 N); allow more time or carry less"),
-    (["mission.limits.thrust_share_max=1", "vehicle.airframe.thrust_max_n=36"], "34.6 N with 0.3 kg of payload and the tether's weight, 32.4 N allowed (0.9 of 36 N)"),
+    (["vehicle.tether.anchor_world_m=[0, -1.2, 0.95]"], "phase 'take-off' brings the tether too close to the rotors or the arm at t = 0.0 s, (-1.00, 0.00, 0.30) m: -0.173 m between line and rotors or arm (tether.clearance_min_m is 0.01; the anchor is seen -23 deg below the horizon); fly higher"),
+    (["mission.catch=null", "vehicle.airframe.thrust_max_n=42"], "needs too much thrust at t = 0.8 s, (-1.00, 0.00, 0.37) m: 35.6 N with 0.4 kg of payload and the tether's weight (limit 33.6 N: 0.8 of 42 N); allow more time or carry less"),
+    (["mission.limits.thrust_share_max=1", "vehicle.airframe.thrust_max_n=36"], "34.6 N with 0.3 kg of payload and the tether's weight (limit 32.4 N: 0.9 of 36 N)"),
     (["vehicle.tether.load_rating_n=50"], "vehicle 'tarot650-2r': tether.load_rating_n is 50 N, but the rotors pull with 60 N (airframe.thrust_max_n); the tether must hold them: use a stronger one"),
     (["vehicle.tether.length_m=0.2"], "vehicle 'tarot650-2r': the tether reaches 0.00 m (length_m 0.2 minus margin_m 0.25 and the lever of attachment_body_m), but the room begins"),
     (["mission.catch.expected_at_m=[0, 0.5]"], "mission 'catch': expects the payload at (0, 0.5) m, but never comes closer than 0.50 m; change catch.expected_at_m or the lines"),
@@ -145,7 +145,7 @@ def test_unflyable_mission_is_refused(overrides: list[str], line: str) -> None:
     [
         (
             {"start_position_world_m": (-1.0, 0.3, 0.3)},
-            "mission 'catch': starts at (-1, 0) m, but the vehicle is at (-1.00, 0.30) m, 0.30 m away, 0.15 m allowed; "
+            "mission 'catch': starts at (-1, 0) m, but the vehicle is at (-1.00, 0.30) m, 0.30 m away (tolerance 0.15 m); "
             "carry it there or change start.position_m",
         ),
         (
@@ -155,13 +155,13 @@ def test_unflyable_mission_is_refused(overrides: list[str], line: str) -> None:
         ),
         (
             {"start_yaw_rad": -1.0},
-            "mission 'catch': starts at a yaw of 0 deg, but the vehicle is at -57 deg, 15 deg of difference allowed; "
-            "turn it or change start.yaw_deg",
+            "mission 'catch': starts at a yaw of 0 deg, but the vehicle's yaw is -57 deg (tolerance 15 deg); "
+            "turn the vehicle or change start.yaw_deg",
         ),
         (
             {"start_arm_rad": (2.0, 2.44)},
-            "mission 'catch': starts with the arm at (165, 140) deg, but it is at (115, 140) deg, 10 deg of difference "
-            "allowed; move it there by hand",
+            "mission 'catch': starts with the arm at (165, 140) deg, but it is at (115, 140) deg "
+            "(tolerance 10 deg); move it there by hand",
         ),
     ],
 )

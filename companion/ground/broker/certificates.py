@@ -18,7 +18,7 @@ _EARLY = datetime.timedelta(days=1)
 
 
 class CertificateError(Exception):
-    """A certificate or key cannot be used. The text is one line."""
+    """A certificate or key cannot be used. The exception's text is one line."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -55,7 +55,7 @@ def make_server(authority: Pair, hosts: Sequence[str], days: int, now: datetime.
         now: current time with time zone.
 
     Raises:
-        CertificateError: the authority is invalid, its key does not match, or it expires earlier.
+        CertificateError: the authority is invalid, its key does not match, or it expires before the new certificate would.
     """
     issuer, signer = _opened(authority)
     until = now + datetime.timedelta(days=days)
@@ -80,7 +80,7 @@ def certificate_hosts(certificate: bytes) -> list[str]:
     """Return the names and addresses in a certificate (PEM).
 
     Raises:
-        CertificateError: it is not a certificate with host names.
+        CertificateError: `certificate` is not a certificate with host names.
     """
     try:
         parsed = x509.load_pem_x509_certificate(certificate)

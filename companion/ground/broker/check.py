@@ -20,7 +20,7 @@ ANSWER_S = 5.0
 
 
 class CheckError(Exception):
-    """The broker is unreachable or refuses the connection. The text is one line."""
+    """The broker is unreachable or refuses the connection. The exception's text is one line."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,7 +44,7 @@ _HASH_DEADLINE_S = 60.0
 
 
 class SetupError(Exception):
-    """A tool is missing or fails. The text is one line."""
+    """A tool is missing or fails. The exception's text is one line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def create(folder: Path, users: BrokerUsers, now: datetime.datetime) -> None:
     """Create the folder completely or not at all.
 
     Args:
-        folder: absolute path; must not exist, or be empty.
+        folder: absolute path; must not exist or must be empty.
         users: hosts and users.
         now: with time zone.
 
@@ -102,7 +102,7 @@ def renew_certificate(folder: Path, hosts: Sequence[str], days: int, now: dateti
         now: with time zone.
 
     Returns:
-        The hosts.
+        The hosts in the new certificate.
 
     Raises:
         ConfigError: files are missing or invalid; nothing was changed.

@@ -94,7 +94,7 @@ class Connection(aiomqtt.Client):
             raise
 
     async def subscribe_topic(self, topic: str, qos: int) -> str | None:
-        """Subscribe. Return None, or the reason of the broker's refusal.
+        """Subscribe. Return None, or the reason why the broker refuses.
 
         Raises:
             aiomqtt.MqttError: no answer.

@@ -37,7 +37,7 @@ M = TypeVar("M")
 
 
 class MessageError(ValueError):
-    """The payload is not a valid message. The text is one line."""
+    """The payload is not a valid message. The exception's text is one line."""
 
 
 class Topic(Enum):

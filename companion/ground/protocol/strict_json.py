@@ -12,15 +12,15 @@ _NUMBER_CHARACTERS_MAX = 40
 
 
 class StrictJsonError(ValueError):
-    """The payload is not valid strict JSON. The text is one line."""
+    """The payload is not valid strict JSON. The exception's text is one line."""
 
 
 def parse(payload: bytes) -> Any:
     """Return the data of a payload.
 
     Raises:
-        StrictJsonError: the payload is not UTF-8 or not JSON, is nested too deeply, repeats a field name, or holds a number that is
-            not finite or beyond `NUMBER_MAX`.
+        StrictJsonError: the payload is not UTF-8 or not JSON, is nested too deeply, repeats a field name, or contains a number that
+            is non-finite or exceeds `NUMBER_MAX` in magnitude.
     """
     try:
         text = payload.decode("utf-8")

@@ -36,7 +36,7 @@ def signer_of(
         view_only: whether commands are disabled.
 
     Raises:
-        ConfigError: the file or the name is wrong.
+        ConfigError: the file cannot be used, or it does not contain the name.
     """
     if view_only:
         return "this monitor was started with --view-only"

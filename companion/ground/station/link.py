@@ -18,15 +18,15 @@ ANSWER_S = 2.0
 _PAUSE_MIN_S, _PAUSE_MAX_S = 0.2, 2.0
 _TOPIC_ROOM_BYTES = 1024
 _PERMANENT_REASON_CODES = frozenset({128, 132, 133, 134, 135, 138, 140, 144, 149, 156, 157})
-"""CONNACK reason codes (MQTT 5, 3.2.2.2) that a retry does not change: bad login, not authorised, banned, ..."""
+"""CONNACK reason codes (MQTT 5, 3.2.2.2) after which retrying is pointless: bad login, not authorised, banned, ..."""
 
 
 class LinkError(Exception):
-    """A message could not be published. The text is one line."""
+    """A message could not be published. The exception's text is one line."""
 
 
 class BrokerRefused(Exception):
-    """The broker permanently refuses the connection, so a retry is useless. The text is one line for the user."""
+    """The broker permanently refuses the connection, so retrying is pointless. The exception's text is one line for the user."""
 
 
 class Link:
@@ -59,7 +59,7 @@ class Link:
         """Stay connected.
 
         Raises:
-            BrokerRefused: the first connection was refused for a permanent reason. Later refusals are retried.
+            BrokerRefused: the first connection was refused for a permanent reason. After a later refusal the link tries again.
         """
         pause_s = _PAUSE_MIN_S
         while True:

@@ -20,7 +20,7 @@ from companion.model.types import Vec3
 from companion.plugins import PluginError
 
 STREAMS_MAX = 12_000
-"""Max number of stream messages: ten minutes at 20 Hz; longer logs are shown at a lower rate."""
+"""Maximum number of stream messages: ten minutes at 20 Hz; longer logs are shown at a lower rate."""
 TICKS_MAX = 60_000
 _GZIP_LEVEL = 5
 
@@ -43,7 +43,7 @@ def read_for_page(path: Path, number: int) -> ReplayLog:
         number: index of this log on the page.
 
     Raises:
-        LogError: one line: the log is missing, damaged, not of a flight, or of a different version.
+        LogError: one line: the log is missing, damaged, not that of a flight, or of a different version.
     """
     log = FlightLog.read(path, ticks_max=TICKS_MAX)
     if not log.inputs:
@@ -56,7 +56,8 @@ def read_for_page(path: Path, number: int) -> ReplayLog:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise LogError(
-            f"{path}: its configuration does not fit this version ({where}: {first['msg']}); it was written by {writer(log.metadata)}"
+            f"{path}: its configuration is not compatible with this version ({where}: {first['msg']}); "
+            f"it was written by {writer(log.metadata)}"
         ) from None
     except PluginError as error:
         raise LogError(f"{path}: {error}") from None

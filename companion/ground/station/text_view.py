@@ -93,7 +93,7 @@ def stale(vehicle: Vehicle, now_s: float) -> bool:
 
 
 def status_line(vehicle: Vehicle, now_s: float) -> str:
-    """Return one vehicle in one line, for pipes and logs."""
+    """Return the state of one vehicle as one line, for pipes and logs."""
     parts = [printable(vehicle.name), status_word(vehicle, now_s)[0]]
     stream = vehicle.stream
     if stream is not None and not vehicle.ended:

@@ -64,7 +64,7 @@ class ProvenState:
     clock: FlightClock = field(default_factory=FlightClock)
 
     def live(self, now_s: float) -> bool:
-        """Whether proven messages arrive."""
+        """Whether proven messages are arriving."""
         return now_s - self.received_s < LIVE_S
 
     def now_ms(self, now_s: float) -> int:
@@ -98,7 +98,7 @@ class Vehicle:
         return None if self.stream_received_s is None else now_s - self.stream_received_s
 
     def live(self, now_s: float) -> bool:
-        """Whether its stream is arriving."""
+        """Whether the vehicle's stream is arriving."""
         age_s = self.stream_age_s(now_s)
         return age_s is not None and age_s < LIVE_S
 
@@ -171,7 +171,7 @@ class VehicleTracker:
         )
 
     def proven(self, now_s: float) -> list[str]:
-        """Return the names of vehicles whose proven messages arrive."""
+        """Return the names of the vehicles whose proven messages are arriving."""
         return sorted(
             name for name, known in self.vehicles.items() if known.proven is not None and known.proven.live(now_s)
         )

@@ -2,15 +2,15 @@
 
 WebSocket at ``/ws``, JSON text. Server to page:
 
-    {"kind": "hello", "version", "can_command", "operator", "why_not", "replay"}     first message; again if the token came late
+    {"kind": "hello", "version", "can_command", "operator", "why_not", "replay"}     first message; again if the token was late
     {"kind": "broker", "connected", "text", "rejected"?, "rejected_text"?}           connection to the broker; rejected messages
     {"kind": "state" | "scene" | "preflight" | "events" | "ack", "vehicle", "data"}  records of `companion.ground.protocol.messages`
     {"kind": "stream", "vehicle", "age_s", "data"}                                   age_s: delay until it reached the server
-    {"kind": "sent", "vehicle", "command", "nonce"}                                  to the commanding viewer; its `ack` has the nonce
-    {"kind": "refused", "vehicle", "command", "text"}                                to the commanding viewer
+    {"kind": "sent", "vehicle", "command", "nonce"}                                  to the commanding viewer; its `ack` has the
+    nonce {"kind": "refused", "vehicle", "command", "text"}                                to the commanding viewer
 
-Page to server: ``{"kind": "token", "token"}`` first (empty without one: view only), then ``{"kind": "command", "vehicle", "command",
-"hold"?}``. With "resume", `hold` is the number of the hold that was displayed; without it, the current hold.
+Page to server: ``{"kind": "token", "token"}`` first (empty without one: view only), then ``{"kind": "command", "vehicle",
+"command", "hold"?}``. With "resume", `hold` is the number of the hold that was displayed; without it, the current hold.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ _VIEW_ONLY_TEXT = "commands from other computers need TLS (--cert and --key) or 
 
 
 class WebError(Exception):
-    """The server cannot run. The text is one line for the user."""
+    """The server cannot run. The exception's text is one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)

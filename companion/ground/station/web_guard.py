@@ -38,7 +38,7 @@ def new_token() -> str:
 
 
 def same_token(given: object, token: str) -> bool:
-    """Return whether the token is equal; compare in constant time."""
+    """Return whether the given value equals the token; the comparison takes constant time."""
     return isinstance(given, str) and hmac.compare_digest(given.encode("utf-8", "replace"), token.encode())
 
 

@@ -1,7 +1,7 @@
 """Health of each device according to the limits in the vehicle file, with the measured value. Pure.
 
-The limits are those of the safety monitors (`companion.safety.rules`): a value that lands the vehicle or disables a device is BAD,
-one that causes a warning is WARN. The health is for display only; the monitors act on their own.
+The limits are those of the safety monitors (`companion.safety.rules`): a value for which they land the vehicle or disable a device
+is BAD, one that causes a warning is WARN. The health is for display only; the monitors act on their own.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class WorstAges:
     """Age of the oldest of position, attitude and IMU sample from PX4."""
     heartbeat_s: float = UNKNOWN_S
     mocap_s: float = UNKNOWN_S
-    """Age since the datagram's arrival."""
+    """Time since the datagram arrived."""
     arm_s: float = UNKNOWN_S
     force_s: float = UNKNOWN_S
     lateness_s: float = UNKNOWN_S

@@ -34,7 +34,7 @@ from companion.model.types import ControlLog, Inputs, Outputs, Quat, Reference, 
 STREAM_PERIOD_S = 0.05
 """Period of the stream messages over MQTT."""
 _TOUCHDOWN = Stage.TOUCHDOWN.value
-"""Phases on the ground, in which a reference below the floor is not a tracking error."""
+"""Phase after touchdown, in which a reference below the floor is not a tracking error."""
 WAITS_FOR_START = Stage.READY.value
 """`Outputs.phase` of a flight that is ready and waits for START."""
 TEXT_MAX = 300
@@ -235,7 +235,7 @@ def replay(
         session: any session id.
         epoch_offset_s: wall clock when the flight clock was zero.
         rate_hz: rate of the messages; halved until a long flight fits into `max_records`.
-        max_records: max number of messages, at least 2.
+        max_records: maximum number of messages, at least 2.
         max_events: number of newest events to keep.
 
     Returns:

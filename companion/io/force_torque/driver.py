@@ -33,13 +33,13 @@ _MODEL: Final = "RFT60"
 class RobotousForceTorque:
     """RFT60-HA01 in continuous output; implements `companion.io.protocols.ForceTorque`.
 
-    The port is read from the event loop: 200 packets/s of 19 bytes need no thread. Samples are raw, in the sensor frame; the user of a
-    sample removes the bias. When the sensor falls silent or the port vanishes, `latest()` becomes stale and nothing is raised.
+    The port is read from the event loop: 200 packets/s of 19 bytes need no thread. Samples are raw, in the sensor frame; the user
+    of a sample removes the bias. When the sensor falls silent or the port vanishes, `latest()` becomes stale and nothing is raised.
 
     Args:
         device: port, rate and the force above which a sample counts as overloaded.
         clock: the flight clock.
-        answer_timeout_s: timeout of each reply of the sensor, and of the first samples.
+        answer_timeout_s: timeout for each reply of the sensor, and for the first samples.
     """
 
     def __init__(self, device: ForceDevice, clock: Clock, *, answer_timeout_s: float = 2.0) -> None:
@@ -141,7 +141,7 @@ class RobotousForceTorque:
         if number in (errno.EBUSY, errno.EAGAIN):
             return "in use by another program; close it (lsof names it)"
         if number in (errno.EACCES, errno.EPERM):
-            return "no permission; add your user to the group dialout and log in again"
+            return "no permission; add your user to the dialout group and log in again"
         return f"not usable as a serial port ({error}); set devices.force.port to the sensor's port"
 
     async def _set_rate(self) -> None:
@@ -162,8 +162,8 @@ class RobotousForceTorque:
         return rft.RATE_CODES.get((await self._ask(Command.GET_RATE))[1])
 
     async def _ask(self, command: Command, parameter: int = 0, repeat_s: float | None = None) -> bytes:
-        """Send one request and return its reply. The first request is repeated, because half a command of an earlier run may be in the
-        sensor's buffer and corrupt it.
+        """Send one request and return its reply. The first request is repeated, because half a command from an earlier run may be
+        in the sensor's buffer and corrupt the request.
         """
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + self._answer_timeout_s

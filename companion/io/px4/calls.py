@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from companion.io.px4.link import device_error
 
 NATIVE_CALL_DEADLINE_S = 5.0
-"""MAVSDK sends a command or parameter request up to six times at intervals of 0.5 s."""
+"""Deadline for a native call. MAVSDK sends a command or parameter request up to six times at intervals of 0.5 s."""
 
 _T = TypeVar("_T")
 

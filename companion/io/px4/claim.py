@@ -36,11 +36,11 @@ class LinkClaim:
     """This process's hold on a link, besides MAVSDK's own descriptor.
 
     A serial port is locked with flock on the device itself, so that every name of the device counts and pyserial's `exclusive` mode
-    conflicts with the lock. A `udpin` port is bound without SO_REUSEADDR and only then shared with MAVSDK, which sets that option and
-    would join any program on the port. MAVSDK's socket is connected to PX4's address once that is verified; from then on the kernel
-    delivers datagrams of all other senders to the socket held here. When PX4 is silent for REPIN_SILENCE_S and another port of the same
-    IPv4 address sends a HEARTBEAT of its system, MAVSDK's socket is connected to that port, because a restarted router sends from
-    another one.
+    conflicts with the lock. A `udpin` port is bound without SO_REUSEADDR and only then shared with MAVSDK, which sets that option
+    and would join any program on the port. MAVSDK's socket is connected to PX4's address once that is verified; from then on the
+    kernel delivers datagrams of all other senders to the socket held here. When PX4 is silent for REPIN_SILENCE_S and another port
+    of the same IPv4 address sends a HEARTBEAT with PX4's system id, MAVSDK's socket is connected to that port, because a restarted
+    router sends from a new one.
 
     Args:
         address: as in `devices.autopilot.address`, checked.
@@ -94,11 +94,12 @@ class LinkClaim:
 
     @contextlib.asynccontextmanager
     async def calling(self, own: tuple[int, int]) -> AsyncIterator[None]:
-        """While the context is open, send PX4 a HEARTBEAT from the port of a `udpin` link every second until MAVSDK has received one
-        from PX4.
+        """While the context is open, send PX4 a HEARTBEAT from the port of a `udpin` link every second until MAVSDK has received
+        one from PX4.
 
         PX4 on Ethernet may broadcast until it has received a partner's message (MAV_x_BROADCAST), and MAVSDK's connected socket
-        receives no broadcasts. Several are needed, because PX4 accepts no partner in the first 3 s after it has opened its port.
+        receives no broadcasts. Several HEARTBEATs are needed, because PX4 accepts no partner in the first 3 s after it has opened
+        its port.
 
         Args:
             own: system and component id of MAVSDK.

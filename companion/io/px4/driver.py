@@ -53,7 +53,7 @@ from companion.runtime.clock import Clock
 
 _CONNECT_DEADLINE_S = 5.0
 _HEARTBEAT_DEADLINE_S = 5.0
-"""PX4 sends one per second."""
+"""Deadline for PX4's heartbeat, which is sent once per second."""
 _CLOSE_DEADLINE_S = 4.0
 # One NaN makes PX4 use EKF2_EVP_NOISE and EKF2_EVA_NOISE instead of a covariance.
 _COVARIANCE_FROM_PARAMS = Covariance([float("nan")])
@@ -99,7 +99,7 @@ class MavsdkAutopilot:
         """Open the link, find PX4, request the streams, and set a global origin if PX4 has none and is not armed.
 
         Raises:
-            DeviceError: with one line for each kind of failure; nothing stays open.
+            DeviceError: the link could not be opened or set up; the text gives the reason, and nothing stays open.
         """
         address = self._device.address
         check_address(address)

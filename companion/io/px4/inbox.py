@@ -174,7 +174,7 @@ class Inbox:
             self._requests.hear(json.loads(message.fields_json), self._clock())
 
     def _on_heartbeat(self, message: Any, _: Any) -> None:
-        # A gimbal or camera behind the same system id has a heartbeat of its own.
+        # A gimbal or camera with the same system id has a heartbeat of its own.
         if message.component_id == messages.MAV_COMP_ID_AUTOPILOT1:
             self._heartbeat = (self._clock(), message.fields_json)
             self._after_heartbeat()

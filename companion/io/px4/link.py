@@ -40,7 +40,7 @@ def device_error(address: str, expected: str, found: str, fix: str) -> DeviceErr
 
 def no_heartbeat(address: str, timeout_s: float) -> DeviceError:
     """Return the error for a link without an autopilot's heartbeat."""
-    fix = "power the autopilot, check cable, baud or PX4's MAVLink target address and port"
+    fix = "power the autopilot; check the cable, and the baud rate or PX4's MAVLink target address and port"
     return device_error(address, f"a PX4 heartbeat within {timeout_s:g} s", "none", fix)
 
 
@@ -49,8 +49,8 @@ def check_address(address: str) -> None:
     reason.
 
     Raises:
-        DeviceError: syntax, port range, the local address is busy or not one of this computer, or the serial port is missing or not
-            accessible.
+        DeviceError: the syntax or the port is invalid, the local address is busy or not one of this computer, or the serial port is
+            missing or not accessible.
     """
     match = _ADDRESS.fullmatch(address)
     if match is None:
@@ -123,7 +123,7 @@ def bind_alone(address: str, host: str, port: int, kind: socket.SocketKind) -> s
         if error.errno == errno.EADDRINUSE:
             fix = "stop that program (another companion, QGroundControl, a MAVLink router?) or use another port"
             raise device_error(address, f"port {port} to be free", "another program on it", fix) from None
-        fix = "use an address of this computer, 0.0.0.0 for all"
+        fix = "use an address of this computer, or 0.0.0.0 for all"
         raise device_error(address, f"a local address in {host}", error.strerror or str(error), fix) from None
     return bound
 
@@ -147,7 +147,7 @@ def add_connection(mavsdk: Mavsdk, address: str, forwarding: bool = False) -> An
         if ConnectionResult.BAUDRATE_UNKNOWN.name in str(error):
             fix = "use a baud rate that the port supports, 921600 for PX4's TELEM2"
         else:
-            fix = "check cable, address and that no other program holds it"
+            fix = "check the cable and the address, and that no other program holds it"
         raise device_error(address, "to open the connection", found, fix) from None
 
 
@@ -155,7 +155,7 @@ async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any
     """Return the first MAVSDK system with a heartbeat, if it is PX4.
 
     Raises:
-        DeviceError: no heartbeat within `timeout_s`, or only that of another autopilot.
+        DeviceError: no heartbeat within `timeout_s`, or only one of an autopilot other than PX4.
     """
     loop = asyncio.get_running_loop()
     found: asyncio.Future[Any] = loop.create_future()
@@ -214,8 +214,8 @@ def pin_new_udp(before: Container[int], peer: tuple[str, int]) -> tuple[socket.s
         peer: IPv4 address and port.
 
     Returns:
-        A second descriptor of the socket, by which it can be connected to another peer, and its local port. The port is free once both
-            descriptors are closed.
+        A second descriptor of the socket, by which it can be connected to another peer, and the socket's local port. The port is
+        free once both descriptors are closed.
 
     Raises:
         OSError: the socket is not found, or cannot be connected.

@@ -81,7 +81,7 @@ _COMMANDS: dict[AutopilotRequest, tuple[int, float, float]] = {
 
 
 def heartbeat_state(heartbeat_json: str) -> tuple[bool, FlightMode, int]:
-    """Return armed flag, flight mode and MAV_STATE of a HEARTBEAT's fields (`base_mode`, `custom_mode`, `system_status`)."""
+    """Return the armed flag, flight mode and MAV_STATE from a HEARTBEAT's fields (`base_mode`, `custom_mode`, `system_status`)."""
     fields = json.loads(heartbeat_json)
     base_mode = int(fields["base_mode"])
     armed = bool(base_mode & MAV_MODE_FLAG_SAFETY_ARMED)
@@ -190,7 +190,8 @@ def vision_ned(pose: MocapPose) -> tuple[Vec3, Vec3]:
 
 
 def command(request: AutopilotRequest) -> tuple[int, float, float]:
-    """Return MAV_CMD and its first two parameters, the others are 0: DO_SET_MODE (176), COMPONENT_ARM_DISARM (400) or NAV_LAND (21).
+    """Return MAV_CMD and its first two parameters (the others are 0): DO_SET_MODE (176), COMPONENT_ARM_DISARM (400) or NAV_LAND
+    (21).
 
     Raises:
         KeyError: for `AutopilotRequest.NONE`, which is not a command.

@@ -58,7 +58,7 @@ async def ensure_origin(
 
 
 async def _has_origin(address: str, calls: NativeCalls, direct: Any, system_id: int) -> bool:
-    expected = "PX4 to say whether it has a global origin"
+    expected = "PX4 to report whether it has a global origin"
     command = MavlinkMessage("COMMAND_LONG", fields_json=request_message_json(GPS_GLOBAL_ORIGIN_ID, system_id))
     try:
         ack = await calls.run(expected, NATIVE_CALL_DEADLINE_S, direct.send_command, command)

@@ -1,8 +1,8 @@
 """Reads many of PX4's parameters with a window of requests, and writes one value with verification.
 
-PARAM_REQUEST_READ by name is sent through MavlinkDirect, several at a time, because MAVSDK's Param plugin requests them one after the
-other and spends seconds on each name that PX4 does not have (PX4 1.16 does not answer those). A parameter counts as absent if PX4 does
-not answer although it answers requests that were sent later.
+PARAM_REQUEST_READ by name is sent through MavlinkDirect, several at a time, because MAVSDK's Param plugin requests them one after
+the other and spends seconds on each name that PX4 does not have (PX4 1.16 does not answer requests for them). A parameter counts as
+absent if PX4 does not answer although it answers requests that were sent later.
 """
 
 from __future__ import annotations
@@ -94,8 +94,8 @@ class ParamQueries:
 def value_of(fields: dict[str, Any]) -> tuple[str, Value | None]:
     """Return name and value of a PARAM_VALUE's fields, an int where PX4 stores one.
 
-    PX4 sends the bytes of an INT32 in place of the float. The value is None where those are a NaN (negative numbers), which JSON cannot
-    represent.
+    PX4 sends the bytes of an INT32 in place of the float. The value is None if those bytes are a NaN (as for small negative
+    numbers), which JSON cannot represent.
     """
     name, wire = str(fields["param_id"]), fields["param_value"]
     if wire is None:

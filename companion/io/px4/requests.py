@@ -1,7 +1,7 @@
 """Turns requests of the core into commands for PX4, paced over time. Pure: time is an argument, nothing is sent here.
 
-The core repeats a request in every tick until the status shows it done. The queue turns that into one command at a time per kind of
-request, with pauses. One kind never waits for another, so LAND is sent even while ARM hangs.
+The core repeats a request in every tick until the status shows its effect. The queue turns that into one command at a time per kind
+of request, with pauses. One kind never waits for another, so LAND is sent even while ARM hangs.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ class RequestQueue:
         self._texts = Texts()
 
     def claim(self, request: AutopilotRequest, now_s: float) -> bool:
-        """Return whether to send this request's command now and to report its result by `answer`. `now_s` is on the flight clock."""
+        """Return whether to send this request's command now; if so, report its result with `answer`. `now_s` is on the flight
+        clock.
+        """
         if request is AutopilotRequest.NONE:
             return False
         with self._lock:

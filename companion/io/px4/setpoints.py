@@ -34,7 +34,7 @@ class SetpointPath(Protocol):
 
 
 def setpoint_path(kind: Literal["direct", "offboard"], system: Any, direct: MavlinkDirect) -> SetpointPath:
-    """Return the path selected by `devices.autopilot.setpoint_path` to a MAVSDK system."""
+    """Return the path to a MAVSDK system that `devices.autopilot.setpoint_path` selects."""
     if kind == "offboard":
         return OffboardSetpoints(system)
     return DirectSetpoints(direct, int(system.get_system_id()))

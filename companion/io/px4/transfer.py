@@ -36,13 +36,13 @@ class Difference:
 
     @property
     def reboot(self) -> bool | None:
-        """Return whether writing it takes effect only after a reboot, or None if that is not known."""
+        """Return whether a new value takes effect only after a reboot, or None if that is not known."""
         wanted = BY_NAME.get(self.name)
         return None if wanted is None else wanted.reboot
 
     @property
     def type_problem(self) -> str | None:
-        """Return why it cannot be written (the types of file and PX4 differ), or None if it can."""
+        """Return why the value cannot be written (the types in the file and in PX4 differ), or None if it can."""
         if isinstance(self.px4, int) is isinstance(self.file, int):
             return None
         names = ("a REAL32", "an INT32")

@@ -7,7 +7,7 @@ import os
 import socket
 
 REPIN_SILENCE_S = 1.0
-"""Silence after which PX4 may be sought at another port of its address; it sends hundreds of datagrams per second."""
+"""Silence after which PX4 is looked for at other ports of its address; PX4 sends hundreds of datagrams per second."""
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _ANY_PEER = bytes(16)

@@ -1,8 +1,9 @@
 """Extracts MAVLink frames to and from a ground station from datagrams, checks them, and passes or refuses them. Pure: no socket, no
 clock.
 
-A message from the ground passes only as a whole frame with a valid checksum, of a kind that ground stations need, and never with the
-vehicle's own ids, because MAVSDK does not distinguish the connections of messages (`docs/qgroundcontrol.md`).
+A message from the ground passes only as a whole frame with a valid checksum, of a kind that ground stations need, and never with
+the vehicle's own ids, because MAVSDK does not distinguish messages by the connection on which they arrive
+(`docs/qgroundcontrol.md`).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ UP_RATE_HZ = 100.0
 UP_BURST = 100
 """Largest burst of messages from the ground; a ground station with a joystick needs 60 per second."""
 GROUND_SYSTEMS_MAX = 4
-"""Largest number of system ids, because MAVSDK keeps a record of every one."""
+"""Largest number of ground stations' system ids. It is limited because MAVSDK keeps a record of each."""
 STREAM_RATE_HZ = 10.0
 """Rate of each fast stream to the ground; the companion requests up to 250 Hz from PX4."""
 
@@ -173,8 +174,8 @@ class AutopilotHeartbeat:
 def autopilot_heartbeat(datagram: bytes) -> AutopilotHeartbeat | None:
     """Return the HEARTBEAT of an autopilot with a correct checksum in the datagram, or None if there is none.
 
-    Unknown senders choose the content, and the control loop waits for this call. A datagram longer than one Ethernet frame is therefore
-    ignored; of others only the first 32 frames are read and the first two checksums computed.
+    Unknown senders choose the content, and the control loop waits for this call. A datagram longer than one Ethernet frame is
+    therefore ignored; in others only the first 32 frames are read and the first two checksums computed.
     """
     if len(datagram) > _PROOF_MAX_BYTES:
         return None

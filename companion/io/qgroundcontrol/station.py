@@ -1,9 +1,9 @@
 """Link to QGroundControl or any other MAVLink ground station: forwards MAVLink between it and PX4.
 
-MAVSDK forwards between PX4's connection and a second one on loopback. It does not distinguish the connections of messages: a HEARTBEAT
-with PX4's ids from the ground would count as PX4's. The second connection therefore ends at a process
-(`companion.io.qgroundcontrol.relay`) that blocks such messages and also sends the companion's own texts. A call here costs the control
-tick one send on a local socket.
+MAVSDK forwards between PX4's connection and a second one on loopback. It does not distinguish messages by the connection on which
+they arrive: a HEARTBEAT with PX4's ids from the ground would count as PX4's. The second connection therefore ends at a process
+(`companion.io.qgroundcontrol.relay`) that blocks such messages and also sends the companion's own texts. A call here costs the
+control tick one send on a local socket.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def check_address(address: str) -> tuple[str, int]:
 
 
 class GroundStation:
-    """Driver of the link. Enter it after the autopilot's driver, which must have been made with `forwarding`, and leave it before that
-    one.
+    """Driver of the link. Enter it after the autopilot's driver, which must have been made with `forwarding`, and leave it before
+    that driver.
 
     Args:
         address: `udpout://HOST:PORT`.

@@ -71,8 +71,8 @@ def values(inputs: Inputs, outputs: Outputs) -> dict[str, float]:
 
 
 class Texts:
-    """STATUSTEXTs at a rate for a slow link: bursts of 10, then 5 per second, the most severe first. Dropped texts are counted and
-    reported.
+    """STATUSTEXTs at a rate that suits a slow link: bursts of 10, then 5 per second, the most severe first. Dropped texts are
+    counted and reported.
     """
 
     def __init__(self) -> None:

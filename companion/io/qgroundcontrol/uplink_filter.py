@@ -1,7 +1,7 @@
 """Filter of messages from a ground station to the vehicle. Pure: time is an argument.
 
 While PX4 is armed only listed messages pass: those that read, and those that end or pause the flight (LAND, HOLD, a pilot's mode, a
-disarm that PX4 itself may refuse). Everything else is refused until PX4 is disarmed, among it a forced disarm, a restart, flight
+disarm that PX4 itself may refuse). Everything else is refused until PX4 is disarmed, including a forced disarm, a restart, flight
 termination, parameters, missions, files, and RETURN, which climbs although the vehicle is tethered.
 """
 
@@ -29,7 +29,7 @@ from companion.io.qgroundcontrol.frames import (
 )
 
 HEARTBEAT_MAX_AGE_S = 3.0
-"""PX4 sends one heartbeat per second. Without a fresh one PX4 counts as armed."""
+"""Max age of PX4's heartbeat, which is sent once per second. Without a fresh one PX4 counts as armed."""
 
 ARMED_MESSAGES = frozenset(
     getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
@@ -93,7 +93,7 @@ class UplinkFilter:
 
     Args:
         vehicle_system: MAVLink system id of PX4, which is also the companion's.
-        while_armed: while PX4 is armed pass everything that passes while it is not, except SERIAL_CONTROL.
+        while_armed: while PX4 is armed, pass everything that passes while it is disarmed, except SERIAL_CONTROL.
         console: pass SERIAL_CONTROL while PX4 is not armed.
     """
 
@@ -118,7 +118,7 @@ class UplinkFilter:
 
     def _objection(self, frame: Frame | None, now_s: float) -> str | None:
         if frame is None or not frame.intact():
-            return "no MAVLink"
+            return "not MAVLink"
         if frame.system in (0, self._vehicle_system):
             return f"sent with the vehicle's system id {frame.system}"
         if frame.message_id not in GROUND_MESSAGES:
