@@ -25,6 +25,10 @@ _SOURCE_TREE = Path(__file__).parents[1]
 class PluginError(Exception):
     """A plug-in cannot be used. The text is one line that names the plug-in and the reason."""
 
+    def __init__(self, plugin: object, reason: str) -> None:
+        super().__init__(f"{plugin}: {reason}")
+        self.reason = reason
+
 
 @dataclass(frozen=True)
 class Plugin:
@@ -54,7 +58,7 @@ class Plugin:
 
     def error(self, reason: str) -> PluginError:
         """Return the error that this plug-in cannot be used for a reason."""
-        return PluginError(f"{self}: {reason}")
+        return PluginError(self, reason)
 
 
 def one_line(error: BaseException) -> str:
@@ -81,7 +85,7 @@ def find(group: str, name: str) -> Plugin:
     """
     plugins = installed(group)
     if name not in plugins:
-        raise PluginError(f"{KINDS[group]} '{name}' is not installed; installed: {', '.join(plugins) or 'none'}")
+        raise PluginError(f"{KINDS[group]} '{name}'", f"is not installed; installed: {', '.join(plugins) or 'none'}")
     return plugins[name]
 
 

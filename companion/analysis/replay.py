@@ -12,6 +12,7 @@ from companion import __version__
 from companion.analysis.log import FlightLog, LogError, writer
 from companion.model.codec import differences, fingerprint, from_packet, to_packet
 from companion.model.types import Inputs, Outputs, Sent
+from companion.plugins import CONTROL_LAWS, installed
 
 
 class Core(Protocol):
@@ -51,7 +52,7 @@ def replay(log: FlightLog, make_core: Callable[[str], Core]) -> ReplayResult:
         make_core: makes the core from the recorded configuration (JSON).
 
     Raises:
-        LogError: no configuration, a different version, an empty log, or missing ticks.
+        LogError: no configuration, a different version of the companion or of the control law, an empty log, or missing ticks.
     """
     config_json = check_replayable(log)
     try:
@@ -89,6 +90,7 @@ def check_replayable(log: FlightLog) -> str:
             f"{log.path}: the fields of its records differ from those of this version; it was written by "
             f"{writer(log.metadata)}; replay it with that version"
         )
+    _check_law(log)
     config_json = log.config_json
     if config_json is None:
         raise LogError(f"{log.path}: has no configuration (metadata record 'config'); it cannot be replayed")
@@ -103,6 +105,19 @@ def check_replayable(log: FlightLog) -> str:
         )
         raise LogError(f"{log.path}: {what} (dropped by the recorder); the core's state cannot be rebuilt")
     return config_json
+
+
+def _check_law(log: FlightLog) -> None:
+    flight = log.metadata.get("flight", {})
+    if "law_distribution" not in flight:  # an older log, of one of the companion's own laws
+        return
+    law, distribution, version = flight["law"], flight["law_distribution"], flight["law_version"]
+    plugin = installed(CONTROL_LAWS).get(law)
+    if plugin is None or (plugin.distribution, plugin.version) != (distribution, version):
+        found = "it is not installed" if plugin is None else f"{plugin.distribution} {plugin.version} is installed"
+        raise LogError(
+            f"{log.path}: was flown by control law '{law}' of {distribution} {version}, but {found}; install that version to replay it"
+        )
 
 
 def flight_core(config_json: str) -> Core:

@@ -42,7 +42,7 @@ _WITH_MODULES = (
         "monitor",
         "command",
     ),
-    *("broker", "report", "init"),
+    *("broker", "report", "init", "plugins"),
 )
 """Commands whose parser is in `companion.cli.NAME`."""
 

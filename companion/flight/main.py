@@ -18,6 +18,7 @@ import time
 import traceback
 from pathlib import Path
 
+from companion import plugins
 from companion.config.loader import FlightConfig
 from companion.core.flight_core import FlightCore
 from companion.flight.command_effect import effect_of
@@ -289,6 +290,7 @@ async def fly(
     clock = flight_clock(origin_s)
     client = GuardianClient(guardian_channel, clock) if guardian_channel is not None else None
     operator = Operator(channel)
+    law = plugins.find(plugins.CONTROL_LAWS, config.controller.law)
     checked: Checked | None = None
     async with contextlib.AsyncExitStack() as stack:
         stack.enter_context(operator.attention())
@@ -308,7 +310,9 @@ async def fly(
                 epoch_offset_ns=epoch_offset_ns(clock()),
                 metadata={
                     "mission": config.mission.name,
-                    "law": config.controller.law,
+                    "law": law.entry.name,
+                    "law_distribution": law.distribution,
+                    "law_version": law.version,
                     "preset": config.controller.preset,
                     "simulated": str(sitl).lower(),
                 },

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from companion import plugins
 from companion.config.controller import law_class
+from companion.config.shipped import FILES
 
 
 def write_distribution(site: Path, name: str, version: str, entry_points: Mapping[str, str]) -> None:
@@ -39,3 +40,36 @@ def on_path(site: Path) -> Iterator[None]:
 def _forget() -> None:
     plugins.installed.cache_clear()
     law_class.cache_clear()
+
+
+LAW = """
+from typing import Literal
+from companion.config.controller import PscConfig
+from companion.control.psc import PscController
+
+class LiftConfig(PscConfig):
+    '''A law for tests.'''
+    presets = ("stiff", "soft")
+    law: Literal["lift"]
+    lift_n: float = 0.0
+
+class Lift(PscController):
+    settings = LiftConfig
+"""
+"""Module of a control law that flies as psc does."""
+
+
+def write_law(site: Path, law: str = LAW, version: str = "1.0") -> None:
+    """Write the distribution lab-a with the law `lift` and its presets."""
+    write_distribution(site, "lab-a", version, {"lift": "lab_a:Lift"})
+    (site / "lab_a.py").write_text(law)
+    gains = FILES / "controllers" / "psc_tuned.yaml"
+    folder = site / "files" / "controllers"
+    folder.mkdir(parents=True)
+    for preset in ("stiff", "soft"):
+        text = (
+            gains.read_text(encoding="utf-8")
+            .replace("law: psc", "law: lift")
+            .replace("preset: tuned", f"preset: {preset}")
+        )
+        (folder / f"lift_{preset}.yaml").write_text(text, encoding="utf-8")

@@ -79,5 +79,5 @@ def test_a_name_that_two_distributions_announce_is_refused(tmp_path: Path) -> No
 
 
 def test_a_plug_in_that_is_absent_is_named_with_those_that_are_there() -> None:
-    with pytest.raises(PluginError, match=r"^control law 'lift' is not installed; installed: adaptive, csc, psc$"):
+    with pytest.raises(PluginError, match=r"^control law 'lift': is not installed; installed: adaptive, csc, psc$"):
         plugins.find(CONTROL_LAWS, "lift")

@@ -16,6 +16,7 @@ from companion.campaigns.compare.paper_results import SOURCE
 from companion.campaigns.compare.tables import by_payload, compliance_table, print_tables, tracking_table
 from companion.campaigns.process import Message
 from companion.campaigns.runner import Campaign, Row
+from companion.plugins import CONTROL_LAWS, find
 
 STATISTIC = "RMS, p50 (p95) over seeds; a failed flight counts as worse than all others and is shown as –"
 EXPLAINED = (
@@ -48,6 +49,7 @@ class Compare(Campaign):
                 {
                     "controller": variant.controller,
                     "preset": variant.preset,
+                    "plugin": str(find(CONTROL_LAWS, variant.controller)),
                     "file": config.sources.controller,
                     "overrides": list(variant.overrides),
                 }

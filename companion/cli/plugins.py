@@ -1,0 +1,42 @@
+"""`companion plugins`: list the parts that installed distributions provide."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import Any
+
+from companion.config.base import Model
+from companion.config.controller import LAWS
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
+from companion.plugins import CONTROL_LAWS, KINDS, PluginError, installed
+
+_SETTINGS: dict[str, Mapping[str, type[Model]]] = {CONTROL_LAWS: LAWS}
+"""Settings of the plug-ins of each group by name."""
+
+
+def add_parser(commands: Any) -> None:
+    """Add `plugins` to the sub-parsers of `companion`."""
+    parser = commands.add_parser(
+        "plugins",
+        help="list the installed control laws, and who provides them",
+        description="List the installed plug-ins: name, kind, distribution, version and what it is. Exit code 2: one cannot be used.",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(_: argparse.Namespace) -> int:
+    """Print one row per plug-in; return the exit code."""
+    rows = [("name", "kind", "distribution", "version", "what it is")]
+    code = EXIT_OK
+    for group, kind in KINDS.items():
+        for name, plugin in installed(group).items():
+            try:
+                what = (_SETTINGS[group][name].__doc__ or "").strip().partition("\n")[0]
+            except PluginError as error:
+                code, what = EXIT_BAD_INPUT, f"cannot be used: {error.reason}"
+            rows.append((name, kind, plugin.distribution, plugin.version, what))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    return code

@@ -1,0 +1,124 @@
+"""A control law of another distribution: where a user meets it, and when a log of it can be replayed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from companion import DISTRIBUTION, __version__
+from companion.analysis.log import FlightLog, LogError
+from companion.analysis.replay import check_replayable
+from companion.cli.main import main
+from companion.cli.schema import schema_json
+from companion.config.loader import load_flight, logged_flight
+from companion.model.codec import fingerprint
+from companion.model.types import Inputs, Outputs, Sent
+from companion.plugins import PluginError
+from tests.plugins.installed import LAW, on_path, write_law
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Path]:
+    write_law(tmp_path)
+    with on_path(tmp_path):
+        yield tmp_path
+
+
+@pytest.mark.usefixtures("site")
+def test_it_is_chosen_on_the_command_line_and_shown_where_the_others_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "hover", "--plan-only", "--controller", "lift", "--preset", "stiff"]) == 0
+    for words, shown in (
+        (["fly", "--help"], ("control law: adaptive, csc, psc, lift", "lift: soft, stiff")),
+        (["compare", "--help"], ("default: adaptive,csc,psc,lift",)),
+    ):
+        with pytest.raises(SystemExit):
+            main(words)
+        out = " ".join(capsys.readouterr().out.split())
+        assert [text for text in shown if text not in out] == []
+    assert main(["check", "hover", "--plan-only", "--controller", "lift", "--preset", "hard"]) == 2
+    assert capsys.readouterr().err == "--preset hard: no such preset of 'lift'; available: stiff, soft\n"
+
+
+@pytest.mark.usefixtures("site")
+def test_its_settings_are_checked_and_are_in_the_schema() -> None:
+    config = load_flight("hover", controller_law="lift", overrides=["controller.lift_n=2"])
+    assert config.controller.model_dump()["lift_n"] == 2.0
+    assert logged_flight(config.model_dump_json()) == config
+    schema = json.loads(schema_json("controller"))
+    assert schema["discriminator"]["mapping"]["lift"] == "#/$defs/LiftConfig"
+    assert schema["$defs"]["LiftConfig"]["properties"]["lift_n"]["type"] == "number"
+    assert json.loads(schema_json("mission"))["$defs"]["ControllerChoice"]["properties"]["law"]["enum"][-1] == "lift"
+
+
+@pytest.mark.usefixtures("site")
+def test_it_is_listed_with_its_distribution(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plugins"]) == 0
+    heading, *rows = (line.split() for line in capsys.readouterr().out.splitlines())
+    assert heading == ["name", "kind", "distribution", "version", "what", "it", "is"]
+    assert rows[-1] == ["lift", "control", "law", "lab-a", "1.0", "A", "law", "for", "tests."]
+    assert [(row[0], row[3]) for row in rows[:-1]] == [(law, DISTRIBUTION) for law in ("adaptive", "csc", "psc")]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("import PscController", "import Pid", "lab_a:Lift cannot be imported: ImportError: cannot import name 'Pid'"),
+        ("settings = LiftConfig", "pass", "'law' of PscConfig is not Literal[\"lift\"]"),
+        ("settings = LiftConfig", "settings = dict", "'settings' is not a subclass of companion.config.controller."),
+        ('("stiff", "soft")', "()", "LiftConfig names no presets"),
+        ('("stiff", "soft")', '("hard",)', "files/controllers/lift_hard.yaml does not exist"),
+    ],
+)
+def test_one_that_cannot_be_used_is_refused_by_name_and_does_not_disturb_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, reason: str
+) -> None:
+    write_law(tmp_path, LAW.replace(old, new))
+    with on_path(tmp_path):
+        assert main(["check", "hover", "--plan-only", "--controller", "lift"]) == 2
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err.count("\n") == 1
+        assert err.startswith("control law 'lift' (lab-a 1.0): ")
+        assert reason in err
+        assert main(["check", "hover", "--plan-only"]) == 0
+        with pytest.raises(SystemExit):
+            main(["fly", "--help"])
+        assert "lift: see companion plugins" in " ".join(capsys.readouterr().out.split())
+        assert main(["plugins"]) == 2
+        assert "cannot be used: " in capsys.readouterr().out
+
+
+def log_by(distribution: str, version: str) -> FlightLog:
+    """The head of a log that the law `lift` flew."""
+    about = {"version_companion": __version__, "records": fingerprint(Inputs, Outputs, Sent)}
+    flight = {"law": "lift", "law_distribution": distribution, "law_version": version}
+    return FlightLog(
+        path=Path("flight.mcap"),
+        inputs=(),
+        outputs=(),
+        sent=(),
+        metadata={"companion": about, "flight": flight},
+        closed=True,
+    )
+
+
+@pytest.mark.usefixtures("site")
+@pytest.mark.parametrize("other", [("lab-a", "0.9"), ("lab-b", "1.0")])
+def test_a_log_is_not_replayed_by_another_version_of_the_law(other: tuple[str, str]) -> None:
+    with pytest.raises(LogError, match=r"was flown by control law 'lift' of lab-\S+ \S+, but lab-a 1\.0 is installed"):
+        check_replayable(log_by(*other))
+    with pytest.raises(LogError, match="has no configuration"):
+        check_replayable(log_by("lab-a", "1.0"))
+
+
+def test_a_log_is_not_replayed_without_its_law(tmp_path: Path) -> None:
+    write_law(tmp_path)
+    with on_path(tmp_path):
+        config_json = load_flight("hover", controller_law="lift").model_dump_json()
+    with pytest.raises(LogError, match=r"'lift' of lab-a 1\.0, but it is not installed; install that version"):
+        check_replayable(log_by("lab-a", "1.0"))
+    with pytest.raises(PluginError, match=r"^control law 'lift': is not installed"):
+        logged_flight(config_json)
