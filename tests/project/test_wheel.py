@@ -13,6 +13,7 @@ import pytest
 
 from companion import DISTRIBUTION, __version__
 from companion.cli.main import main
+from companion.config.yaml_strict import read_document
 from tests.support import ROOT
 
 PACKAGES = ("companion", "sitl")
@@ -54,13 +55,15 @@ def test_the_wheel_contains_every_file_of_the_packages(wheel: Path) -> None:
     assert "companion/config/files/missions/catch.yaml" in files(wheel)
 
 
-def test_the_wheel_has_the_programs_name_and_version(wheel: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wheel_command_citation_and_changelog_name_one_version(wheel: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (metadata,) = wheel.glob("*.dist-info/METADATA")
     lines = metadata.read_text(encoding="utf-8").splitlines()
     assert {f"Name: {DISTRIBUTION}", f"Version: {__version__}"} <= set(lines)
     with pytest.raises(SystemExit, match="0"):
         main(["--version"])
     assert capsys.readouterr().out == f"companion {__version__}\n"
+    assert read_document(ROOT / "CITATION.cff").data["version"] == __version__
+    assert f"\n## {__version__} - " in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
 def test_the_installed_program_needs_no_repository(wheel: Path, tmp_path: Path) -> None:
