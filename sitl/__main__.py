@@ -1,6 +1,7 @@
 """`python -m sitl`: the simulated world as a process.
 
-`companion sitl` and `companion fly --sitl` start it; with --for-launcher it writes JSON lines to stdout and ends when stdin ends.
+`companion sitl` and `companion fly --sitl` start this process. With --for-launcher it writes JSON lines to standard output and ends
+when standard input closes.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ from sitl.server import Ports, Sitl, start_of
 _STANDARD = Ports(autopilot_local=14580, autopilot_remote=14540, mocap_command=1510, mocap_data=1511, multicast=True)
 
 TRUTH_FILE = "world.json"
-"""File with the true course, modes and frames, written next to the configuration after a flight with faults or several throws."""
+"""File with the vehicle's true course, the autopilot's modes and the motion-capture frames. It is written next to the configuration
+after a flight with faults or several throws.
+"""
 
 
 def _send(message: dict[str, Any]) -> None:
@@ -72,7 +75,7 @@ def _send_final(sitl: Sitl, truth_file: Path | None) -> None:
 
 
 def _end_with_launcher(sitl: Sitl) -> None:
-    """Read the flight process's pid from standard input; when the launcher ends, end as soon as the vehicle has landed."""
+    """Read the flight process's pid from standard input. When the launcher ends, end the world once the vehicle has landed."""
     loop = asyncio.get_running_loop()
     descriptor = sys.stdin.fileno()
 
@@ -114,7 +117,7 @@ def _print_addresses(devices: dict[str, dict[str, Any]], px4: RealPx4 | None) ->
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the world until it is asked to end; return 0, or 3 if it cannot start or PX4 fails."""
+    """Run the world until it is asked to end; return exit code 0, or 3 if the world cannot start or PX4 fails."""
     parser = argparse.ArgumentParser(prog="python -m sitl")
     parser.add_argument("--config", type=Path, required=True, help="effective configuration, a JSON file")
     parser.add_argument("--for-launcher", action="store_true")

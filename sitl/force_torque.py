@@ -1,7 +1,7 @@
 """An emulated Robotous RFT60-HA01 force-torque sensor on a pty.
 
-It answers like the sensor (see `companion.io.force_torque.rft`): commands 1, 2, 3, 10, 11, 12, 15, 16 and 17. While it streams it
-executes only STOP and SET_BIAS, which have no answer. Readings are quantised to 1/50 N and 1/2000 N m. The caller adds noise and
+It answers commands 1, 2, 3, 10, 11, 12, 15, 16 and 17 as the real sensor does (see `companion.io.force_torque.rft`). While streaming,
+it executes only STOP and SET_BIAS, which have no answer. Readings are quantised to 1/50 N and 1/2000 N m. The caller adds noise and
 latency.
 """
 
@@ -33,7 +33,7 @@ def quantised(force_n: Vec3, torque_nm: Vec3) -> tuple[Vec3, Vec3]:
 
 
 def overloaded(force_n: Vec3, torque_nm: Vec3) -> bool:
-    """Return whether an axis is loaded beyond its capacity."""
+    """Return whether the load on any axis exceeds that axis's capacity."""
     return max(map(abs, force_n)) > FORCE_CAPACITY_N or max(map(abs, torque_nm)) > TORQUE_CAPACITY_NM
 
 
@@ -47,8 +47,8 @@ class ForceTorqueServer:
 
     Attributes:
         silent: fault in which the sensor neither answers nor streams, as with a cut cable.
-        stuck: fault in which it repeats its last reading.
-        dropped: number of packets that were dropped because the pty is not read.
+        stuck: fault in which the sensor repeats its last reading.
+        dropped: number of packets that were dropped because nothing reads the pty.
     """
 
     def __init__(
@@ -83,12 +83,12 @@ class ForceTorqueServer:
 
     @property
     def rate_hz(self) -> int:
-        """Present output rate."""
+        """Present output rate in Hz."""
         return rft.RATE_CODES[self._rate_code]
 
     @property
     def streaming(self) -> bool:
-        """Whether continuous output was started."""
+        """Whether continuous output is on."""
         return self._streaming
 
     async def __aenter__(self) -> Self:
@@ -99,12 +99,12 @@ class ForceTorqueServer:
         self._pty.close()
 
     def set_wrench(self, force_n: Vec3, torque_nm: Vec3) -> None:
-        """Set the wrench on the sensor, in the sensor frame, N and N m."""
+        """Set the true wrench on the sensor: force in N and torque in N m, in the sensor frame."""
         self._force_n = force_n
         self._torque_nm = torque_nm
 
     def tick(self, t_s: float) -> None:
-        """Send every packet that is due by the world's time `t_s`; call it every millisecond or two of world time."""
+        """Send every packet that is due by world time `t_s`; call this method every 1 to 2 ms of world time."""
         if not self._streaming:
             return
         period_s = 1.0 / self.rate_hz
@@ -115,7 +115,7 @@ class ForceTorqueServer:
             self._send_reading(Command.START)
 
     def inject(self, noise: bytes) -> None:
-        """Put bytes on the line unchanged, such as noise or half a packet."""
+        """Send bytes on the line unchanged, for example noise or half a packet."""
         self._write(noise)
 
     def _measure(self) -> Wrench:

@@ -1,7 +1,7 @@
 """An emulated NatNet server (Motive): multicast and unicast, any bitstream version since 3.0.
 
-Layouts as in the NatNet SDK (`NatNetTypes.h`, packet client). It shares only the message ids with the companion's parser, so that an
-error in either of them shows. The caller adds latency and noise.
+The packet layouts follow the NatNet SDK (`NatNetTypes.h`, packet client). This module shares only the message ids with the companion's
+parser, so that an error in either becomes visible. The caller adds latency and noise.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from companion.model.frames import quat_rotate
 from companion.model.types import Quat, Vec3
 
 CLOCK_FREQUENCY_HZ: Final = 10_000_000
-"""Windows' performance counter, as Motive reports it."""
+"""Frequency of the Windows performance counter, as Motive reports it."""
 _CLOCK_ORIGIN_S: Final = 1000.0  # the server has been running; tick 0 means "no stamp"
 _APPLICATION = b"Motive"
 _OLDEST, _SELECTABLE, _MARKER_NAMES, _SIZES, _PIVOT_ROTATION, _NEWEST = (3, 0), (4, 0), (4, 0), (4, 1), (4, 2), (4, 4)
@@ -33,7 +33,7 @@ _MARKERS_BODY_M: Final[tuple[Vec3, ...]] = (
 )
 _STRAY_MARKER_M: Final[Vec3] = (2.5, -2.0, 0.03)  # a reflection on the floor
 LOOPBACK, LOOPBACK_BROADCAST = "127.0.0.1", "127.255.255.255"
-"""A socket on the loopback address receives no broadcasts, so a second socket listens for them."""
+"""A socket bound to the loopback address receives no broadcasts, so a second socket listens for them."""
 OTHER_BODY: Final = "wand"
 OTHER_PLACE_M: Final[Vec3] = (1.9, -1.5, 0.04)
 """Position of the second rigid body, which lies on the floor."""
@@ -48,7 +48,7 @@ _END_OF_DATA = bytes(4)
 
 @dataclass(frozen=True, slots=True)
 class BodyPose:
-    """One rigid body of one frame, in the axes of the stream."""
+    """Pose of one rigid body in one frame, in the axes of the stream."""
 
     id: int
     position_m: Vec3
@@ -58,7 +58,7 @@ class BodyPose:
 
 
 class NatNetServer:
-    """Streams frames of data and answers clients; an async context manager on the running event loop.
+    """Streams motion-capture frames and answers clients; an async context manager on the running event loop.
 
     A client becomes a unicast client when it connects or, with a multicast group, when it sends a keep-alive. A unicast client of a
     server since 4.0 may choose an older bitstream ("Bitstream,3.0").
@@ -280,8 +280,15 @@ def encode_frame(
     exposure_t_s: float | None,
     names: dict[int, str],
 ) -> bytes:
-    """Return one NAT_FRAMEOFDATA datagram with all sections that this NatNet version defines; arguments as for
-    `NatNetServer.publish`.
+    """Return one NAT_FRAMEOFDATA datagram with all sections that this NatNet version defines.
+
+    Args:
+        version: NatNet bitstream version.
+        number: frame number.
+        t_s: as for `NatNetServer.publish`.
+        poses: as for `NatNetServer.publish`.
+        exposure_t_s: as for `NatNetServer.publish`.
+        names: name of each rigid body, by its id.
     """
     sizes = _numbers(version) >= _SIZES
     markers = {

@@ -22,10 +22,10 @@ class PtyLine:
         self._on_bytes = on_bytes
         self._device_fd = -1
         self._companion_fd = -1
-        """The companion's end, kept open so that a companion that closes the port does not hang up the line."""
+        """The companion's end, kept open so that the line does not hang up when the companion closes the port."""
 
     def open(self) -> None:
-        """Create the pseudo-terminal in raw mode and start to listen.
+        """Create the pseudo-terminal in raw mode and start listening.
 
         Raises:
             OSError: the kernel has no pseudo-terminal left.
@@ -41,7 +41,7 @@ class PtyLine:
             raise
 
     def close(self) -> None:
-        """Close both ends; the line then hangs up for a companion that still holds the port."""
+        """Close both ends. If the companion still has the port open, it sees a hang-up."""
         if self._device_fd < 0:
             return
         asyncio.get_running_loop().remove_reader(self._device_fd)
@@ -53,7 +53,7 @@ class PtyLine:
         """Send bytes to the companion without blocking; nothing is sent on a closed line.
 
         Returns:
-            The number of bytes dropped because the line is not read.
+            The number of bytes dropped because the companion does not read the line.
         """
         if self._device_fd < 0:
             return 0

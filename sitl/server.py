@@ -49,7 +49,7 @@ class Ports:
 
     autopilot_local: int = 0
     autopilot_remote: int = 0
-    """Port to which PX4 sends from the start; if 0, it waits for the first message of a partner."""
+    """Port to which PX4 sends from the start; if 0, PX4 waits for the first message from a partner."""
     mocap_command: int = 0
     mocap_data: int = 0
     multicast: bool = False
@@ -65,7 +65,7 @@ class Start:
 
 
 class Sitl:
-    """The plant and the devices' links.
+    """SITL server: the simulated plant and the links to its devices.
 
     Args:
         vehicle: vehicle file.
@@ -115,7 +115,7 @@ class Sitl:
         """True position, tilt and tether of the vehicle, sampled from the first fault."""
         self._course_due_s = 0.0
         self.frames: list[tuple[int, float]] = []
-        """(number, world time) of some of the motion-capture frames, from which a log's clock is related to the world's."""
+        """(number, world time) of some of the motion-capture frames; they relate the clock of a log to world time."""
         self.modes: list[tuple[float, str | None, bool]] = []
         """(world time, mode, armed) at every change of the autopilot's state."""
         self._injected: set[FaultKind] = set()
@@ -133,7 +133,7 @@ class Sitl:
 
     @contextlib.asynccontextmanager
     async def wires(self) -> AsyncIterator[dict[str, dict[str, Any]]]:
-        """Open every link and yield the addresses, as `devices` settings of a vehicle file."""
+        """Open every link and yield the addresses in the form of a vehicle file's `devices` settings."""
         device = self._vehicle.devices
         async with contextlib.AsyncExitStack() as stack:
             self.bus = await stack.enter_async_context(ServoBus(self._on_bus))
@@ -175,16 +175,16 @@ class Sitl:
         return environment({fault.kind for fault in self._config.faults}, stalls[0] if stalls else None)
 
     def stop(self) -> None:
-        """End at the next step."""
+        """End `run` at the next step."""
         self._end_s = -math.inf
 
     def leave(self) -> None:
-        """End as soon as the vehicle is disarmed, `_LEAVE_S` from now at the latest."""
+        """End `run` as soon as the vehicle is disarmed, but at the latest `_LEAVE_S` from now."""
         self._leaving = True
         self._end_s = min(self._end_s, self.plant.t_s + _LEAVE_S)
 
     async def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
-        """Follow the wall clock until asked to stop; call `on_ready` once the autopilot is ready to fly.
+        """Run the world in real time until `stop` or `leave` ends it; call `on_ready` once the autopilot is ready to fly.
 
         Raises:
             Px4Error: a real PX4 cannot be started, has ended or hangs.
@@ -298,7 +298,7 @@ class Sitl:
             self._lost_servo = None
 
     def _inject_process_faults(self) -> None:
-        """Inject faults of the recorder and the guardian, once each, and resume the flight process after a limited SIGSTOP."""
+        """Inject each due fault of the recorder and the guardian once, and resume the flight process when its SIGSTOP fault ends."""
         active, plant = self.faults.active, self.plant
         due = [kind for kind in OTHER_PROCESS_FAULTS if kind in active and kind not in self._injected]
         if due and self.flight.pid is not None and plant.t_s >= self._inject_due_s:
@@ -318,7 +318,7 @@ class Sitl:
         self.course.append(sample(plant.world, self._vehicle.tether.anchor_world_m))
 
     def ground_truth(self) -> dict[str, Any]:
-        """Return the true course of a flight with faults, for the table of a campaign (`world.json`)."""
+        """Return the true course of a flight with faults, for a campaign's table (file `world.json`)."""
         return {
             **self.final(),
             "armed": self.autopilot.armed,

@@ -29,7 +29,7 @@ class UdpEndpoint(asyncio.DatagramProtocol):
         self._closed.set()
 
     def error_received(self, exc: Exception) -> None:
-        """Ignore an ICMP error, which means that the other end does not listen yet."""
+        """Ignore an ICMP error, which means that the other end is not listening yet."""
 
     @property
     def port(self) -> int:

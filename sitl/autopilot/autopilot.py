@@ -1,6 +1,6 @@
-"""The PX4 stub without I/O and clock: commander, navigator, estimator and cascade, stepped on world time.
+"""The PX4 stub, with neither I/O nor a clock of its own: commander, navigator, estimator and cascade, stepped on world time.
 
-Frames are PX4's: local NED, body FRD. Every input carries the world time of its arrival, so the same object flies behind MAVLink in
+Frames are PX4's: local NED, body FRD. Every input carries the world time of its arrival, so the same object runs behind MAVLink in
 real time and inside the fast closed loop.
 """
 
@@ -30,7 +30,7 @@ _COMMANDER_PERIOD_S = 0.01
 _POSITION_PERIOD_S = 0.004
 _EARTH_RADIUS_M = 6371000.0
 _EV_POSITION_AND_YAW = 1 | 2 | 8
-"""Bits of EKF2_EV_CTRL for horizontal position, vertical position and yaw. Without magnetometer, barometer and GPS PX4 needs all of
+"""Bits of EKF2_EV_CTRL for horizontal position, vertical position and yaw. Without magnetometer, barometer and GPS, PX4 needs all of
 them.
 """
 _TIME_EPSILON_S = 1e-9
@@ -58,13 +58,13 @@ class Origin:
     altitude_m: float
 
     def local_ned_m(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vec3:
-        """Return the local position of a nearby point (equirectangular projection)."""
+        """Return the local NED position of a nearby point in m (equirectangular projection)."""
         north = math.radians(latitude_deg - self.latitude_deg) * _EARTH_RADIUS_M
         east = math.radians(longitude_deg - self.longitude_deg) * _EARTH_RADIUS_M * self._shrink()
         return (north, east, self.altitude_m - altitude_m)
 
     def global_deg_m(self, position_ned_m: Vec3) -> Vec3:
-        """Return latitude and longitude in degrees and altitude in m."""
+        """Return the latitude and longitude in degrees and the altitude in m of a local position."""
         north, east, down = position_ned_m
         latitude = self.latitude_deg + math.degrees(north / _EARTH_RADIUS_M)
         longitude = self.longitude_deg + math.degrees(east / (_EARTH_RADIUS_M * self._shrink()))
@@ -124,10 +124,10 @@ class Px4Stub:
         self.origin: Origin | None = None
         self.home_ned_m: Vec3 | None = None
         self.notices: deque[Notice] = deque(maxlen=64)
-        """STATUSTEXTs that wait to be sent; the oldest are dropped if the queue is full."""
+        """STATUSTEXTs waiting to be sent; if the queue is full, the oldest are dropped."""
         self.t_s = 0.0
         self.imu: ImuSample | None = None
-        """Newest sample, without the learned biases, as in HIGHRES_IMU."""
+        """Newest IMU sample after subtraction of the learned biases, as in HIGHRES_IMU."""
         self.estimate: Estimate | None = None
         self.target = AttitudeTarget((1.0, 0.0, 0.0, 0.0), 0.0)
         """Setpoint of the attitude loop (ATTITUDE_TARGET)."""
@@ -142,11 +142,11 @@ class Px4Stub:
         """Fault: PX4 leaves OFFBOARD and refuses to enter it."""
         self.refuses_arming = False
         self.booted_at_s = 0.0
-        """World time of the last boot, at which PX4's own clock is zero and before which PX4 does not run."""
+        """World time of the last boot. PX4 does not run before this time, and its own clock is zero at it."""
         self.clock_ahead_s = 0.0
-        """Sum of the pauses of the world, during which PX4's own clock continues."""
+        """Total duration of the world's pauses, during which PX4's own clock continues."""
         self.since_sample_s = 0.0
-        """Time from the last IMU sample to the message that is being answered, for PX4's clock; set by the links."""
+        """Time from the last IMU sample to the arrival of the message being answered, for PX4's clock; set by the links."""
         self._queue: deque[tuple[float, OffboardTarget]] = deque()
         self._offboard: OffboardTarget | None = None
         self._setpoint_at_s: float | None = None
@@ -192,7 +192,7 @@ class Px4Stub:
         return self.home_ned_m is not None and self.origin is not None
 
     def step(self, imu: ImuSample) -> RotorCommands:
-        """Advance to the sample's world time and return normalised rotor commands; all are zero while disarmed."""
+        """Advance to the sample's world time and return normalised rotor commands (0 to 1); all are zero while disarmed."""
         t_s = imu.t_s
         if self._learned is not None:
             imu = _without(imu, self._learned)
@@ -230,11 +230,11 @@ class Px4Stub:
         self._queue.append((t_s + self._setpoint_delay_s, target))
 
     def on_attitude_target(self, t_s: float, target: AttitudeTarget) -> None:
-        """Process SET_ATTITUDE_TARGET that arrived at world time `t_s`."""
+        """Process a SET_ATTITUDE_TARGET that arrived at world time `t_s`."""
         self.on_setpoint(t_s, target)
 
     def on_vision(self, t_s: float, position_ned_m: Vec3, attitude_ned_frd: Quat) -> bool:
-        """Process a vision pose that arrived at world time `t_s`; return whether EKF2_EV_CTRL admits it."""
+        """Process a vision pose that arrived at world time `t_s`; return whether EKF2_EV_CTRL enables its fusion."""
         self.vision_received += 1
         if self.params.integer("EKF2_EV_CTRL") & _EV_POSITION_AND_YAW != _EV_POSITION_AND_YAW:
             return False
@@ -243,7 +243,7 @@ class Px4Stub:
         return True
 
     def on_command(self, t_s: float, command: int, params: Command7) -> Result:
-        """Execute a MAV_CMD with param1 to param7 that arrived at world time `t_s`; positions are in degrees and m."""
+        """Execute a MAV_CMD that arrived at world time `t_s`. `params` are param1 to param7, with positions in degrees and m."""
         refusal = self._refusal(command, params)
         if refusal is not None:
             self.notices.append(Notice(Severity.CRITICAL, refusal))
@@ -267,7 +267,7 @@ class Px4Stub:
         return None
 
     def reboot(self, for_s: float) -> None:
-        """Restart and lose everything but the parameters; PX4 runs again `for_s` later."""
+        """Restart PX4, which keeps only its parameters and runs again after `for_s`."""
         self.booted_at_s = self.t_s + for_s
         self.commander, self.navigator = Commander(self.params), Navigator(self.params)
         self.land, self._estimator = LandDetector(self.params), Estimator()
@@ -279,7 +279,9 @@ class Px4Stub:
         self._climb_rate_controlled = False
 
     def pilot_sets_mode(self, state: NavState) -> None:
-        """Change the mode as the switch of a pilot's radio does, after setting a home position."""
+        """Change the mode as the mode switch of a pilot's radio does; set the origin and the home position first if they are not
+        known.
+        """
         estimate = self.estimate
         if estimate is None:
             return
@@ -290,7 +292,7 @@ class Px4Stub:
         self.commander.change_mode(state, self._health(self.t_s))
 
     def set_origin(self, origin: Origin) -> None:
-        """Set the global origin (SET_GPS_GLOBAL_ORIGIN), with which the local position also gives a global one."""
+        """Set the global origin (SET_GPS_GLOBAL_ORIGIN), from which the global position follows."""
         self.origin = origin
 
     def arming_problem(self) -> str | None:
@@ -356,7 +358,7 @@ class Px4Stub:
         )
 
     def _attitude_for_rates(self, estimate: Estimate, rates: RateTarget) -> AttitudeTarget:
-        """Return the attitude whose P loop commands exactly these rates, because the cascade takes only attitudes."""
+        """Return the attitude setpoint for which the attitude P loop commands these rates, because the cascade takes only attitudes."""
         gains = (self.params.real("MC_ROLL_P"), self.params.real("MC_PITCH_P"), self.params.real("MC_YAW_P"))
         x, y, z = (rate / (2.0 * gain) for rate, gain in zip(rates.rates_frd_rad_s, gains, strict=True))
         size = math.sqrt(x * x + y * y + z * z)
@@ -401,7 +403,7 @@ class Px4Stub:
 
     @property
     def heading_rad(self) -> float:
-        """Return the estimated yaw, rad."""
+        """Return the estimated yaw in rad; 0 before the first estimate."""
         return heading_rad(self.estimate.attitude_ned_frd) if self.estimate is not None else 0.0
 
 

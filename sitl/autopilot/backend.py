@@ -1,4 +1,4 @@
-"""Interface between the simulated world and its autopilot, and its implementation with the stub; `sitl.px4.backend` runs a real PX4."""
+"""Interface between the simulated world and its autopilot, implemented here by the stub and in `sitl.px4.backend` by a real PX4."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STUB_VERSION = "1.16"
 
 
 class Observation(NamedTuple):
-    """What the world can observe of an autopilot; a field is None if this autopilot does not reveal it."""
+    """The state of an autopilot that the world can observe; a field is None if this autopilot does not reveal it."""
 
     setpoint_at_s: float | None
     """World time at which the newest setpoint arrived."""
@@ -39,7 +39,7 @@ class AutopilotBackend(Protocol):
     """An autopilot of the simulated world. The plant steps it with IMU samples."""
 
     lockstep: bool
-    """Whether it answers over a network link, so that the world calls `sense` and awaits `answered` before each `step`."""
+    """Whether the autopilot answers over a network link; if so, the world calls `sense` and awaits `answered` before each `step`."""
 
     @property
     def armed(self) -> bool:
@@ -51,47 +51,47 @@ class AutopilotBackend(Protocol):
 
     @property
     def down(self) -> bool:
-        """Whether it is booting and does not communicate."""
+        """Whether the autopilot is booting and does not communicate."""
 
     def attach(self, world: World) -> None:
-        """Set the world in which it flies; call this before everything else."""
+        """Set the world in which the autopilot flies; call this method before all others."""
 
     def wires(self) -> AbstractAsyncContextManager[str]:
-        """Open its links and yield the companion's `devices.autopilot.address`."""
+        """Open the autopilot's links and yield the value for the companion's `devices.autopilot.address`."""
 
     async def prepare(self) -> None:
-        """Make it ready to fly while the world is being stepped."""
+        """Make the autopilot ready to fly while the world is being stepped."""
 
     def sense(self, imu: ImuSample) -> None:
-        """Send the IMU sample of the next `step` as soon as it is known."""
+        """Send the IMU sample of the next `step` to the autopilot as soon as it is known."""
 
     async def answered(self) -> None:
-        """Wait until it has answered that sample."""
+        """Wait until the autopilot has answered the sample that `sense` sent."""
 
     def step(self, imu: ImuSample) -> Vec4:
-        """Process one IMU sample and return normalised rotor commands, which are zero while disarmed."""
+        """Process one IMU sample and return normalised rotor commands (0 to 1), which are zero while disarmed."""
 
     def pump(self, t_s: float, battery: Battery) -> None:
-        """Stream telemetry; call it after every step of the physics."""
+        """Stream telemetry; call this method after every step of the physics."""
 
     def set_link(self, down: bool, delay_s: float) -> None:
-        """Inject link faults: nothing arrives, or everything arrives `delay_s` late, in both directions."""
+        """Inject link faults in both directions: nothing arrives if `down`; otherwise messages arrive `delay_s` late."""
 
     def skip(self, paused_s: float) -> None:
         """Advance the autopilot's own clock by a pause of the world, because a real autopilot's clock does not pause."""
 
     def observe(self) -> Observation:
-        """Return its observable state."""
+        """Return the autopilot's observable state."""
 
     def about(self) -> dict[str, Any]:
-        """Return kind (stub or px4) and version, for `summary.json`."""
+        """Return the autopilot's kind (stub or px4) and version, for `summary.json`."""
 
 
 def stub_of(config: WorldConfig, link_delay_s: float = 0.0) -> Px4Stub:
-    """Return the stub with the parameters of this world, gains included; `set_hover_thrust` sets its hover thrust.
+    """Return a stub with the parameters and gains of this world; `set_hover_thrust` sets its hover thrust.
 
     Args:
-        config: `setpoint_delay_s`, `px4_params` and the biases of `imu`.
+        config: configuration of the world; `setpoint_delay_s`, `thr_mdl_fac`, `px4_params` and the biases of `imu` are used.
         link_delay_s: added to the setpoint delay, for a loop without a real link.
     """
     params = Params()
@@ -106,13 +106,14 @@ def stub_of(config: WorldConfig, link_delay_s: float = 0.0) -> Px4Stub:
 def _learned(imu: Imu) -> LearnedBias | None:
     """Return the biases that EKF2 learns while the vehicle is on the floor, limited by EKF2_GYR_B_LIM and EKF2_ABL_LIM.
 
-    The world starts seconds before take-off; a real PX4 has run for longer. At rest it observes the bias of the gyroscopes directly
-    (ZeroGyroUpdate, and the module gyro_calibration), and that of the vertical accelerometer from the height. It does not observe the
-    bias of a horizontal accelerometer, which position cannot distinguish from a tilt, at rest and in every flight at constant yaw. EKF2
-    starts with a tilt from the accelerometers, which is wrong by bias / g, and no innovation corrects it. In flight its gains would
-    learn little (Kalman filter with EKF2's parameters and vision at 125 Hz: 0.01 m/s^2 per s and m of innovation, against 1.7 rad/s per
-    m on the tilt). Measured on 1.16.1: a bias of 0.1 and 0.08 m/s^2 (0.58 and 0.47 deg) tilts it by 0.60 to 0.69 and 0.45 to 0.54 deg,
-    before take-off, in flight and after the catch; a gyroscope bias of 0.3 deg/s by less than 0.03 deg.
+    The world starts seconds before take-off; a real PX4 has run for longer. At rest, EKF2 observes the gyroscope biases directly
+    (ZeroGyroUpdate, and the module gyro_calibration) and the bias of the vertical accelerometer from the height. It does not observe
+    the biases of the horizontal accelerometers: at rest, and in every flight at constant yaw, position cannot distinguish them from a
+    tilt. EKF2 initialises its tilt from the accelerometers, so the tilt is wrong by bias / g, and no innovation corrects it. In
+    flight, EKF2 would learn little of these biases (a Kalman filter with EKF2's parameters and vision at 125 Hz: 0.01 m/s^2 per s and
+    m of innovation, against 1.7 rad/s per m for the tilt). Measured on PX4 1.16.1 before take-off, in flight and after the catch:
+    accelerometer biases of 0.1 and 0.08 m/s^2 (0.58 and 0.47 deg) tilt the estimate by 0.60 to 0.69 and 0.45 to 0.54 deg; a gyroscope
+    bias of 0.3 deg/s tilts it by less than 0.03 deg.
     """
     if not imu.on:
         return None
@@ -125,7 +126,7 @@ def set_hover_thrust(px4: Px4Stub, config: WorldConfig, world: World) -> float:
     """Set MPC_THR_HOVER to this vehicle's hover thrust times 1 + `hover_thrust_error`, unless `px4_params` overrides it.
 
     Returns:
-        The hover thrust before the override.
+        The hover thrust before any override by `px4_params`.
     """
     hover_thrust = world.hover_command * (1.0 + config.hover_thrust_error)
     if "MPC_THR_HOVER" not in config.px4_params:
@@ -134,7 +135,7 @@ def set_hover_thrust(px4: Px4Stub, config: WorldConfig, world: World) -> float:
 
 
 class StubBackend:
-    """The PX4 stub, in this process."""
+    """The PX4 stub, which runs in this process."""
 
     lockstep = False
 
@@ -155,7 +156,7 @@ class StubBackend:
 
     @property
     def down(self) -> bool:
-        """Whether it is booting after a restart."""
+        """Whether the stub is booting after a restart."""
         return self.px4.t_s < self.px4.booted_at_s
 
     def attach(self, world: World) -> None:
@@ -189,13 +190,13 @@ class StubBackend:
             self._mavlink.pump(t_s)
 
     def set_link(self, down: bool, delay_s: float) -> None:
-        """Apply link faults to both of its links."""
+        """Apply link faults to both links of the stub."""
         if down is not self._mavlink.link_down:
             self._mavlink.link_down = down
         self._mavlink.delay_s = delay_s
 
     def skip(self, paused_s: float) -> None:
-        """Advance the clock of its messages."""
+        """Advance the clock with which the stub stamps its messages."""
         self.px4.clock_ahead_s += paused_s
 
     def observe(self) -> Observation:

@@ -19,7 +19,7 @@ MIX_YAW = (1.0, 1.0, -1.0, -1.0)
 
 @dataclass(frozen=True, slots=True)
 class CascadeGains:
-    """Gains for roll, pitch and yaw, defined as MC_ROLL_P, MC_ROLLRATE_P/I/D and so on."""
+    """Gains for roll, pitch and yaw, as PX4's parameters MC_ROLL_P, MC_ROLLRATE_P/I/D and so on define them."""
 
     attitude_p: Vec3 = (6.5, 6.5, 2.8)
     rate_p: Vec3 = (0.15, 0.15, 0.2)
@@ -31,8 +31,8 @@ class CascadeGains:
 
 
 def motor_signal(command: float, factor: float) -> float:
-    """Return the motor signal for a normalised thrust command, 0 to 1, according to THR_MDL_FAC (FunctionMotors::updateValues): PX4
-    assumes that thrust is factor signal^2 + (1 - factor) signal.
+    """Return the motor signal (0 to 1) for a normalised thrust command (0 to 1). `factor` is THR_MDL_FAC: PX4 assumes that thrust is
+    factor * signal^2 + (1 - factor) * signal (FunctionMotors::updateValues).
     """
     if factor <= 0.0 or command <= 0.0:
         return command
@@ -43,7 +43,7 @@ def motor_signal(command: float, factor: float) -> float:
 class Cascade:
     """PX4's multicopter attitude P loop, rate PID loop and quad-x mixer.
 
-    Products of quaternions and sums over axes are written out: this runs at 250 Hz.
+    Products of quaternions and sums over axes are written out for speed, because the cascade runs at 250 Hz.
     """
 
     def __init__(self, gains: CascadeGains | None = None) -> None:
@@ -51,20 +51,22 @@ class Cascade:
         self.reset()
 
     def reset(self) -> None:
-        """Reset integrators and filters, on arming."""
+        """Reset integrators and filters; call this method on arming."""
         self._integral: Vec3 = (0.0, 0.0, 0.0)
         self._rate_previous: Vec3 | None = None
         self._d_filtered: Vec3 = (0.0, 0.0, 0.0)
         self._unsaturated = True
 
     def step(self, dt_s: float, estimate: Estimate, target: AttitudeTarget) -> RotorCommands:
-        """Run one control period and return normalised rotor commands."""
+        """Run one control period and return normalised rotor commands, 0 to 1."""
         rate_sp = self._rate_setpoint(estimate.attitude_ned_frd, target)
         torque = self._rate_loop(dt_s, estimate.rates_frd_rad_s, rate_sp, target.thrust)
         return self._mix(torque, target.thrust)
 
     def _rate_setpoint(self, q: Quat, target: AttitudeTarget) -> Vec3:
-        """Compute the rate setpoint: quaternion P control with reduced yaw priority (Brescianini et al., as mc_att_control)."""
+        """Return the rate setpoint in rad/s: quaternion P control with reduced yaw priority (Brescianini et al., as in
+        mc_att_control).
+        """
         w, x, y, z = q
         wd, xd, yd, zd = target.attitude_ned_frd
         # z axes of both attitudes and the shortest rotation between them.
@@ -131,7 +133,7 @@ class Cascade:
         return (kx * error_x + ix - lx * dx, ky * error_y + iy - ly * dy, kz * error_z + iz - lz * dz)
 
     def _mix(self, torque: Vec3, thrust: float) -> RotorCommands:
-        """Mix collective thrust and torques into rotor commands; on saturation yaw is reduced first, then the collective."""
+        """Mix collective thrust and torques into rotor commands; on saturation, yaw is reduced first, then the collective thrust."""
         roll, pitch, yaw = torque
         # MIX_ROLL and MIX_PITCH: the rotors get -across, +across, +along, -along.
         across, along = roll - pitch, roll + pitch

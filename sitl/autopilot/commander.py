@@ -1,8 +1,8 @@
-"""PX4's commander without I/O and clock: arming state, user intention, failsafe fallbacks, automatic disarm.
+"""PX4's commander, with neither I/O nor a clock: arming state, user intention, failsafe fallbacks and automatic disarming.
 
-Sources: PX4 1.16 Commander.cpp, UserModeIntention.cpp, failsafe.cpp, HealthAndArmingChecks. While disarmed any mode can be chosen, but
-arming may then be refused. In flight a mode is refused if it cannot run. `nav_state` is the active mode: the user intention, or a
-failsafe mode while the intended one cannot run.
+Sources: PX4 1.16 Commander.cpp, UserModeIntention.cpp, failsafe.cpp, HealthAndArmingChecks. While PX4 is disarmed, any mode can be
+chosen, but arming may then be refused. While it is armed, a mode that cannot run is refused. `nav_state` is the active mode: the user
+intention, or a failsafe mode while the intended one cannot run.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from sitl.autopilot.params import Params
 
 FORCE_MAGIC = 21196
 OFFBOARD_LOSS_EXTRA_S = 0.05
-"""Measured on 1.16: the failsafe acts this long after COM_OF_LOSS_T has passed."""
+"""Delay of the failsafe after COM_OF_LOSS_T has passed, measured on PX4 1.16."""
 
 
 class Result(IntEnum):
@@ -62,7 +62,7 @@ class Notice:
 
 
 class Commander:
-    """Arming and mode logic. `notices` collects STATUSTEXTs for ground stations; the caller empties it."""
+    """Arming and mode logic. `notices` collects STATUSTEXTs for ground stations; the caller empties the list."""
 
     def __init__(self, params: Params) -> None:
         self._params = params
@@ -109,7 +109,7 @@ class Commander:
                 return Result.UNSUPPORTED
 
     def change_mode(self, state: NavState, health: Health) -> bool:
-        """Set the user intention (UserModeIntention::change); return False if it is refused and nothing changed."""
+        """Set the user intention (UserModeIntention::change); return False if the mode is refused, in which case nothing changes."""
         if self.nav_state is NavState.TERMINATION:
             return False
         if self.armed and health.missing(state, self._offboard_timeout_s()) is not None:
@@ -122,7 +122,7 @@ class Commander:
         return True
 
     def arm(self, t_s: float, health: Health) -> bool:
-        """Arm on an external command; return False if it is refused (see `arming_problem`)."""
+        """Arm on an external command; return False if arming is refused (see `arming_problem`)."""
         if self.armed:
             return True
         if self.arming_problem(health) is not None:
@@ -144,7 +144,7 @@ class Commander:
         return missing.value if missing else None
 
     def disarm(self, landed: bool, forced: bool, reason: str) -> bool:
-        """Disarm; return False if it is refused because the vehicle is in the air and `forced` is not set."""
+        """Disarm; return False if disarming is refused because the vehicle has not landed and `forced` is false."""
         if not self.armed:
             return True
         if not forced and not landed:
@@ -162,7 +162,7 @@ class Commander:
         return True
 
     def update(self, t_s: float, health: Health) -> None:
-        """Run one cycle of the commander: take-off detection, failsafe, automatic disarm."""
+        """Run one cycle of the commander: take-off detection, failsafe and automatic disarming."""
         if not self.armed:
             self.nav_state = self.user_intention if self.nav_state is not NavState.TERMINATION else self.nav_state
             return
@@ -184,7 +184,7 @@ class Commander:
             self._notify(Severity.CRITICAL, f"Failsafe activated: {_FAILSAFE_NAMES.get(state, state.name)}")
 
     def _select(self, health: Health) -> NavState | None:
-        """Return the mode to fly (checkModeFallback and getSelectedAction), or None to disarm at once."""
+        """Return the mode to fly (as checkModeFallback and getSelectedAction choose it), or None to disarm at once."""
         if self.nav_state is NavState.TERMINATION:
             return NavState.TERMINATION
         timeout_s = self._offboard_timeout_s() + OFFBOARD_LOSS_EXTRA_S

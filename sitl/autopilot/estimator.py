@@ -1,8 +1,8 @@
 """The PX4 stub's substitute for EKF2: IMU prediction and delayed vision fusion.
 
-A fixed-gain observer with the couplings that matter in EKF2: position innovations correct velocity and, through gravity, tilt; vision
-corrects yaw; without vision the state is dead-reckoned from the IMU and drifts. Vision is fused at the time of its exposure, against
-the state at that time, as EKF2 does on its delayed horizon; the output is predicted forward to the present.
+It is a fixed-gain observer with the couplings that matter in EKF2: position innovations correct velocity and, through gravity, tilt;
+vision corrects yaw; without vision the state is dead-reckoned from the IMU and drifts. As in EKF2 with its delayed horizon, a vision
+pose is compared with the state at the time of its exposure, and the output is predicted forward to the present.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _L_ACCELERATION = 14.7
 _L_BIAS = 1.0
 _L_YAW = 0.3
 _BIAS_MAX_M_S2 = 0.4
-"""EKF2_ABL_LIM."""
+"""Limit of the accelerometer bias (EKF2_ABL_LIM)."""
 
 # EKF2's defaults: gate in standard deviations (EKF2_EVP_GATE), accelerometer noise (EKF2_ACC_NOISE). The rest was
 # measured on 1.16.1: a filtered ratio falls by e in 1 s, is 2 at most, and the position is good to 4 mm with vision at
@@ -62,7 +62,7 @@ class Estimator:
         self._arrived_t_s: float | None = None
         self._tilt_aligned = False
         self._test = (_TEST_MAX, _TEST_MAX)
-        """Filtered squared innovations divided by their squared gates: horizontal, vertical."""
+        """Filtered ratios of squared innovation to squared gate: (horizontal, vertical)."""
         self._variance_m2 = _FAKE_POSITION_SIGMA_M**2
 
     def predict(self, imu: ImuSample) -> None:
@@ -123,7 +123,7 @@ class Estimator:
     def fuse_vision(
         self, t_s: float, position_ned_m: Vec3, attitude_ned_frd: Quat, noise_m: float = _VISION_NOISE_M
     ) -> None:
-        """Fuse a vision pose of world time `t_s` (arrival minus EKF2_EV_DELAY); `noise_m` is EKF2_EVP_NOISE."""
+        """Fuse a vision pose taken at world time `t_s` (arrival minus EKF2_EV_DELAY); `noise_m` is EKF2_EVP_NOISE."""
         # A sum is finite only if every term is.
         if self._t_s is None or not math.isfinite(sum((*position_ned_m, *attitude_ned_frd))):
             return
@@ -183,7 +183,7 @@ class Estimator:
         self._q = quat_normalize(quat_multiply((math.cos(norm), k * x, k * y, k * z), self._q))
 
     def fusion(self) -> Fusion:
-        """Return innovation test ratios and accuracy of vision."""
+        """Return the innovation test ratios of vision and the accuracy of the position."""
         since_s = (self._t_s or 0.0) - self._fused_t_s if self._fused_t_s is not None else math.inf
         if since_s == math.inf:
             return Fusion(math.nan, math.nan, _FAKE_POSITION_SIGMA_M, _FAKE_POSITION_SIGMA_M)

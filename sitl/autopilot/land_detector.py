@@ -10,7 +10,7 @@ from sitl.autopilot.types import Estimate
 
 _DESCENT_THRESHOLD_M_S = 0.3
 _BLIND_S = 8.0
-"""Without a velocity estimate, this time at minimum thrust and without rotation counts as landed."""
+"""Without a velocity estimate, the vehicle counts as landed after this time at minimum thrust without rotation."""
 
 
 class _Settings(NamedTuple):
@@ -25,7 +25,7 @@ class _Settings(NamedTuple):
 
 
 class LandDetector:
-    """Three conditions in sequence, each held for a third of LNDMC_TRIG_TIME and reset at once."""
+    """Three conditions in sequence; each must hold for a third of LNDMC_TRIG_TIME and is reset at once."""
 
     def __init__(self, params: Params) -> None:
         self._params = params
@@ -48,7 +48,7 @@ class LandDetector:
         climb_rate_controlled: bool,
         descend_m_s: float,
     ) -> None:
-        """Run one cycle; `thrust` is the collective setpoint, `descend_m_s` the commanded speed downwards."""
+        """Run one cycle. `thrust` is the collective thrust setpoint (0 to 1), `descend_m_s` the commanded descent speed."""
         if not armed:
             self.ground_contact = self.maybe_landed = self.landed = True
             self._contact_since_s = self._maybe_since_s = self._landed_since_s = -math.inf
@@ -111,7 +111,7 @@ class LandDetector:
 
 
 def _held(t_s: float, now: bool, since_s: float | None, hold_s: float) -> tuple[float | None, bool]:
-    """Return the time since when a condition has held, and whether it has held for `hold_s`."""
+    """Return the time at which a condition began to hold, None if it does not hold, and whether it has held for `hold_s`."""
     if not now:
         return None, False
     if since_s is None:

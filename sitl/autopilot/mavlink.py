@@ -1,8 +1,8 @@
-"""The PX4 stub's MAVLink 2 over UDP on 127.0.0.1: an onboard link and optionally one to a ground station.
+"""MAVLink 2 of the PX4 stub over UDP on 127.0.0.1: an onboard link and, optionally, a link to a ground station.
 
-As in PX4 SITL, a link sends to its remote port until a message arrives, and then to the first sender for as long as PX4 runs; messages
-from other senders are handled too. A link without a remote port sends to the newest sender. Streams run on world time, driven by
-`pump`; messages are handled when they arrive.
+As in PX4 SITL, a link sends to its remote port until a message arrives, and then to the sender of that message until PX4 reboots;
+messages from other senders are handled too. A link without a remote port sends to the newest sender. Streams run on world time,
+driven by `pump`; messages are handled when they arrive.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Message = Any
 
 _PARAMS_PER_PUMP = 4
 _GROUND_STATION_TIMEOUT_S = 2.5
-"""telemetry_status HEARTBEAT_TIMEOUT_US."""
+"""Time after the last heartbeat for which a ground station counts as connected (HEARTBEAT_TIMEOUT_US of telemetry_status)."""
 _STATUS_TEXT_BYTES = 50
 _TEXTS_KEPT, _TEXT_STALE_S = 8, 5.0
 """Length of the mavlink_log queue, and age after which the stream skips a text."""
@@ -73,7 +73,7 @@ class Link(UdpEndpoint):
         self._texts: deque[tuple[float, int, bytes]] = deque(maxlen=_TEXTS_KEPT)
         self._text_id = 0
         self._pumped: tuple[float, float] | None = None
-        """(wall clock, world time) of the last `pump`."""
+        """(wall-clock time, world time) of the last `pump`."""
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
         """Decode and handle a datagram, after `delay_s`."""
@@ -120,21 +120,21 @@ class Link(UdpEndpoint):
             self.send_to(data, partner)
 
     def send_all_params(self) -> None:
-        """Queue _HASH_CHECK and every parameter; `pump` sends a few at a time."""
+        """Queue _HASH_CHECK and every parameter; each `pump` sends a few of them."""
         self._params_to_send = deque([None, *self._stub.params])
 
     def note_ground_station(self) -> None:
-        """Note a ground station: PX4 sends STATUSTEXT only on links with one, and then also recent texts."""
+        """Record that a ground station is on this link: PX4 sends STATUSTEXT only on such links, starting with recent texts."""
         self._ground_station_at_s = self._stub.t_s
         self._send_texts()
 
     def status_text(self, severity: int, text: str) -> None:
-        """Queue a STATUSTEXT; it is sent in chunks if it is long, once a ground station is known."""
+        """Queue a STATUSTEXT, which is sent once a ground station is known; a long text is sent in chunks."""
         self._texts.append((self._stub.t_s, severity, text.encode()))
         self._send_texts()
 
     def _send_texts(self) -> None:
-        """Send queued texts as MavlinkStreamStatustext::send does: ids count from 0, even for texts of one chunk."""
+        """Send queued texts as MavlinkStreamStatustext::send does: ids count up from 0, even for texts of one chunk."""
         seen_s, now_s = self._ground_station_at_s, self._stub.t_s
         if seen_s is None or now_s - seen_s > _GROUND_STATION_TIMEOUT_S:
             return
@@ -166,10 +166,10 @@ def _new_decoder() -> Any:
 
 
 class MavlinkServer:
-    """The links of one stub, an async context manager.
+    """The links of one stub; an async context manager.
 
-    Raises (on entering):
-        LinkError: a port is in use or cannot be opened.
+    Raises:
+        LinkError: on entry, a port is in use or cannot be opened.
     """
 
     def __init__(
@@ -204,7 +204,7 @@ class MavlinkServer:
 
     @property
     def delay_s(self) -> float:
-        """Fault: delay of every link in each direction."""
+        """Fault: delay of every link in each direction, s."""
         return self._links[0].delay_s if self._links else 0.0
 
     @delay_s.setter
@@ -239,7 +239,7 @@ class MavlinkServer:
         await self._close()
 
     def pump(self, t_s: float) -> None:
-        """Send everything that is due at world time `t_s`; call it every 2 to 4 ms."""
+        """Send everything that is due at world time `t_s`; call this method every 2 to 4 ms."""
         notices = self._stub.notices
         while notices:
             notice = notices.popleft()

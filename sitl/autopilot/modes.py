@@ -1,4 +1,4 @@
-"""PX4's navigation states: their code in HEARTBEAT.custom_mode and their requirements (ModeUtil/mode_requirements)."""
+"""PX4's navigation states, with their codes in HEARTBEAT.custom_mode and their requirements (ModeUtil/mode_requirements)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class NavState(Enum):
 
     @property
     def auto(self) -> bool:
-        """Whether it is an automatic mode (MAV_MODE_FLAG_AUTO_ENABLED)."""
+        """Whether this is an automatic mode (MAV_MODE_FLAG_AUTO_ENABLED)."""
         numbers: tuple[int, ...] = self.value
         return numbers[0] == 4
 
@@ -41,14 +41,18 @@ _BY_CUSTOM = {state.value: state for state in NavState if len(state.value) == 2}
 
 
 def nav_state_from_custom(main_mode: int, sub_mode: int) -> NavState | None:
-    """Return the navigation state of DO_SET_MODE param2 and param3, or None; AUTO without a sub mode is MISSION."""
+    """Return the navigation state for the main and sub mode in param2 and param3 of DO_SET_MODE; AUTO without a sub mode is MISSION.
+
+    Returns:
+        None if the stub has no such mode.
+    """
     if main_mode == 4 and sub_mode == 0:
         return NavState.MISSION
     return _BY_CUSTOM.get((main_mode, sub_mode if main_mode == 4 else 0))
 
 
 class Need(Enum):
-    """A requirement of a mode; the value is PX4's text if it is not met."""
+    """A requirement of a mode; the value is PX4's text for an unmet requirement."""
 
     ATTITUDE = "No valid attitude estimate"
     LOCAL_ALTITUDE = "No valid altitude estimate"
@@ -79,7 +83,7 @@ REQUIREMENTS: dict[NavState, tuple[Need, ...]] = {
 }
 
 PREVENT_ARMING = frozenset({NavState.RTL, NavState.LAND, NavState.DESCEND, NavState.TERMINATION})
-"""Modes in which PX4 does not arm (mode_req_prevent_arming); it leaves them on disarming."""
+"""Modes in which PX4 does not arm (mode_req_prevent_arming) and which it leaves on disarming."""
 
 
 class OffboardKind(Enum):
@@ -93,22 +97,25 @@ class OffboardKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """State of the rest of the autopilot, as the commander checks it at one moment."""
+    """State of the rest of the autopilot at one moment, which the commander checks."""
 
     attitude_valid: bool
     position_valid: bool
     origin_set: bool
-    """Whether SET_GPS_GLOBAL_ORIGIN was received, so that the local position also gives a global one."""
+    """Whether SET_GPS_GLOBAL_ORIGIN was received, so that the global position is known as well."""
     home_set: bool
     landed: bool
     maybe_landed: bool
     """Last stage of the land detector before `landed`; it is sufficient for a disarm command."""
     setpoint_age_s: float | None
-    """Time since the newest offboard setpoint arrived, or None."""
+    """Time since the newest offboard setpoint arrived; None if none has arrived."""
     setpoint_kind: OffboardKind = OffboardKind.ATTITUDE
 
     def offboard_available(self, timeout_s: float) -> bool:
-        """Return whether setpoints are fresh and the estimate they need is valid (offboardCheck); `timeout_s` is COM_OF_LOSS_T."""
+        """Return whether offboard setpoints are fresh and the estimate that they need is valid (offboardCheck).
+
+        `timeout_s` is COM_OF_LOSS_T.
+        """
         if self.setpoint_age_s is None or self.setpoint_age_s > timeout_s:
             return False
         return self.setpoint_kind is OffboardKind.ATTITUDE or self.position_valid

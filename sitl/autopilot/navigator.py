@@ -1,6 +1,6 @@
-"""PX4's own modes: Hold, Takeoff, Land, Descend, Return, position setpoints in OFFBOARD, and the take-off ramp.
+"""PX4's modes with position control (Hold, Takeoff, Land, Descend, Return, and OFFBOARD with position setpoints) and the take-off ramp.
 
-Every mode produces a `PositionTarget`, and `PositionControl` converts it to attitude and thrust.
+Every mode produces a `PositionTarget`, which `PositionControl` converts to attitude and thrust.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from sitl.autopilot.smoothing import Smoothing
 from sitl.autopilot.types import AttitudeTarget, Estimate
 
 _STOP_AHEAD_S = 0.6
-"""Delay until full deceleration (constant of Navigator::preproject_stop_point, PX4 1.16)."""
+"""Delay until full deceleration (a constant in Navigator::preproject_stop_point of PX4 1.16)."""
 _BLIND_DESCENT_M_S2 = 0.3
-"""Thrust deficit of FlightTaskDescend without a vertical velocity estimate."""
+"""Downward acceleration that FlightTaskDescend commands without a vertical velocity estimate."""
 _DESCENT_SLEW_M_S2 = 1.0
 _REACHED_M = 0.1
 _HOME_RADIUS_M = 0.3
@@ -56,11 +56,11 @@ class Navigator:
 
     @property
     def descend_m_s(self) -> float:
-        """Commanded descent speed for the land detector (trajectory_setpoint.velocity[2]); a position setpoint does not count."""
+        """Commanded descent speed for the land detector (trajectory_setpoint.velocity[2]); 0 if only a position is commanded."""
         return self.target.velocity_ned_m_s[2] or 0.0
 
     def enter(self, state: NavState, estimate: Estimate, home_ned_m: Vec3 | None, landed: bool) -> None:
-        """Enter a mode and set the point that it holds."""
+        """Enter a mode and set the point that the mode holds."""
         previous, self._state = self._state, state
         came_from_takeoff = previous is NavState.TAKEOFF and self.takeoff_done
         self.takeoff_done = False
@@ -82,15 +82,15 @@ class Navigator:
             self._hold_ned_m = self._stopping_point(estimate)
 
     def leave(self) -> None:
-        """Leave the mode, on disarming."""
+        """Leave the active mode; called on disarming."""
         self._state = None
 
     def settle(self, landed: bool) -> None:
-        """Reset the take-off phase while the position loop is inactive (disarmed, or attitude setpoints)."""
+        """Reset the take-off phase; called while the position loop is inactive (disarmed, or with attitude or rate setpoints)."""
         self.phase = Phase.GROUND if landed else Phase.FLIGHT
 
     def reposition(self, position_ned_m: Vec3, yaw_rad: float | None) -> None:
-        """Move the point that Hold holds (MAV_CMD_DO_REPOSITION)."""
+        """Move the point that the mode Hold keeps (MAV_CMD_DO_REPOSITION); None keeps the yaw."""
         self._hold_ned_m = position_ned_m
         if yaw_rad is not None:
             self._yaw_rad = yaw_rad
@@ -149,7 +149,7 @@ class Navigator:
         return PositionTarget((x, y, self._hold_ned_m[2]), (vx, vy, None), (ax, ay, None), yaw_rad=self._yaw_rad)
 
     def _descent(self, dt_s: float, estimate: Estimate, home_ned_m: Vec3 | None) -> float:
-        """Return the landing speed at this height above home (MPC_LAND_ALT1/2), limited in its rate of change."""
+        """Return the descent speed for the present height above home (MPC_LAND_ALT1/2), with a limited rate of change."""
         real = self._params.real
         height = (home_ned_m[2] if home_ned_m else 0.0) - estimate.position_ned_m[2]
         low, high = real("MPC_LAND_ALT2"), max(real("MPC_LAND_ALT1"), real("MPC_LAND_ALT2") + 1e-3)
@@ -181,8 +181,8 @@ class Navigator:
         return (vz is not None and vz < 0.0) or (az is not None and az < 0.0)
 
     def _climb_limit(self, t_s: float) -> float | None:
-        """Return the upward speed limit; during the take-off ramp it rises from the value that commands zero thrust
-        (Takeoff::updateRamp).
+        """Return the upward speed limit in m/s, or None for no additional limit. During the take-off ramp, the limit rises from the
+        value that commands zero thrust (Takeoff::updateRamp).
         """
         real = self._params.real
         speed = real("MPC_TKO_SPEED")

@@ -1,7 +1,7 @@
 """Parameter store of the PX4 stub: PX4's names, types, order, wire encoding and defaults for this vehicle.
 
-Values are stored as in PX4: INT32, or REAL32 in single precision. The defaults are those of PX4 1.16, except for
-`VEHICLE_DEFAULTS`: settings for flying indoors on motion capture alone, and lower speeds for a small room.
+Values are stored as in PX4: INT32, or REAL32 in single precision. The defaults are those of PX4 1.16, except for `VEHICLE_DEFAULTS`:
+settings for flying indoors with motion capture as the only position source, and lower speeds for a small room.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MAV_PARAM_TYPE_INT32 = 6
 MAV_PARAM_TYPE_REAL32 = 9
 HASH_CHECK = "_HASH_CHECK"
 VERSION = "1.16"
-"""PX4 version of the names and defaults."""
+"""PX4 version from which the names and defaults come."""
 
 Value = int | float
 
@@ -37,11 +37,11 @@ class Params:
         """Set the defaults of this vehicle, then `overrides`.
 
         Raises:
-            KeyError: an override names an unknown parameter. ValueError: an override is not finite, or is not a whole number although
-            PX4 has an INT32.
+            KeyError: an override names an unknown parameter.
+            ValueError: an override is not finite, or is not a whole number in the range of INT32 although the parameter is an INT32.
         """
         self.revision = 0
-        """Counter that grows with every change, so that a cache can detect changes."""
+        """Counter that increases with every change, so that caches can detect changes."""
         self._integer = {name: isinstance(default, int) for name, default in PX4_DEFAULTS.items()}
         self._values: dict[str, Value] = {name: PX4_DEFAULTS[name] for name in sorted(PX4_DEFAULTS)}
         self._names = tuple(self._values)
@@ -78,10 +78,11 @@ class Params:
         return int(self._values[name])
 
     def set(self, name: str, value: Value) -> Value:
-        """Store a value and return the stored value.
+        """Store a value and return it as stored, in the parameter's type.
 
         Raises:
-            KeyError: the name is unknown. ValueError: the value is not finite, or is not a whole number although PX4 has an INT32.
+            KeyError: the name is unknown.
+            ValueError: the value is not finite, or is not a whole number in the range of INT32 although the parameter is an INT32.
         """
         integer = self._integer[name]
         if not math.isfinite(value):
@@ -96,7 +97,7 @@ class Params:
         return stored
 
     def index(self, name: str) -> int:
-        """Return the index of a parameter in the protocol.
+        """Return the index of a parameter in the MAVLink parameter protocol.
 
         Raises:
             KeyError: the name is unknown.
@@ -104,7 +105,7 @@ class Params:
         return self._index[name]
 
     def name_at(self, index: int) -> str | None:
-        """Return the name at an index of the protocol, or None."""
+        """Return the name of the parameter with this index in the MAVLink parameter protocol, or None."""
         return self._names[index] if 0 <= index < len(self._names) else None
 
     def mav_type(self, name: str) -> int:
@@ -116,7 +117,7 @@ class Params:
         return MAV_PARAM_TYPE_INT32 if self._integer[name] else MAV_PARAM_TYPE_REAL32
 
     def wire_value(self, name: str) -> float:
-        """Return PARAM_VALUE.param_value; integers are bit-cast into the float (MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE).
+        """Return a parameter as PARAM_VALUE.param_value; an integer is bit-cast to float (PARAM_ENCODE_BYTEWISE).
 
         Raises:
             KeyError: the name is unknown.
@@ -124,18 +125,18 @@ class Params:
         return encode_bytewise(self._values[name])
 
     def set_from_wire(self, name: str, wire: float, mav_type: int) -> Value:
-        """Store the value of PARAM_SET; PX4 rejects a message whose type differs from its own table.
+        """Store and return the value from a PARAM_SET message.
 
         Raises:
             KeyError: the name is unknown.
-            ValueError: the type differs or the value is not finite.
+            ValueError: the message's type differs from the parameter's, or the value is not finite.
         """
         if mav_type != self.mav_type(name):
             raise ValueError(f"{name}: MAV_PARAM_TYPE {mav_type} sent, {self.mav_type(name)} expected")
         return self.set(name, decode_bytewise(wire, mav_type))
 
     def hash_check(self) -> float:
-        """Return the value of the pseudo parameter _HASH_CHECK, a bit-cast CRC over names and values."""
+        """Return the value of the pseudo-parameter _HASH_CHECK: a CRC over names and values, bit-cast to float."""
         crc = 0
         for name, value in self._values.items():
             crc = zlib.crc32(name.encode(), crc)
@@ -144,7 +145,7 @@ class Params:
 
 
 def encode_bytewise(value: Value) -> float:
-    """Return the float that has the bytes of an int32; return a float unchanged."""
+    """Return the float with the same bytes as an int32; return a float unchanged."""
     if isinstance(value, int):
         return float(struct.unpack("<f", struct.pack("<i", value))[0])
     return value

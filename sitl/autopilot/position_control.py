@@ -1,4 +1,4 @@
-"""PX4's position controller: position P, velocity PID, then thrust vector and yaw to attitude. Frames: local NED, body FRD."""
+"""PX4's position controller: position P, velocity PID, and conversion of thrust vector and yaw to attitude (local NED, body FRD)."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class PositionControl:
     def step(
         self, dt_s: float, estimate: Estimate, target: PositionTarget, climb_limit_m_s: float | None = None
     ) -> AttitudeTarget:
-        """Run one control period; `climb_limit_m_s` lowers the upward speed limit during the take-off ramp (if negative, only descent
-        is possible).
+        """Run one control period and return the attitude setpoint. `climb_limit_m_s` lowers the upward speed limit during the take-off
+        ramp; if it is negative, only descent is possible.
         """
         if self._revision != self._params.revision:
             self._gains = self._read()
@@ -67,7 +67,7 @@ class PositionControl:
         return AttitudeTarget(attitude, thrust, yaw_rate)
 
     def idle(self, estimate: Estimate) -> AttitudeTarget:
-        """Return the setpoint on the ground: level, present heading, no thrust; reset the integrators."""
+        """Reset the integrators and return the setpoint for the ground: level attitude, present heading and zero thrust."""
         self.reset()
         yaw = heading_rad(estimate.attitude_ned_frd)
         return AttitudeTarget((math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)), 0.0)
@@ -111,7 +111,7 @@ class PositionControl:
         return out
 
     def _thrust_attitude(self, push: list[float], yaw_rad: float) -> tuple[Quat, float]:
-        """Convert an acceleration setpoint to attitude and thrust: hover thrust gives 1 g, vertical has priority over horizontal."""
+        """Convert an acceleration setpoint to attitude and thrust: hover thrust gives 1 g, and the vertical axis has priority."""
         gains = self._gains
         up = max(STANDARD_GRAVITY_M_S2 - push[2], 1e-3)
         horizontal = math.hypot(push[0], push[1])
@@ -168,12 +168,12 @@ class PositionControl:
 
 
 def heading_rad(attitude_ned_frd: Quat) -> float:
-    """Return the yaw of an attitude, rad."""
+    """Return the yaw of an attitude in rad."""
     return euler_zyx_from_quat(attitude_ned_frd)[2]
 
 
 def attitude_from_up(thrust_direction_ned: Vec3, yaw_rad: float) -> Quat:
-    """Return the attitude whose -z axis (the thrust) points along a unit vector, with heading `yaw_rad`."""
+    """Return the attitude with heading `yaw_rad` whose -z axis (the thrust direction) points along a unit vector in NED."""
     zx, zy, zz = -thrust_direction_ned[0], -thrust_direction_ned[1], -thrust_direction_ned[2]
     # x axis: the heading turned into the plane normal to z.
     xx, xy, xz = zz * math.cos(yaw_rad), zz * math.sin(yaw_rad), -(zx * math.cos(yaw_rad) + zy * math.sin(yaw_rad))

@@ -1,4 +1,6 @@
-"""Handlers of the MAVLink messages that the PX4 stub receives: parameters, commands, setpoints, vision. No sockets, no clock."""
+"""Handlers for the MAVLink messages that the PX4 stub receives: parameters, commands, setpoints and vision; without sockets or
+clock.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,7 @@ class Reply(Protocol):
     schedule: Schedule
 
     def send(self, message: Message) -> None:
-        """Send to the link's partner."""
+        """Send a message to the link's partner."""
 
     def send_all_params(self) -> None:
         """Start sending every parameter."""
@@ -149,7 +151,7 @@ class Receiver:
         )
 
     def _link_command(self, link: Reply, command: int, params: Command7) -> Result | None:
-        """Handle a command that PX4's mavlink module answers itself. Return None if the commander handles it."""
+        """Handle a command that PX4's mavlink module answers itself; return None if the commander must handle it."""
         number = int(params[0]) if math.isfinite(params[0]) else -1
         match command:
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
@@ -208,7 +210,9 @@ class Receiver:
         self._vision((m.x, m.y, m.z), quat_from_euler_zyx(m.roll, m.pitch, m.yaw))
 
     def _odometry(self, _link: Reply, message: Message) -> None:
-        """Accept ODOMETRY only if it is external vision; PX4 silently does not fuse MOCAP_NED, unset and naive estimators."""
+        """Accept ODOMETRY only if it is external vision; PX4 silently ignores frame MOCAP_NED and the estimator types unset and
+        naive.
+        """
         m = message
         if m.estimator_type in _FUSED_ESTIMATORS and m.frame_id in _FUSED_FRAMES:
             self._vision((m.x, m.y, m.z), (m.q[0], m.q[1], m.q[2], m.q[3]))
@@ -245,7 +249,7 @@ class Receiver:
 
 
 def param_value_message(stub: Px4Stub, name: str) -> Message:
-    """Return PARAM_VALUE of one parameter."""
+    """Return the PARAM_VALUE message for one parameter."""
     params = stub.params
     return mavlink.MAVLink_param_value_message(
         name.encode(), params.wire_value(name), params.mav_type(name), len(params), params.index(name)
@@ -253,7 +257,7 @@ def param_value_message(stub: Px4Stub, name: str) -> Message:
 
 
 def hash_check_message(stub: Px4Stub) -> Message:
-    """Return PARAM_VALUE of _HASH_CHECK, which has index -1 and is not counted."""
+    """Return the PARAM_VALUE message for _HASH_CHECK, which has index -1 and is not included in the parameter count."""
     return mavlink.MAVLink_param_value_message(
         HASH_CHECK.encode(), stub.params.hash_check(), MAV_PARAM_TYPE_INT32, len(stub.params), 65535
     )

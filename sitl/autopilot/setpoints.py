@@ -24,7 +24,7 @@ class RateTarget:
 
 @dataclass(frozen=True, slots=True)
 class PositionTarget:
-    """Position setpoint (trajectory_setpoint); None means that this quantity does not command the axis."""
+    """Position setpoint (trajectory_setpoint); None means that the quantity is not commanded on that axis."""
 
     position_ned_m: Axis3 = NOTHING
     velocity_ned_m_s: Axis3 = NOTHING
@@ -43,7 +43,7 @@ class PositionTarget:
 
     @property
     def empty(self) -> bool:
-        """Whether it commands no axis."""
+        """Whether the setpoint commands no axis."""
         axes = (*self.position_ned_m, *self.velocity_ned_m_s, *self.acceleration_ned_m_s2)
         return all(value is None for value in axes)
 
@@ -57,11 +57,11 @@ _THROTTLE_IGNORE, _ATTITUDE_IGNORE = 64, 128
 def decode_attitude_target(
     type_mask: int, q_wxyz: Quat, rates_frd_rad_s: Vec3, thrust: float
 ) -> AttitudeTarget | RateTarget | None:
-    """Decode SET_ATTITUDE_TARGET as PX4 does, with thrust limited to 0 .. 1.
+    """Decode SET_ATTITUDE_TARGET as PX4 does, with thrust limited to 0 to 1.
 
     Returns:
-        The setpoint, or None if the message does not count as one: its quaternion has no direction, its thrust is not finite or
-        masked out, or its rates are not finite.
+        The setpoint, or None if PX4 ignores the message: its thrust is non-finite or masked out, its quaternion is zero or
+        non-finite, or, without an attitude, a body rate is non-finite or the roll or pitch rate is masked out.
     """
     if type_mask & _THROTTLE_IGNORE or not math.isfinite(thrust):
         return None
@@ -96,7 +96,7 @@ def decode_position_target(
 ) -> PositionTarget | None:
     """Decode SET_POSITION_TARGET_LOCAL_NED as PX4 does; return None if it commands nothing.
 
-    PX4 uses every field in MAV_FRAME_LOCAL_NED; in MAV_FRAME_BODY_NED it uses velocity and acceleration, rotated by the heading.
+    In MAV_FRAME_LOCAL_NED PX4 uses every field; in MAV_FRAME_BODY_NED it uses only velocity and acceleration, rotated by the heading.
     """
     if frame not in (MAV_FRAME_LOCAL_NED, MAV_FRAME_BODY_NED) or type_mask & _FORCE_SET:
         return None

@@ -1,7 +1,8 @@
 """Jerk-limited motion to a point in the horizontal plane, after PX4's PositionSmoothing and VelocitySmoothing.
 
-The speed towards the point is what TrajMath's computeMaxSpeedFromDistance allows, at most MPC_XY_CRUISE; the velocity follows it within
-MPC_ACC_HOR and MPC_JERK_AUTO. Near the point the approach is exponential, with a time constant of 2 MPC_ACC_HOR / MPC_JERK_AUTO.
+The speed towards the point is the speed that TrajMath's computeMaxSpeedFromDistance allows, but at most MPC_XY_CRUISE. The velocity
+follows it within the limits MPC_ACC_HOR and MPC_JERK_AUTO. Near the point the approach is exponential, with a time constant of 2
+MPC_ACC_HOR / MPC_JERK_AUTO.
 """
 
 from __future__ import annotations
@@ -12,15 +13,15 @@ from companion.model.types import Vec2
 from sitl.autopilot.params import Params
 
 _SETTLE_S = 0.1
-"""Time constant with which the velocity approaches the wanted one once they are close, so that the acceleration does not chatter."""
+"""Time constant with which the velocity approaches a commanded velocity close to it, so that the acceleration does not chatter."""
 
 
 class Smoothing:
-    """The trajectory's position, velocity and acceleration, local NED.
+    """Position, velocity and acceleration of the trajectory in the horizontal plane, local NED.
 
     Args:
         position_ned_m: horizontal position at the start.
-        velocity_ned_m_s: horizontal velocity at the start; the acceleration there is zero.
+        velocity_ned_m_s: horizontal velocity at the start; the initial acceleration is zero.
     """
 
     __slots__ = ("acceleration_m_s2", "position_m", "velocity_m_s")
@@ -31,7 +32,7 @@ class Smoothing:
         self.acceleration_m_s2: Vec2 = (0.0, 0.0)
 
     def step(self, dt_s: float, to_ned_m: Vec2, params: Params) -> None:
-        """Advance by one period of the position loop towards the point."""
+        """Advance the trajectory towards the point by one period of the position loop."""
         jerk, acceleration = params.real("MPC_JERK_AUTO"), params.real("MPC_ACC_HOR")
         away = (to_ned_m[0] - self.position_m[0], to_ned_m[1] - self.position_m[1])
         distance_m = math.hypot(*away)
@@ -53,6 +54,6 @@ class Smoothing:
 
 
 def max_speed_m_s(distance_m: float, acceleration_m_s2: float, jerk_m_s3: float) -> float:
-    """Return the speed from which the vehicle can stop within a distance (TrajMath: computeMaxSpeedFromDistance, final speed 0)."""
+    """Return the largest speed from which the vehicle can stop within a distance (TrajMath: computeMaxSpeedFromDistance)."""
     b = 4.0 * acceleration_m_s2 * acceleration_m_s2 / jerk_m_s3
     return 0.5 * (math.sqrt(b * b + 8.0 * acceleration_m_s2 * distance_m) - b)

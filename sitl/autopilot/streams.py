@@ -1,4 +1,4 @@
-"""Telemetry streams of the PX4 stub: PX4's default and maximum rates, and a schedule on world time. No I/O, no clock."""
+"""Telemetry streams of the PX4 stub: PX4's default and maximum rates, and a schedule on world time; without I/O or clock."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Builder = Callable[[Px4Stub], Message | None]
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """One message type with its rates in Hz: default on the onboard link, default on the ground station link, maximum."""
+    """One message type with its rates in Hz: the defaults on the onboard and the ground station link, and the maximum."""
 
     build: Builder
     onboard_hz: float
@@ -85,7 +85,7 @@ STREAMS: dict[int, Stream] = {
 
 
 class Schedule:
-    """Schedule of the streams of one link, on world time."""
+    """Schedule, in world time, of the streams of one link."""
 
     def __init__(self, ground: bool) -> None:
         self._default_hz = {key: stream.ground_hz if ground else stream.onboard_hz for key, stream in STREAMS.items()}
@@ -106,7 +106,9 @@ class Schedule:
         return True
 
     def set_interval_us(self, message_id: int, interval_us: float) -> bool:
-        """Handle MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 is the default rate. Return False if there is no such stream."""
+        """Handle MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops the stream, 0 sets the default rate. Return False if there is no such
+        stream.
+        """
         if message_id not in STREAMS or not math.isfinite(interval_us):
             return False
         if interval_us == 0:
@@ -114,7 +116,7 @@ class Schedule:
         return self.set_rate(message_id, 1e6 / interval_us if interval_us > 0 else 0.0)
 
     def interval_us(self, message_id: int) -> int:
-        """Return the interval for MESSAGE_INTERVAL: -1 if stopped, 0 if unknown."""
+        """Return the interval in us for MESSAGE_INTERVAL: -1 for a stopped stream, 0 for an unknown one."""
         if message_id not in STREAMS:
             return 0
         period_s = self._period_s.get(message_id)

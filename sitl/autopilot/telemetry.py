@@ -1,6 +1,6 @@
-"""Telemetry of the PX4 stub: one builder per MAVLink message. No I/O, no clock.
+"""Telemetry of the PX4 stub: one builder per MAVLink message, without I/O or clock.
 
-A builder returns None while PX4 would not send the message: ATTITUDE without an aligned filter, HOME_POSITION without home.
+A builder returns None while PX4 would not send the message, for example ATTITUDE before the filter is aligned.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ def _ms(stub: Px4Stub) -> int:
 
 
 def clock_us(stub: Px4Stub) -> int:
-    """Return PX4's own clock: microseconds since it booted."""
+    """Return the time on PX4's own clock in us since it booted."""
     return int((stub.t_s - stub.booted_at_s + stub.clock_ahead_s) * 1e6)
 
 
 def heartbeat(stub: Px4Stub) -> Message:
-    """HEARTBEAT."""
+    """Return HEARTBEAT."""
     state = stub.nav_state
     base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     if state not in (NavState.TERMINATION, NavState.MANUAL, NavState.ACRO):
@@ -50,7 +50,7 @@ def heartbeat(stub: Px4Stub) -> Message:
 
 
 def system_status(stub: Px4Stub) -> int:
-    """HEARTBEAT.system_status (MAV_STATE), as PX4 1.16's HEARTBEAT.hpp chooses it."""
+    """Return HEARTBEAT.system_status (MAV_STATE), chosen as in HEARTBEAT.hpp of PX4 1.16."""
     if stub.nav_state is NavState.TERMINATION:
         return int(mavlink.MAV_STATE_FLIGHT_TERMINATION)
     if not stub.armed:
@@ -59,7 +59,9 @@ def system_status(stub: Px4Stub) -> int:
 
 
 def sys_status(stub: Px4Stub) -> Message:
-    """SYS_STATUS. As measured, PREARM_CHECK is never healthy with SYS_HAS_MAG = 0, and position sources are not reported."""
+    """Return SYS_STATUS. As measured on PX4, PREARM_CHECK is never healthy with SYS_HAS_MAG = 0, and position sources are not
+    reported.
+    """
     present = (
         mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
         | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
@@ -84,7 +86,7 @@ def sys_status(stub: Px4Stub) -> Message:
 
 
 def extended_sys_state(stub: Px4Stub) -> Message:
-    """Build EXTENDED_SYS_STATE."""
+    """Return EXTENDED_SYS_STATE."""
     if stub.landed:
         landed = mavlink.MAV_LANDED_STATE_ON_GROUND
     elif stub.nav_state is NavState.TAKEOFF:
@@ -97,7 +99,7 @@ def extended_sys_state(stub: Px4Stub) -> Message:
 
 
 def battery_status(stub: Px4Stub) -> Message:
-    """BATTERY_STATUS of battery 1."""
+    """Return BATTERY_STATUS for battery 1."""
     battery, cells = stub.battery, max(1, min(10, stub.params.integer("BAT1_N_CELLS")))
     each = _u16(battery.voltage_v / cells * 1e3)
     voltages = [each if i < cells else 65535 for i in range(10)]
@@ -110,7 +112,7 @@ def battery_status(stub: Px4Stub) -> Message:
 
 
 def attitude(stub: Px4Stub) -> Message | None:
-    """ATTITUDE."""
+    """Return ATTITUDE."""
     estimate = _attitude(stub)
     if estimate is None:
         return None
@@ -120,7 +122,7 @@ def attitude(stub: Px4Stub) -> Message | None:
 
 
 def attitude_quaternion(stub: Px4Stub) -> Message | None:
-    """ATTITUDE_QUATERNION."""
+    """Return ATTITUDE_QUATERNION."""
     estimate = _attitude(stub)
     if estimate is None:
         return None
@@ -128,7 +130,9 @@ def attitude_quaternion(stub: Px4Stub) -> Message | None:
 
 
 def local_position_ned(stub: Px4Stub) -> Message | None:
-    """LOCAL_POSITION_NED. PX4 sends it even if the position is invalid: (0, 0, 0) before vision, dead reckoning after its loss."""
+    """Return LOCAL_POSITION_NED. PX4 sends it even if the position is invalid: (0, 0, 0) before the first vision pose, dead
+    reckoning after vision is lost.
+    """
     estimate = _attitude(stub)
     if estimate is None:
         return None
@@ -136,7 +140,7 @@ def local_position_ned(stub: Px4Stub) -> Message | None:
 
 
 def odometry(stub: Px4Stub) -> Message | None:
-    """ODOMETRY; on 1.16 the velocity is NED, as child_frame_id states."""
+    """Return ODOMETRY; in PX4 1.16 the velocity is in NED, as child_frame_id states."""
     estimate = _attitude(stub)
     if estimate is None:
         return None
@@ -149,7 +153,7 @@ def odometry(stub: Px4Stub) -> Message | None:
 
 
 def highres_imu(stub: Px4Stub) -> Message | None:
-    """HIGHRES_IMU: accelerometer and gyroscope only; specific force and rates in FRD."""
+    """Return HIGHRES_IMU with specific force (m/s^2) and body rates (rad/s) in FRD; the other sensors have constants."""
     imu = stub.imu
     if imu is None:
         return None
@@ -169,7 +173,7 @@ def highres_imu(stub: Px4Stub) -> Message | None:
 
 
 def scaled_imu(stub: Px4Stub) -> Message | None:
-    """SCALED_IMU: mG and mrad/s."""
+    """Return SCALED_IMU with specific force in mG and body rates in mrad/s."""
     imu = stub.imu
     if imu is None:
         return None
@@ -179,8 +183,8 @@ def scaled_imu(stub: Px4Stub) -> Message | None:
 
 
 def estimator_status(stub: Px4Stub) -> Message | None:
-    """ESTIMATOR_STATUS as EKF2 1.16 sends it: a ratio is NaN while no measurement of its kind is fused, the absolute position needs an
-    origin, and the flag for constant position is also set at rest.
+    """Return ESTIMATOR_STATUS as EKF2 of PX4 1.16 sends it: a ratio is NaN while no measurement of its kind is fused, the flag for
+    absolute position needs an origin, and the flag for constant position is also set at rest.
     """
     estimate = stub.estimate
     if estimate is None:
@@ -201,7 +205,7 @@ def estimator_status(stub: Px4Stub) -> Message | None:
 
 
 def vfr_hud(stub: Px4Stub) -> Message | None:
-    """VFR_HUD."""
+    """Return VFR_HUD."""
     estimate = _attitude(stub)
     if estimate is None:
         return None
@@ -217,7 +221,7 @@ def vfr_hud(stub: Px4Stub) -> Message | None:
 
 
 def altitude(stub: Px4Stub) -> Message | None:
-    """ALTITUDE."""
+    """Return ALTITUDE."""
     estimate = _position(stub)
     if estimate is None:
         return None
@@ -228,7 +232,7 @@ def altitude(stub: Px4Stub) -> Message | None:
 
 
 def attitude_target(stub: Px4Stub) -> Message | None:
-    """ATTITUDE_TARGET: setpoint of the attitude loop."""
+    """Return ATTITUDE_TARGET, the setpoint of the attitude loop; None while disarmed."""
     if not stub.armed:
         return None
     target = stub.target
@@ -238,7 +242,7 @@ def attitude_target(stub: Px4Stub) -> Message | None:
 
 
 def position_target_local_ned(stub: Px4Stub) -> Message | None:
-    """POSITION_TARGET_LOCAL_NED: setpoint of the position controller."""
+    """Return POSITION_TARGET_LOCAL_NED, the setpoint of the position controller; None while that does not control the vehicle."""
     if not stub.armed or not stub.position_controlled:
         return None
     target = stub.navigator.target
@@ -251,7 +255,7 @@ def position_target_local_ned(stub: Px4Stub) -> Message | None:
 
 
 def global_position_int(stub: Px4Stub) -> Message | None:
-    """GLOBAL_POSITION_INT; only with an origin and a valid position."""
+    """Return GLOBAL_POSITION_INT; None without an origin or a valid position."""
     estimate, origin = _position(stub), stub.origin
     if estimate is None or origin is None:
         return None
@@ -266,7 +270,7 @@ def global_position_int(stub: Px4Stub) -> Message | None:
 
 
 def gps_global_origin(stub: Px4Stub) -> Message | None:
-    """GPS_GLOBAL_ORIGIN; only with an origin and a valid position."""
+    """Return GPS_GLOBAL_ORIGIN; None without an origin or a valid position."""
     origin = stub.origin
     if origin is None or _position(stub) is None:
         return None
@@ -279,7 +283,7 @@ def gps_global_origin(stub: Px4Stub) -> Message | None:
 
 
 def home_position(stub: Px4Stub) -> Message | None:
-    """HOME_POSITION; only with an origin."""
+    """Return HOME_POSITION; None without a home position or an origin."""
     home, origin = stub.home_ned_m, stub.origin
     if home is None or origin is None:
         return None
@@ -291,38 +295,38 @@ def home_position(stub: Px4Stub) -> Message | None:
 
 
 def servo_output_raw(stub: Px4Stub) -> Message:
-    """SERVO_OUTPUT_RAW: 1000 to 2000 us per rotor, 900 when disarmed."""
+    """Return SERVO_OUTPUT_RAW: 1000 to 2000 us per rotor, or 900 us while disarmed."""
     pulses = [round(1000 + 1000 * command) for command in stub.rotors] if stub.armed else [900] * 4
     return mavlink.MAVLink_servo_output_raw_message(clock_us(stub) & 0xFFFFFFFF, 0, *pulses, 0, 0, 0, 0)
 
 
 def actuator_output_status(stub: Px4Stub) -> Message:
-    """ACTUATOR_OUTPUT_STATUS: rotor commands, 0 to 1."""
+    """Return ACTUATOR_OUTPUT_STATUS with the rotor commands, 0 to 1."""
     return mavlink.MAVLink_actuator_output_status_message(clock_us(stub), 0xF, [*stub.rotors, *[0.0] * 28])
 
 
 def system_time(stub: Px4Stub) -> Message:
-    """SYSTEM_TIME; the wall clock is 0 without GPS."""
+    """Return SYSTEM_TIME; the wall-clock time is 0 without GPS."""
     return mavlink.MAVLink_system_time_message(0, _ms(stub))
 
 
 def timesync_request(stub: Px4Stub) -> Message:
-    """TIMESYNC request of PX4."""
+    """Return a TIMESYNC request from PX4."""
     return mavlink.MAVLink_timesync_message(0, clock_us(stub) * 1000)
 
 
 def ping(stub: Px4Stub) -> Message:
-    """PING request to all systems."""
+    """Return a PING request to all systems."""
     return mavlink.MAVLink_ping_message(clock_us(stub), int(stub.t_s) & 0xFFFFFFFF, 0, 0)
 
 
 def vibration(stub: Px4Stub) -> Message:
-    """VIBRATION."""
+    """Return VIBRATION; every value is 0."""
     return mavlink.MAVLink_vibration_message(clock_us(stub), 0.0, 0.0, 0.0, 0, 0, 0)
 
 
 def autopilot_version(stub: Px4Stub) -> Message:
-    """AUTOPILOT_VERSION: PX4 1.16.1."""
+    """Return AUTOPILOT_VERSION for PX4 1.16.1."""
     capabilities = (
         mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
         | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT

@@ -1,6 +1,6 @@
-"""Records inside the PX4 stub; frames are PX4's own: local NED, body FRD.
+"""Records used inside the PX4 stub; the frames are PX4's: local NED, body FRD.
 
-They are named tuples because they are created at 250 Hz, at a quarter of the cost of a frozen dataclass.
+The records are named tuples: they are created at 250 Hz, and a named tuple costs a quarter of a frozen dataclass.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ class ImuSample(NamedTuple):
     t_s: float
     gyro_frd_rad_s: Vec3
     accel_frd_m_s2: Vec3
-    """Specific force: (0, 0, -9.81) at rest, level."""
+    """Specific force; (0, 0, -9.81) for a level vehicle at rest."""
 
 
 class LearnedBias(NamedTuple):
@@ -36,17 +36,19 @@ class Estimate(NamedTuple):
     rates_frd_rad_s: Vec3
     accel_frd_m_s2: Vec3
     vision_fused: bool
-    """Whether vision was fused within the last 0.55 s (as PX4's EV flags)."""
+    """Whether vision was fused within the last 0.55 s (like PX4's EV flags)."""
     position_valid: bool
-    """xy_valid and z_valid of VEHICLE_LOCAL_POSITION: true up to 4.5 s after vision was last fused."""
+    """xy_valid and z_valid of vehicle_local_position: true until 4.5 s after vision was last fused."""
     attitude_valid: bool
 
 
 class Fusion(NamedTuple):
-    """Vision innovation test ratios as in ESTIMATOR_STATUS (square roots of filtered test ratios), and accuracy (one sigma)."""
+    """Innovation test ratios of vision as in ESTIMATOR_STATUS (square roots of the filtered test ratios), and accuracies (one
+    sigma).
+    """
 
     horizontal_ratio: float
-    """NaN if vision is not fused."""
+    """Test ratio of the horizontal position; NaN while vision is not fused."""
     vertical_ratio: float
     horizontal_accuracy_m: float
     vertical_accuracy_m: float

@@ -1,4 +1,4 @@
-"""`python -m sitl.campaigns`: flies the job on standard input."""
+"""`python -m sitl.campaigns`: reads a job from standard input and flies it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _CAMPAIGNS = {
 
 
 def main() -> int:
-    """Fly the job on standard input; return the exit code."""
+    """Read a job from standard input and fly it; return the exit code."""
     job = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
     prepare, fly = _CAMPAIGNS[job["campaign"]]

@@ -1,4 +1,7 @@
-"""Flights of `companion compare`: {controller, preset, payload_kg, seed, model_error, series}; `series` requests a time series."""
+"""Flies the flights of `companion compare`.
+
+A flight is {controller, preset, payload_kg, seed, model_error, series}; `series` requests a time series.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ def prepare(job: Data, _: Sequence[SitlConfig]) -> list[Data]:
 
 
 def fly(config: SitlConfig, flight: Data) -> Data:
-    """Fly one flight; return its row (see `companion.campaigns.compare.aggregate`) and its time series."""
+    """Fly one flight; return its row (see `companion.campaigns.compare.aggregate`) and its time series, if requested."""
     changes = {key: flight[key] for key in ("payload_kg", "seed", "model_error")}
     flown = fly_to_end(with_world(config, changes))
     row, log = row_of(flown.config.flight, flown.result, flown.caught_t_s, flown.error)
@@ -36,7 +39,7 @@ def fly(config: SitlConfig, flight: Data) -> Data:
 
 
 def series_of(log: FlightLog) -> Data:
-    """Return errors and joint angles in flight over the mission clock, for plots; None where a value is unknown."""
+    """Return the errors and joint angles in flight against mission time, for plots; an unknown value is None."""
     pre, post = metrics.flight_masks(log)
     used = np.flatnonzero(pre | post)[::SERIES_EVERY]
     columns = log.columns

@@ -1,4 +1,7 @@
-"""Flights of `companion faults`: {kind, size, duration_s, phase}, as in `companion.campaigns.faults.variants.Variant`."""
+"""Flies the flights of `companion faults`.
+
+A flight is {kind, size, duration_s, phase}: the fields of `companion.campaigns.faults.variants.Variant` and the phase of flight.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +46,7 @@ def fly(config: SitlConfig, flight: Data) -> Data:
 
 
 def record_of(flown: Flown) -> FaultFlight:
-    """Return the record of a flight for the judge."""
+    """Return the record of a flight in the form that `companion.campaigns.faults.judge` grades."""
     fast, result = flown.fast, flown.result
     if fast is None:
         return FaultFlight(

@@ -23,11 +23,11 @@ from sitl.fast.loop import FastFlight, FastResult
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """A fast flight that has ended, perhaps by an exception."""
+    """A fast flight that has ended, normally or by an exception."""
 
     config: SitlConfig
     fast: FastFlight | None
-    """Result of the flight; None if an exception ended it."""
+    """The flight with its final world; None if an exception ended it."""
     result: FastResult
     error: str | None
     """The exception that ended the flight, if any."""
@@ -39,11 +39,11 @@ class Flown:
 
 
 def with_world(config: SitlConfig, changes: Data) -> SitlConfig:
-    """Return the configuration with keys of its world changed; another seed draws another laboratory.
+    """Return the configuration with some keys of its world changed; a different seed draws a different laboratory.
 
     Args:
         config: configuration of a flight.
-        changes: plain data by key of the world. A key given here is not drawn.
+        changes: new values (plain data) by key of the world. A key given here is not drawn at random.
     """
     laboratory = config.laboratory.without(list(changes))
     data = config.world.model_dump(mode="json") | changes
@@ -52,14 +52,12 @@ def with_world(config: SitlConfig, changes: Data) -> SitlConfig:
 
 
 def laboratory_of(config: SitlConfig) -> Data:
-    """Return the entries of a row about the flight's world."""
+    """Return a row's entries about the flight's world."""
     return {"world_seed": config.world.seed, "model_error": config.world.model_error}
 
 
 def fly_to_end(config: SitlConfig, limit_s: float = 90.0) -> Flown:
-    """Fly the mission, at most until world time `limit_s`. An exception ends this flight as it would end the flight process, not the
-    campaign.
-    """
+    """Fly the mission, at most until world time `limit_s`. An exception ends only this flight; it is returned in `Flown.error`."""
     try:
         fast = FastFlight(config)
         return Flown(fast.config, fast, fast.run(limit_s), None)
@@ -70,7 +68,9 @@ def fly_to_end(config: SitlConfig, limit_s: float = 90.0) -> Flown:
 def row_of(
     config: FlightConfig, result: FastResult, caught_t_s: float | None, error: str | None = None
 ) -> tuple[Data, FlightLog]:
-    """Return a flight's row of graded results (see `companion.campaigns.compare.aggregate`), without its identification, and its log.
+    """Return the row of a flight and its log.
+
+    The row has the graded results (see `companion.campaigns.compare.aggregate`), but not the flight's identification.
 
     Args:
         config: configuration of the flight.
@@ -103,8 +103,8 @@ def row_of(
 
 
 def torque_activity_nm(log: FlightLog, mask: metrics.Mask) -> float | None:
-    """Return the RMS change of the commanded joint torques (norm of both) from one tick to the next, over the ticks that `mask`
-    selects.
+    """Return the RMS of the change in commanded joint torque (norm over both joints, N m) from one tick to the next, over the ticks
+    that `mask` selects.
     """
     torque = log.column(lambda i, o, s: o.arm_torque_nm, 2)
     return metrics.rms_norm(np.diff(torque, axis=0)[mask[1:] & mask[:-1]])
@@ -116,7 +116,7 @@ def _peak(rows: Array) -> float | None:
 
 
 def log_of(config: FlightConfig, result: FastResult, caught_t_s: float | None) -> FlightLog:
-    """Return the log of a fast flight, for metrics and plots; it has no file."""
+    """Return the log of a fast flight, for metrics and plots; the log has no file."""
     outputs = _with_catch(result, caught_t_s)
     return FlightLog(
         path=Path("fast"),
@@ -129,8 +129,8 @@ def log_of(config: FlightConfig, result: FastResult, caught_t_s: float | None) -
 
 
 def _with_catch(result: FastResult, caught_t_s: float | None) -> tuple[Outputs, ...]:
-    """Return the outputs with a catch event, at the true catch if the core did not detect it, so that errors before and after are not
-    mixed.
+    """Return the outputs with a catch event. If the core did not detect the catch, the event is added at the true catch, so that the
+    errors before and after it are not mixed.
     """
     outputs = list(result.outputs)
     seen = any(event.id == "catch" for output in outputs for event in output.events)

@@ -1,7 +1,8 @@
-"""Flights of `companion robustness`: {name, number, world}; a flight without a `world` is drawn at random by its number.
+"""Flies the flights of `companion robustness`.
 
-Payload, throw and catch point are drawn here, because they depend on the mission; the rest is drawn as the world's file says. The job
-also has `seed` (seed of the random draws) and `fixed` (names of world keys that keep their configured values).
+A flight is {name, number, world}. If `world` is null, the world is drawn at random; `number` is the number of the draw. Payload,
+throw and catch point are drawn here, because they depend on the mission; the rest is drawn as the world file specifies. The job also
+has `seed` (seed of the random draws) and `fixed` (names of world keys that keep their configured values).
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ from sitl.world.payload import THROW_LEAD_S
 
 PAYLOAD_KG = (0.05, 0.4)
 THROW_SPEED_M_S = (0.5, 4.0)
-"""Range of the horizontal speed at the catch, from any side; the descent is added."""
+"""Range of the payload's horizontal speed at the catch. It comes from any side; the descent is drawn separately."""
 DESCENT_MAX_M_S = 2.5
 
 ALONG_MIN_M_S = 0.08
-"""Smallest speed of the vehicle in the direction of +x at a catch point."""
+"""Smallest speed of the vehicle in the +x direction at a catch point."""
 END_MARGIN_M = 0.08
-"""Distance of the catch points from the ends of the line: a vehicle displaced by the wind may not pass a point closer to them."""
+"""Smallest distance of a catch point from the ends of the line, which a vehicle displaced by wind might not reach."""
 HAND_HEIGHT_M = 0.1
 """Smallest height above the floor at which the payload is released."""
 ROTORS_ABOVE_BODY_M = 0.03
@@ -50,14 +51,14 @@ class Throw:
 
     at_m: tuple[float, float]
     descent_m_s: tuple[float, float]
-    """Range of the descent speed: the slowest throw is from `HAND_HEIGHT_M`; the fastest still clears the rotors."""
+    """Range of the descent speed: the slowest throw starts at `HAND_HEIGHT_M`; the fastest still clears the rotors."""
 
 
 def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
-    """Return the catch points along the first pass in the direction of +x, in the order of the flight.
+    """Return the catch points along the first pass in the +x direction, in flight order.
 
     Raises:
-        CampaignError: there is no such pass.
+        CampaignError: the mission has no such pass.
     """
     plan = Plan.build(mission, vehicle)
     manipulator = Manipulator(vehicle.arm, vehicle.tool)
@@ -94,7 +95,7 @@ def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
 
 
 def draw(seed: int, number: int, places: list[Throw]) -> Data:
-    """Draw payload, throw, catch point and the world's seed, which draws the rest. Return these keys of the world, rounded.
+    """Draw the payload, the throw, the catch point and the seed for the rest of the world; return these keys of the world.
 
     Args:
         seed: seed of the campaign.
@@ -121,7 +122,7 @@ def draw(seed: int, number: int, places: list[Throw]) -> Data:
 
 
 def prepare(job: Data, configs: Sequence[SitlConfig]) -> list[Data]:
-    """Return the flights of the job, each with the keys of its world that differ from the configuration.
+    """Return the flights of the job, each with the world keys in which it differs from the configuration.
 
     Raises:
         CampaignError: no payload can be thrown to the vehicle in this mission.
@@ -201,7 +202,7 @@ def _graded(flown: Flown) -> Data:
 
 
 def _extremes(log: FlightLog) -> Data:
-    """Return the extremes of a flight relative to its limits."""
+    """Return the largest tilt, the smallest tether slack and the distance of the landing from the start; None if unknown."""
     nothing = {"tilt_max_deg": None, "slack_min_m": None, "home_m": None}
     if not log.inputs:
         return nothing

@@ -17,8 +17,8 @@ WORKERS_TIMEOUT_S = 30.0
 
 Data = dict[str, Any]
 Fly = Callable[[SitlConfig, Data], Data]
-"""Flies one flight of a job and returns its `row`, and a `series` if it has one; must be a module-level function, so that workers find
-it.
+"""Flies one flight of a job and returns its `row`, and its `series` if it has one; must be a module-level function, so that workers can
+import it.
 """
 
 

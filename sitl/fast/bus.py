@@ -1,4 +1,4 @@
-"""The servo bus of the fast closed loop, without a pty: the outcome of the companion's bus set-up, reads and writes."""
+"""The servo bus of the fast closed loop: without a pty, it models the outcome of the companion's bus set-up, reads and writes."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def scales_of(vehicle: Vehicle, servos: Sequence[ServoModel]) -> tuple[JointScal
         servos: all servos that are connected to the bus.
 
     Returns:
-        None if a servo is not the only one to answer at the vehicle file's id and baud rate, or if its current limit is below
-        what `torque_max_nm` needs.
+        None unless exactly one servo answers at each joint's id and baud rate in the vehicle file and its current limit suffices
+        for `torque_max_nm`.
     """
     line, arm = ServoLine(servos), vehicle.arm
     first, second = (_current_limit_counts(line, joint, vehicle.devices.arm.baud) for joint in arm.joints)
@@ -56,11 +56,11 @@ def _current_limit_counts(line: ServoLine, joint: Joint, baud_bps: int) -> int |
 
 
 class FastBus:
-    """The companion's cycle on the bus of two servos.
+    """The companion's cycle of reads and writes on the bus of two servos.
 
     Args:
-        drives: motors of the servos, in current mode from now on.
-        scales: scale of each joint; None if the set-up of the bus failed, and then the arm never answers.
+        drives: motors of the servos; they are set to current mode.
+        scales: scale of each joint; None if the bus set-up failed, in which case the arm never answers.
         watchdog_s: timeout of the servos' bus watchdog.
         faults: faults of the world; None if it has none.
     """
@@ -81,7 +81,9 @@ class FastBus:
             drive.start_watchdog(watchdog_s)
 
     def read(self, t_s: float) -> ArmState | None:
-        """Return the joint state of this tick, or the last one with one more failure."""
+        """Return the joint state of this tick. If the read fails, return the last state with one more read failure; None if the bus
+        set-up failed.
+        """
         if self._arm is None or self._faults is None or not self._read_fails(self._faults):
             self._arm = self._state(t_s)
         else:
@@ -89,14 +91,14 @@ class FastBus:
         return self._arm
 
     def keep_alive(self, t_s: float) -> None:
-        """Do what the bus thread does while the flight process stalls: feed the watchdogs and withdraw stale currents."""
+        """Do what the bus thread does while the flight process stalls: feed the watchdogs and set stale currents to zero."""
         for drive in self._drives:
             drive.heard_instruction()
             if t_s - self._goal_s > self._watchdog_s:
                 drive.set_goal_current(0)
 
     def write(self, t_s: float, torque_nm: Vec2 | None) -> None:
-        """Write the currents for these torques; if None, write nothing and withdraw stale currents."""
+        """Write the currents for these joint torques. If `torque_nm` is None, only set stale currents to zero."""
         faults = self._faults
         if torque_nm is not None and self._scales is not None:
             self._goal_s = t_s

@@ -92,7 +92,7 @@ class _StubEnd:
         self._wire.post(message)
 
     def send_all_params(self) -> None:
-        """Do nothing: the guardian does not ask for parameters."""
+        """Do nothing: the guardian does not request parameters."""
 
     def note_ground_station(self) -> None:
         """Do nothing: there is no ground station."""
@@ -106,7 +106,7 @@ class FastGuardian:
 
     Args:
         vehicle: vehicle file; provides the timeout and the height of the vehicle on the floor.
-        px4: the stub that it connects to.
+        px4: the stub to which the guardian connects.
     """
 
     def __init__(self, vehicle: Vehicle, px4: Px4Stub) -> None:
@@ -127,7 +127,7 @@ class FastGuardian:
         self._beat = self._heartbeats.of(inputs, outputs)
 
     def decides_to_take_over(self, t_s: float, heard: bool, dead: bool) -> bool:
-        """Check the flight process; call it in every tick.
+        """Return whether the guardian now takes over from the flight process, and record the event; call this method in every tick.
 
         Args:
             t_s: world time.
@@ -150,7 +150,7 @@ class FastGuardian:
         return True
 
     def take_over(self, t_s: float) -> Landing:
-        """Take control and return the landing."""
+        """Take control of the vehicle and return the landing."""
         assert self._beat is not None
         return Landing(self._beat, self._vehicle, self._px4, t_s, self._notify)
 
@@ -176,7 +176,7 @@ class Landing:
         return self._landing.landed
 
     def step(self, t_s: float, poses: list[MocapPose]) -> None:
-        """Advance the landing; call it in every step of the physics."""
+        """Advance the landing; call this method in every step of the physics."""
         self._landing.take_poses(poses)
         if t_s - self._round_s >= PERIOD_S - 1e-9:
             self._round_s = t_s

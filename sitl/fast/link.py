@@ -1,4 +1,4 @@
-"""The MAVLink link of the fast closed loop with its faults: lost, or delayed in both directions."""
+"""The MAVLink link of the fast closed loop, with its faults: loss, or a delay in both directions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class FastLink:
 
     Args:
         faults: faults of the world.
-        world: the world, for its time.
+        world: simulated world, which provides the time.
         px4: the stub; while it boots, the link is dead.
         tick_s: period of the control tick.
     """
@@ -38,7 +38,7 @@ class FastLink:
         return "link_loss" not in self._faults.active and self._world.t_s >= self._px4.booted_at_s
 
     def send(self, deliver: Callable[[], None]) -> None:
-        """Send something to PX4; `deliver` is called when it arrives."""
+        """Send a message to PX4; `deliver` is called when the message arrives."""
         if not self.alive:
             return
         delay_s = self._faults.size("link_delay")
@@ -48,7 +48,7 @@ class FastLink:
             deliver()
 
     def deliver_due(self) -> None:
-        """Deliver delayed messages that are due; call it in every tick."""
+        """Deliver delayed messages that are due; call this method in every tick."""
         late, t_s = self._in_flight, self._world.t_s
         while late and late[0][0] <= t_s + 1e-9:
             deliver = late.popleft()[1]
@@ -58,7 +58,9 @@ class FastLink:
     def receive(
         self, state: VehicleState | None, status: AutopilotStatus
     ) -> tuple[VehicleState | None, AutopilotStatus]:
-        """Return the state that the core receives in this tick: delayed if the link is slow, the last state if the link is lost."""
+        """Return what the core receives in this tick: a delayed state if the link is slow, the last received state if the link is
+        lost.
+        """
         received = self._received
         if not self.alive and received:
             return received[0]

@@ -1,6 +1,6 @@
 """The fast closed loop: flight core, PX4 stub, servos and world on simulated time, without sockets.
 
-It keeps the sensor rates, quantisation, noise and delays of the real protocols and leaves out only their bytes.
+It keeps the sensor rates, quantisation, noise and delays of the real protocols and omits only their encoding.
 """
 
 from __future__ import annotations
@@ -79,10 +79,10 @@ class FastResult:
     crashed: bool = False
     caught: bool = False
     snapshots: list[Snapshot] = field(default_factory=list)
-    """State of the world after each tick."""
+    """States of the world, one after each tick."""
     layout: Layout | None = None
     after: list[Snapshot] = field(default_factory=list)
-    """State of the world after the last tick, every 5 ms, while the guardian or PX4 lands."""
+    """States of the world every 5 ms after the last tick, while the guardian or PX4 lands the vehicle."""
     guardian_events: list[Event] = field(default_factory=list)
     """Events of the guardian; empty if it did not act."""
     guardian_landed: bool | None = None
@@ -93,7 +93,7 @@ class FastResult:
 
     @property
     def truth(self) -> list[Truth]:
-        """True state after each tick; computed at the first access."""
+        """True state after each tick; computed on first access."""
         if self._truth is None:
             layout = self.layout
             self._truth = [] if layout is None else [layout.truth(snapshot) for snapshot in self.snapshots]
@@ -123,7 +123,7 @@ class _RecordedImu:
         self.total = DeltaVelocity()
 
     def step(self, imu: ImuSample) -> Vec4:
-        """Step PX4 by one IMU sample and add it to `total`, which starts again when PX4 reboots."""
+        """Step PX4 by one IMU sample, add the sample to `total` and return the rotor commands."""
         rotors = self._px4.step(imu)
         boot_s = imu.t_s - self._px4.booted_at_s
         if boot_s >= 0.0 and self._px4.imu is not None:
@@ -232,7 +232,9 @@ class FastFlight:
                 result.after.append(world.snapshot())
 
     def _flight_process_stalled(self, guardian: FastGuardian) -> bool:
-        """Return whether a fault keeps the flight process from its tick, and then do what its bus thread does."""
+        """Return whether a fault stops the control ticks of the flight process. If only its event loop is stalled, also do what its bus
+        thread still does.
+        """
         active, t_s = self.faults.active, self.plant.world.t_s
         guardian.alive = "kill_guardian" not in active
         if "stall_loop" in active:

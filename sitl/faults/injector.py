@@ -1,6 +1,6 @@
 """Injects the faults of the simulated world: their schedule, and their effect on physics, sensors and PX4.
 
-The kinds of fault are in companion/sitl_config/faults.py (`FaultKind` and `KINDS`); a new kind begins there.
+The kinds of fault are defined in companion/sitl_config/faults.py (`FaultKind` and `KINDS`); begin there to add one.
 
 The plant calls `Faults.step` in every step. `sitl.server` and the fast closed loop read faults of the link, the servo bus and the
 processes from `active`.
@@ -28,11 +28,11 @@ from sitl.world.world import World
 FULL_V = 16.6
 OVERHEATED_C = 80.0
 OVERLOAD, OVERHEATING = 0x20, 0x04
-"""Bits of register 70."""
+"""Bits of register 70 (hardware error status)."""
 COOL_C = 35.0
 _FOREVER_M = 1000.0
 LATE_S = 0.01
-"""A fault that has been due for longer than this when its origin becomes known begins at that moment."""
+"""If a fault has already been due for longer than this when its time origin becomes known, it begins at that moment."""
 _OTHER_BODY_Z_M = 0.05
 _OTHER_BODY_YAW_RAD = math.radians(120.0)
 _BESIDE = (0.6, 0.8)
@@ -55,10 +55,10 @@ class Autopilot(Protocol):
     refuses_arming: bool
 
     def reboot(self, for_s: float) -> None:
-        """Restart; it runs again `for_s` later."""
+        """Restart the autopilot; it runs again after `for_s`."""
 
     def pilot_sets_mode(self, state: NavState) -> None:
-        """Change the mode as a pilot does by radio."""
+        """Change the mode as a pilot does by radio control."""
 
 
 class Faults:
@@ -66,7 +66,7 @@ class Faults:
 
     Args:
         config: configuration of the world; every fault has a time (`with_fault_times`).
-        world: the physics.
+        world: simulated physics.
         px4: the autopilot.
         drives: motors of both servos.
         anchor_world_m: anchor of the tether.
@@ -96,7 +96,7 @@ class Faults:
         self.sag_v = 0.0
         """Voltage drop of the battery caused by a fault."""
         self.errors = [0, 0]
-        """Register 70 of each servo without a control table."""
+        """Register 70 (hardware error status) of each servo, if the servos have no control tables."""
         self.temperatures_c = [COOL_C, COOL_C]
         self._frozen: tuple[Vec3, Quat] | None = None
         self._other: tuple[Vec3, Quat] | None = None
@@ -153,7 +153,7 @@ class Faults:
     # -- what ------------------------------------------------------------------------------------------------------
 
     def _act(self, fault: Fault, on: bool, t_s: float) -> None:
-        """Apply the start (`on`) or the end of a fault of the physics, the servos or PX4."""
+        """Apply the start (`on`) or the end of a fault that acts on the physics, the servos or PX4."""
         world, px4, size = self._world, self._px4, fault.magnitude
         match fault.kind:
             case "motor_weak" | "battery_sag":
@@ -237,7 +237,7 @@ class Faults:
     # -- sensors ---------------------------------------------------------------------------------------------------
 
     def pose(self, position_world_m: Vec3, attitude_wxyz: Quat) -> tuple[Vec3, Quat, bool]:
-        """Return the pose that motion capture measures instead of the true one, and whether it tracks the body."""
+        """Return the pose that motion capture measures in place of the true pose, and whether it tracks the body."""
         active = self.active
         pose = (position_world_m, attitude_wxyz)
         if "mocap_freeze" in active:
@@ -258,12 +258,12 @@ class Faults:
         return usual_s if slow is None else max(usual_s, 1.0 / slow.magnitude)
 
     def size(self, kind: FaultKind) -> float:
-        """Return the size of the active fault of this kind, or 0 if none is active."""
+        """Return the size of the active fault of this kind, in the kind's unit; 0 if none is active."""
         fault = self.active.get(kind)
         return 0.0 if fault is None else fault.magnitude
 
     def server_clock_s(self, t_s: float) -> float:
-        """Return the clock of the motion-capture server at a world time."""
+        """Return the time on the motion-capture server's clock at world time `t_s`."""
         return t_s + self.size("clock_step") if t_s >= self._stepped_s else t_s
 
     def wrench(self, force_n: Vec3, torque_nm: Vec3) -> tuple[Vec3, Vec3]:
@@ -279,7 +279,7 @@ class Faults:
         return force_n, torque_nm
 
     def packet_lost(self) -> bool:
-        """Decide at random whether noise destroys this transaction on the servo bus."""
+        """Return whether noise corrupts this transaction on the servo bus, decided at random."""
         share = self.size("bus_noise")
         return share > 0.0 and float(self._chance.random()) < share
 
@@ -292,12 +292,12 @@ class Sample:
     position_world_m: Vec3
     tilt_rad: float
     slack_m: float
-    """Slack of the tether at its present length."""
+    """Slack of the tether, computed with its present length."""
     tension_n: float
 
 
 def sample(world: World, anchor_world_m: Vec3) -> Sample:
-    """Return the present true state."""
+    """Return the present true state of the vehicle and its tether."""
     x, y, z, *attitude = world.q[0:7]
     slack_m = world.tether_length_m - math.dist(world.attachment_world_m, anchor_world_m)
     tension_n = world.sensors()[world.layout.tether]

@@ -30,11 +30,11 @@ _SAMPLE_S = 0.01
 
 
 def environment(kinds: set[str], stall_s: float | None = None) -> dict[str, str]:
-    """Return the environment variables of the flight process for these kinds of faults.
+    """Return the environment variables that the flight process needs for these kinds of faults.
 
     Args:
         kinds: fault kinds.
-        stall_s: duration of the event loop's stall; None for ever.
+        stall_s: duration of the event loop's stall; None if it never ends.
     """
     if not kinds & {"hold_gil", "stall_loop"}:
         return {}
@@ -80,11 +80,11 @@ def _command(pid: int) -> list[str]:
 
 
 class ProcessFaults:
-    """Injects one fault of the flight process, then records PX4's inputs and the vehicle's motion."""
+    """Injects one fault into the flight process, then records PX4's inputs and the vehicle's motion."""
 
     def __init__(self) -> None:
         self.pid: int | None = None
-        """Pid of the flight process from the launcher, or None."""
+        """Pid of the flight process, which the launcher sends; None until then."""
         self.kind: FlightFaultKind | None = None
         """Kind of the fault that was injected, or None."""
         self._t_s = 0.0
@@ -159,12 +159,14 @@ class ProcessFaults:
         return True
 
     def sample(self, position_m: Vec3, attitude_wxyz: tuple[float, float, float, float]) -> None:
-        """Record position and attitude of the vehicle."""
+        """Record the position (world frame) and the attitude of the vehicle."""
         self._position_m = position_m
         self._worst_tilt_rad = max(self._worst_tilt_rad, tilt_rad(attitude_wxyz))
 
     def report(self) -> dict[str, Any] | None:
-        """Return times in s since the fault (None for what never happened), or None if no fault was injected."""
+        """Return the report on the fault, or None if no fault was injected. Times are in s after the fault; None for an event that
+        never happened.
+        """
         if self.kind is None:
             return None
 

@@ -13,9 +13,9 @@ from companion.sitl_config.faults import Fault, FaultKind, FlightPhase
 from companion.sitl_config.loader import SitlConfig
 
 AFTER_CATCH_S = 0.1
-"""Start of a fault in phase "catch", after the catch."""
+"""Time from the catch to a fault in phase "catch"."""
 REBOOT_ON_GROUND_S = 1.3
-"""Start of a PX4 restart in phase "ground", after PX4's first boot."""
+"""World time of a PX4 reboot in phase "ground": after PX4's first boot."""
 _ALONG_M = 0.3
 _EARLY_IN_LINE, _MIDDLE = 0.35, 0.5
 _FROM_START: frozenset[FaultKind] = frozenset({"payload_missed", "payload_heavy"})

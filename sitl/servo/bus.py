@@ -29,7 +29,7 @@ from sitl.servo.registers import BAUDS
 _BITS_PER_BYTE = 10
 _CLEAR_TURNS = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
 _PARTIAL_TIMEOUT_S = 0.02
-"""Byte-to-byte timeout; the servo's own is 1.5 ms, but a pty on a busy computer may be slower."""
+"""Byte-to-byte timeout. The real servo's is 1.5 ms, but a pty on a busy computer may be slower."""
 _BAUD_OF_SPEED = {getattr(termios, f"B{baud}"): baud for baud in BAUDS if hasattr(termios, f"B{baud}")}
 
 
@@ -48,11 +48,11 @@ class ServoLine:
         return self._parser.pending
 
     def drop_partial(self) -> None:
-        """Drop an incomplete packet, after the line was idle in the middle of it."""
+        """Drop an incomplete packet; call this method if the line goes idle in the middle of a packet."""
         self._parser.drop_partial()
 
     def feed(self, data: bytes, baud_bps: int | None = None) -> bytes:
-        """Process bytes from the master and return the servos' answer. Never raises.
+        """Process bytes from the master and return the servos' answer; never raise an exception.
 
         Args:
             data: any bytes.
@@ -266,8 +266,8 @@ class ServoBus:
 
     Args:
         servos: the servos on the wire.
-        wire_time: delay every answer by the time of its bytes at the line's baud rate and by the return delays. The event
-            loop's granularity of 1 ms represents the latency timer of the USB adapter.
+        wire_time: delay every answer by the transmission time of request and answer at the line's baud rate and by the return
+            delays. The event loop's granularity of 1 ms represents the latency timer of the USB adapter.
 
     The companion's baud rate is read from the pty's line settings; servos at another baud rate stay silent, as on a real wire.
     """
@@ -319,11 +319,13 @@ class ServoBus:
         self._timers.add(loop.call_at(self._line_free_s, self._send, answer))
 
     def inject(self, noise: bytes) -> None:
-        """Put bytes on the line unchanged, such as noise."""
+        """Send bytes on the line unchanged, for example noise."""
         self._pty.write(noise)
 
     def answer_to(self, data: bytes, baud_bps: int) -> tuple[bytes, float]:
-        """Return the servos' answer to a request sent at a given baud rate, and their return delay, s; noise may corrupt it."""
+        """Return the servos' answer to a request sent at a given baud rate, and their total return delay in s; noise may corrupt
+        the request.
+        """
         if self.damaged():
             middle = len(data) // 2
             data = data[:middle] + bytes((data[middle] ^ 0x5A,)) + data[middle + 1 :]

@@ -51,7 +51,7 @@ class ServoDrive:
         self.current_loop_s = 0.0
         """Time constant of the current loop; 0 if the current reaches its goal at once."""
         self._current = 0.0
-        """Present current in counts, unrounded, if there is a time constant."""
+        """Present current in counts, unrounded; used only if `current_loop_s` is not 0."""
         self.now_s = 0.0
         self.angle_rad = shaft_angle_rad
         self.velocity_rad_s = 0.0
@@ -73,7 +73,7 @@ class ServoDrive:
         """Process the shaft's state and return the motor current.
 
         Args:
-            t_s: world time; must not run backwards.
+            t_s: world time; must not decrease.
             shaft_angle_rad: continuous shaft angle in the servo's own convention (counts = angle / 2 pi * 4096).
             shaft_velocity_rad_s: shaft velocity, same convention.
 
@@ -112,7 +112,7 @@ class ServoDrive:
 
         Args:
             counts: goal current.
-            at_once: take effect at once, and drop pending goals.
+            at_once: whether the goal takes effect at once and pending goals are dropped.
         """
         if at_once or self.goal_delay_s == 0.0:
             self._pending_goals.clear()
@@ -121,7 +121,7 @@ class ServoDrive:
             self._pending_goals.append((math.inf, counts))
 
     def heard_instruction(self) -> None:
-        """Feed the watchdog: a valid instruction packet was on the bus."""
+        """Restart the watchdog's timer, because a valid instruction packet was on the bus."""
         self._heard_s = self.now_s
         self._silent_until_s = self.now_s + self._watchdog_s
 
@@ -147,7 +147,7 @@ class ServoDrive:
         return self._current_counts, velocity, position
 
     def forget_turns(self) -> None:
-        """Reduce the position to one turn: the encoder is absolute only within one turn."""
+        """Reduce the position to one turn, because the encoder is absolute only within one turn."""
         counts = self.direction * round(self.angle_rad / RAD_PER_COUNT)
         self.turn_counts = counts - counts % COUNTS_PER_TURN
         self.show_no_current()

@@ -1,4 +1,4 @@
-"""Makes the servos configured in `world.servos`, for real time and for the fast closed loop."""
+"""Builds the servos configured in `world.servos`, for real-time simulation and for the fast closed loop."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def servo_of(joint: Joint, device: ArmDevice, settings: Servo) -> ServoModel:
     """Return the servo of a joint.
 
     Args:
-        joint: joint of the vehicle file; its id is the default.
-        device: arm device of the vehicle file; its baud rate is the default.
-        settings: true settings of this servo.
+        joint: joint of the vehicle file; gives the servo's id unless `settings` does.
+        device: arm device of the vehicle file; gives the baud rate unless `settings` does.
+        settings: actual settings of the simulated servo.
     """
     servo = ServoModel(
         joint.servo_id if settings.id is None else settings.id,

@@ -48,7 +48,7 @@ class ServoModel:
 
     Args:
         servo_id: register 7.
-        baud_bps: baud rate (register 8); the servo receives only packets sent at it.
+        baud_bps: baud rate (register 8); the servo receives only packets sent at this rate.
         firmware: register 6.
         model: model number (register 0).
         shaft_angle_rad: shaft angle before the first `update`.
@@ -67,7 +67,7 @@ class ServoModel:
         shaft_angle_rad: float = 0.0,
     ) -> None:
         if baud_bps not in reg.BAUDS:
-            raise ValueError(f"an XM430 has no baud rate {baud_bps}; it has {reg.BAUDS}")
+            raise ValueError(f"an XM430 does not support the baud rate {baud_bps}; supported: {reg.BAUDS}")
         if not reg.ID.low <= servo_id <= reg.ID.high:
             raise ValueError(f"servo id {servo_id} is not in 0..252")
         self._memory = bytearray(reg.TABLE_SIZE)
@@ -116,20 +116,22 @@ class ServoModel:
         self.drive.goal_delay_s = delay_s
 
     def fail_silent(self, silent: bool) -> None:
-        """Break or restore the data wire: the servo receives and answers nothing, and its motor continues until its watchdog trips."""
+        """Break or restore the data wire. While it is broken, the servo neither receives nor answers, and its motor runs on until its
+        watchdog trips.
+        """
         self._silent = silent
 
     def trip_overload(self) -> None:
-        """Raise the overload error, as after holding too large a load."""
+        """Raise the overload error, as the servo does after holding too large a load."""
         self._raise_error(ERROR_OVERLOAD)
 
     def set_temperature_c(self, temperature_c: float) -> None:
-        """Set the motor temperature; above register 31 it raises the overheating error."""
+        """Set the motor temperature; a value above the limit in register 31 raises the overheating error."""
         self._set(reg.PRESENT_TEMPERATURE, max(0, min(255, round(temperature_c))))
         self._check_environment()
 
     def set_voltage_v(self, voltage_v: float) -> None:
-        """Set the supply voltage; outside registers 34 to 32 it raises the input voltage error."""
+        """Set the supply voltage; a value outside the limits in registers 34 (min) and 32 (max) raises the input voltage error."""
         self._set(reg.PRESENT_VOLTAGE, max(0, round(voltage_v * 10.0)))
         self._check_environment()
 
@@ -172,7 +174,7 @@ class ServoModel:
 
     @property
     def status_return_level(self) -> int:
-        """Register 68: 0 answers pings, 1 also reads, 2 everything."""
+        """Register 68: with 0 the servo answers pings only, with 1 also reads, with 2 every instruction."""
         return self._memory[68]
 
     @property
@@ -182,11 +184,11 @@ class ServoModel:
 
     @property
     def alert(self) -> int:
-        """Bit 7 of every status packet's error byte."""
+        """Alert bit (0x80) of every status packet's error byte if register 70 reports an error, else 0."""
         return ALERT if self._memory[70] else 0
 
     def heard_instruction(self) -> None:
-        """Feed the watchdog: a valid instruction packet for any servo was on the bus."""
+        """Restart the watchdog's timer, because a valid instruction packet for any servo was on the bus."""
         self.drive.heard_instruction()
 
     def read(self, address: int, length: int) -> bytes:
@@ -201,16 +203,16 @@ class ServoModel:
         return bytes(self._memory[self._resolve(a, StatusError.ACCESS)] for a in range(address, address + length))
 
     def write(self, address: int, data: bytes) -> None:
-        """Write whole registers: all of them or, on a refusal, none.
+        """Write whole registers. If any of them is refused, none is written.
 
         Raises:
-            ServoRefusal: with the error number of the status packet.
+            ServoRefusal: a write is refused; the exception has the error number of the status packet.
         """
         for register, value in self._checked(address, data):
             self._apply(register, value)
 
     def register_write(self, address: int, data: bytes) -> None:
-        """Store a write for `action`.
+        """Store a write, which `action` carries out later.
 
         Raises:
             ServoRefusal: as for `write`.
@@ -223,7 +225,7 @@ class ServoModel:
         """Carry out the registered write.
 
         Raises:
-            ServoRefusal: INSTRUCTION without a registered write, else as for `write`.
+            ServoRefusal: INSTRUCTION if no write is registered; otherwise as for `write`.
         """
         if self._registered is None:
             raise ServoRefusal(StatusError.INSTRUCTION)
@@ -251,7 +253,7 @@ class ServoModel:
         """Reduce the present position to one turn (CLEAR 0x01).
 
         Raises:
-            ServoRefusal: RESULT_FAIL while the shaft moves.
+            ServoRefusal: RESULT_FAIL if the shaft is moving.
         """
         self._show_present()
         if self._memory[122]:
@@ -278,7 +280,7 @@ class ServoModel:
         return address
 
     def _checked(self, address: int, data: bytes) -> list[tuple[Register, int]]:
-        """Split `data` into register writes and check that each of them is allowed."""
+        """Split `data` into writes of single registers and check that each of them is allowed."""
         if not data:
             raise ServoRefusal(StatusError.DATA_LENGTH)
         targets = [self._resolve(address + i, StatusError.ACCESS) for i in range(len(data))]
@@ -362,7 +364,7 @@ class ServoModel:
         self._set(reg.GOAL_VELOCITY, 0)
 
     def _settings_to_drive(self) -> None:
-        """Copy the table's settings to the drive, except the goal current, which has a delay."""
+        """Copy the table's settings to the drive, except the goal current, which takes effect after a delay."""
         drive, memory = self.drive, self._memory
         watchdog = memory[98]
         drive.torque_on = bool(memory[64])

@@ -100,8 +100,10 @@ def fast_status(blocks: list[tuple[int, int, bytes]], total_blocks_size: int) ->
 
     Args:
         blocks: (servo id, error byte, data) of the servos that answered, in the order of the request.
-        total_blocks_size: data bytes of all requested servos plus 4 per servo; the first servo announces it even if others do
-            not answer. The packet is not stuffed, and each block ends with the CRC of everything before it.
+        total_blocks_size: data bytes of all requested servos plus 4 per servo; the first servo announces this size even if others
+            do not answer.
+
+    The packet is not stuffed, and each block ends with the CRC of everything before it.
     """
     out = bytearray(HEADER)
     out.append(BROADCAST_ID)

@@ -12,7 +12,7 @@ from companion.config.vehicle import ServoBaud
 
 MODEL = 1030
 BAUDS: tuple[int, ...] = (9600, *get_args(ServoBaud), 4_500_000)
-"""Baud rate by value of register 8."""
+"""Baud rates in bit/s, indexed by the value of register 8."""
 TABLE_SIZE = 662
 EEPROM_END = 64
 """Registers below this address survive a reboot and are locked while torque is on."""
@@ -101,7 +101,7 @@ GOALS = (GOAL_PWM, GOAL_CURRENT, GOAL_VELOCITY, GOAL_POSITION)
 """Goal registers; read-only after the bus watchdog has tripped."""
 
 INDIRECT_BLOCKS = ((168, 224, 28), (578, 634, 28))
-"""(first indirect address register, first indirect data register, number of them)."""
+"""(first indirect address register, first indirect data register, number of indirect data bytes) of each block."""
 INDIRECT_TARGETS = range(64, 662)
 
 _PLAIN = (

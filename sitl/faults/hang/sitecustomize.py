@@ -1,4 +1,4 @@
-"""Makes the flight process hang on a signal from the simulated world, in one of two ways. Other processes are not affected."""
+"""Makes the flight process hang in one of two ways when the simulated world sends a signal. Other processes are not affected."""
 
 from __future__ import annotations
 
