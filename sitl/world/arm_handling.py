@@ -1,4 +1,4 @@
-"""A simulated person who holds the arm while it is limp, and moves it through the poses of `companion arm zero`."""
+"""A simulated user who holds the arm while it is limp and moves it through the poses of `companion arm zero`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from companion.model.types import Vec2
 
 MOVE_S: Final = 2.0
 FORGET_S: Final = 1.5
-"""Time without a lit LED after which the poses start again from the first."""
+"""Time without a lit LED after which the sequence of poses restarts."""
 
 
 class ArmHandling:
@@ -36,7 +36,7 @@ class ArmHandling:
             t_s: world time.
             limp: whether torque is off on both servos.
             angle_rad: joint angles.
-            lights: number of times that an LED was switched on; each time the arm moves to the next pose.
+            lights: number of times that an LED was switched on; each time, the arm is moved to the next pose.
             lit: whether an LED is on.
         """
         if limp and not self._limp:

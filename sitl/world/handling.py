@@ -1,7 +1,8 @@
 """Handling of the vehicle on the ground: carrying it through the guided hand test, tapping it, and hanging a weight on its net.
 
-The operator's hand is modelled as a spring and a damper on the base, and sways. It repeats one round (lift, forward, turn left, back)
-with a pause in between, or lifts and holds the vehicle while a second hand taps it. It acts only while the vehicle is disarmed.
+The operator's hand is modelled as a spring and a damper on the base; it also sways. The hand repeats one round (lift, forward, turn
+left, back) with pauses in between, or it lifts and holds the vehicle while a second hand taps it. It acts only while the vehicle is
+disarmed.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ LIFT_M, FORWARD_M, TURN_DEG = 0.30, 0.30, 45.0
 REST_S = 6.0
 """Time on the floor between two rounds."""
 _GRIP_S = 0.4
-"""Time to take the weight, and to release it."""
+"""Time in which the hand takes up the weight, and in which it releases it."""
 SWAY_DEG, SWAY_M = 2.0, 0.004
 
 
@@ -55,7 +56,7 @@ _LEGS: Final = (
 )
 ROUND_S: Final = sum(leg.duration_s for leg in _LEGS)
 TAP_S: Final = 0.024
-"""Duration of a tap with the flat hand: half a period of a sine."""
+"""Duration of a tap with the flat hand; its force is half a period of a sine."""
 TAP_EVERY_S: Final = 1.1
 _HELD_S: Final = _GRIP_S + 1.6
 """Time from the grip until the vehicle is steady enough to be tapped."""
@@ -80,7 +81,7 @@ class Handling:
     """Computes the force and torque that handling applies to the vehicle.
 
     Args:
-        config: `hand`, `hand_t_s`, `hand_taps`, `hand_tap_n`, and the random seed of the hand's sway.
+        config: configuration of the world; `hand_t_s`, `hand_taps`, `hand_tap_n`, and `seed` for the hand's sway are used.
         weight_n: weight of the whole vehicle.
     """
 
@@ -98,8 +99,8 @@ class Handling:
 
         Args:
             t_s: world time.
-            q: MuJoCo's qpos; it begins with position and quaternion of the base (world).
-            v: MuJoCo's qvel; it begins with velocity (world) and angular rate (body) of the base.
+            q: MuJoCo's qpos, which begins with the position and quaternion of the base (world frame).
+            v: MuJoCo's qvel, which begins with the velocity (world frame) and angular rate (body frame) of the base.
         """
         t_s -= self._from_s
         if t_s < 0.0:
@@ -138,7 +139,7 @@ class Handling:
         return Wrench(force_n=(fx, fy, fz + grip * self._weight_n), torque_nm=torque)
 
     def _tap(self, t_s: float) -> Vec3:
-        """Return the force of a tap, world frame."""
+        """Return the present force of the taps in N, world frame; zero between taps."""
         count, since_s = divmod(t_s - _HELD_S - 0.5 * TAP_EVERY_S, TAP_EVERY_S)
         # Taps by hand are irregular.
         since_s -= 0.13 * (1.0 + math.sin(5.1 * count + self._phases[0]))
@@ -149,7 +150,7 @@ class Handling:
         return (x * size_n, y * size_n, z * size_n)
 
     def _goal(self, t_s: float) -> tuple[float, float, float]:
-        """Return the target pose: forward and up in m, turn in rad."""
+        """Return the target pose of a round: forward and up in m, turn to the left in rad."""
         before = _Leg(0.0, 0.0, 0.0, 0.0)
         for leg in self._legs:
             if t_s < leg.duration_s:
@@ -166,7 +167,7 @@ class HungWeight:
     """A known weight that is hung on the net while the force sensor is being read.
 
     Args:
-        config: `net_weight_kg`, `net_weight_t_s`.
+        config: configuration of the world; `net_weight_kg` and `net_weight_t_s` are used.
     """
 
     def __init__(self, config: WorldConfig) -> None:
@@ -174,7 +175,7 @@ class HungWeight:
         self._read_since_s: float | None = None
 
     def pull_n(self, t_s: float, read: bool) -> float:
-        """Return the force on the centre of the net, N, downwards.
+        """Return the downward force on the centre of the net in N.
 
         Args:
             t_s: world time.

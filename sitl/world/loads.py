@@ -1,4 +1,4 @@
-"""Collects external forces and torques on the bodies of the world, by cause."""
+"""Sums the external forces and torques that different causes exert on the bodies of the world."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import mujoco
 from companion.model.types import Vec3
 
 EFFECT_PERIOD_S = 0.01
-"""Time between two updates of the loads of effects."""
+"""Time between two updates of the loads that effects exert."""
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 
 class Loads:
-    """The external forces and torques on bodies; each acts until its cause sets it again.
+    """The external forces and torques on bodies, by cause; each acts until its cause sets a new one.
 
     Args:
         data: MuJoCo's data, whose `xfrc_applied` is written only here.
@@ -24,12 +24,12 @@ class Loads:
         self._changed: set[int] = set()
 
     def set(self, body: int, cause: str, force_n: Vec3, torque_nm: Vec3 = ZERO) -> None:
-        """Set force and torque of one cause on the centre of mass of a body, world frame."""
+        """Set the force (N) and torque (N m) that one cause exerts on the centre of mass of a body, world frame."""
         self._loads[body][cause] = (force_n, torque_nm)
         self._changed.add(body)
 
     def write(self) -> None:
-        """Write to MuJoCo the sums for the bodies whose loads have changed."""
+        """Write the summed loads of each body whose loads have changed to MuJoCo."""
         for body in self._changed:
             fx = fy = fz = tx = ty = tz = 0.0
             for (ax, ay, az), (bx, by, bz) in self._loads[body].values():

@@ -1,7 +1,8 @@
 """Simulates the poses of an incorrectly configured motion-capture server.
 
-A rigid body's rotation is zero in the attitude that the vehicle had when the body was created, and it is streamed in the axes of the
-stream. At that time the nose is assumed to have pointed along the stream's x axis if that axis is level, else along the true x axis.
+The rotation of a rigid body is zero at the attitude that the vehicle had when the body was created, and it is expressed in the axes of
+the stream. The nose is assumed to have pointed along the stream's x axis at that time if that axis is level, otherwise along the true x
+axis.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ _PLACE = {"x": 0, "y": 1, "z": 2}
 
 
 class MocapMisalignment:
-    """Converts true poses to streamed ones: `p' = A p`, `R' = A R Z A'`, with A from `world.mocap_axes` and Z the body's zero error."""
+    """Converts true poses to streamed poses: p_s = A p, R_s = A R Z A^T. A is given by `world.mocap_axes`, Z is the body's zero
+    error.
+    """
 
     def __init__(self, config: World) -> None:
         names = config.mocap_axes
@@ -43,7 +46,7 @@ class MocapMisalignment:
         return None if upright == (("x", "y", "z"), 0.0, (0.0, 0.0)) and not config.mocap.on else cls(config)
 
     def pose(self, position_world_m: Vec3, attitude_wxyz: Quat) -> tuple[Vec3, Quat]:
-        """Return position and attitude as streamed."""
+        """Return the position (m) and attitude that the server streams for this true pose."""
         w, x, y, z = quat_multiply(attitude_wxyz, self._zero)
         x, y, z = self._axes((x, y, z))
         m = self._mirror

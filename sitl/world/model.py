@@ -19,25 +19,25 @@ ROTORS = ((1, -1, -1), (-1, 1, -1), (1, 1, 1), (-1, -1, 1))
 
 
 def rotor_offset_m(airframe: Airframe) -> float:
-    """Return the distance of each rotor from the x-z plane and the y-z plane of the body."""
+    """Return the distance in m of each rotor from the x-z and y-z planes of the body."""
     return airframe.rotor_arm_m / math.sqrt(2.0)
 
 
 def base_mass_kg(vehicle: Vehicle, world: World) -> float:
-    """Return the true mass of the flying base without arm and tool."""
+    """Return the true mass of the flying base, without arm and tool."""
     arm, tool = vehicle.arm, vehicle.tool
     rest = sum(arm.link_masses_kg) + tool.sensor_mass_kg + tool.net_mass_kg
     return (vehicle.airframe.mass_kg - rest) * (1.0 + world.mass_error)
 
 
 def link_masses_kg(vehicle: Vehicle, world: World) -> tuple[float, float]:
-    """Return the true masses of the links; sensor and net have the masses of the vehicle file."""
+    """Return the true masses of both links, without sensor and net, whose masses in the vehicle file are taken as true."""
     first, second = vehicle.arm.link_masses_kg
     return first * (1.0 + world.link_mass_error[0]), second * (1.0 + world.link_mass_error[1])
 
 
 def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
-    """Return the model of the real vehicle as MJCF."""
+    """Return the MuJoCo model of the true vehicle as MJCF text."""
     vehicle = machine.as_built(vehicle, world.machine)
     airframe, arm, tool = vehicle.airframe, vehicle.arm, vehicle.tool
     l1, l2 = arm.link_lengths_m

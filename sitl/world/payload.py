@@ -1,4 +1,4 @@
-"""Throws a payload that meets the net with the configured velocity, stays in it and is thrown again."""
+"""Throws a payload that meets the net with the configured velocity, stays in the net and can be thrown again."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _THROW_BESIDE_M = 0.5
 
 
 class Ball(NamedTuple):
-    """Indices of a ball: body, first index in qpos and in qvel, and the constraint that holds it in the net."""
+    """Indices of a ball: its body, its first elements in qpos and qvel, and the constraint that holds it in the net."""
 
     body: int
     q: int
@@ -33,7 +33,7 @@ class Ball(NamedTuple):
 
     @classmethod
     def of(cls, model: mujoco.MjModel, name: str, catch: str) -> Ball:
-        """Look up a ball by the names of its body and its constraint."""
+        """Return the indices of the ball with these names of body and constraint."""
         joint = model.joint(name).id
         return cls(
             model.body(name).id, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]), model.equality(catch).id
@@ -53,7 +53,7 @@ class Payload:
         self.bag = Net.of(config.net, model, data, world.loads, self._net_radius_m, PAYLOAD_RADIUS_M)
         """The bag of the net, or None if its effect is off."""
         self.ball = Ball.of(model, "payload", "catch") if config.payload_kg > 0 else None
-        """The payload, or None if nothing is thrown."""
+        """Indices of the payload; None if no payload is configured."""
         self.aside_m = 0.0
         """Distance by which the throw misses the net."""
         self.thrown_t_s: float | None = None
@@ -63,15 +63,15 @@ class Payload:
         self.throws = self.catches = 0
         """Number of throws and of catches so far."""
         self._flies_since_s: float | None = None
-        """Time of the present throw; a throw that missed the net may still be caught."""
+        """Time of the throw in flight, None without one; a throw that missed the net may still be caught."""
         self._kept_since_s: float | None = None
-        """Time of the catch of the payload in the net."""
+        """Time at which the payload in the net was caught; None if the net is empty."""
         self._missed = False
         """Whether the throw in flight has missed the net."""
         self._last_x = 0.0
 
     def step(self, airborne: bool) -> None:
-        """Throw, catch or remove the payload when it is due.
+        """Throw, catch or remove the payload if that is due in this step.
 
         Args:
             airborne: whether a payload may be thrown.
@@ -154,7 +154,9 @@ class Payload:
             self.bag.watch(ball.body, ball.q, ball.v)
 
     def catch(self, ball: Ball) -> bool:
-        """Return whether the ball is caught: it touches the net, which then holds it, or it has settled in the bag."""
+        """Return whether the ball is caught: with a bag, once it has settled in the bag; without, once it touches the net, to which
+        this call attaches it.
+        """
         return self._caught_s(ball) is not None
 
     def _caught_s(self, ball: Ball) -> float | None:
@@ -164,7 +166,7 @@ class Payload:
         return self._world.t_s if self._attach(ball) else None
 
     def _attach(self, ball: Ball) -> bool:
-        """Attach the ball to the net if it touches it; return whether it does."""
+        """Attach the ball to the net if it touches the net; return whether it does."""
         d = self._data
         gap = d.xpos[ball.body] - d.xpos[self._net]
         if float(gap @ gap) > self._net_radius_m**2:
@@ -176,7 +178,7 @@ class Payload:
         return True
 
     def drop(self) -> None:
-        """Let the payload fall out of the net if it is in the net."""
+        """Let the payload fall out of the net, if it is there."""
         if self.ball is not None and self._kept_since_s is not None:
             self._data.eq_active[self.ball.catch] = 0
             if self.bag is not None:

@@ -46,14 +46,14 @@ class JointDrive(Protocol):
     """The motor of one servo, in the servo's own angle convention."""
 
     goal_delay_s: float
-    """Delay from writing a goal current to its effect."""
+    """Delay from writing a goal current to its effect in s."""
 
     def update(self, t_s: float, shaft_angle_rad: float, shaft_velocity_rad_s: float) -> float:
         """Process the shaft's state and return the motor current in A."""
 
 
 class MocapFrame(NamedTuple):
-    """One motion-capture frame, delivered `mocap_latency_s` after its exposure."""
+    """One motion-capture frame, which is delivered `mocap_latency_s` after its exposure."""
 
     number: int
     exposure_t_s: float
@@ -77,15 +77,15 @@ _IMU_DRIFT = 11
 
 
 class Plant:
-    """World, sensors and motors.
+    """The simulated world with its sensors and motors.
 
     Args:
         vehicle: vehicle file.
         config: configuration of the world.
         px4: the autopilot.
         drives: motors of both joints.
-        start: position, yaw and joint angles, m and rad.
-        between_steps: whether the cameras expose at the exact time instead of at the end of the physics step.
+        start: horizontal position in m, yaw in rad and joint angles in rad at the start.
+        between_steps: whether the cameras expose at the exact time between physics steps instead of at the end of a step.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class Plant:
         self._handling = Handling(config, self.world.weight_n) if config.hand else None
         self._weight = HungWeight(config) if config.net_weight_kg > 0.0 else None
         self.force_is_read = True
-        """Whether the force sensor is read; in the fast closed loop it always is."""
+        """Whether the force sensor is being read; always true in the fast closed loop."""
         self._force_sensor = ForceSensor.of(config.force_sensor, config.seed)
         self._rotors: Vec4 = (0.0, 0.0, 0.0, 0.0)
         self._tick = 0
@@ -142,8 +142,8 @@ class Plant:
         """Faults of this world; None if there are none."""
 
     def _seed_noise(self) -> None:
-        """Start one noise sequence per sensor. It restarts at arming, so that the noise in flight depends only on the seed, not on the
-        time before arming or on reads of another sensor.
+        """Start one noise sequence per sensor. The sequences restart at arming, so that the noise in flight depends only on the seed,
+        not on the time before arming or on the reading of other sensors.
         """
         self._mocap_noise, self._imu_noise, self._force_noise = (
             noise(self._config.seed, sensor) for sensor in (_MOCAP, _IMU, _FORCE)
@@ -161,7 +161,7 @@ class Plant:
         return self.world.truth()
 
     def mission_t_s(self) -> float | None:
-        """Return the time since arming, or None before it."""
+        """Return the time since arming, or None before arming."""
         return None if self.armed_t_s is None else self.t_s - self.armed_t_s
 
     def fault(self, kind: FaultKind) -> Fault | None:
@@ -169,7 +169,7 @@ class Plant:
         return None if self.faults is None else self.faults.active.get(kind)
 
     def _load_on_net(self, push: Push | None, weight: HungWeight | None) -> Vec3:
-        """Return the force of the push and the hung weight on the centre of the net, N, world frame."""
+        """Return the total force of the push and the hung weight on the centre of the net in N, world frame."""
         now, force = self.mission_t_s(), (0.0, 0.0, 0.0)
         if push is not None and now is not None and push.t_s <= now < push.t_s + push.duration_s:
             force = push.force_world_n
@@ -227,7 +227,7 @@ class Plant:
         return self._tick % IMU_EVERY == 0
 
     def sample_imu(self) -> ImuSample:
-        """Return the IMU sample before the step, for an autopilot that needs time to answer."""
+        """Return the IMU sample of the next step ahead of that step, for an autopilot that needs time to answer."""
         if self._imu_sample is None:
             self._imu_sample = self._imu()
         return self._imu_sample
@@ -294,7 +294,9 @@ class Plant:
         return [frame for _, frame in self.mocap_until(self.world.t_s)]
 
     def mocap_until(self, until_s: float) -> list[tuple[float, MocapFrame]]:
-        """Return and remove the frames that the motion-capture server sends up to `until_s`, each with its time."""
+        """Return and remove the frames that the motion-capture server sends until world time `until_s`, each with its transmission
+        time.
+        """
         queue, until_s = self._mocap_queue, until_s + 1e-9
         if not queue or queue[0][0] > until_s:
             return []
@@ -304,7 +306,9 @@ class Plant:
         return [] if self.fault("mocap_loss") else frames
 
     def battery(self) -> Battery:
-        """Return the measurement of the power module. Without the battery effect the charge falls with the time since arming."""
+        """Return the measurement of the power module. If the battery effect is off, the charge falls linearly with the time since
+        arming.
+        """
         pack, sag_v = self.world.battery, 0.0 if self.faults is None else self.faults.sag_v
         if pack is not None:
             return Battery(pack.voltage_v - sag_v, pack.current_a, pack.remaining, pack.drawn_as / 3.6)
@@ -313,7 +317,7 @@ class Plant:
         return Battery(voltage_v=battery_voltage_v(remaining) - sag_v, remaining=remaining)
 
     def force_torque(self) -> tuple[Vec3, Vec3]:
-        """Return a reading of the force-torque sensor in N and N m, sensor frame, with noise, bias, faults and scale error."""
+        """Return a reading of the force-torque sensor in N and N m, in the sensor frame, with noise, bias, faults and scale error."""
         s, f, tq = self.world.sensors(), self.world.layout.force, self.world.layout.torque
         (fx, fy, fz), (tx, ty, tz) = (-s[f], -s[f + 1], -s[f + 2]), (-s[tq], -s[tq + 1], -s[tq + 2])
         if self._force_sensor is not None:

@@ -1,4 +1,4 @@
-"""The physics in MuJoCo: quadrotor, 2R arm, net, tether, floor and a thrown payload. Sensor noise is added in `plant`."""
+"""The MuJoCo physics of quadrotor, 2R arm, net, tether, floor and thrown payload. `plant` adds the sensor noise."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from sitl.world.payload import Payload
 PHYSICS_DT_S = 0.002
 DRAG_N_PER_M_S = 0.25
 FALL_M_S = 2.5
-"""Speed at which the legs break on the floor, that of a fall from 0.3 m. PX4 descends at 0.7 m/s at most."""
+"""Speed of impact on the floor at which the legs break: the speed after a fall from 0.3 m. PX4 descends at 0.7 m/s at most."""
 _EFFECT_STEPS = round(EFFECT_PERIOD_S / PHYSICS_DT_S)
 SNAG_STIFFNESS_N_M, SNAG_DAMPING_NS_M = 400.0, 30.0
 
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """True state of the vehicle; world ENU, body FLU."""
+    """True state of the vehicle; the world frame is ENU, the body frame FLU."""
 
     t_s: float
     position_world_m: Vec3
@@ -43,7 +43,7 @@ class Truth:
     joint_angle_rad: Vec2
     joint_velocity_rad_s: Vec2
     force_sensor_n: Vec3
-    """Force on the tool side of the sensor, with weight and inertia of the net, sensor frame."""
+    """Force on the tool side of the sensor, including the weight and inertia of the net, sensor frame."""
     torque_sensor_nm: Vec3
     tether_tension_n: float
 
@@ -59,7 +59,7 @@ class Snapshot(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Indices into a `Snapshot`. The base comes first in q and v; each sensor has three numbers."""
+    """Indices into a `Snapshot`. The base comes first in q and v; each sensor has three values, except the tether, which has one."""
 
     joint_q: tuple[int, int]
     joint_v: tuple[int, int]
@@ -70,7 +70,7 @@ class Layout:
     tether: int
 
     def truth(self, snapshot: Snapshot) -> Truth:
-        """Decode a snapshot."""
+        """Return the true state that a snapshot contains."""
         t_s, q, v, s = snapshot
         (q1, q2), (v1, v2) = self.joint_q, self.joint_v
         a, g, f, tq = self.accel, self.gyro, self.force, self.torque
@@ -105,7 +105,7 @@ class Effect(Protocol):
         """Set this effect's loads for the next `EFFECT_PERIOD_S`."""
 
     def restart_noise(self) -> None:
-        """Start its noise sequence again."""
+        """Restart the effect's noise sequence."""
 
 
 class World:
@@ -141,7 +141,7 @@ class World:
         self.rotor_share: Vec4 | None = None
         """Fraction of each rotor's thrust that remains during a fault; None without a fault."""
         self.snag: tuple[Vec3, float] | None = None
-        """Point where the tether is snagged, and its free length from there; None if it is free."""
+        """Point where the tether is snagged and its free length from there to the vehicle; None if it is not snagged."""
         self._tether = m.tendon("tether").id
         self._attachment = m.site("tether").id
         self._thrust: Vec4 = (0.0, 0.0, 0.0, 0.0)
@@ -154,13 +154,13 @@ class World:
         self.payload = Payload(self, vehicle, config)
         self.effects = self._effects_on()
         self._step = 0
-        """Steps since the noise of the effects began."""
+        """Number of steps since the noise of the effects was last restarted."""
         self.t_s = 0.0
         self.q: list[float] = []
         self.v: list[float] = []
         """qpos and qvel after the last step; see `layout`."""
         self._sensors: list[float] | None = None
-        """Sensor values of the last step; read from MuJoCo at the first access."""
+        """Sensor values of the last step, read from MuJoCo on first access; None until then."""
         self._place(start_position_m, start_yaw_rad, arm_rad)
 
     def _effects_on(self) -> tuple[Effect, ...]:
@@ -191,7 +191,7 @@ class World:
         return self._sensors
 
     def push(self, force_world_n: Vec3) -> None:
-        """Set the external force on the centre of the net, N."""
+        """Set the external force on the centre of the net in N, world frame."""
         self.loads.set(self._net, "push", force_world_n)
 
     def hold(self, wrench: Wrench | None) -> None:
@@ -199,30 +199,30 @@ class World:
         self.loads.set(self._base, "hold", *(wrench or (ZERO, ZERO)))
 
     def restart_noise(self) -> None:
-        """Start the noise of all effects again."""
+        """Restart the noise of all effects."""
         self._step = 0
         for effect in self.effects:
             effect.restart_noise()
 
     @property
     def rotor_thrust_n(self) -> Vec4:
-        """Thrust of each rotor, in PX4's quad-x order."""
+        """Thrust of each rotor in N, in PX4's quad-x order."""
         a, b, c, d = self._ctrl[0:4].tolist()
         return (a, b, c, d)
 
     @property
     def weight_n(self) -> float:
-        """Weight of the vehicle without payload."""
+        """Weight of the vehicle without payload, N."""
         return GRAVITY_M_S2 * float(self.model.body_subtreemass[self._base])
 
     @property
     def thrust_n(self) -> Vec4:
-        """Thrust of each rotor, without ground effect and faults, in PX4's quad-x order."""
+        """Thrust of each rotor in N before ground effect and faults, in PX4's quad-x order."""
         return self._thrust
 
     @property
     def hover_command(self) -> float:
-        """True normalised hover thrust without payload, at the battery's start and far from the ground."""
+        """True normalised hover thrust (0 to 1) without payload, far from the ground, at the battery's initial charge."""
         ratio = 1.0 if self.battery is None else self.battery.thrust_ratio(self.battery.hover_v)
         return self._rotors.hover_command(self.weight_n / 4.0, self._rotor_max_n * ratio, self._config.thr_mdl_fac)
 
@@ -231,7 +231,7 @@ class World:
 
         Args:
             rotor_commands: motor signals, 0 to 1, in PX4's quad-x order.
-            joint_torque_nm: torque of the motors or of their gears on both joints.
+            joint_torque_nm: torque on both joints, from the motors or from their gears.
             airborne: whether a payload may be thrown.
             drag: whether aerodynamic drag and wind act.
         """
@@ -266,7 +266,7 @@ class World:
         self._watch_crash()
 
     def _drag_and_snag_n(self, thrust_n: Vec4, drag: bool) -> Vec3:
-        """Return the force of air and a snagged tether on the base, N, world frame."""
+        """Return the force of the air and of a snagged tether on the base in N, world frame."""
         force_n = ZERO
         if drag:
             (wx, wy, wz), v = self.wind_m_s, self.v
@@ -292,7 +292,7 @@ class World:
 
     @property
     def attachment_world_m(self) -> Vec3:
-        """Point where the tether is attached to the vehicle."""
+        """Point where the tether is attached to the vehicle, world frame."""
         x, y, z = self.data.site_xpos[self._attachment].tolist()
         return (x, y, z)
 
@@ -306,7 +306,7 @@ class World:
         self.model.tendon_range[self._tether, 1] = length_m
 
     def _snag_pull_n(self, point_m: Vec3, length_m: float) -> Vec3:
-        """Return the force of a stiff, damped line from the point to the vehicle."""
+        """Return the pull of a stiff, damped line from the snag point on the vehicle in N, world frame."""
         x, y, z = (p - a for p, a in zip(point_m, self.attachment_world_m, strict=True))
         distance_m = math.sqrt(x * x + y * y + z * z)
         if distance_m <= length_m or distance_m == 0.0:
@@ -318,7 +318,7 @@ class World:
         return (pull_n * x, pull_n * y, pull_n * z)
 
     def _watch_crash(self) -> None:
-        """Detect a crash: the vehicle is far below its standing height, upside down, or reaches the floor in a fall."""
+        """Detect a crash: the vehicle is far below its standing height, tilted by more than 72 deg, or has hit the floor too fast."""
         if self.crashed:
             return
         q = self.q
@@ -334,7 +334,7 @@ class World:
         self._events.append(WorldEvent(self.t_s, kind))
 
     def take_events(self) -> list[WorldEvent]:
-        """Return the events since the last call."""
+        """Return and clear the events since the last call."""
         events, self._events = self._events, []
         return events
 

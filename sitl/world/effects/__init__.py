@@ -1,5 +1,5 @@
-"""Effects of a laboratory that the plain simulation leaves out, one module each.
+"""Effects of a laboratory that the plain simulation omits, one module each.
 
-A new effect has a section in `companion.sitl_config.effects`, a key in `companion.sitl_config.world.World`, its physics here, and a
-line where it acts: `sitl.world.world` (loads on bodies) or `sitl.world.plant` (sensors and motors).
+To add an effect, write its section in `companion.sitl_config.effects`, its key in `companion.sitl_config.world.World` and its physics
+here; then apply it in `sitl.world.world` (loads on bodies) or `sitl.world.plant` (sensors and motors).
 """

@@ -22,7 +22,7 @@ class Air:
         config: section `air`.
         seed: seed of the world.
         base: MuJoCo's index of the base.
-        weight_n: weight of the vehicle, its thrust in hover.
+        weight_n: weight of the vehicle, equal to its thrust in hover.
     """
 
     def __init__(self, config: AirConfig, seed: int, base: int, weight_n: float) -> None:
@@ -35,11 +35,11 @@ class Air:
         return cls(config, seed, base, weight_n) if config.on else None
 
     def restart_noise(self) -> None:
-        """Start the noise sequence again."""
+        """Restart the noise sequence."""
         self._gust = OrnsteinUhlenbeck(2, self._config.correlation_time_s, EFFECT_PERIOD_S, self._seed, _NOISE)
 
     def apply(self, world: World) -> None:
-        """Set the force and torque on the base."""
+        """Set the gusts' force and torque on the base."""
         (x, y, z), (roll, pitch, _) = self._gust.step()
         strength = self.strength(sum(world.rotor_thrust_n), world.q[2])
         force, torque = strength * self._config.force_rms_n, strength * self._config.torque_rms_nm

@@ -1,4 +1,4 @@
-"""The true battery: open-circuit voltage as a function of charge, internal resistance, and the current that the rotors' power draws.
+"""The true battery: open-circuit voltage as a function of charge, internal resistance, and the current for the rotors' power.
 
 Sources: open-circuit voltage of a lithium-polymer cell (Chen and Rincon-Mora, IEEE Trans. Energy Conversion 2006, eq. 2; without its RC
 elements); power of a rotor proportional to thrust^1.5 (momentum theory with a constant figure of merit); thrust at a given motor signal
@@ -16,7 +16,7 @@ CELLS = 4
 
 
 def open_circuit_v(charge: float) -> float:
-    """Return the voltage of the battery without load at a state of charge of 0 to 1."""
+    """Return the battery's voltage without load at a state of charge (0 to 1)."""
     cell_v = 3.685 + charge * (0.2156 + charge * (-0.1178 + charge * 0.3201)) - 1.031 * math.exp(-35.0 * charge)
     return CELLS * cell_v
 
@@ -27,7 +27,7 @@ class BatteryPack:
     Args:
         config: section `battery`.
         start: state of charge at arming, 0 to 1.
-        life_s: hover time of a full battery.
+        life_s: hover time with a full battery.
         weight_n: weight of the vehicle, for the hover current.
     """
 
@@ -40,7 +40,7 @@ class BatteryPack:
         hover_w = config.electronics_w + config.power_w_n15 * weight_n * math.sqrt(weight_n / 4.0)
         self.hover_v = self._loaded_v(open_circuit_v(start), hover_w)
         self.capacity_as = hover_w / self._loaded_v(open_circuit_v(0.5), hover_w) * life_s
-        """Charge of the full battery, A s: hover current at half charge times life."""
+        """Charge of the full battery in A s: the hover current at half charge multiplied by `life_s`."""
         self.restart()
 
     @classmethod
@@ -49,7 +49,7 @@ class BatteryPack:
         return cls(config, start, life_s, weight_n) if config.on else None
 
     def restart(self) -> None:
-        """Set the charge at arming."""
+        """Reset the battery to its charge at arming."""
         self.drawn_as = 0.0
         """Charge drawn since arming, A s."""
         self.voltage_v = self._loaded_v(open_circuit_v(self._start), self._electronics_w)
@@ -65,12 +65,12 @@ class BatteryPack:
         return max(0.0, self._start - self.drawn_as / self.capacity_as)
 
     def thrust_ratio(self, voltage_v: float) -> float:
-        """Return the ratio of the thrust at this voltage to the vehicle file's thrust at the same motor signal."""
+        """Return the thrust at this voltage relative to the thrust in the vehicle file, at the same motor signal."""
         ratio = voltage_v / self._full_thrust_v
         return ratio * ratio
 
     def step(self, dt_s: float, thrust_n: Vec4) -> None:
-        """Draw current for one physics step with these rotor thrusts."""
+        """Draw the current for these rotor thrusts during one physics step."""
         a, b, c, d = thrust_n
         root = math.sqrt
         rotors_n15 = a * root(a) + b * root(b) + c * root(c) + d * root(d)

@@ -1,11 +1,11 @@
 """Force of the rotors' wakes on the links of the arm, the net and the payload.
 
-A wake develops and contracts according to momentum theory: at a depth of z rotor radii below the disk the velocity is the induced
-velocity in hover sqrt(T / (2 rho A)) times 1 + z / sqrt(1 + z^2), and the area shrinks by continuity. Turbulence smears its edge but
-conserves its momentum; the momenta of the four wakes add (Reichardt's hypothesis for free turbulence). The cross-section is
-approximated by a square of the same area, whose smeared profile is a product of error functions. All dynamic pressures are proportional
-to thrust, and the density of the air cancels. The flow turns aside above the floor. The flow across a link's axis loads the link
-(cross-flow principle, Hoerner 1965) at its middle; the whole flow loads net and payload at their centres of mass.
+A wake develops and contracts according to momentum theory: z rotor radii below the disk, the velocity is the induced velocity in hover,
+sqrt(T / (2 rho A)), times 1 + z / sqrt(1 + z^2), and the area shrinks by continuity. Turbulence blurs the wake's edge but conserves its
+momentum; the momenta of the four wakes add (Reichardt's hypothesis for free turbulence). The cross-section is approximated by a square
+of the same area, whose blurred profile is a product of error functions. All dynamic pressures are proportional to thrust, and the
+density of the air cancels. The flow turns aside above the floor. The component of the flow across a link's axis loads the link at its
+middle (cross-flow principle, Hoerner 1965); the whole flow loads net and payload at their centres of mass.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Wakes:
     """Time-averaged dynamic pressure below the four rotors.
 
     Args:
-        rotor_offset_m: distance of the rotors from the x-z plane and the y-z plane of the body.
+        rotor_offset_m: distance of the rotors from the x-z and y-z planes of the body.
         radius_m: radius of a rotor.
         spread: see section `downwash`.
     """
@@ -40,12 +40,12 @@ class Wakes:
         self._offset_m, self._radius_m, self._spread = rotor_offset_m, radius_m, spread
 
     def pressure_pa(self, thrust_n: Vec4, point_m: Vec3, blur_m: float = 0.0) -> float:
-        """Return the mean dynamic pressure.
+        """Return the mean dynamic pressure at a point in Pa.
 
         Args:
             thrust_n: thrust of each rotor, in PX4's quad-x order.
             point_m: position relative to the centre of the four rotors, body FLU.
-            blur_m: standard deviation along x and y of the area over which the pressure is averaged.
+            blur_m: size of the area over which the pressure is averaged, as a standard deviation along x and y.
         """
         x, y, z = point_m
         if z >= 0.0:
@@ -65,18 +65,18 @@ class Wakes:
 
 
 def _smeared(x_m: float, half_m: float, per_m: float) -> float:
-    """Return the profile, 0 to 1, of a smeared strip from -`half_m` to `half_m` at `x_m`."""
+    """Return the value (0 to 1) at `x_m` of the profile of a strip from -`half_m` to `half_m` with blurred edges."""
     return 0.5 * (math.erf((x_m + half_m) * per_m) - math.erf((x_m - half_m) * per_m))
 
 
 class Downwash:
-    """The force of the wakes.
+    """The forces of the rotors' wakes.
 
     Args:
         config: section `downwash`.
         rotor_radius_m: radius of a rotor.
         vehicle: vehicle file.
-        world: the world whose bodies it loads.
+        world: the world whose bodies the wakes load.
         seed: seed of the world.
     """
 
@@ -116,11 +116,11 @@ class Downwash:
         return cls(config, rotor_radius_m, vehicle, world, seed) if config.on else None
 
     def restart_noise(self) -> None:
-        """Start the noise sequence again."""
+        """Restart the noise sequence."""
         self._turbulence = OrnsteinUhlenbeck(3, self._config.correlation_time_s, EFFECT_PERIOD_S, self._seed, _NOISE)
 
     def apply(self, world: World) -> None:
-        """Set the forces."""
+        """Set the wakes' forces on links, net and payload."""
         gusts = self._turbulence.step()
         thrust_n = world.rotor_thrust_n
         origin = self._base_position.tolist()
@@ -152,7 +152,9 @@ class Downwash:
             world.loads.set(body, "downwash", (k * ux, k * uy, k * uz))
 
     def _pressure_pa(self, thrust_n: Vec4, origin: list[float], axes: list[float], point: Vec3, blur_m: float) -> float:
-        """Return the mean dynamic pressure at a point in the world frame. The flow stops at the floor, from one radius above it."""
+        """Return the mean dynamic pressure in Pa at a point in the world frame; it falls to zero over the last rotor radius above
+        the floor.
+        """
         px, py, pz = point
         x, y, z = px - origin[0], py - origin[1], pz - origin[2]
         a, b, c, d, e, f, g, h, i = axes

@@ -1,7 +1,7 @@
-"""Errors of the force-torque sensor: mounting, cross-talk, drift, its own low-pass and its resolution.
+"""Errors of the force-torque sensor: mounting, cross-talk, drift, internal low-pass filter and resolution.
 
-Mounting and cross-talk (one 6x6 matrix), the drift of the zero and the low-pass act on the readings in this order; then `Plant` adds
-noise, bias, faults and scale, and `rounded` comes last.
+Mounting and cross-talk (one 6x6 matrix), zero drift and the low-pass filter act on the readings in this order. `Plant` then applies
+noise, bias, faults and scale error, and `rounded` is applied last.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _TORQUE_PER_FORCE_M = TORQUE_CAPACITY_NM / FORCE_CAPACITY_N
 
 
 class ForceSensor:
-    """The sensor's errors.
+    """Errors of the force-torque sensor.
 
     Args:
         config: the section `force_sensor`.
@@ -48,10 +48,10 @@ class ForceSensor:
         return cls(config, seed) if config.on else None
 
     def measure(self, t_s: float, force_n: Vec3, torque_nm: Vec3) -> tuple[Vec3, Vec3]:
-        """Return the reading before noise, bias and rounding, sensor frame.
+        """Return the reading before noise, bias and rounding, in the sensor frame.
 
         Args:
-            t_s: world time, not before that of the last call.
+            t_s: world time; must not decrease from call to call.
             force_n: true force, in the sensor frame of the vehicle file.
             torque_nm: true torque, same frame.
         """
@@ -77,7 +77,7 @@ class ForceSensor:
         return (fx, fy, fz), (tx, ty, tz)
 
     def rounded(self, force_n: Vec3, torque_nm: Vec3) -> tuple[Vec3, Vec3]:
-        """Return the reading in steps of the resolution."""
+        """Return the reading rounded to the sensor's resolution."""
         return _rounded(force_n, self._config.resolution_n), _rounded(torque_nm, self._config.resolution_nm)
 
 

@@ -1,9 +1,9 @@
 """Errors of the autopilot's IMU: bias, drift, mounting, and the rotors' vibration averaged over a sample.
 
-A sample of PX4 is the mean of the raw samples since the previous one (vehicle_imu's delta velocity and delta angle). The vibration is
-averaged exactly over each sample, so that the samples contain what remains of it and its alias. An unbalanced rotor shakes the body in
-the rotor's plane at its own frequency, with a force proportional to the square of its speed, hence to its thrust. A rotor with
-two blades shakes the body along its axis at twice its frequency, and therefore also turns it.
+One of PX4's samples is the mean of the raw samples since the previous one (delta velocity and delta angle of vehicle_imu). The
+vibration is averaged exactly over the interval of each sample, so that the samples contain its remainder and its alias. An unbalanced
+rotor shakes the body in the rotor's plane at the rotor's frequency, with a force proportional to the square of its speed and thus to
+its thrust. A rotor with two blades shakes the body along the rotor's axis at twice that frequency and thereby also rotates it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ImuErrors:
     """Converts true samples to measured ones.
 
     Args:
-        config: the section.
+        config: section `imu`.
         interval_s: time from one sample to the next.
         hover_n: thrust of one rotor in hover.
     """
@@ -66,19 +66,19 @@ class ImuErrors:
 
     @classmethod
     def of(cls, config: Imu, interval_s: float, hover_n: float) -> ImuErrors | None:
-        """Return the errors of this section, or None if it is off."""
+        """Return the errors, or None if the effect is off."""
         return cls(config, interval_s, hover_n) if config.on else None
 
     def drift(self, noise: Iterator[Vec3]) -> None:
-        """Let the biases drift, starting from zero drift now; `noise` yields standard normal numbers."""
+        """Start the drift of the biases at zero; `noise` yields triples of standard normal numbers."""
         self._noise, self._tick = noise, 0
         self._accel_drift = self._gyro_drift = (0.0, 0.0, 0.0)
 
     def measure(self, thrust_n: Vec4, gyro_rad_s: Vec3, accel_m_s2: Vec3) -> tuple[Vec3, Vec3]:
-        """Return gyroscopes and accelerometers in the board's axes.
+        """Return the measured angular rate (rad/s) and specific force (m/s^2) in the axes of the autopilot board.
 
         Args:
-            thrust_n: thrust of each rotor, in PX4's order.
+            thrust_n: thrust of each rotor, in PX4's quad-x order.
             gyro_rad_s: angular rate, body frame (FLU).
             accel_m_s2: specific force, body frame (FLU).
         """

@@ -10,7 +10,7 @@ from companion.sitl_config.effects.machine import Machine
 
 
 def as_built(vehicle: Vehicle, machine: Machine) -> Vehicle:
-    """Return the vehicle with its true inertia, shoulder position, link lengths and links' centres of mass."""
+    """Return the vehicle with its true inertia, shoulder position, link lengths and centres of mass of the links."""
     if not machine.on:
         return vehicle
     airframe, arm = vehicle.airframe, vehicle.arm
@@ -38,7 +38,7 @@ def centre_of_mass_m(machine: Machine) -> Vec3:
 
 
 def shoulder_ypr_rad(machine: Machine) -> Vec3:
-    """Return yaw, pitch and roll of the shoulder mount in the body frame, in MuJoCo's order of ZYX angles."""
+    """Return yaw, pitch and roll of the shoulder mount in the body frame, in the order of MuJoCo's ZYX angles."""
     if not machine.on:
         return (0.0, 0.0, 0.0)
     roll, pitch, yaw = machine.shoulder_rpy_deg
@@ -46,6 +46,6 @@ def shoulder_ypr_rad(machine: Machine) -> Vec3:
 
 
 def _inertia_kg_m2(nominal: Vec3, machine: Machine) -> Vec3:
-    """Return the true moments of inertia; each is limited to the sum of the other two, as for every rigid body."""
+    """Return the true moments of inertia, each limited to the sum of the other two because no rigid body exceeds it."""
     x, y, z = (moment * (1.0 + error) for moment, error in zip(nominal, machine.inertia_error, strict=True))
     return (min(x, y + z), min(y, x + z), min(z, x + y))

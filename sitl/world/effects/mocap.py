@@ -1,6 +1,6 @@
-"""Errors of motion capture: offset of the pivot, hidden markers, lost frames, uneven delivery.
+"""Errors of motion capture: pivot offset, hidden markers, lost frames and delivery jitter.
 
-Yaw and tilt of the rigid body are in `sitl.world.mocap_misalignment`.
+The yaw and tilt errors of the rigid body are in `sitl.world.mocap_misalignment`.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ _STREAM = 12
 
 
 class MocapErrors:
-    """Converts true poses to tracked ones.
+    """Converts true poses to tracked poses.
 
     Args:
-        config: the section.
+        config: section `mocap`.
         seed: seed of the world.
     """
 
@@ -36,16 +36,16 @@ class MocapErrors:
 
     @classmethod
     def of(cls, config: Mocap, seed: int) -> MocapErrors | None:
-        """Return the errors of this section, or None if it is off."""
+        """Return the errors, or None if the effect is off."""
         return cls(config, seed) if config.on else None
 
     def restart(self, t_s: float) -> None:
-        """Start the sequence of events and delays again at world time `t_s`."""
+        """Restart the random sequence of events and delays at world time `t_s`."""
         self._rng = np.random.default_rng((self._seed, _STREAM))
         self._lost = False
         self._loss_changes_s = t_s + self._after(self._tracked_s)
         self._hidden_s = t_s + self._after(self._config.wobble_every_s)
-        """Times at which markers are hidden next."""
+        """World time at which markers are next hidden."""
         self._draw_wobble()
 
     def _after(self, mean_s: float) -> float:
@@ -57,7 +57,7 @@ class MocapErrors:
         self._wobble = ((m * x, m * y, m * z), (rad * roll, rad * pitch, rad * yaw))
 
     def pose(self, t_s: float, position_world_m: Vec3, attitude_wxyz: Quat) -> tuple[Vec3, Quat, bool]:
-        """Return the measured pose at `t_s`, and whether the body is tracked."""
+        """Return the measured pose at world time `t_s`, and whether the body is tracked."""
         config = self._config
         x, y, z = quat_rotate(attitude_wxyz, config.pivot_offset_m)
         x, y, z = position_world_m[0] + x, position_world_m[1] + y, position_world_m[2] + z
@@ -75,7 +75,7 @@ class MocapErrors:
         return (x, y, z), attitude_wxyz, not self._lost
 
     def sent_s(self, due_s: float) -> float:
-        """Return the transmission time of the next frame, which is `due_s` without jitter."""
+        """Return the transmission time of the next frame; without jitter it would be `due_s`."""
         late_s = due_s + float(self._rng.standard_exponential()) * self._config.delivery_jitter_s
         self._sent_s = late_s if late_s > self._sent_s else self._sent_s
         return self._sent_s

@@ -1,11 +1,11 @@
 """Contact of a thrown payload with the net: a hoop with a bag of elastic mesh.
 
-The hoop lies in the x-y plane of link 2 about the net's centre and opens towards +z, which points up in the catch pose. The mesh is a
-membrane in the hoop, slack up to the bag's depth: a payload that crosses the plane inside the hoop from above is in the bag; one that
-crosses it from below lifts the mesh and falls back. The taut mesh acts as a unilateral spring between the payload and a point in the
-plane, the pocket, about which the payload swings. It acts with full stiffness while being stretched and with restitution^2 times that
-stiffness while relaxing, which returns the payload with `restitution` times its speed whatever its mass (Walton and Braun 1986, J.
-Rheology 30: 949). The hoop is a ring with the same contact law.
+The hoop lies in the x-y plane of link 2, centred on the net, and opens towards +z, which points up in the catch pose. The mesh is a
+membrane in the hoop that is slack up to the bag's depth. A payload that crosses the hoop's plane inside the hoop from above is in the
+bag; one that crosses it from below lifts the mesh and falls back. The taut mesh acts as a unilateral spring between the payload and a
+point in the plane, the pocket, about which the payload swings. The spring has full stiffness while it is being stretched and
+restitution^2 times that stiffness while it relaxes, which returns the payload with `restitution` times its speed, whatever its mass
+(Walton and Braun 1986, J. Rheology 30: 949). The hoop is a ring with the same contact law.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from sitl.world.loads import ZERO, Loads
 
 RIM_STIFFNESS_N_M = 3000.0
 SETTLED_S = 0.4
-"""A payload is caught when it has been in the bag for this time; one that bounces out leaves within 0.2 s."""
+"""Time in the bag after which a payload counts as caught; a payload that bounces out leaves the bag within 0.2 s."""
 _TURN_M_S = 0.1
-"""The stiffness changes from stretching to relaxing over this range of speed, which damps a payload at rest."""
+"""Speed range over which the stiffness changes between its stretching and relaxing values; the transition damps a payload at rest."""
 _NEAR_M2 = 1.0
-"""Square of the distance from the vehicle's origin within which contact is computed; the arm with the bag reaches 0.65 m."""
+"""Square of the largest distance from the vehicle's origin at which contact is computed; the arm with the bag reaches 0.65 m."""
 
 
 class Bag:
-    """Contact of one payload with the hoop and its mesh, in the frame of the hoop (m, m/s, N)."""
+    """Contact of one payload with the hoop and its mesh, in the hoop's frame (m, m/s, N)."""
 
     def __init__(self, config: NetConfig, hoop_radius_m: float, payload_radius_m: float) -> None:
         self._hoop_m, self._payload_m = hoop_radius_m, payload_radius_m
@@ -46,9 +46,9 @@ class Bag:
         self.entered_s: float | None = None
         """Time at which the payload entered the bag; None if it is not in the bag."""
         self.touched_s: float | None = None
-        """Time of the first contact with hoop or mesh since the throw or since it bounced out."""
+        """Time of the first contact with hoop or mesh since the throw or the last bounce out of the bag; None before it."""
         self.bounced = False
-        """Whether the payload has just left the bag after it touched the mesh, without a catch."""
+        """Whether the payload touched the mesh and has just left the bag without being caught."""
         self._above = True
 
     def caught_s(self, t_s: float) -> float | None:
@@ -62,7 +62,7 @@ class Bag:
 
         Args:
             position: position of the payload's centre relative to the centre of the hoop.
-            velocity: velocity of the payload relative to the point of the net's frame at its centre.
+            velocity: velocity of the payload's centre relative to the point of the net's frame that coincides with it.
             t_s: world time.
         """
         x, y, z = position
@@ -114,7 +114,7 @@ class Bag:
     def _pressed(
         self, stiffness: float, depth: float, nx: float, ny: float, nz: float, vx: float, vy: float, vz: float
     ) -> Vec3:
-        """Return the force of a surface with the unit normal n that the payload presses in by `depth`, with friction."""
+        """Return the force, including friction, of a surface with unit normal n that the payload has pressed in by `depth`."""
         along = vx * nx + vy * ny + vz * nz
         stretching = -along / _TURN_M_S
         stretching = 1.0 if stretching > 1.0 else -1.0 if stretching < -1.0 else stretching
@@ -129,8 +129,8 @@ class Net:
 
     Args:
         config: section `net`.
-        model: the model with the bodies base, sensor and net.
-        data: its data.
+        model: MuJoCo model with the bodies base, sensor and net.
+        data: data of that model.
         loads: external forces and torques on the bodies.
         hoop_radius_m: radius of the hoop.
         payload_radius_m: radius of the payloads.
@@ -167,7 +167,7 @@ class Net:
         return cls(config, model, data, loads, hoop_radius_m, payload_radius_m) if config.on else None
 
     def watch(self, body: int, q: int, v: int) -> None:
-        """Let the net act on a thrown payload, given its body and its first indices in qpos and qvel."""
+        """Let the net act on a thrown payload, given its body index and its first indices in qpos and qvel."""
         self.let_go(body)
         self._bags[body] = (Bag(self._config, *self._radii_m), q, v)
 
@@ -186,7 +186,7 @@ class Net:
         return body in self._bags and self._bags[body][0].side > 0
 
     def step(self, q: list[float], v: list[float], t_s: float) -> bool:
-        """Advance MuJoCo by one step, with all loads; return whether a payload bounces out of the bag.
+        """Advance MuJoCo by one step with all loads applied; return whether a payload bounces out of the bag.
 
         Args:
             q: qpos before the step.
@@ -207,7 +207,7 @@ class Net:
         return any(bag.bounced for _, (bag, _, _) in near)
 
     def _press(self, body: int, bag: Bag, position_m: list[float], velocity_m_s: list[float], t_s: float) -> None:
-        """Load the payload at this position and velocity (world frame), and the net with the opposite force."""
+        """Apply the contact force to the payload at this position and velocity (world frame), and the opposite force to the net."""
         px, py, pz = position_m
         vx, vy, vz = velocity_m_s
         cx, cy, cz = self._centre.tolist()

@@ -1,8 +1,8 @@
-"""Thrust of the true rotors: static curve, spread, lag, ground effect, drag.
+"""Thrust of the true rotors: static curve, differences between rotors, lag, ground effect and drag.
 
 Sources: static curve of PX4's THR_MDL_FAC (`FunctionMotors::updateValues`); drag linear in thrust and airspeed (Faessler, Franchi,
-Scaramuzza, RA-L 2018); ground effect of four rotors (Sanchez-Cuevas, Heredia, Ollero, Int. J. Aerospace Eng. 2017, eq. for the
-quadrotor, which adds the other rotors' images and the fountain below the body to Cheeseman and Bennett 1955).
+Scaramuzza, RA-L 2018); ground effect of four rotors (Sanchez-Cuevas, Heredia, Ollero, Int. J. Aerospace Eng. 2017; the equation for
+the quadrotor, which adds the images of the other rotors and the fountain below the body to Cheeseman and Bennett 1955).
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from companion.sitl_config.effects.rotors import Rotors as RotorsConfig
 from sitl.autopilot.cascade import motor_signal
 
 LOWEST_RADII = 0.5
-"""Height in rotor radii below which the ground effect no longer grows; the formula holds above it."""
+"""Height in rotor radii below which the ground effect is held constant; the formula is valid only above it."""
 
 
 def curve(signal: float, factor: float) -> float:
-    """Return thrust / full thrust at a motor signal of 0 to 1."""
+    """Return the fraction of full thrust at a motor signal of 0 to 1; `factor` is defined like THR_MDL_FAC."""
     return signal * (factor * signal + 1.0 - factor)
 
 
 class LinearRotors:
-    """Rotors whose thrust is linear in the signal, with one lag: the rotors of a world in which the effect is off.
+    """Rotors with thrust linear in the motor signal and a single lag, used in a world in which the effect is off.
 
     Args:
         lag_s: time constant of the thrust.
@@ -55,7 +55,7 @@ class LinearRotors:
         return 1.0
 
     def drag_n(self, thrust_n: float, airspeed_m_s: Vec3, q: Sequence[float]) -> Vec3:
-        """Return no force."""
+        """Return a zero force, because these rotors have no drag."""
         return (0.0, 0.0, 0.0)
 
 
@@ -76,7 +76,7 @@ class Rotors:
         self._drag_s_m = config.drag_s_m
         self._radius_m, self._body_lift, self._diagonal_m = config.radius_m, config.ground_body_lift, 2.0 * rotor_arm_m
         self._root: Vec4 = (0.0, 0.0, 0.0, 0.0)
-        """Square root of each rotor's thrust, proportional to its speed, N^0.5."""
+        """Square root of each rotor's thrust in N^0.5, which is proportional to the rotor's speed."""
 
     @classmethod
     def of(cls, config: RotorsConfig, rotor_arm_m: float, dt_s: float) -> Rotors | None:
@@ -84,7 +84,7 @@ class Rotors:
         return cls(config, rotor_arm_m, dt_s) if config.on else None
 
     def step(self, signals: Vec4, full_n: float) -> Vec4:
-        """Advance by one physics step and return the thrust of each rotor far from the ground, N.
+        """Advance by one physics step and return the thrust of each rotor in N, as it is far from the ground.
 
         Args:
             signals: motor signals, 0 to 1.
@@ -108,7 +108,7 @@ class Rotors:
         """Return PX4's collective thrust setpoint, 0 to 1, at which each rotor produces `each_n` far from the ground.
 
         Args:
-            each_n: thrust of each rotor; PX4's attitude loop evens out the spread of the rotors.
+            each_n: thrust of each rotor; PX4's attitude loop compensates for differences between the rotors.
             full_n: thrust of one rotor at full signal and the present voltage.
             thr_mdl_fac: PX4's THR_MDL_FAC.
         """
@@ -116,7 +116,7 @@ class Rotors:
         return sum(curve(signal, thr_mdl_fac) for signal in signals) / 4.0
 
     def ground_effect(self, height_m: float) -> float:
-        """Return the ground-effect factor by which the thrust of all rotors is multiplied when they are this high above the floor."""
+        """Return the factor by which the ground effect multiplies the thrust of all rotors at a height above the floor."""
         radius_m, diagonal_m = self._radius_m, self._diagonal_m
         z = max(height_m, LOWEST_RADII * radius_m)
         r2, b2, z4 = radius_m * radius_m, diagonal_m * diagonal_m, 4.0 * z * z
@@ -126,7 +126,8 @@ class Rotors:
         return 1.0 / (1.0 - r2 * (0.25 / z4 + z / beside + (0.5 + 2.0 * self._body_lift) * z / across))
 
     def drag_n(self, thrust_n: float, airspeed_m_s: Vec3, q: Sequence[float]) -> Vec3:
-        """Return the drag of all rotors, N, world frame: against the airspeed across the rotor axis.
+        """Return the drag of all rotors in N, world frame; it acts along the component of the relative air velocity across the rotor
+        axis.
 
         Args:
             thrust_n: thrust of all rotors.

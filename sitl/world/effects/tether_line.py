@@ -1,8 +1,8 @@
-"""Pull of the slack tether on the vehicle: the weight of the hanging part, a catenary when little slack is left, friction on the floor.
+"""Pull of the slack tether on the vehicle: weight of the hanging part, catenary tension when little slack is left, and floor friction.
 
-The taut line remains MuJoCo's tendon limit, and `Truth.tether_tension_n` is only the limit's tension, without this pull. The catenary's
-tension grows without bound towards no slack, so the slack is taken to be at least `SLACK_MIN_SHARE` of the distance. Air drag of the
-line is left out: at 0.5 m/s a hanging metre of 5 mm rope has less than 1 mN.
+The taut line is still modelled by MuJoCo's tendon limit, and `Truth.tether_tension_n` is the tension of that limit alone, without this
+pull. The catenary's tension grows without bound as the slack vanishes, so the slack is taken to be at least `SLACK_MIN_SHARE` of the
+distance. The line's air drag is neglected: at 0.5 m/s it is below 1 mN for one hanging metre of 5 mm rope.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 SLACK_MIN_SHARE = 0.005
 _DRAGGED_SHARE = 0.5
 _SLIDES_M_S = 0.05
-"""Speed at which the smoothed friction has 0.7 of its full value."""
+"""Speed at which the smoothed friction reaches 0.7 of its full value."""
 _STEPS = 40
 
 
 class Hanging(NamedTuple):
-    """Static equilibrium of the line."""
+    """Static equilibrium of the slack line."""
 
     level_n: float
     """Horizontal pull on the upper end, towards the anchor."""
@@ -35,7 +35,7 @@ class Hanging(NamedTuple):
 
 
 def hanging(level_m: float, height_m: float, length_m: float, weight_n_m: float) -> Hanging:
-    """Return the static pull of a line from an anchor on the floor.
+    """Return the static equilibrium of a line from an anchor on the floor.
 
     Args:
         level_m: horizontal distance from the anchor to the upper end.
@@ -63,7 +63,7 @@ def hanging(level_m: float, height_m: float, length_m: float, weight_n_m: float)
 
 
 def _length_m(level_m: float, height_m: float, a_m: float) -> float:
-    """Return the length of a catenary, including a part on the floor, whose horizontal tension is the weight of `a_m` of line."""
+    """Return the length, including any part on the floor, of a catenary whose horizontal tension is the weight of `a_m` of line."""
     reach_m = a_m * math.acosh(1.0 + height_m / a_m)
     if reach_m <= level_m:
         return math.sqrt(height_m * (height_m + 2.0 * a_m)) + level_m - reach_m
@@ -75,7 +75,7 @@ class TetherLine:
 
     Args:
         config: section `tether_line`.
-        tether: the vehicle file's tether.
+        tether: tether of the vehicle file.
         base: MuJoCo's index of the base.
     """
 
@@ -94,7 +94,7 @@ class TetherLine:
         """Do nothing: this effect has no noise."""
 
     def apply(self, world: World) -> None:
-        """Set the pull on the base."""
+        """Set the pull of the tether on the base."""
         x, y, z = end = world.attachment_world_m
         ax, ay, az = self._anchor
         dx, dy, dz = ax - x, ay - y, az - z

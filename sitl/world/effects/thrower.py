@@ -1,7 +1,7 @@
-"""A person who throws the payload: the errors of a throw.
+"""Errors of the person who throws the payload.
 
-Speed and direction scatter as measured on basketball free throws (Slegers et al. 2021, J. Sports Sci. Med. 20: 508). At the default
-values and 0.45 s of flight the payload arrives with a standard deviation of about 4 cm on each axis across its path.
+Speed and direction scatter as measured for basketball free throws (Slegers et al. 2021, J. Sports Sci. Med. 20: 508). With the default
+values and 0.45 s of flight, the payload arrives with a standard deviation of about 4 cm on each axis across its path.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ class Thrower:
 
     @classmethod
     def of(cls, config: ThrowerConfig, seed: int) -> Thrower | None:
-        """Return the person, or None if the effect is off."""
+        """Return the thrower, or None if the effect is off."""
         return cls(config, seed) if config.on else None
 
     def prediction_error_s(self) -> float:
-        """Draw the error of the lead time, s, over which the thrower extrapolates the vehicle's motion for this throw."""
+        """Draw the error in s of the lead time for which the thrower extrapolates the vehicle's motion in this throw."""
         return self._config.prediction_error_s * float(self._rng.standard_normal())
 
     def release(self, point_m: Vec3, velocity_m_s: Vec3, flight_s: float) -> tuple[Vec3, Vec3]:
-        """Draw the release of a throw: return its point and its velocity, world frame.
+        """Draw the release of a throw and return its point (m) and velocity (m/s), world frame.
 
         Args:
-            point_m: intended point.
-            velocity_m_s: intended velocity.
-            flight_s: time until the arrival.
+            point_m: intended release point.
+            velocity_m_s: intended release velocity.
+            flight_s: time from the release to the arrival.
         """
         config = self._config
         scatter = [config.release_error_m * value for value in self._rng.standard_normal(3).tolist()]

@@ -1,16 +1,16 @@
 """Motor, gear and flexible mount of a joint: the effects `servo_mechanics` and `compliance`.
 
-The angle of the joint in MuJoCo is the true angle of the link. The rotor is integrated here, one degree of freedom per joint: the
-motor's torque and the friction act on it, and a spring with backlash connects it to the link. The stiffness of that spring is that of
-gear and mount (or link) in series; the masses between them are negligible. Springs and rotors inside MuJoCo would need bodies for these
-masses, and a step of 2 ms does not represent their frequencies of several hundred hertz.
+MuJoCo's joint angle is the true angle of the link. The rotor is integrated here with one degree of freedom per joint: the motor's
+torque and the friction act on it, and a spring with backlash connects it to the link. The spring's stiffness is the series stiffness
+of gear and mount (or link); the masses between them are negligible. Springs and rotors inside MuJoCo would need bodies for these
+masses, and a step of 2 ms cannot represent their frequencies of several hundred hertz.
 
 Friction: Duclusaud et al., "Extended Friction Models for the Physics Simulation of Servo Actuators", ICRA 2025 (arXiv 2410.08650),
-model M4, with their update: friction is the torque that would stop the rotor within the step, limited to
+model M4, with their update rule: the friction is the torque that would stop the rotor within the step, limited to
 
     F = friction + load_friction L + exp(-(|v| / stribeck)^exponent) (stiction + load_stiction L) + viscous |v|,
 
-where L = |motor torque - external torque|, and the external torque is what the link exerts on the gear.
+where L = |motor torque - external torque|, and the external torque is the torque of the link on the gear.
 """
 
 from __future__ import annotations
@@ -23,21 +23,24 @@ from companion.sitl_config.effects.servo_mechanics import ServoMechanics
 from companion.sitl_config.world import World
 
 ARMATURE_MIN_KG_M2 = 4e-3
-"""Smallest inertia of a rotor, as felt at the joint, so that its oscillation against the gear is slow enough for the physics step."""
+"""Smallest simulated rotor inertia, referred to the joint, with which the physics step can represent the oscillation against the
+gear.
+"""
 _WARM_UP_STEPS = 500
 
 
 class Transmission:
-    """One joint; angles and torques in the direction of the joint angle. Call `encoder`, then `step`, once per physics step.
+    """Transmission of one joint, with angles and torques in the direction of the joint angle. Call `encoder`, then `step`, in each
+    step.
 
     Args:
         servo: friction, backlash, gear and warm-up.
-        armature_kg_m2: inertia of the rotor, felt at the joint.
+        armature_kg_m2: inertia of the rotor, referred to the joint.
         gear_rad_per_nm: compliance between the rotor and the encoder.
         outer_rad_per_nm: compliance between the encoder and the base or the link.
-        outer_relaxation_s: damping over stiffness of the latter.
-        start_rad: angle of the link at the start, with the gear in the middle of its play.
-        dt_s: time from step to step.
+        outer_relaxation_s: damping of that outer part divided by its stiffness.
+        start_rad: angle of the link at the start; the gear is in the middle of its backlash.
+        dt_s: physics step.
     """
 
     def __init__(
@@ -68,7 +71,7 @@ class Transmission:
         self._torque_share = self._friction_share = 1.0
 
     def encoder(self, link_rad: float, link_rad_s: float) -> tuple[float, float]:
-        """Update with the link's angle and velocity, and return those of the servo's output shaft."""
+        """Update with the link's angle and velocity, and return the angle and velocity of the servo's output shaft."""
         stretch, half = self._rotor_rad - link_rad, self._half_play_rad
         if stretch > half:
             stretch -= half
@@ -83,7 +86,10 @@ class Transmission:
         return link_rad + share * stretch, link_rad_s + share * rate
 
     def friction_nm(self, motor_nm: float, external_nm: float, speed_rad_s: float) -> float:
-        """Return the largest friction torque under a load at a speed of 0 or more."""
+        """Return the largest possible friction torque for these motor and external torques, whose difference is the load.
+
+        `speed_rad_s` is the magnitude of the rotor's speed.
+        """
         friction, stiction, load_friction, load_stiction = self._friction
         load = abs(motor_nm - external_nm)
         rest = math.exp(-((speed_rad_s / self._stribeck_rad_s) ** self._exponent))
@@ -92,8 +98,9 @@ class Transmission:
         )
 
     def step(self, motor_nm: float) -> float:
-        """Advance the rotor by one physics step under the torque that the motor would have when cold; return the torque on the link in
-        that step.
+        """Advance the rotor by one physics step and return the torque on the link in that step.
+
+        `motor_nm` is the torque that the motor would have when cold.
         """
         if self._step % _WARM_UP_STEPS == 0:
             self._warm_up(self._step * self._dt_s)
@@ -125,16 +132,16 @@ class Transmission:
 
 
 def acts(world: World) -> bool:
-    """Return whether a joint has a rotor of its own; otherwise MuJoCo's joint has the armature, the friction and the damping."""
+    """Return whether each joint has a rotor of its own; otherwise MuJoCo's joint models armature, friction and damping."""
     return world.servo_mechanics.on or world.compliance.on
 
 
 def transmissions_of(
     vehicle: Vehicle, world: World, start_rad: Vec2, dt_s: float
 ) -> tuple[Transmission, Transmission] | None:
-    """Return the transmission of each joint for the joint angles at the start, or None if neither effect is on.
+    """Return the transmission of each joint, starting at the joint angles `start_rad`; None if neither effect is on.
 
-    With `compliance` alone the servo has the plain world's constant friction and no backlash.
+    With `compliance` alone, the servo has the plain world's constant friction and no backlash.
     """
     if not acts(world):
         return None
