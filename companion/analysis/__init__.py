@@ -1,6 +1,6 @@
 """Evaluation of flight logs.
 
-`log` reads a log, and `metrics` computes metrics from it. `summary` has the keys of summary.json; `companion.launcher.run` and
-`companion.cli.report` fill in those that the log does not hold. `report` has the sections of report.html, `plots` the plots, and
-`plot_style` their colours. `companion.recorder` writes the log.
+`log` reads a log, and `metrics` computes metrics from it. `summary` builds summary.json; `companion.launcher.run` and
+`companion.cli.report` fill in the values that are not in the log. `report` writes report.html, `plots` draws its plots, and
+`plot_style` defines their colours. `companion.recorder` writes the log.
 """

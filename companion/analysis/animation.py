@@ -1,6 +1,7 @@
 """Animation of a flight: the vehicle in 3D with plots of position and arm error, as a GIF or as a player in an HTML page.
 
-No sensor measures the payload before the catch: it is drawn from the simulated world's throw, and not at all for a real flight.
+No sensor measures the payload before the catch: its path is computed from the throw configured in the simulated world. For a real
+flight it is not drawn.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _GRAVITY_WORLD_M_S2 = np.array([0.0, 0.0, -GRAVITY_M_S2])
 _TARGET_M = np.array([0.1, 0.0, -0.16])
 """Point that the camera looks at, relative to the vehicle, world axes."""
 _THROWN_S = 0.45
-"""Time before the catch for which the payload is drawn."""
+"""Time before the catch during which the payload is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +60,8 @@ class Movie:
 
 
 def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
-    """Return the animation of a flight; None if the vehicle did not take off or the logged configuration lacks its geometry.
+    """Return the animation of a flight; None if the vehicle did not take off, or its poses, joint angles or geometry were not
+    logged.
 
     Args:
         log: log of the flight.
@@ -108,14 +110,16 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
 
 
 def _end(log: FlightLog, flying: npt.NDArray[np.intp], scene: Scene) -> int:
-    """Return the index of the last frame, at which the reference of a landing reaches the floor."""
+    """Return the index in the log at which the animation ends: where the landing's reference reaches the floor, or else the end
+    of the flight.
+    """
     landing = np.array([log.outputs[k].phase_kind is PhaseKind.LANDING for k in flying])
     low = log.columns.reference_position_world_m[flying, 2] < scene.standing_height_m
     return int(flying[np.argmax(landing & low)] if (landing & low).any() else flying[-1])
 
 
 def _times(first_s: float, last_s: float, catch_s: float | None) -> Iterator[tuple[float, float]]:
-    """Yield the time of each frame and its speed: 1 is real time, the catch is slower, a long flight is faster."""
+    """Yield the time of each frame and its playback speed: 1 is real time, the catch is slower, a long flight is faster."""
     spans: list[tuple[float, float, float]] = []
     if catch_s is None:
         spans = [(last_s, 0.0, 10.0)]
@@ -172,7 +176,9 @@ class _Track:
 
 
 def _filled(values: Array) -> Array:
-    """Return for each row the index of the newest finite row, or of the first finite row."""
+    """Return, for each row, the index of the newest finite row up to it. Rows before the first finite one get the index of that
+    one.
+    """
     known = np.isfinite(values).all(axis=1)
     index = np.where(known, np.arange(len(values)), -1)
     filled = np.maximum.accumulate(index)

@@ -1,5 +1,5 @@
-"""Fit of the hover thrust without payload to the steady parts of a flight's log: least squares on the balance of
-`companion.control.hover_thrust`, thrust = h . load, and on the battery voltage if it changed enough.
+"""Fits the hover thrust (without payload) to the steady parts of a flight log: least squares on the force balance of
+`companion.control.hover_thrust`, thrust = h . load, with a slope over the battery voltage if that changed enough.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from companion.model.types import PhaseKind
 
 FIT_MIN_S = 2.0
 PIECE_S = 1.0
-"""Length of the pieces of data that are treated as independent: the vertical loop correlates neighbouring ticks, but not these."""
+"""Length of the pieces of data that are treated as independent: the vertical control loop correlates neighbouring ticks, but not
+pieces of this length.
+"""
 SLOPE_MIN_V = 0.3
 """Smallest change of the voltage for which a slope is fitted."""
 
@@ -41,13 +43,13 @@ class HoverFit:
     hover_thrust: float
     """Hover thrust at `voltage_mean_v`."""
     standard_error: float
-    """Standard error from noise alone; it does not contain an error of the configured mass."""
+    """Standard error due to noise alone; it does not include the error of the configured mass."""
     used_s: float
     """Duration of the steady flight that was used, s."""
     configured: float | None
     """Hover thrust at the start of the flight."""
     last_estimate: float | None
-    """The flight's own estimate at its end; the same as `configured` if the estimator was off."""
+    """Hover thrust that the vehicle had estimated by the end of the flight; equal to `configured` if the estimator was off."""
     voltage_mean_v: float | None
     """Mean battery voltage; None if PX4 did not report it throughout."""
     voltage_span_v: float | None
@@ -93,12 +95,14 @@ def fit_hover_thrust(log: FlightLog) -> HoverFit:
 
 
 def _calm(log: FlightLog) -> Array:
-    """Return the valid ticks: duration s, thrust, load as a fraction of the weight, battery V (NaN if unknown)."""
+    """Return the ticks of steady flight, shape (N, 4): duration in s, normalised thrust, load as a fraction of the weight, and
+    battery voltage in V (NaN if unknown).
+    """
     vehicle = log.config.get("vehicle") or {}
     mass_kg = (vehicle.get("airframe") or {}).get("mass_kg")
     force_timeout_s = (vehicle.get("safety") or {}).get("force_timeout_s", 0.25)
     if mass_kg is None:
-        raise HoverFitError(f"{log.path}: no vehicle.airframe.mass_kg in its configuration; expected a flight's log")
+        raise HoverFitError(f"{log.path}: no vehicle.airframe.mass_kg in its configuration; expected a flight log")
     balance = Balance(mass_kg)
     rows: list[tuple[float, float, float, float]] = []
     sent: float | None = None

@@ -60,12 +60,12 @@ class FlightLog:
 
         Args:
             path: path of the file.
-            ticks_max: keep about this many ticks, evenly spread (`stride`), and those with events; a tick takes about 8 kB of memory.
-                None keeps all, which a replay needs.
+            ticks_max: keep about this many ticks, evenly spread (`stride`), and those with events; a tick takes about 8 kB of
+                memory. None keeps all, which a replay needs.
 
         Raises:
-            LogError: the file does not exist, is not MCAP, was not written by the recorder, is damaged, or has records with
-                different fields. An optional field that an older version lacks is read as None.
+            LogError: the file does not exist, is not MCAP, was not written by the recorder, is damaged, or has records whose
+                fields differ from those of this version. An optional field that an older log lacks is read as None.
         """
         rows = _Rows(ticks_max)
         metadata: dict[str, dict[str, str]] = {}
@@ -85,7 +85,8 @@ class FlightLog:
                     closed = True
         except RecordError as error:
             raise LogError(
-                f"{path}: its records have different fields ({error}); it was written by {writer(metadata)}: open it with that version"
+                f"{path}: its records' fields differ from this version's ({error}); it was written by {writer(metadata)}: "
+                "open it with that version"
             ) from None
         except (McapError, ZstdError, RuntimeError, MemoryError, struct.error, ValueError, KeyError) as error:
             raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
@@ -200,7 +201,7 @@ def _cells(record: Any) -> dict[str, Any]:
 
 class _Rows:
     """Assembles the three records of each tick, and thins the ticks when there are too many. Chunks hold whole ticks; a file with
-    incomplete ones was not written by the recorder.
+    incomplete ticks was not written by the recorder.
     """
 
     def __init__(self, ticks_max: int | None) -> None:
@@ -295,7 +296,7 @@ def _columns(log: FlightLog) -> Columns:
 
 
 def writer(metadata: dict[str, dict[str, str]]) -> str:
-    """Return version and git revision of the companion that wrote a log with this metadata."""
+    """Return the version and git revision of the companion that wrote a log with this metadata."""
     about = metadata.get("companion", {})
     return f"companion {about.get('version_companion', 'of unknown version')} ({about.get('version_git', 'no git revision')})"
 

@@ -19,10 +19,14 @@ Mask = npt.NDArray[np.bool_]
 SLIDING_LOWPASS_HZ = 10.0
 FINAL_WINDOW_S = 0.5
 TARGET = tuple(np.array(row) for row in ([1.0] * 3 + [0.1] * 2, [40.0] * 3 + [0.7] * 2, [144.0] * 3 + [1.225] * 2))
-"""The impedance (M_d, K_d, K_p of x, y, z and both joints) that every law is graded against: the paper's (tab:control_parameters)."""
+"""The impedance (M_d, K_d, K_p of x, y, z and both joints) against which every law is graded, from the paper
+(tab:control_parameters).
+"""
 _TARGET_ROWS = [0, 1, 2, 6, 7]
 DESIRED_FORCE_TIME_S = 0.5
-"""Time constant of the desired force of `TARGET`, by which a lasting load is carried instead of yielded to."""
+"""Time constant with which the desired force F_d follows the measured force, so that a lasting load is carried rather than
+yielded to.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,18 +48,19 @@ class TrackingRms:
 
 
 def catch_index(log: FlightLog) -> int | None:
-    """Return the tick (position in the log) of the catch, at the time of the first event "catch".
+    """Return the tick (index in the log) of the catch: the tick at the time of the first "catch" event.
 
-    The detector confirms a catch with a delay and dates its event back to the contact, so that the impact counts as after the catch.
-    Without such an event it is the tick of an unconfirmed catch (`unconfirmed_catch_index`). None if no contact was measured.
+    The detector confirms a catch with a delay and dates its event back to the contact, so that the impact belongs to the time
+    after the catch. Without such an event, return the tick of an unconfirmed catch (`unconfirmed_catch_index`), or None if no
+    contact was measured.
     """
     confirmed = _confirmed_catch_index(log)
     return confirmed if confirmed is not None else unconfirmed_catch_index(log)
 
 
 def unconfirmed_catch_index(log: FlightLog) -> int | None:
-    """Return the tick of an impact that the detector did not confirm before the flight was killed or left its plan. The flight's
-    own detector is run on the logged forces again. None if a catch was confirmed, or no contact was measured.
+    """Return the tick of an impact that the detector did not confirm before the flight was killed or left its mission plan. To
+    find it, the catch detector is run again on the logged forces. None if a catch was confirmed, or no contact was measured.
     """
     if _confirmed_catch_index(log) is not None:
         return None
@@ -76,7 +81,9 @@ def _confirmed_catch_index(log: FlightLog) -> int | None:
 
 
 def flight_masks(log: FlightLog) -> tuple[Mask, Mask]:
-    """Return the ticks of kind FLIGHT before the catch, and those from the catch; without a catch the second mask is empty."""
+    """Return two masks of the ticks of kind FLIGHT: those before the catch, and those from the catch on. Without a catch the
+    second selects none.
+    """
     flight = np.array([o.phase_kind is PhaseKind.FLIGHT for o in log.outputs], dtype=np.bool_)
     caught = catch_index(log)
     after = np.arange(len(flight)) >= (len(flight) if caught is None else caught)
@@ -95,7 +102,7 @@ def position_error_m(log: FlightLog) -> Array:
 
 
 def attitude_error_rad(log: FlightLog) -> Array:
-    """Return roll, pitch, yaw measured by motion capture minus the law's desired attitude, wrapped, (ticks, 3)."""
+    """Return roll, pitch, yaw measured by motion capture minus the law's desired attitude, wrapped to +-pi, (ticks, 3)."""
     return _wrapped(log.columns.mocap_attitude_rad - log.columns.attitude_desired_rad)
 
 
@@ -115,7 +122,7 @@ def tracking_rms(log: FlightLog, mask: Mask) -> TrackingRms:
 
 
 def rms_norm(rows: Array) -> float | None:
-    """Return sqrt(mean ||row||^2) over rows without NaN, or None if there is none."""
+    """Return sqrt(mean ||row||^2) over the rows without NaN, or None if there are none."""
     known = rows[np.isfinite(rows).all(axis=1)]
     return float(np.sqrt(np.mean(np.sum(known * known, axis=1)))) if len(known) else None
 
@@ -134,12 +141,12 @@ def final_e_z_m(log: FlightLog) -> float | None:
 
 
 def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:
-    """Return the RMS after the catch of ||dI|| on the position rows (N) and on the joint rows (N m), against one target for every law.
-    None if a part of it was not logged or the log is thinned.
+    """Return the RMS of ||dI|| after the catch, for the position rows (N) and for the joint rows (N m); None if a required value
+    was not logged or the log is thinned.
 
-    dI = M_d e'' + K_d e' + K_p e - e_tau with `TARGET`, the paper's table, for every law: graded against its own gains, a stiff law
-    would look worse by definition. On the joints e_tau is J'(F - F_d), where F_d is F low-passed by `DESIRED_FORCE_TIME_S`; it is 0
-    on the base. Derivatives are central differences, low-passed at 10 Hz without phase shift.
+    dI = M_d e'' + K_d e' + K_p e - e_tau, with the same `TARGET` for every law: if each law were graded against its own gains, a
+    stiff one would look worse by definition. On the joints, e_tau is J'(F - F_d), where F_d is F low-passed with
+    `DESIRED_FORCE_TIME_S`; on the base, e_tau is 0. Derivatives are central differences, low-passed at 10 Hz without phase shift.
     """
     if log.stride > 1:
         return None, None  # derivatives need every tick
@@ -164,7 +171,7 @@ def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:
 
 
 def _joint_torque_error_nm(log: FlightLog, used: Mask, period_s: float) -> Array:
-    """Return J'(F - F_d) of the ticks of the mask; NaN if the vehicle's arm is not logged."""
+    """Return J'(F - F_d) for the ticks of the mask, N m, (ticks, 2); NaN if the logged configuration has no arm."""
     arm = (log.config.get("vehicle") or {}).get("arm") or {}
     lengths = arm.get("link_lengths_m")
     if not isinstance(lengths, list) or len(lengths) != 2:
@@ -188,8 +195,8 @@ def _joint_torque_error_nm(log: FlightLog, used: Mask, period_s: float) -> Array
 
 
 def lowpass_zero_phase(rows: Array, period_s: float, cutoff_hz: float) -> Array:
-    """Filter with a second-order Butterworth forwards and backwards along axis 0 (gain 1/2 at the cutoff), odd reflection at
-    the ends.
+    """Apply a second-order Butterworth low-pass filter forwards and backwards along axis 0 (gain 1/2 at the cutoff), with odd
+    reflection at the ends.
     """
     k = math.tan(math.pi * min(cutoff_hz * period_s, 0.49))
     norm = 1.0 / (1.0 + math.sqrt(2.0) * k + k * k)

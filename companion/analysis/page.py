@@ -27,7 +27,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A heading and what is below it; empty parts are left out."""
+    """A heading and the content below it; empty parts are omitted."""
 
     title: str
     lead: str = ""

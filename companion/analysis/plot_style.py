@@ -21,9 +21,9 @@ REFERENCE = "#55626e"
 SERIES = ("#1f6fb4", "#e07b22", "#2e9d6b", "#8a5cc2")
 """Colours of the lines in a flight's report."""
 SERIES_DARK = ("#0b365c", "#7d3d05")
-"""Colours of a reference drawn over its own measurement."""
+"""Colours of a reference that is drawn over the measurement of the same quantity."""
 DASHED = (0, (4, 2))
-"""Line style of a reference; the flown motion is solid."""
+"""Line style of a reference; the measured motion is solid."""
 COLOURS = ("#0072b2", "#d55e00", "#000000", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a5cc2", "#6b705c", "#a3b18a")
 """Colours of flights and laws in comparisons; the first six by Okabe and Ito, "Color Universal Design", for any colour vision."""
 
@@ -39,7 +39,7 @@ def write_png(figure: Figure, path: Path) -> None:
 
 
 def write_svg(figure: Figure, path: Path) -> None:
-    """Write the figure as SVG, byte for byte the same for the same data."""
+    """Write the figure as SVG; the same data always gives the same bytes."""
     with matplotlib.rc_context({"svg.hashsalt": "companion"}):
         FigureCanvasSVG(figure).print_svg(path, metadata={"Date": None, "Creator": None})
 
@@ -59,7 +59,7 @@ def dress(ax: Any) -> None:
 
 
 def figure_legend(figure: Figure, title: str, handles: Sequence[Any], names: Sequence[str], columns: int) -> None:
-    """Write title and legend above the axes; a `$` in a name is shown literally."""
+    """Write the title and the legend above the axes; a `$` in a name is shown literally."""
     figure.legend(
         handles, [name.replace("$", r"\$") for name in names], loc="outside upper left", ncols=min(columns, len(names)), fontsize=8.5,
         frameon=False, handlelength=2.6, title=title, title_fontproperties={"size": 13, "weight": "bold"}, alignment="left",
@@ -67,7 +67,7 @@ def figure_legend(figure: Figure, title: str, handles: Sequence[Any], names: Seq
 
 
 def mark_catch(axes: Sequence[Any], t_s: float) -> None:
-    """Draw a dashed vertical line through axes over time and name it in the first one."""
+    """Draw a dashed vertical line at the time of the catch in all axes, and label it in the first one."""
     for ax in axes:
         ax.axvline(t_s, color=CATCH, lw=1.3, ls=(0, (5, 3)), zorder=2)
     axes[0].annotate(

@@ -64,8 +64,8 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
             "Loads estimated by the adaptation: force on the base, first moments of the links, joint friction.",
             _load,
         ),
-        ("force", "Contact force", "Tared force on the net in the world frame, its weight removed.", _force),
-        ("path", "Path", "Measured by motion capture, seen from above and from the side.", _path),
+        ("force", "Contact force", "Tared force on the net in the world frame, without the weight of the net.", _force),
+        ("path", "Path", "Path measured by motion capture, seen from above and from the side.", _path),
         (
             "timing",
             "Timing",
@@ -263,8 +263,9 @@ def _timing(log: FlightLog) -> Figure | None:
 def _stack(
     log: FlightLog, title: str, heights: tuple[float, ...], height_in: float = 6.8
 ) -> tuple[Figure, list[Any], Array]:
-    """Return the figure, its axes stacked over a common time axis with the phases and the catch marked, and the mission clock, s: NaN
-    outside the phases."""
+    """Return a figure, its axes stacked over a common time axis on which the phases and the catch are marked, and the mission
+    time of each tick, s (NaN outside the marked phases).
+    """
     figure = new_figure(height_in)
     grid = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)
     axes = [row[0] for row in grid]

@@ -24,7 +24,7 @@ class Core(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """First field of the first output that differs."""
+    """First field that differs, in the first output that differs."""
 
     tick: int
     t_s: float
@@ -48,18 +48,21 @@ def replay(log: FlightLog, make_core: Callable[[str], Core]) -> ReplayResult:
     """Step a new core through the logged inputs; stop at the first difference.
 
     Args:
-        log: a log without gaps from its first tick on.
+        log: a log that begins at tick 0 and has no gaps.
         make_core: makes the core from the recorded configuration (JSON).
 
     Raises:
-        LogError: no configuration, a different version of the companion or of the control law, an empty log, or missing ticks.
+        LogError: the log has no configuration, is empty, lacks ticks, or was recorded by a different version of the companion or of
+            the control law.
     """
     config_json = check_replayable(log)
     try:
         core = make_core(config_json)
     except ValueError as error:
         reason = str(error).splitlines()[0]
-        raise LogError(f"{log.path}: the recorded configuration does not fit this version: {reason}") from None
+        raise LogError(
+            f"{log.path}: the recorded configuration is not compatible with this version: {reason}"
+        ) from None
     for k, (inputs, logged) in enumerate(zip(log.inputs, log.outputs, strict=True)):
         recomputed = from_packet(Outputs, to_packet(core.step(inputs)))  # as in a log, where a float 1 is 1.0
         found = differences(logged, recomputed)
@@ -76,14 +79,14 @@ def check_replayable(log: FlightLog) -> str:
     """Return the recorded configuration (JSON) of a log that can be replayed.
 
     Raises:
-        LogError: the log cannot be replayed, with the reason.
+        LogError: the log cannot be replayed; the text gives the reason.
     """
     about = log.metadata.get("companion", {})
     version = about.get("version_companion")
     if version != __version__:
         found = f"companion {version}" if version else "a companion of unknown version"
         raise LogError(
-            f"{log.path}: was recorded by {found}, but this is {__version__}; replay it with the version that flew"
+            f"{log.path}: was recorded by {found}, but this is companion {__version__}; replay it with the version that recorded it"
         )
     if about.get("records") != fingerprint(Inputs, Outputs, Sent):
         raise LogError(
@@ -101,7 +104,7 @@ def check_replayable(log: FlightLog) -> str:
         what = (
             f"{missing} of {log.inputs[-1].tick - first + 1} ticks are missing"
             if missing
-            else f"begins at tick {first}"
+            else f"the first {first} ticks are missing"
         )
         raise LogError(f"{log.path}: {what} (dropped by the recorder); the core's state cannot be rebuilt")
     return config_json

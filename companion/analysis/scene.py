@@ -62,10 +62,10 @@ class Camera:
 
         Args:
             target_m: world point in the middle of the frame.
-            yaw_rad: horizontal direction of view, counted from world x.
+            yaw_rad: horizontal direction of view, measured from world x.
             pitch_rad: angle of the view below the horizon.
             distance_m: distance from the eye to the target.
-            size_px: width and height of the frame, which shows `VIEW_M` of height at the target.
+            size_px: width and height of the frame; its height covers `VIEW_M` at the target.
         """
         cy, sy, cp, sp = math.cos(yaw_rad), math.sin(yaw_rad), math.cos(pitch_rad), math.sin(pitch_rad)
         self._axes = np.array([[sy, -cy, 0.0], [-sp * cy, -sp * sy, -cp], [cp * cy, cp * sy, -sp]])
@@ -82,7 +82,7 @@ class Camera:
         return self._focal_px / max(self.depth_m(point), _NEAR_M)
 
     def pixels(self, points: Array, *, closed: bool = False) -> Array:
-        """Return the pixels of points, shape (N, 2). The part of a line or area behind the eye is cut off."""
+        """Return the pixel coordinates of world points, shape (N, 2). The part of a line or area behind the eye is cut off."""
         seen = (points - self._eye) @ self._axes.T
         if (seen[:, 2] < _NEAR_M).any():
             seen = _cut(seen, closed=closed)
@@ -130,11 +130,11 @@ class Scene:
         return float(self._low[2] + self._foot_m)
 
     def net_world_m(self, pose: Pose) -> Array:
-        """Return the centre of the net."""
+        """Return the centre of the net, world frame, m."""
         return self._world(pose, self._arm_body_m(pose.arm_rad)[1])
 
     def shapes(self, camera: Camera, pose: Pose) -> list[Shape]:
-        """Return the shapes of one frame."""
+        """Return the shapes of one frame, the farthest first."""
         shapes = self._room(camera)
         centre = np.array(pose.position_world_m)
         shapes.append(self._shadow(camera, centre, 0.8 * (self._hub_m + self._disk_m), 0.16))
@@ -154,7 +154,7 @@ class Scene:
         return np.array(pose.position_world_m) + body @ _rotation(pose.attitude_wxyz).T
 
     def _arm_body_m(self, arm_rad: Vec2) -> tuple[Array, Array]:
-        """Return elbow and centre of the net."""
+        """Return the positions of the elbow and of the centre of the net, body frame, m."""
         a, b = arm_rad[0], arm_rad[0] - arm_rad[1]
         elbow = self._shoulder + self._links_m[0] * np.array([math.cos(a), 0.0, -math.sin(a)])
         return elbow, elbow + self._links_m[1] * np.array([math.cos(b), 0.0, -math.sin(b)])

@@ -1,4 +1,4 @@
-"""summary.json: the contract that outside scripts rely on. Every key is always present; None (null) where a value is unknown."""
+"""summary.json: the contract that outside scripts rely on. Every key is always present; an unknown value is None (null)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from companion.analysis.log import FlightLog
 from companion.analysis.metrics import Percentiles, TrackingRms
 
 STAGES = ("wait_for_joints", "core", "send", "whole", "bus_read", "bus_cycle")
-"""Keys of `stages_ms`: fields `NAME_s` of `companion.analysis.timing.Timing`."""
+"""Keys of `stages_ms`; the key NAME holds the percentiles of the field `NAME_s` of `companion.analysis.timing.Timing`."""
 _NO_RMS = TrackingRms(None, None, None)
 
 
@@ -24,7 +24,7 @@ def empty_summary(
     payload_kg: float | None = None,
     recorder: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the summary of a flight that left no log; arguments are those of `summarise`."""
+    """Return the summary of a flight that left no log; the arguments are those of `summarise`."""
     recorder = recorder or {}
     return {
         "outcome": outcome,
@@ -67,13 +67,13 @@ def summarise(
         log: the flight.
         outcome: completed, refused, aborted, crashed or lost, as determined by the launcher.
         controller: control law.
-        preset: built-in preset or name of a user's preset.
+        preset: name of the built-in or user's preset.
         payload_kg: true mass in SITL; None on hardware.
         recorder: the recorder's own report (samples, dropped, error); None to count from the log.
 
     Returns:
-        Keys as in the contract. Times `*_t_s` and `catch_t_s` are on the mission clock (0 at the take-off command); an event's `t_s` is
-            on the flight clock (as recorded) and comes with `mission_t_s`.
+        The content of summary.json. Times `*_t_s` and `catch_t_s` are on the mission clock (0 at the take-off command); an
+            event's `t_s` is on the flight clock (as recorded) and comes with `mission_t_s`.
     """
     timing = log.timing
     counted = {"samples": timing.ticks, "dropped": log.missing_ticks()}
@@ -110,7 +110,9 @@ def summarise(
 
 
 def effective_config(log: FlightLog, summary: dict[str, Any]) -> dict[str, Any]:
-    """Return the log's configuration, with the simulated world's if the summary has it; empty if the log has none."""
+    """Return the logged configuration, plus that of the simulated world if the summary has one; empty if the log has no
+    configuration.
+    """
     world = summary.get("world")
     if not log.config or not world:
         return log.config
@@ -122,7 +124,7 @@ def world_text(world: dict[str, Any] | None) -> str:
     """Return name, seed and model error of a simulated world on one line; empty for a flight on hardware.
 
     Args:
-        world: world of a summary or of an effective configuration; old ones have no name.
+        world: world of a summary or of an effective configuration; those of older versions have no name.
     """
     if not world:
         return ""
@@ -133,7 +135,12 @@ def world_text(world: dict[str, Any] | None) -> str:
 
 
 def write_summary(summary: dict[str, Any], path: Path) -> None:
-    """Write the summary as JSON (never NaN)."""
+    """Write the summary as JSON.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: a value is NaN or infinite.
+    """
     path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 

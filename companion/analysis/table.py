@@ -81,7 +81,7 @@ def table(
     group: Callable[[Any], object] = lambda _: None,
     folded: bool = False,
 ) -> Table:
-    """Show items as a table.
+    """Return a table of items.
 
     Args:
         columns: columns of the table.

@@ -1,4 +1,4 @@
-"""Timing of every tick of a flight. It is small enough to be kept for every tick of a log that is thinned otherwise."""
+"""Timing of every tick of a flight. It is small enough to be kept for every tick even if the log is otherwise thinned."""
 
 from __future__ import annotations
 
@@ -28,9 +28,11 @@ class Timing:
     lateness_s: Array
     """Delay of the tick's start after its deadline."""
     joint_read_to_write_s: Array
-    """Time from all servos' answers to the currents written, both in the bus thread, for ticks that wrote currents."""
+    """Time from the last servo's answer until the currents are written, both measured in the bus thread, for ticks that wrote
+    currents.
+    """
     mocap_to_setpoint_s: Array
-    """Time from the mocap datagram to the setpoint sent, for ticks with a new frame that sent a setpoint."""
+    """Time from the arrival of the mocap datagram until the setpoint is sent, for ticks with a new frame that sent a setpoint."""
     wait_for_joints_s: Array
     """Time from the tick's start to the joint state's arrival."""
     core_s: Array
@@ -40,10 +42,12 @@ class Timing:
     whole_s: Array
     """Time from the tick's start until the setpoint is sent and the bus thread has the currents."""
     bus_read_s: Array
-    """Time from the start of the joint read to all servos' answers, both in the bus thread, for ticks with a new joint state."""
+    """Time from the start of the joint read to the last servo's answer, both measured in the bus thread, for ticks with a new
+    joint state.
+    """
     bus_cycle_s: Array
-    """Time from the start of the joint read until the resulting currents are written, both in the bus thread; same ticks as
-    `joint_read_to_write_s`.
+    """Time from the start of the joint read until the resulting currents are written, both measured in the bus thread, for the
+    same ticks as `joint_read_to_write_s`.
     """
 
 

@@ -28,9 +28,11 @@ def add_parser(commands: Any) -> None:
         parts, "setup", _TOOLS,
         help="set up the servos: id, baud rate, return delay, mode, limits",
         description="Write the required settings to each servo. Torque is off; you see and confirm the values, which "
-        "are then written and read back. Exit 0: all servos are set up; 3: they are not.",
+        "are then written and read back. Exit 0: all servos are set up; 3: not all are.",
     )  # fmt: skip
-    setup.add_argument("--joint", type=_joint, metavar="N", help="the only connected servo belongs to joint 1 or 2")
+    setup.add_argument(
+        "--joint", type=_joint, metavar="N", help="joint to which the only connected servo belongs, 1 or 2"
+    )
     add_tool(
         parts, "zero", _TOOLS, yes=False,
         help="find zeros and directions: hold the arm by hand in three poses",
@@ -41,10 +43,10 @@ def add_parser(commands: Any) -> None:
     jog = add_tool(
         parts, "jog", _TOOLS, write="",
         help="move one joint slowly with keys",
-        description="Move one joint at a time, at most 20 deg/s, within the joint limits. It stops when you release "
+        description="Move one joint at a time, at up to 20 deg/s, within the joint limits. It stops when you release "
         "the key, and at an obstacle. Afterwards the arm is limp: hold it.",
     )  # fmt: skip
-    jog.add_argument("--joint", type=_joint, metavar="N", help="with --to: joint 1 or 2")
+    jog.add_argument("--joint", type=_joint, metavar="N", help="with --to: joint to move, 1 or 2")
     jog.add_argument("--to", type=float, metavar="DEG", help="move to this angle instead of using keys")
     add_tool(
         parts, "friction", _TOOLS,

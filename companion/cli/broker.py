@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from companion.ground.broker.setup import BrokerUsers
 
 VEHICLE = "tarot650-2r"
-"""Name of the supplied vehicle file's vehicle."""
+"""Name of the vehicle in the supplied vehicle file."""
 
 
 def add_parser(commands: Any) -> None:
@@ -45,9 +45,7 @@ def add_parser(commands: Any) -> None:
     init.add_argument(
         "--days", type=_days, default=730, help="validity of the broker's certificate in days (default: 730)"
     )
-    init.add_argument(
-        "--renew-certificates", action="store_true", help="only renew the certificate of the broker in DIR"
-    )
+    init.add_argument("--renew-certificates", action="store_true", help="only renew the broker's certificate in DIR")
     init.set_defaults(run=_init)
 
     check = parts.add_parser(
@@ -62,7 +60,7 @@ def add_parser(commands: Any) -> None:
     check.add_argument(
         "--vehicle",
         metavar="NAME",
-        help="vehicle whose topics are tested for writing, with its own login (default: none)",
+        help="vehicle whose topics are tested; it counts one rejected message (default: a name that no vehicle has)",
     )
     check.set_defaults(run=_check)
 
@@ -117,7 +115,7 @@ def _init(arguments: argparse.Namespace) -> int:
 
 
 def _instructions(folder: Path, users: BrokerUsers, ends: str) -> list[str]:
-    """Return the instructions: which files to copy where."""
+    """Return the instructions to the user: which files to copy where."""
     host = (*users.hosts, "localhost")[0]
     url = f"mqtts://{f'[{host}]' if ':' in host else host}:8883"
     here = shlex.quote(str(folder))
@@ -159,7 +157,7 @@ def _instructions(folder: Path, users: BrokerUsers, ends: str) -> list[str]:
         ]
     return [
         *lines,
-        "Each folder holds credentials: copy it only to the computer that it is named for (scp -rp), and keep ca.key here.",
+        "Each folder contains credentials: copy it only to the computer that it is named for (scp -rp), and keep ca.key here.",
     ]
 
 

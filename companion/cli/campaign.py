@@ -29,7 +29,7 @@ def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | 
 
     Args:
         parser: parser of the command.
-        one_law: whether the campaign flies one control law, for `--controller` and `--preset`.
+        one_law: whether the campaign flies a single control law; adds `--controller` and `--preset`.
         world: default of `--world`.
     """
     parser.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
@@ -66,14 +66,14 @@ def common(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def count(text: str) -> int:
-    """Return the number of flights, seeds or processes that an argument names, for argparse."""
+    """Parse a number of flights, seeds or processes, for argparse."""
     if not text.isdecimal() or not 1 <= int(text) <= 10_000:
         raise argparse.ArgumentTypeError(f"expected a number from 1 to 10000, got '{text}'")
     return int(text)
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Return the names in a comma-separated argument, for argparse."""
+    """Parse comma-separated names, for argparse."""
     found = tuple(name.strip() for name in text.split(","))
     if not all(found):
         raise argparse.ArgumentTypeError(f"expected comma-separated names, got '{text}'")
@@ -132,10 +132,10 @@ def wide_console(width: int = PIPED_WIDTH) -> Console:
 
 
 def why_unusable(folder: Path, result: str) -> str | None:
-    """Create the folder; return None if results can be written into it, otherwise the reason.
+    """Create the folder if it does not exist. Return why results cannot be written into it, or None if they can.
 
     Args:
-        folder: may exist.
+        folder: folder for the results.
         result: name of the file by which earlier results are recognised.
     """
     try:

@@ -53,7 +53,7 @@ GROUPS = {
     "mission": "Mission",
     "machine": "Computer",
 }
-"""Table heading for each first part of a row's id."""
+"""Table headings, keyed by the first part of a row's id."""
 _MARK_WIDTH, _TITLE_WIDTH, _WIDTH_MAX, _GAP = 4, 34, 160, 2
 _STYLES = {"ok": "green", "WARN": "yellow", "FAIL": "bold red"}
 
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace, config: SitlConfig, problems: Plans) -> i
     Args:
         arguments: parsed arguments.
         config: configuration loaded from them.
-        problems: reasons why the mission cannot be flown.
+        problems: returns the reasons why a mission cannot be flown.
     """
     found = problems(config)
     if arguments.plan_only:
@@ -114,7 +114,7 @@ def _rows(task: Task, plan: tuple[str, ...], scratch: Path, people: Console) -> 
     """Return the rows of all checks.
 
     Raises:
-        LaunchError: the simulated world does not start.
+        LaunchError: the simulated world could not be started.
     """
     config = task.config.flight
     with contextlib.ExitStack() as stack:
@@ -246,7 +246,7 @@ def _line(console: Console, mark: str, title: str, read: str, wanted: str, *, he
 
 
 def _under(row: Row) -> Padding:
-    """Return the remedy and the reason for a row that does not pass."""
+    """Return the remedy for a row that does not pass, and the reason for the check."""
     table = Table.grid(padding=(0, 1, 0, 0))
     if row.fix:
         table.add_row("->", Text(row.fix, style="bold"))

@@ -46,7 +46,7 @@ def add_parser(commands: Any) -> None:
         "--hold",
         type=int,
         metavar="N",
-        help="resume: with resume: number of the hold to end, as in the telemetry (default: the current hold)",
+        help="with resume: number of the hold to end, as in the telemetry (default: the current hold)",
     )
     add_broker_options(command)
     command.set_defaults(run=run)
@@ -109,9 +109,9 @@ class _Commander:
             self._end(EXIT_REFUSED, f"{vehicle}: {ack_text(ack)}")
 
     async def _found(self, station: Station) -> str | None:
-        """Return the vehicle to command; None if there are several, which has then been reported.
+        """Return the vehicle to command; None if there are several, after reporting this.
 
-        Retained messages arrive before the link reports that it is connected (`Station`, in_order): until then no vehicle is
+        Retained messages arrive before the link reports that it is connected (`Station`, in_order): before that, no vehicle is
         reported as missing.
         """
         connected_s: float | None = None

@@ -1,4 +1,4 @@
-"""`companion compare`: compare controllers, presets, payloads and seeds in the fast loop, in the paper's table."""
+"""`companion compare`: compare controllers, presets, payloads and seeds in the fast loop, in the form of the paper's table."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _campaign(arguments: argparse.Namespace) -> Compare:
-    """Check every configuration before the first flight.
+    """Return the campaign, after checking every configuration.
 
     Raises:
         ConfigError: one line per problem.
@@ -93,7 +93,7 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
     for override in arguments.overrides:
         for key, option in _OPTIONS.items():
             if override.partition("=")[0].strip() == key:
-                raise ConfigError([f"companion compare: --set {key}: the grid sets it; use {option}"])
+                raise ConfigError([f"companion compare: --set {key}: the grid sets this key; use {option}"])
     try:
         variants = variants_of(
             PRESETS, arguments.controllers, arguments.presets, arguments.ablation, arguments.adaptation

@@ -54,7 +54,7 @@ def _known(known: Sequence[str], what: str) -> Callable[[str], tuple[str, ...]]:
         for name in found:
             if name not in known:
                 like = nearest(name, list(known))
-                hint = f"did you mean '{like}'?" if like else f"there are: {', '.join(known)}"
+                hint = f"did you mean '{like}'?" if like else f"available: {', '.join(known)}"
                 raise argparse.ArgumentTypeError(f"there is no {what} '{name}'; {hint}")
         return found
 
@@ -73,19 +73,21 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _campaign(arguments: argparse.Namespace) -> Faults:
-    """Check everything before the first flight.
+    """Return the campaign, after checking its configuration and its flights.
 
     Raises:
-        ConfigError: one line per problem; also if no fault is left to fly.
+        ConfigError: one line per problem; also if there is no fault to fly.
     """
     flights = planned(arguments.kinds, arguments.phases, wires=arguments.wires)
     if not flights:
-        what = "with --wires there is no" if arguments.wires else "there is no"
-        kinds, phases = " or ".join(arguments.kinds), " or ".join(arguments.phases) or "any"
-        raise ConfigError([f"companion faults: {what} {kinds} in phase {phases} to be flown"])
+        where = " with --wires" if arguments.wires else ""
+        kinds, phases = " or ".join(arguments.kinds) or "any", " or ".join(arguments.phases) or "any"
+        raise ConfigError([f"companion faults: no fault to fly{where}: kind {kinds}, phase {phases}"])
     for override in arguments.overrides:
         if override.partition("=")[0].strip().partition("[")[0] == "world.faults":
-            raise ConfigError(["companion faults: --set world.faults: the campaign sets it; use --kinds and --phases"])
+            raise ConfigError(
+                ["companion faults: --set world.faults: the campaign sets this key; use --kinds and --phases"]
+            )
     given = arguments.vehicle, arguments.controller, arguments.preset
     return Faults(
         configs=[checked(arguments.mission, *given, arguments.overrides, world=arguments.world)],

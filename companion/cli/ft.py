@@ -16,7 +16,7 @@ def add_parser(commands: Any) -> None:
     check = add_tool(
         parts, "check", _TOOLS,
         help="check rate, noise and bias; with a known weight also scale and direction",
-        description="Measure the force sensor at rest and, with --weight, under a known weight on the net. The arm hangs limp. Exit 0: "
+        description="Measure the force sensor at rest and, with --weight, with a known weight on the net. The arm hangs limp. Exit 0: "
         "no problem; 3: a problem was found.",
     )  # fmt: skip
     check.add_argument(
@@ -32,7 +32,7 @@ def add_parser(commands: Any) -> None:
         "--seconds", type=number(5.0, 600.0, " s"), default=60.0, metavar="N", help="duration (default: 60)"
     )
     what = tare.add_mutually_exclusive_group()
-    what.add_argument("--sensor", action="store_true", help="then set the sensor's own zero to the present reading")
+    what.add_argument("--sensor", action="store_true", help="then set the sensor's own zero to the current reading")
     what.add_argument("--clear", action="store_true", help="first clear the sensor's own zero")
     for part in (check, tare):
         part.add_argument(

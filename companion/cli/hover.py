@@ -1,4 +1,4 @@
-"""`companion hover fit`: fit the hover thrust to a flight's log and compare it with the configured one."""
+"""`companion hover fit`: fit the hover thrust to a flight log and compare it with the configured value."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _DIGITS = 4
 
 def add_parser(commands: Any) -> None:
     """Add `hover` to the sub-parsers of `companion`."""
-    hover = commands.add_parser("hover", help="fit the hover thrust to a flight's log")
+    hover = commands.add_parser("hover", help="fit the hover thrust to a flight log")
     parts = hover.add_subparsers(dest="part", required=True, metavar="PART")
     fit = parts.add_parser(
         "fit",
         help="fit the hover thrust to a log",
-        description="Fit the hover thrust without payload to the steady parts of a flight, and print the lines for the vehicle file.",
+        description="Fit the hover thrust (without payload) to the steady parts of a flight, and print the lines for the vehicle file.",
     )
     fit.add_argument("log", type=Path, help="flight.mcap")
     fit.add_argument("--json", action="store_true", help="print only the result, as JSON")

@@ -39,13 +39,13 @@ def add_parser(commands: Any) -> None:
     """Add `install` to the sub-parsers of `companion`."""
     install = commands.add_parser(
         "install",
-        help="set up the vehicle's computer: service, adapter names and latency, limits, full clock; or undo it",
+        help="set up the vehicle's computer: service, adapter names and latency, limits, full CPU clock; or undo this",
         description="Install companion as a systemd service that waits on the ground for an operator's START, with the settings that "
-        "its timing needs; show the changes, and undo them exactly. Exit 0: done, or nothing to do; 2: wrong input; 3: failed, "
+        "its timing needs; or undo this exactly. Exit 0: done, or nothing to do; 2: wrong input; 3: failed, "
         "nothing was changed; 4: cancelled.",
     )
     what = install.add_mutually_exclusive_group(required=True)
-    what.add_argument("--systemd", action="store_true", help="install")
+    what.add_argument("--systemd", action="store_true", help="install the service")
     what.add_argument("--undo", action="store_true", help="restore the state from before the first --systemd")
     install.add_argument(
         "--dry-run", action="store_true", help="only show the changes, with the contents of every file"
@@ -88,10 +88,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Plan, show, ask and apply; return the exit code."""
     root = Path(os.path.abspath(arguments.root))
     if not root.is_dir():
-        print_error(f"companion install: --root {arguments.root}: expected a folder that holds a system")
+        print_error(f"companion install: --root {arguments.root}: expected the root folder of a system")
         return EXIT_BAD_INPUT
     if arguments.json and not (arguments.yes or arguments.dry_run):
-        print_error("companion install: --json cannot ask: add --yes or --dry-run")
+        print_error("companion install: --json cannot ask for confirmation: add --yes or --dry-run")
         return EXIT_BAD_INPUT
     if root == Path("/") and os.geteuid() != 0 and not arguments.dry_run:
         print_error(
@@ -205,7 +205,7 @@ def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tupl
 
 
 def _seen_by_the_service(option: str, file: str, root: Path) -> str:
-    """Return the absolute path on the vehicle's computer.
+    """Return the absolute path of a file on the vehicle's computer.
 
     Raises:
         ConfigError: the service could not read the file there.
@@ -269,9 +269,9 @@ def _afterwards(settings: Settings, live: bool) -> Iterator[str]:
         yield f"Vehicle file: {', '.join(f'devices.{k}.port: {v}' for k, v in (('arm', arm), ('force', force)) if v)}"
     if live:
         yield "Log in again before you fly from a shell: limits and groups are set at login."
-    boot = ", and at boot" if settings.at_boot else ""
-    yield f"It starts with: systemctl start companion{boot}. Then it waits for an operator's START."
-    yield "It stops with: systemctl stop companion; a flying vehicle lands first. To undo everything: companion install --undo"
+    boot = " (it also starts at boot)" if settings.at_boot else ""
+    yield f"Start the service with: systemctl start companion{boot}. It then waits for an operator's START."
+    yield "Stop it with: systemctl stop companion; a flying vehicle lands first. To undo everything: companion install --undo"
 
 
 def _as_json(wanted: Plan, found: Changes, live: bool, *, done: bool) -> dict[str, Any]:

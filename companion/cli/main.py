@@ -48,7 +48,7 @@ _WITH_MODULES = (
 
 
 class _Parser(argparse.ArgumentParser):
-    """argparse with one line per error and no abbreviations."""
+    """Argument parser that prints one line per error and accepts no abbreviations."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(allow_abbrev=False, **settings)
@@ -117,7 +117,9 @@ def _normalised(argv: list[str]) -> list[str]:
 
 
 def make_parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
-    """Return the parser of the command that a command line names first, else of all commands, which take half a second to load."""
+    """Return the parser of the command that comes first on the command line, or else of all commands, which takes half a second to
+    load.
+    """
     parser = _Parser(
         prog="companion", description="Flies an aerial manipulator on PX4 with adaptive impedance control."
     )
@@ -159,7 +161,7 @@ def make_parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
         metavar="stub|px4",
         help="check the simulated world's devices, with the PX4 stub or a real PX4",
     )
-    check.add_argument("--hand", action="store_true", help="then run the guided hand test, required for a new set-up")
+    check.add_argument("--hand", action="store_true", help="also run the guided hand test, which a new set-up requires")
     check.add_argument("--json", action="store_true", help="print only the rows, as JSON")
     check.add_argument("--plan-only", action="store_true", help="check only the mission, without devices")
     check.set_defaults(run=_check)
@@ -264,7 +266,7 @@ def _fly(arguments: argparse.Namespace) -> int:
 
 
 def _start_impossible(config: FlightConfig) -> list[str]:
-    """Return why a flight with `--wait-for-start` could never be started, as one line; empty if it could."""
+    """Return one line on why a flight with `--wait-for-start` could never be started; an empty list if it could."""
     if config.mission.start.takeoff != "by_operator":
         return []
     mqtt = config.vehicle.ground.mqtt

@@ -1,4 +1,4 @@
-"""`companion monitor`: watch and command vehicles from the ground, in a browser or in a terminal; or view logs of flights."""
+"""`companion monitor`: watch and command vehicles from the ground, in a browser or in a terminal; or view flight logs."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def add_parser(commands: Any) -> None:
         help="address on which the page is served (default: %(default)s)",
     )
     monitor.add_argument("--cert", metavar="FILE", help="certificate (PEM) to serve the page with TLS")
-    monitor.add_argument("--key", metavar="FILE", help="its private key (PEM)")
+    monitor.add_argument("--key", metavar="FILE", help="private key of --cert (PEM)")
     monitor.add_argument("--open", action="store_true", help="open the page in this user's browser")
     monitor.set_defaults(run=run)
 
@@ -67,7 +67,7 @@ def add_broker_options(parser: argparse.ArgumentParser) -> None:
         "--operator", metavar="NAME", help="operator who signs commands (default: the only one in the file)"
     )
     parser.add_argument("--operators", metavar="FILE", help="file of operator keys (default: this user's own)")
-    parser.add_argument("--vehicle", metavar="NAME", help="show only this vehicle")
+    parser.add_argument("--vehicle", metavar="NAME", help="use only this vehicle")
 
 
 def vehicle_option(arguments: argparse.Namespace) -> str | None:
@@ -117,7 +117,7 @@ def _check(arguments: argparse.Namespace) -> None:
     """Check that the options are compatible.
 
     Raises:
-        ConfigError: one line.
+        ConfigError: an option is out of range, or two options exclude each other; one line.
     """
     if arguments.text and arguments.logs:
         raise ConfigError(
@@ -143,7 +143,9 @@ def _serve(arguments: argparse.Namespace) -> None:
     except ModuleNotFoundError as error:
         if error.name != "aiohttp":
             raise
-        raise _Refusal(f"the page needs aiohttp: pip install '{DISTRIBUTION}[ground]'; --text does not") from None
+        raise _Refusal(
+            f"the page needs aiohttp: pip install '{DISTRIBUTION}[ground]'; --text works without it"
+        ) from None
     serving = web.ServerSettings(arguments.host, arguments.port, _tls(arguments.cert, arguments.key))
 
     def listening(monitor: web.Monitor) -> None:
@@ -168,7 +170,7 @@ def _serve(arguments: argparse.Namespace) -> None:
 
 
 def _read(paths: Sequence[Path]) -> list[ReplayLog]:
-    """Read the logs before serving the page: a log of an hour takes one to two minutes, and Ctrl-C cancels it."""
+    """Read the logs before the page is served. An hour of log takes one to two minutes to read; Ctrl-C cancels the reading."""
     from companion.ground.station.replay_log import read_for_page
 
     logs = []

@@ -1,4 +1,4 @@
-"""Progress bar while a mission is planned and checked; shown in a terminal if planning takes long."""
+"""Progress bar for planning and checking a mission; shown in a terminal if this takes long."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ _HEARTBEAT_DEADLINE_S = 5.0
 
 def add_parser(commands: Any) -> None:
     """Add `px4` to the sub-parsers of `companion`."""
-    px4 = commands.add_parser("px4", help="PX4's parameters: compare, write")
+    px4 = commands.add_parser("px4", help="compare PX4's parameters with a file, or write them")
     parts = px4.add_subparsers(dest="part", required=True, metavar="PART")
     params = parts.add_parser(
         "params",
@@ -44,7 +44,11 @@ def add_parser(commands: Any) -> None:
     what.add_argument("--diff", action="store_true", help="only compare")
     what.add_argument("--write", action="store_true", help="write the differing values; refused while PX4 is armed")
     params.add_argument(
-        "file", nargs="?", type=Path, metavar="FILE", help="default: indoor motion capture, configs/px4/"
+        "file",
+        nargs="?",
+        type=Path,
+        metavar="FILE",
+        help="parameter file (default: the one in configs/px4/, for indoor motion capture)",
     )
     where = params.add_mutually_exclusive_group()
     where.add_argument(
@@ -95,7 +99,7 @@ async def _run(arguments: argparse.Namespace, wanted: dict[str, Value], device: 
             return EXIT_OK if comparison.same else EXIT_REFUSED
         if await _armed(autopilot):
             print_error(
-                f"autopilot {device.address}: expected a disarmed PX4, found it armed; land and disarm before writing"
+                f"autopilot {device.address}: expected a disarmed PX4, but it is armed; land and disarm before writing"
             )
             return EXIT_REFUSED
         stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
@@ -118,7 +122,7 @@ async def _armed(autopilot: MavsdkAutopilot) -> bool:
 
 def _back_up(path: Path, differences: Sequence[Difference], firmware: str, source: str) -> str | None:
     """Save the old values; return why nothing may be written, or None if they are saved."""
-    heading = [f"Values in {firmware} of the parameters that {source} changes, before writing.", ""]
+    heading = [f"Values, before writing, of the parameters that {source} changes, read from {firmware}.", ""]
     text = params_file.text({difference.name: difference.px4 for difference in differences}, heading)
     try:
         with path.open("x", encoding="utf-8") as file:

@@ -25,7 +25,7 @@ from companion.runtime.console import print_error
 PAGE = "side_by_side.html"
 RESULT = "side_by_side.json"
 _NAME_BYTES_MAX = 200
-"""Longest name of a folder named after flights; file systems allow 255."""
+"""Longest name of a folder that is named after flights, in bytes; file systems allow 255."""
 
 
 def add_parser(commands: Any) -> None:
@@ -102,7 +102,7 @@ class Graded:
 
 
 def graded(path: Path) -> Graded:
-    """Read and evaluate a log. What only the flight's launcher knew comes from the summary beside the log.
+    """Read and evaluate a log. Values that only the flight's launcher knew come from the summary beside the log.
 
     Raises:
         LogError: the file is not a log.
@@ -129,7 +129,7 @@ def graded(path: Path) -> Graded:
 
 
 def _known(path: Path, own: dict[str, Any]) -> tuple[dict[str, Any], str | None]:
-    """Return the summary beside the log, and a note if it is not used: beside a copied log there may be another flight's summary."""
+    """Return the summary beside the log, and a note if it is not used: the summary beside a copied log may be another flight's."""
     try:
         known = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -227,7 +227,7 @@ def write_page(comparison: Comparison, out: Path) -> Path:
 
     Raises:
         ImportError: matplotlib is missing.
-        OSError: it cannot be written.
+        OSError: a file cannot be written.
     """
     from companion.campaigns.side_by_side.page import write_html
     from companion.campaigns.side_by_side.plots import write_pictures

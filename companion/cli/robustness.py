@@ -20,7 +20,7 @@ def add_parser(commands: Any) -> None:
         "robustness",
         help="fly a mission in many randomly drawn worlds",
         description="Fly a mission in the fast closed loop in randomly drawn worlds: payload, throw, catch point, "
-        "and everything that the world's seed determines. A key of the section world that --set sets is "
+        "and everything that the world's seed determines. A key of the world section that is set with --set is "
         "not drawn. Exit code 5 if any flight crashed or was lost.",
     )
     parser.add_argument("mission", nargs="?", help=MISSION_OR_DEFAULT_HELP)
@@ -35,7 +35,7 @@ def add_parser(commands: Any) -> None:
         type=_model_error_override,
         metavar="SHARE",
         help="fraction by which masses, inertia and torque constants differ from the vehicle file, 0 to 0.3 (short "
-        "for --set world.model_error=FRACTION)",
+        "for --set world.model_error=SHARE)",
     )
     parser.add_argument("--cases", metavar="FILE", help="fly the cases of this file instead of draws")
     parser.add_argument("--case", action="append", default=[], metavar="NAME", help="only this case of --cases")
@@ -62,13 +62,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _campaign(arguments: argparse.Namespace) -> Robustness:
-    """Check everything before the first flight.
+    """Return the campaign, after checking its configuration and its cases.
 
     Raises:
         ConfigError: one line per problem.
     """
     if arguments.case and arguments.cases is None:
-        raise ConfigError(["companion robustness: --case needs --cases FILE, the file that holds the case"])
+        raise ConfigError(["companion robustness: --case needs --cases FILE, the file that contains the case"])
     kept: Cases | None = None
     cases: tuple[Case, ...] = ()
     if arguments.cases is not None:

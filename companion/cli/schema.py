@@ -33,7 +33,9 @@ KINDS: dict[str, Callable[[], TypeAdapter[Any]]] = {
 
 
 class _Brief(GenerateJsonSchema):
-    """Generates schemas without titles of fields, which repeat the keys, and with the schema of a vector's elements only once."""
+    """Generates schemas without field titles, which would repeat the keys, and with the schema of a vector's elements given only
+    once.
+    """
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         """Return False: fields get no title."""

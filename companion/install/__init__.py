@@ -1,4 +1,4 @@
-"""`companion install`: set up the vehicle's computer, and undo that.
+"""`companion install`: set up the vehicle's computer, or undo the installation.
 
 templates.py  contents of the installed files
 adapters.py   USB serial adapters that are plugged in, from /sys

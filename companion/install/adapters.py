@@ -76,7 +76,7 @@ def choose_adapters(
             )
         else:
             reasons.append(
-                f"{which}: no stable name: no adapter of its kind is plugged in; plug it in, or give --{which}-serial"
+                f"{which}: no stable name: no adapter of its kind is plugged in; plug one in, or give --{which}-serial"
             )
     return chosen["arm"], chosen["force"], tuple(reasons)
 

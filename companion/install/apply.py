@@ -1,4 +1,5 @@
-"""Install and undo: change files below a root folder; run commands only if that folder is the root of the running system.
+"""Installation and undo. Files are changed below a root folder; commands run only if that folder is the root of the running
+system.
 
 Every change is recorded before it is made. A failed installation is rolled back at once, and `undo` also reverts one that was
 interrupted by a power loss.
@@ -37,20 +38,21 @@ class Changes:
     entries: Mapping[str, Entry]
     """All entries of the record, by path."""
     now: Mapping[str, PathState]
-    """Present content of each path."""
+    """Current content of each path."""
     folders: tuple[str, ...]
     """Folders to create, outermost first."""
 
     @property
     def to_do(self) -> tuple[str, ...]:
-        """Paths whose content differs from the planned one."""
+        """Paths whose content differs from the plan."""
         return tuple(path for path, entry in self.entries.items() if not self.now[path].matches(entry.after))
 
 
 def pending_changes(root: Path, plan: Plan, record: Record | None) -> Changes:
-    """Compare the plan with the file system; changes nothing.
+    """Return the changes that the plan requires in the file system, without making any.
 
-    Raises: InstallError: a path is blocked, or a file has been modified since it was installed.
+    Raises:
+        InstallError: a path holds something other than a file or link, or a file has been modified since it was installed.
     """
     old = record or Record()
     entries, now = {}, {}
@@ -138,14 +140,16 @@ def install(root: Path, plan: Plan, user: str, report: Report) -> bool:
         why = error if isinstance(error, InstallError) else f"{error.filename}: {error.strerror}"
         if trouble:
             raise InstallError(
-                f"{why}; not restored: {trouble}; correct that, then run: companion install --undo"
+                f"{why}; not restored: {trouble}; fix that, then run: companion install --undo"
             ) from None
         raise InstallError(f"{why}; all changes were reverted") from None
     return True
 
 
 def _roll_back(root: Path, found: Changes, record: Record | None, made: Record) -> str:
-    """Restore the state before this installation, which created the users in `made`; return what could not be restored."""
+    """Restore the state from before this installation and remove the users in `made`, which it created. Return what could not be
+    restored.
+    """
     trouble = []
     for path in reversed(found.to_do):
         try:
@@ -170,8 +174,8 @@ def undo(root: Path, report: Report) -> bool:
     """Revert the installation; return False if nothing is installed.
 
     Raises:
-        InstallError: a file was modified after the installation or the service is running, and nothing was reverted; or the undo was
-            interrupted and can be run again.
+        InstallError: nothing was reverted, because a file was modified after the installation or the service is running; or the
+            undo failed part-way and can be run again.
     """
     record = load(root)
     if record is None:
@@ -188,7 +192,7 @@ def undo(root: Path, report: Report) -> bool:
         if _service_active(SERVICE):
             raise InstallError(f"{SERVICE} is running; first run: systemctl stop companion (a flying vehicle lands)")
         if PERFORMANCE in " ".join(back):
-            _run(Command(("systemctl", "stop", PERFORMANCE), "restores the clock"), report)
+            _run(Command(("systemctl", "stop", PERFORMANCE), "restores the CPU clock"), report)
     try:
         for path in reversed(back):
             write_state(under_root(root, path), record.entries[path].before)
@@ -201,7 +205,7 @@ def undo(root: Path, report: Report) -> bool:
         under_root(root, RECORD_PATH).unlink()
     except OSError as error:
         raise InstallError(
-            f"{error.filename}: {error.strerror}; correct that, then run: companion install --undo"
+            f"{error.filename}: {error.strerror}; fix that, then run: companion install --undo"
         ) from None
     for folder in _remove_folders(root, record.folders):
         report(f"kept {folder}: it is not empty")
@@ -327,4 +331,4 @@ def _run(command: Command, report: Report) -> None:
     elif command.needed:
         raise InstallError(f"{command}: {why}")
     else:
-        report(f"failed; it runs again at the next boot: {command}: {why}")
+        report(f"{command} failed ({why}); the next boot has the same effect")

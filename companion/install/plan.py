@@ -1,4 +1,4 @@
-"""Plan of an installation: derives files and commands from the settings. Pure."""
+"""Plan of an installation: the files and commands that follow from its settings. Pure functions."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Item:
     why: str
     content: str | None = None
     link: str | None = None
-    """Target of a symbolic link, which has no content."""
+    """Target of a symbolic link; a link has no `content`."""
     mode: int = 0o644
 
 
@@ -70,9 +70,13 @@ def plan(settings: Settings) -> Plan:
     items = [
         Item(_SYSUSERS, "service user, without login, member of dialout", templates.sysusers(settings.user)),
         Item("/etc/modules-load.d/companion.conf", "USB serial drivers, loaded at boot", templates.modules()),
-        Item("/etc/udev/rules.d/99-companion.rules", "latency timer 1 ms, stable names", rules),
-        Item("/etc/security/limits.d/companion.conf", "real-time limits for the group dialout", templates.limits()),
-        Item(f"{_UNITS}/{PERFORMANCE}", "full clock", templates.performance_service()),
+        Item("/etc/udev/rules.d/99-companion.rules", "latency timer of 1 ms, stable device names", rules),
+        Item(
+            "/etc/security/limits.d/companion.conf",
+            "real-time limits for members of the dialout group",
+            templates.limits(),
+        ),
+        Item(f"{_UNITS}/{PERFORMANCE}", "the service that sets the full CPU clock", templates.performance_service()),
         Item(f"{_UNITS}/{SERVICE}", "the flight service; it waits for an operator's START", unit),
         Item(f"{_AT_BOOT}/{PERFORMANCE}", "full CPU clock from boot", link=f"{_UNITS}/{PERFORMANCE}"),
     ]
@@ -83,13 +87,13 @@ def plan(settings: Settings) -> Plan:
         commands=(
             Command(("systemd-sysusers", _SYSUSERS), "creates the user", needed=True),
             Command(("modprobe", "-a", "ftdi_sio", "cdc_acm"), "loads the drivers"),
-            Command(("udevadm", "control", "--reload"), "reloads the rules"),
+            Command(("udevadm", "control", "--reload"), "reloads the udev rules"),
             Command(
                 ("udevadm", "trigger", "--action=add", "--subsystem-match=usb-serial", "--subsystem-match=tty"),
-                "applies them to connected adapters",
+                "applies the udev rules to connected adapters",
             ),
-            Command(("systemctl", "daemon-reload"), "reloads the units"),
-            Command(("systemctl", "restart", PERFORMANCE), "full CPU clock now"),
+            Command(("systemctl", "daemon-reload"), "reloads the systemd units"),
+            Command(("systemctl", "restart", PERFORMANCE), "sets the full CPU clock now"),
         ),
     )
 
@@ -100,7 +104,7 @@ def isolation(cores: int) -> tuple[str, ...]:
         return ()
     rest, own = f"0-{cores - 3}" if cores > 3 else "0", f"{cores - 2},{cores - 1}"
     return (
-        f"Cores: nothing is reserved. If the report shows late ticks, keep cores {own} for the flight:",
+        f"Cores: none are reserved. If the report shows late ticks, keep cores {own} for the flight:",
         f"  vehicle file                                   computer: {{cpus: [{own.replace(',', ', ')}]}}",
         f"  /etc/systemd/system.conf.d/50-cores.conf       [Manager] CPUAffinity={rest}",
         "isolcpus= can replace CPUAffinity, but only with real-time scheduling: threads are not balanced between isolated cores.",

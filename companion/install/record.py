@@ -1,6 +1,6 @@
 """Record of an installation, kept on the vehicle's computer so that it can be reverted exactly.
 
-It is written before the first change (`complete` is false) and again after the last.
+It is written before the first change (with `complete` false) and again after the last one.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Record:
     users: tuple[str, ...] = ()
     """Users that the installation created."""
     joined: tuple[str, ...] = ()
-    """Existing users that the installation added to the group dialout."""
+    """Existing users that the installation added to the dialout group."""
     complete: bool = False
 
 
@@ -61,7 +61,7 @@ def load(root: Path) -> Record | None:
         data = json.loads(path.read_text(encoding="utf-8"))
         if data["schema_version"] != SCHEMA_VERSION:
             raise InstallError(
-                f"{path}: schema_version {data['schema_version']}, expected {SCHEMA_VERSION}; use the companion that wrote it"
+                f"{path}: schema_version {data['schema_version']}, expected {SCHEMA_VERSION}; use the companion version that wrote it"
             )
         entries = {
             str(name): Entry(PathState.from_json(entry["before"]), PathState.from_json(entry["after"]))
@@ -81,7 +81,7 @@ def save(root: Path, record: Record) -> None:
     """Write the record.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the record cannot be written.
     """
     data: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,

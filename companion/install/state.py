@@ -1,4 +1,4 @@
-"""Content of a path: a file, a symbolic link or nothing. Read, write and compare it."""
+"""Content of a path (a file, a symbolic link or nothing): reading, writing and comparing it."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class PathState:
         return self.content is None and self.link is None
 
     def matches(self, other: PathState) -> bool:
-        """Whether both are equal; an unknown owner matches any owner."""
+        """Return whether both are equal; an unknown owner matches any owner."""
         owners = self.owner is None or other.owner is None or self.owner == other.owner
         return owners and (self.content, self.link, self.mode) == (other.content, other.link, other.mode)
 
     def as_json(self) -> dict[str, Any] | None:
-        """Return JSON data; None if nothing exists."""
+        """Return the state as JSON data; None if nothing exists at the path."""
         if self.absent:
             return None
         if self.link is not None:
@@ -90,7 +90,7 @@ def read_state(path: Path) -> PathState:
 
 
 def write_state(path: Path, state: PathState) -> None:
-    """Write, replace or remove a path atomically, even if power is lost.
+    """Write, replace or remove a path atomically, even across a loss of power.
 
     Raises:
         OSError: the change failed; the path is unchanged.

@@ -1,4 +1,4 @@
-"""Contents of the installed files. Pure.
+"""Contents of the installed files. Pure functions.
 
 Sources: systemd.exec(5), systemd.service(5), systemd.kill(5), systemd.resource-control(5), sysusers.d(5), modules-load.d(5),
 udev(7), limits.conf(5).
@@ -7,9 +7,11 @@ udev(7), limits.conf(5).
 from __future__ import annotations
 
 STOP_TIMEOUT_S = 180
-"""Time for a landing: return along the tether, PX4's landing and its confirmation take one minute at most, tripled as a margin."""
+"""Time allowed for a landing: three times the minute that the return along the tether, PX4's landing and its confirmation take at
+most.
+"""
 RTPRIO = 60
-"""Real-time priority limit: that of the guardian; the flight process uses less."""
+"""Limit of the real-time priority: the guardian's priority; the flight process uses a lower one."""
 STATE_DIRECTORY = "companion/fly"
 """Folder below /var/lib. Its parent holds the record that `--undo` trusts and therefore belongs to root."""
 _GOVERNORS = "/sys/devices/system/cpu/cpufreq/policy*/scaling_governor"
@@ -23,11 +25,11 @@ def exec_word(text: str) -> str:
 
 
 def service(user: str, program: str, mission: str, vehicle: str | None) -> str:
-    """Return companion.service."""
+    """Return the content of companion.service."""
     words = [program, "fly", mission, *(("--vehicle", vehicle) if vehicle is not None else ()), "--wait-for-start"]
     return f"""{_HEAD}
 [Unit]
-Description=companion: waits on the ground until a signed operator commands start
+Description=companion: waits on the ground for an operator's signed start command
 Wants=network-online.target
 After=network-online.target mosquitto.service companion-performance.service
 
@@ -58,7 +60,7 @@ LimitRTPRIO={RTPRIO}
 LimitMEMLOCK=infinity
 Nice=-5
 
-# Serial ports and pseudo-terminals, nothing else of /dev. No system call filter: it would kill the process in the air.
+# Serial ports and pseudo-terminals, nothing else in /dev. No system call filter: it would kill the process in the air.
 DevicePolicy=closed
 DeviceAllow=char-ttyUSB rw
 DeviceAllow=char-ttyACM rw
@@ -86,7 +88,8 @@ WantedBy=multi-user.target
 
 
 def performance_service(governors: str = _GOVERNORS, memory: str = "/run/companion-performance/before") -> str:
-    """Return companion-performance.service: it runs every core at full clock, and restores the previous governors when stopped.
+    """Return the content of companion-performance.service, which runs every core at full clock and restores the previous
+    governors when stopped.
 
     Args:
         governors, memory: paths of the governor files, and of the file that keeps their previous values; for tests.
@@ -136,12 +139,16 @@ def udev_rules(arm_serial: str | None, force_serial: str | None) -> str:
 
 
 def limits() -> str:
-    """Return limits for users of the group dialout who fly from a shell; a service has its own limits."""
+    """Return the limits file: real-time priority and locked memory for members of the dialout group who fly from a shell. A
+    service has its own limits.
+    """
     return f"{_HEAD}\n@dialout - rtprio {RTPRIO}\n@dialout - memlock unlimited\n"
 
 
 def modules() -> str:
-    """Return the drivers to load at boot: a service's DeviceAllow only covers drivers that are loaded when it starts."""
+    """Return the modules-load.d file with the drivers to load at boot: a service's DeviceAllow covers only drivers that are
+    loaded when it starts.
+    """
     return f"{_HEAD}\nftdi_sio\ncdc_acm\n"
 
 

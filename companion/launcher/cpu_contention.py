@@ -1,4 +1,4 @@
-"""Detects a computer that is too busy for a flight from the time that the flight's processes wait for a core.
+"""Detects that the computer is too busy for a flight, by the time that the flight's processes wait for a core.
 
 When other programs occupy the cores, the symptoms resemble failing devices: answers arrive late or not at all. The scheduler's
 statistics show the cause.
@@ -19,7 +19,7 @@ from companion.model.types import SafetyAction, Severity
 WAIT_MAX = 0.15
 """Fraction of the time that a process may wait for a core before it responds too late."""
 WAIT_LATE_MAX, LATE_S = 0.05, 0.005
-"""`WAIT_MAX` for ticks that are late by `LATE_S` or more."""
+"""The limit that replaces `WAIT_MAX` if ticks are late by `LATE_S` or more."""
 WINDOW_S, SAMPLE_S = 3.0, 0.5
 CAUSED_BY_LATENESS = frozenset({
     "mocap_lost", "mocap_too_late", "vehicle_state_lost", "heartbeat_lost", "offboard_left", "arm_lost",
@@ -28,7 +28,7 @@ CAUSED_BY_LATENESS = frozenset({
     "arm.reads", "force.rate",
 })  # fmt: skip
 """Landings and refusals that a busy computer may cause: ids of events and of preflight rows."""
-ADVICE = "close other programs, or permit real-time priority: docs/raspberry-pi.md, Real time"
+ADVICE = "close other programs, or allow real-time priority (see docs/raspberry-pi.md, section Real time)"
 
 CoreWaits = Mapping[int, float]
 """Time that each thread has waited for a core since its start, s, by thread id."""
@@ -49,7 +49,7 @@ def contention_message(waits: Sequence[ProcessWait], late_s: float) -> str | Non
 
     Args:
         waits: one entry per process.
-        late_s: 99th percentile of the ticks' lateness; 0 before the first tick.
+        late_s: 99th percentile of the ticks' lateness, s; 0 before the first tick.
     """
     worst = max((wait.share for wait in waits), default=0.0)
     late = late_s >= LATE_S
@@ -93,7 +93,7 @@ class CpuContention:
         """The first contention message; None if the computer was not busy, or no such event occurred."""
 
     def sample(self, now_s: float) -> None:
-        """Read the waits, at most every `SAMPLE_S`; call often."""
+        """Read the waits if `SAMPLE_S` has passed since the last sample. Call it often."""
         if self._samples and now_s - self._samples[-1][0] < SAMPLE_S:
             return
         self._samples.append((now_s, {name: self._read(pid) for name, pid in self._pids.items()}))

@@ -77,7 +77,7 @@ class GuardianProcess:
 
     @property
     def outcome(self) -> Outcome | None:
-        """Outcome of a flight that the guardian took over; None if it did not."""
+        """Outcome of the flight if the guardian has taken over, otherwise None."""
         if not self.took_over:
             return None
         return outcome_of(self.result)
@@ -102,11 +102,11 @@ class GuardianProcess:
         return heard
 
     def hangs(self) -> bool:
-        """Whether the guardian has taken over and is silent."""
+        """Return whether the guardian has taken over but has been silent for longer than `SILENT_S`."""
         return self.open and self.took_over and time.monotonic() - self._heard_s > SILENT_S
 
     def stop(self, patience_s: float) -> None:
-        """Wait for the guardian to exit, then end it. After the flight it exits by itself."""
+        """Wait up to `patience_s` for the guardian to exit by itself, as it does after a flight; then end it."""
         terminate(self.process, patience_s)
         remove_file(self._pid_file)
         self.receive()
@@ -117,7 +117,7 @@ class GuardianProcess:
         self.process.kill()
 
     def failure(self) -> str | None:
-        """Return one line about a guardian that failed, or None."""
+        """Return one line on how the guardian failed, or None if it did not."""
         code = self.process.returncode
         if code not in (0, 1):
             return f"guardian: the guardian process {how_it_ended(code)}{last_line(self.log)}; see {self.log}"

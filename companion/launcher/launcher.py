@@ -48,7 +48,7 @@ FLIGHT_SILENT_TIMEOUT_S = 5.0
 be dead. Once the flight process is killed, PX4 lands by its own offboard-loss failsafe.
 """
 GUARDIAN_EXIT_TIMEOUT_S = 5.0
-"""Timeout for a guardian that is not needed to exit after the flight process has ended."""
+"""Time allowed for a guardian that has not taken over to exit after the flight process has ended."""
 RECORDER_CLOSE_TIMEOUT_S = 10.0
 
 OnMessage = Callable[[ipc.Message], None]
@@ -65,7 +65,9 @@ class FlightResult:
     world: dict[str, Any] = field(default_factory=dict)
     """True state of the simulated world: payload_kg, caught, crashed, ..."""
     events: tuple[dict[str, Any], ...] = ()
-    """Events that the flight process reported in the format of summary.json. The log holds them too, unless the recorder died."""
+    """Events that the flight process reported, in the format of summary.json. The log contains them too, unless the recorder
+    died.
+    """
     guardian_events: tuple[dict[str, Any], ...] = ()
     """Events of the guardian in the format of summary.json; empty if it did not take over."""
     lines: tuple[str, ...] = ()
@@ -92,10 +94,10 @@ class Launcher:
     """Runs one flight.
 
     Args:
-        config: checked configuration; with SITL the device addresses are replaced by the simulated world's. Only sitl is
-            given the configuration of the world.
+        config: checked configuration. With SITL, the addresses of the simulated devices replace its device addresses, and only
+            the sitl process receives the configuration of the world.
         out: existing folder for all files of the flight.
-        sitl: False for hardware; True or "stub" for the simulated world with the PX4 stub; "px4" with a real PX4.
+        sitl: False for hardware; True or "stub" for the simulated world with the PX4 stub; "px4" for a real PX4.
         on_message: called with every message of the flight process, for the display; messages of the world have "source": "sitl".
     """
 
@@ -112,13 +114,13 @@ class Launcher:
         """Tick and text of the events that end a flight; those of the first tick are the cause, later ones its consequences."""
         self._events: list[dict[str, Any]] = []
         self._px4_texts: list[str] = []
-        """Texts of PX4 since the flight began."""
+        """Texts that PX4 has sent since the flight began."""
         self._failures: list[str] = []
         self._recorder_pid: int | None = None
         self._guardian: GuardianProcess | None = None
         self._cpu_contention = CpuContention({})
         self._flying = False
-        """Whether the flight process ticks and sends ten messages per second; False after the flight."""
+        """Whether the flight process is ticking and sending ten status messages per second; False after the flight."""
 
     def request_landing(self) -> None:
         """Request a landing (Ctrl-C); repeated requests change nothing."""
@@ -127,7 +129,7 @@ class Launcher:
             ipc.send(self._channel, {"type": "land"})
 
     def run(self) -> FlightResult:
-        """Run the flight; call inside of `landing_signals(launcher.request_landing)`.
+        """Run the flight. Call it inside `landing_signals(launcher.request_landing)`.
 
         This process and its children leave the cores of `computer.cpus`; only the flight process returns to them.
 
@@ -273,7 +275,7 @@ class Launcher:
         if reasons is None:
             said = "; ".join(dict.fromkeys(self._px4_texts))
             reasons = [
-                f"{text}; PX4 said: {said}" if said and "PX4" in text else text
+                f"{text}; PX4 reported: {said}" if said and "PX4" in text else text
                 for tick, text in self._critical_events
                 if tick == self._critical_events[0][0]
             ]
@@ -287,7 +289,7 @@ class Launcher:
         guardian: GuardianProcess,
         sitl: SitlProcess | None,
     ) -> None:
-        """Forward the messages of flight and guardian until both have closed their channels; kill one that hangs."""
+        """Forward the messages of flight and guardian until both have closed their channels; kill a process that hangs."""
         flight_open = True
         heard_s = flight_open_s = time.monotonic()
         while flight_open or guardian.open:
@@ -364,7 +366,9 @@ class Launcher:
         self._events.append({**stamps, **about, "text": text})
 
     def _await_recorder(self) -> None:
-        """Wait for the recorder to close the log of a killed flight process; it is not a child of this process, so poll its pidfd."""
+        """Wait for the recorder to close the log if the flight process was killed. The recorder is not a child of this process,
+        so its pidfd is polled.
+        """
         if self._recorder_pid is None or self._result is not None:
             return
         try:

@@ -17,7 +17,9 @@ from companion.runtime.subprocesses import LaunchError
 from companion.sitl_config.loader import SitlConfig
 
 TICKS_MAX = 60_000
-"""Max number of evaluated ticks. A flight of more than 5 minutes is thinned, because one hour at 200 Hz would need 6 GB."""
+"""Maximum number of ticks that are evaluated. A flight of more than 5 minutes is thinned, because one hour at 200 Hz would need 6
+GB of memory.
+"""
 
 
 def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Console, report: bool = True) -> int:
@@ -92,13 +94,17 @@ def _summary(config: SitlConfig, result: FlightResult, out: Path) -> tuple[Fligh
 
 
 def autopilot_of(log: FlightLog | None, world: dict[str, Any]) -> dict[str, Any]:
-    """Return the autopilot's kind (stub or px4), version and the world's details; on hardware, the version that PX4 reported."""
+    """Return the autopilot's kind (stub or px4), its version and what the world reports about it; on hardware, the version that
+    PX4 reported.
+    """
     firmware = None if log is None else log.metadata.get("autopilot", {}).get("firmware")
     return {"kind": "px4", "version": firmware, "firmware": firmware, **world.get("autopilot", {})}
 
 
 def report_of(log: FlightLog, summary: dict[str, Any], out: Path) -> Path | None:
-    """Write report.html with its plots; return None without matplotlib, which a flight does not need."""
+    """Write report.html with its plots and return its path. Return None if matplotlib is not installed, which a flight does not
+    need.
+    """
     try:
         from companion.analysis.report import write_report
     except ImportError:

@@ -99,14 +99,16 @@ class SitlProcess:
         return None
 
     def exit_summary(self) -> str:
-        """Return one line about a world that ended by itself."""
+        """Return one line on how the world ended, for a world that ended by itself."""
         terminate(self.process)
         if self._error is not None:
             return self._error
         return f"sitl: the simulated world {how_it_ended(self.process.returncode)}{last_line(self.log)}; see {self.log}"
 
     def messages(self, deadline_s: float) -> Iterator[dict[str, Any]]:
-        """Yield JSON lines until the deadline (0: only those that have arrived) or the end of the process."""
+        """Yield the world's messages until the deadline (`time.monotonic`) or the end of the process. With deadline 0, yield only
+        those that have already arrived.
+        """
         for message in self._lines.read(deadline_s):
             self._update(message)
             yield message

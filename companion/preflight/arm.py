@@ -1,4 +1,4 @@
-"""Checks of the arm: servo models, settings, hardware errors, communication, and joint limits. Pure."""
+"""Checks of the arm: servo models, settings, hardware errors, communication, and joint limits. Pure functions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from companion.preflight.checks import Check
 from companion.safety.arm import error_text
 
 DEVICE = Check(
-    "arm.device", "arm bus", "the port opens, both servos answer and accept their settings", "the flight needs the arm"
+    "arm.device",
+    "arm bus",
+    "the port opens, and both servos answer and accept their settings",
+    "the flight needs the arm",
 )
 MODEL = Check(
     "arm.model",
@@ -24,7 +27,7 @@ MODEL = Check(
 FIRMWARE = Check(
     "arm.firmware",
     "servo firmware",
-    "38 or newer, the same on both",
+    "38 or newer, the same on both servos",
     "older firmware has no bus watchdog: the arm would keep its torque if the companion died",
 )
 MODE = Check(
@@ -66,21 +69,21 @@ TEMPERATURE = Check(
 ERROR = Check(
     "arm.error",
     "servo hardware error",
-    "none (register 70); a tripped bus watchdog is reported",
+    "none (register 70); a tripped bus watchdog only warns",
     "a servo with an error gives no torque until it is rebooted",
 )
 ANGLES = Check(
     "arm.angles",
     "joint angles",
     "within the limits of both joints",
-    "beyond a limit the links touch the airframe, or zero_count or sign is wrong",
+    "beyond a limit the links touch the airframe; or zero_count or sign is wrong",
 )
 STILL = Check("arm.still", "arm at rest", "moves less than 3 deg", "motion of the arm makes the tare wrong")
 READS = Check(
     "arm.reads",
     "bus cycles without an answer",
-    "0.1 %; refused above 10 %",
-    "`safety.arm_read_failures_max` in a row end the flight",
+    "at most 0.1 %; refused above 10 %",
+    "`safety.arm_read_failures_max` of them in a row end the flight",
 )
 USB = Check(
     "arm.usb_latency",
@@ -148,7 +151,9 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
     )
     watchdogs_ms = [servo.watchdog_ms for servo in servos]
     wanted_ms = vehicle.devices.arm.watchdog_ms
-    yield _equal(WATCHDOG, watchdogs_ms, wanted_ms, "{} ms".format, "cycle the servos' power; check for a loose supply")
+    yield _equal(
+        WATCHDOG, watchdogs_ms, wanted_ms, "{} ms".format, "cycle the servos' power; check for a loose supply cable"
+    )
     yield _current_limit(servos, vehicle)
     yield supply(VOLTAGE, [servo.voltage_v for servo in servos])
 
@@ -237,7 +242,7 @@ def usb_latency(check: Check, latency_ms: int | None) -> Row:
         return check.good("not an FTDI adapter", wanted)
     if latency_ms <= LATENCY_GOOD_MS:
         return check.good(f"{latency_ms} ms", wanted)
-    fix = "keep it at 1 with a udev rule: docs/commissioning.md, step 2"
+    fix = "keep it at 1 ms with a udev rule (see docs/commissioning.md, step 2)"
     return check.bad(f"{latency_ms} ms", wanted, fix)
 
 

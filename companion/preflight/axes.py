@@ -1,4 +1,4 @@
-"""The 48 signed permutations of three axes: 24 rotations and 24 reflections. Pure."""
+"""The 48 signed permutations of three axes: 24 rotations and 24 reflections. Pure functions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LETTERS = "xyz"
 
 @dataclass(frozen=True)
 class AxisMap:
-    """Streamed axis i is `sign[i]` times true axis `index[i]`."""
+    """Map between true and streamed axes: streamed axis i is `sign[i]` times true axis `index[i]`."""
 
     index: tuple[int, int, int]
     sign: tuple[int, int, int]
@@ -64,7 +64,7 @@ class AxisMap:
 
     @cached_property
     def quat(self) -> Quat:
-        """Return the map as a rotation of true vectors; for determinant 1 only.
+        """Return the map as a quaternion (w, x, y, z) that rotates true vectors to streamed ones; the determinant must be 1.
 
         Raises:
             ValueError: the map is a reflection.
@@ -85,7 +85,7 @@ class AxisMap:
 
 IDENTITY: Final = AxisMap((0, 1, 2), (1, 1, 1))
 Y_UP: Final = AxisMap.of(("x", "z", "-y"))
-"""Axis map of a stream with y up, Motive's other setting, to a world with z up."""
+"""Axis map of a stream with y up, Motive's other setting, in a world with z up."""
 ALL: Final = tuple(
     AxisMap((i, j, k), (a, b, c))
     for i, j, k in itertools.permutations(range(3))

@@ -1,4 +1,6 @@
-"""A check: its identity and texts, from which it makes rows. Each module lists its checks, so that all of them can be documented."""
+"""A check: its identity and its texts, from which its rows are made. Each module lists its checks, so that all of them can be
+documented.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ class Check:
     warns: bool = False
     """Whether a failure only warns."""
     settles: bool = False
-    """Whether the check may pass later, on a PX4 that has just started."""
+    """Whether a failed check may pass later, because PX4 has just started."""
 
     def good(self, read: str, wanted: str = "") -> Row:
         """Return a row that passes."""

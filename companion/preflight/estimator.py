@@ -1,6 +1,8 @@
 """Checks of PX4's telemetry: alive, disarmed, fusing motion capture, battery charged. `preflight.px4` checks firmware and
-parameters. Pure. PX4 accepts poses without fusing them and does not say so. Only the estimator's own status and position over the
-whole observation prove fusion.
+parameters. Pure functions.
+
+PX4 accepts poses without fusing them, and does not report it. Only the estimator's own status and position over the whole
+observation prove fusion.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from companion.preflight.checks import Check
 from companion.px4.required import HOVER as HOVER_PARAM
 from companion.safety.mocap import FUSED_WITHIN_M, FUSED_WITHIN_RAD
 
-DEVICE = Check("px4.device", "PX4", "the link opens, PX4 answers", "the flight needs PX4")
+DEVICE = Check("px4.device", "PX4", "the link opens and PX4 answers", "the flight needs PX4")
 HEARTBEAT = Check(
     "px4.heartbeat",
     "PX4 heartbeat",
@@ -42,14 +44,14 @@ LAG = Check(
 VISION = Check(
     "px4.vision",
     "EKF2 fuses motion capture",
-    "local position, attitude, velocity and position flags, live test ratios below 1, accuracy below 0.1 m, all the time",
+    "throughout: local position; flags of attitude, velocity and position; test ratios above 0 and below 1; accuracy below 0.1 m",
     "PX4 accepts poses without fusing them; in flight the vehicle would drift away",
     settles=True,
 )
 AGREES = Check(
     "px4.agrees",
-    "PX4 against motion capture",
-    "0.10 m, 8 deg of yaw",
+    "PX4 compared with motion capture",
+    "within 0.10 m and 8 deg of yaw",
     "PX4 would hold a different position or heading from the mission's",
     settles=True,
 )
@@ -63,21 +65,21 @@ STEADY = Check(
 BATTERY = Check(
     "px4.battery",
     "battery",
-    "`safety.battery_warn` of charge and `safety.battery_voltage_min_v`",
+    "at least `safety.battery_warn` of charge and `safety.battery_voltage_min_v`",
     "below `safety.battery_min` the vehicle lands at once",
 )
 HOVER = Check(
     "px4.hover_thrust",
     "hover thrust",
-    "within 15 % of weight over `airframe.thrust_max_n`; refused beyond 35 % (a value from PX4 has its own row)",
-    "it determines the thrust in the first second: if too high, the vehicle jumps; if too low, it does not take off",
+    "within 15 % of the weight divided by `airframe.thrust_max_n`; refused beyond 35 % (a value from PX4 has its own row)",
+    "it determines the thrust in the first second: if it is too high, the vehicle jumps; if too low, it does not take off",
 )
 CHECKS = (DEVICE, HEARTBEAT, DISARMED, RATES, LAG, VISION, AGREES, STEADY, BATTERY, HOVER)
 
 RATE_GOOD_HZ, RATE_MIN_HZ = 80.0, 40.0
 ACCURACY_MAX_M = 0.1
 COVER_S = 0.6
-"""Time within which a stream that is present from the start begins."""
+"""A stream covers the observation if its first and its last sample are within this time of the beginning and the end."""
 PAIR_S = 0.1
 STEADY_M, STEADY_RAD = 0.04, math.radians(3.0)
 HOVER_GOOD, HOVER_MAX = 0.15, 0.35
@@ -136,21 +138,23 @@ def _rates(o: Observations) -> Row:
     if min(rates_hz) >= RATE_GOOD_HZ:
         return RATES.good(read, wanted)
     if rates_hz[0] == 0.0:
-        fix = "PX4 sends no position while it does not fuse motion capture: see that row"
+        fix = "PX4 sends no position until it fuses motion capture: see the row on that"
     else:
         fix = "make the link faster: 921600 baud, MAV_x_RATE 80000 or more, MAV_x_MODE onboard (docs/px4.md)"
     return (RATES.doubtful if min(rates_hz) >= RATE_MIN_HZ else RATES.bad)(read, wanted, fix)
 
 
 def _lag(o: Observations, vehicle: Vehicle) -> Row:
-    """Return the row on delays over the whole observation: arrival minus PX4's own clock, relative to the shortest."""
+    """Return the row on delays over the whole observation: arrival time minus PX4's own time stamp, relative to the smallest
+    difference.
+    """
     offsets_s = sorted(state.attitude_stamp_s - state.boot_s for state in o.vehicle if state.boot_s is not None)
     late_s = offsets_s[int(0.99 * (len(offsets_s) - 1))] - offsets_s[0]
     limit_s = vehicle.safety.link_lag_max_s
     read, wanted = f"{late_s * 1e3:.0f} ms at the 99th percentile", f"{limit_s * 1e3:.0f} ms"
     if late_s <= limit_s:
         return LAG.good(read, wanted)
-    return LAG.bad(read, wanted, "reduce other traffic on the link and the load of this computer")
+    return LAG.bad(read, wanted, "reduce other traffic on the link and the load on this computer")
 
 
 def vision(o: Observations) -> Row:
@@ -171,7 +175,7 @@ def vision(o: Observations) -> Row:
 
 
 def missing_evidence(o: Observations) -> str | None:
-    """Return the missing evidence that EKF2 fuses vision, or None if the evidence is complete from the start of the observation."""
+    """Return the missing evidence that EKF2 fuses vision, or None if the evidence is complete throughout the observation."""
     if not o.vehicle:
         return "no LOCAL_POSITION_NED"
     if not o.estimator:
@@ -208,11 +212,11 @@ def _finite(ratio: float) -> float:
 
 
 def agreement(o: Observations) -> Iterator[Row]:
-    """Return the row on the difference between PX4's position and motion capture, frame by frame, and its variation."""
+    """Return the rows on the difference between PX4's pose and motion capture, frame by frame, and on its variation."""
     pairs = list(_pairs(o.vehicle, o.mocap))
     if not pairs:
         fix = "check the rates of PX4's position and of motion capture"
-        yield AGREES.bad("no state and pose match in time", "", fix)
+        yield AGREES.bad("no state of PX4 and no pose of motion capture are close enough in time", "", fix)
         return
     apart = [
         tuple(a - b for a, b in zip(state.position_world_m, pose.position_world_m, strict=True))
@@ -235,7 +239,9 @@ def agreement(o: Observations) -> Iterator[Row]:
         yield STEADY.good(read, wanted)
     else:
         yield STEADY.bad(
-            read, wanted, "leave the vehicle at rest; if it does not settle, reboot PX4 and calibrate its gyros"
+            read,
+            wanted,
+            "leave the vehicle at rest; if the estimate does not settle, reboot PX4 and calibrate its gyros",
         )
 
 
@@ -277,7 +283,7 @@ def _hover(hover: float, vehicle: Vehicle) -> Row:
     own = airframe.hover_thrust is not None
     source = "airframe.hover_thrust" if own else HOVER_PARAM
     read = f"{source} = {hover:.3f}"
-    wanted = f"about {expected:.3f}: {airframe.mass_kg:g} kg on {airframe.thrust_max_n:g} N"
+    wanted = f"about {expected:.3f} ({airframe.mass_kg:g} kg, maximum thrust {airframe.thrust_max_n:g} N)"
     if abs(off) <= HOVER_GOOD:
         return HOVER.good(read, wanted)
     fix = f"measure it (companion hover fit) and set {source}, or correct airframe.mass_kg and airframe.thrust_max_n"

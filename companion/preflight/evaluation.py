@@ -1,4 +1,4 @@
-"""All rows of a preflight in display order. Pure."""
+"""All rows of a preflight in display order. Pure functions."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ CHECKS: tuple[Check, ...] = (
 )
 """All checks except those of `companion.preflight.px4`: one row for PX4's firmware and one for each parameter."""
 SETTLE_S = 30.0
-"""Longest time that the estimate of a PX4 that has just started takes to become steady."""
+"""Longest time that PX4's estimate takes to become steady after PX4 has started."""
 BEGIN_S = 2.0
-"""Longest time that PX4 takes to fuse poses that have just begun to arrive."""
+"""Longest time from the arrival of the first poses until PX4 fuses them."""
 _SETTLES = {check.id: check.title for check in CHECKS if check.settles}
 
 
 def rows(o: Observations, config: FlightConfig) -> list[Row]:
-    """Return one row for every check, except for those of a missing device."""
+    """Return one row for every check, except for the checks of a missing device."""
     vehicle = config.vehicle
     link, *state = estimator.rows(o, vehicle)
     return [
@@ -46,8 +46,10 @@ def rows(o: Observations, config: FlightConfig) -> list[Row]:
 
 
 def unsettled(o: Observations, config: FlightConfig) -> Waiting | None:
-    """Return the condition that may pass later, or None if waiting is useless. If a row fails permanently, wait only until the data
-    of the other rows no longer includes the start of motion capture.
+    """Return the failed checks that may still pass, with the longest time to wait for them; None if there are none.
+
+    The time is `SETTLE_S`. If a check has also failed that cannot pass by waiting, the time is only `BEGIN_S`: long enough that the
+    observation no longer contains the moment when poses began to arrive.
     """
     refusing = refusals(rows(o, config))
     settling = [_SETTLES[row.id] for row in refusing if row.id in _SETTLES]

@@ -1,4 +1,4 @@
-"""Checks of the force-torque sensor at rest: rate, noise, overload, and whether the tare fits an empty net. Pure."""
+"""Checks of the force-torque sensor at rest: rate, noise, overload, and whether the tare fits an empty net. Pure functions."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from companion.preflight.checks import Check
 DEVICE = Check(
     "force.device",
     "force sensor",
-    "the port opens, an RFT60 answers and streams; a vehicle without `devices.force` only warns",
-    "the controller needs the payload's force",
+    "the port opens, and an RFT60 answers and streams; a vehicle without `devices.force` only warns",
+    "the controller needs the force of the payload",
 )
 RATE = Check(
     "force.rate",
     "force sensor rate",
-    "90 % of `devices.force.rate_hz`; refused below half",
+    "at least 90 % of `devices.force.rate_hz`; refused below 50 %",
     "a catch is detected late, or not at all",
 )
 CHECKSUMS = Check(
     "force.checksums",
     "force sensor packets",
     "none with an invalid checksum",
-    "interference causes samples to be lost, and more of them in flight",
+    "interference causes samples to be lost, and in flight even more of them",
     warns=True,
 )
 NOISE = Check(
     "force.noise",
     "force sensor noise",
-    "0.3 N; refused above 1.5 N",
+    "at most 0.3 N (one sigma); refused above 1.5 N",
     "the controller responds to every measured force, so noise becomes motion",
 )
 OVERLOAD = Check(
@@ -47,7 +47,7 @@ TARE = Check(
     "force.tare",
     "force sensor tare",
     "bias below 5 % of `devices.force.force_max_n`; refused above 10 %",
-    "the tare removes every force at rest except the empty net's weight, so a load on the net would be missing in flight",
+    "the tare removes every force at rest except the empty net's weight, so a load on the net at that time would be missing in flight",
 )
 STILL = Check(
     "force.still",
@@ -99,12 +99,12 @@ def stream_rows(
     """Return the rows of a sensor that was recorded at rest.
 
     Args:
-        stream: counters.
-        samples: in order of time.
+        stream: counters of the stream.
+        samples: samples in order of time.
         duration_s: duration of the observation.
         vehicle: limits, and the tool whose weight the tare accounts for.
         device: expected rate and range of the sensor.
-        pose: attitude of the body and joint angles, rad; None if unknown; the row of the tare is then left out.
+        pose: attitude of the body and joint angles, rad; None if unknown, which omits the row on the tare.
     """
     if stream.lost is not None:
         yield DEVICE.bad(stream.lost, "the sensor keeps streaming", "check plug and cable")
@@ -156,7 +156,7 @@ def _overload(samples: Sequence[ForceSample], device: ForceDevice) -> Row:
 def _tare(bias_n: Vec3, tool: Tool, device: ForceDevice) -> Row:
     size_n, full_n = math.hypot(*bias_n), device.force_max_n
     x, y, z = bias_n
-    read = f"({x:.1f}, {y:.1f}, {z:.1f}) N beyond the net's {tool.net_mass_kg:g} kg"
+    read = f"({x:.1f}, {y:.1f}, {z:.1f}) N besides the net's {tool.net_mass_kg:g} kg"
     wanted = f"{TARE_GOOD * full_n:g} N"
     if size_n <= TARE_GOOD * full_n:
         return TARE.good(read, wanted)

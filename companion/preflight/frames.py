@@ -1,6 +1,7 @@
-"""Checks that motion capture, PX4 and the mission use the same axes, from data at rest. Pure. PX4 fuses motion capture, so a wrong
-yaw is invisible to EKF2. Gravity measured by the accelerometer reveals a tilted frame; the mission's start position and yaw reveal
-a rotated one; the hand test reveals the rest (`companion.preflight.hand_test.steps`).
+"""Checks that motion capture, PX4 and the mission use the same axes, from data at rest. Pure functions.
+
+PX4 fuses motion capture, so a wrong yaw is invisible to EKF2. Gravity measured by the accelerometer reveals a tilted frame; the
+mission's start position and yaw reveal a rotated one; the hand test reveals the rest (`companion.preflight.hand_test.steps`).
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from companion.preflight.hand_test.motion import angle_rad, mean_attitude, mean_
 HAND_TEST = Check(
     "frames.hand_test",
     "hand test",
-    "passed once with this vehicle, server, rigid body, up axis and NatNet version (not in SITL)",
-    "PX4 fuses motion capture and cannot detect wrong axes; not all of them show at rest",
+    "passed once with this vehicle, server, rigid body, up axis and NatNet version (not required in SITL)",
+    "PX4 fuses motion capture and cannot detect wrong axes; at rest, some axis errors cannot be seen",
     warns=True,
 )
 REST = Check("frames.rest", "at rest", "no motion during the observation", "gravity can only be measured at rest")
@@ -56,13 +57,13 @@ YAW = Check(
 NOISE_POSITION = Check(
     "frames.noise_position",
     "noise of the position at rest",
-    "2 mm, and no frame 30 mm off; refused above 10 mm",
+    "at most 2 mm, and no frame more than 30 mm off; refused above 10 mm",
     "the vehicle would shake, or lose its estimate",
 )
 NOISE_ATTITUDE = Check(
     "frames.noise_attitude",
     "noise of the attitude at rest",
-    "0.3 deg, and no frame 10 deg off; refused above 2 deg",
+    "at most 0.3 deg, and no frame more than 10 deg off; refused above 2 deg",
     "yaw jumps when Motive mixes up markers, and PX4 follows the jumps",
 )
 ACCELEROMETER = Check(
@@ -74,15 +75,15 @@ ACCELEROMETER = Check(
 )
 PX4_TILT = Check(
     "frames.px4_tilt",
-    "PX4's tilt against motion capture's",
+    "PX4's tilt compared with motion capture",
     "within 3 deg",
     "every attitude setpoint would be wrong by this angle",
     settles=True,
 )
 PX4_YAW = Check(
     "frames.px4_yaw",
-    "PX4's yaw against motion capture's",
-    "`safety.yaw_disagreement_deg`",
+    "PX4's yaw compared with motion capture",
+    "within `safety.yaw_disagreement_deg`",
     "PX4 does not fuse motion capture's yaw: the vehicle would fly away sideways",
     settles=True,
 )
@@ -139,7 +140,7 @@ def rows(observations: Observations, mission: Mission, vehicle: Vehicle) -> Iter
     states = observations.vehicle
     if len(poses) < SAMPLES_MIN or len(states) < SAMPLES_MIN:
         read = f"{len(poses)} tracked poses and {len(states)} states of PX4"
-        yield REST.bad(read, f"{SAMPLES_MIN} of each", "see motion capture and PX4's link")
+        yield REST.bad(read, f"{SAMPLES_MIN} of each", "see the rows on motion capture and on PX4's link")
         return
     rest = _rest(poses, states)
     yield rest
@@ -157,7 +158,7 @@ def standing(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> Iterat
     """Return the rows on gravity, height, position and yaw of a vehicle at rest.
 
     Args:
-        at: pose measured by motion capture, as configured.
+        at: pose measured by motion capture, with the configured up axis.
         force_m_s2: specific force measured by the accelerometer, body FLU.
         wanted: start pose of the mission.
         up_axis: devices.mocap.up_axis, "y" or "z".
@@ -194,7 +195,7 @@ def standing(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> Iterat
     if away_m <= wanted.tolerance_m:
         yield PLACE.good(read, text)
     else:
-        yield PLACE.bad(read, text, fix or "carry it there or change the mission's start.position_m")
+        yield PLACE.bad(read, text, fix or "carry the vehicle there or change the mission's start.position_m")
 
     read = f"{math.degrees(yaw_from_quat(at.attitude)):.0f} deg"
     text = f"{math.degrees(wanted.yaw_rad):g} ± {wanted.yaw_tolerance_deg:g} deg"
@@ -253,7 +254,7 @@ def _least_turned(axes: AxisMap) -> float:
 
 
 def _nose(axes: AxisMap) -> Quat:
-    """Return the true yaw of the stream's x axis, or 0 if that axis is not horizontal."""
+    """Return the rotation by the true yaw of the stream's x axis, or no rotation if that axis is not horizontal."""
     if axes.index[0] == 2:
         return (1.0, 0.0, 0.0, 0.0)
     half = 0.5 * (math.atan2(axes.sign[0], 0.0) if axes.index[0] == 1 else math.atan2(0.0, axes.sign[0]))
@@ -308,7 +309,7 @@ def _rest(poses: list[MocapPose], states: tuple[VehicleState, ...]) -> Row:
     if moved_m > MOVED_MAX_M or moved_deg > MOVED_MAX_DEG:
         return REST.bad(read, wanted, "do not touch the vehicle, and check again")
     if rate_deg_s > RATE_MAX_DEG_S:
-        return REST.bad(read, wanted, "motion capture shows it at rest: calibrate PX4's gyro")
+        return REST.bad(read, wanted, "motion capture shows that the vehicle is at rest: calibrate PX4's gyro")
     return REST.good(read, wanted)
 
 
@@ -339,14 +340,16 @@ def _accelerometer(force_m_s2: Vec3) -> Row:
 
 
 def _px4(at: Pose, states: tuple[VehicleState, ...], vehicle: Vehicle) -> Iterator[Row]:
-    """Return the rows on PX4's attitude compared with motion capture, from the newest half because its filter may have just started."""
+    """Return the rows that compare PX4's attitude with motion capture. Only the newest half of PX4's states is used, because its
+    filter may have just started.
+    """
     estimate = mean_attitude([state.attitude_wxyz for state in states[len(states) // 2 :]])
     tilt_deg = math.degrees(angle_rad(quat_rotate(estimate, _UP), quat_rotate(at.attitude, _UP)))
     read, wanted = f"{tilt_deg:.1f} deg apart", f"within {TILT_MAX_DEG:g} deg"
     if tilt_deg <= TILT_MAX_DEG:
         yield PX4_TILT.good(read, wanted)
     else:
-        fix = "see gravity; if that is right, set PX4's level horizon (SENS_BOARD_X_OFF, SENS_BOARD_Y_OFF)"
+        fix = "see the row on gravity; if it passes, set PX4's level horizon (SENS_BOARD_X_OFF, SENS_BOARD_Y_OFF)"
         yield PX4_TILT.bad(read, wanted, fix)
     yaw_deg = math.degrees(wrap_rad(yaw_from_quat(estimate) - yaw_from_quat(at.attitude)))
     most_deg = vehicle.safety.yaw_disagreement_deg

@@ -1,4 +1,4 @@
-"""Checks of the computer: disk space for the log, processor, real-time permission, memory, cores, recorder. Pure."""
+"""Checks of the computer: disk space for the log, processor, real-time permission, memory, cores, recorder. Pure functions."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from companion.runtime.cores import listed
 DISK = Check(
     "machine.disk",
     "disk space",
-    "the log of the mission and of twice its length",
+    "room for the log of a mission twice as long; refused if there is not even room for this one",
     "an incomplete log cannot explain the flight, and a full disk slows down the whole computer",
 )
 GOVERNOR = Check(
     "machine.governor",
     "processor",
     "governor `performance` on every core, where it is reported",
-    "at a reduced clock frequency ticks are late",
+    "at a reduced clock frequency, ticks are late",
     warns=True,
 )
 REALTIME = Check(
     "machine.realtime",
     "real-time permission",
     "SCHED_FIFO",
-    "without it ticks are late on a busy computer",
+    "without it, ticks are late on a busy computer",
     warns=True,
 )
 MEMORY_LOCK = Check(
@@ -82,14 +82,14 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         yield _cpus(machine, vehicle.computer)
     if o.recorder is not None:
         if o.recorder:
-            yield RECORDER.bad(o.recorder, "the recorder opens a log", "the line names file and reason")
+            yield RECORDER.bad(o.recorder, "the recorder opens a log", "remove the cause that this row names")
         else:
             yield RECORDER.good("opens a log", "the recorder opens a log")
 
 
 _PERMIT = (
-    "sudo companion install --systemd permits it for the service and for users in the group dialout; manually, `{}` in "
-    "/etc/security/limits.conf; then log in again"
+    "sudo companion install --systemd allows it for the service and for members of the dialout group; or add `{}` to "
+    "/etc/security/limits.conf yourself; then log in again"
 )
 
 

@@ -1,4 +1,6 @@
-"""Checks of the mission, the arm's start pose, and the vehicle's position in the room. `frames` checks start position and yaw. Pure."""
+"""Checks of the mission, the arm's start pose, and the vehicle's position in the room. `frames` checks start position and yaw. Pure
+functions.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from companion.preflight.checks import Check
 PLAN = Check(
     "mission.plan",
     "mission",
-    "inside room and tether, within all limits; `fly` checks it before it opens a device (exit code 2)",
+    "inside room and tether, within all limits; `fly` checks this before it opens a device (exit code 2)",
     "the flight would leave the room, load the tether or exceed the vehicle's limits",
 )
 ARM = Check(
@@ -59,7 +61,7 @@ def _arm(angle_rad: Vec2, start: Start) -> Row:
     wanted = f"({start.arm_deg[0]:g}, {start.arm_deg[1]:g}) ± {start.arm_tolerance_deg:g} deg"
     if off_deg <= start.arm_tolerance_deg:
         return ARM.good(read, wanted)
-    return ARM.bad(read, wanted, "move it there by hand, or change the mission's start.arm_deg")
+    return ARM.bad(read, wanted, "move the arm there by hand, or change the mission's start.arm_deg")
 
 
 def _room(position: Vec3, room: Room, radius_m: float) -> Row:
@@ -71,4 +73,6 @@ def _room(position: Vec3, room: Room, radius_m: float) -> Row:
     inside = all(low + r <= p <= high - r for p, r, (low, high) in zip(position, reach, spans, strict=True))
     if inside:
         return ROOM.good(read, wanted)
-    return ROOM.bad(read, f"{wanted}, rotors ({radius_m:g} m) included", "move it further inside, or correct room")
+    return ROOM.bad(
+        read, f"{wanted}, rotors ({radius_m:g} m) included", "move the vehicle further inside, or correct room"
+    )

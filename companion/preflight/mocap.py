@@ -1,4 +1,6 @@
-"""Checks of the motion-capture stream: rate, jitter, latency, gaps, our rigid body. `frames` checks its axes. Pure."""
+"""Checks of the motion-capture stream: rate, jitter, latency, gaps, the vehicle's rigid body. `frames` checks its axes. Pure
+functions.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ DEVICE = Check("mocap.device", "motion capture", "the server answers and streams
 RATE = Check(
     "mocap.rate",
     "mocap rate",
-    "90 % of `devices.mocap.rate_hz`; refused below `safety.mocap_rate_min_hz`",
+    "at least 90 % of `devices.mocap.rate_hz`; refused below `safety.mocap_rate_min_hz`",
     "PX4's estimate becomes slow and noisy; in flight this is a fault",
 )
 JITTER = Check(
@@ -34,7 +36,7 @@ LATENCY = Check(
 LOST = Check(
     "mocap.lost",
     "mocap frames lost",
-    "0.5 %; refused above 5 %",
+    "at most 0.5 %; refused above 5 %",
     "a network that loses frames at rest loses more of them in flight",
 )
 TRACKED = Check(
@@ -53,14 +55,14 @@ BODY = Check(
 ERROR = Check(
     "mocap.error",
     "marker error",
-    "2 mm on average",
+    "at most 2 mm on average",
     "bent or swapped markers rotate the body's axes",
     warns=True,
 )
 CLOCK = Check(
     "mocap.clock",
     "mocap clock compared with the companion's",
-    "frames arrive regularly for their frame numbers: rate within 1 %, jitter below 20 ms",
+    "frames arrive at the times that their frame numbers predict: rate within 1 %, jitter below 20 ms",
     "diverging clocks, or a server that stalls and catches up, make every age wrong",
     warns=True,
 )
@@ -145,7 +147,7 @@ def _tracked(poses: tuple[MocapPose, ...]) -> Row:
     read = f"{share:.1%} of the frames"
     if share == 1.0:
         return TRACKED.good(read, "all")
-    fix = "clean or move the markers, uncover them from the cameras, calibrate the volume"
+    fix = "clean or move the markers, make sure that the cameras can see them, calibrate the volume"
     return (TRACKED.doubtful if share >= TRACKED_MIN else TRACKED.bad)(read, "all", fix)
 
 
@@ -168,7 +170,9 @@ def _error(poses: tuple[MocapPose, ...]) -> Row:
 
 
 def _clock(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
-    """Fit arrival over frame number by least squares: the slope is the server's frame period by our clock, the residual is jitter."""
+    """Return the row on a least-squares fit of arrival time over frame number: the slope is the server's frame period by the
+    companion's clock, and the residual is jitter.
+    """
     count, first = len(poses), poses[0]
     n = [pose.frame_number - first.frame_number for pose in poses]
     t = [pose.stamp_s - first.stamp_s for pose in poses]
@@ -179,7 +183,7 @@ def _clock(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
     wanted = f"{1e3 / expected_hz:.3f} ms per frame, steady within {WANDER_GOOD_S * 1e3:.0f} ms"
     if not period_s > 0.0:
         return CLOCK.bad(
-            "the frame number does not advance", wanted, "restart streaming in Motive; it is paused or plays a take"
+            "the frame number does not advance", wanted, "Motive is paused or is playing a take: restart live streaming"
         )
     # Late frames are jitter; only the median of each tenth of the time is used here.
     off_s = sorted(_medians([b - mean_t - period_s * (a - mean_n) for a, b in zip(n, t, strict=True)]))
@@ -187,7 +191,7 @@ def _clock(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
     read = f"{period_s * 1e3:.3f} ms per frame, jitter {wander_s * 1e3:.1f} ms"
     if abs(period_s * expected_hz - 1.0) <= CLOCK_GOOD and wander_s <= WANDER_GOOD_S:
         return CLOCK.good(read, wanted)
-    fix = "set devices.mocap.rate_hz to the camera rate; check for a server that stalls, or for steps by time synchronisation"
+    fix = "set devices.mocap.rate_hz to the camera rate; check for a server that stalls, or for clock steps by time synchronisation"
     return CLOCK.bad(read, wanted, fix)
 
 

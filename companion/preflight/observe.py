@@ -1,4 +1,4 @@
-"""Observe the open devices for a few seconds and collect their data: the only part of the preflight with I/O."""
+"""Observes the open devices for a few seconds and collects their data: the only part of the preflight with I/O."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ async def observe(
     and parameters, and read the servo bus as in flight, which keeps its watchdogs from tripping.
 
     Args:
-        devices: open devices; of a device that could not be opened, only the failure is reported.
+        devices: open devices; for a device that could not be opened, only the failure is reported.
         config: the effective configuration.
         clock: the flight clock.
         out: folder of the flight's files, for the free disk space.
@@ -285,7 +285,7 @@ def _between(first: StateCounts, now: StateCounts) -> StateCounts:
 
 
 def machine_of(config: FlightConfig, out: Path) -> Machine:
-    """Return disk, processor, permissions, cores and serial adapters of this computer."""
+    """Return the disk space, processor, permissions, cores and serial adapters of this computer."""
     folder = next((path for path in (out, *out.absolute().parents) if path.is_dir()), Path())
     try:
         free_bytes: int | None = shutil.disk_usage(folder).free

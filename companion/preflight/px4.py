@@ -1,4 +1,4 @@
-"""Checks of PX4's firmware and parameters against the table `companion.px4.required`. Pure."""
+"""Checks of PX4's firmware and parameters against the table `companion.px4.required`. Pure functions."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from companion.model.check_row import Level, Row
 from companion.px4.required import WANTED, Value, Wanted
 
 KNOWN_GOOD = ((1, 16), (1, 18))
-"""Versions with which missions were flown, in simulation."""
+"""Versions with which missions have been flown, in simulation."""
 OLDEST = (1, 15)
 FIRMWARE_ID, UNREAD_ID = "px4.firmware", "px4.params"
 PARAM_ID = "px4.param."
-"""Prefix of the row's id, followed by the parameter's name."""
+"""Prefix of the id of a parameter's row; the parameter's name follows it."""
 
 _FIRMWARE = re.compile(r"PX4 (\d+)\.(\d+)\.(\d+) (\w+)")
 _FIRMWARE_WHY = "the meaning of parameters and the behaviour of EKF2 change between versions"
@@ -38,7 +38,7 @@ def rows(firmware: str | None, params: Mapping[str, Value], vehicle: Vehicle) ->
                     id=UNREAD_ID,
                     title="PX4 parameters",
                     ok=False,
-                    read="none was read",
+                    read="none could be read",
                     wanted="",
                     why=why,
                     fix="check the link, then try again",
@@ -127,5 +127,5 @@ def fix_of(wanted: Wanted) -> str:
 
 
 def text_of(value: Value | None) -> str:
-    """Return a value as text, a REAL32 with its significant digits only."""
+    """Return a value as text, with at most seven significant digits for a REAL32."""
     return f"{value:.7g}" if isinstance(value, float) else f"{value}"

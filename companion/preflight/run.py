@@ -1,4 +1,4 @@
-"""Runs a preflight: observe, evaluate, write."""
+"""Runs a preflight: observes the devices, evaluates the data and writes the result."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ async def preflight(
 
     Args:
         devices, config, clock, out, progress, known: arguments of `companion.preflight.observe.observe`.
-        sitl: in SITL no record of the hand test is required.
+        sitl: whether the devices are simulated; no record of the hand test is then required.
     """
     if not sitl and devices.mocap is not None and devices.mocap.server is not None:
         passed, changed = _hand_test(config, devices.mocap.server.protocol_version)
@@ -81,6 +81,6 @@ def write(rows: Sequence[Row], out: Path) -> None:
     """Write `preflight.json` into a flight's folder.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     (out / FILE).write_text(json.dumps(as_json(rows), indent=1), encoding="utf-8")

@@ -1,5 +1,5 @@
-"""Rows on the safety tether as the vehicle file describes it at the current position. No sensor measures it; the operator compares.
-Pure.
+"""Rows on the safety tether as described in the vehicle file. No sensor measures the tether; the operator compares the rows with
+it. Pure functions.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LINE = Check(
 STRENGTH = Check(
     "tether.strength",
     "tether strength",
-    "`tether.load_rating_n` is full thrust or more",
+    "`tether.load_rating_n` is at least the full thrust",
     "the tether must not break",
 )
 SLACK = Check(
@@ -40,7 +40,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     x, y, z = tether.anchor_world_m
     ax, ay, az = tether.attachment_body_m
     yield LINE.good(
-        f"{tether.length_m:g} m, from the anchor at ({x:g}, {y:g}, {z:g}) m to ({ax:g}, {ay:g}, {az:g}) m of the body",
+        f"{tether.length_m:g} m, from the anchor at ({x:g}, {y:g}, {z:g}) m to ({ax:g}, {ay:g}, {az:g}) m on the body",
         "compare with a tape measure",
     )
     read, wanted = f"{tether.load_rating_n:g} N", f"{airframe.thrust_max_n:g} N (airframe.thrust_max_n)"

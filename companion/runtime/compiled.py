@@ -1,5 +1,5 @@
-"""Tells which build of the computing modules this process runs: plain Python, or compiled by `make compile`. Both give identical
-results to the bit.
+"""Tells which build of the computing modules this process runs: plain Python, or compiled by `make compile`. Both give
+bit-identical results.
 """
 
 from __future__ import annotations

@@ -171,7 +171,7 @@ class FlightDisplay:
             self._line("ground", message["text"], "cyan")
 
     def _preflight(self, rows: list[Message]) -> None:
-        """Show the preflight's result; the rows that refuse are printed at the end as the reason for the refusal."""
+        """Show the preflight's result. The checks that refuse the flight are printed at the end, as the reason for the refusal."""
         self._progress.update(self._task, description="starting", completed=0.0, note="")
         bad = [row for row in rows if not row["ok"]]
         warned = [row for row in bad if row["level"] == Level.WARN.value]

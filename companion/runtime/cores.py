@@ -15,8 +15,8 @@ CPU_MAX = 1023
 def usable_cpus() -> tuple[int, ...]:
     """Return the cores that this process may run on, in ascending order.
 
-    They include isolated cores (isolcpus=) and cores outside its present affinity, but not those that a cpuset excludes. A short-lived
-    thread finds them by trying.
+    They include isolated cores (isolcpus=) and cores outside its current affinity, but not those that a cpuset excludes. A
+    short-lived thread finds them by trying.
     """
     found: set[int] = set()
 

@@ -15,7 +15,7 @@ def fine_loop() -> asyncio.AbstractEventLoop:
     """Return an event loop with timers more precise than 1 ms.
 
     asyncio's default loop waits in `epoll`, whose timeouts Python rounds up to whole milliseconds; `select` takes microseconds.
-    `select` does not support descriptors from 1024 on, which these processes do not reach.
+    `select` does not support descriptors of 1024 and above, which these processes do not reach.
     """
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
@@ -27,10 +27,10 @@ def run(main: Coroutine[Any, Any, _T]) -> _T:
 
 
 def run_until_interrupted(work: Coroutine[Any, Any, _T]) -> _T:
-    """Run a coroutine in its own event loop. Ctrl-C cancels it and is raised again after its end.
+    """Run a coroutine in its own event loop. Ctrl-C cancels the coroutine; KeyboardInterrupt is raised once it has ended.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C.
+        KeyboardInterrupt: Ctrl-C was pressed.
     """
 
     async def guarded() -> tuple[_T] | None:

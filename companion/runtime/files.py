@@ -1,4 +1,4 @@
-"""Atomic writing of a file: a reader finds the old or the new content, never a part."""
+"""Atomic writing of a file: a reader finds either the old or the new content, never a part of it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def write_whole(
         mode: permission bits; None for the default of the process (umask).
         owner: user and group id; None for those of the process.
         replace: False refuses to replace an existing file.
-        durable: wait until the content is on the medium, so that it survives a loss of power.
+        durable: wait until the content is on the storage medium, so that it survives a loss of power.
 
     Raises:
         FileExistsError: the file exists and `replace` is False; it is left unchanged.

@@ -1,8 +1,8 @@
 """The local channel between the launcher and the flight process: short JSON messages on a SOCK_SEQPACKET pair.
 
-Flight to launcher: `status` (10 a second), `event`, `px4`, `command` (a command from the ground, and its effect), `ground` (state of
-the connection to ground stations), `started`, `refused`, `result`. Launcher to flight: `land`. The flight never waits for the
-launcher: if the channel is full the message is lost. If the launcher has ended (end of file) the flight lands.
+Flight to launcher: `status` (10 a second), `event`, `px4`, `command` (a command from the ground, and its effect), `ground` (state
+of the connection to ground stations), `started`, `refused`, `result`. Launcher to flight: `land`. The flight process never waits
+for the launcher: if the channel is full, the message is lost. If the launcher has ended (end of file), the flight process lands.
 """
 
 from __future__ import annotations

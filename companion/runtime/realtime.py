@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 GIL_SWITCH_S = 0.0005
-"""Interpreter switch interval: the longest time that the bus thread waits for a tick that is computing. Python's default of 5 ms is a
-whole tick.
+"""Interpreter switch interval: the longest time that the bus thread waits for the computation of a tick. Python's default of 5 ms
+is as long as a whole tick.
 """
 FLIGHT_PRIORITY = 50
 GUARDIAN_PRIORITY = 60
@@ -37,7 +37,7 @@ class Realtime:
     cpus: tuple[int, ...]
     """Cores that the process may run on."""
     memory_locked: bool
-    """Present pages, and those touched later, stay in memory (mlockall)."""
+    """Whether current pages, and those touched later, stay in memory (mlockall)."""
     refused: tuple[str, ...]
     """Requests that were refused, each with the reason."""
 
@@ -129,7 +129,7 @@ def _set_cpus(cpus: Collection[int]) -> str | None:
                 os.sched_setaffinity(thread, cpus)
     except (OSError, ValueError) as error:
         asked = ",".join(map(str, sorted(cpus)))
-        return f"not moved to CPUs {asked} ({getattr(error, 'strerror', None) or error}; there are {os.cpu_count()})"
+        return f"not moved to CPUs {asked} ({getattr(error, 'strerror', None) or error}; this computer has {os.cpu_count()})"
     return None
 
 

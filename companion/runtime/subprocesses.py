@@ -22,7 +22,7 @@ TMP_PREFIX = "tmp-"
 
 
 class LaunchError(Exception):
-    """A process of the flight could not be started; one line."""
+    """A process of the flight could not be started. The text is one line for the user."""
 
 
 def use_default_signals() -> None:
@@ -41,7 +41,9 @@ def use_default_signals() -> None:
 
 
 def terminate(process: subprocess.Popen[bytes], patience_s: float = 3.0) -> None:
-    """End a child: wait, then send SIGTERM, then SIGKILL. The child is reaped and its pipes are closed."""
+    """End a child: wait up to `patience_s` for it to exit, then send SIGTERM, then SIGKILL, waiting as long after each. The child
+    is reaped and its pipes are closed.
+    """
     for number in (0, signal.SIGTERM, signal.SIGKILL):  # 0 sends nothing
         process.send_signal(number)
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -66,7 +68,9 @@ def write_text(path: Path, text: str) -> None:
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file of the flight's folder if possible: the id of an ended process may be assigned to another one."""
+    """Remove a file with a process id from the flight's folder if possible: the system may assign the id of an ended process to
+    another one.
+    """
     with contextlib.suppress(OSError):
         path.unlink()
 
@@ -83,7 +87,7 @@ def scratch_folder(out: Path) -> Iterator[Path]:
     try:
         path = Path(tempfile.mkdtemp(prefix=TMP_PREFIX, dir=out))
     except OSError as error:
-        raise LaunchError(f"{out}: a folder in it cannot be created: {error.strerror}; choose another --out") from None
+        raise LaunchError(f"{out}: cannot create a folder there: {error.strerror}; choose another --out") from None
     try:
         yield path.absolute()
     finally:
@@ -101,7 +105,7 @@ def how_it_ended(code: int) -> str:
 
 
 class JsonLines:
-    """JSON objects, one a line, that a child process writes to a pipe.
+    """JSON objects, one per line, that a child process writes to a pipe.
 
     Args:
         fd: read end of the pipe.
@@ -111,7 +115,7 @@ class JsonLines:
         self._fd = fd
         self._buffer = b""
         self.ended = False
-        """The child has closed its end: it has exited or is about to."""
+        """Whether the child has closed its end, which means that it has exited or is about to."""
 
     def read(self, deadline_s: float) -> Iterator[dict[str, Any]]:
         """Yield JSON objects until the deadline (`time.monotonic`) or the end of the pipe. With deadline 0, yield only what has already

@@ -11,7 +11,7 @@ async def until_first(*coroutines: Coroutine[Any, Any, Any]) -> None:
     """Run all coroutines until the first one ends, then cancel the others and wait for them.
 
     Raises:
-        the exception of the first one that failed.
+        The exception of the first one that failed.
     """
     tasks = [asyncio.ensure_future(coroutine) for coroutine in coroutines]
     try:

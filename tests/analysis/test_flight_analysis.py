@@ -483,7 +483,7 @@ def test_a_log_with_records_of_another_shape_is_refused_in_one_line(
     path = rewritten(flight.path, tmp_path / "other.mcap", change, "0" * 16)
     with pytest.raises(LogError) as refusal:
         FlightLog.read(path)
-    assert str(refusal.value).startswith(f"{path}: its records have different fields (Outputs: ")
+    assert str(refusal.value).startswith(f"{path}: its records' fields differ from this version's (Outputs: ")
     assert "at `$.control`" in str(refusal.value)
     assert reason in str(refusal.value)
     assert "written by companion " in str(refusal.value)
@@ -569,7 +569,7 @@ def test_a_log_that_cannot_be_replayed_says_why_in_one_line(flight: FlightLog) -
 
     for log, make, reason in (
         (gap, refuse, "3 of 4401 ticks are missing"),
-        (late, refuse, "begins at tick 5"),
+        (late, refuse, "the first 5 ticks are missing"),
         (older, refuse, "recorded by companion 0.0.1"),
         (bare, refuse, "has no configuration"),
         (empty, refuse, "has no ticks"),

@@ -126,7 +126,7 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "model error set for a comparison": (
         ("compare", "--set", "world.model_error=0.1"),
-        (r"--set world\.model_error: the grid sets it; use --model-error$",),
+        (r"--set world\.model_error: the grid sets this key; use --model-error$",),
     ),
     "set without a value": ((*FLY, "--set"), (r"^companion fly: argument --set: expected",)),
     "set without =": ((*FLY, "--set", "world.seed"), (r"--set world\.seed: no '='; expected SECTION\.KEY=VALUE",)),

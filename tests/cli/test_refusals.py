@@ -197,7 +197,7 @@ def test_refuses_a_start_other_than_the_missions(sandbox: Sandbox, fresh_world: 
     ended = refused(sandbox, fresh_world, *fresh_world.addresses(), *set_options(**start))
     assert len(ended.err_lines) == 2, ended.err
     for pattern in (
-        r"^arm at the start: \(165, 140\) deg, wanted \(150, 140\) ± 10 deg; move it there by hand",
+        r"^arm at the start: \(165, 140\) deg, wanted \(150, 140\) ± 10 deg; move the arm there by hand",
         r"^start position in motion capture's axes: \(-1\.0\d, -?0\.0\d\) m, 0\.50 m away, wanted \(-0\.5, 0\) m, .*; carry it there",
     ):
         assert [line for line in ended.err_lines if re.search(pattern, line)], (pattern, ended.err)
@@ -328,7 +328,7 @@ def test_refuses_when_px4_does_not_arm_and_passes_its_answer_on(sandbox: Sandbox
     refuses = ("world.faults=[{kind: arming_refused, phase: ground}]",)
     with sandbox_in(tmp_path / "world") as around, World(around, CATCH, refuses) as world:
         ended = refused(sandbox, world, *world.addresses(), events=True)
-    assert_one_line(ended, r"^PX4 did not arm; PX4 said: ARM refused: temporarily rejected")
+    assert_one_line(ended, r"^PX4 did not arm; PX4 reported: ARM refused: temporarily rejected")
 
 
 @SHARED

@@ -41,7 +41,7 @@ def test_the_line_comes_by_the_schedulers_figures(flight: float, world: float, l
 def test_the_line_says_how_long_who_waited_and_what_to_do() -> None:
     assert contention_message((ProcessWait("flight process", 0.123), ProcessWait("simulated world", 0.4)), 0.0231) == (
         "this computer is too busy (flight process waited 12 % of the time for a core, simulated world waited 40 % of the time for a "
-        "core, ticks are 23 ms late); close other programs, or permit real-time priority: docs/raspberry-pi.md, Real time"
+        "core, ticks are 23 ms late); close other programs, or allow real-time priority (see docs/raspberry-pi.md, section Real time)"
     )
 
 

@@ -105,7 +105,7 @@ def test_a_body_whose_zero_is_turned_is_named_wherever_it_stands(axes: AxisMap) 
 def test_a_machine_that_only_stands_elsewhere_is_not_explained_away() -> None:
     wanted = Wanted((-1.0, 0.3, 0.3), 0.0, 0.15, 15.0)
     rows = list(standing(Pose((-0.6, 0.5, 0.31), (1.0, 0.0, 0.0, 0.0)), G, wanted, "z"))
-    assert failed(rows) == {"frames.place": "carry it there or change the mission's start.position_m"}
+    assert failed(rows) == {"frames.place": "carry the vehicle there or change the mission's start.position_m"}
 
 
 def test_a_little_too_high_is_reported_but_does_not_refuse() -> None:
@@ -175,7 +175,7 @@ def test_the_hand_test_on_record_is_reported_on_hardware_only() -> None:
 
     assert row() is None
     passed, never, changed = row(hand_test="passed on 2026-11-21"), row(hand_test=""), None
-    changed = row(hand_test="", hand_test_changed="passed on 2026-11-21, but since then up_axis was y, is z")
+    changed = row(hand_test="", hand_test_changed="passed on 2026-11-21, but since then up_axis changed from y to z")
     assert passed is not None
     assert never is not None
     assert changed is not None
@@ -185,4 +185,4 @@ def test_the_hand_test_on_record_is_reported_on_hardware_only() -> None:
         assert not missing.refuses
         assert "companion check --hand" in missing.fix
     assert never.read == "never passed"
-    assert "up_axis was y, is z" in changed.read
+    assert "up_axis changed from y to z" in changed.read

@@ -44,10 +44,10 @@ def test_a_passed_test_counts_for_its_own_set_up() -> None:
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"server": "10.0.0.2"}, "server was 192.168.1.10, is 10.0.0.2"),
-        ({"rigid_body_id": 2}, "rigid_body_id was 1, is 2"),
-        ({"up_axis": "y"}, "up_axis was z, is y"),
-        ({"natnet_version": "3.0"}, "natnet_version was 4.1, is 3.0"),
+        ({"server": "10.0.0.2"}, "server changed from 192.168.1.10 to 10.0.0.2"),
+        ({"rigid_body_id": 2}, "rigid_body_id changed from 1 to 2"),
+        ({"up_axis": "y"}, "up_axis changed from z to y"),
+        ({"natnet_version": "3.0"}, "natnet_version changed from 4.1 to 3.0"),
     ],
 )
 def test_what_has_changed_since_then_is_reported(change: dict[str, Any], told: str) -> None:

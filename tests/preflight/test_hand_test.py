@@ -203,7 +203,7 @@ def test_it_does_not_begin_when_px4_is_armed() -> None:
 
 def test_it_ends_when_px4_does_not_say_whether_it_is_armed() -> None:
     view = ran(dataclasses.replace(sample, armed=None if sample.t_s > 3.0 else False) for sample in samples())
-    assert view.ended.startswith(f"no report for {SILENCE_MAX_S:g} s on whether PX4 is armed")
+    assert view.ended.startswith(f"PX4 has not reported for {SILENCE_MAX_S:g} s whether it is armed")
 
 
 def test_a_test_without_a_result_names_the_command_to_do_again() -> None:
@@ -216,7 +216,7 @@ def test_a_test_without_a_result_names_the_command_to_do_again() -> None:
 
 def test_a_machine_that_nobody_lifts_is_reported_after_the_time_limit() -> None:
     view = ran(standing())
-    assert view.ended.startswith(f"not within {STEP_TIMEOUT_S:g} s: hold it by its legs")
+    assert view.ended.startswith(f"not done within {STEP_TIMEOUT_S:g} s: hold it by its legs")
     assert "moved by 0 cm" in view.ended
 
 

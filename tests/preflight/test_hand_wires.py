@@ -162,7 +162,7 @@ def test_it_is_refused_when_px4_is_armed() -> None:
 def test_without_motion_capture_or_px4_it_says_which() -> None:
     config = load_sitl(CATCH)
     (row,) = asyncio.run(run_hand_test(AvailableDevices(VisionFilter()), config, terminal()))
-    assert row.read == "motion capture is not open"
+    assert row.read == "motion capture is not connected"
 
 
 def test_scripts_keep_their_standard_output(config: SitlConfig, capsys: pytest.CaptureFixture[str]) -> None:

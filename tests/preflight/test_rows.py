@@ -82,7 +82,7 @@ CASES = {
     "armed": Case("px4.disarmed", "armed", "disarm it", {"status": r.status(armed=True)}),
     "slow state": Case("px4.rates", "position 60,", "MAV_x_RATE", {"state_counts": StateCounts(300, 1000, 1000)}, WARN),
     "very slow state": Case("px4.rates", "IMU 20 Hz", "MAV_x_RATE", {"state_counts": StateCounts(600, 1000, 100)}),
-    "no position": Case("px4.rates", "position 0,", "does not fuse", {"state_counts": StateCounts(0, 1000, 1000)}),
+    "no position": Case("px4.rates", "position 0,", "until it fuses", {"state_counts": StateCounts(0, 1000, 1000)}),
     "late link": Case("px4.lag", "90 ms", "other traffic", {"vehicle": late(0.05, 0.09)}, WARN),
     "no local position": Case("px4.vision", "no LOCAL_POSITION_NED", "EKF2_EV_CTRL", {"vehicle": ()}),
     "no estimator status": Case("px4.vision", "no ESTIMATOR_STATUS", "EKF2_HGT_REF", {"estimator": ()}),
@@ -111,7 +111,7 @@ CASES = {
     "turned": Case("px4.agrees", "20.", "body's axes", {"vehicle": moved(yaw_rad=math.radians(20))}, also=("frames.px4_yaw",)),
     "wandering": Case("px4.steady", "0.06", "at rest", {"vehicle": moved(x_m=0.06, until=200)}),
     "wandering yaw": Case("px4.steady", "4.", "gyros", {"vehicle": moved(yaw_rad=math.radians(4), until=200)}),
-    "never in time together": Case("px4.agrees", "no state and pose", "rates", {"mocap": r.mocap(stamp_s=90.0)}),
+    "never in time together": Case("px4.agrees", "no state of PX4 and no pose", "rates", {"mocap": r.mocap(stamp_s=90.0)}),
     "flat battery": Case("px4.battery", "25%", "charge", {"status": r.status(battery_remaining=0.25)}),
     "battery of other cells": Case("px4.battery", "11.4 V", "cells", {"status": r.status(battery_voltage_v=11.4)}),
     "battery unknown": Case("px4.battery", "97%", "BAT1_N_CELLS", {"status": r.status(battery_voltage_v=None)}, WARN),
@@ -204,7 +204,7 @@ CASES = {
     "no core beside the flight's": Case(
         "machine.cpus", "cores 0-3", "remove at least one core", {}, WARN, vehicle={"computer.cpus": (0, 1, 2, 3)}
     ),
-    "no recorder": Case("machine.recorder", "no space", "names file", {"recorder": "no space"}),
+    "no recorder": Case("machine.recorder", "no space", "this row names", {"recorder": "no space"}),
 }  # fmt: skip
 NEVER_BAD = {"tether.line"}
 """It only reports."""

@@ -85,7 +85,7 @@ def test_writing_is_refused_while_armed(mine: Path, capsys: pytest.CaptureFixtur
     with Px4Peer(port) as peer:
         peer.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
         assert params(port, "--write", str(mine), "--backup", str(mine.with_name("old"))) == EXIT_REFUSED
-        assert "expected a disarmed PX4, found it armed" in capsys.readouterr().err
+        assert "expected a disarmed PX4, but it is armed" in capsys.readouterr().err
         assert peer.of("PARAM_SET") == []
         assert params(port, "--diff", str(mine)) == EXIT_REFUSED
         assert "2 differ" in capsys.readouterr().out

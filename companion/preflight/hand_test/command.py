@@ -48,14 +48,14 @@ async def run_hand_test(
     *,
     record: Path | None = None,
 ) -> list[Row]:
-    """Guide the operator through the test and return its rows. Any key or Ctrl-C ends it.
+    """Guide the operator through the test and return its rows. Any key or Ctrl-C ends the test.
 
     Args:
         devices: open devices; poses need not be forwarded to PX4. An open arm is read during the test to keep its watchdogs from
             tripping.
         config: the effective configuration.
         console: terminal of the operator.
-        json: keep standard output free: all text for the operator goes to standard error.
+        json: whether standard output must stay free; all text for the operator then goes to standard error.
         record: file in which a passed test is recorded (`hand_record.record_path()`); None to record nothing, as in SITL.
     """
     outcome = await perform(devices, config, console, json)
@@ -76,7 +76,7 @@ async def perform(
     mocap, autopilot, arm = devices.mocap, devices.autopilot, devices.arm
     if mocap is None or autopilot is None:
         missing = "motion capture" if mocap is None else "PX4"
-        return f"{missing} is not open"
+        return f"{missing} is not connected"
     test, clock, arm_due_s = HandTest(), _StampClock(), 0.0
     stop = asyncio.Event()
     if json and console.file is sys.stdout:

@@ -1,6 +1,7 @@
-"""Evaluates a hand test: rows with the measurements, and which axis is wrong. Pure. IMU measurements are in the vehicle's body
-frame (x forward, y left, z up), motion-capture measurements in the frame of its rigid body. In a correct set-up both frames are the
-same.
+"""Evaluates a hand test: returns rows with the measurements, and names the axis that is wrong. Pure functions.
+
+IMU measurements are in the vehicle's body frame (x forward, y left, z up), motion-capture measurements in the frame of its rigid
+body. In a correct set-up both frames are the same.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ LIFT = Check("hand.lift", "hand test: up", "IMU and motion capture agree on the 
 FORWARD = Check(
     "hand.forward",
     "hand test: forward",
-    "the same directions, and within 12 deg about the vertical",
+    "the same for this direction, and within 12 deg about the vertical",
     "PX4 fuses this yaw and cannot detect that it is wrong: the vehicle would circle or fly away",
 )
 TURN = Check(
@@ -41,7 +42,7 @@ TURN = Check(
 SCALE = Check(
     "hand.scale",
     "hand test: distance",
-    "motion capture sees 0.7 to 1.4 m for each metre that the IMU measures",
+    "motion capture measures 0.7 to 1.4 m for each metre that the IMU measures",
     "every distance would be wrong by this factor",
 )
 CHECKS = (DONE, AS_REQUESTED, LEVEL, LIFT, FORWARD, TURN, SCALE)
@@ -116,7 +117,7 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
         row(
             SCALE,
             all(SCALE_SPAN[0] <= scale <= SCALE_SPAN[1] for scale in scales),
-            f"motion capture saw {scales[0]:.2f} m up and {scales[1]:.2f} m forward for each metre that the IMU measured",
+            f"motion capture measured {scales[0]:.2f} m up and {scales[1]:.2f} m forward for each metre that the IMU measured",
             f"{SCALE_SPAN[0]:g} to {SCALE_SPAN[1]:g} m",
             far,
         ),

@@ -1,8 +1,8 @@
-"""Compares one motion of the carried vehicle as measured by PX4's IMU and by motion capture. Pure.
+"""Compares one motion of the carried vehicle as measured by PX4's IMU and by motion capture. Pure functions.
 
-PX4's attitude is derived from motion capture and adds no information; accelerometer and gyro do. Gravity and the accelerometer's
-bias are nearly constant over a motion of two seconds, so both velocities are compared after their mean and slope are removed. The
-vehicle need not be perfectly at rest at both ends.
+PX4's attitude is derived from motion capture and adds no information; the accelerometer and the gyro do. Gravity and the
+accelerometer's bias are nearly constant over a motion of two seconds, so both velocities are compared after their mean and slope
+are removed. The vehicle need not be perfectly at rest at both ends.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 
 GRID_S: Final = 0.02
 GAP_MAX_S: Final = 0.3
-"""Longest gap between samples of a motion that is evaluated."""
+"""Longest gap between samples with which a motion is still evaluated."""
 
 
 class PoseAt(NamedTuple):
-    """A tracked motion-capture pose, as configured and streamed."""
+    """A pose from motion capture in which the body was tracked, with the configured up axis."""
 
     t_s: float
     position_m: Vec3
@@ -69,14 +69,14 @@ def measure(
     """Compare a motion that begins and ends at rest.
 
     Args:
-        poses: in order of time, beyond both ends.
-        imu: in order of time, beyond both ends.
+        poses: poses in order of time, from before `start_s` until after `end_s`.
+        imu: samples in order of time, from before `start_s` until after `end_s`.
         start_s: a time of rest before the motion.
-        end_s: a time of rest after it.
-        gyro_bias_rad_s: measured on the floor.
+        end_s: a time of rest after the motion.
+        gyro_bias_rad_s: bias of the gyro, measured while the vehicle stood on the floor.
 
     Raises:
-        GapError: samples are missing.
+        GapError: samples are missing for longer than `GAP_MAX_S`.
     """
     count = int((end_s - start_s) / GRID_S)
     _no_gaps([pose.t_s for pose in poses], start_s, end_s, "motion capture lost the rigid body (markers covered?)")
@@ -129,7 +129,7 @@ def _felt(imu: Sequence[ImuAt], times: Sequence[float], bias: Vec3) -> tuple[lis
 
 
 def turned(q: Quat, rate_rad_s: Vec3, dt_s: float) -> Quat:
-    """Return the attitude after a rotation at a body rate."""
+    """Return the attitude after a rotation at a constant body rate for `dt_s`."""
     angle = norm(rate_rad_s) * dt_s
     if angle < 1e-12:
         return q

@@ -1,6 +1,6 @@
 """Record of passed hand tests: the motion-capture set-ups that an IMU has confirmed.
 
-`$XDG_STATE_HOME/companion/hand-tests.json`, else `~/.local/state/companion/hand-tests.json`.
+The file is `$XDG_STATE_HOME/companion/hand-tests.json`, or else `~/.local/state/companion/hand-tests.json`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Setup:
 
     @classmethod
     def of(cls, vehicle: Vehicle, natnet_version: str) -> Setup:
-        """Return the set-up of a vehicle file and a server's reply."""
+        """Return the set-up given by a vehicle file and by the NatNet version that the server reports."""
         device = vehicle.devices.mocap
         return cls(
             vehicle=vehicle.name,
@@ -80,13 +80,13 @@ def on_record(setup: Setup, tests: Sequence[Passed]) -> tuple[str, str]:
     for test in reversed(tests):
         if test.setup.vehicle == setup.vehicle:
             then, now = asdict(test.setup), asdict(setup)
-            changes = [f"{key} was {then[key]}, is {now[key]}" for key in now if then[key] != now[key]]
+            changes = [f"{key} changed from {then[key]} to {now[key]}" for key in now if then[key] != now[key]]
             return "", f"passed on {test.at}, but since then {', '.join(changes)}"
     return "", ""
 
 
 def with_passed(tests: Sequence[Passed], setup: Setup, at: datetime, rows: Sequence[Row]) -> list[Passed]:
-    """Return the tests plus a newly passed one, which replaces an older one of the same set-up."""
+    """Return the tests plus a newly passed one, which replaces an older test with the same set-up."""
     measured = {row.id: row.read for row in rows}
     return [*(test for test in tests if test.setup != setup), Passed(setup, at.isoformat(timespec="seconds"), measured)]
 
@@ -116,7 +116,7 @@ def save(path: Path, tests: Sequence[Passed]) -> None:
     """Replace the whole record.
 
     Raises:
-        RecordError: it cannot be written.
+        RecordError: the record cannot be written.
     """
     document = {"schema_version": SCHEMA_VERSION, "passed": [asdict(test) for test in tests]}
     try:

@@ -1,7 +1,9 @@
-"""The guided hand test: the operator carries the vehicle, rotors off, and every axis of motion capture is compared with the IMU. Pure.
+"""The guided hand test: the operator carries the vehicle, rotors off, and every axis of motion capture is compared with the IMU. No
+I/O.
 
-The steps are: rest on the floor, lift, forward, turn left. Each step is recognised by the distance that motion capture measures, in any
-direction, because the directions are under test. Directions are evaluated at the end (`companion.preflight.hand_test.evaluation`).
+The steps are: rest on the floor, lift, forward, turn left. Each step is recognised by the distance that motion capture measures, in
+any direction, because the directions are under test. Directions are evaluated at the end
+(`companion.preflight.hand_test.evaluation`).
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ TURN_WANTED_DEG: Final = 45.0
 TURN_MIN_DEG: Final = 30.0
 STEP_TIMEOUT_S: Final = 60.0
 STAND_S: Final = 2.5
-"""Time at rest on the floor that begins the test, longer than an accidental pause."""
+"""Time that the vehicle must rest on the floor before the test begins; longer than an accidental pause."""
 STILL_S: Final = 0.6
 STILL_M, STILL_DEG = 0.02, 5.0
 """Largest deviation from the mean within `STILL_S` for a vehicle of 3 kg held by hand."""
@@ -173,7 +175,7 @@ class HandTest:
         if sample.armed is not None:
             self._heard_s = sample.t_s
         elif sample.t_s - self._heard_s > SILENCE_MAX_S:
-            self._ended = f"no report for {SILENCE_MAX_S:g} s on whether PX4 is armed: check the link"
+            self._ended = f"PX4 has not reported for {SILENCE_MAX_S:g} s whether it is armed: check the link"
             return
         pose, vehicle = sample.pose, sample.vehicle
         if pose is not None and pose.tracking_valid and pose.frame_number != self._frame:
@@ -194,7 +196,7 @@ class HandTest:
         elif self._rest is not None:
             self._move(t_s, self._rest, still)
         if self._step is not Step.DONE and t_s - self._step_s > STEP_TIMEOUT_S:
-            self._ended = f"not within {STEP_TIMEOUT_S:g} s: {INSTRUCTIONS[self._step]} ({self._why(t_s)})"
+            self._ended = f"not done within {STEP_TIMEOUT_S:g} s: {INSTRUCTIONS[self._step]} ({self._why(t_s)})"
 
     def _why(self, t_s: float) -> str:
         for samples, what in (
@@ -227,7 +229,9 @@ class HandTest:
         rest = self._still(t_s, STAND_S, STAND_M, STAND_DEG)
         stood_s = 0.0 if self._still_since_s is None else t_s - max(self._still_since_s, self._step_s)
         self._progress = min(1.0, stood_s / STAND_S)
-        self._seen = "it is at rest" if self._still_since_s is not None else "the vehicle moves, or is not tracked"
+        self._seen = (
+            "the vehicle is at rest" if self._still_since_s is not None else "the vehicle is moving or is not tracked"
+        )
         felt = self._imu[bisect_left(self._imu, t_s - STAND_S, key=lambda sample: sample.t_s) :]
         if rest is None or len(felt) < _POSES_MIN:
             return
@@ -267,7 +271,7 @@ class HandTest:
         try:
             motion = measure(self._poses, self._imu, start_s, end_s, self._stood.rate_rad_s)
         except GapError as error:
-            self._again(after, f"{error}: repeat it")
+            self._again(after, f"{error}: repeat the move")
             return
         self._motions[self._step] = motion
         self._go_on(t_s, after)
