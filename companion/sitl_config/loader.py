@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from companion.config.overrides import apply_overrides, parse_overrides
 from companion.config.shipped import named_file, names
 from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import read_document
+from companion.control.trial import try_law
 from companion.sitl_config.distributions import Laboratory, check_world, take_ranges
 from companion.sitl_config.world import World
 
@@ -52,6 +54,7 @@ def load_sitl(
 
     Raises:
         ConfigError: one message per problem of all files.
+        PluginError: the control law cannot be used, or failed its trial (`companion.control.trial`).
     """
     lines: list[str] = []
     flight = simulated = None
@@ -65,6 +68,8 @@ def load_sitl(
         lines += [line for line in error.lines if line not in lines]
     if flight is None or simulated is None:
         raise ConfigError(lines)
+    first_deg, second_deg = flight.mission.start.arm_deg
+    try_law(flight.controller, flight.vehicle, (math.radians(first_deg), math.radians(second_deg)))
     truth, laboratory = simulated
     if lines := list(_faults_of_absent_parts(truth, flight.vehicle)):
         raise ConfigError(lines)

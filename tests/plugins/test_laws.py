@@ -17,6 +17,8 @@ from companion.config.loader import load_flight, logged_flight
 from companion.model.codec import fingerprint
 from companion.model.types import Inputs, Outputs, Sent
 from companion.plugins import PluginError
+from companion.sitl_config.loader import load_sitl
+from sitl.campaigns.flights import fly_to_end, row_of
 from tests.plugins.installed import LAW, on_path, write_law
 
 
@@ -122,3 +124,66 @@ def test_a_log_is_not_replayed_without_its_law(tmp_path: Path) -> None:
         check_replayable(log_by("lab-a", "1.0"))
     with pytest.raises(PluginError, match=r"^control law 'lift': is not installed"):
         logged_flight(config_json)
+
+
+STEP = """
+    def step(self, dt_s, state, reference, vertical_scale):
+        wrench = super().step(dt_s, state, reference, vertical_scale)
+        """
+REPLACE = "from msgspec.structs import replace\n"
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        ("\n    def __init__(self, config):\n        pass\n", "cannot be built: TypeError: Lift.__init__() takes 2 "),
+        ("\n    __slots__ = ()\n    def __init__(self, *_):\n        1 / 0\n", "cannot be built: ZeroDivisionError: division"),
+        ("\n    def step(self, state):\n        pass\n", "step raises TypeError: Lift.step() takes 2 positional arguments"),
+        ("\n    step = None\n", "step raises TypeError: 'NoneType' object is not callable"),
+        (STEP + "return wrench.collective_n\n", "step returns a float, not a companion.control.types.Wrench"),
+        (STEP + "return replace(wrench, collective_n=float('nan'))\n", "step returns collective_n = nan, which is not finite"),
+        (STEP + "return replace(wrench, arm_torque_nm=(0.0,))\n", "of length 2, got 1 - at `$.arm_torque_nm`"),
+        (STEP + "return replace(wrench, arm_torque_nm=[0.0, 0.0])\n", "step returns a Wrench with a list in the place of a tuple"),
+        (STEP + "return replace(wrench, log=replace(wrench.log, rho=float('inf')))\n", "step returns log.rho = inf, which"),
+        (STEP + "return replace(wrench, attitude_wxyz=(0.0, 0.0, 0.0, 0.0))\n", "attitude_wxyz of norm 0, expected 1"),
+        (STEP + "return replace(wrench, collective_n=-1.0)\n", "step returns collective_n = -1, expected 0 or more"),
+        (STEP + "import time; time.sleep(0.006)\n        return wrench\n", "ms or more (limit 5 ms, one tick)"),
+    ],
+)  # fmt: skip
+def test_one_that_fails_its_trial_is_refused_by_name_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], code: str, reason: str
+) -> None:
+    write_law(tmp_path, REPLACE + LAW + code)
+    with on_path(tmp_path):
+        assert main(["check", "hover", "--plan-only", "--controller", "lift"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.startswith("control law 'lift' (lab-a 1.0): ")
+    assert reason in err
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["fly hover --sitl --controller lift", "check hover --sitl --controller lift", "compare --controllers lift"],
+)
+def test_one_that_fails_its_trial_is_refused_before_anything_is_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    write_law(tmp_path, LAW + "\n    step = None\n")
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    with on_path(tmp_path):
+        assert main(command.split()) == 2
+    assert "step raises TypeError" in capsys.readouterr().err
+    assert [path for path in sorted(tmp_path.iterdir()) if path.name != "__pycache__"] == before
+
+
+def test_one_that_raises_in_the_air_ends_the_flight_as_every_exception_of_the_core_does(tmp_path: Path) -> None:
+    """A campaign reports the flight as lost. Over the wires the guardian lands: tests/flights/test_guardian.py."""
+    code = "if 0.5 < state.position_world_m[2] < 0.9:\n            raise RuntimeError('stuck')\n        return wrench\n"
+    write_law(tmp_path, LAW + STEP + code)
+    with on_path(tmp_path):
+        flown = fly_to_end(load_sitl("hover", controller_law="lift"))
+        row, _ = row_of(flown.config, flown.result, None, flown.error)
+    assert (row["outcome"], row["error"]) == ("lost", "RuntimeError: stuck")

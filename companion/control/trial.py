@@ -1,0 +1,120 @@
+"""The trial of a control law on the ground: a law that cannot be built, raises or returns a malformed command is refused."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from itertools import product
+from typing import Any
+
+import msgspec
+from msgspec.structs import replace
+
+from companion.config.controller import ControllerConfig, law_class
+from companion.config.vehicle import Vehicle
+from companion.control.types import Law, PlantState, Wrench
+from companion.model.constants import TICK_PERIOD_S
+from companion.model.types import IDENTITY_QUAT, Reference, Vec2, Vec3
+from companion.plugins import CONTROL_LAWS, find, one_line
+
+HOVER_THRUST = 0.5
+"""Normalised hover thrust of a trial for a vehicle file without one."""
+_ZERO: Vec3 = (0.0, 0.0, 0.0)
+AT_REST = PlantState(
+    position_world_m=(0.0, 0.0, 1.0),
+    velocity_world_m_s=_ZERO,
+    acceleration_world_m_s2=_ZERO,
+    attitude_wxyz=IDENTITY_QUAT,
+    angular_rate_body_rad_s=_ZERO,
+    arm_rad=(0.0, 0.0),
+    arm_rate_rad_s=(0.0, 0.0),
+)
+"""The vehicle at rest, 1 m above the origin."""
+HOVER = Reference(
+    position_world_m=AT_REST.position_world_m,
+    velocity_world_m_s=_ZERO,
+    acceleration_world_m_s2=_ZERO,
+    yaw_rad=0.0,
+    yaw_rate_rad_s=0.0,
+    arm_rad=(0.0, 0.0),
+    arm_rate_rad_s=(0.0, 0.0),
+    arm_acceleration_rad_s2=(0.0, 0.0),
+    jerk_world_m_s3=_ZERO,
+)
+"""The reference of a vehicle that stays as in `AT_REST`."""
+
+
+def build_law(config: ControllerConfig, vehicle: Vehicle) -> Law:
+    """Return a new instance of the configured law.
+
+    Raises:
+        PluginError: the law is not installed, or cannot be built.
+    """
+    try:
+        law: Law = law_class(config.law)(config, vehicle, vehicle.airframe.hover_thrust or HOVER_THRUST)
+    except Exception as error:
+        raise find(CONTROL_LAWS, config.law).error(f"cannot be built: {one_line(error)}") from error
+    return law
+
+
+def try_law(config: ControllerConfig, vehicle: Vehicle, start_arm_rad: Vec2) -> None:
+    """Build the law and run it for some ticks at hover: on the ground and in the air, with and without a sample of force.
+
+    Raises:
+        PluginError: the law is not installed, cannot be built, raises, returns a malformed command, or needs more than a tick.
+    """
+    plugin = find(CONTROL_LAWS, config.law)
+    law = build_law(config, vehicle)
+    reference = replace(HOVER, arm_rad=start_arm_rad)
+    fastest_s = math.inf
+    for force, airborne, offset_m in product((None, (0.0, 0.0, -1.0)), (False, True), (0.0, 0.1)):
+        position: Vec3 = (offset_m, 0.0, 1.0)
+        state = replace(
+            AT_REST, position_world_m=position, arm_rad=start_arm_rad, force_ext_world_n=force, airborne=airborne
+        )
+        begin_s = time.perf_counter()
+        try:
+            law.hover_thrust = HOVER_THRUST
+            wrench = law.step(TICK_PERIOD_S, state, reference, 1.0 if airborne else 0.5)
+        except Exception as error:
+            raise plugin.error(f"step raises {one_line(error)}") from error
+        fastest_s = min(fastest_s, time.perf_counter() - begin_s)
+        problem = problem_of(wrench)
+        if problem is not None:
+            raise plugin.error(f"step returns {problem}")
+    if fastest_s > TICK_PERIOD_S:
+        raise plugin.error(f"step takes {fastest_s * 1e3:.1f} ms or more (limit {TICK_PERIOD_S * 1e3:g} ms, one tick)")
+
+
+def problem_of(wrench: object) -> str | None:
+    """Return why a command cannot be sent: wrong type or shape, a number that is not finite, no attitude. None if it can."""
+    if not isinstance(wrench, Wrench):
+        return f"a {type(wrench).__name__}, not a companion.control.types.Wrench"
+    try:
+        plain = msgspec.to_builtins(wrench)
+        converted = msgspec.convert(plain, Wrench)
+    except (TypeError, ValueError) as error:
+        return f"a malformed Wrench: {one_line(error)}"
+    for path, value in _numbers(plain):
+        if not math.isfinite(value):
+            return f"{path} = {value}, which is not finite"
+    if converted != wrench:
+        return "a Wrench with a list in the place of a tuple"
+    norm = math.hypot(*wrench.attitude_wxyz)
+    if abs(norm - 1.0) > 1e-6:
+        return f"attitude_wxyz of norm {norm:g}, expected 1"
+    if wrench.collective_n < 0.0:
+        return f"collective_n = {wrench.collective_n:g}, expected 0 or more"
+    return None
+
+
+def _numbers(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _numbers(inner, f"{path}.{key}".lstrip("."))
+    elif isinstance(value, (list, tuple)):
+        for index, inner in enumerate(value):
+            yield from _numbers(inner, f"{path}[{index}]")
+    elif value is not None:
+        yield path, value
