@@ -9,6 +9,7 @@ from pathlib import Path
 
 from companion import plugins
 from companion.config.controller import law_class
+from companion.config.explain import schema_of
 from companion.config.shipped import FILES
 
 
@@ -40,6 +41,7 @@ def on_path(site: Path) -> Iterator[None]:
 def _forget() -> None:
     plugins.installed.cache_clear()
     law_class.cache_clear()
+    schema_of.cache_clear()
 
 
 LAW = """
