@@ -24,7 +24,7 @@ _LAG_S = 0.05
 seconds.
 """
 _TIME_MIN_S, _TIME_MAX_S = 1.0, 6.0
-"""The estimate is a running mean over the time in the air, at least over the first and at most over the second of these times."""
+"""Minimum and maximum averaging time. The estimate is a running mean over the time in the air, limited to this range."""
 _TILT_COS_MIN = math.cos(math.radians(15.0))
 _ACCELERATION_MAX_M_S2 = 1.5
 _ACCELERATION_LOWPASS_S = 0.05

@@ -81,7 +81,7 @@ class ModelBasedLaw:
         force_world_n: Vec3,
         payload_estimate_kg: float | None = None,
     ) -> Wrench:
-        """Advance F_d and return the tick's log record. Fields of adaptive laws are 0."""
+        """Advance F_d and return the tick's log record. Fields that only adaptive laws use are 0."""
         self._desired.advance(dt_s, force_world_n)
         sent = self._actuation
         (fx, fy, fz), (t1, t2) = sent.force_world_n, sent.arm_torque_nm

@@ -45,7 +45,7 @@ class Turn(NamedTuple):
     command: OperatorCommand
     """Command for the core."""
     asked: GroundCommand | None
-    """The ground station's command that this tick executes and answers."""
+    """The ground station's command that this tick executes and answers; None if there is none."""
     refused: str | None = None
     """Why the command is refused before it reaches the core; None if the core decides."""
 

@@ -46,7 +46,7 @@ class Wire(Protocol):
         """Return the descriptor to wait on."""
 
     def send(self, data: bytes) -> None:
-        """Send one message; drop it if the transport does not take it."""
+        """Send one message; drop it if the transport does not accept it."""
 
     def receive(self) -> list[bytes]:
         """Return all data that has arrived."""

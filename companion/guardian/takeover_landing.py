@@ -32,9 +32,11 @@ HEARTBEAT_PERIOD_S = 1.0
 ASK_PERIOD_S = 0.1
 """Period at which the guardian requests PX4's mode, which PX4 otherwise sends once a second."""
 LINK_TIMEOUT_S = 1.0
-"""Timeout for PX4's first message, which reveals its address on a `udpin` link; after it the landing starts without a message."""
+"""Timeout for PX4's first message, which reveals its address on a `udpin` link. After the timeout the landing starts without a
+message.
+"""
 MODE_TIMEOUT_S = 0.15
-"""Timeout for PX4's mode, which is requested first because a pilot may be flying; after it PX4 is commanded to land."""
+"""Timeout for PX4's mode, which is requested first because a pilot may be flying. After the timeout PX4 is commanded to land."""
 REPEAT_S = 0.25
 """Period at which a command is repeated until the status shows its effect."""
 ZERO_THRUST_PERIOD_S = 0.02
@@ -44,7 +46,7 @@ TOUCH_DOWN = "touchdown"
 DISARMED_AFTER_S = 1.5
 """Time after the takeover for which `disarmed` is ignored: PX4 reports it once a second, so it may be older than the takeover."""
 ATTEMPTS_MAX = 4
-"""Number of landing attempts of 30 s each, while PX4 sends messages, after which the vehicle counts as lost."""
+"""Maximum number of landing attempts, 30 s each, while PX4 sends messages. After the last one the vehicle counts as lost."""
 _STREAMS = (
     (mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 50.0),
     (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, 50.0),

@@ -255,7 +255,7 @@ def _arm_limits(mission: Mission, vehicle: Vehicle) -> ArmLimits:
 
 
 def _part(progress: Progress | None, done: int, count: int) -> Progress | None:
-    """Return a progress callback that converts the progress of one path into that of all."""
+    """Return a progress callback that converts the progress of one path into the progress of all paths."""
     return None if progress is None else lambda share: progress((done + share) / count)
 
 

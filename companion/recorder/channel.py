@@ -36,7 +36,7 @@ class Channel:
         self._thread.start()
 
     def packets(self) -> Iterator[bytes | None]:
-        """Yield packets in order, and None when none arrived for a flush period; ends with the channel."""
+        """Yield packets in order, and None when no packet has arrived for a flush period; end when the channel ends."""
         while True:
             try:
                 packet = self._packets.get(timeout=FLUSH_PERIOD_S)

@@ -55,7 +55,7 @@ class TelemetryThread:
         self.session = secrets.token_hex(8)
         """Session id of this flight, which commands must name."""
         self.dropped = 0
-        """Packets that the queue had no room for."""
+        """Number of packets that the queue had no room for."""
         self._config_json = config_json
         self._simulated = simulated
         self._flight = flight

@@ -78,7 +78,7 @@ class RecorderSide:
     state: Callable[[], tuple[int, str | None]]
     """Returns the number of lost records, and why recording stopped."""
     ending: Callable[[], bool | None]
-    """Returns None during the flight, then whether it ended normally."""
+    """Returns None during the flight, and afterwards whether the flight ended normally."""
     counts: Counts
     """Updated while the session runs."""
 

@@ -79,7 +79,7 @@ def servo_error(a: ArmTracker, _: None) -> Values | None:
 
 
 def arm_let_go(a: ArmTracker, _: None) -> Values | None:
-    """Fires if a servo's bus watchdog had switched its torque off."""
+    """Fires if a servo's bus watchdog has switched the torque off."""
     arm = a.arm
     return HOLDS if arm is not None and (arm.hardware_error[0] | arm.hardware_error[1]) & WATCHDOG_RESTARTED else None
 

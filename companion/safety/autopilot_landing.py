@@ -249,7 +249,7 @@ class AutopilotLanding:
         return high or sink_m_s is None or sink_m_s > STILL_M_S
 
     def _watch_zero_thrust(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
-        """Handle a vehicle in OFFBOARD without thrust for `FORCE_DISARM_S` whose landing PX4 has not detected."""
+        """Handle a vehicle that has been in OFFBOARD with zero thrust for `FORCE_DISARM_S` although PX4 has detected no landing."""
         since_s = self.zero_thrust_since_s
         if not in_offboard(i.status):
             since_s = None

@@ -71,7 +71,7 @@ class FlightTracker:
         return self._inputs is not None and seems_flipped(self._inputs)
 
     def stop_s(self, vehicle: VehicleState) -> float:
-        """Return the stopping time; multiplied by the velocity it is the displacement to the predicted stop after a fault."""
+        """Return the stopping time, s; the velocity multiplied by it is the displacement to the predicted stop after a fault."""
         vx, vy, vz = vehicle.velocity_world_m_s
         return self._stop.time_s(math.sqrt(vx * vx + vy * vy + vz * vz))
 

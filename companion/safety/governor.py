@@ -220,7 +220,9 @@ class Governor:
         return self._set.holds(stop) and self._admits_restrained(p, v, speed)
 
     def _admits_restrained(self, p: Vec3, v: Vec3, speed: float) -> bool:
-        """Return whether p and the end of straight braking lie in the present set; without restraint it is enough that p does."""
+        """Return whether p and the end of straight braking lie in the present set; without restraint it is enough that p lies in
+        it.
+        """
         return self._admits(p) and (not self._restrained or self._admits(_ahead(p, v, speed * self._half_per_a)))
 
     def _admits(self, p: Vec3) -> bool:
@@ -322,7 +324,9 @@ class Governor:
         return (px + half * (vx + nx), py + half * (vy + ny), pz + half * (vz + nz)), (nx, ny, nz)
 
     def _nearest(self, p: Vec3, inside_m: float) -> Vec3:
-        """Return a point of the present set close to the nearest: alternating projections, then a step from a point inside."""
+        """Return a point of the present set close to the one nearest to p: alternating projections, then a step from a point
+        inside.
+        """
         low, anchor = self._set.low_m, self._set.anchor_m
         high = (self._set.high_m[0], self._set.high_m[1], self._top_m)
         radius = max(0.0, self._radius_m - inside_m)

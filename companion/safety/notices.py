@@ -74,7 +74,7 @@ TOUCHDOWN = Notice("touchdown", _INFO, _NOMINAL, "the vehicle is on the ground")
 NO_TOUCHDOWN = Notice("no_touchdown", _CRITICAL, _PX4_LANDS, "no touchdown 5 s after the plan's end: PX4 lands")
 DISARM_REFUSED = Notice(
     "disarm_refused", _CRITICAL, _NOMINAL,
-    "PX4 did not disarm within 8 s, or left OFFBOARD before: PX4 lands. If the vehicle had not "
+    "PX4 did not disarm within 8 s, or left OFFBOARD before it was disarmed: PX4 lands. If the vehicle had not "
     "lifted, the crew is asked to disarm it, and the guardian takes over",
 )  # fmt: skip
 AUTOPILOT_LANDING = Notice("autopilot_landing", _CRITICAL, _PX4_LANDS, "progress of the landing by PX4")

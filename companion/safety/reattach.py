@@ -12,10 +12,10 @@ from companion.safety.rotor_stop import LOW_WITHIN_M, OWN_MODES, fresh_pose
 
 
 def found_armed(i: Inputs, clearance_m: float) -> tuple[bool, str]:
-    """Return whether the vehicle is treated as flying, and a message with observation and action.
+    """Return whether the vehicle is treated as flying, and a message with the observation and the action.
 
-    A vehicle on the ground with turning rotors is disarmed. It counts as flying if a pilot selected its mode, if the mode is neither
-    OFFBOARD nor LAND, or if motion capture does not measure its height.
+    A vehicle on the ground with turning rotors is disarmed. It counts as flying if a pilot selected its mode, if the mode is
+    neither OFFBOARD nor LAND, or if motion capture does not measure its height.
 
     Args:
         i: inputs with PX4 armed.

@@ -53,9 +53,11 @@ class Rule:
     hold_time: float | str = 0.0
     """Time for which the condition must hold, s, or the key of `safety:` with this time."""
     ground: SafetyAction | None
-    """Action before the rotors may lift; LAND and more severe actions cancel the start. None if the rule is not evaluated there."""
+    """Action before the rotors may lift; LAND and more severe actions cancel the start. None if the rule is not evaluated on the
+    ground.
+    """
     air: SafetyAction | None
-    """Action while the rotors may lift. None if the rule is not evaluated there."""
+    """Action while the rotors may lift. None if the rule is not evaluated in the air."""
     message: str
     """Text of the event, a format string for the predicate's values."""
     severity: Severity | None = None

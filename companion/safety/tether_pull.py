@@ -19,7 +19,7 @@ HORIZONTAL_N = 0.7
 VERTICAL_N = 2.0
 """Standard deviation of the vertical residual: 7 % of the hover thrust."""
 CERTAIN = 3.0
-"""Number of standard deviations of the fit at which a pull counts."""
+"""Number of standard deviations of the fit from which a pull is accepted as one."""
 RELEASE = 0.6
 """A pull ends when it falls below this fraction of its threshold."""
 SIDEWAYS_N = 6.0

@@ -29,7 +29,7 @@ ALONE_S = 0.4
 RELIEF_S = 1.0
 """Time in which thrust is reduced from full to zero."""
 RELIEF_SINK_MAX_M_S = 0.15
-"""A vehicle that sinks faster while thrust is reduced is flying."""
+"""A vehicle that sinks faster than this while thrust is reduced is still flying."""
 SINK_WINDOW_S = 0.15
 MOCAP_FRESH_S = 0.3
 

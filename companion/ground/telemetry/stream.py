@@ -42,7 +42,7 @@ TEXT_MAX = 300
 _TEXT_MAX_BYTES = 1600
 """`TEXT_MAX` as a limit on the JSON text, in which a character may take twelve bytes."""
 _HEALTH_WINDOW_S = 1.0
-"""Window whose worst values the health shows, so that a problem in a single tick is visible."""
+"""Length of the time window whose worst values the health shows, so that a problem in a single tick is visible."""
 
 T = TypeVar("T", bound=tuple[float, ...])
 
