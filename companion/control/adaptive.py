@@ -82,8 +82,8 @@ class Adaptation:
 
 
 class AccelerationFilter:
-    """Low-pass filter of chi'' of the active rows, exact for a held input: measured for the base, differentiated numerically for the
-    joints.
+    """Low-pass filter of the acceleration chi'' of the active rows, exact for a held input. The acceleration of the base is
+    measured, that of the joints differentiated numerically.
     """
 
     def __init__(self, cutoff_hz: float) -> None:

@@ -107,7 +107,7 @@ class Dynamics:
         """Return M, C chi' and g at a state. They do not depend on the position.
 
         Args:
-            rotation: rotation matrix from body to world of the three angles.
+            rotation: rotation matrix from body to world that corresponds to the three angles.
             roll_pitch_yaw_rad: ZYX; |pitch| < 90 deg.
             angle_rad: joint angles.
             chi_rate: chi'; rows 3-5 are the rates of roll, pitch, yaw.

@@ -80,7 +80,7 @@ class HoverThrust:
 
         Args:
             dt_s: time since the last step.
-            thrust_sent: normalised thrust sent in the last tick. The estimate does not change while it is at its limits.
+            thrust_sent: normalised thrust sent in the last tick. The estimate does not change while the thrust is at its limits.
             state: state of this tick.
             airborne: whether only the rotors carry the vehicle.
             carrying: whether a payload was caught; without a force sensor the estimate is then frozen.
@@ -105,7 +105,7 @@ class HoverThrust:
 
 
 def off_the_ground(inputs: Inputs, ground_clearance_m: float) -> bool:
-    """Return whether only the rotors carry the vehicle, according to PX4's landed state and to height."""
+    """Return whether only the rotors carry the vehicle, according to PX4's landed state and the height."""
     if inputs.vehicle is None or inputs.status is None or inputs.status.landed is not LandedState.IN_AIR:
         return False
     return inputs.vehicle.position_world_m[2] > ground_clearance_m + AIRBORNE_M

@@ -42,7 +42,7 @@ class LoadAdaptation:
 
         self._held = HoldTable(held)
         self.force_n: Vec3 = (0.0, 0.0, 0.0)
-        """Estimated force that the rotors must produce in addition, world frame."""
+        """Estimated additional force that the rotors must produce, world frame."""
         self.moments_kg_m: Vec2 = (0.0, 0.0)
         """Estimated first moments of the links about their joints, in addition to the nominal ones."""
         self.friction_nm: Vec2 = (0.0, 0.0)

@@ -55,7 +55,7 @@ class FlightCore:
         self._state = self._parameters.initial_state()
         self._situation = Situation(False, False, None)
         self._situation_stage: Stage | None = None
-        """The stage for which the situation was made."""
+        """The stage for which the situation was built."""
         self._tether_watched = False
         self._last_t_s: float | None = None
         self._pose_s = -math.inf
@@ -116,7 +116,7 @@ class FlightCore:
         )
 
     def _dt_s(self, t_s: float) -> float:
-        """Return the time since the previous tick, limited."""
+        """Return the time since the previous tick, s, limited to the range from `_DT_MIN_S` to `_DT_MAX_S`."""
         last_s, self._last_t_s = self._last_t_s, t_s
         if last_s is None:
             return TICK_PERIOD_S

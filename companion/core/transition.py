@@ -31,7 +31,7 @@ class Parameters:
     clearance_m: float
     """Height of the body's origin when the vehicle is on the ground."""
     tilt_max_rad: float
-    """`safety.tilt_abort_deg`."""
+    """`safety.tilt_abort_deg`, in rad."""
     fold_rad: Vec2
     times: LadderTimes
     waits_for_start: bool

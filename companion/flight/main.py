@@ -279,7 +279,7 @@ async def fly(
         out: folder of the flight.
         channel: channel to the launcher.
         guardian_channel: channel to the guardian; None if there is no guardian.
-        sitl: whether the devices are those of the simulated world.
+        sitl: whether the devices are simulated.
 
     Raises:
         DeviceError: a device is missing or does not meet the requirements; nothing was armed.

@@ -32,7 +32,7 @@ class Settings:
     clearance_m: float
     """`airframe.ground_clearance_m`."""
     tilt_max_rad: float
-    """`safety.tilt_abort_deg`."""
+    """`safety.tilt_abort_deg`, in rad."""
     timeout_s: float
     """`safety.guardian_timeout_s`."""
 

@@ -44,7 +44,7 @@ LINK_FRESH_S = 2.5
 TOUCH_DOWN = "touchdown"
 """Text of `LandingStep` at touchdown."""
 DISARMED_AFTER_S = 1.5
-"""Time after the takeover for which `disarmed` is ignored: PX4 reports it once a second, so it may be older than the takeover."""
+"""Time after the takeover for which `disarmed` is ignored: PX4 reports it once a second, so the report may predate the takeover."""
 ATTEMPTS_MAX = 4
 """Maximum number of landing attempts, 30 s each, while PX4 sends messages. After the last one the vehicle counts as lost."""
 _STREAMS = (
@@ -75,7 +75,7 @@ class TakeoverLanding:
     Args:
         last_heartbeat: newest heartbeat of the flight process.
         clearance_m: height of the body's origin when the vehicle rests on the ground.
-        tilt_max_rad: `safety.tilt_abort_deg`.
+        tilt_max_rad: `safety.tilt_abort_deg`, in rad.
         link: an open link.
         t_s: current flight clock.
         notify: called with each notice.
@@ -107,7 +107,9 @@ class TakeoverLanding:
         self.overturned = False
         """Whether the rotors were commanded to stop because the vehicle was flipped or tipped over."""
         self.landed: bool | None = None
-        """None during the landing; True if on the ground and disarmed (or PX4 does not answer); False if no landing was confirmed."""
+        """None during the landing; then True if the vehicle is on the ground (disarmed, or PX4 does not answer), False if no
+        landing was confirmed.
+        """
 
     @property
     def pose(self) -> MocapPose | None:
@@ -145,7 +147,7 @@ class TakeoverLanding:
             self._px4.take(t_s, message)
 
     def link_reopened(self) -> None:
-        """Request the message streams again in the next step: PX4 may have restarted, or the port is new to it."""
+        """Request the message streams again in the next step: PX4 may have restarted, or may not have sent to this port before."""
         self._spoken_s = None
 
     def step(self, t_s: float) -> None:

@@ -37,7 +37,9 @@ class VisionFilter:
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """All open devices of a flight. A device is None if the vehicle has none, or if PX4 was found armed and it could not be opened."""
+    """All open devices of a flight. A device is None if the vehicle does not have it, or if PX4 was found armed and the device
+    could not be opened.
+    """
 
     vision: VisionFilter
     autopilot: Autopilot
@@ -49,7 +51,7 @@ class Devices:
     failures: tuple[str, ...] = ()
     """Error lines of the devices that could not be opened, if PX4 was found armed."""
     ground: GroundLink | None = None
-    """None if MAVLink is not forwarded."""
+    """Link to a MAVLink ground station; None if MAVLink is not forwarded."""
 
 
 @dataclass(slots=True)

@@ -3,6 +3,6 @@
 Durations, positions and speed limits of the phases are in the mission file (configs/missions), also for the flight after a catch:
 the plan is made before take-off, and no phase reacts to a catch. To add a type of phase or a key, begin in
 `companion.config.mission`, then extend `plan`; `plan_builder` builds the tracks and chooses the profile of each move. `reference`
-has the shape of a motion over time, `minsnap` that of paths and `arm_motion` that of the arm. `active_plan` stops and resumes the
-plan, and `retract` and `plan.landing_from` replace it. `sample_check` has the limits that a plan must respect.
+defines the shape of a motion over time, `minsnap` plans paths and `arm_motion` plans the arm's motion. `active_plan` stops and
+resumes the plan, and `retract` and `plan.landing_from` replace it. `sample_check` defines the limits that a plan must respect.
 """

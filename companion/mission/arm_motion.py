@@ -17,11 +17,13 @@ from companion.mission.reference import Shape
 from companion.model.types import Vec2
 
 _DECIMALS = 12
-"""Times of the profile are rounded, so that a replay on another computer, whose roots differ in the last bit, builds the same plan."""
+"""Decimal places to which the times of the profile are rounded, so that a replay on another computer, whose roots differ in the
+last bit, builds the same plan.
+"""
 
 
 JERK_BOUND = 32.0
-"""jerk duration^3 / distance of the fastest move that is limited by jerk alone."""
+"""Value of jerk * duration^3 / distance for the fastest move that is limited by jerk alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +60,9 @@ class JerkLimited:
 
 
 SPEED_ENOUGH, ACCELERATION_ENOUGH, JERK_ENOUGH = 20.0, 400.0, 2.0e4
-"""Limits in units of the whole move and its shortest duration. With these limits alone a move would take an eighth of that duration."""
+"""Largest limits passed to Ruckig, in units of the whole move and its shortest duration. With these limits alone a move would take
+an eighth of that duration.
+"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,10 +39,10 @@ _WORTH = 1e-4
 """A smaller relative gain is ignored, so that rounding errors do not decide."""
 _SAMPLES = 150
 _MARGIN = 1.001
-"""Margin over the largest of `_SAMPLES` samples of a piece, which covers the true peak."""
+"""Factor on the largest of `_SAMPLES` samples of a piece, so that the true peak between the samples is covered."""
 _DECIMALS = 9
-"""Velocities, accelerations and jerks at the waypoints are rounded, so that a replay on another computer, whose linear algebra differs
-in the last bit, builds the same plan.
+"""Decimal places to which velocities, accelerations and jerks at the waypoints are rounded, so that a replay on another computer,
+whose linear algebra differs in the last bit, builds the same plan.
 """
 _KNOWN_MAX = 32
 

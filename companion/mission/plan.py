@@ -157,7 +157,7 @@ class Plan:
         return self.segments[index - 1 if index else 0]
 
     def _repeated(self, t_s: float, repeats: Repeats) -> Segment:
-        """Return the segment of a repetition that the second one stands in for."""
+        """Return the segment at a time within one of the repetitions that the second one stands in for."""
         before = repeats.before(t_s)
         shift_s = before * repeats.period_s
         # The shift is rounded: just after the seam the shifted time may lie just before it.

@@ -1,4 +1,4 @@
-"""Builds the three tracks of a plan, position, yaw and arm, one move after the other.
+"""Builds the three tracks of a plan (position, yaw and arm), one move after the other.
 
 The durations come from the mission file, and nothing here reacts to a catch.
 """

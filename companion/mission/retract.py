@@ -40,14 +40,16 @@ def retract_from(
     arm_fold_rad: Vec2,
     vehicle: Vehicle,
 ) -> Plan:
-    """Plan a stop and a slow return towards the anchor's vertical until the tether has `retract_slack_m` of slack, while the arm folds.
+    """Plan a stop and a slow return towards the anchor's vertical until the tether has `retract_slack_m` of slack, while the arm
+    folds.
 
-    Neither the distance from the anchor's vertical nor the height ever increases, and the path stays in the room. Two segments; a
-    landing follows.
+    Neither the distance from the anchor's vertical nor the height ever increases, and the path stays in the room. The plan has two
+    segments; a landing follows.
 
     Args:
         position_world_m: start of the reference: the last reference.
-        velocity_world_m_s: initial velocity; its components outward and up are removed, the rest is limited to `STOP_SPEED_MAX_M_S`.
+        velocity_world_m_s: initial velocity; its components outward and up are removed, the rest is limited to
+            `STOP_SPEED_MAX_M_S`.
         yaw_rad: kept constant.
         arm_rad: joint angles at the start, at rest.
         arm_fold_rad: joint angles at the end.

@@ -39,7 +39,7 @@ class TelemetryThread:
 
     Args:
         config_json: effective configuration of the flight.
-        simulated: whether the devices are those of the simulated world.
+        simulated: whether the devices are simulated.
         flight: connection to the flight process and to the log.
         recorder_state: returns the number of lost records, and why recording stopped; called from the thread.
     """

@@ -40,7 +40,9 @@ PAUSE_MIN_S, PAUSE_MAX_S = 0.2, 2.0
 END_TIMEOUT_S = 1.0
 """Timeout for the last messages of the session, if a broker is connected."""
 FLOOD_PER_S = 1500
-"""Refused messages per second that are processed at full speed; further ones at `FLOOD_STEP / FLOOD_PAUSE_S` a second."""
+"""Number of refused messages per second that are processed at full speed; further ones are processed at `FLOOD_STEP /
+FLOOD_PAUSE_S` a second.
+"""
 FLOOD_STEP, FLOOD_PAUSE_S = 30, 0.02
 _ACKS_MAX = 200
 

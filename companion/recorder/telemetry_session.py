@@ -72,7 +72,7 @@ class TelemetrySession:
     Args:
         config: effective configuration.
         session: random id of this flight.
-        simulated: whether the devices are those of the simulated world.
+        simulated: whether the devices are simulated.
         verifier: verifies commands; None if commands are not accepted.
         no_commands: why commands are not accepted.
     """
@@ -328,7 +328,7 @@ class TelemetrySession:
         refusals.text = text
 
     def _report_refusals(self, now_s: float) -> None:
-        """Report the first refusal of a reason at once and count the following, so that an attack does not flood the log."""
+        """Report the first refusal for each reason at once and count the following ones, so that an attack does not flood the log."""
         for reason, refusals in self._refusals.items():
             if not refusals.count or now_s - refusals.reported_s < REFUSAL_PERIOD_S:
                 continue

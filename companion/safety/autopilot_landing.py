@@ -102,13 +102,13 @@ class AutopilotLanding:
     """One landing in LAND mode."""
 
     start_s: float
-    """Time on the flight clock at its start."""
+    """Time on the flight clock at the start of the landing."""
     clearance_m: float
     """Height of the body's origin when the vehicle is on the ground."""
     pilot: bool
     """Whether a pilot has taken over; the landing is then only monitored."""
     pose_s: float
-    """Time on the flight clock of the newest pose that PX4 received; if -inf, its estimate does not count until poses arrive."""
+    """Time on the flight clock of the newest pose that PX4 received; if -inf, PX4's estimate does not count until poses arrive."""
     stop: RotorStop
     height: HeightEvidence
     sinking: Sinking = field(default_factory=Sinking)
@@ -137,7 +137,7 @@ class AutopilotLanding:
         Args:
             start_s: time on the flight clock.
             clearance_m: height of the body's origin when the vehicle is on the ground.
-            tilt_max_rad: `safety.tilt_abort_deg`; a vehicle that lies on the floor beyond it is tipped over.
+            tilt_max_rad: `safety.tilt_abort_deg`, in rad; a vehicle that lies on the floor beyond it is tipped over.
             pilot: a pilot has taken over. PX4's mode shows a later takeover.
             pose_s: time on the flight clock of the newest pose that PX4 received; -inf if unknown.
             flipped: the vehicle is known to have been flipped for long enough.

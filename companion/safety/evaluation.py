@@ -61,8 +61,9 @@ class Evaluation:
 
         Args:
             t_s: flight clock.
-            airborne: evaluate only rules with an action in the air, and request that action.
-            waiting: evaluate only rules with `while_waiting`.
+            airborne: if True, evaluate the rules with an action in the air and request that action; if False, those with an action
+                on the ground.
+            waiting: if True, evaluate only rules with `while_waiting`.
         """
         if airborne:
             rows = self._air_waiting if waiting else self._air

@@ -185,6 +185,6 @@ def tether_wound(f: FlightTracker, turns_max: float) -> Values | None:
 
 
 def tether_separated(f: FlightTracker, _: None) -> Values | None:
-    """Fires if the distance to the anchor exceeds the tether's length, without a pull."""
+    """Fires if the distance to the anchor exceeds the tether's length although the tether does not pull."""
     t = f.tether
     return (t.range_m,) if t is not None and t.separated else None

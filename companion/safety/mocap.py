@@ -291,7 +291,7 @@ def estimate_disagrees(m: MocapTracker, disagreement_m: float) -> Values | None:
 
 
 def yaw_disagrees(m: MocapTracker, disagreement_rad: float) -> Values | None:
-    """Fires if PX4's yaw and the pose's differ by more than the threshold."""
+    """Fires if the yaw of PX4 and that of the pose differ by more than the threshold."""
     if m.compared is None:
         return None
     pose, vehicle = m.compared[0].attitude_wxyz, m.compared[1].attitude_wxyz

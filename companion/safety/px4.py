@@ -155,7 +155,7 @@ def battery_below(p: Px4Tracker, remaining_min: float) -> Values | None:
 
 
 def battery_voltage(p: Px4Tracker, voltage_min_v: float | None) -> Values | None:
-    """Fires if the voltage is below the threshold, if there is one."""
+    """Fires if a voltage threshold is configured and the voltage is below it."""
     voltage_v = p.status.battery_voltage_v if p.status is not None else None
     below = voltage_v is not None and voltage_min_v is not None and voltage_v < voltage_min_v
     return (voltage_v, voltage_min_v) if below else None

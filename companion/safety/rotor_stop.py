@@ -120,7 +120,7 @@ class RotorStop:
 
         Args:
             clearance_m: height of the body's origin when the vehicle is on the ground.
-            tilt_max_rad: `safety.tilt_abort_deg`.
+            tilt_max_rad: `safety.tilt_abort_deg`, in rad.
             pose_s: time on the flight clock of the newest pose that PX4 received; -inf if unknown.
             flipped: the vehicle is known to have been flipped for long enough.
         """

@@ -51,7 +51,7 @@ class Rule:
     tracked_by: tuple[str, ...] = ()
     """Keys of thresholds that the tracker applies itself."""
     hold_time: float | str = 0.0
-    """Time for which the condition must hold, s, or the key of `safety:` with this time."""
+    """Time for which the condition must hold, s, or the key of `safety:` that gives this time."""
     ground: SafetyAction | None
     """Action before the rotors may lift; LAND and more severe actions cancel the start. None if the rule is not evaluated on the
     ground.

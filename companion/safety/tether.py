@@ -45,7 +45,7 @@ def allowed_m(tether: Tether) -> float:
 
 
 class Winding:
-    """Counts the turns of a direction from the first one."""
+    """Counts the turns of a direction, starting at the first direction given."""
 
     __slots__ = ("_last_rad", "turns")
 

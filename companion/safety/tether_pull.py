@@ -1,10 +1,10 @@
 """Pull of the tether, estimated from the residual force on the vehicle.
 
-The residual is the disturbance of the whole vehicle minus the force at the net: a caught payload is in both and cancels. The rest is
-wind, errors of the thrust model, and the tether. Errors of the thrust lie along the rotors' axis, nearly vertical, so the vertical part
-of the residual has less weight than the horizontal: the pull is the weighted least-squares fit of a force along the line. For the same
-reason a payload is not mistaken for the tether when the force sensor is lost: it only pulls down, whereas a pull along the line also
-has a horizontal part.
+The residual is the disturbance of the whole vehicle minus the force at the net: a caught payload is in both and cancels. The rest
+is wind, errors of the thrust model, and the tether. Errors of the thrust lie along the rotors' axis, nearly vertical, so the
+vertical part of the residual has less weight than the horizontal part: the pull is the weighted least-squares fit of a force along
+the line. For the same reason a payload is not mistaken for the tether when the force sensor is lost: it only pulls down, whereas a
+pull along the line also has a horizontal part.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SIDEWAYS_N = 6.0
 _FLAT, _STEEP = 1.0 / HORIZONTAL_N**2, 1.0 / VERTICAL_N**2
 GROWTH_S = 0.3
 GROWTH_N_PER_M = 10.0
-"""Slope of the pull over the range at which the line counts as tightening."""
+"""Slope of the pull over the range (the distance to the anchor) from which the line counts as tightening."""
 GROWTH_SPREAD_M2 = 1e-6
 """Below this variance of the range no slope can be estimated."""
 
@@ -83,7 +83,7 @@ class PullEstimate:
         disturbance_world_n: Vec3 | None,
         tool_force_world_n: Vec3 | None,
     ) -> None:
-        """Update the pull; `towards_anchor` is the unit vector from the attachment to the anchor, forces are in the world frame, N."""
+        """Update the pull; `towards_anchor` is the unit vector from the attachment to the anchor; forces are in the world frame, N."""
         if disturbance_world_n is None:
             if self._f is not None:
                 self.forget()

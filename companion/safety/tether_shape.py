@@ -14,14 +14,14 @@ from companion.config.vehicle import Vehicle
 from companion.model.types import Vec2, Vec3
 
 _NEVER = 1.0
-"""Length, m, to which a line that does not leave the disk is followed."""
+"""Length, m, over which a line that does not leave the disk is followed."""
 
 
 def steepest_slope(level_m: float, drop_m: float, chord_m: float, slack_m: float) -> Vec2:
     """Return the unit direction (towards the anchor's vertical, up) of the hanging line at the vehicle.
 
-    A parabola over the horizontal span h with the sag s has the length c + 8/3 s^2 h^2 / c^3 (c the chord, flat enough), so s =
-    sqrt(3/8 slack c^3) / h, and the slope at its end is that of the chord minus 4 s / h.
+    A parabola over the horizontal span h with the sag s has the length c + 8/3 s^2 h^2 / c^3 (c is the chord; the parabola is
+    assumed to be flat), so s = sqrt(3/8 slack c^3) / h, and the slope at its end is that of the chord minus 4 s / h.
 
     Args:
         level_m: horizontal distance to the anchor, h.
@@ -109,7 +109,9 @@ class Clearance:
         return max(l1, net_m + self._net_m)
 
     def _arm_m(self, d: Vec3, reach_m: float) -> float:
-        """Return the distance of a ray from the slab |y - y_shoulder| <= net radius, within `reach_m` of the shoulder, in its plane."""
+        """Return the distance, in the arm's plane, of a ray from the arm: a slab |y - y_shoulder| <= net radius within `reach_m` of
+        the shoulder.
+        """
         px, py, pz = self._p
         sx, sy, sz = self._shoulder
         dx, dy, dz = d

@@ -14,7 +14,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 AUTHORITY_DAYS = 3650
 _EARLY = datetime.timedelta(days=1)
-"""Time by which the validity of a certificate begins early: the clock of a computer without an RTC may be behind."""
+"""Time by which a certificate's validity begins before it is issued: the clock of a computer without an RTC may be behind."""
 
 
 class CertificateError(Exception):

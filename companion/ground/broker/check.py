@@ -38,7 +38,7 @@ class CheckResult:
     """Permissions of a login at a broker."""
 
     tls: str | None
-    """TLS version, or None."""
+    """TLS version; None without TLS."""
     certificate_ends: str | None
     rights: tuple[TopicRights, ...]
     vehicles: tuple[str, ...]

@@ -55,7 +55,7 @@ class Limits(NamedTuple):
 
     age_max_s: float
     per_s: int
-    """Accepted commands per operator and second."""
+    """Maximum number of accepted commands per operator and second."""
 
 
 LIMITS = {
@@ -346,7 +346,7 @@ class Verifier:
 
 
 def _parsed(payload: bytes) -> Command | Refused:
-    """Return the command of a payload with every field in range, or the refusal."""
+    """Return the payload's command if every field is in range, otherwise the refusal."""
     try:
         data = parse(payload)
     except StrictJsonError as error:

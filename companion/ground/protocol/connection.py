@@ -170,7 +170,7 @@ class Connection(aiomqtt.Client):
 
 
 def reason_code(error: aiomqtt.MqttError) -> ReasonCode | None:
-    """Return the broker's reason code of an error, or None."""
+    """Return the broker's reason code from an error, or None if it has none."""
     cause = error.__cause__ if isinstance(error.__cause__, aiomqtt.MqttError) else error
     code = getattr(cause, "rc", None)
     return code if isinstance(code, ReasonCode) else None

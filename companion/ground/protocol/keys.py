@@ -47,7 +47,7 @@ class Permission(StrEnum):
     """Commands that an operator may give."""
 
     SAFER_COMMANDS = "safer"
-    """Hold, land, abort."""
+    """Hold, land and abort only."""
     ALL = "all"
 
 

@@ -197,7 +197,7 @@ class ControlView(Record, frozen=True, kw_only=True):
     """Force on the vehicle, world, N."""
     arm_torque_nm: Vec2
     force_ext_world_n: Vec3 | None
-    """None without a force sensor."""
+    """External force on the net, world frame, N; None without a force sensor."""
     hover_thrust: float
     saturated: bool
     payload_estimate_kg: float | None = None

@@ -30,7 +30,7 @@ from companion.ground.protocol.proof import Signer, ack_proven, stream_proven
 
 VEHICLE_TOPICS = (Topic.STATE, Topic.SCENE, Topic.PREFLIGHT, Topic.EVENTS, Topic.STREAM, Topic.ACK)
 VEHICLES_MAX = 64
-"""Maximum number of tracked vehicles; the longest silent one is forgotten first, those with proven messages last."""
+"""Maximum number of tracked vehicles; the one that has been silent longest is forgotten first, those with proven messages last."""
 LIVE_S = 1.0
 """Age of the newest stream message below which a vehicle is present."""
 
@@ -185,7 +185,7 @@ class VehicleTracker:
         """Store the state that a proven stream message carries; return False if the message must not be displayed.
 
         A message of a different flight is accepted if that flight is later on the vehicle's wall clock, or if the current flight no
-        longer sends. A recording of an earlier flight therefore cannot replace a running one.
+        longer sends messages. A recording of an earlier flight therefore cannot replace a running one.
         """
         known = self.vehicles.get(name)
         proven = known.proven if known is not None else None

@@ -6,8 +6,8 @@ WebSocket at ``/ws``, JSON text. Server to page:
     {"kind": "broker", "connected", "text", "rejected"?, "rejected_text"?}           connection to the broker; rejected messages
     {"kind": "state" | "scene" | "preflight" | "events" | "ack", "vehicle", "data"}  records of `companion.ground.protocol.messages`
     {"kind": "stream", "vehicle", "age_s", "data"}                                   age_s: delay until it reached the server
-    {"kind": "sent", "vehicle", "command", "nonce"}                                  to the commanding viewer; its `ack` has the
-    nonce {"kind": "refused", "vehicle", "command", "text"}                                to the commanding viewer
+    {"kind": "sent", "vehicle", "command", "nonce"}                                  to the commanding viewer; its `ack` has the nonce
+    {"kind": "refused", "vehicle", "command", "text"}                                to the commanding viewer
 
 Page to server: ``{"kind": "token", "token"}`` first (empty without one: view only), then ``{"kind": "command", "vehicle",
 "command", "hold"?}``. With "resume", `hold` is the number of the hold that was displayed; without it, the current hold.
@@ -55,7 +55,7 @@ TOKEN_WAIT_S = 1.0
 """Time for which the server waits for the page's token, so that one hello is enough."""
 HEARTBEAT_S = 6.0
 SEND_S = 10.0
-"""Time without a read after which a viewer is disconnected."""
+"""Time after which a viewer that reads nothing is disconnected."""
 CLOSE_S = 1.0
 _SEND_BUFFER_BYTES = 65536
 """Kernel send buffer per viewer; a larger one would delay the data."""

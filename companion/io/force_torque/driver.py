@@ -31,7 +31,7 @@ _MODEL: Final = "RFT60"
 
 
 class RobotousForceTorque:
-    """RFT60-HA01 in continuous output; implements `companion.io.protocols.ForceTorque`.
+    """RFT60-HA01 in continuous-output mode; implements `companion.io.protocols.ForceTorque`.
 
     The port is read from the event loop: 200 packets/s of 19 bytes need no thread. Samples are raw, in the sensor frame; the user
     of a sample removes the bias. When the sensor falls silent or the port vanishes, `latest()` becomes stale and nothing is raised.

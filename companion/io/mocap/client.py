@@ -19,7 +19,7 @@ SUPPORTED_VERSIONS: Final = "{}.{} or later".format(*OLDEST_VERSION)
 CONNECT_PERIOD_S: Final = 0.25
 KEEP_ALIVE_PERIOD_S: Final = 0.5
 RECONNECT_SILENCE_S: Final = 1.0
-"""A server that was restarted knows its clients only after a new connect request."""
+"""Silence after which a connect request is sent: a restarted server knows its clients only after a new one."""
 
 
 class NatNetClient:
@@ -55,7 +55,7 @@ class NatNetClient:
         self.out_of_order = 0
         self.malformed = 0
         self.problem: str | None = None
-        """Why the newest datagram that was not accepted was rejected."""
+        """Why the newest rejected datagram was rejected; None if none was."""
 
     def requests(self, now_s: float) -> list[bytes]:
         """Return the datagrams to send to the server now; call it again after `request_period_s`."""
@@ -104,7 +104,7 @@ class NatNetClient:
         return frame.body if isinstance(frame, Frame) else None
 
     def pose(self, frame: Frame, stamp_s: float) -> MocapPose | None:
-        """Return the rigid body's pose in the world frame, or None if the frame does not hold it.
+        """Return the rigid body's pose in the world frame, or None if the frame does not contain it.
 
         Args:
             frame: as returned by `receive`.

@@ -1,7 +1,7 @@
 """NatNet model definitions (NAT_MODELDEF) since version 3.0; sources as in `companion.io.mocap.natnet`.
 
-A rigid body has its markers' names since 4.0 and the rotation of its pivot since 4.2. A definition states its size since 4.1, so that
-only the start of a rigid body, its name and id, is read; before, every type has to be known.
+Since 4.0 a rigid body contains its markers' names, and since 4.2 the rotation of its pivot. Since 4.1 a definition states its size,
+so that only the start of a rigid body (its name and id) is read; in earlier versions every type has to be known.
 """
 
 from __future__ import annotations

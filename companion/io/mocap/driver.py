@@ -31,15 +31,15 @@ OnFrame = Callable[[Frame, bytes, float], None]
 class NatNetMocap:
     """OptiTrack rigid body over NatNet; implements `companion.io.protocols.Mocap`.
 
-    `on_pose` is called synchronously from the event loop for every new frame that holds the body, tracked or not. When several frames
-    wait in the socket (the loop was late) only the newest one is delivered. Poses are world ENU-like / body FLU.
+    `on_pose` is called synchronously from the event loop for every new frame that contains the body, tracked or not. When several
+    frames wait in the socket (the loop was late) only the newest one is delivered. Poses are world ENU-like / body FLU.
 
     Args:
         device: addresses, transport, version, body id and up axis.
         clock: the flight clock.
-        on_pose: called with every pose; an exception is logged once and never stops the reception.
-        connect_timeout_s: timeout of the server's answer.
-        body_timeout_s: timeout of the first frame in which the body is tracked.
+        on_pose: called with every pose; an exception is logged once and never stops reception.
+        connect_timeout_s: timeout for the server's answer.
+        body_timeout_s: timeout for the first frame in which the body is tracked.
         on_frame: called with every frame, delivered or not. If given, opening waits for any frame, not for the body.
     """
 
@@ -116,7 +116,8 @@ class NatNetMocap:
         """Connect, check the server, wait until the body is tracked.
 
         Raises:
-            DeviceError: no answer, wrong version, wrong transport, port in use, body never seen or never tracked.
+            DeviceError: the server does not answer or has the wrong version or transport, the port is in use, or the body is never
+                seen or never tracked.
         """
         try:
             await self._resolve()

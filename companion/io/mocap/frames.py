@@ -1,8 +1,8 @@
 """NatNet frames of data (NAT_FRAMEOFDATA) since version 3.0; sources, units and axes as in `companion.io.mocap.natnet`.
 
-A frame is its number, sections and a suffix with the time stamps. The sections are marker sets, other markers, rigid bodies, skeletons,
-assets (since 4.1), labelled markers, force plates and devices. Each starts with `u32 count`, since 4.1 followed by `u32 bytes`, so that
-its content need not be known. 3.0, 3.1 and 4.0 have the same frame; 4.1 to 4.4 have the same frame.
+A frame consists of its number, sections and a suffix with the time stamps. The sections are marker sets, other markers, rigid
+bodies, skeletons, assets (since 4.1), labelled markers, force plates and devices. Each starts with `u32 count`, followed since 4.1
+by `u32 bytes`, so that its content need not be known. 3.0, 3.1 and 4.0 have the same frame; 4.1 to 4.4 have the same frame.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LABELLED_MARKER_BYTES: Final = 26
 SUFFIX_BYTES: Final = 54
 """Size of the whole suffix since 4.1: stamps, precision time stamp, parameters and end-of-data tag."""
 LATER_LATENCY_MAX_S: Final = 1.0
-"""A longer latency in a version later than the newest described one means that its suffix is another."""
+"""If a version later than the newest described one yields a longer latency than this, its suffix has a different layout."""
 _RIGID_BODY = struct.Struct("<I7ffH")
 _SUFFIX = struct.Struct("<IIdQQQ")
 _PARAM_TRACKING_VALID = 0x01
@@ -61,7 +61,7 @@ class Frame:
     """Time from mid-exposure to transmission; None if the server has no exposure stamp or no clock frequency, or if the suffix of a
     version later than the newest described one is not understood."""
     exposure_s: float | None
-    """Time of mid-exposure on the server's own clock; None in the same cases."""
+    """Time of mid-exposure on the server's own clock; None in the same cases as `latency_s`."""
     body: RigidBody | None
     """The requested rigid body; None if it is not in this frame."""
     body_ids: tuple[int, ...]

@@ -85,7 +85,7 @@ class ServerInfo:
 
     @property
     def name(self) -> str:
-        """Program, its version and NatNet's, such as "Motive 3.1, NatNet 4.1"."""
+        """Name and version of the server program, and the NatNet version, such as "Motive 3.1, NatNet 4.1"."""
         version = ".".join(map(str, self.application_version)).removesuffix(".0").removesuffix(".0")
         return f"{self.application} {version}, NatNet {self.version}".strip()
 
@@ -185,5 +185,5 @@ def printable(name: bytes) -> str:
 
 
 def skip_string(data: bytes, offset: int) -> int:
-    """Return the offset behind a zero-terminated string; ValueError if it does not end within 256 bytes."""
+    """Return the offset after a zero-terminated string. Raise ValueError if the string does not end within 256 bytes."""
     return data.index(b"\0", offset, offset + MAX_NAME_BYTES) + 1

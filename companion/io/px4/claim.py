@@ -35,12 +35,12 @@ _CALL_PERIOD_S = 1.0
 class LinkClaim:
     """This process's hold on a link, besides MAVSDK's own descriptor.
 
-    A serial port is locked with flock on the device itself, so that every name of the device counts and pyserial's `exclusive` mode
-    conflicts with the lock. A `udpin` port is bound without SO_REUSEADDR and only then shared with MAVSDK, which sets that option
-    and would join any program on the port. MAVSDK's socket is connected to PX4's address once that is verified; from then on the
-    kernel delivers datagrams of all other senders to the socket held here. When PX4 is silent for REPIN_SILENCE_S and another port
-    of the same IPv4 address sends a HEARTBEAT with PX4's system id, MAVSDK's socket is connected to that port, because a restarted
-    router sends from a new one.
+    A serial port is locked with flock on the device itself, so that the lock applies under every name of the device and pyserial's
+    `exclusive` mode conflicts with it. A `udpin` port is bound without SO_REUSEADDR and only then shared with MAVSDK, which sets
+    that option and would join any program on the port. MAVSDK's socket is connected to PX4's address once that is verified; from
+    then on the kernel delivers datagrams of all other senders to the socket held here. When PX4 is silent for REPIN_SILENCE_S and
+    another port of the same IPv4 address sends a HEARTBEAT with PX4's system id, MAVSDK's socket is connected to that port, because
+    a restarted router sends from a new one.
 
     Args:
         address: as in `devices.autopilot.address`, checked.

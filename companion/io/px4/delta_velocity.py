@@ -18,10 +18,11 @@ _SMOOTHING = 1.0 / 16.0
 class DeltaVelocity:
     """Sum of specific force times the sample's interval.
 
-    PX4's HIGHRES_IMU carries `vehicle_imu.delta_velocity` divided by its interval, minus EKF2's estimate of the accelerometer bias: the
-    mean over the interval that ends at `time_usec`, with every raw sample in it. The sum over consecutive messages is therefore the
-    integral of the specific force and contains no alias of vibration. PX4 skips a sample when its MAVLink task is late (1 in 28 of PX4
-    1.16 in SITL). The mean of the preceding samples replaces a lost one, so that only the vibration in that interval is aliased.
+    PX4's HIGHRES_IMU carries `vehicle_imu.delta_velocity` divided by its interval, minus EKF2's estimate of the accelerometer bias:
+    the mean over the interval that ends at `time_usec`, with every raw sample in it. The sum over consecutive messages is therefore
+    the integral of the specific force and contains no alias of vibration. PX4 skips a sample when its MAVLink task is late (1 in 28
+    with PX4 1.16 in SITL). The mean of the preceding samples replaces a lost one, so that only the vibration in that interval is
+    aliased.
     """
 
     __slots__ = ("_interval_s", "_mean_m_s2", "boot_s", "sum_m_s")
@@ -38,7 +39,7 @@ class DeltaVelocity:
         """Add a sample. A repeated, late or non-finite one is ignored.
 
         Args:
-            boot_s: end of its interval on PX4's clock.
+            boot_s: end of the sample's interval on PX4's clock.
             specific_force_m_s2: mean over the interval, in body axes.
         """
         x, y, z = specific_force_m_s2

@@ -106,7 +106,7 @@ def value_of(fields: dict[str, Any]) -> tuple[str, Value | None]:
 
 
 class ParamTransfer:
-    """Reads and writes on an open link."""
+    """Reads and writes parameters over an open link."""
 
     def __init__(
         self, address: str, clock: Clock, calls: NativeCalls, direct: MavlinkDirect, param: Param, system_id: int

@@ -21,7 +21,7 @@ _V1, _V2 = 0xFE, 0xFD
 _V1_HEADER_BYTES, _V2_HEADER_BYTES, _CHECKSUM_BYTES, _SIGNATURE_BYTES = 6, 10, 2, 13
 _FLAG_SIGNED = 1
 REQUEST_EVENT = 412
-"""From MAVLink's events.xml, which pymavlink's dialect does not contain; its CRC_EXTRA is 33."""
+"""Message id from MAVLink's events.xml, which pymavlink's dialect does not contain; its CRC_EXTRA is 33."""
 _CRC_EXTRA: dict[int, int] = {number: message.crc_extra for number, message in mavlink.mavlink_map.items()}
 _CRC_EXTRA[REQUEST_EVENT] = 33
 _NAMES: dict[int, str] = {number: message.msgname for number, message in mavlink.mavlink_map.items()}

@@ -187,7 +187,7 @@ def _received(source: socket.socket) -> list[bytes]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point."""
+    """Entry point of the relay process."""
     parser = argparse.ArgumentParser(prog="companion.io.qgroundcontrol.relay")
     parser.add_argument("--fd", type=int, required=True, help="channel to the flight process")
     parser.add_argument("--host", required=True, help="ground station, an IP address")
