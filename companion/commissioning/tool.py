@@ -89,7 +89,7 @@ class Session:
             raise ConfigError(
                 [f"companion {arguments.command}: --vehicle: expected the name of a file, got an empty one"]
             )
-        if getattr(arguments, "write", False) and arguments.vehicle in names("vehicles"):
+        if arguments.writes_vehicle_file and arguments.write and arguments.vehicle in names("vehicles"):
             raise ConfigError(
                 [
                     f"companion {arguments.command}: --write: {arguments.vehicle} is part of the installation; name your own vehicle "
@@ -261,7 +261,10 @@ def add_tool(
         parser.add_argument("--write", action="store_true", help=write)
     if yes:
         parser.add_argument("--yes", action="store_true", help="answer every question with yes")
-    parser.set_defaults(run=lambda arguments: run_tool(importlib.import_module(module).TOOLS[name], arguments))
+    parser.set_defaults(
+        run=lambda arguments: run_tool(importlib.import_module(module).TOOLS[name], arguments),
+        writes_vehicle_file=write == WRITE_HELP,
+    )
     return parser
 
 

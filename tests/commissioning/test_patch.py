@@ -9,7 +9,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from companion.cli.main import make_parser
 from companion.commissioning.patch import propose
+from companion.commissioning.tool import ARM, SENSORS, Session
 from companion.commissioning.yaml_edit import edited
 from companion.config.document import ConfigError, Data, Origin
 from companion.config.loader import load_vehicle
@@ -17,6 +19,13 @@ from companion.config.yaml_strict import parse_value, read_document
 from tests.support import ROOT
 
 SHIPPED = ROOT / "configs/vehicles/tarot650_2r.yaml"
+
+
+def test_only_a_tool_that_writes_the_vehicle_file_refuses_the_shipped_one() -> None:
+    with pytest.raises(ConfigError, match=r"^companion arm: --write: tarot650_2r is part of the installation"):
+        Session(make_parser().parse_args(["arm", "friction", "--write"]), ARM)
+    writes_a_parameter = Session(make_parser().parse_args(["latency", "--write"]), SENSORS)
+    assert writes_a_parameter.vehicle.name == "tarot650-2r"
 
 
 @pytest.fixture
