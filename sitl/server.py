@@ -100,7 +100,7 @@ class Sitl:
             self.plant.world,
             self.autopilot.fault_target,
             [servo.drive for servo in self.servos],
-            vehicle.tether.anchor_world_m,
+            vehicle.tether,
             self.servos,
         )
         if config.faults:
@@ -315,7 +315,7 @@ class Sitl:
         if self.faults.begun_s is None or plant.t_s < self._course_due_s:
             return
         self._course_due_s = plant.t_s + COURSE_PERIOD_S
-        self.course.append(sample(plant.world, self._vehicle.tether.anchor_world_m))
+        self.course.append(sample(plant.world, self._vehicle.tether))
 
     def ground_truth(self) -> dict[str, Any]:
         """Return the true course of a flight with faults, for a campaign's table (file `world.json`)."""

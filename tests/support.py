@@ -24,6 +24,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from companion.cli.main import main
+from companion.config.vehicle import Tether, Vehicle
 from companion.model.types import Inputs, Outputs
 from companion.sitl_config.loader import load_sitl
 
@@ -362,6 +363,12 @@ class World:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+
+
+def tether_of(vehicle: Vehicle) -> Tether:
+    """The tether of a vehicle that has one."""
+    assert vehicle.tether is not None
+    return vehicle.tether
 
 
 def set_options(**values: object) -> list[str]:

@@ -110,7 +110,7 @@ class Scene:
         Raises:
             KeyError, TypeError: the section lacks a value.
         """
-        airframe, arm, tool, tether = vehicle["airframe"], vehicle["arm"], vehicle["tool"], vehicle["tether"]
+        airframe, arm, tool = vehicle["airframe"], vehicle["arm"], vehicle["tool"]
         rotor_arm_m = airframe.get("rotor_arm_m", 0.6 * airframe["radius_m"])  # older logs lack it in the vehicle file
         self._hub_m: float = rotor_arm_m * math.sqrt(0.5)
         self._disk_m: float = airframe["radius_m"] - rotor_arm_m
@@ -118,9 +118,7 @@ class Scene:
         self._shoulder: Array = np.array(arm["shoulder_body_m"])
         self._links_m: tuple[float, float] = tuple(arm["link_lengths_m"])
         self._net_radius_m: float = tool["net_radius_m"]
-        self._anchor: Vec3 = tuple(tether["anchor_world_m"])
-        self._attachment: Vec3 = tuple(tether["attachment_body_m"])
-        self._tether_m: float = tether["length_m"]
+        self._tether_line: dict[str, Any] | None = vehicle["tether"]
         room = vehicle["room"]
         self._low, self._high = (np.array([room[axis][k] for axis in ("x_m", "y_m", "z_m")]) for k in (0, 1))
 
@@ -138,7 +136,9 @@ class Scene:
         shapes = self._room(camera)
         centre = np.array(pose.position_world_m)
         shapes.append(self._shadow(camera, centre, 0.8 * (self._hub_m + self._disk_m), 0.16))
-        parts = [*self._machine(camera, pose), self._tether(camera, pose)]
+        parts = self._machine(camera, pose)
+        if self._tether_line is not None:
+            parts.append(self._tether(camera, pose, self._tether_line))
         for k, ball in enumerate(pose.ball_world_m):
             if k == 0:
                 shapes.append(self._shadow(camera, np.array(ball), BALL_RADIUS_M, 0.3))
@@ -176,10 +176,11 @@ class Scene:
         below = np.array([point[0], point[1], self._low[2]])
         return Shape(camera.pixels(_circle(below, _X, _Y, radius_m), closed=True), FRAME, 0.0, alpha)
 
-    def _tether(self, camera: Camera, pose: Pose) -> tuple[float, list[Shape]]:
-        end = self._world(pose, np.array(self._attachment))
+    def _tether(self, camera: Camera, pose: Pose, tether: dict[str, Any]) -> tuple[float, list[Shape]]:
+        end = self._world(pose, np.array(tether["attachment_body_m"]))
         x, y, z = end.tolist()
-        line = np.array(hanging_line_m(self._anchor, (x, y, z), self._tether_m, float(self._low[2])))
+        anchor: Vec3 = tuple(tether["anchor_world_m"])
+        line = np.array(hanging_line_m(anchor, (x, y, z), tether["length_m"], float(self._low[2])))
         return camera.depth_m(end) + 0.2, [
             Shape(camera.pixels(line), TETHER, 2.0),
             Shape(camera.pixels(line[:1]), FRAME, 9.0),

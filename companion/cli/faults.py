@@ -16,7 +16,8 @@ from companion.config.document import ConfigError
 from companion.config.explain import nearest
 from companion.config.shipped import DEFAULT_MISSION
 from companion.model.exit_codes import EXIT_OK
-from companion.sitl_config.faults import KINDS, PHASES
+from companion.runtime.console import print_error
+from companion.sitl_config.faults import KINDS, PHASES, absent_part
 
 
 def add_parser(commands: Any) -> None:
@@ -89,8 +90,17 @@ def _campaign(arguments: argparse.Namespace) -> Faults:
                 ["companion faults: --set world.faults: the campaign sets this key; use --kinds and --phases"]
             )
     given = arguments.vehicle, arguments.controller, arguments.preset
+    config = checked(arguments.mission, *given, arguments.overrides, world=arguments.world)
+    absent = {v.kind: key for v, _ in flights if (key := absent_part(v.kind, config.vehicle)) is not None}
+    if absent:
+        missing = " and ".join(sorted(set(absent.values())))
+        text = f"companion faults: not flown, because the vehicle has no {missing}: {', '.join(absent)}"
+        flights = [(v, phase) for v, phase in flights if v.kind not in absent]
+        if not flights:
+            raise ConfigError([text])
+        print_error(text)
     return Faults(
-        configs=[checked(arguments.mission, *given, arguments.overrides, world=arguments.world)],
+        configs=[config],
         flights=[
             {"variant": 0, "kind": v.kind, "size": v.size, "duration_s": v.duration_s, "phase": phase}
             for v, phase in flights

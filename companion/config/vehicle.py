@@ -98,6 +98,10 @@ class Tool(Model):
     """Sensor frame in the frame of link 2 (x outwards along the link, y along the joint axis), ZYX roll, pitch, yaw."""
 
 
+REACT_TIME_S, STOP_DECELERATION_M_S2 = 0.18, 2.0
+"""Defaults of the stop model, also for a vehicle without a tether."""
+
+
 class Tether(Model):
     """The safety tether."""
 
@@ -110,9 +114,9 @@ class Tether(Model):
     """Working load of the whole tether from anchor to attachment; it must hold the rotors at full command."""
     weight_n_per_m: NonNegative = 0.1
     """Weight per length; the vehicle carries the part that hangs from it."""
-    react_time_s: NonNegative = 0.18
+    react_time_s: NonNegative = REACT_TIME_S
     """Time from a fault to PX4's LAND mode; 0.07 to 0.18 s were measured with the guardian."""
-    stop_deceleration_m_s2: Positive = 2.0
+    stop_deceleration_m_s2: Positive = STOP_DECELERATION_M_S2
     """Deceleration of the reference by the governor. Stopping distances assume the slower of this and PX4's LAND at that speed."""
     turns_max: Positive = 1.5
     """Largest number of turns about the anchor's vertical, and of the tether about the vehicle, in either direction."""
@@ -345,7 +349,8 @@ class Vehicle(Model):
     airframe: Airframe
     arm: Arm
     tool: Tool
-    tether: Tether
+    tether: Tether | None = None
+    """Safety tether. If it is absent, only the room limits the flight, and no tether rule is evaluated (docs/parts.md)."""
     room: Room
     devices: Devices
     computer: Computer = Computer()

@@ -48,7 +48,7 @@ class FlightCore:
         # Solved once here, so that planning from the measured start costs next to nothing in a tick.
         Plan.build(config.mission, config.vehicle)
         self._monitors = Monitors(vehicle)
-        self._watch = TetherWatch(vehicle)
+        self._watch = TetherWatch.of(vehicle)
         self._governor = Governor(vehicle, config.mission.limits)
         self._gate = Gate(vehicle)
         self._parameters = Parameters.of(config)
@@ -158,11 +158,11 @@ class FlightCore:
 
     def _watch_tether(self, i: Inputs) -> None:
         """Update the tether's state once the vehicle is armed. Earlier turns are unknown and assumed to be zero."""
-        v = i.vehicle
-        if v is None or not self._tether_watched:
+        v, watch = i.vehicle, self._watch
+        if v is None or watch is None or not self._tether_watched:
             return
         log, flying = self._log, self._state.stage is _PLAN
-        self._situation.tether = self._watch.update(
+        self._situation.tether = watch.update(
             i.t_s,
             v.position_world_m,
             v.velocity_world_m_s,

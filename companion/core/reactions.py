@@ -109,14 +109,15 @@ def _hold(t: Transition) -> None:
 
 
 def _retract(t: Transition) -> None:
-    now, course = t.o.reference, t.state.course
+    now, course, tether = t.o.reference, t.state.course, t.parameters.vehicle.tether
+    assert tether is not None, "only a tether's rule requests a retract"
     if now is None or course is None or course.segment(t.i.t_s).kind is PhaseKind.LANDING:
         _land_instead(t, "already landing; no retract")
         return
     arm_rad = t.i.arm.angle_rad if t.i.arm is not None else now.arm_rad
     p = t.parameters
     t.leave_mission(
-        retract_from(now.position_world_m, now.velocity_world_m_s, now.yaw_rad, arm_rad, p.fold_rad, p.vehicle)
+        retract_from(now.position_world_m, now.velocity_world_m_s, now.yaw_rad, arm_rad, p.fold_rad, p.vehicle, tether)
     )
 
 
@@ -148,7 +149,7 @@ def _land(t: Transition) -> None:
 
 def _allowed_velocity(t: Transition, now: Reference) -> Vec3:
     """Return the start velocity of a stop, m/s, without its outward and upward parts while the tether pulls."""
-    tether = t.o.tether
-    if tether is not None and (tether.taut or tether.snagged):
-        return inward_only(now.velocity_world_m_s, now.position_world_m, t.parameters.vehicle.tether.anchor_world_m)
+    tether, state = t.parameters.vehicle.tether, t.o.tether
+    if tether is not None and state is not None and (state.taut or state.snagged):
+        return inward_only(now.velocity_world_m_s, now.position_world_m, tether.anchor_world_m)
     return now.velocity_world_m_s

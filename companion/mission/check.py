@@ -96,7 +96,7 @@ def check_mission(
     for limit, text in told.items():
         problems.append(text + (f" (also in {', '.join(also[limit])})" if also[limit] else ""))
     turns = samples.turns_in_the_end(mission.repeat)
-    if "turns" not in told and turns > vehicle.tether.turns_max:
+    if vehicle.tether is not None and "turns" not in told and turns > vehicle.tether.turns_max:
         problems.append(
             f"mission '{mission.name}': its {mission.repeat} repetitions wind up the tether: {turns:.2f} turns about anchor or vehicle "
             f"at the end (tether.turns_max is {vehicle.tether.turns_max:g}); fly back the way it came, or lower repeat"
@@ -107,10 +107,10 @@ def check_mission(
 def check_vehicle(vehicle: Vehicle) -> list[str]:
     """Return the reasons why nothing can be flown with this vehicle, tether and room, whatever the mission; one line each."""
     problems = []
-    rating_n, thrust_n = vehicle.tether.load_rating_n, vehicle.airframe.thrust_max_n
-    if rating_n < thrust_n:
+    tether, thrust_n = vehicle.tether, vehicle.airframe.thrust_max_n
+    if tether is not None and tether.load_rating_n < thrust_n:
         problems.append(
-            f"vehicle '{vehicle.name}': tether.load_rating_n is {rating_n:g} N, but the rotors pull with {thrust_n:g} N "
+            f"vehicle '{vehicle.name}': tether.load_rating_n is {tether.load_rating_n:g} N, but the rotors pull with {thrust_n:g} N "
             "(airframe.thrust_max_n); the tether must hold them: use a stronger one"
         )
     try:

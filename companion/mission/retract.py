@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from companion.config.vehicle import Room, Vehicle
+from companion.config.vehicle import Room, Tether, Vehicle
 from companion.mission.plan import FOLD_MIN_S, FOLD_SPEED_RAD_S, Plan
 from companion.mission.plan_builder import PlanBuilder, stopping
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED
@@ -39,6 +39,7 @@ def retract_from(
     arm_rad: Vec2,
     arm_fold_rad: Vec2,
     vehicle: Vehicle,
+    tether: Tether,
 ) -> Plan:
     """Plan a stop and a slow return towards the anchor's vertical until the tether has `retract_slack_m` of slack, while the arm
     folds.
@@ -53,9 +54,10 @@ def retract_from(
         yaw_rad: kept constant.
         arm_rad: joint angles at the start, at rest.
         arm_fold_rad: joint angles at the end.
-        vehicle: provides tether, room, airframe and the speed of the return.
+        vehicle: provides room, airframe and the speed of the return.
+        tether: its anchor and length.
     """
-    tether, safety, anchor = vehicle.tether, vehicle.safety, vehicle.tether.anchor_world_m
+    safety, anchor = vehicle.safety, tether.anchor_world_m
     builder = PlanBuilder(position_world_m, yaw_rad, arm_rad)
     fold_rad = max(abs(arm_fold_rad[0] - arm_rad[0]), abs(arm_fold_rad[1] - arm_rad[1]))
     fold_s = max(FOLD_MIN_S, REST_TO_REST_PEAK_SPEED * fold_rad / FOLD_SPEED_RAD_S)

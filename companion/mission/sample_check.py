@@ -65,10 +65,10 @@ class SampleCheck:
         self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
         self._safe = SafeSet(vehicle)
         self._stop_model = StopModel(vehicle.tether)
-        self._watch = TetherWatch(vehicle)
+        self._watch = TetherWatch.of(vehicle)
         airframe, tether = vehicle.airframe, vehicle.tether
         self._payload_kg = airframe.payload_max_kg if mission.catch is None else mission.catch.payload_max_kg
-        self._tether_n = tether.weight_n_per_m * tether.length_m
+        self._tether_n = 0.0 if tether is None else tether.weight_n_per_m * tether.length_m
         self._blow_until_s = 0.0
         """Time at which the catch's impact has decayed; 0 before the catch. Passing the same place again is not a catch."""
         self._repetition = 0
@@ -196,11 +196,13 @@ class SampleCheck:
 
     def _line(self, t_s: float, position: Vec3, reference: Reference) -> Iterator[Violation]:
         """Check the tether itself: whether it is wound up or too close to the rotors or the arm."""
-        tether = self._vehicle.tether
+        tether, watch = self._vehicle.tether, self._watch
+        if tether is None or watch is None:
+            return
         attitude = _leaning(reference)
-        state = self._watch.update(t_s, position, reference.velocity_world_m_s, attitude, reference.arm_rad, None, None)
+        state = watch.update(t_s, position, reference.velocity_world_m_s, attitude, reference.arm_rad, None, None)
         if self._repetition == 2:
-            self._windings.append(self._watch.windings)
+            self._windings.append(watch.windings)
         if abs(state.turns) > tether.turns_max:
             detail = f"{abs(state.turns):.2f} turns about anchor or vehicle (tether.turns_max is {tether.turns_max:g})"
             yield Violation(
@@ -303,9 +305,9 @@ class SampleCheck:
         share = min(limits.thrust_share_max, THRUST_SHARE_MAX)
         allowed_n = share * airframe.thrust_max_n
         if thrust_n > allowed_n * (1.0 + TOLERANCE):
+            carried = f"{self._payload_kg:g} kg of payload" + (" and the tether's weight" if self._tether_n else "")
             detail = (
-                f"{thrust_n:.1f} N with {self._payload_kg:g} kg of payload and the tether's weight (limit {allowed_n:.1f} N: "
-                f"{share:g} of {airframe.thrust_max_n:g} N)"
+                f"{thrust_n:.1f} N with {carried} (limit {allowed_n:.1f} N: {share:g} of {airframe.thrust_max_n:g} N)"
             )
             yield Violation(
                 limit="thrust",

@@ -16,7 +16,7 @@ from companion.preflight.checks import Check
 LINE = Check(
     "tether.line",
     "tether as described",
-    "shown for comparison with the real tether",
+    "shown for comparison with the real tether; a vehicle without `tether` only warns",
     "every distance to the taut sphere is computed from it",
 )
 STRENGTH = Check(
@@ -35,8 +35,12 @@ CHECKS = (LINE, STRENGTH, SLACK)
 
 
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
-    """Return the rows of the tether."""
+    """Return the rows of the tether, or one warning if the vehicle has none."""
     tether, airframe = vehicle.tether, vehicle.airframe
+    if tether is None:
+        fix = "add tether to the vehicle file if the vehicle is tied; without it only the room limits the flight"
+        yield LINE.doubtful("none: slack, pull, winding and clearance of a tether are not watched", "", fix)
+        return
     x, y, z = tether.anchor_world_m
     ax, ay, az = tether.attachment_body_m
     yield LINE.good(

@@ -1,12 +1,12 @@
 """The governor constrains references so that they cannot leave the tether sphere and the room, whatever the input reference. Pure.
 
-The safe set is convex: a ball about the anchor (its radius is the tether's length minus the margin and the lever of the attachment) and
-a box (the room minus the space for the rotors). A state (p, v) of the reference is *safe* if p, and the point q at which the vehicle
-would come to rest after a fault (`companion.safety.stop`), both lie in the set, and the speed is within its limit. Straight braking
-never moves q beyond its first position, and p and q stay on the segment from the first p to the first q, which lies in the convex set
-because its ends do: from a safe state braking is always possible and stays safe. It is therefore enough to accept a step towards the
-input reference only if the state after it is safe, and otherwise to blend in as much braking as that requires. No constraint needs a
-look-ahead, and no reference can violate one.
+The safe set is convex: a ball about the anchor (its radius is the tether's length minus the margin and the lever of the attachment;
+infinite without a tether) and a box (the room minus the space for the rotors). A state (p, v) of the reference is *safe* if p, and the
+point q at which the vehicle would come to rest after a fault (`companion.safety.stop`), both lie in the set, and the speed is within
+its limit. Straight braking never moves q beyond its first position, and p and q stay on the segment from the first p to the first q,
+which lies in the convex set because its ends do: from a safe state braking is always possible and stays safe. It is therefore enough
+to accept a step towards the input reference only if the state after it is safe, and otherwise to blend in as much braking as that
+requires. No constraint needs a look-ahead, and no reference can violate one.
 
 A safe reference that continues the previous one passes unchanged, as the same object. The mission check uses the same `SafeSet`, so an
 accepted plan is never constrained.
@@ -64,8 +64,11 @@ class SafeSet:
 
     def __init__(self, vehicle: Vehicle) -> None:
         tether, room, reach_m = vehicle.tether, vehicle.room, vehicle.airframe.radius_m
-        self.anchor_m = tether.anchor_world_m
-        self.radius_m = tether.length_m - tether.margin_m - math.hypot(*tether.attachment_body_m)
+        self.anchor_m: Vec3 = (0.0, 0.0, 0.0)
+        self.radius_m = math.inf
+        if tether is not None:
+            self.anchor_m = tether.anchor_world_m
+            self.radius_m = tether.length_m - tether.margin_m - math.hypot(*tether.attachment_body_m)
         lowest_m = vehicle.airframe.ground_clearance_m - BELOW_STANDING_M
         self.low_m: Vec3 = (room.x_m[0] + reach_m, room.y_m[0] + reach_m, min(room.z_m[0], 0.0) + lowest_m)
         self.high_m: Vec3 = (room.x_m[1] - reach_m, room.y_m[1] - reach_m, room.z_m[1] - BODY_TOP_M)
@@ -76,7 +79,7 @@ class SafeSet:
                     f"small for the vehicle; measure the room, or airframe.radius_m ({reach_m:g} m)"
                 )
         into = math.dist(self.anchor_m, _clamped(self.anchor_m, self.low_m, self.high_m))
-        if into > self.radius_m:
+        if tether is not None and into > self.radius_m:
             raise ValueError(
                 f"vehicle '{vehicle.name}': the tether reaches {max(0.0, self.radius_m):.2f} m (length_m {tether.length_m:g} minus "
                 f"margin_m {tether.margin_m:g} and the lever of attachment_body_m), but the room begins {into:.2f} m from the anchor; "
@@ -104,7 +107,7 @@ class SafeSet:
         return max(max(low - x, x - high) for x, low, high in zip(p, self.low_m, self.high_m, strict=True))
 
     def breach_tether_m(self, p: Vec3) -> float:
-        """Return the distance by which a position is outside the ball; negative inside it."""
+        """Return the distance by which a position is outside the ball; negative inside it, -inf without a tether."""
         return math.dist(p, self.anchor_m) - self.radius_m
 
 
@@ -121,8 +124,8 @@ class Governor:
 
     def __init__(self, vehicle: Vehicle, limits: Limits) -> None:
         self._set = SafeSet(vehicle)
-        self.stop_deceleration_m_s2 = vehicle.tether.stop_deceleration_m_s2
         self._stop = StopModel(vehicle.tether)
+        self.stop_deceleration_m_s2 = self._stop.deceleration_m_s2
         self.acceleration_max_m_s2 = max(limits.acceleration_max_m_s2, self.stop_deceleration_m_s2)
         self.speed_max_m_s = max(limits.speed_max_m_s, vehicle.safety.land_speed_m_s)
         self._half_per_a = 0.5 / self.stop_deceleration_m_s2
@@ -203,7 +206,7 @@ class Governor:
             if (
                 self._set.breach_tether_m(p) > _TOLERANCE
                 or self._set.breach_tether_m(stop) > _TOLERANCE
-                or not self._admits_restrained(p, v, speed)
+                or (self._restrained and not self._admits_restrained(p, v, speed))
             ):
                 reasons.append("tether")
             if any(self._set.breach_walls_m(end) > _TOLERANCE for end in (p, stop)):

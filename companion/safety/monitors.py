@@ -47,11 +47,12 @@ class Monitors:
             Subject.ARM: self._arm,
             Subject.PROCESS: self._process,
             Subject.FLIGHT: self._flight,
-            Subject.TETHER: self._flight,
             Subject.OPERATOR: self._process,
         }
         if vehicle.devices.force is not None:
             trackers[Subject.FORCE] = self._force
+        if vehicle.tether is not None:
+            trackers[Subject.TETHER] = self._flight
         self._evaluation = Evaluation(vehicle, trackers)
         self._awake_s = 0.0
         self._last_t_s: float | None = None

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from companion.config.vehicle import Tether
+from companion.config.vehicle import REACT_TIME_S, STOP_DECELERATION_M_S2, Tether
 
 LAND_AHEAD_S = 0.6
 """PX4 sets the stop point of LAND this far ahead, in addition to the braking distance. Confirmed by measurement: docs/px4.md."""
@@ -24,14 +24,16 @@ class StopModel:
 
     Args:
         tether: provides `react_time_s` (time from a fault to LAND mode) and `stop_deceleration_m_s2` (braking deceleration of the
-            governor).
+            governor). If it is None, their defaults hold.
     """
 
-    __slots__ = ("_half_per_a", "_half_per_land", "_knee_ahead_m", "_knee_m_s", "_react_s")
+    __slots__ = ("_half_per_a", "_half_per_land", "_knee_ahead_m", "_knee_m_s", "_react_s", "deceleration_m_s2")
 
-    def __init__(self, tether: Tether) -> None:
-        self._react_s = tether.react_time_s
-        self._half_per_a = 0.5 / tether.stop_deceleration_m_s2
+    def __init__(self, tether: Tether | None) -> None:
+        self._react_s = REACT_TIME_S if tether is None else tether.react_time_s
+        self.deceleration_m_s2 = STOP_DECELERATION_M_S2 if tether is None else tether.stop_deceleration_m_s2
+        """Deceleration with which the governor brakes the reference."""
+        self._half_per_a = 0.5 / self.deceleration_m_s2
         self._half_per_land = 0.5 / LAND_DECELERATION_M_S2
         slower = self._half_per_a - self._half_per_land
         self._knee_m_s = 0.5 * LAND_AHEAD_S / slower if slower > 0.0 else math.inf

@@ -77,22 +77,27 @@ class TetherWatch:
     `clearance_m` counts the arm only if the line is not tied in the arm's own plane (`Clearance.judges_arm`).
 
     Args:
-        vehicle: tether, airframe, arm and tool.
+        vehicle: airframe, arm and tool.
+        tether: the vehicle's tether.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        tether = vehicle.tether
+    def __init__(self, vehicle: Vehicle, tether: Tether) -> None:
         self._anchor = tether.anchor_world_m
         self._attachment = tether.attachment_body_m
         self._length_m = tether.length_m
         self._stop = StopModel(tether)
         self._taut_slack_m = tether.taut_slack_m
         self._separation_m = tether.separation_m
-        self._clearance = Clearance(vehicle)
+        self._clearance = Clearance(vehicle, tether)
         self._pull = PullEstimate(tether)
         self._about_anchor = Winding()
         self._about_vehicle = Winding()
         self._last_t_s: float | None = None
+
+    @classmethod
+    def of(cls, vehicle: Vehicle) -> TetherWatch | None:
+        """Return the watch of the vehicle's tether, or None if the vehicle has none."""
+        return cls(vehicle, vehicle.tether) if vehicle.tether is not None else None
 
     @property
     def windings(self) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from companion.config.vehicle import Vehicle
+from companion.config.vehicle import Tether, Vehicle
 from companion.model.types import Vec2, Vec3
 
 _NEVER = 1.0
@@ -39,12 +39,13 @@ class Clearance:
     """Models the rotors as a ring in the plane through the body's origin and the arm as a slab about its plane.
 
     Args:
-        vehicle: airframe, arm, tool, and the tether's attachment.
+        vehicle: airframe, arm and tool.
+        tether: its attachment.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._p = vehicle.tether.attachment_body_m
-        self._inner_m = vehicle.tether.rotor_inner_radius_m
+    def __init__(self, vehicle: Vehicle, tether: Tether) -> None:
+        self._p = tether.attachment_body_m
+        self._inner_m = tether.rotor_inner_radius_m
         self._outer_m = max(vehicle.airframe.radius_m, self._inner_m)
         self._off_axis_m = math.hypot(self._p[0], self._p[1])
         self._below = self._p[2] <= 0.0

@@ -12,6 +12,7 @@ from typing import Literal, Self, get_args
 from pydantic import Field, model_validator
 
 from companion.config.base import Location, Model, NonNegative, Positive, refuse
+from companion.config.vehicle import Vehicle
 
 FaultKind = Literal[
     "mocap_loss",
@@ -254,6 +255,15 @@ KINDS: dict[FaultKind, Kind] = {
         process=True,
     ),
 }
+
+
+def absent_part(kind: FaultKind, vehicle: Vehicle) -> str | None:
+    """Return the key of the part that a kind of fault needs and the vehicle does not have; None if nothing is missing."""
+    if kind.startswith("force_") and vehicle.devices.force is None:
+        return "devices.force"
+    if kind.startswith("tether_") and vehicle.tether is None:
+        return "tether"
+    return None
 
 
 class Fault(Model):

@@ -14,6 +14,7 @@ from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import read_document
 from companion.control.trial import try_law
 from companion.sitl_config.distributions import Laboratory, check_world, take_ranges
+from companion.sitl_config.faults import absent_part
 from companion.sitl_config.world import World
 
 WORLDS = names("worlds")
@@ -80,10 +81,9 @@ def load_sitl(
 
 def _faults_of_absent_parts(world: World, vehicle: Vehicle) -> Iterator[str]:
     """Yield one line for each fault of a part that the vehicle does not have."""
-    parts = {"force": ("devices.force", vehicle.devices.force)}
     for number, fault in enumerate(world.faults):
-        key, part = parts.get(fault.kind.partition("_")[0], ("", vehicle))
-        if part is None:
+        key = absent_part(fault.kind, vehicle)
+        if key is not None:
             yield f"world.faults[{number}].kind: {fault.kind} needs {key}, which the vehicle file of '{vehicle.name}' does not have"
 
 

@@ -5,14 +5,14 @@ A flight is {kind, size, duration_s, phase}: the fields of `companion.campaigns.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 from companion.campaigns.faults.judge import FaultFlight, Point, row_of, ticks_of
 from companion.campaigns.faults.variants import Variant
 from companion.campaigns.process import CampaignError
-from companion.model.frames import quat_rotate, tilt_rad
+from companion.model.frames import tilt_rad
 from companion.model.types import Outcome
+from companion.safety.tether import slack_m as slack_of
 from companion.safety.touchdown import HEIGHT_MARGIN_M
 from companion.sitl_config.loader import SitlConfig
 from sitl.campaigns.flights import Flown, fly_to_end, laboratory_of, with_world
@@ -60,20 +60,18 @@ def record_of(flown: Flown) -> FaultFlight:
             error=flown.error,
         )
     tether, layout = fast.config.vehicle.tether, result.layout
-    anchor, lever = tether.anchor_world_m, tether.attachment_body_m
     assert layout is not None
 
     def point(snapshot: Snapshot) -> Point:
         x, y, z, w, i, j, k = snapshot.q[0:7]
         attitude = (w, i, j, k)
-        tied = [a + b for a, b in zip((x, y, z), quat_rotate(attitude, lever), strict=True)]
-        slack_m = tether.length_m - math.dist(tied, anchor)
+        slack_m = slack_of(tether, (x, y, z), attitude) if tether is not None else None
         return Point(
             t_s=snapshot.t_s,
             position_world_m=(x, y, z),
             tilt_rad=tilt_rad(attitude),
             slack_m=slack_m,
-            tension_n=abs(snapshot.sensors[layout.tether]),
+            tension_n=abs(layout.tension_n(snapshot.sensors)),
         )
 
     # A flight process that stalls leaves snapshots between its ticks.

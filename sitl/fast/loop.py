@@ -149,7 +149,7 @@ class FastFlight:
         pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
         self._imu = _RecordedImu(self.px4)
         self.plant = Plant(vehicle, world, self._imu, drives, (pose.position_m, pose.yaw_rad, pose.arm_rad))
-        self.faults = Faults(world, self.plant.world, self.px4, drives, vehicle.tether.anchor_world_m)
+        self.faults = Faults(world, self.plant.world, self.px4, drives, vehicle.tether)
         if world.faults:
             self.plant.faults = self.faults
         self._guardian = FastGuardian(vehicle, self.px4) if world.faults else None

@@ -15,6 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
+from companion.config.vehicle import Tether
 from companion.model.frames import quat_from_euler_zyx, tilt_rad
 from companion.model.types import Quat, Vec3, Vec4
 from companion.sitl_config.faults import Fault, FaultKind
@@ -69,7 +70,7 @@ class Faults:
         world: simulated physics.
         px4: the autopilot.
         drives: motors of both servos.
-        anchor_world_m: anchor of the tether.
+        tether: the vehicle's tether, or None if it has none.
         servos: control tables of both servos; empty in the fast closed loop.
     """
 
@@ -79,14 +80,14 @@ class Faults:
         world: World,
         px4: Autopilot,
         drives: Sequence[ServoDrive],
-        anchor_world_m: Vec3,
+        tether: Tether | None,
         servos: Sequence[Servo] = (),
     ) -> None:
         self._faults = config.faults
         self._on = [False] * len(config.faults)
         self._begins_s: list[float | None] = [None] * len(config.faults)
         self._world, self._px4, self._drives, self._servos = world, px4, drives, servos
-        self._anchor_m = anchor_world_m
+        self._tether = tether
         self._wind_m_s = world.wind_m_s
         self._tether_m = world.tether_length_m
         self._chance = np.random.default_rng([config.seed, len(config.faults)])
@@ -161,7 +162,8 @@ class Faults:
             case "gust":
                 self._set_gust(size if on else 0.0)
             case "tether_taut":
-                away_m = math.dist(world.attachment_world_m, self._anchor_m)
+                assert self._tether is not None, "refused when the configuration is loaded"
+                away_m = math.dist(world.attachment_world_m, self._tether.anchor_world_m)
                 world.tether_length_m = min(self._tether_m, away_m + size) if on else self._tether_m
             case "tether_cut":
                 world.tether_length_m = _FOREVER_M if on else self._tether_m
@@ -214,7 +216,9 @@ class Faults:
         self._world.rotor_share = None if min(share) == 1.0 else share
 
     def _set_gust(self, speed_m_s: float) -> None:
-        x, y = (p - a for p, a in zip(self._world.q[0:2], self._anchor_m[0:2], strict=True))
+        """Add wind away from the tether's anchor, or without a tether away from the world's origin."""
+        ax, ay = self._tether.anchor_world_m[0:2] if self._tether is not None else (0.0, 0.0)
+        x, y = self._world.q[0] - ax, self._world.q[1] - ay
         away_m = math.hypot(x, y) or 1.0
         wx, wy, wz = self._wind_m_s
         self._world.wind_m_s = (wx + speed_m_s * x / away_m, wy + speed_m_s * y / away_m, wz)
@@ -291,20 +295,21 @@ class Sample:
     t_s: float
     position_world_m: Vec3
     tilt_rad: float
-    slack_m: float
-    """Slack of the tether, computed with its present length."""
+    slack_m: float | None
+    """Slack of the tether, computed with its present length; None without a tether."""
     tension_n: float
 
 
-def sample(world: World, anchor_world_m: Vec3) -> Sample:
+def sample(world: World, tether: Tether | None) -> Sample:
     """Return the present true state of the vehicle and its tether."""
     x, y, z, *attitude = world.q[0:7]
-    slack_m = world.tether_length_m - math.dist(world.attachment_world_m, anchor_world_m)
-    tension_n = world.sensors()[world.layout.tether]
+    slack_m = None
+    if tether is not None:
+        slack_m = world.tether_length_m - math.dist(world.attachment_world_m, tether.anchor_world_m)
     return Sample(
         t_s=world.t_s,
         position_world_m=(x, y, z),
         tilt_rad=tilt_rad((attitude[0], attitude[1], attitude[2], attitude[3])),
         slack_m=slack_m,
-        tension_n=tension_n,
+        tension_n=world.layout.tension_n(world.sensors()),
     )

@@ -70,6 +70,15 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     if transmission.acts(world):
         friction_nm = damping_nms = armature = 0.0
     roll, pitch, yaw = tool.sensor_rpy_deg
+    anchor = tendon = tension = ""
+    if vehicle.tether is not None:
+        anchor = f'<site name="anchor" pos="{xyz(vehicle.tether.anchor_world_m)}"/>'
+        tendon = f"""<tendon>
+    <spatial name="tether" limited="true" range="0 {vehicle.tether.length_m}" solreflimit="0.02 1">
+      <site site="anchor"/><site site="tether"/>
+    </spatial>
+  </tendon>"""
+        tension = '<tendonlimitfrc name="tether" tendon="tether"/>'
     payload = ""
     connect = ""
     balls = [("payload", "catch", world.payload_kg)]
@@ -92,13 +101,13 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
   <size memory="2M"/>
   <worldbody>
     <geom name="floor" type="plane" size="20 20 1" contype="2" conaffinity="1"/>
-    <site name="anchor" pos="{xyz(vehicle.tether.anchor_world_m)}"/>
+    {anchor}
     <body name="base" pos="0 0 {clearance}">
       <freejoint name="base"/>
       <inertial pos="{xyz(machine.centre_of_mass_m(world.machine))}" mass="{base_mass_kg(vehicle, world)}"
                 diaginertia="{xyz(airframe.inertia_kg_m2)}"/>
       <site name="imu"/>
-      <site name="tether" pos="{xyz(vehicle.tether.attachment_body_m)}"/>
+      <site name="tether" pos="{xyz(vehicle.tether.attachment_body_m if vehicle.tether is not None else (0.0, 0.0, 0.0))}"/>
       {rotors}
       {feet}
       <body name="link1" pos="{xyz(arm.shoulder_body_m)}" euler="{xyz(machine.shoulder_ypr_rad(world.machine))}">
@@ -124,11 +133,7 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     <joint name="park1" joint1="alpha1" solref="0.01 1"/>
     <joint name="park2" joint1="alpha2" solref="0.01 1"/>{connect}
   </equality>
-  <tendon>
-    <spatial name="tether" limited="true" range="0 {vehicle.tether.length_m}" solreflimit="0.02 1">
-      <site site="anchor"/><site site="tether"/>
-    </spatial>
-  </tendon>
+  {tendon}
   <actuator>
     {motors}
     <motor name="alpha1" joint="alpha1"/>
@@ -139,6 +144,6 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     <gyro name="gyro" site="imu"/>
     <force name="force" site="net"/>
     <torque name="torque" site="net"/>
-    <tendonlimitfrc name="tether" tendon="tether"/>
+    {tension}
   </sensor>
 </mujoco>"""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -67,7 +68,8 @@ class Layout:
     gyro: int
     force: int
     torque: int
-    tether: int
+    tether: int | None
+    """None without a tether."""
 
     def truth(self, snapshot: Snapshot) -> Truth:
         """Return the true state that a snapshot contains."""
@@ -85,8 +87,12 @@ class Layout:
             joint_velocity_rad_s=(v[v1], v[v2]),
             force_sensor_n=(-s[f], -s[f + 1], -s[f + 2]),
             torque_sensor_nm=(-s[tq], -s[tq + 1], -s[tq + 2]),
-            tether_tension_n=s[self.tether],
+            tether_tension_n=self.tension_n(s),
         )
+
+    def tension_n(self, sensors: Sequence[float]) -> float:
+        """Return the tension of the tether, N; 0 without a tether."""
+        return 0.0 if self.tether is None else sensors[self.tether]
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +129,11 @@ class World:
         self.layout = Layout(
             (int(m.jnt_qposadr[joints[0]]), int(m.jnt_qposadr[joints[1]])),
             (int(m.jnt_dofadr[joints[0]]), int(m.jnt_dofadr[joints[1]])),
-            *(int(m.sensor(name).adr[0]) for name in ("accel", "gyro", "force", "torque", "tether")),
+            accel=int(m.sensor("accel").adr[0]),
+            gyro=int(m.sensor("gyro").adr[0]),
+            force=int(m.sensor("force").adr[0]),
+            torque=int(m.sensor("torque").adr[0]),
+            tether=int(m.sensor("tether").adr[0]) if vehicle.tether is not None else None,
         )
         self._base = m.body("base").id
         self._net = m.body("net").id
@@ -142,7 +152,7 @@ class World:
         """Fraction of each rotor's thrust that remains during a fault; None without a fault."""
         self.snag: tuple[Vec3, float] | None = None
         """Point where the tether is snagged and its free length from there to the vehicle; None if it is not snagged."""
-        self._tether = m.tendon("tether").id
+        self._tether = m.tendon("tether").id if vehicle.tether is not None else None
         self._attachment = m.site("tether").id
         self._thrust: Vec4 = (0.0, 0.0, 0.0, 0.0)
         self.crashed = False
@@ -292,14 +302,14 @@ class World:
 
     @property
     def attachment_world_m(self) -> Vec3:
-        """Point where the tether is attached to the vehicle, world frame."""
+        """Point where the tether is attached to the vehicle, world frame; the body's origin without a tether."""
         x, y, z = self.data.site_xpos[self._attachment].tolist()
         return (x, y, z)
 
     @property
     def tether_length_m(self) -> float:
-        """Present length of the tether."""
-        return float(self.model.tendon_range[self._tether, 1])
+        """Present length of the tether; infinite without a tether."""
+        return math.inf if self._tether is None else float(self.model.tendon_range[self._tether, 1])
 
     @tether_length_m.setter
     def tether_length_m(self, length_m: float) -> None:

@@ -15,7 +15,7 @@ from companion.campaigns.faults.variants import VARIANTS, WIRES, Variant, planne
 from companion.cli.main import main
 from companion.launcher.launcher import FlightResult
 from companion.launcher.run import _summary
-from companion.model.exit_codes import EXIT_OK
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.model.types import (
     Event,
     Inputs,
@@ -138,7 +138,7 @@ def test_a_tether_that_was_made_taut_may_be_so_but_not_be_followed_outward() -> 
             t_s=p.t_s,
             position_world_m=p.position_world_m,
             tilt_rad=p.tilt_rad,
-            slack_m=p.slack_m - (0.3 if p.t_s > 12.5 else 0.0),
+            slack_m=(p.slack_m or 0.0) - (0.3 if p.t_s > 12.5 else 0.0),
             tension_n=p.tension_n,
         )
         for p in made.course
@@ -272,3 +272,11 @@ def test_the_list_names_every_kind(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["faults", "--list"]) == EXIT_OK
     shown = capsys.readouterr().out
     assert all(kind in shown for kind in KINDS)
+
+
+def test_faults_of_an_absent_part_are_not_flown(capsys: pytest.CaptureFixture[str]) -> None:
+    only = ["--kinds", "tether_cut,force_loss", "--set", "vehicle.tether=null", "--set", "vehicle.devices.force=null"]
+    assert main(["faults", str(CATCH), *only]) == EXIT_BAD_INPUT
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "not flown, because the vehicle has no devices.force and tether: " in line
+    assert all(kind in line for kind in ("tether_cut", "force_loss"))

@@ -25,7 +25,7 @@ from companion.model.types import (
 )
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
-from tests.support import SHORT_CATCH
+from tests.support import SHORT_CATCH, tether_of
 
 replace = msgspec.structs.replace
 Change = Callable[[Inputs], Inputs]
@@ -139,7 +139,7 @@ def test_taut_it_goes_back_along_the_tether_and_lands() -> None:
     ids = event_ids(result)
     assert ids == ["takeoff", "tether_taut", "retract_done", "touchdown"]
     assert result.outputs[-1].outcome is Outcome.ABORTED
-    anchor = load_sitl("configs/missions/catch.yaml").vehicle.tether.anchor_world_m
+    anchor = tether_of(load_sitl("configs/missions/catch.yaml").vehicle).anchor_world_m
     way = [o.reference.position_world_m for o in result.outputs if o.action is SafetyAction.RETRACT and o.reference]
     away = [math.dist(p[:2], anchor[:2]) for p in way]
     # The governor takes the little that is left of the climb out within its acceleration.

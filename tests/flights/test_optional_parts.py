@@ -14,10 +14,10 @@ from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from tests.support import SHORT_CATCH
 
-NO_FORCE = "vehicle.devices.force=null"
+NO_FORCE, NO_TETHER = "vehicle.devices.force=null", "vehicle.tether=null"
 
 
-@pytest.mark.parametrize("absent", [NO_FORCE])
+@pytest.mark.parametrize("absent", [NO_FORCE, NO_TETHER])
 def test_the_catch_is_flown_without_the_part(absent: str) -> None:
     flight = FastFlight(load_sitl(SHORT_CATCH, overrides=[absent]))
     result = flight.run()
@@ -41,7 +41,18 @@ def test_without_a_force_sensor_no_catch_is_reported() -> None:
     assert [event.id for o in result.outputs for event in o.events] == ["takeoff"]
 
 
-@pytest.mark.parametrize(("absent", "fault", "key"), [(NO_FORCE, "force_loss", "devices.force")])
+def test_without_a_tether_a_commanded_landing_and_a_gust_are_flown() -> None:
+    gust = "world.faults=[{kind: gust, t_s: 4.5, duration_s: 0.5, size: 2.0}]"
+    result = FastFlight(load_sitl(SHORT_CATCH, overrides=[NO_TETHER, gust]), land_at_s=5.0).run()
+    assert result.outputs[-1].outcome is Outcome.ABORTED
+    assert not result.crashed
+    assert all(o.tether is None for o in result.outputs)
+    assert all(truth.tether_tension_n == 0.0 for truth in result.truth)
+
+
+@pytest.mark.parametrize(
+    ("absent", "fault", "key"), [(NO_FORCE, "force_loss", "devices.force"), (NO_TETHER, "tether_cut", "tether")]
+)
 def test_a_fault_of_an_absent_part_is_refused(absent: str, fault: str, key: str) -> None:
     with pytest.raises(ConfigError) as refused:
         load_sitl(SHORT_CATCH, overrides=[absent, f"world.faults=[{{kind: {fault}, t_s: 5.0}}]"])

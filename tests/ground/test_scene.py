@@ -12,7 +12,7 @@ from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, Scene, Topic, 
 from companion.ground.telemetry.scene import PATH_POINTS_MAX, scene_of
 from companion.mission.plan import Plan
 from companion.model.types import Vec3
-from tests.support import CATCH
+from tests.support import CATCH, tether_of
 from tools.docs.telemetry import FOLDER, schema_file, schema_of, schema_text
 
 
@@ -22,14 +22,21 @@ def test_the_scene_is_the_vehicle_file_and_the_mission() -> None:
     vehicle = config.vehicle
     assert scene.room_min_world_m == (vehicle.room.x_m[0], vehicle.room.y_m[0], vehicle.room.z_m[0])
     assert scene.room_max_world_m == (vehicle.room.x_m[1], vehicle.room.y_m[1], vehicle.room.z_m[1])
-    assert scene.anchor_world_m == vehicle.tether.anchor_world_m
-    assert scene.tether_length_m == vehicle.tether.length_m
+    assert scene.anchor_world_m == tether_of(vehicle).anchor_world_m
+    assert scene.tether_length_m == tether_of(vehicle).length_m
     for joint, low_rad, high_rad in zip(vehicle.arm.joints, scene.joint_min_rad, scene.joint_max_rad, strict=True):
         assert (math.degrees(low_rad), math.degrees(high_rad)) == pytest.approx(joint.angle_deg)
     assert math.degrees(scene.tilt_abort_rad) == pytest.approx(vehicle.safety.tilt_abort_deg)
     assert scene.tracking_warn_m < scene.tracking_abort_m == vehicle.safety.tracking_error_abort_m
     assert (scene.path_world_m, scene.mission_s) == (((0.0, 1.0, 2.0),), 31.5)
     assert decode(Scene, encode(scene)) == scene
+
+
+def test_the_scene_of_a_vehicle_without_a_tether_has_no_anchor() -> None:
+    scene = scene_of(load_flight(CATCH, overrides=["vehicle.tether=null"]), "s1")
+    assert (scene.anchor_world_m, scene.tether_length_m) == (None, None)
+    assert decode(Scene, encode(scene)) == scene
+    jsonschema.Draft202012Validator(schema_of(Topic.SCENE)).validate(json.loads(encode(scene)))
 
 
 def test_phases_are_named_as_the_flight_names_them() -> None:

@@ -292,6 +292,14 @@ def test_an_absent_force_sensor_is_shown_as_absent_and_no_force_is_shown() -> No
     assert stream_of(IN_FLIGHT).control.force_ext_world_n is not None  # type: ignore[union-attr]
 
 
+def test_an_absent_tether_is_shown_as_absent() -> None:
+    maker = StreamBuilder(load_flight(CATCH, overrides=["vehicle.tether=null"]), "s")
+    maker.add_tick(*changed(IN_FLIGHT, outputs__tether=None))
+    stream = maker.build(1.7e9)
+    assert stream.tether is None
+    assert light_of(stream, "tether") == (HealthLevel.OFF, "none on this vehicle")
+
+
 AGES = [
     ("PX4", old("vehicle", SAFETY.vehicle_timeout_s)),
     ("PX4", old("status", 2.0 * SAFETY.heartbeat_timeout_s)),

@@ -25,7 +25,7 @@ from companion.safety.governor import BODY_TOP_M
 from companion.safety.tether import slack_m
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
-from tests.support import ROOT
+from tests.support import ROOT, tether_of
 
 FLIGHT_LIMIT_S = 120.0
 
@@ -175,7 +175,7 @@ def margins_m(config: SitlConfig, result: FastResult) -> tuple[float, float]:
         if outputs.phase_kind in (PhaseKind.GROUND, PhaseKind.DONE):
             continue
         p, q = truth.position_world_m, truth.attitude_wxyz
-        tether_m = min(tether_m, slack_m(vehicle.tether, p, q) - vehicle.tether.margin_m)
+        tether_m = min(tether_m, slack_m(tether_of(vehicle), p, q) - tether_of(vehicle).margin_m)
         dx, dy, dz = quat_rotate(q, manipulator.net_body_m(truth.joint_angle_rad))
         for at, to, span in ((p[0], p[0] + dx, room.x_m), (p[1], p[1] + dy, room.y_m)):
             low, high = min(at - reach_m, to - net_reach_m), max(at + reach_m, to + net_reach_m)

@@ -18,6 +18,7 @@ from companion.safety.rule import thresholds_of
 from companion.safety.rules import RULES
 from companion.safety.tether import TetherWatch, allowed_m, attachment_world_m, distance_m, slack_m
 from tests.safety.healthy import flying, healthy
+from tests.support import tether_of
 
 ROOT = Path(__file__).parents[2]
 
@@ -64,7 +65,7 @@ def test_0_2_m_s_or_more_off_the_fastest_accepted_plan_no_monitor_stops_it(
         assert all(f"could not stop within the {end}" in problem for problem in found)
     vehicle, start = config.vehicle, config.mission.start
     plan = Plan.build(config.mission, vehicle, (*start.position_m, vehicle.airframe.ground_clearance_m), 0.0)
-    tracker, watch = FlightTracker(vehicle), TetherWatch(vehicle)
+    tracker, watch = FlightTracker(vehicle), TetherWatch(vehicle, tether_of(vehicle))
     stopping = {"geofence_near", "geofence_left", "tether_short", "tether_taut"}
     rules = [(rule, thresholds_of(rule, vehicle)) for rule in RULES if rule.id in stopping]
     assert len(rules) == len(stopping)
@@ -138,6 +139,14 @@ def test_unflyable_mission_is_refused(overrides: list[str], line: str) -> None:
     found = problems(*overrides)
     assert any(line in problem for problem in found), found
     assert all("\n" not in problem for problem in found)
+
+
+def test_without_a_tether_nothing_about_a_tether_is_refused() -> None:
+    short = "vehicle.tether.length_m=1.5"
+    assert any("leaves the tether sphere" in line for line in problems(short))
+    assert problems("vehicle.tether=null") == []
+    (heavy,) = problems("vehicle.tether=null", "mission.catch.payload_max_kg=2")
+    assert "with 2 kg of payload (limit " in heavy
 
 
 @pytest.mark.parametrize(
@@ -234,9 +243,9 @@ def test_without_payload_less_thrust_will_do() -> None:
 
 
 def test_tether_geometry() -> None:
-    tether = load(
-        "vehicle.tether.attachment_body_m=[0.1, 0, 0.2]", "vehicle.tether.anchor_world_m=[0, 0, 0]"
-    ).vehicle.tether
+    tether = tether_of(
+        load("vehicle.tether.attachment_body_m=[0.1, 0, 0.2]", "vehicle.tether.anchor_world_m=[0, 0, 0]").vehicle
+    )
     half = 0.5**0.5
     left: tuple[float, float, float, float] = (half, 0.0, 0.0, half)  # yaw +90 deg
     assert attachment_world_m(tether, (1.0, 0.0, 0.8), left) == pytest.approx((1.0, 0.1, 1.0))

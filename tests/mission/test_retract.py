@@ -12,9 +12,10 @@ from companion.config.loader import load_vehicle
 from companion.mission.plan_builder import STOP_SPEED_MAX_M_S
 from companion.mission.retract import BESIDE_ANCHOR_M, inward_only, retract_from
 from companion.model.types import Vec2, Vec3
+from tests.support import tether_of
 
 VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
-ANCHOR = VEHICLE.tether.anchor_world_m
+ANCHOR = tether_of(VEHICLE).anchor_world_m
 FOLD: Vec2 = (math.radians(165.0), math.radians(140.0))
 RADIUS_M = VEHICLE.airframe.radius_m
 ROOM = VEHICLE.room
@@ -34,7 +35,7 @@ def away_m(p: Vec3) -> float:
 
 @given(inside, velocity, angle, st.tuples(angle, angle))
 def test_from_anywhere(position: Vec3, speed: Vec3, yaw_rad: float, arm_rad: Vec2) -> None:
-    plan = retract_from(position, speed, yaw_rad, arm_rad, FOLD, VEHICLE)
+    plan = retract_from(position, speed, yaw_rad, arm_rad, FOLD, VEHICLE, tether_of(VEHICLE))
     before = plan.reference(0.0)
     assert before.position_world_m == pytest.approx(position)
     for k in range(1, 201):
@@ -52,7 +53,7 @@ def test_from_anywhere(position: Vec3, speed: Vec3, yaw_rad: float, arm_rad: Vec
 
 @given(inside, angle)
 def test_at_rest_it_stays_in_the_room_and_beside_the_anchor(position: Vec3, yaw_rad: float) -> None:
-    plan = retract_from(position, (0.0, 0.0, 0.0), yaw_rad, FOLD, FOLD, VEHICLE)
+    plan = retract_from(position, (0.0, 0.0, 0.0), yaw_rad, FOLD, FOLD, VEHICLE, tether_of(VEHICLE))
     end = plan.reference(plan.duration_s).position_world_m
     assert ROOM.x_m[0] + RADIUS_M - 1e-9 <= end[0] <= ROOM.x_m[1] - RADIUS_M + 1e-9
     assert ROOM.y_m[0] + RADIUS_M - 1e-9 <= end[1] <= ROOM.y_m[1] - RADIUS_M + 1e-9
@@ -61,10 +62,10 @@ def test_at_rest_it_stays_in_the_room_and_beside_the_anchor(position: Vec3, yaw_
 
 def test_it_frees_the_tether() -> None:
     position = (1.4, 0.9, 1.2)
-    assert VEHICLE.tether.length_m - math.dist(position, ANCHOR) < 0.3
-    plan = retract_from(position, (0.0, 0.0, 0.0), 0.0, FOLD, FOLD, VEHICLE)
+    assert tether_of(VEHICLE).length_m - math.dist(position, ANCHOR) < 0.3
+    plan = retract_from(position, (0.0, 0.0, 0.0), 0.0, FOLD, FOLD, VEHICLE, tether_of(VEHICLE))
     end = plan.reference(plan.duration_s).position_world_m
-    assert VEHICLE.tether.length_m - math.dist(end, ANCHOR) >= VEHICLE.safety.retract_slack_m - 1e-6
+    assert tether_of(VEHICLE).length_m - math.dist(end, ANCHOR) >= VEHICLE.safety.retract_slack_m - 1e-6
 
 
 @given(velocity, inside)

@@ -26,6 +26,7 @@ from companion.recorder.log_writer import LogWriter
 from companion.recorder.viewer_scene import machine_of, path_of
 from tests.recorder.flights import EPOCH_NS, Row, config_json, tethered
 from tests.recorder.viewers import Seen, Viewed, view
+from tests.support import tether_of
 
 NAN = math.nan
 
@@ -198,7 +199,7 @@ def colour_of(rgba: dict[str, float]) -> str:
     ],
 )
 def test_the_tether_is_coloured_by_its_slack(tmp_path: Path, away_m: float, held: bool, colour: str) -> None:
-    tether = load_flight("configs/missions/catch.yaml").vehicle.tether
+    tether = tether_of(load_flight("configs/missions/catch.yaml").vehicle)
     x, y, z = tether.anchor_world_m
     inputs, outputs, sent = moved(still()[0], (x, y, z + away_m), (1.0, 0.0, 0.0, 0.0), (2.0, 2.0))
     watched = TetherState(

@@ -15,6 +15,7 @@ from companion.mission.plan import Plan
 from companion.mission.reference import at_rest
 from companion.model.types import Reference, TetherState, Vec3
 from companion.safety.governor import Governed, Governor, SafeSet
+from tests.support import tether_of
 
 DT_S = 0.005
 ARM = (2.0, 1.0)
@@ -201,7 +202,7 @@ def test_along_the_edge_it_slides() -> None:
 
 
 def test_taut_it_stops_at_once_and_may_only_come_home() -> None:
-    g, anchor = governor(), config().vehicle.tether.anchor_world_m
+    g, anchor = governor(), tether_of(config().vehicle).anchor_world_m
     plan = Plan.build(config().mission, config().vehicle)
     t_s = 0.0
     while t_s < 7.5:
@@ -225,6 +226,18 @@ def test_taut_it_stops_at_once_and_may_only_come_home() -> None:
     assert up.position_world_m[2] <= 0.7 + CLOSE
     free = at_rest((0.0, -0.5, 1.2), 0.0, ARM)
     assert follow(g, free, 5.0, tether()).reference is free
+
+
+def test_without_a_tether_only_the_walls_constrain() -> None:
+    g, room = governor("vehicle.tether=null"), config().vehicle.room
+    beyond_the_tether = (0.0, 1.2, 1.9)
+    assert math.dist(beyond_the_tether, tether_of(config().vehicle).anchor_world_m) > 2.75
+    free = at_rest(beyond_the_tether, 0.0, ARM)
+    assert follow(g, free, 12.0).reference is free
+    outside = follow(g, at_rest((9.0, 1.2, 1.9), 0.0, ARM), 12.0)
+    assert "geofence" in outside.limited_by
+    assert "tether" not in outside.limited_by
+    assert outside.reference.position_world_m[0] == pytest.approx(room.x_m[1] - 0.45, abs=0.01)
 
 
 def test_a_late_tick_is_caught_up_without_a_step() -> None:

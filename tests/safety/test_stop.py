@@ -26,6 +26,10 @@ def model(react_s: float = 0.18, deceleration_m_s2: float = 2.0) -> StopModel:
     )
 
 
+def test_without_a_tether_the_defaults_hold() -> None:
+    assert [StopModel(None).distance_m(v) for v in (0.5, 3.0)] == [model().distance_m(v) for v in (0.5, 3.0)]
+
+
 @pytest.mark.parametrize(
     ("speed_m_s", "drift_m"),
     [(0.625, 0.45), (1.13, 0.75)],

@@ -19,6 +19,7 @@ from companion.safety.tether_shape import Clearance, steepest_slope
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from sitl.world.world import Truth
+from tests.support import tether_of
 
 LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
 STILL: Vec3 = (0.0, 0.0, 0.0)
@@ -38,8 +39,16 @@ def vehicle(*overrides: str) -> Vehicle:
     return config(*overrides).vehicle
 
 
+def watch_of(machine: Vehicle) -> TetherWatch:
+    return TetherWatch(machine, tether_of(machine))
+
+
+def clearance(machine: Vehicle) -> Clearance:
+    return Clearance(machine, tether_of(machine))
+
+
 def once(p: Vec3, v: Vec3 = STILL, attitude: Quat = LEVEL, *overrides: str) -> TetherState:
-    return TetherWatch(vehicle(*overrides)).update(0.0, p, v, attitude, FOLDED, None, None)
+    return watch_of(vehicle(*overrides)).update(0.0, p, v, attitude, FOLDED, None, None)
 
 
 # -- geometry ----------------------------------------------------------------------------------------------------------
@@ -78,7 +87,7 @@ def test_used_up_is_taut_and_far_beyond_is_separated() -> None:
 
 
 def turned(way: Callable[[float], tuple[Vec3, Quat]], overrides: tuple[str, ...] = ()) -> float:
-    watch = TetherWatch(vehicle(*overrides))
+    watch = watch_of(vehicle(*overrides))
     for step in range(1001):
         p, q = way(step / 1000)
         state = watch.update(step * DT_S, p, STILL, q, FOLDED, None, None)
@@ -115,7 +124,7 @@ def test_winding(way: Callable[[float], tuple[Vec3, Quat]], turns: float) -> Non
 
 def ring_distance_m(clearance_of: Vehicle, ray: Vec3) -> float:
     """Brute force: least distance of a ray from the attachment to the ring of the rotors; negative if it comes up through it."""
-    p, inner = clearance_of.tether.attachment_body_m, clearance_of.tether.rotor_inner_radius_m
+    p, inner = tether_of(clearance_of).attachment_body_m, tether_of(clearance_of).rotor_inner_radius_m
     outer = clearance_of.airframe.radius_m
     least, above = math.inf, -math.inf
     for step in range(4000):
@@ -141,7 +150,7 @@ def test_clearance_of_the_rotors_against_brute_force(azimuth: float, elevation: 
         math.cos(elevation) * math.sin(azimuth),
         -math.sin(elevation),
     )
-    found, true = Clearance(machine).least_m(ray, None, FOLDED), ring_distance_m(machine, ray)
+    found, true = clearance(machine).least_m(ray, None, FOLDED), ring_distance_m(machine, ray)
     if true <= 0.0:
         assert found <= 1e-6
     else:
@@ -168,9 +177,9 @@ def test_a_slack_line_from_above_hangs_into_the_rotors_and_a_straight_one_does_n
 def test_the_arm_counts_when_the_line_is_tied_beside_it() -> None:
     beside = "vehicle.tether.attachment_body_m=[0, -0.13, -0.05]"
     machine = vehicle(beside)
-    assert not Clearance(vehicle()).judges_arm
-    assert Clearance(machine).judges_arm
-    watch = TetherWatch(machine)
+    assert not clearance(vehicle()).judges_arm
+    assert clearance(machine).judges_arm
+    watch = watch_of(machine)
 
     def clear(p: Vec3, yaw_deg: float, arm: Vec2 | None) -> float:
         q = quat_from_euler_zyx(0.0, 0.0, math.radians(yaw_deg))
@@ -214,7 +223,7 @@ def pulled(
     v: Vec3 = STILL,
     p: Vec3 = (0.5, 0.0, 1.0),
 ) -> list[TetherState]:
-    watch, states = TetherWatch(vehicle()), []
+    watch, states = watch_of(vehicle()), []
     for tick in range(round(seconds / DT_S)):
         t_s = tick * DT_S
         at = (p[0] + v[0] * t_s, p[1] + v[1] * t_s, p[2] + v[2] * t_s)
@@ -318,7 +327,7 @@ def test_an_ordinary_flight_raises_no_alarm(overrides: tuple[str, ...]) -> None:
     assert len(states) > 1000
     assert not any(state.taut or state.snagged or state.separated for state in states)
     assert max(state.pull_n for state in states) < 2.3
-    assert min(state.clearance_m for state in states) > vehicle().tether.clearance_min_m
+    assert min(state.clearance_m for state in states) > tether_of(vehicle()).clearance_min_m
     assert max(abs(state.turns) for state in states) < 0.5
 
 

@@ -16,6 +16,7 @@ from companion.sitl_config.world import World as WorldConfig
 from sitl.world.model import base_mass_kg
 from sitl.world.world import PHYSICS_DT_S, World
 from tests.pinocchio_or_skip import pin
+from tests.support import tether_of
 
 Array = NDArray[np.float64]
 NO_PAYLOAD = WorldConfig(payload_kg=0.0, joint_friction_nm=0.0, joint_damping_nms=0.0)
@@ -170,8 +171,8 @@ def test_a_taut_tether_pulls_and_a_slack_one_does_not(vehicle: Vehicle) -> None:
         world.step(rotors, (0, 0), False)
         truth = world.truth()
         tension.append(truth.tether_tension_n)
-        away = math.dist(truth.position_world_m, vehicle.tether.anchor_world_m)
-        assert away < vehicle.tether.length_m + 0.1
-        if away < vehicle.tether.length_m - 0.05:
+        away = math.dist(truth.position_world_m, tether_of(vehicle).anchor_world_m)
+        assert away < tether_of(vehicle).length_m + 0.1
+        if away < tether_of(vehicle).length_m - 0.05:
             assert truth.tether_tension_n == 0.0
     assert max(tension) > 1.0

@@ -41,8 +41,8 @@ class Point:
     """Flight clock."""
     position_world_m: Vec3
     tilt_rad: float
-    slack_m: float
-    """Slack of the tether with its configured length."""
+    slack_m: float | None
+    """Slack of the tether with its configured length; None without a tether."""
     tension_n: float
 
 
@@ -119,7 +119,7 @@ def row_of(variant: Variant, phase: FlightPhase, flown: FaultFlight, vehicle: Ve
         "action": max(actions, key=lambda action: action.rank, default=SafetyAction.NOMINAL).value,
         "worst_tilt_deg": math.degrees(max(point.tilt_rad for point in course)) if course else None,
         "min_height_m": _min_height_m(flown, course),
-        "min_slack_m": min(point.slack_m for point in course) if course else None,
+        "min_slack_m": min((point.slack_m for point in course if point.slack_m is not None), default=None),
         "drift_m": _drift_m(flown, course, abort) if outcome != "refused" else None,
         "caught": flown.caught,
         "problems": [],
@@ -205,7 +205,7 @@ def _problems(
 
 def _outward_m(course: Sequence[Point], abort: Event) -> float:
     """Return by how much the distance from the anchor grows after the stopping time, m."""
-    slack = [point.slack_m for point in course if point.t_s >= abort.t_s + STOPPING_S]
+    slack = [p.slack_m for p in course if p.t_s >= abort.t_s + STOPPING_S and p.slack_m is not None]
     return slack[0] - min(slack) if slack else 0.0
 
 

@@ -103,10 +103,11 @@ class Scene(Record, frozen=True, kw_only=True):
     session: str
     room_min_world_m: Vec3
     room_max_world_m: Vec3
-    anchor_world_m: Vec3
-    tether_length_m: float
-    tether_margin_m: float
-    attachment_body_m: Vec3
+    anchor_world_m: Vec3 | None = None
+    """None without a tether, as are the other three values of the tether."""
+    tether_length_m: float | None = None
+    tether_margin_m: float | None = None
+    attachment_body_m: Vec3 | None = None
     radius_m: float
     """Horizontal reach including the rotor disks."""
     ground_clearance_m: float
@@ -196,7 +197,7 @@ class ControlView(Record, frozen=True, kw_only=True):
     tau: Vec3
     """Force on the vehicle, world, N."""
     arm_torque_nm: Vec2
-    force_ext_world_n: Vec3 | None
+    force_ext_world_n: Vec3 | None = None
     """External force on the net, world frame, N; None without a force sensor."""
     hover_thrust: float
     saturated: bool

@@ -197,6 +197,8 @@ class HealthEvaluator:
 
     def _tether_health(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
         state, tether = snapshot.outputs.tether, self._tether
+        if tether is None:
+            return HealthLevel.OFF, "none on this vehicle"
         if state is None:
             return HealthLevel.OFF, "not measured"
         left = f"{state.slack_m:.2f} m left"

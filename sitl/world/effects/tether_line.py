@@ -86,9 +86,9 @@ class TetherLine:
         self._base = base
 
     @classmethod
-    def of(cls, config: TetherLineConfig, tether: Tether, base: int) -> TetherLine | None:
-        """Return the effect, or None if it is off."""
-        return cls(config, tether, base) if config.on else None
+    def of(cls, config: TetherLineConfig, tether: Tether | None, base: int) -> TetherLine | None:
+        """Return the effect, or None if it is off or the vehicle has no tether."""
+        return cls(config, tether, base) if config.on and tether is not None else None
 
     def restart_noise(self) -> None:
         """Do nothing: this effect has no noise."""

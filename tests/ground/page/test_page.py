@@ -231,6 +231,15 @@ def test_tether_slack_shows_in_its_colour(
     assert watched.body("level") == level
 
 
+def test_a_vehicle_without_a_tether_is_drawn_without_one(stub: MonitorStub, shared: Page) -> None:
+    absent = {"anchor_world_m": None, "tether_length_m": None, "tether_margin_m": None, "attachment_body_m": None}
+    stub.greeting = [hello(), BROKER, *retained(), relayed(replace(flown().scene, **absent))]
+    shared.open_anew(stub)
+    shared.show(relayed(in_flight(tether=None)))
+    assert "no tether" in shared.text(".tile:first-child")
+    assert shared.body("level") == "ok"
+
+
 def test_the_catch_appears_among_the_events_and_is_read_out(page: Page) -> None:
     page.show(relayed(in_flight()))
     assert page.tab.locator("#event-list li").count() == 0

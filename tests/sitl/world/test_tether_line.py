@@ -13,10 +13,10 @@ from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.tether_line import Hanging, TetherLine, hanging
 from sitl.world.world import World
-from tests.support import CATCH
+from tests.support import CATCH, tether_of
 
 VEHICLE = load_sitl(CATCH).vehicle
-ANCHOR = VEHICLE.tether.anchor_world_m
+ANCHOR = tether_of(VEHICLE).anchor_world_m
 WEIGHT_N_M = 0.2
 
 
@@ -101,7 +101,7 @@ def test_a_nearly_straight_line_pulls_towards_the_anchor_without_a_pull_that_cou
         act(world)
         fx, fy, fz, *_ = load(world)
         assert fx * (ANCHOR[1] - y) == pytest.approx(fy * (ANCHOR[0] - x)) and fy < 0.0 and fz < 0.0
-        assert math.hypot(fx, fy, fz) < VEHICLE.tether.pull_min_n
+        assert math.hypot(fx, fy, fz) < tether_of(VEHICLE).pull_min_n
     assert world.truth().tether_tension_n == 0.0
 
 
@@ -114,7 +114,7 @@ def test_a_line_that_was_cut_off_its_anchor_pulls_no_more_than_its_weight() -> N
 
 
 def test_a_pull_beside_the_centre_of_mass_turns_the_vehicle() -> None:
-    tether = VEHICLE.tether.model_copy(update={"attachment_body_m": (0.1, 0.0, 0.0)})
+    tether = tether_of(VEHICLE).model_copy(update={"attachment_body_m": (0.1, 0.0, 0.0)})
     config = WorldConfig(payload_kg=0.0, tether_line=TetherLineConfig(on=True))
     world = World(VEHICLE.model_copy(update={"tether": tether}), config, (0.4, 0.0), 0.0, (1.7, 1.0))
     act(world)

@@ -12,7 +12,7 @@ const TILES = [
     id: "tether", title: "Tether slack", unit: "m", digits: 2,
     read: (s, scene) => ({
       value: s.tether?.slack_m, level: tetherLevel(s.tether, scene),
-      note: s.tether ? `margin ${quantity(scene?.tether_margin_m, 2, "m")}` : "not known",
+      note: s.tether ? `margin ${quantity(scene?.tether_margin_m, 2, "m")}` : scene && !scene.anchor_world_m ? "no tether" : "not known",
     }),
   },
   {

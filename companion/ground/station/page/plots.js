@@ -56,7 +56,7 @@ export const PLOTS = [
       { label: "slack", unit: "m", colour: "3", value: (r) => r.tether?.slack_m },
       { label: "pull", unit: "N", colour: "2", right: true, value: (r) => r.tether?.pull_n },
     ],
-    limits: (scene) => [{ value: scene.tether_margin_m, label: "margin", level: "warn" }, { value: 0, label: "taut", level: "bad" }],
+    limits: (scene) => !scene.anchor_world_m ? [] : [{ value: scene.tether_margin_m, label: "margin", level: "warn" }, { value: 0, label: "taut", level: "bad" }],
   },
   {
     title: "Times, ms", digits: 1, floor: 0, span: 5,

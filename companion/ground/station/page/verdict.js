@@ -19,7 +19,7 @@ const KINDS = { ground: "GROUND", takeoff: "TAKE-OFF", flight: "FLYING", landing
 export function tetherLevel(tether, scene) {
   if (!tether) return "unknown";
   if (tether.taut || tether.snagged || tether.slack_m <= 0) return "bad";
-  const margin = scene ? scene.tether_margin_m : 0;
+  const margin = scene?.tether_margin_m ?? 0;
   return tether.slack_m < margin || tether.stop_slack_m < margin ? "warn" : "ok";
 }
 
