@@ -59,6 +59,11 @@ class Lift(PscController):
     settings = LiftConfig
 """
 """Module of a control law that flies as psc does."""
+STEP = """
+    def step(self, dt_s, state, reference, vertical_scale):
+        wrench = super().step(dt_s, state, reference, vertical_scale)
+        """
+"""The begin of a method for `LAW`."""
 
 
 def write_law(site: Path, law: str = LAW, version: str = "1.0") -> None:

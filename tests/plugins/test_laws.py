@@ -19,7 +19,7 @@ from companion.model.types import Inputs, Outputs, Sent
 from companion.plugins import PluginError
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import fly_to_end, row_of
-from tests.plugins.installed import LAW, on_path, write_law
+from tests.plugins.installed import LAW, STEP, on_path, write_law
 
 
 @pytest.fixture
@@ -126,10 +126,6 @@ def test_a_log_is_not_replayed_without_its_law(tmp_path: Path) -> None:
         logged_flight(config_json)
 
 
-STEP = """
-    def step(self, dt_s, state, reference, vertical_scale):
-        wrench = super().step(dt_s, state, reference, vertical_scale)
-        """
 REPLACE = "from msgspec.structs import replace\n"
 
 

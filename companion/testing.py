@@ -1,0 +1,177 @@
+"""The contract of control laws, as checks that the author of a law runs in his own tests.
+
+`check_law("NAME")` runs all of them; `sitl.testing.check_catch` flies the law. A law has no reset: each flight and each check makes a
+new instance.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from companion.config.controller import PRESETS
+from companion.config.loader import FlightConfig, load_flight
+from companion.config.shipped import DEFAULT_MISSION
+from companion.config.vehicle import Vehicle
+from companion.control.trial import AT_REST, HOVER, build_law, problem_of, try_law
+from companion.control.types import Law, PlantState, Wrench
+from companion.model.codec import differences, to_packet
+from companion.model.constants import GRAVITY_M_S2, TICK_PERIOD_S
+from companion.model.frames import quat_from_euler_zyx, quat_rotate, tilt_rad
+from companion.model.types import Reference, Vec2, Vec3
+
+RANDOM_TICKS = 300
+THRUST_TOLERANCE = 0.03
+"""Largest error of the thrust at hover as a fraction of the weight."""
+HELD_S = 5.0
+TILT_TOLERANCE_RAD = math.radians(1.0)
+Tick = tuple[float, PlantState, Reference, float]
+"""Arguments of one step of a law."""
+
+
+def check_law(law: str, preset: str | None = None, vehicle: str | Path | None = None) -> None:
+    """Run every check on an installed control law.
+
+    Args:
+        law: name of the law.
+        preset: one of its presets; None for all of them, one after the other.
+        vehicle: vehicle file, or the name of a shipped one; None for that of the shipped catch mission.
+
+    Raises:
+        AssertionError: a check fails; the text names the preset and what was found.
+        PluginError: the law cannot be used at all, or fails the trial that precedes every flight.
+        ConfigError: a preset does not fit the law's settings.
+    """
+    for name in PRESETS[law] if preset is None else (preset,):
+        config = load_flight(DEFAULT_MISSION, vehicle, law, name)
+        first_deg, second_deg = config.mission.start.arm_deg
+        arm_rad = (math.radians(first_deg), math.radians(second_deg))
+        try_law(config.controller, config.vehicle, arm_rad)
+        _check_random_inputs(config, f"{law}/{name}")
+        _check_hover(config, f"{law}/{name}", arm_rad)
+
+
+def _check_random_inputs(config: FlightConfig, label: str) -> None:
+    """Check that commands can be sent, depend on nothing but the inputs, and that the law does not change what it is given."""
+    ticks = list(_random_ticks(config.vehicle))
+    settings, inputs = config.model_dump_json(), to_packet(ticks)
+    first = _commands(config, ticks)
+    assert (config.model_dump_json(), to_packet(ticks)) == (settings, inputs), (
+        f"{label}: the law has changed its inputs"
+    )
+    for number, wrench in enumerate(first):
+        problem = problem_of(wrench)
+        assert problem is None, f"{label}: tick {number} of random inputs: step returns {problem}"
+    second = _commands(config, ticks)
+    for number, (one, other) in enumerate(zip(first, second, strict=True)):
+        found = differences(one, other)
+        assert found is None, (
+            f"{label}: the same inputs twice: tick {number}: {found[0]} = {found[1]!r}, then {found[2]!r}"
+        )
+    assert (config.model_dump_json(), to_packet(ticks)) == (settings, inputs), (
+        f"{label}: the law has changed its inputs"
+    )
+
+
+def _check_hover(config: FlightConfig, label: str, arm_rad: Vec2) -> None:
+    """Check that a law hovers level with hover thrust, and that its integrators do not change while the ground or a limit of the
+    actuators keeps the vehicle from its reference: the time spent there has no effect on later commands.
+    """
+    weight_n = config.vehicle.airframe.mass_kg * GRAVITY_M_S2
+
+    def hovering(offset_m: Vec3, airborne: bool, duration_s: float) -> tuple[float, float]:
+        """Return thrust as a fraction of the weight, and tilt, after 2 s at the reference that follow `duration_s` away from it."""
+        law = build_law(config.controller, config.vehicle)
+        wrench = _held(law, config.vehicle, arm_rad, offset_m, airborne, duration_s, None)
+        wrench = _held(law, config.vehicle, arm_rad, (0.0, 0.0, 0.0), True, 2.0, wrench)
+        assert wrench is not None
+        return wrench.collective_n / weight_n, tilt_rad(wrench.attitude_wxyz)
+
+    share, tilt = hovering((0.0, 0.0, 0.0), True, 0.0)
+    assert abs(share - 1.0) <= THRUST_TOLERANCE, f"{label}: the thrust at hover is {share:.3f} of the weight"
+    assert tilt <= TILT_TOLERANCE_RAD, f"{label}: the attitude at hover is tilted by {math.degrees(tilt):.1f} deg"
+    for what, offset_m, airborne in (
+        ("on the ground, 0.3 m from the reference on each axis", (-0.3, -0.3, -0.3), False),
+        ("of saturated thrust", (0.0, 0.0, -20.0), True),
+        ("at the tilt limit", (-20.0, 0.0, 0.0), True),
+    ):
+        (share, tilt), (once, tilt_once) = (hovering(offset_m, airborne, s) for s in (HELD_S, TICK_PERIOD_S))
+        found = f"{label}: after {HELD_S:g} s {what} the command at hover differs from that after one tick of it"
+        assert abs(share - once) <= THRUST_TOLERANCE, f"{found}: thrust {share:.3f} and {once:.3f} of the weight"
+        degrees = f"{math.degrees(tilt):.1f} and {math.degrees(tilt_once):.1f} deg"
+        assert abs(tilt - tilt_once) <= TILT_TOLERANCE_RAD, f"{found}: tilt {degrees}"
+
+
+def _held(
+    law: Law,
+    vehicle: Vehicle,
+    arm_rad: Vec2,
+    offset_m: Vec3,
+    airborne: bool,
+    duration_s: float,
+    wrench: Wrench | None,
+) -> Wrench | None:
+    """Run the law with a constant error of the position. The acceleration in the air is that of its last command."""
+    x, y, z = AT_REST.position_world_m
+    position: Vec3 = (x + offset_m[0], y + offset_m[1], z + offset_m[2])
+    reference = replace(HOVER, arm_rad=arm_rad)
+    for _ in range(round(duration_s / TICK_PERIOD_S)):
+        state = replace(AT_REST, position_world_m=position, arm_rad=arm_rad, airborne=airborne)
+        if airborne and wrench is not None:
+            mass_kg, attitude = vehicle.airframe.mass_kg, wrench.attitude_wxyz
+            fx, fy, fz = quat_rotate(attitude, (0.0, 0.0, wrench.collective_n))
+            felt = (fx / mass_kg, fy / mass_kg, fz / mass_kg - GRAVITY_M_S2)
+            state = replace(state, acceleration_world_m_s2=felt, attitude_wxyz=attitude)
+        wrench = law.step(TICK_PERIOD_S, state, reference, 1.0)
+    return wrench
+
+
+def _commands(config: FlightConfig, ticks: list[Tick]) -> list[Wrench]:
+    law = build_law(config.controller, config.vehicle)
+    return [law.step(*tick) for tick in ticks]
+
+
+def _random_ticks(vehicle: Vehicle) -> Iterator[Tick]:
+    """Yield the same random inputs every time: states within the limits of a flight, and short and long ticks."""
+    draw = random.Random(1)
+
+    def three(most: float) -> Vec3:
+        return (draw.uniform(-most, most), draw.uniform(-most, most), draw.uniform(-most, most))
+
+    def two(most: float) -> Vec2:
+        return (draw.uniform(-most, most), draw.uniform(-most, most))
+
+    def angles() -> Vec2:
+        first, second = (draw.uniform(*joint.angle_deg) for joint in vehicle.arm.joints)
+        return (math.radians(first), math.radians(second))
+
+    for _ in range(RANDOM_TICKS):
+        roll, pitch = two(0.6)
+        airborne = draw.random() < 0.8
+        state = PlantState(
+            position_world_m=three(2.0),
+            velocity_world_m_s=three(2.0),
+            acceleration_world_m_s2=three(5.0),
+            attitude_wxyz=quat_from_euler_zyx(roll, pitch, draw.uniform(-math.pi, math.pi)),
+            angular_rate_body_rad_s=three(2.0),
+            arm_rad=angles(),
+            arm_rate_rad_s=two(3.0),
+            force_ext_world_n=three(10.0) if draw.random() < 0.7 else None,
+            airborne=airborne,
+        )
+        reference = Reference(
+            position_world_m=three(2.0),
+            velocity_world_m_s=three(2.0),
+            acceleration_world_m_s2=three(2.0),
+            yaw_rad=draw.uniform(-math.pi, math.pi),
+            yaw_rate_rad_s=draw.uniform(-1.0, 1.0),
+            arm_rad=angles(),
+            arm_rate_rad_s=two(2.0),
+            arm_acceleration_rad_s2=two(5.0),
+            jerk_world_m_s3=three(5.0),
+        )
+        yield draw.uniform(0.001, 0.05), state, reference, 1.0 if airborne else draw.random()
