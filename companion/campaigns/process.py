@@ -81,7 +81,7 @@ class CampaignProcess:
                 self._log.unlink()
 
     def ask_to_stop(self) -> None:
-        """Make `results` end soon. Safe in a signal handler."""
+        """Make `results` end soon. May be called in a signal handler."""
         self._stop_asked = True
 
     def results(self) -> Iterator[Message]:

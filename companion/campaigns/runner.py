@@ -1,4 +1,6 @@
-"""Runs any campaign: fly, summarise, write CSV, JSON and HTML, print. A `Campaign` defines flights and output."""
+"""Runs any campaign: flies it, summarises the results, writes them as CSV, JSON and HTML, and prints them. A `Campaign` defines its
+flights and its output.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,7 @@ class Flights(Protocol):
         """
 
     def ask_to_stop(self) -> None:
-        """Make `results` end soon. Safe in a signal handler."""
+        """Make `results` end soon. May be called in a signal handler."""
 
 
 @dataclass(kw_only=True)
@@ -51,7 +53,7 @@ class Campaign(ABC):
     csv_name: ClassVar[str]
 
     configs: Sequence[SitlConfig]
-    """Effective configurations; each flight names one by its position."""
+    """Effective configurations; each flight refers to one of them by its position."""
     flights: Sequence[Message]
     """Each flight in the format of `sitl.campaigns`."""
     command: str
@@ -109,7 +111,11 @@ class Campaign(ABC):
         """Return the content of the HTML page."""
 
     def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:
-        """Write the plots, if there are any; raises ImportError without matplotlib."""
+        """Write the plots, if there are any, and return them.
+
+        Raises:
+            ImportError: matplotlib is not installed.
+        """
         return []
 
     @abstractmethod
@@ -269,12 +275,16 @@ def flat(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def to_json(data: Any) -> str:
-    """Format plain data for files and scripts; raises ValueError for NaN."""
+    """Return plain data as JSON text for files and scripts.
+
+    Raises:
+        ValueError: a value is NaN or infinite.
+    """
     return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
 def write_csv(rows: Iterable[Mapping[str, Any]], path: Path) -> None:
-    """Write one line per row below a header; the keys of the first row are the columns, an unknown value is empty."""
+    """Write one line per row below a header; the keys of the first row are the columns, and an unknown value is an empty cell."""
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer: csv.DictWriter[str] | None = None
         for row in rows:

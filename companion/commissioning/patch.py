@@ -50,7 +50,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """Changes to a vehicle file; false if the file already has all of these values."""
+    """Changes to a vehicle file; falsy if the file already has all of these values."""
 
     path: Path
     shown: str
@@ -90,7 +90,7 @@ class Patch:
         try:
             if path.read_bytes() != self.before:
                 raise ConfigError(
-                    [f"{self.shown}: has changed since it was read; nothing was written, run the tool again"]
+                    [f"{self.shown}: has changed since it was read; nothing was written; run the tool again"]
                 )
             backup = _back_up(path, self.before)
             write_whole(path, self.after, mode=stat.S_IMODE(path.stat().st_mode), durable=True)

@@ -40,7 +40,7 @@ class Cancelled(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """How a group of tools treats the user and the vehicle file."""
+    """How a group of tools guides the user, writes the vehicle file and sets the exit code."""
 
     guides_on_stderr: bool
     """Whether instructions go to standard error even without `--json`."""
@@ -130,11 +130,11 @@ class Tool(Generic[_T]):
     """Words after `companion`."""
     family: Family
     collect: Callable[[Session], _T | Coroutine[Any, Any, _T]]
-    """Check the options, open the devices, guide the user, return the measurements. Ctrl-C cancels it if it is a coroutine."""
+    """Checks the options, opens the devices, guides the user and returns the measurements. Ctrl-C cancels it if it is a coroutine."""
     fit: Callable[[_T, Vehicle], Report]
-    """Evaluates the measurements. Pure."""
+    """Evaluates the measurements; a pure function."""
     device: Check | None = None
-    """Row for a device that does not open or stops answering; None to report it as one line on standard error."""
+    """Check whose row reports a device that cannot be opened or stops answering; None to report it as one line on standard error."""
     no_data: Mapping[str, Any] = field(default_factory=dict)
     """`Report.data` when a device fails."""
 
@@ -217,7 +217,7 @@ def row_lines(rows: Sequence[Row], brief: Mapping[str, str]) -> list[str]:
             wrong.add(group)
             lines += [f"      -> {row.fix}"] if row.fix else []
     lines += [
-        f"{'ok':<5} {brief[group]:<34} {'the other' if group in wrong else 'all'} {count} are right"
+        f"{'ok':<5} {brief[group]:<34} {'the other' if group in wrong else 'all'} {count} are correct"
         for group, count in hidden.items()
     ]
     return lines
@@ -230,7 +230,7 @@ def _patch_lines(patch: Patch | None, written: str | None) -> list[str]:
         "",
         patch.text,
         "",
-        f"written; the old file is kept as {written}" if written else "not written; add --write to write",
+        f"written; the old file is kept as {written}" if written else "not written; add --write to write it",
     ]
 
 

@@ -1,4 +1,4 @@
-"""Replaces or adds single values of a YAML text; comments, order and everything else remain unchanged. Pure."""
+"""Replaces or adds single values of a YAML text; comments, order and everything else remain unchanged. Pure functions."""
 
 from __future__ import annotations
 

@@ -242,7 +242,7 @@ def print_result(console: Console, summary: dict[str, Any], out: Path, report: P
         facts.add_row("tether", f"minimum slack {slack:.2f} m")
     every = summary.get("graded_every", 1)
     if every > 1:
-        facts.add_row("graded", f"every {every}th tick of a long flight; loop and latencies: every tick")
+        facts.add_row("graded", f"one tick in {every} of a long flight; loop and latencies: every tick")
     facts.add_row("report", str(report) if report else f"none; any other files are in {out}")
     console.print()
     console.print(facts, highlight=False, soft_wrap=True)

@@ -157,7 +157,7 @@ def test_a_tether_that_was_made_taut_may_be_so_but_not_be_followed_outward() -> 
         ),
         VEHICLE,
     )
-    assert row["problems"] == ["outward on a taut tether"]
+    assert row["problems"] == ["moved outward on a taut tether"]
 
 
 def test_what_is_reported_after_the_landing_is_no_answer() -> None:

@@ -64,7 +64,7 @@ def test_cases_come_back_from_their_file_as_they_were(tmp_path: Path) -> None:
     assert cases.cases[0].kept == Kept(outcome=Outcome.COMPLETED, caught=True, e_p_m=0.0423)
     assert cases.cases[1].kept.e_p_m is None
     assert [case.name for case in cases.named([names[1]])] == [names[1]]
-    with pytest.raises(ConfigError, match="--case nobody: no such case; there are: heavy"):
+    with pytest.raises(ConfigError, match="--case nobody: no such case; available: heavy"):
         cases.named(["nobody"])
 
 

@@ -143,4 +143,4 @@ def test_a_constant_of_no_such_servo_is_not_proposed(vehicle: Vehicle) -> None:
 
 def test_a_machine_that_is_not_level_is_reported(vehicle: Vehicle) -> None:
     found = fit(swept(vehicle, off_deg=6.0, noise_a=0.003), vehicle)
-    assert any("gravity pulls as if the arm were turned" in note for note in found.notes)
+    assert any("gravity acts as if the arm were turned" in note for note in found.notes)

@@ -128,7 +128,7 @@ def test_half_a_turn_is_reported() -> None:
     bench = Bench(arm_with(), (1, -1), (1024, 3072))
     bench.move(bench.guide.steps[0].pose_deg)
     bench.hold()
-    assert bench.move((90.0, 40.0)).notice.startswith("requested 90 deg, but it has turned by")
+    assert bench.move((90.0, 40.0)).notice.startswith("requested 90 deg, but the joint has turned by")
     assert bench.hold().number == 2
 
 

@@ -111,7 +111,7 @@ def test_ctrl_c_ends_the_check(sandbox: Sandbox) -> None:
     with World(sandbox) as world:
         running = sandbox.start("ft", "check", "--weight", 1, "--vehicle", VEHICLE, *world.addresses())
         with running:
-            wait_for_error(running, "nothing touches it")
+            wait_for_error(running, "empty and untouched")
             running.signal(signal.SIGINT)
             ended = running.end()
     assert ended.code == EXIT_ABORTED

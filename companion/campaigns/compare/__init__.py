@@ -1,5 +1,5 @@
 """`companion compare`: one mission with several control laws, presets, payloads and seeds.
 
-`tables` has the columns. A new metric is measured in `sitl.campaigns.flights`, summarised by `aggregate.FIGURES` and shown in
-`tables`. `grid` has the variants that are flown, `paper_results` the paper's results, and `plots` the pictures.
+`grid` defines the variants that are flown, `paper_results` contains the paper's results, `tables` defines the columns, and `plots`
+draws the pictures. To add a metric, measure it in `sitl.campaigns.flights`, add it to `aggregate.FIGURES` and show it in `tables`.
 """

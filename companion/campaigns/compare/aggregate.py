@@ -1,4 +1,5 @@
-"""Distributions of a comparison's metrics over the seeds, and paired comparison with the adaptation on and off. `tables` formats them.
+"""Distributions of a comparison's metrics over the seeds, and the paired comparison with the adaptation on and off. `tables`
+formats them.
 
 A *row* holds the results of one flight as plain data: controller, preset, payload_kg, seed, world_seed, model_error, outcome,
 error, catch_t_s, rms {pre|post: e_p_m, e_q_deg, e_alpha_deg}, impedance_error {position_n, arm_nm}, final_e_z_m, peak_e_p_m,
@@ -20,7 +21,7 @@ from companion.campaigns.runner import Row, flat
 
 COMPLETED = "completed"
 MISSED = "missed"
-"""Key in `Group.failures` of flights completed without a catch."""
+"""Key in `Group.failures` for flights that were completed without a catch."""
 FIGURES = (
     *(f"rms.{part}.{key}" for part in ("pre", "post") for key in ("e_p_m", "e_q_deg", "e_alpha_deg")),
     "impedance_error.position_n",
@@ -61,8 +62,8 @@ class Group:
         return f"{self.controller}/{self.preset}"
 
     def values(self, name: str) -> list[float]:
-        """Return one of `FIGURES` for each flight: infinite if the flight failed before its value was known. A completed flight
-        without a value, such as one whose payload missed the net, is left out.
+        """Return the value of one of `FIGURES` for each flight: infinite if the flight failed before its value was known. A
+        completed flight without a value, such as one whose payload missed the net, is left out.
         """
         found = ((row, figure(row, name)) for row in self.rows)
         return [math.inf if value is None else value for row, value in found if value is not None or _ended_early(row)]
@@ -76,7 +77,7 @@ class Group:
 
     @property
     def failures(self) -> dict[str, int]:
-        """Number of flights that did not end completed with the payload on board, by outcome."""
+        """Number of flights, by outcome, that were not completed with the payload on board."""
         return dict(Counter(what for row in self.rows if (what := _failure(row)) is not None))
 
     @property
@@ -135,7 +136,7 @@ def _failure(row: Row) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """The same flights with the adaptation off and on: one law and preset, payload and model error, a pair for each seed."""
+    """Flights with the adaptation off and on, paired by seed, for one law, preset, payload and model error."""
 
     controller: str
     preset: str
@@ -153,7 +154,7 @@ class Pairs:
     @property
     def p_value(self) -> float:
         """Two-sided p-value of the sign test: the probability of a count at least as uneven as `better` if on and off were equally
-        good.
+        likely to be better.
         """
         n = sum(on != off for off, on in self.off_on)
         least = min(self.better, n - self.better)
@@ -186,7 +187,7 @@ def _post_by_seed(group: Group) -> dict[int, float]:
 
 
 def figure(row: Row, name: str) -> float | None:
-    """Return one of `FIGURES` of a row."""
+    """Return the value of one of `FIGURES` for a row."""
     if name == "final_abs_e_z_m":
         return None if row["final_e_z_m"] is None else abs(row["final_e_z_m"])
     value = dict(flat(row))[name]

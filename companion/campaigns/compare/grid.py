@@ -69,8 +69,8 @@ def variants_of(
     ablation: bool,
     adaptation: Sequence[str] = ADAPTATION[:1],
 ) -> list[Variant]:
-    """Return the lines of the table. Each law is flown with those requested presets that it has, or with all of its presets if it
-    has none of them.
+    """Return the variants in the order of the table, one per line. Each law is flown with those requested presets that it has, or
+    with all of its presets if it has none of them.
 
     Args:
         available: presets of each law.

@@ -138,7 +138,7 @@ def distributions(groups: Sequence[Group]) -> list[tuple[str, str, str, Figure]]
     ):
         if any(_finite(group, part) for group in shown for part in PARTS):
             caption = (
-                "RMS of ‖e_p‖ of every flight, logarithmic. Long mark: p50, short mark: p95; a failed flight counts as worse "
+                "RMS of ‖e_p‖ of every flight, on a logarithmic axis. Long mark: p50, short mark: p95; a failed flight counts as worse "
                 "than all others. Diamonds: printed in the paper."
             )
             figures.append((name, title, caption, _strips(title, shown)))

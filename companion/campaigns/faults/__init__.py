@@ -1,6 +1,6 @@
 """`companion faults`: flights with one fault each.
 
-`variants` lists the faults that are flown, with sizes and durations. A new kind of fault begins in `companion.sitl_config.faults`
-(`FaultKind` and `KINDS`), and its effect is in `sitl.faults`. `judge` has the outcome of a flight and the columns of its row;
-`campaign` has the tables.
+`variants` lists the faults that are flown, with sizes and durations. To add a kind of fault, define it in
+`companion.sitl_config.faults` (`FaultKind` and `KINDS`) and implement its effect in `sitl.faults`. `judge` determines the outcome
+of a flight and the values of its row; `campaign` makes the tables.
 """

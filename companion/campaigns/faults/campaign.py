@@ -98,7 +98,7 @@ class Faults(Campaign):
 
 
 def extreme(rows: Sequence[Row], key: str, pick: Callable[[list[float]], float]) -> float | None:
-    """Return the largest or smallest value of a key; None if no row has one."""
+    """Return the value of a key that `pick` (max or min) selects over all rows; None if no row has a value."""
     values = [row[key] for row in rows if row[key] is not None]
     return pick(values) if values else None
 
@@ -118,7 +118,7 @@ def size_meaning(size: str | None, unit: str) -> str:
 
 
 def flights_table(rows: Sequence[Row], *, details: bool = False) -> Table:
-    """Return one line per flight.
+    """Return a table with one line per flight.
 
     Args:
         rows: rows of the flights.

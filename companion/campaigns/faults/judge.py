@@ -155,7 +155,7 @@ def _after(begun_s: float | None, event: Event | None) -> float | None:
 
 
 def _min_height_m(flown: FaultFlight, course: Sequence[Point]) -> float | None:
-    """Return the smallest height in planned flight: from the fault or the end of the take-off to the landing."""
+    """Return the smallest height in planned flight: from the fault or the end of the take-off, whichever is later, to the landing."""
     up = [
         tick.t_s for tick in flown.ticks if tick.kind is PhaseKind.FLIGHT and tick.action.rank < SafetyAction.LAND.rank
     ]
@@ -197,7 +197,7 @@ def _problems(
     if variant.kind not in _PULLS_BY_ITSELF and any(point.tension_n > TAUT_N for point in course):
         found.append("pulled its tether taut by its own motion")
     elif variant.kind == "tether_taut" and abort is not None and _outward_m(course, abort) > OUTWARD_M:
-        found.append("outward on a taut tether")
+        found.append("moved outward on a taut tether")
     if any(_outside(point.position_world_m, vehicle) for point in course):
         found.append("left the geofence")
     return found

@@ -32,7 +32,9 @@ LEAVE_TIMEOUT_S = 60.0
 WITNESS = "world.json"
 """File in the flight's folder in which a simulated world with faults writes its record."""
 NEAR_FRAMES = 3
-"""Number of consecutive frame numbers of which the first that is in the log is used: a tick logs only its newest frame."""
+"""Number of consecutive frame numbers that are looked for in the log, because a tick logs only its newest frame. The first one
+found is used.
+"""
 _POLL_S = 0.5
 
 

@@ -1,4 +1,4 @@
-"""The faults that a campaign injects, one per flight. A new kind begins in `companion.sitl_config.faults`."""
+"""The faults that a campaign injects, one per flight. `companion.sitl_config.faults` defines the kinds of faults."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Variant:
 
     @property
     def phases(self) -> tuple[FlightPhase, ...]:
-        """The phases in which a campaign injects it."""
+        """The phases in which a campaign injects the fault."""
         return KINDS[self.kind].phases
 
     @property
@@ -131,8 +131,8 @@ def planned(kinds: Sequence[str], phases: Sequence[str], *, wires: bool = False)
 
     Args:
         kinds: requested kinds; empty for all.
-        phases: requested phases; empty for all. A kind that is requested with a phase is flown in it even if campaigns leave that
-            phase out.
+        phases: requested phases; empty for all. If kinds and phases are both requested, each kind is flown in each phase, even in
+            one that campaigns normally leave out.
         wires: choose from `WIRES`.
     """
     if wires:

@@ -188,7 +188,7 @@ def flights_table(rows: Sequence[Row], cases: Sequence[Case] = ()) -> Table:
 
     Args:
         rows: rows of the flights.
-        cases: the cases flown, each under the name of its row; empty for draws.
+        cases: the cases that were flown, with the same names as their rows; empty for draws.
     """
 
     def drawn(key: str, form: str, scale: float = 1.0) -> Any:

@@ -20,7 +20,7 @@ from companion.sitl_config.world import World
 WORSE_THAN_KEPT = 1.25
 """Largest allowed ratio of a case's error to its recorded error."""
 _HARD_FROM = 0.4
-"""Fraction of the distance from the middle of a range to its hard end above which a case's name mentions the quantity."""
+"""A case's name mentions a quantity whose value lies beyond this fraction of the way from the middle of its range to the hard end."""
 _WORDS = (
     # key, middle and hard end of its range, word
     ("setpoint_delay_s", 0.03, 0.06, "slow_setpoints"),
@@ -73,7 +73,7 @@ class Cases(Model):
         """
         known = [case.name for case in self.cases]
         if missing := [name for name in names if name not in known]:
-            raise ConfigError([f"--case {name}: no such case; there are: {', '.join(known)}" for name in missing])
+            raise ConfigError([f"--case {name}: no such case; available: {', '.join(known)}" for name in missing])
         return tuple(case for case in self.cases if not names or case.name in names)
 
 
@@ -89,7 +89,9 @@ def read_cases(path: Path) -> Cases:
         raise ConfigError(problem_lines(document.problems))
     names = [case.name for case in cases.cases]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ConfigError([f"{path}: cases: expected distinct names, but there are several of {', '.join(twice)}"])
+        raise ConfigError(
+            [f"{path}: cases: expected distinct names, but these occur more than once: {', '.join(twice)}"]
+        )
     return cases
 
 

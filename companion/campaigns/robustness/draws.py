@@ -97,7 +97,7 @@ class Third:
 
 
 def thirds(rows: Sequence[Row]) -> list[Third]:
-    """Split the payload range into three parts of equal width."""
+    """Return the flights of each third of the payload range; the thirds have equal widths."""
     payloads = [row["world"]["payload_kg"] for row in rows if "payload_kg" in row["world"]]
     if not payloads:
         return []

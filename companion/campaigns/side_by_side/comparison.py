@@ -16,7 +16,7 @@ Align = Literal["catch", "takeoff", "start"]
 FLIGHTS_MAX = 6
 """Largest number of flights that can be distinguished in one plot."""
 MARKED_FROM = 0.05
-"""Fraction of the larger value below which a difference is not marked better or worse: single flights scatter."""
+"""Fraction of the larger value below which a difference is not marked better or worse, because single flights scatter."""
 
 
 class NotAlignable(Exception):
@@ -88,7 +88,7 @@ _KNOWN: tuple[tuple[str, str, int, str], ...] = (
     ),
     ("recorder.samples", "recorded ticks", 0, ""),
     ("recorder.dropped", "ticks lost by the recorder", 0, "machine"),
-    ("graded_every", "evaluated: one tick of", 0, ""),
+    ("graded_every", "evaluated: one tick in", 0, ""),
     ("events.info", "events: info", 0, ""),
     ("events.warning", "events: warning", 0, ""),
     ("events.critical", "events: critical", 0, ""),
@@ -96,25 +96,25 @@ _KNOWN: tuple[tuple[str, str, int, str], ...] = (
 
 
 def compare(flights: Sequence[Flight], align: Align | None = None) -> Comparison:
-    """Compare two or more flights with the first of them.
+    """Compare the flights (at least two) with the first one.
 
     Args:
         flights: flights in the order of the report.
-        align: zero of the common time axis; None for the catch if every flight has one, else the take-off, else the start.
+        align: zero of the common time axis; None selects the catch if every flight has one, else the take-off, else the start.
 
     Raises:
-        NotAlignable: a flight lacks this event.
+        NotAlignable: a flight lacks the requested event.
     """
     chosen, notes = _alignment(flights, align)
     settings, addresses = settings_of([flight.config for flight in flights])
     fair, cautions, same_mission = fairness(flights, settings)
     if any(flight.summary["graded_every"] > 1 for flight in flights):
         notes.append(
-            "Long flights: "
+            "Long flights are evaluated and drawn with fewer ticks: "
             + ", ".join(
-                f"{f.letter} every {f.summary['graded_every']}th tick" for f in flights if f.summary["graded_every"] > 1
+                f"{f.letter} one tick in {f.summary['graded_every']}" for f in flights if f.summary["graded_every"] > 1
             )
-            + " is evaluated and drawn; the timing covers every tick."
+            + "; the timing covers every tick."
         )
     zeros = [_zero_s(flight, chosen) for flight in flights]
     return Comparison(

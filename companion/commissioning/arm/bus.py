@@ -1,4 +1,4 @@
-"""Read and write registers of any servo on a bus, at any baud rate. Blocking; nothing here switches torque on.
+"""Reads and writes registers of any servo on a bus, at any baud rate. All calls block; nothing here switches torque on.
 
 Uses dynamixel-sdk on the flight's own port (`companion.io.dynamixel.registers.ServoPort`).
 """
@@ -19,8 +19,9 @@ from companion.io.dynamixel.registers import Register
 from companion.io.protocols import DeviceError
 
 BAUDS: Final[tuple[int, ...]] = (9600, *get_args(ServoBaud))
-"""Baud rates that the tools try, by value of register 8: those of a flight and 9600. 4.5 Mbps, the eighth, has no name in
-termios, and dynamixel-sdk does not know it."""
+"""Baud rates that the tools try, in the order of the values of register 8: 9600 and the rates of a flight. The last value, 4.5
+Mbps, is missing because termios has no name for it and dynamixel-sdk does not support it.
+"""
 FACTORY_BAUD: Final = 57600
 
 ID = Register(7, 1, "id")
@@ -38,7 +39,7 @@ LED = Register(65, 1, "LED")
 PING_BYTES: Final = 14
 _WRITE_TIMEOUT_S = 1.0
 _REPLY_TIMEOUT_MS: Final = 100.0
-"""Timeout of an answer: an FTDI adapter with its factory latency timer delays it by 16 ms, a busy computer by more."""
+"""Timeout for an answer: an FTDI adapter with its factory latency timer delays it by 16 ms, a busy computer by more."""
 _ERROR_NUMBER: Final = 0x7F
 _CRC_ERROR: Final = 3
 _ATTEMPTS: Final = 10
@@ -46,7 +47,7 @@ _ATTEMPTS: Final = 10
 
 
 class _CountingPort(dxl.ServoPort):
-    """Counts bytes, to distinguish noise from silence."""
+    """Serial port that counts received bytes, to distinguish noise from silence."""
 
     came_bytes = 0
 
@@ -91,12 +92,12 @@ class ServoTalk:
         """Open the port, or change its baud rate.
 
         Raises:
-            DeviceError: the port does not exist, is busy, or is not permitted.
+            DeviceError: the port does not exist or is busy, or access to it is denied.
         """
         self._port.reply_timeout_ms = _REPLY_TIMEOUT_MS
         self._port.baudrate = baud
         if not self._port.openPort():
-            raise DeviceError(f"arm bus {self._name}: this computer's serial ports do not know baud rate {baud}")
+            raise DeviceError(f"arm bus {self._name}: this computer's serial ports do not support baud rate {baud}")
         self._port.ser.write_timeout = _WRITE_TIMEOUT_S  # the flight's timeout is one control tick
         # Discard bytes received at the old rate.
         with contextlib.suppress(OSError):
@@ -130,10 +131,10 @@ class ServoTalk:
         return bool(result == COMM_SUCCESS)
 
     def read(self, servo_id: int, register: Register) -> int:
-        """Return a register's value. A lost or corrupt packet is repeated.
+        """Return a register's value. The request is repeated if a packet was lost or corrupted.
 
         Raises:
-            DeviceError: no answer, or a refusal.
+            DeviceError: the servo does not answer, or refuses.
         """
         for _ in range(_ATTEMPTS):
             with self._named(f"servo {servo_id}: reading {register}"):
@@ -144,7 +145,7 @@ class ServoTalk:
         return int.from_bytes(bytes(data), "little", signed=register.signed)
 
     def write(self, servo_id: int, register: Register, value: int, *, read_back: bool = True) -> None:
-        """Write a register and read it back. A lost or corrupt packet is repeated.
+        """Write a register and read it back. The request is repeated if a packet was lost or corrupted.
 
         Args:
             servo_id: id of the servo.
@@ -153,7 +154,7 @@ class ServoTalk:
             read_back: False for id and baud rate, because the servo then answers at another id or rate.
 
         Raises:
-            DeviceError: no answer, a refusal, or a different value is read back.
+            DeviceError: the servo does not answer or refuses, or a different value is read back.
         """
         data = list(value.to_bytes(register.size, "little", signed=register.signed))
         for _ in range(_ATTEMPTS if read_back else 1):

@@ -1,4 +1,4 @@
-"""Move the real arm with the flight's own driver as a leader decides, and always make it limp at the end."""
+"""Moves the real arm as a leader decides, with the flight's own driver, and always makes it limp at the end."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Leader(Protocol):
         ...
 
     def update(self, motion: Motion, moved: Moved | None, state: ArmState) -> bool:
-        """Decide after a control step; `moved` is None before the first. Return True at the end of the motion."""
+        """Decide how to continue after a control step; `moved` is None before the first. Return True at the end of the motion."""
         ...
 
     def status(self) -> str:
@@ -42,17 +42,18 @@ class Driven:
     """Result of a motion."""
 
     stop: str
-    """Why it ended early, one line; empty if the leader ended it."""
+    """Why the motion ended early, one line; empty if the leader ended it."""
     angle_deg: Vec2
     load_max_nm: Vec2
     """Largest torque of each joint in addition to gravity."""
 
 
 async def drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
-    """Open the arm, follow the leader, make the arm limp. After a cancellation the arm is limp within a few ms.
+    """Open the arm's bus, move the arm as `leader` decides, and then make the arm limp. After a cancellation the arm is limp within
+    a few ms.
 
     Raises:
-        DeviceError: the arm does not open, or a pose is too heavy.
+        DeviceError: the bus cannot be opened, or gravity exceeds the torque limit in a pose that `leader` announces.
     """
     clock = flight_clock()
     limits = [joint.angle_deg for joint in vehicle.arm.joints]
@@ -71,7 +72,7 @@ async def drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
                 state = newest
             age_s = clock() - state.stamp_s
             if age_s > vehicle.safety.arm_timeout_s:
-                text = f"the arm is lost: no answer for {age_s:.2f} s, {state.read_failures} reads; check for a loose cable"
+                text = f"the arm is lost: no answer for {age_s:.2f} s, {state.read_failures} failed reads; check for a loose cable"
                 return _driven(text, motion, state)
             if state.stamp_s > stepped_s:
                 moved = motion.step(state, state.stamp_s - stepped_s)

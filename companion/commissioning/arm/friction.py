@@ -1,8 +1,8 @@
-"""Torque constant, dry and viscous friction of both joints, from slow sweeps against gravity. Pure.
+"""Torque constant, dry and viscous friction of both joints, from slow sweeps against gravity. Pure functions.
 
 At constant speed a joint's motor carries gravity and friction alone: `K i = G(alpha) + c sign(rate) + b rate`, with G from the
-vehicle file's masses. Divided by K this is linear in 1/K, c/K and b/K. A fourth unknown is the angle by which the machine is not level
-and the zero is off; a prior keeps it near `LEVEL_DEG`.
+vehicle file's masses. Divided by K this is linear in 1/K, c/K and b/K. A fourth unknown is the angle by which the machine is not
+level or the zero is wrong; a prior with the standard deviation `LEVEL_DEG` keeps it small.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from companion.control.manipulator import Manipulator
 from companion.model.types import IDENTITY_QUAT, Vec2
 
 BIN_S: Final = 0.25
-"""Samples are averaged over this time, because those of neighbouring control ticks are not independent."""
+"""Samples are averaged over this time, because the samples of neighbouring control ticks are not independent."""
 BINS_MIN: Final = 12
 LEVEL_DEG: Final = 2.0
 HUBER: Final = 2.0
-"""Residual, in standard deviations by the median, from which a bin loses weight."""
+"""Residual from which a bin loses weight, in standard deviations as estimated by the median."""
 CONSTANT_ERROR_MAX: Final = 0.05
-"""Relative standard error beyond which a torque constant is unknown."""
+"""Relative standard error beyond which a torque constant counts as undetermined."""
 FRICTION_ERROR_MAX_NM: Final = 0.015
 CONSTANT_SAME: Final = 0.02
 FRICTION_SAME_NM: Final = 0.008
-"""A smaller difference from the vehicle file's value counts as none."""
+"""Smaller differences from the vehicle file's values are ignored."""
 JOINTS_SAME: Final = 0.06
-"""Relative difference of the torque constants of two servos of one model."""
+"""Largest relative difference between the torque constants of two servos of the same model."""
 PLAUSIBLE_NM_A: Final = (0.7, 2.2)
 """Plausible torque constants of an XM430-W210; its stall torque over its stall current is 1.3."""
 _SURE: Final = 3.0
@@ -64,7 +64,7 @@ class JointFit:
     dry_nm: Estimate
     viscous_nms: Estimate
     off_deg: Estimate
-    """Angle between gravity's direction and the one by the joint angles."""
+    """Angle between the measured direction of gravity and the direction that the joint angles imply."""
     gravity_span_nm: float
     """Change of the gravity torque along the sweep."""
     residual_a: float
@@ -107,7 +107,7 @@ def fit(samples: Sequence[Sample], vehicle: Vehicle) -> FrictionFit:
     constants, frictions, notes = [], [], []
     for number, one in enumerate(fits, 1):
         if one is None:
-            notes.append(f"joint {number}: too few samples at constant speed, nothing can be determined")
+            notes.append(f"joint {number}: too few samples at constant speed; nothing can be determined")
             continue
         k, c, off = one.torque_per_amp_nm_a, one.dry_nm, one.off_deg
         if k.standard_error <= CONSTANT_ERROR_MAX * abs(k.value):
@@ -122,7 +122,7 @@ def fit(samples: Sequence[Sample], vehicle: Vehicle) -> FrictionFit:
         else:
             notes.append(f"joint {number}: the data do not determine the dry friction ({c.text(3)} N m)")
         if abs(off.value) > LEVEL_DEG + _SURE * off.standard_error:
-            turned = f"gravity pulls as if the arm were turned by {off.value:+.1f} deg"
+            turned = f"gravity acts as if the arm were turned by {off.value:+.1f} deg"
             notes.append(f"joint {number}: {turned}: check that the machine is level and the zero is correct")
     constant = _together(constants)
     low, high = PLAUSIBLE_NM_A
@@ -137,8 +137,8 @@ def fit(samples: Sequence[Sample], vehicle: Vehicle) -> FrictionFit:
         apart = abs(a.value - b.value)
         if apart > JOINTS_SAME * a.value and apart > _SURE * math.hypot(a.standard_error, b.standard_error):
             notes.append(
-                f"the joints' torque constants differ, {a.value:.3f} and {b.value:.3f} N m/A: servos of one model agree; check the "
-                "masses, lengths and centres of mass of the vehicle file"
+                f"the joints' torque constants differ, {a.value:.3f} and {b.value:.3f} N m/A: servos of one model should agree; check "
+                "the masses, lengths and centres of mass of the vehicle file"
             )
     return FrictionFit((fits[0], fits[1]), constant, _together(frictions), tuple(notes))
 
@@ -166,13 +166,13 @@ def fit_joint(samples: Sequence[Sample], vehicle: Vehicle, joint: int) -> JointF
 
 
 def _huber(residual: _Array) -> _Array:
-    """Return Huber's weights: a touched arm or a computer that was held up for a moment must not decide the fit."""
+    """Return Huber's weights, so that a moment in which the arm was touched or the computer stalled does not dominate the fit."""
     spread = 1.4826 * float(np.median(np.abs(residual)))
     return np.minimum(1.0, HUBER * spread / np.maximum(np.abs(residual), 1e-9))
 
 
 def _binned(samples: Sequence[Sample], vehicle: Vehicle, joint: int) -> tuple[_Array, _Array, list[int]]:
-    """Return the rows of the design matrix, the currents, and the leg of each."""
+    """Return the rows of the design matrix, the currents, and the leg of each row."""
     manipulator = Manipulator(vehicle.arm, vehicle.tool)
     small = 1e-3
     bins: dict[tuple[int, int], list[tuple[float, ...]]] = {}

@@ -1,4 +1,4 @@
-"""`companion arm jog` without `--to`: move a joint with keys. Pure."""
+"""`companion arm jog` without `--to`: moves a joint with keys. No I/O."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def keys_in(data: str) -> list[str]:
 
 
 class ByKeys:
-    """A leader that moves a joint while its keys are pressed.
+    """Leader that moves the selected joint while an arrow key (or + or -) is pressed; 1 and 2 select the joint.
 
     Args:
         pressed: returns the terminal's input since the last call.

@@ -1,6 +1,6 @@
-"""Slow, bounded motion of one joint at a time on the ground, and the conditions that stop it. Pure: joint states in, torques out.
+"""Slow, bounded motion of one joint at a time on the ground, and the conditions that stop it. No I/O: joint states in, torques out.
 The controller is `companion.control.arm_hold` behind a speed-limited reference; a small integral compensates friction and wrong
-masses. Angles are the paper's; the body is assumed to be level.
+masses. Angles are defined as in the paper; the body is assumed to be level.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ REACHED_DEG: Final = 0.7
 _INTEGRAL_NM_RAD_S: Final = 12.0
 _INTEGRAL_MAX_NM: Final = 0.25
 _LEAD_RAD: Final = math.radians(5.0)
-"""Lag of a joint at which the reference stops and waits."""
+"""Lag of a joint behind its reference at which the reference stops and waits."""
 
 
 def gentle(arm: Arm, share: float = TORQUE_SHARE) -> Arm:
@@ -63,7 +63,7 @@ class Moved:
 
 
 class Motion:
-    """Controls both joints, one of which moves.
+    """Controls both joints, of which one moves at a time.
 
     Args:
         vehicle: arm, tool and limits.
@@ -90,12 +90,12 @@ class Motion:
         return (self._reference[0], self._reference[1])
 
     def go(self, joint: int, goal_rad: float, speed_rad_s: float) -> None:
-        """Start to move a joint; the other one stays at its reference.
+        """Start moving a joint; the other one stays at its reference.
 
         Args:
             joint: 0 or 1.
-            goal_rad: clipped to the joint limits minus the margin; a joint beyond them may only return.
-            speed_rad_s: at most `SPEED_MAX_DEG_S`.
+            goal_rad: goal, clipped to the joint limits minus the margin; a joint beyond them may only return.
+            speed_rad_s: speed, limited to `SPEED_MAX_DEG_S`.
         """
         low, high = (math.radians(limit) for limit in limits_deg(self._arm, joint))
         here = self._reference[joint]

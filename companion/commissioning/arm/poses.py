@@ -1,7 +1,7 @@
-"""The poses in which the user holds the arm to determine zeros, directions and swapped plugs. Pure.
+"""The poses in which the user holds the arm to determine zeros, directions and swapped plugs. Pure functions.
 
-Angles are the paper's: joint 1 from body +x, positive turning down; joint 2 turns the lower link the other way, so that it points along
-`alpha_1 - alpha_2`. Only level and plumb directions can be held exactly by hand.
+Angles are defined as in the paper: joint 1 from body +x, positive turning down; joint 2 turns the lower link the other way, so that
+it points along `alpha_1 - alpha_2`. Only level and plumb directions can be held exactly by hand.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class Step:
     joint: int | None
     """Joint that moves, 0 or 1; None if both may."""
     by_deg: float
-    """Angle by which it moves."""
+    """Angle by which the joint moves."""
     exact: bool
-    """Whether it ends in a direction that can be held exactly; if not, only the direction of the motion is used."""
+    """Whether the step ends in a direction that can be held exactly; if not, only the direction of the motion is used."""
     pose_deg: Vec2
     """Both joints at the end; approximate if not exact."""
 
@@ -49,7 +49,7 @@ def steps_of(arm: Arm) -> tuple[Step, Step, Step]:
     """Return the three steps for an arm, within its limits: straight, elbow alone, shoulder alone.
 
     Raises:
-        ConfigError: the joint limits leave no straight pose, or a joint too little room.
+        ConfigError: the joint limits allow no straight pose, or leave a joint too small a range.
     """
     first, second = arm.joints
     straight = next((pose for pose in _STRAIGHT_DEG if _within(first, pose[0]) and _within(second, pose[1])), None)
@@ -105,8 +105,8 @@ def _turn(joint: Joint, from_deg: float, index: int) -> tuple[float, bool]:
     by_deg = min(SWING_DEG, high - from_deg) if high - from_deg >= from_deg - low else -min(SWING_DEG, from_deg - low)
     if abs(by_deg) < SWING_MIN_DEG:
         raise ConfigError(
-            [f"arm.joints[{index}].angle_deg: from {from_deg:g} deg the limits permit a turn of {abs(by_deg):.0f} deg, at least "
-             f"{SWING_MIN_DEG:g} are needed to find which way the servo counts"]
+            [f"arm.joints[{index}].angle_deg: from {from_deg:g} deg the limits allow a turn of {abs(by_deg):.0f} deg; at least "
+             f"{SWING_MIN_DEG:g} deg are needed to find which way the servo counts"]
         )  # fmt: skip
     return by_deg, False
 
@@ -119,12 +119,14 @@ def _elbow_text(alpha1_deg: float, by_deg: float, exact: bool) -> str:
     # The lower link points along alpha_1 - alpha_2: a positive turn of joint 2 turns the link back.
     still = "leave the upper link as it is"
     if exact:
-        return f"{still}, bend the elbow until the lower link points {_direction(alpha1_deg - by_deg)}"
-    return f"{still}, bend the elbow: swing the lower link {_way(alpha1_deg, -by_deg)} by about {abs(by_deg):.0f} deg"
+        return f"{still} and bend the elbow until the lower link points {_direction(alpha1_deg - by_deg)}"
+    return (
+        f"{still} and bend the elbow: swing the lower link {_way(alpha1_deg, -by_deg)} by about {abs(by_deg):.0f} deg"
+    )
 
 
 def _shoulder_text(alpha1_deg: float, by_deg: float, exact: bool) -> str:
-    still = "leave the elbow as it is, turn the shoulder"
+    still = "leave the elbow as it is and turn the shoulder"
     if exact:
         return f"{still} until the upper link points {_direction(alpha1_deg + by_deg)}"
     return f"{still}: swing the upper link {_way(alpha1_deg, by_deg)} by about {abs(by_deg):.0f} deg"

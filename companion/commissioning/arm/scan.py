@@ -56,7 +56,7 @@ def scan_for(session: Session, only: int | None = None) -> Scan:
     """Scan the vehicle file's port and show the progress. `only`: as in `scan`."""
     device = session.vehicle.devices.arm
     where = "every baud rate" if only is None else f"{only} baud only"
-    session.say(f"{device.port}: every servo at {where}; nothing is written, torque stays off")
+    session.say(f"{device.port}: searching for servos at {where}; nothing is written, and torque stays off")
     with session.console.status("searching for servos") as status:
         return scan(device, progress=lambda text: status.update(f"searching for servos at {text}"), only=only)
 
@@ -69,11 +69,11 @@ def scan(
     Args:
         device: port, and the baud rate that is tried first.
         progress: called with the baud rate that is being tried.
-        sysfs: where the kernel shows latency timers.
+        sysfs: folder in which the kernel exposes latency timers.
         only: the one baud rate to try; None for all.
 
     Raises:
-        DeviceError: the port does not open, or fails.
+        DeviceError: the port cannot be opened, or fails.
     """
     bauds = [device.baud, *(baud for baud in SEARCHED if baud != device.baud)] if only is None else [only]
     servos: list[FoundServo] = []

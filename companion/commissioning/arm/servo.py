@@ -1,4 +1,4 @@
-"""Settings of a servo, found and required, and the assignment of servos to joints. Pure."""
+"""Settings of a servo, found and required, and the assignment of servos to joints. Pure functions."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class FoundServo:
         """Return a register's value.
 
         Raises:
-            KeyError: it was not read.
+            KeyError: the register was not read.
         """
         return self.registers[register.name]
 

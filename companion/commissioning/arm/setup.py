@@ -1,6 +1,6 @@
-"""`companion arm setup`: write the required settings to each servo, with torque off and read back, the baud rate last.
+"""`companion arm setup`: writes the required settings to each servo with torque off and reads them back; the baud rate comes last.
 
-`companion arm scan` finds the servos after every step, so an interrupted setup can be repeated.
+`companion arm scan` can find the servos after every step, so an interrupted setup can be repeated.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class ServoPlan:
 
     @property
     def wake(self) -> bool:
-        """Whether torque or bus watchdog is on; both are switched off first."""
+        """Whether torque or the bus watchdog is on; both are switched off first."""
         return bool(self.servo.value(dxl.TORQUE_ENABLE)) or self.servo.value(dxl.BUS_WATCHDOG) != 0
 
     @property
@@ -97,7 +97,9 @@ def plan(found: Scan, arm: Arm, device: ArmDevice, joint: int | None = None) -> 
         text = f"servo {servo.servo_id} at {servo.baud} baud: expected a readable XM430-W210, found model {servo.model}"
         return SetupPlan(refusal=f"{text}; remove it from the bus, or cycle its power")
     if not found.servos:
-        return SetupPlan(refusal="no servo answers at any baud rate; check their power and the plugs of the cable")
+        return SetupPlan(
+            refusal="no servo answers at any baud rate; check the servos' power and the plugs of the cable"
+        )
     if joint is not None:
         if len(found.servos) > 1:
             ids = " and ".join(str(servo.servo_id) for servo in found.servos)
@@ -107,7 +109,7 @@ def plan(found: Scan, arm: Arm, device: ArmDevice, joint: int | None = None) -> 
         who = assign(found.servos, arm)
         if who.others:
             ids = ", ".join(f"{servo.servo_id} at {servo.baud} baud" for servo in found.servos)
-            text = f"it is unknown which joint's servos these are: {ids}; {alone}"
+            text = f"it is unknown to which joints these servos belong: {ids}; {alone}"
             return SetupPlan(refusal=text, one_at_a_time=True)
         joints = list(enumerate(who.joints))
     return SetupPlan(
@@ -125,7 +127,7 @@ def carry_out(port: str, plans: Sequence[ServoPlan], report: Callable[[str], Non
         report: called with a line for each value that is written.
 
     Raises:
-        DeviceError: no answer, a refusal, or a value that was not stored; values already written remain.
+        DeviceError: a servo does not answer, refuses, or does not store a value; values already written remain.
     """
     with ServoTalk(port) as talk:
         for one in plans:
@@ -229,7 +231,7 @@ def _set_up(session: Session, wanted: SetupPlan) -> Done:
     right = not lines and not wanted.absent
     if any(setting.register in (bus.DRIVE_MODE, bus.HOMING_OFFSET) for one in needed for setting in one.writes):
         lines.append("a servo's direction or zero has changed: run companion arm zero")
-    return Done(wanted, "written", (*lines, *(["set up and read back"] if right else [])), right)
+    return Done(wanted, "written", (*lines, *(["all settings are written and read back"] if right else [])), right)
 
 
 def _left(vehicle: Vehicle, wanted: SetupPlan) -> list[str]:
@@ -260,7 +262,7 @@ def _show(session: Session, plans: Sequence[ServoPlan]) -> None:
     for one in plans:
         who = f"joint {one.joint + 1}, servo {one.servo.servo_id}"
         which = "the other" if one.writes else "all"
-        session.say(f"{who}: {which} {len(one.settings) - len(one.writes)} settings are right")
+        session.say(f"{who}: {which} {len(one.settings) - len(one.writes)} settings are correct")
         if one.wake:
             session.say(f"{who}: torque or its bus watchdog is on: both are switched off")
 

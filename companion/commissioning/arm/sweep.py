@@ -1,4 +1,4 @@
-"""Straight motions of one joint after the other: a jog to an angle, and the sweeps that measure friction. Pure."""
+"""Straight motions of one joint after the other: a jog to an angle, and the sweeps that measure friction. No I/O."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ REACH_MIN_DEG: Final = 20.0
 SETTLED_S: Final = 0.4
 """Time at constant speed before a sample counts."""
 HELD_UP_S: Final = 0.1
-"""After a longer gap between two samples the joint has to settle again."""
+"""Gap between two samples after which the joint has to settle again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ def legs_of(arm: Arm) -> tuple[Leg, ...]:
     """Return the sweeps: to the hanging pose, each joint back and forth at each speed, then to the hanging pose, to go limp.
 
     Raises:
-        ConfigError: the joint limits leave too little room.
+        ConfigError: the joint limits leave too small a range.
     """
     limits = [limits_deg(arm, joint) for joint in (0, 1)]
     home = [max(low, min(high, deg)) for (low, high), deg in zip(limits, HANGING_DEG, strict=True)]
@@ -63,8 +63,8 @@ def legs_of(arm: Arm) -> tuple[Leg, ...]:
         begin, end = max(low, home[joint] + down), min(high, home[joint] + up)
         if end - begin < REACH_MIN_DEG:
             room = f"about the hanging pose and within its limits joint {joint + 1} can turn {max(0.0, end - begin):.0f} deg"
-            why = f"at least {REACH_MIN_DEG:g} are needed to separate gravity from friction"
-            raise ConfigError([f"arm.joints[{joint}].angle_deg: {room}, {why}"])
+            why = f"at least {REACH_MIN_DEG:g} deg are needed to separate gravity from friction"
+            raise ConfigError([f"arm.joints[{joint}].angle_deg: {room}; {why}"])
         legs.append(Leg(joint, begin, fast))
         for speed in SPEEDS_DEG_S:
             legs += [Leg(joint, end, speed, True), Leg(joint, begin, speed, True)]
@@ -83,7 +83,7 @@ def duration_s(legs: Sequence[Leg], start_deg: Vec2) -> float:
 
 
 class Sweeper:
-    """A leader that follows its legs and keeps the samples for the fit.
+    """Leader that moves the arm through the legs and keeps the samples for the fit.
 
     Args:
         legs: legs in order.
@@ -107,7 +107,7 @@ class Sweeper:
         return poses
 
     def update(self, motion: Motion, moved: Moved | None, state: ArmState) -> bool:
-        """Store the sample and begin the next leg at the end of one. Return True after the last."""
+        """Store the sample, and begin the next leg when one ends. Return True after the last leg."""
         if moved is not None and 0 <= self._leg < len(self.legs):
             self._note(moved, state)
         if self._leg < 0 or (moved is not None and moved.reached):
@@ -119,7 +119,7 @@ class Sweeper:
         return self._leg >= len(self.legs)
 
     def status(self) -> str:
-        """Return the present motion for display."""
+        """Return the current motion for display."""
         if not 0 <= self._leg < len(self.legs):
             return ""
         leg = self.legs[self._leg]

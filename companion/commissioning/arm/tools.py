@@ -35,7 +35,7 @@ def _stand_text(vehicle: Vehicle) -> str:
     if below_m <= vehicle.airframe.ground_clearance_m:
         return text
     clearance = f"on its landing gear the vehicle has {vehicle.airframe.ground_clearance_m:.2f} m of clearance"
-    return f"{text}, {clearance}: put it on a level stand, with nothing below the arm"
+    return f"{text}, but {clearance}: put it on a level stand, with nothing below the arm"
 
 
 def _scan(session: Session) -> Scan:
@@ -62,7 +62,7 @@ def _judge_scan(found: Scan, vehicle: Vehicle) -> Report:
 
 def _zero(session: Session) -> ZeroResult:
     guide = ZeroGuide(session.vehicle.arm)
-    session.say("zero: the arm is limp, nothing moves by itself; propellers off", "bold")
+    session.say("zero: the arm is limp and nothing moves by itself; propellers off", "bold")
     session.say(f"  {_stand_text(session.vehicle)}")
     session.say(
         "  the servos' LEDs are on during a step and go off when it is accepted: when the arm is held still for 2 s, or on Enter"
@@ -78,7 +78,7 @@ def _judge_zero(result: ZeroResult, vehicle: Vehicle) -> Report:
         text.append("the servos are swapped: each moved when the other joint was requested")
     for number, (found, joint) in enumerate(zip(result.joints, vehicle.arm.joints, strict=True), 1):
         error_deg = result.error_deg(vehicle.arm, number - 1)
-        turned = "" if found.sign == joint.sign else ", which is the opposite direction"
+        turned = "" if found.sign == joint.sign else ", the opposite of the vehicle file's"
         spread = "" if found.spread_deg is None else f", poses agree within {found.spread_deg:.1f} deg"
         text.append(
             f"joint {number}: servo {found.servo_id}, sign {found.sign:+d}{turned}, zero_count {found.zero_count} "
@@ -92,7 +92,7 @@ def _judge_zero(result: ZeroResult, vehicle: Vehicle) -> Report:
 
 
 async def _drive(session: Session, leader: Leader, what: str) -> Driven:
-    """Announce the motion, ask, move."""
+    """Announce the motion, ask the user, and move the arm."""
     part = session.arguments.part
     session.say(f"{part}: {what}", "bold")
     session.say(f"  propellers off; {_stand_text(session.vehicle)}")

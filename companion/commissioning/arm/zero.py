@@ -1,4 +1,4 @@
-"""Finds zeros, directions and swapped plugs of the arm's servos from three hand-held poses. Pure."""
+"""Finds zeros, directions and swapped plugs of the arm's servos from three hand-held poses. No I/O."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ZeroJoint:
     zero_count: int
     """Present position (register 132) at joint angle 0, within one turn unless the joint turns more than once."""
     spread_deg: float | None
-    """Difference between the zeros of two poses; None if only one pose shows it."""
+    """Difference between the zeros of two poses; None if only one pose determines the zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class ZeroResult:
 
     joints: tuple[ZeroJoint, ZeroJoint]
     swapped: bool
-    """Whether the vehicle file assigns each servo to the other's joint."""
+    """Whether the vehicle file assigns each servo to the other joint."""
 
     def changes(self, arm: Arm) -> dict[Location, Data]:
         """Return the values to change in the vehicle file; empty if it is correct within `HAND_DEG`."""
@@ -114,7 +114,7 @@ class ZeroGuide:
         Args:
             t_s: time on any clock.
             counts: present positions (register 132), in the order of the vehicle file's servos.
-            accept: the user confirms that the arm is held, whether or not it has moved.
+            accept: whether the user confirms that the arm is held, even if it has not moved.
         """
         index = len(self._held)
         step = self.steps[index]
@@ -159,9 +159,9 @@ class ZeroGuide:
         if least > ALONE_SHARE * max(most, SWING_MIN_DEG):
             return "both joints have moved; turn only the requested one and move the other one back"
         if step.exact and abs(most - abs(step.by_deg)) > NEAR_SHARE * abs(step.by_deg):
-            return f"requested {abs(step.by_deg):.0f} deg, but it has turned by {most:.0f}"
+            return f"requested {abs(step.by_deg):.0f} deg, but the joint has turned by {most:.0f} deg"
         if most < SWING_MIN_DEG:
-            return f"turn it further, {SWING_MIN_DEG:.0f} deg at least; it has turned by {most:.0f}"
+            return f"turn the joint further, by at least {SWING_MIN_DEG:.0f} deg; it has turned by {most:.0f} deg"
         return ""
 
     def _conclude(self, moved: tuple[float, float]) -> ZeroView:
@@ -170,14 +170,14 @@ class ZeroGuide:
         view = ZeroView(step=None, number=len(self.steps), moved_deg=moved, held=1.0, notice="")
         if elbow == shoulder:
             servo_id = self._arm.joints[elbow].servo_id
-            text = f"the servo with id {servo_id} turned in both steps, the other one did not: turn the elbow first, then the shoulder"
+            text = f"servo {servo_id} turned in both steps, and the other one did not: turn the elbow first, then the shoulder"
             return _failed(view, text)
         counts = (tuple(held[shoulder] for held in self._held), tuple(held[elbow] for held in self._held))
         joints = tuple(self._joint(joint, (shoulder, elbow)[joint], counts[joint]) for joint in (0, 1))
         for joint, found in enumerate(joints):
             if found.spread_deg is not None and found.spread_deg > DISAGREE_DEG:
                 text = f"joint {joint + 1}: the poses disagree by {found.spread_deg:.1f} deg"
-                return _failed(view, f"{text}; hold them more precisely, and check for a slipping horn")
+                return _failed(view, f"{text}; hold the arm more precisely, and check for a slipping horn")
         result = ZeroResult((joints[0], joints[1]), elbow == 0)
         return ZeroView(step=None, number=view.number, moved_deg=moved, held=1.0, notice="", result=result)
 

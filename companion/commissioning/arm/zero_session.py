@@ -45,7 +45,7 @@ def hold(vehicle: Vehicle, guide: ZeroGuide, console: Console) -> ZeroResult:
 def _ready(talk: ServoTalk, servo_id: int) -> None:
     name = f"arm bus: servo {servo_id}"
     if not talk.answers(servo_id):
-        fix = "find it with companion arm scan, correct it with companion arm setup"
+        fix = "find it with companion arm scan, and correct it with companion arm setup"
         raise DeviceError(f"{name} does not answer at {talk.baud} baud; {fix}")
     talk.write(servo_id, dxl.TORQUE_ENABLE, 0)
     drive, offset = talk.read(servo_id, bus.DRIVE_MODE), talk.read(servo_id, bus.HOMING_OFFSET)

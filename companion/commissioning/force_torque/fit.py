@@ -1,7 +1,7 @@
-"""Mounting and scale of the force sensor from a known weight on the net, and its drift at rest. Pure.
+"""Mounting and scale of the force sensor from a known weight on the net, and its drift at rest. Pure functions.
 
-Frames: link 2 (x outwards along the link, y along the joint axis) and the sensor, rotated against it by `tool.sensor_rpy_deg`. A
-reading is the force of the surroundings on the tool side of the sensor.
+Frames: link 2 (x outwards along the link, y along the joint axis) and the sensor, which is rotated relative to it by
+`tool.sensor_rpy_deg`. A reading is the force of the surroundings on the tool side of the sensor.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class WeightFit:
     rest_deg: float
     """Remaining angle after that turn."""
     others: tuple[AxisMap, ...]
-    """Other turns that explain it nearly as well."""
+    """Other turns that explain the weight nearly as well."""
     rpy_deg: Vec3
     """Value of `tool.sensor_rpy_deg` with that turn."""
 
@@ -68,7 +68,8 @@ def down_in_link2(arm_rad: Vec2) -> Vec3:
 
 
 def fit_weight(empty_n: Vec3, loaded_n: Vec3, arm_rad: Vec2, weight_kg: float, sensor_rpy_deg: Vec3) -> WeightFit:
-    """Return which of the 24 right-angle turns explains the weight best, preferring the configured mounting.
+    """Return the scale and the mounting of the sensor: of the 24 right-angle turns, the one that explains the weight best. The
+    configured mounting is preferred.
 
     Args:
         empty_n: mean reading with the net empty, sensor frame.
@@ -102,7 +103,7 @@ def rows(fit: WeightFit) -> Iterator[Row]:
     read = f"{fit.measured_n:.2f} N of {fit.expected_n:.2f} N, ratio {fit.scale:.3f}"
     fix = (
         f"the sensor reads {fit.scale:.2f} times the true force: check the weight, and hang it on the net only; if "
-        "that is correct, the sensor is a different model (this one has 50 counts per N) or must be calibrated by its manufacturer"
+        "that is correct, the sensor is a different model (the RFT60 has 50 counts per N) or must be calibrated by its manufacturer"
     )
     yield SCALE.row(abs(fit.scale - 1.0) <= SCALE_TOLERANCE, read, f"within {100 * SCALE_TOLERANCE:g} %", fix)
     read = f"{fit.off_deg:.0f} deg from the direction according to tool.sensor_rpy_deg"
@@ -112,9 +113,11 @@ def rows(fit: WeightFit) -> Iterator[Row]:
     )
     if changes(fit):
         rpy = ", ".join(f"{angle:g}" for angle in fit.rpy_deg)
-        fix = f"the sensor is turned: set tool.sensor_rpy_deg: [{rpy}] (remaining error {fit.rest_deg:.0f} deg)"
+        fix = (
+            f"the sensor is mounted rotated: set tool.sensor_rpy_deg: [{rpy}] (remaining error {fit.rest_deg:.0f} deg)"
+        )
     yield DIRECTION.row(fit.off_deg <= DIRECTION_MAX_DEG, read, f"within {DIRECTION_MAX_DEG:g} deg", fix)
-    read = f"{len(fit.others) or 'no'} other right-angle turns explain it as well"
+    read = f"{len(fit.others) or 'no'} other right-angle turns explain the weight as well"
     yield POSE.row(not fit.others, read, "none", "repeat with link 2 about 20 to 35 deg below level, not straight down")
 
 

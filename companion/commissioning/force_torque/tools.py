@@ -1,4 +1,4 @@
-"""`companion ft check`: measure the force sensor at rest and under a known weight. `companion ft tare`: measure its drift and set
+"""`companion ft check`: measure the force sensor at rest and with a known weight. `companion ft tare`: measure its drift and set
 its own zero.
 """
 
@@ -33,7 +33,7 @@ TARE_S: Final = 1.0
 """Duration of a flight's tare."""
 DRIFT_WARN_N_MIN: Final = 0.3
 ZERO_MAX_N: Final = 0.3
-_EMPTY: Final = "the vehicle rests level on its landing gear, the net is empty, nothing touches it"
+_EMPTY: Final = "leave the vehicle level on its landing gear, and the net empty and untouched,"
 
 DRIFT = Check(
     "ft.drift",
@@ -46,7 +46,7 @@ BIAS_SET = Check("ft.bias_set", "sensor's own bias", why="the sensor ignored the
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """Measurement of the sensor at rest and, if requested, under a known weight."""
+    """Measurement of the sensor at rest and, if requested, with a known weight."""
 
     empty: Sequence[ForceSample]
     arm_rad: Vec2
@@ -55,14 +55,14 @@ class Watched:
     weight_kg: float | None
     """Known weight given by the user; None if none was given."""
     loaded: Sequence[ForceSample] = ()
-    """Samples under the weight; empty if no weight was recognised."""
+    """Samples with the weight on the net; empty if no weight was detected."""
     loaded_arm_rad: Vec2 = (0.0, 0.0)
     problem: str = ""
     """Why a device failed after the measurement at rest; empty if none did."""
 
 
 async def watch(session: Session) -> Watched:
-    """Measure the sensor at rest, then under the weight."""
+    """Measure the sensor at rest, then with the known weight if one was given."""
     vehicle, weight_kg = session.vehicle, session.arguments.weight
     clock, device = flight_clock(), force_device(vehicle)
     given_rad = pose_rad(session.arguments.arm_pose, vehicle)
@@ -115,9 +115,7 @@ def judge(seen: Watched, vehicle: Vehicle) -> Report:
             rows, data, advice=["to check scale and direction with a known weight: companion ft check --weight KG"]
         )
     if not seen.loaded:
-        fix = (
-            "hang it on the net itself; if the sensor does not measure it, its cable is broken or its mount bypasses it"
-        )
+        fix = "hang the weight on the net itself; if that changes nothing, the sensor's cable is broken or its mount is bypassed"
         wanted = f"{GRAVITY_M_S2 * seen.weight_kg:.2f} N"
         return Report([*rows, ft_fit.WEIGHT.bad("no steady force appeared", wanted, fix)], data)
     fit = ft_fit.fit_weight(
@@ -129,7 +127,7 @@ def judge(seen: Watched, vehicle: Vehicle) -> Report:
     )
     rows.append(ft_fit.WEIGHT.good(f"{fit.measured_n:.2f} N"))
     if over := sum(sample.overload for sample in seen.loaded):
-        rows.append(preflight.OVERLOAD.bad(f"{over} samples under the weight", "none", "a lighter weight"))
+        rows.append(preflight.OVERLOAD.bad(f"{over} samples with the weight", "none", "use a lighter weight"))
     return Report([*rows, *ft_fit.rows(fit)], {**data, "weight": ft_fit.as_json(fit)}, changes=ft_fit.changes(fit))
 
 
@@ -170,7 +168,7 @@ async def watch_drift(session: Session) -> Tared:
     arguments, vehicle = session.arguments, session.vehicle
     given_rad = pose_rad(arguments.arm_pose, vehicle)
     for wanted, question in (
-        (arguments.sensor, "set the sensor's own zero to the present reading?"),
+        (arguments.sensor, "set the sensor's own zero to the current reading?"),
         (arguments.clear, "clear the sensor's own zero?"),
     ):
         if wanted and not session.confirm(question):
@@ -217,7 +215,7 @@ def judge_drift(seen: Tared, vehicle: Vehicle) -> Report:
             f"+- {one.standard_error_n:.3f} N per minute"
             for name, one in axes.items()
         ),
-        f"  a flight's tare would remove ({x:+.2f}, {y:+.2f}, {z:+.2f}) N beyond the net's {net_kg:g} kg",
+        f"  a flight's tare would remove ({x:+.2f}, {y:+.2f}, {z:+.2f}) N besides the net's {net_kg:g} kg",
         "  temperature: the sensor's protocol does not report it",
         "",
     ]

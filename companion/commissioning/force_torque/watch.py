@@ -26,14 +26,14 @@ _STILL_N: Final = 0.3
 """Largest difference between means over `_LOOK_S` once the weight has stopped swinging."""
 _CHANGE_MIN_N: Final = 0.5
 _CHANGE_SHARE: Final = 0.15
-"""Fraction of the weight that counts as the weight, low enough for a sensor that reads too little."""
+"""Fraction of the expected weight from which a change counts as the weight; low enough for a sensor that reads too little."""
 
 
 class FtSensor(RobotousForceTorque):
     """The force sensor's driver with SET_BIAS, which no flight uses."""
 
     async def set_bias(self, on: bool) -> None:
-        """Set the sensor's zero to the present reading (SET_BIAS 1) or clear it (0), and drop the samples in transit.
+        """Set the sensor's zero to the current reading (SET_BIAS 1) or clear it (0), and drop the samples in transit.
 
         The sensor does not acknowledge the command; check its reading.
 
@@ -59,7 +59,7 @@ def pose_rad(text: str | None, vehicle: Vehicle) -> Vec2 | None:
     """Parse `--arm-pose`.
 
     Raises:
-        ConfigError: not two angles within the joint limits.
+        ConfigError: the text is not two angles within the joint limits.
     """
     if text is None:
         return None
@@ -81,7 +81,7 @@ async def arm_angles(
     """Yield a function that returns the given joint angles, or reads them from the servos without torque.
 
     Raises:
-        DeviceError: the arm does not open, or stops answering.
+        DeviceError: the arm's bus cannot be opened, or the servos stop answering.
     """
 
     async def given() -> Vec2:

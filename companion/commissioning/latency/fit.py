@@ -1,4 +1,4 @@
-"""Measures the delay of motion capture from taps on the airframe, by comparison with the IMU. Pure.
+"""Measures the delay of motion capture from taps on the airframe, by comparison with the IMU. Pure functions.
 
 A tap moves the vehicle too little to differentiate motion capture twice: its noise of 0.2 mm gives 20 m/s^2 at 200 Hz. Therefore
 the IMU is integrated. Around each tap the specific force is rotated into the world and integrated twice, the gyro once. Position
@@ -111,7 +111,7 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
         tap: found in `imu`.
         imu: samples in order of time.
         poses: poses in order of arrival.
-        noise: noise of motion capture, m and rad, one sigma of one axis (`mocap_noise`).
+        noise: noise of motion capture per axis, one sigma, m and rad (`mocap_noise`).
     """
     low, high = DELAY_SPAN_S
     felt = [s for s in imu if tap.t_s - BEFORE_S - high - 0.05 <= s.t_s <= tap.t_s + AFTER_S - low + 0.05]
@@ -184,9 +184,8 @@ def combine(taps: Sequence[TapDelay]) -> Delay | str:
     error_s = spread_s / math.sqrt(len(good))
     if error_s > ERROR_MAX_S:
         return (
-            f"the taps differ by {1e3 * spread_s:.1f} ms (standard deviation), the mean is known only to within {1e3 * error_s:.1f} "
-            "ms, "
-            f"expected {1e3 * ERROR_MAX_S:g} ms"
+            f"the taps differ by {1e3 * spread_s:.1f} ms (standard deviation), so the mean is known only to within "
+            f"{1e3 * error_s:.1f} ms; expected {1e3 * ERROR_MAX_S:g} ms"
         )
     return Delay(float(values.mean()), error_s, spread_s, tuple(good))
 

@@ -1,8 +1,8 @@
-"""Read IMU samples with PX4's timestamps (HIGHRES_IMU) and measure the offset between PX4's and the companion's clock (TIMESYNC). I/O
-only.
+"""Reads IMU samples with PX4's timestamps (HIGHRES_IMU) and measures the offset between PX4's and the companion's clock (TIMESYNC).
+I/O only.
 
-HIGHRES_IMU carries the time of its sample (`time_usec`), so the latency of the message does not matter. PX4 answers a TIMESYNC request
-(`tc1` = 0) immediately with its time; half the round-trip time is used as the delay of the reply.
+HIGHRES_IMU carries the time of its sample (`time_usec`), so the latency of the message does not matter. PX4 answers a TIMESYNC
+request (`tc1` = 0) immediately with its time; half the round-trip time is used as the delay of the reply.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class LatencyLink(MavsdkAutopilot):
         """Open the link as for a flight, then wait for PX4's clock.
 
         Raises:
-            DeviceError: the link does not open, or PX4 does not answer TIMESYNC.
+            DeviceError: the link cannot be opened, or PX4 does not answer TIMESYNC.
         """
         await super().__aenter__()
         try:

@@ -80,7 +80,7 @@ class Measured:
 
 
 async def measure(session: Session) -> Measured:
-    """Open motion capture and PX4, wait for the taps, write the parameter on request."""
+    """Open motion capture and PX4, wait for the taps, and write the parameter on request."""
     from companion.commissioning.latency.link import LatencyLink  # imports MAVSDK
     from companion.io.mocap.driver import NatNetMocap
 
@@ -122,7 +122,7 @@ async def measure(session: Session) -> Measured:
 def _refuse_armed(link: LatencyLink, address: str) -> None:
     status = link.status()
     if status is not None and status.armed:
-        raise DeviceError(f"autopilot {address}: expected a disarmed PX4, found it armed; land and disarm")
+        raise DeviceError(f"autopilot {address}: expected a disarmed PX4, but it is armed; land and disarm")
 
 
 async def _tapped(session: Session, link: LatencyLink, clock: Clock, poses: list[MocapPose]) -> tuple[TapDelay, ...]:
@@ -178,7 +178,7 @@ def judge(m: Measured, vehicle: Vehicle) -> Report:
     """Compare the measured delay with PX4's parameter and with the preflight's limit."""
     advice = []
     if m.written_ms is not None:
-        advice.append(f"{PARAMETER} = {m.written_ms:g} ms is written to PX4 (was {m.px4_ms} ms); restart PX4")
+        advice.append(f"{PARAMETER} = {m.written_ms:g} ms was written to PX4 (before: {m.px4_ms} ms); restart PX4")
     return Report(rows(m, _max_ms(vehicle)), as_json(m), text(m), advice=advice)
 
 
@@ -193,10 +193,8 @@ def rows(m: Measured, max_ms: float) -> list[Row]:
     assert m.total_ms is not None
     has = "no such parameter" if m.px4_ms is None else f"{m.px4_ms:g} ms"
     right = m.px4_ms is not None and abs(m.px4_ms - m.total_ms) <= TOLERANCE_MS
-    set_it = (
-        f"set {PARAMETER} to {round(m.total_ms, _DIGITS):g} (companion latency --write, or QGroundControl), restart PX4"
-    )
-    relieve = "reduce Motive's load (no video, fewer bodies), use a cable on a separate network; then measure again"
+    set_it = f"set {PARAMETER} to {round(m.total_ms, _DIGITS):g} (companion latency --write, or QGroundControl), then restart PX4"
+    relieve = "reduce Motive's load (no video, fewer bodies) and use a cable on a separate network; then measure again"
     return [
         TAPS.good(f"{len(m.delay.used)} of {len(m.taps)}, {1e3 * m.delay.spread_s:.1f} ms from tap to tap"),
         DELAY.row(

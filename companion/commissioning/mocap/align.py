@@ -1,4 +1,6 @@
-"""Finds the one setting that explains a hand test: up axis, yaw of the rigid body, yaw of the world, or a mirrored stream. Pure."""
+"""Finds the one setting that explains a hand test: up axis, yaw of the rigid body, yaw of the world, or a mirrored stream. Pure
+functions.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Evaluates rate, jitter, latency and bodies of a recorded motion-capture stream, and names remedies. Pure.
+"""Evaluates rate, jitter, latency and bodies of a recorded motion-capture stream, and names remedies. Pure functions.
 
-The preflight's rows are used as they are (`companion.preflight.mocap`); the others are for a new set-up.
+The preflight's rows (`companion.preflight.mocap`) are reused; the other rows are for a new set-up.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ OWN = Check("mocap.own", "rigid body of the vehicle", why="the pose of another b
 STEADY = Check("mocap.steady", "mocap jitter", why="EKF2 subtracts the same fixed delay from all poses", warns=True)
 DELAY = Check(
     "mocap.delay",
-    "mocap latency against EKF2_EV_DELAY",
+    "mocap latency compared with EKF2_EV_DELAY",
     why="PX4 fuses each pose at the wrong time: the estimate oscillates with the vehicle's motion",
 )
 NETWORK = Check(
@@ -111,7 +111,9 @@ class Timing:
 
 
 def timing(frames: Sequence[FrameSeen]) -> Timing | None:
-    """Fit arrival over frame number by least squares; None if there are fewer than 10 frames or their number does not advance."""
+    """Return the regularity of the arrivals, from a least-squares fit of arrival time over frame number; None if there are fewer
+    than 10 frames or the frame number does not advance.
+    """
     if len(frames) < 10 or frames[-1].number <= frames[0].number:
         return None
     n = [frame.number - frames[0].number for frame in frames]
@@ -265,7 +267,7 @@ def _own(seen: Sequence[BodyMotion], own_id: int, moving: bool, changes: dict[Lo
     key: Location = ("devices", "mocap", "rigid_body_id")
     if len(moved) == 1 and moved[0].id != own_id:
         changes[key] = moved[0].id
-        fix = f"it is {moved[0].label}: set devices.mocap.rigid_body_id: {moved[0].id}"
+        fix = f"the vehicle is {moved[0].label}: set devices.mocap.rigid_body_id: {moved[0].id}"
         return OWN.bad(read, f"id {own_id} moves", fix)
     if moving and not moved:
         return OWN.bad(read, f"id {own_id} moves", "nothing moved: repeat, and carry the vehicle about 30 cm")
@@ -290,7 +292,7 @@ def _rate(t: Timing, expected_hz: float, changes: dict[Location, Data]) -> Row:
     read = f"{t.rate_hz:.1f} Hz, the cameras run at {camera_hz:.1f} Hz"
     if abs(t.rate_hz / expected_hz - 1.0) <= RATE_TOLERANCE:
         return preflight.RATE.good(read, wanted)
-    fix = "frames are lost on the network: use a cable, a separate network or a less busy computer"
+    fix = "frames are being lost on the network: use a cable, a separate network or a less busy computer"
     if abs(camera_hz / expected_hz - 1.0) > RATE_TOLERANCE:
         changes["devices", "mocap", "rate_hz"] = float(round(camera_hz))
         fix = f"set the camera rate to {expected_hz:g} Hz in Motive; or fly at this rate with devices.mocap.rate_hz: {round(camera_hz)}"

@@ -81,7 +81,7 @@ async def watch(session: Session) -> Watched | NotStreaming:
 
 
 def judge(seen: Watched | NotStreaming, vehicle: Vehicle) -> Report:
-    """Return the report on the stream; if there is none, propose where to find it."""
+    """Return the report on the stream; without a stream, return a report that proposes the settings to find one."""
     if isinstance(seen, Watched):
         rows, changes = mocap_judge.judge(seen, vehicle)
         return Report(rows, mocap_judge.as_json(seen), mocap_judge.text(seen), changes)
