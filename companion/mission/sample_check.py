@@ -190,8 +190,8 @@ class SampleCheck:
                     limit=f"{STOP}{limit}",
                     excess=beyond_m,
                     what=f"could not stop within the {what}",
-                    detail=f"{speed:.2f} m/s needs {speed * stop_s:.2f} m to stop, {beyond_m:.2f} m too far{with_m}",
-                    advice="fly more slowly towards its edge or turn back earlier",
+                    detail=f"at {speed:.2f} m/s the vehicle needs {speed * stop_s:.2f} m to stop, {beyond_m:.2f} m too far{with_m}",
+                    advice="fly more slowly towards the edge or turn back earlier",
                 )
 
     def _line(self, t_s: float, position: Vec3, reference: Reference) -> Iterator[Violation]:

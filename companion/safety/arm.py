@@ -155,14 +155,14 @@ class ForceTracker:
         self.force: ForceSample | None = None
         self.age_s = 0.0
         self.stuck = False
-        """Whether samples repeat themselves although the vehicle moves."""
+        """Whether samples repeat themselves although the vehicle is moving."""
         self.trusted = True
         """Whether samples are passed on; False while they repeat themselves."""
         self.mean_n: Vec3 = _NO_FORCE
         """Low-passed external force in the world frame while the controller flies with an empty net; else 0."""
 
     def update(self, i: Inputs, situation: Situation, awake_s: float, dt_s: float, moving: bool) -> None:
-        """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle moves."""
+        """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle is moving."""
         force = self.force = i.force
         self.age_s = self._age.update(awake_s, force.stamp_s if force else None)
         self.stuck = False
@@ -208,7 +208,7 @@ def force_overload(f: ForceTracker, force_max_n: float) -> Values | None:
 
 
 def force_stuck(f: ForceTracker, _: None) -> Values | None:
-    """Fires if samples repeat themselves although the vehicle moves."""
+    """Fires if samples repeat themselves although the vehicle is moving."""
     return HOLDS if f.stuck else None
 
 

@@ -83,7 +83,7 @@ class MocapTracker:
         self.off = (0.0, 0.0)
         """Deviation of the newest rejected pose: m and deg."""
         self.frozen = False
-        """New frames repeat the same pose while the vehicle moves in the air, for longer than `safety.mocap_frozen_s`."""
+        """New frames repeat the same pose while the vehicle is moving in the air, for longer than `safety.mocap_frozen_s`."""
         self.two_streams = False
         self.dragged = False
         """In the air, while the companion commanded, poses disagreed with the IMU. Latched: the observer soon follows the
@@ -98,7 +98,7 @@ class MocapTracker:
         """Whether the newest pose equals the previous one bit for bit, which no measurement does in the air."""
 
     def update(self, i: Inputs, situation: Situation, awake_s: float, moving: bool) -> None:
-        """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle moves."""
+        """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle is moving."""
         pose, vehicle, s = i.mocap, i.vehicle, self._s
         self.pose = pose
         self._moved = self._moved or moving
@@ -255,7 +255,7 @@ def mocap_dragged(m: MocapTracker, limit_m: float) -> Values | None:
 
 
 def mocap_frozen(m: MocapTracker, _: None) -> Values | None:
-    """Fires if new frames repeat the same pose although the vehicle moves."""
+    """Fires if new frames repeat the same pose although the vehicle is moving."""
     return HOLDS if m.frozen else None
 
 

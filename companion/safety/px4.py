@@ -45,12 +45,12 @@ class Px4Tracker:
         self.rebooted_s: float | None = None
         """PX4's clock in the tick in which it stepped back."""
         self.repeats = False
-        """PX4 sends new positions with the same values although the vehicle moves in the air."""
+        """PX4 sends new positions with the same values although the vehicle is moving in the air."""
         self.left_offboard: AutopilotStatus | None = None
         """PX4's status if PX4 has left OFFBOARD without a request; else None."""
 
     def update(self, i: Inputs, situation: Situation, awake_s: float, moving: bool) -> None:
-        """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle moves."""
+        """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle is moving."""
         v = self.vehicle = i.vehicle
         status = self.status = i.status
         self.lag_s, self.rebooted_s, self.repeats = 0.0, None, False
@@ -110,7 +110,7 @@ def link_late(p: Px4Tracker, lag_max_s: float) -> Values | None:
 
 
 def estimate_frozen(p: Px4Tracker, _: None) -> Values | None:
-    """Fires if PX4 sends new positions with the same values although the vehicle moves."""
+    """Fires if PX4 sends new positions with the same values although the vehicle is moving."""
     return HOLDS if p.repeats else None
 
 

@@ -29,7 +29,7 @@ def found_armed(i: Inputs, clearance_m: float) -> tuple[bool, str]:
         height_m = vehicle.position_world_m[2]
     where = "at an unknown height" if height_m is None else f"at a height of {height_m:.2f} m"
     mode = i.status.mode.value.upper() if i.status is not None else "?"
-    found = f"PX4 is armed, but the companion has not armed it: {where}, in {mode}"
+    found = f"PX4 is armed, but the companion did not arm it: {where}, in {mode}"
     if flown_by_pilot(i.status):
         return True, f"{found}, which a pilot has chosen: only motion capture is sent to PX4"
     if stands:

@@ -84,7 +84,7 @@ RULES: tuple[Rule, ...] = (
         message="no motion-capture frame for more than {:.2f} s",
     ),
     Rule(
-        id="mocap_invalid", subject=Subject.MOCAP, what="frames arrive, but Motive does not track the body",
+        id="mocap_invalid", subject=Subject.MOCAP, what="frames are arriving, but Motive does not track the body",
         predicate=mocap.mocap_invalid, thresholds=("mocap_timeout_s",), ground=_PX4_LANDS, air=_PX4_LANDS,
         message="motion capture has not tracked the body for more than {:.2f} s",
     ),
@@ -111,12 +111,12 @@ RULES: tuple[Rule, ...] = (
         what="poses do not move as the IMU measures: an attacker is shifting them, or the calibration is drifting",
         predicate=mocap.mocap_dragged, thresholds=("mocap_inertial_m",), tracked_by=("mocap_inertial_s",), ground=None,
         air=_PX4_LANDS, repeat=Repeat.NEVER,
-        message="motion capture does not move as the IMU measures: {:.0f} mm off (limit {:.0f} mm); PX4 lands without it",
+        message="motion-capture poses do not move as the IMU measures: {:.0f} mm off (limit {:.0f} mm); PX4 lands without it",
     ),
     Rule(
-        id=MOCAP_FROZEN, subject=Subject.MOCAP, what="new frames repeat the same pose although the vehicle moves",
+        id=MOCAP_FROZEN, subject=Subject.MOCAP, what="new frames repeat the same pose although the vehicle is moving",
         predicate=mocap.mocap_frozen, tracked_by=("mocap_frozen_s",), ground=None, air=_PX4_LANDS,
-        message="motion capture repeats the same pose although the vehicle moves",
+        message="motion capture repeats the same pose although the vehicle is moving",
     ),
     Rule(
         id="mocap_slow", subject=Subject.MOCAP, what="frame rate too low", predicate=mocap.mocap_slow,
@@ -155,9 +155,9 @@ RULES: tuple[Rule, ...] = (
         message="messages from PX4 are {:.0f} ms late (limit {:.0f} ms)",
     ),
     Rule(
-        id="estimate_frozen", subject=Subject.PX4, what="new positions from PX4 repeat the same values although the vehicle moves",
+        id="estimate_frozen", subject=Subject.PX4, what="new positions from PX4 repeat the same values although the vehicle is moving",
         predicate=px4.estimate_frozen, hold_time="vehicle_timeout_s", ground=None, air=_PX4_LANDS,
-        message="PX4 repeats the same position and velocity although the vehicle moves",
+        message="PX4 repeats the same position and velocity although the vehicle is moving",
     ),
     Rule(
         id="vehicle_state_lost", subject=Subject.PX4, what="PX4's position, attitude or IMU sample is stale",
@@ -214,7 +214,7 @@ RULES: tuple[Rule, ...] = (
         predicate=arm.servo_error, ground=_LAND, air=_LAND, message="hardware error (register 70) of {}",
     ),
     Rule(
-        id="arm_let_go", subject=Subject.ARM, what="a servo's bus watchdog had switched its torque off",
+        id="arm_let_go", subject=Subject.ARM, what="a servo's bus watchdog has switched its torque off",
         predicate=arm.arm_let_go, ground=_WARN, air=_WARN,
         message="a servo's bus watchdog had switched its torque off; it is on again",
     ),
@@ -265,9 +265,10 @@ RULES: tuple[Rule, ...] = (
         message="force sensor overloaded: {:.0f}, {:.0f}, {:.0f} N",
     ),
     Rule(
-        id="force_stuck", subject=Subject.FORCE, what="samples repeat the same values although the vehicle moves; they count as lost",
-        predicate=arm.force_stuck, tracked_by=("force_stuck_s",), ground=None, air=_WARN,
-        message="the force sensor repeats the same values although the vehicle moves; the controller flies without it",
+        id="force_stuck", subject=Subject.FORCE,
+        what="samples repeat the same values although the vehicle is moving; they count as lost", predicate=arm.force_stuck,
+        tracked_by=("force_stuck_s",), ground=None, air=_WARN,
+        message="the force sensor repeats the same values although the vehicle is moving; the controller flies without it",
     ),
     Rule(
         id="force_drift", subject=Subject.FORCE, what="a lasting force on an empty net",
@@ -286,8 +287,8 @@ RULES: tuple[Rule, ...] = (
         message="no control tick for {:.0f} ms (limit {:.0f} ms)",
     ),
     Rule(
-        id="recorder_drops", subject=Subject.PROCESS, what="the recorder drops samples",
-        predicate=process.recorder_drops, ground=_WARN, air=_WARN, message="the recorder drops samples",
+        id="recorder_drops", subject=Subject.PROCESS, what="the recorder is dropping samples",
+        predicate=process.recorder_drops, ground=_WARN, air=_WARN, message="the recorder is dropping samples",
     ),
     Rule(
         id="guardian_lost", subject=Subject.PROCESS, what="the guardian is dead or cannot take over",
@@ -310,14 +311,14 @@ RULES: tuple[Rule, ...] = (
         message="horizontal speed {:.1f} m/s (limit {:.1f} m/s)",
     ),
     Rule(
-        id="climbs_too_fast", subject=Subject.FLIGHT, what="climbs too fast", predicate=flight.climbs_too_fast,
+        id="climbs_too_fast", subject=Subject.FLIGHT, what="climbing too fast", predicate=flight.climbs_too_fast,
         thresholds=("climb_max_m_s",), hold_time=0.1, ground=None, air=_LAND,
-        message="climbs at {:.1f} m/s (limit {:.1f} m/s)",
+        message="climbing at {:.1f} m/s (limit {:.1f} m/s)",
     ),
     Rule(
-        id="sinks_too_fast", subject=Subject.FLIGHT, what="sinks too fast", predicate=flight.sinks_too_fast,
+        id="sinks_too_fast", subject=Subject.FLIGHT, what="sinking too fast", predicate=flight.sinks_too_fast,
         thresholds=("sink_max_m_s",), hold_time=0.1, ground=None, air=_LAND,
-        message="sinks at {:.1f} m/s (limit {:.1f} m/s)",
+        message="sinking at {:.1f} m/s (limit {:.1f} m/s)",
     ),
     Rule(
         id="geofence_left", subject=Subject.FLIGHT, what="the rotors are outside the room",
@@ -377,7 +378,7 @@ RULES: tuple[Rule, ...] = (
         message="the tether is wound {:.1f} times about its anchor (limit {:.1f})",
     ),
     Rule(
-        id="tether_separated", subject=Subject.TETHER, what="the distance exceeds the tether's length: it is cut",
+        id="tether_separated", subject=Subject.TETHER, what="the distance to the anchor exceeds the tether's length: the tether is cut",
         predicate=flight.tether_separated, tracked_by=("tether.separation_m",), hold_time=0.1, ground=None, air=_LAND,
         repeat=Repeat.NEVER, message="{:.2f} m from the anchor without a pull: the tether is cut or detached",
     ),

@@ -111,7 +111,7 @@ def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[st
         (folder / "mine").mkdir(parents=True)
     assert main(["broker", "init", str(folder)]) == 2
     assert capsys.readouterr().err == (
-        f"{folder}: already exists, nothing was changed; choose another, or use --renew-certificates\n"
+        f"{folder}: already exists; nothing was changed. Choose another folder, or use --renew-certificates\n"
     )
     assert [path.name for path in tmp_path.iterdir()] == ["site"]
 

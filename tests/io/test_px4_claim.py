@@ -259,7 +259,7 @@ def test_px4_that_a_router_moved_to_another_port_is_heard_there() -> None:
 
                     await eventually(armed, "PX4 is heard at its new port")
                     assert autopilot.identity().peer == moved.address
-                    said = [text for text in texts if "is now received from there only" in text]
+                    said = [text for text in texts if "messages are now accepted from there only" in text]
                     assert len(said) == 1 and f"{moved.address[0]}:{moved.address[1]}" in said[0]
 
     asyncio.run(main())

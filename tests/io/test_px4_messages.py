@@ -124,7 +124,7 @@ def test_a_lost_answer_does_not_block_the_request_for_ever() -> None:
     assert requests.claim(LAND, 0.0)
     assert not requests.claim(LAND, ANSWER_DEADLINE_S - 0.001)
     assert requests.claim(LAND, ANSWER_DEADLINE_S)
-    assert requests.take_messages(ANSWER_DEADLINE_S) == ["LAND: no answer within 3 s, requesting it again"]
+    assert requests.take_messages(ANSWER_DEADLINE_S) == ["LAND: no answer within 3 s; requesting it again"]
 
 
 def test_the_newest_messages_are_kept_when_nobody_takes_them() -> None:

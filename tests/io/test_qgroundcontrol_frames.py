@@ -364,7 +364,7 @@ def test_texts_are_bounded_gravest_first_and_what_was_left_out_is_said() -> None
     assert first[0] == (2, "LAND: motion capture lost")
     assert len(first) == 10
     rest = [text for i in range(1, 100) for text in _heard(texts.due(i * 0.1))]
-    assert rest[-1] == (5, f"{501 - TEXTS_WAITING_MAX} messages dropped, see the log")
+    assert rest[-1] == (5, f"{501 - TEXTS_WAITING_MAX} messages dropped; see the log")
     assert len(first) + len(rest) == TEXTS_WAITING_MAX + 1
 
 

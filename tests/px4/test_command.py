@@ -116,7 +116,7 @@ def test_another_type_than_px4s_is_reported_and_not_written(tmp_path: Path, caps
     port = free_udp_port()
     with Px4Peer(port) as peer:
         assert params(port, "--write", str(path), "--backup", str(tmp_path / "old.params")) == EXIT_REFUSED
-        assert "MPC_THR_HOVER: PX4 has a REAL32, the file says an INT32; correct the file" in capsys.readouterr().out
+        assert "MPC_THR_HOVER: PX4 has a REAL32, but the file has an INT32; correct the file" in capsys.readouterr().out
         assert peer.of("PARAM_SET") == []
 
 

@@ -100,7 +100,7 @@ def at(x: float, y: float, z: float, vx: float = 0.05, vy: float = 0.0, vz: floa
     return change
 
 
-FOUND = "PX4 is armed, but the companion has not armed it"
+FOUND = "PX4 is armed, but the companion did not arm it"
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ def create(folder: Path, users: BrokerUsers, now: datetime.datetime) -> None:
         raise ConfigError([f"{folder}: the folder's name contains control characters; choose another"])
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(
-            [f"{folder}: already exists, nothing was changed; choose another, or use --renew-certificates"]
+            [f"{folder}: already exists; nothing was changed. Choose another folder, or use --renew-certificates"]
         )
     beside = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}")
     try:

@@ -302,7 +302,7 @@ class Verifier:
         if command.session != self._session:
             return self._refuse(Reason.WRONG_SESSION, f"{who} is for another flight", command)
         if now_t_s - t_s > history.limits.age_max_s:
-            text = f"{who} is {now_t_s - t_s:.1f} s old, expected at most {history.limits.age_max_s:.1f} s"
+            text = f"{who} is {now_t_s - t_s:.1f} s old (limit {history.limits.age_max_s:.1f} s)"
             return self._refuse(Reason.STALE, text, command)
         if history.contains(command):
             return Refused(Reason.REPLAYED, f"{who} was received before")
@@ -324,7 +324,7 @@ class Verifier:
         if now_t_s == float("-inf"):
             return Reason.EARLY, "the flight has not started"
         if t_s - now_t_s > AHEAD_MAX_S:
-            text = f"{who} is {t_s - now_t_s:.1f} s ahead of the flight clock, expected at most {AHEAD_MAX_S:.1f} s"
+            text = f"{who} is {t_s - now_t_s:.1f} s ahead of the flight clock (limit {AHEAD_MAX_S:.1f} s)"
             return Reason.FROM_THE_FUTURE, text
         if not self.operators.is_allowed(command.operator, command.command):
             return (

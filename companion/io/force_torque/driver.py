@@ -154,7 +154,7 @@ class RobotousForceTorque:
         rate_hz = await self._read_rate()
         if rate_hz != wanted_hz:
             raise DeviceError(
-                f"{self._where}: output rate {wanted_hz} Hz was rejected (error {answer[2]}), it stays at {rate_hz or 'unknown'} Hz; "
+                f"{self._where}: output rate {wanted_hz} Hz was rejected (error {answer[2]}); it stays at {rate_hz or 'unknown'} Hz; "
                 "set devices.force.rate_hz to a rate that the sensor offers"
             )
 

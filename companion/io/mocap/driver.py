@@ -236,7 +236,7 @@ class NatNetMocap:
             if (info.multicast_group, info.data_port) != (device.multicast_group, device.data_port):
                 raise DeviceError(
                     f"{self._where}: the server streams to {info.multicast_group}:{info.data_port}, expected "
-                    f"{device.multicast_group}:{device.data_port}; change Motive's streaming pane or devices.mocap"
+                    f"{device.multicast_group}:{device.data_port}; change the settings in Motive's streaming pane or devices.mocap"
                 )
 
     async def _wait_for_body(self) -> None:
@@ -258,7 +258,7 @@ class NatNetMocap:
             malformed, last = self._client.malformed, self._client.problem
             bad = f"; {malformed} malformed, the last: {last}" if malformed else ""
             raise DeviceError(
-                f"{self._where}: the server answers but no frame of data arrived {within} ({how}); check that Motive streams and "
+                f"{self._where}: the server answers, but no frame of data arrived {within} ({how}); check that Motive streams and "
                 f"is not paused, its local interface and the firewall{bad}{self._foreign_hint()}"
             )
         if device.rigid_body_id in ids:
@@ -336,7 +336,7 @@ class NatNetMocap:
         except Exception as error:
             if self._callback_error is None:
                 self._callback_error = f"{type(error).__name__}: {error}"
-                _LOG.exception("%s: on_pose failed; reception goes on, further failures are not logged", self._where)
+                _LOG.exception("%s: on_pose failed; reception continues; further failures are not logged", self._where)
 
     def _close(self) -> None:
         if self._keep_alive is not None:

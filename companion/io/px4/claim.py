@@ -206,7 +206,7 @@ class LinkClaim:
         self._mavsdk.connect(sender)
         self._moved = (
             f"PX4 (system {self._system}) was silent at {_text(self.peer)} for {REPIN_SILENCE_S:g} s and is heard at {_text(sender)}; "
-            "it is now received from there only"
+            "messages are now accepted from there only"
         )
         self.peer = sender
         self._rivals.discard(sender)

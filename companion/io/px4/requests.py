@@ -57,7 +57,7 @@ class RequestQueue:
                     if now_s < kind.sent_s + ANSWER_DEADLINE_S:
                         return False
                     self._messages.append(
-                        f"{request.name}: no answer within {ANSWER_DEADLINE_S:g} s, requesting it again"
+                        f"{request.name}: no answer within {ANSWER_DEADLINE_S:g} s; requesting it again"
                     )
                 elif now_s < kind.not_before_s:
                     return False

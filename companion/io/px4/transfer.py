@@ -46,7 +46,7 @@ class Difference:
         if isinstance(self.px4, int) is isinstance(self.file, int):
             return None
         names = ("a REAL32", "an INT32")
-        return f"PX4 has {names[isinstance(self.px4, int)]}, the file says {names[isinstance(self.file, int)]}"
+        return f"PX4 has {names[isinstance(self.px4, int)]}, but the file has {names[isinstance(self.file, int)]}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -95,10 +95,10 @@ class GroundStation:
     @property
     def line(self) -> str:
         """Return one line about the open link for the operator."""
-        when = ", in flight too," if self._while_armed else " while it is disarmed,"
+        when = " even in flight," if self._while_armed else " while it is disarmed,"
         return (
-            f"MAVLink is forwarded to and from {self.address}. Anyone who can send from there can change PX4's mode, and its parameters"
-            f"{when} but nothing in the companion"
+            f"MAVLink is forwarded to and from {self.address}. Anyone who can send from there can change PX4's mode and,"
+            f"{when} its parameters, but nothing in the companion"
         )
 
     async def __aenter__(self) -> Self:

@@ -96,7 +96,7 @@ class Texts:
             self._waiting.remove((severity, text))
             messages += self._chunks(severity, text)
         if self._left_out and not self._waiting and self._bucket.take(now_s):
-            messages += self._chunks(_NOTICE, f"{self._left_out} messages dropped, see the log")
+            messages += self._chunks(_NOTICE, f"{self._left_out} messages dropped; see the log")
             self._left_out = 0
         return messages
 
