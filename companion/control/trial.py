@@ -1,4 +1,6 @@
-"""The trial of a control law on the ground: a law that cannot be built, raises or returns a malformed command is refused."""
+"""The trial of a control law on the ground: a law that cannot be built, raises an exception or returns a malformed command is
+refused.
+"""
 
 from __future__ import annotations
 
@@ -59,10 +61,11 @@ def build_law(config: ControllerConfig, vehicle: Vehicle) -> Law:
 
 
 def try_law(config: ControllerConfig, vehicle: Vehicle, start_arm_rad: Vec2) -> None:
-    """Build the law and run it for some ticks at hover: on the ground and in the air, with and without a sample of force.
+    """Build the law and run it for some ticks at hover: on the ground and in the air, with and without a force sample.
 
     Raises:
-        PluginError: the law is not installed, cannot be built, raises, returns a malformed command, or needs more than a tick.
+        PluginError: the law is not installed, cannot be built, raises an exception, returns a malformed command, or takes longer
+            than a tick.
     """
     plugin = find(CONTROL_LAWS, config.law)
     law = build_law(config, vehicle)
@@ -88,7 +91,7 @@ def try_law(config: ControllerConfig, vehicle: Vehicle, start_arm_rad: Vec2) -> 
 
 
 def problem_of(wrench: object) -> str | None:
-    """Return why a command cannot be sent: wrong type or shape, a number that is not finite, no attitude. None if it can."""
+    """Return why a command cannot be sent (wrong type or shape, a non-finite number, or no attitude), or None if it can."""
     if not isinstance(wrench, Wrench):
         return f"a {type(wrench).__name__}, not a companion.control.types.Wrench"
     try:
@@ -100,7 +103,7 @@ def problem_of(wrench: object) -> str | None:
         if not math.isfinite(value):
             return f"{path} = {value}, which is not finite"
     if converted != wrench:
-        return "a Wrench with a list in the place of a tuple"
+        return "a Wrench with a list in place of a tuple"
     norm = math.hypot(*wrench.attitude_wxyz)
     if abs(norm - 1.0) > 1e-6:
         return f"attitude_wxyz of norm {norm:g}, expected 1"

@@ -303,7 +303,7 @@ def _crash(t: Transition, text: str) -> None:
 
 
 def missing_inputs(i: Inputs, vehicle: Vehicle) -> list[str]:
-    """Return the devices of the vehicle that have delivered nothing."""
+    """Return the devices of the vehicle that have delivered no data yet."""
     devices: dict[str, object] = {
         "PX4 state": i.vehicle,
         "PX4": i.status,

@@ -139,7 +139,7 @@ REPLACE = "from msgspec.structs import replace\n"
         (STEP + "return wrench.collective_n\n", "step returns a float, not a companion.control.types.Wrench"),
         (STEP + "return replace(wrench, collective_n=float('nan'))\n", "step returns collective_n = nan, which is not finite"),
         (STEP + "return replace(wrench, arm_torque_nm=(0.0,))\n", "of length 2, got 1 - at `$.arm_torque_nm`"),
-        (STEP + "return replace(wrench, arm_torque_nm=[0.0, 0.0])\n", "step returns a Wrench with a list in the place of a tuple"),
+        (STEP + "return replace(wrench, arm_torque_nm=[0.0, 0.0])\n", "step returns a Wrench with a list in place of a tuple"),
         (STEP + "return replace(wrench, log=replace(wrench.log, rho=float('inf')))\n", "step returns log.rho = inf, which"),
         (STEP + "return replace(wrench, attitude_wxyz=(0.0, 0.0, 0.0, 0.0))\n", "attitude_wxyz of norm 0, expected 1"),
         (STEP + "return replace(wrench, collective_n=-1.0)\n", "step returns collective_n = -1, expected 0 or more"),

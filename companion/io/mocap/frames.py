@@ -162,9 +162,10 @@ def _skip_sized(data: bytes, offset: int) -> int:
 
 
 def _skip_unknown(data: bytes, offset: int) -> int:
-    """Skip the sections that lie between the known ones and the suffix.
+    """Return the offset of the suffix, which follows any unknown sections that begin at `offset`.
 
-    If the rest is not whole sections and a suffix of the known size, the suffix has grown and starts at `offset`.
+    If the data from `offset` on does not consist of whole sections and a suffix of the known size, the suffix has grown and starts
+    at `offset`.
     """
     end = offset
     while len(data) - end > SUFFIX_BYTES:
