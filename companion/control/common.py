@@ -89,8 +89,8 @@ class DesiredForce:
 
 
 class Actuation:
-    """Converts force and joint torques to commands: vertical force first, then lateral force within the tilt limit, filtered roll and
-    pitch, joint torques within their limits.
+    """Converts force and joint torques to commands: vertical force first, then lateral force within the tilt limit, filtered roll
+    and pitch, and joint torques within their limits.
 
     Results of the last tick are attributes, because a record per tick would cost more than the arithmetic.
     """

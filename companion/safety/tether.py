@@ -1,8 +1,8 @@
 """The safety tether: slack now and at the predicted stop, clearance from rotors and arm, winding, pull, separation. Pure.
 
-The tether is a line between its anchor and an attachment point on the vehicle that can be no longer than `tether.length_m`.
-Unmeasured quantities are bounded: the shape of the line (`companion.safety.tether_shape`) and its pull
-(`companion.safety.tether_pull`). Plain floats: the watch runs in the control tick.
+The tether is a line, no longer than `tether.length_m`, between its anchor and an attachment point on the vehicle. Unmeasured
+quantities are bounded: the shape of the line (`companion.safety.tether_shape`) and its pull (`companion.safety.tether_pull`). Plain
+floats: the watch runs in the control tick.
 """
 
 from __future__ import annotations
