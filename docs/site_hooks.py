@@ -19,12 +19,12 @@ from mkdocs.structure.pages import Page
 
 OUTSIDE = "repository"
 FLIGHT_CODE = (
-    "companion/config/files/controllers",
-    "companion/config/files/worlds",
     "companion/control",
     "companion/core",
     "companion/safety",
     "companion/sitl_config",
+    "configs/controllers",
+    "configs/worlds",
     "sitl",
 )
 """What the figures of a flight depend on."""

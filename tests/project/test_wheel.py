@@ -48,8 +48,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_wheel_contains_every_file_of_the_packages(wheel: Path) -> None:
     def files(root: Path) -> set[str]:
-        found = (path for name in PACKAGES for path in (root / name).rglob("*"))
-        return {str(path.relative_to(root)) for path in found if path.is_file() and path.parent.name != "__pycache__"}
+        walked = (found for name in PACKAGES for found in os.walk(root / name, followlinks=True))
+        paths = (Path(folder, name) for folder, _, names in walked for name in names)
+        return {str(path.relative_to(root)) for path in paths if path.parent.name != "__pycache__"}
 
     assert files(wheel) == files(ROOT)
     assert "companion/config/files/missions/catch.yaml" in files(wheel)
