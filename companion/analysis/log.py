@@ -145,8 +145,9 @@ class FlightLog:
     def to_pandas(self) -> dict[str, Any]:
         """Return a pandas DataFrame for each of `/inputs`, `/outputs`, `/sent` and `/events`, indexed by `t_s` (s, flight clock).
 
-        A column is named by the path of its field, which contains unit and frame, with an element in brackets:
-        `mocap.position_world_m[0]`. NaN where a tick lacks the field. `/events` has a row per event, the others a row per tick.
+        A column has the name of its field's path, which contains unit and frame; the index of an element is in brackets:
+        `mocap.position_world_m[0]`. The value is NaN where a tick lacks the field. `/events` has one row per event, the others have
+        one row per tick.
 
         Raises:
             LogError: pandas is not installed.
@@ -178,7 +179,7 @@ class FlightLog:
 
 
 def _cells(record: Any) -> dict[str, Any]:
-    """Return the fields of a record, also those of the records in it, without `t_s` and `events`, by the names of their columns."""
+    """Return the values of a record and of the records in it, except `t_s` and `events`, keyed by column name."""
     cells: dict[str, Any] = {}
 
     def take(name: str, value: Any) -> None:

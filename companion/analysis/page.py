@@ -60,11 +60,15 @@ class Page:
     player_html: str = ""
     """HTML element that plays an animation of the flight; inserted unchanged."""
     width_rem: int = 86
-    """Largest width of the text."""
+    """Maximum width of the text, rem."""
 
 
 def write_page(page: Page, path: Path) -> None:
-    """Write a page; raise OSError if the file cannot be written."""
+    """Write a page.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     path.write_text(_environment().get_template("page.html").render(page=page), encoding="utf-8")
 
 

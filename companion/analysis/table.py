@@ -45,7 +45,7 @@ class Column:
     """Title, which may have several lines."""
     show: Callable[[Any], str | Cell]
     left: bool = False
-    """Align left; numbers are aligned right."""
+    """Whether to align the cells left; numbers are aligned right."""
     kind: str = ""
     """Default kind of the cells."""
     line: Line | None = None

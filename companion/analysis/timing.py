@@ -52,7 +52,7 @@ class Timing:
 
 
 class Stopwatch:
-    """Collects the timing, 80 bytes per tick."""
+    """Collects the timing of ticks; needs 80 bytes of memory per tick."""
 
     def __init__(self) -> None:
         self._t_s, self._lateness_s = array("d"), array("d")

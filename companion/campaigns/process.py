@@ -88,7 +88,7 @@ class CampaignProcess:
         """Yield the result of each flight as it ends, until the last one or until asked to stop.
 
         Raises:
-            CampaignError: the campaign reported an error, died or hangs.
+            CampaignError: the campaign reported an error, died or is hanging.
         """
         assert self._process.stdout is not None
         fd = self._process.stdout.fileno()
@@ -97,7 +97,7 @@ class CampaignProcess:
             if not select.select([fd], [], [], _POLL_S)[0]:
                 if time.monotonic() - heard_s > STALL_TIMEOUT_S:
                     raise CampaignError(
-                        f"campaign: no flight has ended for {STALL_TIMEOUT_S:g} s; the campaign was stopped, see {self._log}"
+                        f"campaign: no flight has ended for {STALL_TIMEOUT_S:g} s; the campaign was stopped; see {self._log}"
                     )
                 continue
             data = os.read(fd, 1 << 20)

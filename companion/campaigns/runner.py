@@ -36,8 +36,10 @@ class Flights(Protocol):
     """Flights in progress."""
 
     def results(self) -> Iterator[Message]:
-        """Yield a message with at least `{index, row, wall_s}` as each flight ends, in any order. Raises `CampaignError` if it
-        cannot continue.
+        """Yield a message with at least `{index, row, wall_s}` as each flight ends, in any order.
+
+        Raises:
+            CampaignError: the campaign cannot continue.
         """
 
     def ask_to_stop(self) -> None:

@@ -43,8 +43,8 @@ def add_parser(commands: Any) -> None:
     jog = add_tool(
         parts, "jog", _TOOLS, write="",
         help="move one joint slowly with keys",
-        description="Move one joint at a time, at up to 20 deg/s, within the joint limits. It stops when you release "
-        "the key, and at an obstacle. Afterwards the arm is limp: hold it.",
+        description="Move one joint at a time, at up to 20 deg/s, within the joint limits. It stops as soon as you release "
+        "the key or it meets an obstacle. Afterwards the arm is limp: hold it.",
     )  # fmt: skip
     jog.add_argument("--joint", type=_joint, metavar="N", help="with --to: joint to move, 1 or 2")
     jog.add_argument("--to", type=float, metavar="DEG", help="move to this angle instead of using keys")

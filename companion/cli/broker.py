@@ -34,7 +34,7 @@ def add_parser(commands: Any) -> None:
         description="Create a folder with all files that a mosquitto broker with logins and TLS needs, and in it a folder for each "
         "computer that connects. Exit 0: created; 2: a name is invalid or the folder is not empty; 3: a tool or package is missing.",
     )
-    init.add_argument("folder", metavar="DIR", help="folder to create; must not exist, or be empty")
+    init.add_argument("folder", metavar="DIR", help="folder to create; must not exist or must be empty")
     several = {"action": "extend", "nargs": "+", "default": [], "metavar": "NAME"}
     init.add_argument(
         "--host", **several, help="names and addresses of the broker's computer (default: the name of this computer)"

@@ -41,7 +41,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--model-error", type=_model_errors, metavar="SHARE,...",
         help="fractions by which masses, inertia and torque constants differ from the vehicle file, 0 to 0.3, e.g. 0,0.1,0.2,0.3 "
-        "(default: the world's)",
+        "(default: the model error of the world)",
     )  # fmt: skip
     parser.add_argument(
         "--adaptation", type=_adaptation, default=ADAPTATION[:1], metavar="on,off",

@@ -17,7 +17,7 @@ def add_parser(commands: Any) -> None:
     init = commands.add_parser(
         "init",
         help="copy the shipped missions, vehicle, control laws, worlds and layouts into a new folder, to edit them",
-        description="Copy the shipped configuration files into a new folder. The pages of the documentation call it configs.",
+        description="Copy the shipped configuration files into a new folder. The documentation calls this folder configs.",
     )
     init.add_argument("folder", nargs="?", type=Path, default=Path("configs"), help="new folder (default: configs)")
     init.set_defaults(run=run)

@@ -41,7 +41,7 @@ def add_parser(commands: Any) -> None:
         "install",
         help="set up the vehicle's computer: service, adapter names and latency, limits, full CPU clock; or undo this",
         description="Install companion as a systemd service that waits on the ground for an operator's START, with the settings that "
-        "its timing needs; or undo this exactly. Exit 0: done, or nothing to do; 2: wrong input; 3: failed, "
+        "its timing needs; or revert the installation exactly. Exit 0: done, or nothing to do; 2: wrong input; 3: failed, "
         "nothing was changed; 4: cancelled.",
     )
     what = install.add_mutually_exclusive_group(required=True)

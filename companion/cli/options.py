@@ -20,7 +20,7 @@ def add_law(parser: argparse.ArgumentParser) -> None:
 
 
 def preset_help() -> str:
-    """Return the help of `--preset`. Every installed law is imported for it, so that it is made only when it is shown."""
+    """Return the help of `--preset`. This imports every installed law, so the text is made only when the help is shown."""
     gains = []
     for law in PRESETS:
         try:

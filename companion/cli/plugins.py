@@ -12,15 +12,15 @@ from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.plugins import CONTROL_LAWS, KINDS, PluginError, installed
 
 _SETTINGS: dict[str, Mapping[str, type[Model]]] = {CONTROL_LAWS: LAWS}
-"""Settings of the plug-ins of each group by name."""
+"""Settings class of each plug-in, by group and name."""
 
 
 def add_parser(commands: Any) -> None:
     """Add `plugins` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "plugins",
-        help="list the installed control laws, and who provides them",
-        description="List the installed plug-ins: name, kind, distribution, version and what it is. Exit code 2: one cannot be used.",
+        help="list the installed control laws and the packages that provide them",
+        description="List the installed plug-ins: name, kind, distribution, version, description. Exit code 2: one cannot be used.",
     )
     parser.set_defaults(run=run)
 

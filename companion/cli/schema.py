@@ -29,7 +29,7 @@ KINDS: dict[str, Callable[[], TypeAdapter[Any]]] = {
     "controller": _controller,
     "world": lambda: TypeAdapter(World),
 }
-"""Type of each kind of file. That of the controller file depends on the installed control laws."""
+"""Type of each kind of file; the type of a controller file depends on the installed control laws."""
 
 
 class _Brief(GenerateJsonSchema):

@@ -26,7 +26,7 @@ class Change:
 
     location: Location
     old: Data
-    """None if the file does not have the key."""
+    """Old value; None if the file does not have the key."""
     new: Data
     origin: Origin | None
     """Place of the old value; None if the file does not have the key."""
@@ -37,7 +37,7 @@ class Change:
         return key_path(self.location)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the JSON document's part."""
+        """Return the change as part of the JSON document."""
         at = self.origin
         return {
             "key": self.key,
@@ -77,7 +77,7 @@ class Patch:
         return "\n".join(f"{left:<{width}}  # {right}" if right else left for left, right in lines)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the JSON document's part."""
+        """Return the patch as part of the JSON document."""
         return {"file": self.shown, "changes": [change.as_json() for change in self.changes], "text": self.text}
 
     def write(self) -> Path:

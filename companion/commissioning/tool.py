@@ -127,7 +127,7 @@ class Tool(Generic[_T]):
     """One commissioning tool."""
 
     name: str
-    """Words after `companion`."""
+    """Words after `companion` on the command line."""
     family: Family
     collect: Callable[[Session], _T | Coroutine[Any, Any, _T]]
     """Checks the options, opens the devices, guides the user and returns the measurements. Ctrl-C cancels it if it is a coroutine."""
@@ -144,7 +144,7 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
 
     Raises:
         ConfigError: an option or the vehicle file is wrong, or the change cannot be written into the vehicle file.
-        KeyboardInterrupt: Ctrl-C.
+        KeyboardInterrupt: Ctrl-C was pressed.
     """
     session = Session(arguments, tool.family)
     try:

@@ -19,7 +19,7 @@ class EditError(Exception):
 
 
 class Edit(NamedTuple):
-    """Replace the characters from `begin` to `end` with `text`."""
+    """Replacement of the characters from `begin` to `end` by `text`."""
 
     begin: int
     end: int

@@ -57,7 +57,7 @@ def load(root: Path) -> Record | None:
     try:
         found = path.lstat()
         if not stat.S_ISREG(found.st_mode) or found.st_uid not in (0, os.geteuid()) or found.st_mode & 0o022:
-            raise InstallError(f"{path}: expected a file that only root can change; it is not trusted")
+            raise InstallError(f"{path}: expected a file that only root can change; this one is not trusted")
         data = json.loads(path.read_text(encoding="utf-8"))
         if data["schema_version"] != SCHEMA_VERSION:
             raise InstallError(

@@ -32,7 +32,7 @@ class SitlProcess:
     Args:
         config: configuration of the flight and its world.
         out: folder of the flight.
-        px4: use a real PX4 instead of the stub.
+        px4: whether to use a real PX4 instead of the stub.
     """
 
     def __init__(self, config: SitlConfig, out: Path, *, px4: bool = False) -> None:
@@ -64,7 +64,7 @@ class SitlProcess:
         on_message: Callable[[dict[str, Any]], None] = lambda message: None,
         given_up: Callable[[], bool] = lambda: False,
     ) -> dict[str, dict[str, Any]]:
-        """Wait until the simulated devices are open and the autopilot can fly; return their addresses.
+        """Wait until the simulated devices are open and the autopilot can fly; return the addresses of the devices.
 
         Args:
             on_message: called with the world's messages until then (type "progress": a line for the user).

@@ -138,7 +138,7 @@ def _rates(o: Observations) -> Row:
     if min(rates_hz) >= RATE_GOOD_HZ:
         return RATES.good(read, wanted)
     if rates_hz[0] == 0.0:
-        fix = "PX4 sends no position until it fuses motion capture: see the row on that"
+        fix = "PX4 sends no position until it fuses motion capture: see the row 'EKF2 fuses motion capture'"
     else:
         fix = "make the link faster: 921600 baud, MAV_x_RATE 80000 or more, MAV_x_MODE onboard (docs/px4.md)"
     return (RATES.doubtful if min(rates_hz) >= RATE_MIN_HZ else RATES.bad)(read, wanted, fix)

@@ -72,7 +72,7 @@ TARE_GOOD, TARE_MAX = 0.05, 0.10
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     """Return the rows of the force sensor, or one warning if the vehicle has none."""
     if vehicle.devices.force is None:
-        fix = "add devices.force to the vehicle file if the sensor is mounted; without it the controller flies without force"
+        fix = "add devices.force to the vehicle file if the sensor is mounted; without it, the controller measures no force"
         yield DEVICE.doubtful("none: a catch, a lost payload and a force on the empty net are not detected", "", fix)
         return
     failure, stream = o.failures.get("force"), o.force_stream

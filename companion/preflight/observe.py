@@ -197,7 +197,7 @@ class _Watcher:
         await asyncio.sleep(LOOK_PERIOD_S)
 
     def seen(self, base: Observations, duration_s: float) -> Observations:
-        """Return the data of the last `duration_s`, to a tenth of a second."""
+        """Return the data of the last `duration_s`, accurate to a tenth of a second."""
         now = self._count()
         while len(self._counts) > 1 and self._counts[1].t_s <= now.t_s - duration_s:
             self._counts.popleft()

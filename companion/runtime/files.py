@@ -21,11 +21,11 @@ def write_whole(
 
     Args:
         path: the file.
-        data: its content.
+        data: content of the file.
         mode: permission bits; None for the default of the process (umask).
         owner: user and group id; None for those of the process.
         replace: False refuses to replace an existing file.
-        durable: wait until the content is on the storage medium, so that it survives a loss of power.
+        durable: whether to wait until the content is on the storage medium, so that it survives a loss of power.
 
     Raises:
         FileExistsError: the file exists and `replace` is False; it is left unchanged.

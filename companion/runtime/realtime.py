@@ -58,8 +58,8 @@ def claim_realtime(priority: int, *, cpus: Collection[int] = (), lock_memory: bo
     Args:
         priority: SCHED_FIFO priority, 1 to 99.
         cpus: cores that the process runs on; empty to leave them unchanged.
-        lock_memory: keep the process in memory. Pages are locked when they are touched (MCL_ONFAULT), which avoids loading all
-            thread stacks and mapped libraries.
+        lock_memory: whether to keep the process in memory. Pages are locked when they are touched (MCL_ONFAULT), which avoids
+            loading all thread stacks and mapped libraries.
     """
     gc.collect()
     gc.freeze()

@@ -20,8 +20,8 @@ class Bars:
     """Live progress bars, each followed by a text; without a terminal only the lines of `say` are printed.
 
     Args:
-        console: where they are shown.
-        names: the bars' names.
+        console: console on which the bars are shown.
+        names: names of the bars.
     """
 
     def __init__(self, console: Console, names: Sequence[str]) -> None:

@@ -307,7 +307,7 @@ def test_json_is_all_that_is_printed(root: Path, capsys: pytest.CaptureFixture[s
         (("--mission", "/etc/companion/none.yaml"), "no such file"),
         (("--mission", "/home/pi/hover.yaml"), "cannot see /home"),
         (("--mission", "/etc/companion/vehicles/tarot650_2r.yaml"), "tarot650_2r.yaml"),
-        (("--root", "/nowhere/at/all"), "expected a folder"),
+        (("--root", "/nowhere/at/all"), "expected the root folder"),
     ],
 )
 def test_wrong_input_is_refused(

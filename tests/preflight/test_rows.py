@@ -189,7 +189,7 @@ CASES = {
     "force's latency timer": Case("force.usb_latency", "16 ms", "udev", {"machine": r.machine(force_latency_ms=16)}, WARN),
     "weak tether": Case("tether.strength", "40 N", "stronger", {}, vehicle={"tether.load_rating_n": 40.0}),
     "vehicle without a tether": Case(
-        "tether.line", "slack, pull, winding and clearance of a tether are not watched", "add tether", {}, WARN,
+        "tether.line", "slack, tension, winding and clearance of a tether are not monitored", "add tether", {}, WARN,
         vehicle={"tether": None},
     ),
     "short tether": Case("tether.slack", "0.11 m", "nearer", {}, vehicle={"tether.length_m": 1.7}),

@@ -39,9 +39,9 @@ class Spread:
     """Percentiles of a metric over seeds, by nearest rank. A failed flight counts as worse than all others."""
 
     p50: float | None
-    """None if half of the flights or more failed."""
+    """Median; None if half of the flights or more failed."""
     p95: float | None
-    """None if more than one flight in twenty failed."""
+    """95th percentile; None if more than one flight in twenty failed."""
     flights: int
     """Number of flights, failed ones included."""
 
@@ -87,7 +87,7 @@ class Group:
 
     @property
     def printed(self) -> PrintedFlight | None:
-        """Results printed in the paper for this group."""
+        """Results printed in the paper for this group; None if there are none."""
         return None if is_ablation(self.preset) else printed(self.controller, self.payload_kg)
 
     def jsonable(self) -> dict[str, Any]:

@@ -76,7 +76,7 @@ def variants_of(
         available: presets of each law.
         controllers: requested laws; empty for all.
         presets: requested presets; empty for all.
-        ablation: add variants of `ABLATED`, each with one part removed.
+        ablation: whether to add variants of `ABLATED`, each with one part removed.
         adaptation: members of `ADAPTATION`: whether the presets of the adaptive law are flown with their adaptation, without it, or
             both.
 

@@ -23,7 +23,7 @@ class Printed:
 
 @dataclass(frozen=True, slots=True)
 class PrintedFlight:
-    """One controller with one payload."""
+    """Results printed for one controller with one payload."""
 
     title: str
     """The controller's name in the table's header."""

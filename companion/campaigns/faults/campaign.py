@@ -122,7 +122,7 @@ def flights_table(rows: Sequence[Row], *, details: bool = False) -> Table:
 
     Args:
         rows: rows of the flights.
-        details: add a column with problems and events.
+        details: whether to add a column with problems and events.
     """
 
     def text(title: str, key: str) -> Column:

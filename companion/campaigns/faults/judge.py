@@ -38,7 +38,7 @@ class Point:
     """The true state of the vehicle at one time."""
 
     t_s: float
-    """Flight clock."""
+    """Time on the flight clock."""
     position_world_m: Vec3
     tilt_rad: float
     slack_m: float | None
@@ -88,7 +88,7 @@ def row_of(variant: Variant, phase: FlightPhase, flown: FaultFlight, vehicle: Ve
 
     Args:
         variant: the fault.
-        phase: phase in which it was injected.
+        phase: phase in which the fault was injected.
         flown: the flight.
         vehicle: vehicle file with the limits.
     """

@@ -72,7 +72,7 @@ class WireFlights:
         self.ask_to_stop()
 
     def ask_to_stop(self) -> None:
-        """Land the flying vehicles and start no further flights. Safe in a signal handler."""
+        """Land the flying vehicles and start no further flights. May be called in a signal handler."""
         self._stop_asked = True
         for process in tuple(self._running):
             process.send_signal(signal.SIGINT)

@@ -133,7 +133,7 @@ def planned(kinds: Sequence[str], phases: Sequence[str], *, wires: bool = False)
         kinds: requested kinds; empty for all.
         phases: requested phases; empty for all. If kinds and phases are both requested, each kind is flown in each phase, even in
             one that campaigns normally leave out.
-        wires: choose from `WIRES`.
+        wires: whether to choose from `WIRES`.
     """
     if wires:
         everything = list(WIRES)

@@ -120,7 +120,7 @@ class Robustness(Campaign):
         keys = hardest if self.cases else {key: hardest[key] for key in DRAWN}
         line = fly_command(self.mission, law, preset, self.configs[0].laboratory.name, keys, self.overrides)
         console.print(
-            f"to fly the worst one with companion fly:\n{line}", highlight=False, markup=False, soft_wrap=True
+            f"to fly the worst world with companion fly:\n{line}", highlight=False, markup=False, soft_wrap=True
         )
 
     def good(self, rows: Sequence[Row]) -> bool:

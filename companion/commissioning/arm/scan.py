@@ -210,7 +210,7 @@ def _states(servos: Sequence[FoundServo], vehicle: Vehicle) -> list[Row]:
             not tripped,
             _each(servos, ["tripped" if servo in tripped else "not tripped" for servo in servos]),
             "not tripped",
-            f"{_SETUP} clears it; it tripped because a companion died or a cable was pulled under torque",
+            f"{_SETUP} clears it; it tripped because the companion died or a cable was pulled while torque was on",
         ),
         preflight.supply(VOLTAGE, [servo.value(dxl.PRESENT_VOLTAGE) * dxl.VOLTAGE_UNIT_V for servo in servos]),
         TEMPERATURE.row(

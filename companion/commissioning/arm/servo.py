@@ -126,7 +126,7 @@ def settings(servo: FoundServo, joint: Joint, arm: Arm, device: ArmDevice) -> li
         (bus.HOMING_OFFSET, 0, str, "the vehicle file's zero_count gives the zero"),
         (bus.SHADOW_ID, NO_SHADOW, lambda v: "none" if v > 252 else str(v), "it would follow another servo's commands"),
         (dxl.CURRENT_LIMIT, wanted_limit, str, f"torque_max_nm {joint.torque_max_nm:g} needs {needed}"),
-        (bus.PWM_LIMIT, 885, str, "a lower voltage gives less torque at speed"),
+        (bus.PWM_LIMIT, 885, str, "a lower limit gives less torque at speed"),
         (bus.MIN_POSITION_LIMIT, 0, str, "the companion itself enforces the joint limits"),
         (bus.MAX_POSITION_LIMIT, dxl.COUNTS_PER_TURN - 1, str, "the companion itself enforces the joint limits"),
         (bus.STARTUP, 0, str, "no torque at power-on"),

@@ -4,7 +4,7 @@ A tap moves the vehicle too little to differentiate motion capture twice: its no
 the IMU is integrated. Around each tap the specific force is rotated into the world and integrated twice, the gyro once. Position
 and rotation measured by motion capture are regressed on the result, shifted by a delay, and on a polynomial for slow changes:
 initial values, gravity, bias, the sway of the hand. The residual is smallest at the delay; a parabola through the minimum resolves
-it below the sample period, and its curvature gives the error. IMU samples are on the companion's clock, poses are stamped on
+it below the sample period, and its curvature gives the error. IMU samples are on the companion's clock, and poses are stamped on
 arrival at the companion.
 """
 
@@ -108,7 +108,7 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
     """Measure the delay from one tap.
 
     Args:
-        tap: found in `imu`.
+        tap: a tap that was found in `imu`.
         imu: samples in order of time.
         poses: poses in order of arrival.
         noise: noise of motion capture per axis, one sigma, m and rad (`mocap_noise`).

@@ -92,7 +92,7 @@ def with_passed(tests: Sequence[Passed], setup: Setup, at: datetime, rows: Seque
 
 
 def load(path: Path) -> list[Passed]:
-    """Return all passed tests; none if there is no record.
+    """Return all passed tests; an empty list if there is no record.
 
     Raises:
         RecordError: the record exists but cannot be parsed.
