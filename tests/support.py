@@ -24,7 +24,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from companion.cli.main import main
-from companion.config.vehicle import Tether, Vehicle
+from companion.config.vehicle import Tether, Tool, Vehicle
 from companion.model.types import Inputs, Outputs
 from companion.sitl_config.loader import load_sitl
 
@@ -369,6 +369,12 @@ def tether_of(vehicle: Vehicle) -> Tether:
     """The tether of a vehicle that has one."""
     assert vehicle.tether is not None
     return vehicle.tether
+
+
+def tool_of(vehicle: Vehicle) -> Tool:
+    """The tool of a vehicle that has one."""
+    assert vehicle.tool is not None
+    return vehicle.tool
 
 
 def set_options(**values: object) -> list[str]:

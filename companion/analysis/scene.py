@@ -117,7 +117,7 @@ class Scene:
         self._foot_m: float = airframe["ground_clearance_m"]
         self._shoulder: Array = np.array(arm["shoulder_body_m"])
         self._links_m: tuple[float, float] = tuple(arm["link_lengths_m"])
-        self._net_radius_m: float = tool["net_radius_m"]
+        self._net_radius_m: float = 0.0 if tool is None else tool["net_radius_m"]
         self._tether_line: dict[str, Any] | None = vehicle["tether"]
         room = vehicle["room"]
         self._low, self._high = (np.array([room[axis][k] for axis in ("x_m", "y_m", "z_m")]) for k in (0, 1))
@@ -231,6 +231,8 @@ class Scene:
                 ],
             )
         )
+        if not self._net_radius_m:
+            return parts
         along = (net - elbow) / self._links_m[1]
         across = np.cross(along, y_axis)
         hoops = [

@@ -73,7 +73,7 @@ class Arm(Model):
 
     shoulder_body_m: Vector3
     link_lengths_m: Positive2
-    """Lengths from shoulder to elbow, and from elbow to the centre of the net."""
+    """Lengths from shoulder to elbow, and from elbow to the centre of the net, or without a tool to the end of link 2."""
     link_masses_kg: Positive2
     """Masses of link 1 with the elbow servo, and of link 2 without sensor and net."""
     link_com_m: Positive2
@@ -84,6 +84,10 @@ class Arm(Model):
     joint_friction_nm: NonNegative = 0.04
     """Dry friction of one joint, for laws with friction feedforward."""
     joints: tuple[Joint, Joint]
+
+
+LINK_RADIUS_M = 0.03
+"""Half the thickness of servos and links."""
 
 
 class Tool(Model):
@@ -348,7 +352,8 @@ class Vehicle(Model):
     name: str
     airframe: Airframe
     arm: Arm
-    tool: Tool
+    tool: Tool | None = None
+    """Net, and the force-torque sensor before it. If it is absent, nothing can be caught (docs/parts.md)."""
     tether: Tether | None = None
     """Safety tether. If it is absent, only the room limits the flight, and no tether rule is evaluated (docs/parts.md)."""
     room: Room
@@ -356,6 +361,16 @@ class Vehicle(Model):
     computer: Computer = Computer()
     safety: Safety = Safety()
     ground: Ground = Ground()
+
+    @property
+    def tip_radius_m(self) -> float:
+        """Radius around the end of link 2: that of the net, or half the thickness of the link without a tool."""
+        return self.tool.net_radius_m if self.tool is not None else LINK_RADIUS_M
+
+    @property
+    def tool_mass_kg(self) -> float:
+        """Mass of sensor and net; 0 without a tool."""
+        return self.tool.sensor_mass_kg + self.tool.net_mass_kg if self.tool is not None else 0.0
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Self:
@@ -379,7 +394,12 @@ class Vehicle(Model):
             if own > others * (1.0 + 1e-9):
                 text = f"expected at most {others:g} kg m^2, the sum of the other two, as for every rigid body, got {own:g}"
                 problems.append((("airframe", "inertia_kg_m2", axis), text))
-        carried_kg = sum(self.arm.link_masses_kg) + self.tool.sensor_mass_kg + self.tool.net_mass_kg
+        if self.tool is None and self.devices.force is not None:
+            text = (
+                "the force-torque sensor is mounted in the tool, but tool is absent; add tool, or remove devices.force"
+            )
+            problems.append((("devices", "force"), text))
+        carried_kg = sum(self.arm.link_masses_kg) + self.tool_mass_kg
         if carried_kg >= self.airframe.mass_kg:
             text = f"{self.airframe.mass_kg:g} kg is the whole vehicle, but arm and tool alone weigh {carried_kg:g} kg"
             problems.append((("airframe", "mass_kg"), text))

@@ -79,12 +79,12 @@ class Dynamics:
     """
 
     def __init__(self, vehicle: Vehicle, mass_scale: float = 1.0) -> None:
-        arm, tool = vehicle.arm, vehicle.tool
+        arm = vehicle.arm
         self._scale = mass_scale
         self._l1, self._l2 = arm.link_lengths_m
         self._m1, self._m2 = (mass_scale * mass for mass in arm.link_masses_kg)
         self._c1, self._c2 = arm.link_com_m
-        self._tool_kg = mass_scale * (tool.sensor_mass_kg + tool.net_mass_kg)
+        self._tool_kg = mass_scale * vehicle.tool_mass_kg
         self._total_kg = mass_scale * vehicle.airframe.mass_kg
         self._shoulder = arm.shoulder_body_m
         ix, iy, iz = vehicle.airframe.inertia_kg_m2

@@ -18,16 +18,18 @@ from companion.model.types import Quat, Vec2, Vec3
 class Manipulator:
     """Geometry and nominal masses of arm and tool, payload excluded."""
 
-    def __init__(self, arm: Arm, tool: Tool) -> None:
+    def __init__(self, arm: Arm, tool: Tool | None) -> None:
         self._shoulder = arm.shoulder_body_m
         self._l1, self._l2 = arm.link_lengths_m
         m1, m2 = arm.link_masses_kg
         c1, c2 = arm.link_com_m
-        tool_mass = tool.sensor_mass_kg + tool.net_mass_kg
+        tool_mass = 0.0 if tool is None else tool.sensor_mass_kg + tool.net_mass_kg
         # First moments about each joint's axis, kg m.
         self._moment_1 = m1 * c1 + (m2 + tool_mass) * self._l1
         self._moment_2 = m2 * c2 + tool_mass * self._l2
-        roll, pitch, yaw = (math.radians(angle) for angle in tool.sensor_rpy_deg)
+        roll, pitch, yaw = (
+            math.radians(angle) for angle in (tool.sensor_rpy_deg if tool is not None else (0.0, 0.0, 0.0))
+        )
         self._sensor_in_link2: Quat = quat_from_euler_zyx(roll, pitch, yaw)
 
     def net_body_m(self, angle_rad: Vec2) -> Vec3:

@@ -54,8 +54,8 @@ class MeanAcceleration:
 class ForceSensing:
     """Tare and gravity compensation of the force-torque sensor."""
 
-    def __init__(self, tool: Tool, manipulator: Manipulator) -> None:
-        self._net_weight_n = tool.net_mass_kg * GRAVITY_M_S2
+    def __init__(self, tool: Tool | None, manipulator: Manipulator) -> None:
+        self._net_weight_n = 0.0 if tool is None else tool.net_mass_kg * GRAVITY_M_S2
         self._manipulator = manipulator
         self._sum = [0.0, 0.0, 0.0]
         self._count = 0

@@ -199,15 +199,21 @@ def _whole(mission: Mission, vehicle: Vehicle, plan: Plan, phase_origins: Sequen
         )
     if mission.catch is not None:
         flown = [segment for segment in plan.segments if segment.kind is PhaseKind.FLIGHT]
-        near_m = min(
+        near_m, catching = min(
             (
-                math.dist(plan.reference(t_s).position_world_m[:2], mission.catch.expected_at_m)
+                (math.dist(plan.reference(t_s).position_world_m[:2], mission.catch.expected_at_m), segment)
                 for segment in flown
                 for t_s in _samples(segment)
             ),
-            default=math.inf,
+            key=lambda found: found[0],
+            default=(math.inf, takeoff),
         )
-        if near_m > CATCH_NEAR_M:
+        if vehicle.tool is None:
+            problems.append(
+                f"{_place(mission, catching, phase_origins)} expects a payload in the net, but vehicle '{vehicle.name}' has no net "
+                "(tool); add tool to the vehicle file, or remove catch from the mission"
+            )
+        elif near_m > CATCH_NEAR_M:
             x_m, y_m = mission.catch.expected_at_m
             problems.append(
                 f"mission '{mission.name}': expects the payload at ({x_m:g}, {y_m:g}) m, but never comes closer than {near_m:.2f} m; "

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from companion.config.mission import Mission
-from companion.config.vehicle import Vehicle
+from companion.config.vehicle import LINK_RADIUS_M, Vehicle
 from companion.control.manipulator import Manipulator
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx
@@ -21,8 +21,6 @@ from companion.safety.governor import BODY_TOP_M, SafeSet
 from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
 
-ARM_RADIUS_M = 0.03
-"""Half the thickness of servos and links, m."""
 FLOOR_GAP_M = 0.01
 TRACKING_M = 0.10
 """Largest expected distance from the plan, m; measured over random missions in a wind of 3 m/s."""
@@ -68,6 +66,8 @@ class SampleCheck:
         self._watch = TetherWatch.of(vehicle)
         airframe, tether = vehicle.airframe, vehicle.tether
         self._payload_kg = airframe.payload_max_kg if mission.catch is None else mission.catch.payload_max_kg
+        if vehicle.tool is None:
+            self._payload_kg = 0.0
         self._tether_n = 0.0 if tether is None else tether.weight_n_per_m * tether.length_m
         self._blow_until_s = 0.0
         """Time at which the catch's impact has decayed; 0 before the catch. Passing the same place again is not a catch."""
@@ -134,7 +134,7 @@ class SampleCheck:
     def _space(self, position: Vec3, reference: Reference, off_m: float) -> Iterator[Violation]:
         vehicle = self._vehicle
         net_m = _world(position, reference.yaw_rad, self._manipulator.net_body_m(reference.arm_rad))
-        net_radius_m = vehicle.tool.net_radius_m
+        net_radius_m = vehicle.tip_radius_m
         radius_m = vehicle.airframe.radius_m
         room = vehicle.room
         why = _allowance(off_m)
@@ -238,9 +238,10 @@ class SampleCheck:
                 yield Violation(
                     limit=f"joint {number}", excess=excess, what=what, detail=detail, advice="change arm_deg"
                 )
-        net_z_m = position[2] + self._manipulator.net_body_m(reference.arm_rad)[2] - self._vehicle.tool.net_radius_m
-        elbow_z_m = position[2] + self._manipulator.elbow_body_m(reference.arm_rad)[2] - ARM_RADIUS_M
-        for part, lowest_m in (("net", net_z_m), ("elbow", elbow_z_m)):
+        net_z_m = position[2] + self._manipulator.net_body_m(reference.arm_rad)[2] - self._vehicle.tip_radius_m
+        elbow_z_m = position[2] + self._manipulator.elbow_body_m(reference.arm_rad)[2] - LINK_RADIUS_M
+        tip = "net" if self._vehicle.tool is not None else "end of the arm"
+        for part, lowest_m in ((tip, net_z_m), ("elbow", elbow_z_m)):
             if lowest_m < FLOOR_GAP_M:
                 what = f"drags the {part} over the floor"
                 detail = f"its lowest point is {lowest_m:.2f} m high (minimum {FLOOR_GAP_M:g} m)"

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 
-from companion.config.vehicle import ForceDevice, Tool, Vehicle
+from companion.config.vehicle import ForceDevice, Vehicle
 from companion.control.manipulator import Manipulator
 from companion.control.sensing import ForceSensing
 from companion.model.check_row import Row
@@ -73,7 +73,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     """Return the rows of the force sensor, or one warning if the vehicle has none."""
     if vehicle.devices.force is None:
         fix = "add devices.force to the vehicle file if the sensor is mounted; without it, the controller measures no force"
-        yield DEVICE.doubtful("none: a catch, a lost payload and a force on the empty net are not detected", "", fix)
+        yield DEVICE.doubtful("none; a catch, a lost payload and a force on the empty net are not detected", "", fix)
         return
     failure, stream = o.failures.get("force"), o.force_stream
     if failure is not None:
@@ -109,6 +109,8 @@ def stream_rows(
     if stream.lost is not None:
         yield DEVICE.bad(stream.lost, "the sensor keeps streaming", "check plug and cable")
         return
+    tool = vehicle.tool
+    assert tool is not None, "a vehicle file with a force sensor has a tool"
     yield DEVICE.good(stream.product or "answers")
     yield _rate(stream.samples / duration_s, device)
     fix = "use a shielded cable, away from motors and their wires"
@@ -117,7 +119,7 @@ def stream_rows(
         yield _noise(samples)
         yield _overload(samples, device)
         if pose is not None:
-            yield _tare(tare_bias_n(samples, vehicle, *pose), vehicle.tool, device)
+            yield _tare(tare_bias_n(samples, vehicle, *pose), tool.net_mass_kg, device)
         yield _still(samples, vehicle)
 
 
@@ -153,10 +155,10 @@ def _overload(samples: Sequence[ForceSample], device: ForceDevice) -> Row:
     return OVERLOAD.bad(f"{count} of {len(samples)} samples", "none", fix)
 
 
-def _tare(bias_n: Vec3, tool: Tool, device: ForceDevice) -> Row:
+def _tare(bias_n: Vec3, net_kg: float, device: ForceDevice) -> Row:
     size_n, full_n = math.hypot(*bias_n), device.force_max_n
     x, y, z = bias_n
-    read = f"({x:.1f}, {y:.1f}, {z:.1f}) N besides the net's {tool.net_mass_kg:g} kg"
+    read = f"({x:.1f}, {y:.1f}, {z:.1f}) N besides the net's {net_kg:g} kg"
     wanted = f"{TARE_GOOD * full_n:g} N"
     if size_n <= TARE_GOOD * full_n:
         return TARE.good(read, wanted)

@@ -39,7 +39,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     tether, airframe = vehicle.tether, vehicle.airframe
     if tether is None:
         fix = "add tether to the vehicle file if the vehicle is tethered; without it, only the room limits the flight"
-        yield LINE.doubtful("none: slack, tension, winding and clearance of a tether are not monitored", "", fix)
+        yield LINE.doubtful("none; slack, tension, winding and clearance of a tether are not monitored", "", fix)
         return
     x, y, z = tether.anchor_world_m
     ax, ay, az = tether.attachment_body_m

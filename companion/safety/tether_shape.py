@@ -49,10 +49,10 @@ class Clearance:
         self._outer_m = max(vehicle.airframe.radius_m, self._inner_m)
         self._off_axis_m = math.hypot(self._p[0], self._p[1])
         self._below = self._p[2] <= 0.0
-        arm, tool = vehicle.arm, vehicle.tool
+        arm = vehicle.arm
         self._shoulder = arm.shoulder_body_m
         self._l1, self._l2 = arm.link_lengths_m
-        self._net_m = tool.net_radius_m
+        self._net_m = vehicle.tip_radius_m
         self._reach_m = self._l1 + self._l2 + self._net_m
         self._aside_m = abs(self._p[1] - self._shoulder[1]) - self._net_m
         self.judges_arm = self._aside_m > 0.0

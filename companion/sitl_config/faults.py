@@ -263,6 +263,8 @@ def absent_part(kind: FaultKind, vehicle: Vehicle) -> str | None:
         return "devices.force"
     if kind.startswith("tether_") and vehicle.tether is None:
         return "tether"
+    if kind.startswith("payload_") and vehicle.tool is None:
+        return "tool"
     return None
 
 

@@ -26,7 +26,9 @@ def rotor_offset_m(airframe: Airframe) -> float:
 def base_mass_kg(vehicle: Vehicle, world: World) -> float:
     """Return the true mass of the flying base, without arm and tool."""
     arm, tool = vehicle.arm, vehicle.tool
-    rest = sum(arm.link_masses_kg) + tool.sensor_mass_kg + tool.net_mass_kg
+    rest = sum(arm.link_masses_kg)
+    if tool is not None:
+        rest = rest + tool.sensor_mass_kg + tool.net_mass_kg
     return (vehicle.airframe.mass_kg - rest) * (1.0 + world.mass_error)
 
 
@@ -69,7 +71,9 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     friction_nm, damping_nms, armature = world.joint_friction_nm, world.joint_damping_nms, arm.joint_armature_kg_m2
     if transmission.acts(world):
         friction_nm = damping_nms = armature = 0.0
-    roll, pitch, yaw = tool.sensor_rpy_deg
+    sensor_kg, net_kg, (roll, pitch, yaw) = 0.0, 0.0, (0.0, 0.0, 0.0)
+    if tool is not None:
+        sensor_kg, net_kg, (roll, pitch, yaw) = tool.sensor_mass_kg, tool.net_mass_kg, tool.sensor_rpy_deg
     anchor = tendon = tension = ""
     if vehicle.tether is not None:
         anchor = f'<site name="anchor" pos="{xyz(vehicle.tether.anchor_world_m)}"/>'
@@ -119,9 +123,9 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
                  armature="{armature}"/>
           {rod(m2, arm.link_com_m[1], l2)}
           <body name="sensor" pos="{l2} 0 0">
-            <inertial pos="0 0 0" mass="{max(tool.sensor_mass_kg, 1e-4)}" diaginertia="1e-4 1e-4 1e-4"/>
+            <inertial pos="0 0 0" mass="{max(sensor_kg, 1e-4)}" diaginertia="1e-4 1e-4 1e-4"/>
             <body name="net" euler="{math.radians(yaw)} {math.radians(pitch)} {math.radians(roll)}">
-              <inertial pos="0 0 0" mass="{max(tool.net_mass_kg, 1e-4)}" diaginertia="1e-4 1e-4 1e-4"/>
+              <inertial pos="0 0 0" mass="{max(net_kg, 1e-4)}" diaginertia="1e-4 1e-4 1e-4"/>
               <site name="net"/>
             </body>
           </body>

@@ -48,12 +48,16 @@ class Payload:
         model, data = world.model, world.data
         self._model, self._data = model, data
         self._net = model.body("net").id
-        self._net_radius_m = vehicle.tool.net_radius_m
+        self._net_radius_m = vehicle.tip_radius_m
         self._thrower = Thrower.of(config.thrower, config.seed)
-        self.bag = Net.of(config.net, model, data, world.loads, self._net_radius_m, PAYLOAD_RADIUS_M)
-        """The bag of the net, or None if its effect is off."""
-        self.ball = Ball.of(model, "payload", "catch") if config.payload_kg > 0 else None
-        """Indices of the payload; None if no payload is configured."""
+        self.bag = (
+            Net.of(config.net, model, data, world.loads, self._net_radius_m, PAYLOAD_RADIUS_M)
+            if vehicle.tool is not None
+            else None
+        )
+        """The bag of the net, or None if its effect is off or there is no net."""
+        self.ball = Ball.of(model, "payload", "catch") if vehicle.tool is not None and config.payload_kg > 0 else None
+        """Indices of the payload; None if no payload is configured, or the vehicle has no net to throw it into."""
         self.aside_m = 0.0
         """Distance by which the throw misses the net."""
         self.thrown_t_s: float | None = None

@@ -15,7 +15,7 @@ from PIL import Image, ImageSequence
 
 from companion.analysis.animation import FRAMES_PER_S, Movie, movie_of, player_html, write_gif
 from companion.analysis.log import FlightLog
-from companion.analysis.scene import Camera, Pose, Scene
+from companion.analysis.scene import NET, TETHER, Camera, Pose, Scene
 from companion.config.loader import load_vehicle
 from companion.control.manipulator import Manipulator
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
@@ -84,6 +84,21 @@ def test_the_net_is_where_the_control_law_has_it(arm_rad: Vec2) -> None:
         pose.position_world_m, quat_rotate(attitude, Manipulator(VEHICLE.arm, VEHICLE.tool).net_body_m(arm_rad))
     )
     assert Scene(json.loads(VEHICLE.model_dump_json())).net_world_m(pose) == pytest.approx(expected)
+
+
+def test_absent_parts_are_not_drawn() -> None:
+    camera = Camera(np.zeros(3), yaw_rad=0.5, pitch_rad=0.3, distance_m=4.0, size_px=(600, 400))
+    pose = Pose(
+        position_world_m=(0.0, 0.0, 1.0),
+        attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
+        arm_rad=(1.2, 0.3),
+        ball_world_m=(),
+        caught=False,
+    )
+    vehicle = json.loads(VEHICLE.model_dump_json())
+    colours = {shape.colour for shape in Scene(vehicle).shapes(camera, pose)}
+    left = {shape.colour for shape in Scene({**vehicle, "tool": None, "tether": None}).shapes(camera, pose)}
+    assert colours - left == {NET, TETHER}
 
 
 def test_what_is_behind_the_camera_is_cut_off() -> None:

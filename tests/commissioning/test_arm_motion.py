@@ -17,6 +17,7 @@ from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
 from companion.model.types import IDENTITY_QUAT, ArmState, Vec2
 from tests.commissioning.arm_rig import SHIPPED
+from tests.support import tool_of
 
 DT_S = 0.005
 INERTIA_KG_M2 = (0.06, 0.02)
@@ -157,7 +158,7 @@ def test_hot_servos_and_hardware_errors_stop_it(vehicle: Vehicle) -> None:
 
 
 def test_a_pose_that_is_too_heavy_is_refused_before_anything_moves(vehicle: Vehicle) -> None:
-    heavy = vehicle.model_copy(update={"tool": vehicle.tool.model_copy(update={"net_mass_kg": 0.5})})
+    heavy = vehicle.model_copy(update={"tool": tool_of(vehicle).model_copy(update={"net_mass_kg": 0.5})})
     motion = Motion(heavy, Bench(heavy).state())
     assert motion.refusal([(math.radians(90.0), 0.0)]) == ""
     assert "joint 1 carries" in motion.refusal([(math.radians(90.0), 0.0), (math.radians(165.0), 0.0)])

@@ -16,7 +16,7 @@ from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EX
 from companion.runtime.clock import flight_clock
 from sitl.force_torque import ForceTorqueServer
 from tests.commissioning.test_mocap_wires import VEHICLE, bad, changes, document, sandbox, vehicle, wait_for_error
-from tests.support import Sandbox, World, run_here
+from tests.support import Sandbox, World, run_here, tool_of
 
 pytestmark = pytest.mark.waits
 
@@ -52,7 +52,7 @@ def test_bias_turn_and_scale_are_found_without_the_arm_and_the_turn_is_written(s
     assert "companion ft tare --sensor" in fixes["force.tare"]
     assert "2.00 times the true force" in fixes["ft.scale"]
     assert changes(found) == {"tool.sensor_rpy_deg": [0.0, 0.0, 90.0]}
-    assert load_vehicle(vehicle).tool.sensor_rpy_deg == (0.0, 0.0, 90.0)
+    assert tool_of(load_vehicle(vehicle)).sensor_rpy_deg == (0.0, 0.0, 90.0)
     assert without_arm.code == EXIT_REFUSED
     assert "--arm-pose A1,A2" in without_arm.out
 

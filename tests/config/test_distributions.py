@@ -24,7 +24,7 @@ from sitl.campaigns.flights import with_world
 from sitl.fast.loop import FastFlight
 from sitl.server import Ports, Sitl, start_of
 from sitl.world.model import base_mass_kg, link_masses_kg
-from tests.support import HOVER
+from tests.support import HOVER, tool_of
 
 FILE = """\
 hover_thrust_error: {uniform: [-0.1, 0.1]}
@@ -201,7 +201,7 @@ def test_both_loops_fly_the_machine_with_the_model_error() -> None:
         config.vehicle, config.world, start_of((0.0, 0.0), 0.0, (90.0, 90.0)), Ports(), lambda message: None
     ).plant
     assert plant.world.weight_n == true
-    tool, errs = config.vehicle.tool, with_model_error(config.world)
+    tool, errs = tool_of(config.vehicle), with_model_error(config.world)
     links_kg = link_masses_kg(config.vehicle, errs)
     true_kg = base_mass_kg(config.vehicle, errs) + sum(links_kg) + tool.sensor_mass_kg + tool.net_mass_kg
     assert true == pytest.approx(GRAVITY_M_S2 * true_kg, rel=1e-6)

@@ -19,6 +19,7 @@ from companion.control.manipulator import Manipulator
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import IDENTITY_QUAT, ControlLog, Reference, Vec2
 from tests.control.states import POSE, ZERO, at
+from tests.support import tool_of
 
 CONFIG = load_flight("configs/missions/catch.yaml", preset="recommended")
 DT_S = 0.005
@@ -85,7 +86,7 @@ def test_moments_and_friction_are_found_while_the_arm_moves() -> None:
 
 
 def test_the_levers_of_gravity_times_the_moments_are_the_gravity_torque() -> None:
-    arm, tool = CONFIG.vehicle.arm, CONFIG.vehicle.tool
+    arm, tool = CONFIG.vehicle.arm, tool_of(CONFIG.vehicle)
     manipulator = Manipulator(arm, tool)
     carried_kg = tool.sensor_mass_kg + tool.net_mass_kg
     first = arm.link_masses_kg[0] * arm.link_com_m[0] + (arm.link_masses_kg[1] + carried_kg) * arm.link_lengths_m[0]

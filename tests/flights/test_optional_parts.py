@@ -14,7 +14,7 @@ from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from tests.support import SHORT_CATCH
 
-NO_FORCE, NO_TETHER = "vehicle.devices.force=null", "vehicle.tether=null"
+NO_FORCE, NO_TETHER, NO_TOOL = "vehicle.devices.force=null", "vehicle.tether=null", "vehicle.tool=null"
 
 
 @pytest.mark.parametrize("absent", [NO_FORCE, NO_TETHER])
@@ -50,12 +50,33 @@ def test_without_a_tether_a_commanded_landing_and_a_gust_are_flown() -> None:
     assert all(truth.tether_tension_n == 0.0 for truth in result.truth)
 
 
+def test_without_all_three_the_path_is_flown_and_nothing_is_thrown() -> None:
+    absent = (NO_FORCE, NO_TETHER, NO_TOOL, "mission.catch=null")
+    flight = FastFlight(load_sitl(SHORT_CATCH, overrides=absent))
+    result = flight.run()
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert flight.plant.world.payload.throws == 0
+    assert [event.id for o in result.outputs for event in o.events] == ["takeoff", "touchdown"]
+
+
 @pytest.mark.parametrize(
-    ("absent", "fault", "key"), [(NO_FORCE, "force_loss", "devices.force"), (NO_TETHER, "tether_cut", "tether")]
+    ("absent", "fault", "key"),
+    [
+        ([NO_FORCE], "force_loss", "devices.force"),
+        ([NO_TETHER], "tether_cut", "tether"),
+        ([NO_TOOL, NO_FORCE], "payload_dropped", "tool"),
+    ],
 )
-def test_a_fault_of_an_absent_part_is_refused(absent: str, fault: str, key: str) -> None:
+def test_a_fault_of_an_absent_part_is_refused(absent: list[str], fault: str, key: str) -> None:
     with pytest.raises(ConfigError) as refused:
-        load_sitl(SHORT_CATCH, overrides=[absent, f"world.faults=[{{kind: {fault}, t_s: 5.0}}]"])
+        load_sitl(SHORT_CATCH, overrides=[*absent, f"world.faults=[{{kind: {fault}, t_s: 5.0}}]"])
     (line,) = refused.value.lines
     assert fault in line
     assert f"needs {key}" in line
+
+
+def test_a_force_sensor_without_a_tool_is_refused() -> None:
+    with pytest.raises(ConfigError) as refused:
+        load_sitl(SHORT_CATCH, overrides=[NO_TOOL])
+    (line,) = refused.value.lines
+    assert "devices.force: the force-torque sensor is mounted in the tool, but tool is absent" in line

@@ -32,9 +32,10 @@ def test_the_scene_is_the_vehicle_file_and_the_mission() -> None:
     assert decode(Scene, encode(scene)) == scene
 
 
-def test_the_scene_of_a_vehicle_without_a_tether_has_no_anchor() -> None:
-    scene = scene_of(load_flight(CATCH, overrides=["vehicle.tether=null"]), "s1")
-    assert (scene.anchor_world_m, scene.tether_length_m) == (None, None)
+def test_the_scene_of_a_vehicle_without_tether_and_net_has_no_anchor_and_no_net() -> None:
+    absent = ["vehicle.tether=null", "vehicle.tool=null", "vehicle.devices.force=null"]
+    scene = scene_of(load_flight(CATCH, overrides=absent), "s1")
+    assert (scene.anchor_world_m, scene.tether_length_m, scene.net_radius_m) == (None, None, None)
     assert decode(Scene, encode(scene)) == scene
     jsonschema.Draft202012Validator(schema_of(Topic.SCENE)).validate(json.loads(encode(scene)))
 

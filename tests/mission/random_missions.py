@@ -25,7 +25,7 @@ from companion.safety.governor import BODY_TOP_M
 from companion.safety.tether import slack_m
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
-from tests.support import ROOT, tether_of
+from tests.support import ROOT, tether_of, tool_of
 
 FLIGHT_LIMIT_S = 120.0
 
@@ -169,7 +169,7 @@ def margins_m(config: SitlConfig, result: FastResult) -> tuple[float, float]:
     """Return the true minimum in flight of the slack beyond the margin, and of the distance to walls and ceiling."""
     vehicle, room = config.vehicle, config.vehicle.room
     manipulator = Manipulator(vehicle.arm, vehicle.tool)
-    reach_m, net_reach_m = vehicle.airframe.radius_m, vehicle.tool.net_radius_m
+    reach_m, net_reach_m = vehicle.airframe.radius_m, tool_of(vehicle).net_radius_m
     tether_m = fence_m = math.inf
     for outputs, truth in zip(result.outputs, result.truth, strict=True):
         if outputs.phase_kind in (PhaseKind.GROUND, PhaseKind.DONE):

@@ -141,6 +141,16 @@ def test_unflyable_mission_is_refused(overrides: list[str], line: str) -> None:
     assert all("\n" not in problem for problem in found)
 
 
+def test_a_catch_without_a_net_is_refused_by_phase_and_part() -> None:
+    absent = ("vehicle.tool=null", "vehicle.devices.force=null")
+    (line,) = problems(*absent)
+    assert (
+        "mission 'catch', phase 'catch' expects a payload in the net, but vehicle 'tarot650-2r' has no net (tool)"
+        in line
+    )
+    assert problems(*absent, "mission.catch=null") == []
+
+
 def test_without_a_tether_nothing_about_a_tether_is_refused() -> None:
     short = "vehicle.tether.length_m=1.5"
     assert any("leaves the tether sphere" in line for line in problems(short))

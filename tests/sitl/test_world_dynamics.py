@@ -16,7 +16,7 @@ from companion.sitl_config.world import World as WorldConfig
 from sitl.world.model import base_mass_kg
 from sitl.world.world import PHYSICS_DT_S, World
 from tests.pinocchio_or_skip import pin
-from tests.support import tether_of
+from tests.support import tether_of, tool_of
 
 Array = NDArray[np.float64]
 NO_PAYLOAD = WorldConfig(payload_kg=0.0, joint_friction_nm=0.0, joint_damping_nms=0.0)
@@ -30,7 +30,7 @@ def vehicle() -> Vehicle:
 
 def oracle(vehicle: Vehicle) -> pin.Model:
     """The same machine in Pinocchio, from the vehicle file and nothing of MuJoCo's."""
-    arm, tool = vehicle.arm, vehicle.tool
+    arm, tool = vehicle.arm, tool_of(vehicle)
     model = pin.Model()
     base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "base")
     base_mass = base_mass_kg(vehicle, NO_PAYLOAD)
@@ -158,7 +158,7 @@ def test_the_catch_conserves_momentum(vehicle: Vehicle, payload_kg: float) -> No
         world.step((0, 0, 0, 0), (0, 0), False, drag=False)
     assert world.payload.caught_t_s is not None
     away = d.xpos[payload] - d.xpos[m.body("net").id]
-    assert np.linalg.norm(away) < 1.1 * vehicle.tool.net_radius_m, "the net did not keep the payload"
+    assert np.linalg.norm(away) < 1.1 * tool_of(vehicle).net_radius_m, "the net did not keep the payload"
     assert np.linalg.norm(momentum() - before) <= 0.005 * np.linalg.norm(before)
 
 

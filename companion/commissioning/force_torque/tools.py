@@ -12,7 +12,14 @@ from typing import Final
 import msgspec
 
 from companion.commissioning.force_torque import fit as ft_fit
-from companion.commissioning.force_torque.watch import FtSensor, arm_angles, force_device, pose_rad, until_loaded
+from companion.commissioning.force_torque.watch import (
+    FtSensor,
+    arm_angles,
+    force_device,
+    pose_rad,
+    tool_of,
+    until_loaded,
+)
 from companion.commissioning.tool import SENSORS, Cancelled, Report, Session, Tool
 from companion.config.vehicle import Vehicle
 from companion.io.dynamixel.registers import usb_latency_ms
@@ -123,7 +130,7 @@ def judge(seen: Watched, vehicle: Vehicle) -> Report:
         mean_force_n(seen.loaded),
         seen.loaded_arm_rad,
         seen.weight_kg,
-        vehicle.tool.sensor_rpy_deg,
+        tool_of(vehicle).sensor_rpy_deg,
     )
     rows.append(ft_fit.WEIGHT.good(f"{fit.measured_n:.2f} N"))
     if over := sum(sample.overload for sample in seen.loaded):
@@ -203,7 +210,7 @@ def judge_drift(seen: Tared, vehicle: Vehicle) -> Report:
     rows.append(DRIFT.row(worst_n <= DRIFT_WARN_N_MIN, read, f"{DRIFT_WARN_N_MIN:g} N per minute", fix))
     rows.append(ft_fit.stuck_row(seen.samples, vehicle))
     x, y, z = bias_n = tare_bias_n(seen.first, vehicle, IDENTITY_QUAT, seen.arm_rad)
-    net_kg = vehicle.tool.net_mass_kg
+    net_kg = tool_of(vehicle).net_mass_kg
     data = {
         "drift": [{"axis": name, **asdict(axis)} for name, axis in axes.items()],
         "tare": {"bias_n": list(bias_n), "net_mass_kg": net_kg},

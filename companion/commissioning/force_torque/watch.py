@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Final
 
 from companion.config.document import ConfigError
-from companion.config.vehicle import ForceDevice, Vehicle
+from companion.config.vehicle import ForceDevice, Tool, Vehicle
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.force_torque.driver import RobotousForceTorque
 from companion.io.force_torque.rft import Command
@@ -53,6 +53,12 @@ def force_device(vehicle: Vehicle) -> ForceDevice:
     if vehicle.devices.force is None:
         raise DeviceError(f"force sensor: vehicle '{vehicle.name}' has none; add devices.force to the vehicle file")
     return vehicle.devices.force
+
+
+def tool_of(vehicle: Vehicle) -> Tool:
+    """Return the tool of a vehicle with a force sensor, which the vehicle file requires to have one."""
+    assert vehicle.tool is not None
+    return vehicle.tool
 
 
 def pose_rad(text: str | None, vehicle: Vehicle) -> Vec2 | None:

@@ -113,7 +113,8 @@ class Scene(Record, frozen=True, kw_only=True):
     ground_clearance_m: float
     shoulder_body_m: Vec3
     link_lengths_m: Vec2
-    net_radius_m: float
+    net_radius_m: float | None = None
+    """None without a net."""
     joint_min_rad: Vec2
     joint_max_rad: Vec2
     tilt_abort_rad: float

@@ -98,12 +98,11 @@ class Downwash:
         )
         names = {model.body(k).name: k for k in range(model.nbody)}
         payload_m2 = config.payload_drag_coefficient * math.pi * PAYLOAD_RADIUS_M**2
+        compact = [("net", config.net_drag_area_m2, vehicle.tool.net_radius_m)] if vehicle.tool is not None else []
+        compact.append(("payload", payload_m2, PAYLOAD_RADIUS_M))
         self._compact = tuple(
             (names[name], data.xipos[names[name]], area_m2, radius_m / 2.0)
-            for name, area_m2, radius_m in (
-                ("net", config.net_drag_area_m2, vehicle.tool.net_radius_m),
-                ("payload", payload_m2, PAYLOAD_RADIUS_M),
-            )
+            for name, area_m2, radius_m in compact
             if name in names
         )
         self.restart_noise()

@@ -231,8 +231,9 @@ def test_tether_slack_shows_in_its_colour(
     assert watched.body("level") == level
 
 
-def test_a_vehicle_without_a_tether_is_drawn_without_one(stub: MonitorStub, shared: Page) -> None:
+def test_a_vehicle_without_tether_and_net_is_drawn_without_them(stub: MonitorStub, shared: Page) -> None:
     absent = {"anchor_world_m": None, "tether_length_m": None, "tether_margin_m": None, "attachment_body_m": None}
+    absent["net_radius_m"] = None
     stub.greeting = [hello(), BROKER, *retained(), relayed(replace(flown().scene, **absent))]
     shared.open_anew(stub)
     shared.show(relayed(in_flight(tether=None)))

@@ -17,7 +17,7 @@ from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.model import base_mass_kg, mjcf
 from sitl.world.world import PHYSICS_DT_S, World
-from tests.support import CATCH
+from tests.support import CATCH, tool_of
 
 Array = NDArray[np.float64]
 VEHICLE = load_sitl(CATCH).vehicle
@@ -108,7 +108,7 @@ def test_the_shoulder_is_moved_and_turned_with_the_whole_arm() -> None:
 
 def test_the_sensor_frame_of_the_vehicle_file_is_turned_by_zyx_angles() -> None:
     rpy_deg = (10.0, 20.0, 30.0)
-    tool = VEHICLE.tool.model_copy(update={"sensor_rpy_deg": rpy_deg})
+    tool = tool_of(VEHICLE).model_copy(update={"sensor_rpy_deg": rpy_deg})
     world = built(VEHICLE.model_copy(update={"tool": tool}))
     link, sensor = (world.data.xmat[world.model.body(name).id].reshape(3, 3) for name in ("link2", "net"))
     assert link.T @ sensor == pytest.approx(rotation(rpy_deg))
@@ -131,7 +131,7 @@ def test_link_masses_sit_where_the_section_says() -> None:
 
 def test_mass_errors_and_the_section_act_together() -> None:
     config = WorldConfig(mass_error=0.03, link_mass_error=(0.1, -0.1), machine=Machine(on=True))
-    arm, tool = VEHICLE.arm, VEHICLE.tool
+    arm, tool = VEHICLE.arm, tool_of(VEHICLE)
     m1, m2 = arm.link_masses_kg
     base_kg = VEHICLE.airframe.mass_kg - m1 - m2 - tool.sensor_mass_kg - tool.net_mass_kg
     model = World(VEHICLE, config, (0.0, 0.0), 0.0, ARM_RAD).model

@@ -23,6 +23,7 @@ from sitl.world.effects.net import SETTLED_S, Bag
 from sitl.world.model import PAYLOAD_RADIUS_M, SECOND, SECOND_CATCH
 from sitl.world.payload import Ball
 from sitl.world.world import PHYSICS_DT_S, World
+from tests.support import tool_of
 
 Array = NDArray[np.float64]
 HOOP_M = 0.09
@@ -258,7 +259,7 @@ def test_a_payload_that_settles_off_centre_turns_the_force_sensor(vehicle: Vehic
         world.step((0, 0, 0, 0), (0, 0), False)
     assert [event.kind for event in world.take_events()] == ["caught"]
     truth = world.truth()
-    net_weight_n = vehicle.tool.net_mass_kg * GRAVITY_M_S2
+    net_weight_n = tool_of(vehicle).net_mass_kg * GRAVITY_M_S2
     weight_n = 0.2 * GRAVITY_M_S2
     assert truth.force_sensor_n[2] == pytest.approx(-weight_n - net_weight_n, rel=0.01)
     lever_x_m, lever_y_m = world.data.xpos[ball_of(world).body][0:2] - world.data.xpos[world._net][0:2]
@@ -306,7 +307,7 @@ def test_two_payloads_lie_in_the_bag(vehicle: Vehicle) -> None:
         world.step((0, 0, 0, 0), (0, 0), False)
     assert world.payload.catch(second)
     assert world.payload.catches == 1
-    both_n = GRAVITY_M_S2 * (config.payload_kg + config.faults[0].magnitude + vehicle.tool.net_mass_kg)
+    both_n = GRAVITY_M_S2 * (config.payload_kg + config.faults[0].magnitude + tool_of(vehicle).net_mass_kg)
     assert world.truth().force_sensor_n[2] == pytest.approx(-both_n, rel=0.01)
 
 

@@ -56,9 +56,10 @@ function drawBody(renderer, world, scene, radius) {
 function drawArm(renderer, scene, world, turn, angles, caught) {
   const { shoulder, elbow, net, along } = armBody(scene, angles);
   renderer.line([world(shoulder), world(elbow)], colours.link, { width: 5 });
-  const mouth = add(net, scale(along, -scene.net_radius_m));
+  const mouth = add(net, scale(along, -(scene.net_radius_m ?? 0)));
   renderer.line([world(elbow), world(mouth)], colours.link, { width: 4 });
   for (const joint of [shoulder, elbow]) renderer.ball(world(joint), 0.02, colours.machine, { least: 3.5, edge: colours.card });
+  if (!scene.net_radius_m) return;
   const across = [-along[2], 0, along[0]];
   const hoops = [[along, Y], [along, across], [across, Y]];
   for (const [u, v] of hoops) {
