@@ -1,1 +1,1 @@
-"""Configuration of the simulated world, for the commands, the launcher, the campaigns and sitl; a flight never reads it."""
+"""Configuration of the simulated world, used by the commands, the launcher, the campaigns and sitl, but never by a flight."""

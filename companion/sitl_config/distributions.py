@@ -1,4 +1,4 @@
-"""Differences between laboratories, drawn by the seed: numbers that a world file gives as distributions, and the signs of the model
+"""Differences between laboratories, drawn from the seed: numbers that a world file gives as distributions, and the signs of the model
 error.
 """
 
@@ -32,7 +32,7 @@ _FAULTLESS = Machine(
 )
 """The vehicle exactly as the vehicle file describes it."""
 NORMAL_ENDS = 3.0
-"""A normal distribution is truncated at this many standard deviations."""
+"""Number of standard deviations at which a normal distribution is truncated."""
 DISTRIBUTIONS = ("uniform", "normal")
 _DIGITS = 6
 _EXPECTED = "expected a number, {uniform: [low, high]} or {normal: [mean, sigma]}"
@@ -42,14 +42,14 @@ class Uniform(Model):
     """A number drawn uniformly from an interval."""
 
     uniform: Vector2
-    """[low, high], low < high."""
+    """[low, high], with low < high."""
 
 
 class Normal(Model):
     """A number drawn from a normal distribution, truncated at 3 sigma."""
 
     normal: Vector2
-    """[mean, sigma], sigma > 0."""
+    """[mean, sigma], with sigma > 0."""
 
 
 class Range(Model):
@@ -61,7 +61,7 @@ class Range(Model):
 
     @property
     def key(self) -> str:
-        """Location as text, such as `imu.accel_bias_m_s2[0]`."""
+        """Location of the number as text, such as `imu.accel_bias_m_s2[0]`."""
         return key_path(self.at)
 
     @property
@@ -73,7 +73,7 @@ class Range(Model):
         return (mean - NORMAL_ENDS * sigma, mean + NORMAL_ENDS * sigma)
 
     def sample(self, seed: int) -> float:
-        """Draw the number, with six digits; it depends only on the seed and the key."""
+        """Draw the number, rounded to six digits; it depends only on the seed and the key."""
         rng = _generator(seed, self.key)
         low, high = self.ends
         if isinstance(self.distribution, Uniform):
@@ -87,10 +87,10 @@ class Range(Model):
 
 
 class Laboratory(Model):
-    """A world file and the numbers in it that the seed draws."""
+    """A world file and those of its numbers that are drawn from the seed."""
 
     name: str = "ideal"
-    """Name of a built-in world, or path of a file as given by the user."""
+    """Name of a built-in world, or path of a file as the user gave it."""
     ranges: tuple[Range, ...] = ()
 
     def drawn(self, world: World) -> dict[str, Any]:
@@ -99,7 +99,7 @@ class Laboratory(Model):
         return {one.key: _get(data, one.at) for one in self.ranges if _holds(data, one.at)}
 
     def without(self, keys: Sequence[str]) -> Laboratory:
-        """Return the laboratory in which these keys of the world, with all below them, are not drawn."""
+        """Return the laboratory without the ranges at or below these keys of the world, so that they are not drawn."""
         return self.model_copy(update={"ranges": tuple(one for one in self.ranges if one.at[0] not in keys)})
 
 
@@ -110,9 +110,9 @@ def _generator(seed: int, key: str) -> np.random.Generator:
 
 
 def draw(data: dict[str, Any], ranges: Sequence[Range], seed: int) -> dict[str, Any]:
-    """Return a copy of a world's plain data with each range replaced by a sample.
+    """Return a copy of a world's plain data in which each range is replaced by a sample.
 
-    The same seed gives the same laboratory; adding or removing a range changes no other sample.
+    The same seed gives the same laboratory. Adding or removing a range does not change any other sample.
 
     Args:
         data: plain data of a world. A range at a missing location (a section that is null, a shorter list) is ignored.
@@ -123,7 +123,7 @@ def draw(data: dict[str, Any], ranges: Sequence[Range], seed: int) -> dict[str, 
 
 
 def with_model_error(world: World) -> World:
-    """Return the world with its `model_error` applied to the errors of base mass, inertia, link masses and torque constants."""
+    """Return the world with `model_error` added to the errors of base mass, inertia, link masses and torque constants."""
     if world.model_error == 0.0:
         return world
 
@@ -150,9 +150,9 @@ def with_model_error(world: World) -> World:
 
 
 def take_ranges(document: Document) -> tuple[Range, ...]:
-    """Return the distributions in a document of a world; invalid ones are appended to the document's problems.
+    """Return the distributions in the document of a world; report invalid distributions in the document's problems.
 
-    A valid number replaces an invalid one, so that it is reported only once.
+    A valid number replaces each invalid distribution, so that it is reported only once.
     """
     found: list[Range] = []
     for at, node, value in list(values(schema_of(World), document.data)):
@@ -167,7 +167,7 @@ def take_ranges(document: Document) -> tuple[Range, ...]:
 
 
 def check_world(document: Document, ranges: Sequence[Range], seed: int) -> World:
-    """Draw and validate a world. Both ends of every range must be valid, so that the seed does not decide whether a file is rejected.
+    """Draw and validate a world. Both ends of every range must be valid, so that acceptance of a file does not depend on the seed.
 
     Raises:
         ConfigError: one message per problem.

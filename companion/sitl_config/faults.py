@@ -1,7 +1,7 @@
-"""Faults of the simulated world: their kinds, the meaning of their size, and one injected fault.
+"""Faults of the simulated world: the kinds, the meaning of their sizes, and the settings of one injected fault.
 
 The world, `companion faults --list` and docs/faults.md use the same table. `sitl.faults` implements the effect of each kind;
-`companion.campaigns.faults.variants` lists what a campaign flies.
+`companion.campaigns.faults.variants` lists the faults that a campaign flies.
 """
 
 from __future__ import annotations
@@ -75,9 +75,9 @@ class Kind:
     named_by: tuple[str, ...] = ()
     """Events that report the fault or its consequence."""
     phases: tuple[FlightPhase, ...] = IN_FLIGHT
-    """Phases in which a campaign injects it."""
+    """Phases in which a campaign injects the fault."""
     process: bool = False
-    """Whether the fault is in a process of the companion instead of the world."""
+    """Whether the fault acts on a process of the companion instead of on the world."""
 
 
 _MOCAP_GONE = ("mocap_lost", "mocap_invalid", "mocap_too_late")
@@ -99,14 +99,14 @@ KINDS: dict[FaultKind, Kind] = {
     "mocap_occluded": Kind("frames arrive, but the body is not tracked", named_by=_MOCAP_GONE),
     "mocap_jump": Kind(what="poses are shifted sideways", size="shift", unit="m", default=0.3, named_by=_MOCAP_WRONG),
     "mocap_drag": Kind(
-        what="poses are dragged sideways, further with every frame",
+        what="poses drift sideways, further with every frame",
         size="speed",
         unit="m/s",
         default=1.0,
         named_by=_MOCAP_WRONG,
     ),
     "mocap_swap": Kind(
-        what="poses are those of another body on the floor",
+        what="the poses are those of another body, which lies on the floor",
         size="distance to that body",
         unit="m",
         default=1.0,
@@ -114,25 +114,29 @@ KINDS: dict[FaultKind, Kind] = {
     ),
     "mocap_freeze": Kind("frames continue with the same pose", named_by=(*_MOCAP_WRONG, *_MOCAP_GONE)),
     "mocap_latency": Kind(
-        what="frames come later",
+        what="frames arrive later",
         size="additional latency",
         unit="s",
         default=0.1,
         named_by=("mocap_late", *_MOCAP_GONE, *_MOCAP_WRONG),
     ),
     "mocap_rate": Kind(
-        what="fewer frames", size="frames a second", unit="Hz", default=30.0, named_by=("mocap_slow", *_MOCAP_GONE)
+        what="fewer frames are sent",
+        size="frames per second",
+        unit="Hz",
+        default=30.0,
+        named_by=("mocap_slow", *_MOCAP_GONE),
     ),
     "link_loss": Kind("the MAVLink link is dead in both directions", named_by=_PX4_GONE),
     "link_delay": Kind(
         what="the MAVLink link is slow in both directions",
-        size="delay each way",
+        size="delay in each direction",
         unit="s",
         default=0.05,
         named_by=("link_late", *_PX4_GONE, *_MOCAP_WRONG, "gate"),
     ),
     "autopilot_reboot": Kind(
-        what="PX4 restarts: rotors off, disarmed, clock at zero; in the air the vehicle falls",
+        what="PX4 reboots: it is disarmed, the rotors stop and its clock restarts at zero; in the air, the vehicle falls",
         size="time to boot",
         unit="s",
         default=2.0,
@@ -160,7 +164,7 @@ KINDS: dict[FaultKind, Kind] = {
         named_by=("joint_jump", "joint_beyond_limit", "joint_far_beyond_limit", "joint_rate", "servo_overload"),
     ),
     "bus_noise": Kind(
-        what="packets on the servo bus are corrupt",
+        what="packets on the servo bus are corrupted",
         size="fraction of packets",
         unit="",
         default=0.3,
@@ -169,7 +173,7 @@ KINDS: dict[FaultKind, Kind] = {
     "force_loss": Kind("the force sensor stops sending", named_by=("force_lost",)),
     "force_stuck": Kind("the force sensor repeats its last reading", named_by=("force_stuck",)),
     "force_bias": Kind(
-        what="the force sensor's zero moves",
+        what="the force sensor's zero shifts",
         size="shift of each axis",
         unit="N",
         default=4.0,
@@ -179,14 +183,14 @@ KINDS: dict[FaultKind, Kind] = {
         what="a rotor loses thrust", size="fraction lost", unit="", default=0.15, named_by=(*_WEAK, "crashed")
     ),
     "battery_sag": Kind(
-        what="the battery's voltage drops, and thrust with its square",
+        what="the battery's voltage drops, and the thrust with the square of the voltage",
         size="drop",
         unit="V",
         default=2.0,
         named_by=("battery_voltage", *_WEAK),
     ),
     "gust": Kind(
-        what="wind, away from the tether's anchor",
+        what="a wind blows away from the tether's anchor",
         size="speed",
         unit="m/s",
         default=6.0,
@@ -207,9 +211,14 @@ KINDS: dict[FaultKind, Kind] = {
         default=0.15,
         named_by=_PULLED,
     ),
-    "tether_cut": Kind("the tether parts", named_by=("tether_separated",)),
+    "tether_cut": Kind("the tether breaks", named_by=("tether_separated",)),
     "payload_missed": Kind(
-        what="the throw misses the net", size="aside", unit="m", default=0.4, named_by=(), phases=("catch",)
+        what="the throw misses the net",
+        size="distance by which it misses",
+        unit="m",
+        default=0.4,
+        named_by=(),
+        phases=("catch",),
     ),
     "payload_double": Kind(
         what="a second payload is thrown into the net",
@@ -237,15 +246,15 @@ KINDS: dict[FaultKind, Kind] = {
         process=True,
     ),
     "stall_loop": Kind(
-        "a blocking call on the event loop", named_by=("loop_late", "loop_stalled", *_GUARDIAN), process=True
+        "a call blocks the event loop", named_by=("loop_late", "loop_stalled", *_GUARDIAN), process=True
     ),
     "hold_gil": Kind("the interpreter lock (GIL) is held permanently", named_by=_GUARDIAN, process=True),
     "stop_flight": Kind(
-        "SIGSTOP to the flight process", named_by=("loop_late", "loop_stalled", *_GUARDIAN), process=True
+        "the flight process receives SIGSTOP", named_by=("loop_late", "loop_stalled", *_GUARDIAN), process=True
     ),
-    "kill_flight": Kind("SIGKILL to the flight process", named_by=_GUARDIAN, process=True),
-    "kill_recorder": Kind("SIGKILL to the recorder", named_by=("recorder_drops",), process=True),
-    "kill_guardian": Kind("SIGKILL to the guardian", named_by=("guardian_lost",), process=True),
+    "kill_flight": Kind("the flight process receives SIGKILL", named_by=_GUARDIAN, process=True),
+    "kill_recorder": Kind("the recorder receives SIGKILL", named_by=("recorder_drops",), process=True),
+    "kill_guardian": Kind("the guardian receives SIGKILL", named_by=("guardian_lost",), process=True),
     "pilot_takeover": Kind(
         what="a pilot switches PX4 to Hold, and later to Land",
         size="time in Hold",
@@ -273,17 +282,17 @@ class Fault(Model):
 
     kind: FaultKind
     t_s: NonNegative | None = None
-    """Seconds since the event of `after`. If it is absent, `phase` determines the start."""
+    """Time from the event in `after` to the start of the fault. If it is absent, `phase` determines the start."""
     after: Literal["start", "arming", "catch"] = "arming"
-    """Event from which `t_s` counts: the world's start, the rotors' arming or the catch."""
+    """Event from which `t_s` counts: the start of the world, arming or the catch."""
     phase: FlightPhase | None = None
     """Alternative to `t_s`: the fault starts in the middle of this part of the mission, or just after the catch."""
     duration_s: Positive | None = None
     """Duration. If it is absent, the fault is permanent."""
     size: float | None = Field(default=None)
-    """Size. If it is absent, the kind's default is used."""
+    """Size, with the meaning and unit of the kind. If it is absent, the kind's default is used."""
     servo: Literal[1, 2] = 1
-    """The servo that fails, for faults of one servo."""
+    """The servo on which the fault acts, for faults of one servo."""
 
     @property
     def magnitude(self) -> float:
@@ -298,7 +307,7 @@ class Fault(Model):
             problems.append((("t_s",), "give either t_s or phase for the start of the fault"))
         kind = KINDS[self.kind]
         if self.size is not None and kind.size is None:
-            problems.append((("size",), f"a {self.kind} has no size; leave it out"))
+            problems.append((("size",), f"a {self.kind} has no size; remove it"))
         elif self.magnitude < 0.0:
             problems.append((("size",), f"must not be negative, got {self.magnitude:g}"))
         elif kind.unit == "Hz" and self.magnitude == 0.0:

@@ -20,13 +20,15 @@ from companion.sitl_config.world import World
 WORLDS = names("worlds")
 """Names of the built-in worlds."""
 DEFAULT_WORLD = "ideal"
-"""The world of a configuration for which none is named."""
+"""The world of a configuration that names none."""
 COMMAND_LINE_WORLD = "lab"
 """The world of a simulated flight or campaign whose command names none."""
 
 
 class SitlConfig(FlightConfig):
-    """A flight's configuration and the true state of its simulated world. The flight process and the core receive only `flight`."""
+    """A flight's configuration and the true parameters of its simulated world. The flight process and the core receive only
+    `flight`.
+    """
 
     world: World = World()
     laboratory: Laboratory = Laboratory()
@@ -48,13 +50,15 @@ def load_sitl(
     hardware: bool = False,
     world: str = DEFAULT_WORLD,
 ) -> SitlConfig:
-    """Read, override, draw and check everything; arguments are those of `load_flight`, and overrides may also set keys of `world.`.
+    """Read all files, apply the overrides, draw the world and check the result.
+
+    The arguments are those of `load_flight`, except that overrides may also set keys of `world.`.
 
     Args:
-        world: a built-in world, or a file.
+        world: name of a built-in world, or path of a file.
 
     Raises:
-        ConfigError: one message per problem of all files.
+        ConfigError: the files have problems; the exception has one message per problem.
         PluginError: the control law cannot be used, or failed its trial (`companion.control.trial`).
     """
     lines: list[str] = []
@@ -88,11 +92,11 @@ def _faults_of_absent_parts(world: World, vehicle: Vehicle) -> Iterator[str]:
 
 
 def load_world(overrides: Sequence[str] = (), world: str = DEFAULT_WORLD) -> tuple[World, Laboratory]:
-    """Return a simulated world, drawn by its seed, and the laboratory that it was drawn from.
+    """Return a simulated world, drawn from its seed, and the laboratory from which it was drawn.
 
     Args:
-        overrides: `--set` options; those of other sections are not read. They override ranges before the draw.
-        world: a built-in world, or a file.
+        overrides: `--set` options; options of other sections are ignored. They override ranges before the draw.
+        world: name of a built-in world, or path of a file.
 
     Raises:
         ConfigError: one message per problem.
@@ -104,6 +108,6 @@ def load_world(overrides: Sequence[str] = (), world: str = DEFAULT_WORLD) -> tup
 
 
 def _seed_of(data: dict[str, Data]) -> int:
-    """Return the seed in a world's data; validation reports an invalid one."""
+    """Return the seed in a world's data; 0 in place of an invalid seed, which validation reports."""
     seed = data.get("seed", World().seed)
     return seed if type(seed) is int and seed >= 0 else 0

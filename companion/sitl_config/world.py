@@ -1,4 +1,4 @@
-"""True parameters of the simulated world, unknown to the flight. Set them with `--set world.KEY=VALUE`."""
+"""True parameters of the simulated world, which the flight does not know. Set them with `--set world.KEY=VALUE`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SignedAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 def _each_axis_once(names: tuple[str, str, str]) -> tuple[str, str, str]:
     if {name[-1] for name in names} != {"x", "y", "z"}:
-        raise ValueError(f"expected each of x, y and z once, with or without a minus, got {list(names)}")
+        raise ValueError(f"expected each of x, y and z once, with or without a minus sign, got {list(names)}")
     return names
 
 
@@ -63,7 +63,9 @@ class Push(Model):
 
 
 class Servo(Model):
-    """True settings of one servo and its joint. The defaults are the factory settings, with id and baud rate of the vehicle file."""
+    """True settings of one servo and its joint. The defaults are the factory settings, with the id and baud rate of the vehicle
+    file.
+    """
 
     id: Annotated[int, Field(ge=0, le=252)] | None = None
     """Register 7; null for the vehicle file's id. The answers of two servos with the same id collide."""
@@ -77,13 +79,13 @@ class Servo(Model):
     current_limit_counts: Annotated[int, Field(ge=0, le=1193)] = 1193
     position_limit_counts: tuple[Annotated[int, Field(ge=0, le=4095)], Annotated[int, Field(ge=0, le=4095)]] = (0, 4095)
     connected: bool = True
-    """Whether its plug is connected."""
+    """Whether the servo is plugged in."""
     reversed: bool = False
-    """Whether its counts increase opposite to the sign in the vehicle file."""
+    """Whether the servo's counts increase in the direction opposite to the sign in the vehicle file."""
     zero_error_deg: float = 0.0
     """True zero of the joint minus the zero in the vehicle file, in the direction of the joint angle."""
     torque_per_amp_error: RelativeError = 0.0
-    """Relative error of the vehicle file's torque constant with respect to the true one."""
+    """Relative error of the vehicle file's torque constant with respect to the true constant."""
 
 
 class World(Model):
@@ -93,8 +95,8 @@ class World(Model):
     """Mass of the payload; 0 if nothing is thrown."""
     seed: Annotated[int, Field(ge=0)] = 1
     catch_at_m: Vector2 = (0.0, 0.0)
-    """x, y of the vehicle when the payload arrives in the net. It is thrown on the first pass in the direction of +x, at most 0.5 m
-    to the left or right."""
+    """x and y of the vehicle when the payload arrives in the net. The payload is thrown on the first pass in the +x direction that is
+    at most 0.5 m to the left or right of this point."""
     throw_velocity_m_s: Vector3 = (-2.0, 0.15, -1.5)
     """Velocity of the payload on arrival, world frame."""
     throws: Annotated[int, Field(ge=1, le=1000)] = 1
@@ -103,11 +105,11 @@ class World(Model):
     hover_thrust_error: RelativeError = 0.0
     """Relative error of MPC_THR_HOVER with respect to the true hover thrust."""
     rotor_lag_s: Positive = 0.04
-    """Time constant of each rotor's thrust; with `rotors.on` those of that section act instead."""
+    """Time constant of each rotor's thrust; with `rotors.on`, the time constants of that section apply instead."""
     setpoint_delay_s: NonNegative = 0.010
-    """Delay from the arrival of a setpoint to the attitude loop, in addition to the link's."""
+    """Delay from the arrival of a setpoint to its effect in the attitude loop, in addition to the delay of the link."""
     arm_delay_s: NonNegative = 0.0
-    """Delay from the writing of a goal current to its effect, in addition to the bus's."""
+    """Delay from writing a goal current to its effect, in addition to the delay of the bus."""
     mocap_rate_hz: Positive = 200.0
     mocap_latency_s: NonNegative = 0.005
     mocap_noise_m: NonNegative = 0.0002
@@ -117,51 +119,52 @@ class World(Model):
     force_noise_n: NonNegative = 0.05
     force_bias_n: Vector3 = (1.2, -0.8, 2.5)
     force_scale: Positive = 1.0
-    """Factor between the force sensor's readings and the true force."""
+    """The force sensor's readings divided by the true force."""
     net_weight_kg: Annotated[float, Field(ge=0, le=5)] = 0.0
     """Mass that hangs from the centre of the net while the force sensor is being read, for its calibration."""
     net_weight_t_s: NonNegative = 8.0
     """Time from the first reading until the mass is attached."""
     joint_friction_nm: NonNegative = 0.04
-    """Constant friction of each joint; with `servo_mechanics` that section's friction acts instead."""
+    """Constant friction of each joint; with `servo_mechanics.on`, the friction of that section applies instead."""
     joint_damping_nms: NonNegative = 0.02
-    """Viscous friction of each joint, N m s/rad; with `servo_mechanics` that section's friction acts instead."""
+    """Viscous friction of each joint, N m s/rad; with `servo_mechanics.on`, the friction of that section applies instead."""
     servos: tuple[Servo, Servo] | None = None
-    """null for the defaults of `Servo`."""
+    """Settings of both servos; null for the defaults of `Servo`."""
     arm_hand: bool = False
-    """Whether a simulated user holds the limp arm and moves it as `companion arm zero` requests, whenever the servos' LEDs are switched
-    on.
+    """Whether a simulated user holds the limp arm and, whenever a servo's LED is switched on, moves it as `companion arm zero`
+    requests.
     """
     wind_m_s: Vector3 = (0.0, 0.0, 0.0)
     mass_error: RelativeError = 0.0
-    """Relative error of the vehicle file's base mass with respect to the true one."""
+    """Relative deviation of the true mass of the base (without arm and tool) from the vehicle file."""
     link_mass_error: tuple[RelativeError, RelativeError] = (0.0, 0.0)
-    """Relative error of the vehicle file's link masses with respect to the true ones; the base's mass does not change."""
+    """Relative deviations of the true link masses from the vehicle file; the mass of the base does not change."""
     model_error: Annotated[float, Field(ge=0, le=0.3)] = 0.0
-    """Error by which the true base mass, inertia, link masses and torque constants differ from the vehicle file, in addition to the
-    other errors: each is multiplied by 1 plus or minus this value, with a sign drawn by the seed (the moments of inertia have a common
-    sign)."""
+    """Relative difference of base mass, inertia, link masses and torque constants between the vehicle file and the true vehicle, in
+    addition to the other errors. Each is multiplied by 1 plus or minus this value, with a sign drawn from the seed (the moments of
+    inertia share
+    one sign)."""
     battery_start: Fraction = 1.0
     battery_life_s: Positive = 900.0
-    """Time from arming until a full battery is empty; with `battery.on`, the time in hover."""
+    """Time from arming until a full battery is empty; with `battery.on`, the hover time with a full battery."""
     push: Push | None = None
-    """A push on the net, for tests of the impedance."""
+    """A push on the net, with which the impedance can be tested; null for none."""
     natnet_version: NatNetVersion = "4.1"
     """NatNet version that the simulated Motive streams."""
     mocap_axes: SignedAxes = ("x", "y", "z")
-    """True axes of the streamed x, y and z, such as "-y". A left-handed set represents a misconfigured server."""
+    """True axis of each streamed axis x, y and z, such as "-y". A left-handed set represents a misconfigured server."""
     mocap_body_yaw_deg: float = 0.0
     """Error of the rigid body's streamed yaw."""
     mocap_body_tilt_deg: Vector2 = (0.0, 0.0)
-    """Errors of its streamed roll and pitch."""
+    """Errors of the rigid body's streamed roll and pitch."""
     mocap_other_id: Annotated[int, Field(ge=0)] | None = None
-    """Streaming id of another rigid body, which lies on the floor; null if there is none."""
+    """Streaming id of another rigid body, which lies on the floor; null for none."""
     hand: bool = False
-    """Whether a simulated user carries the vehicle through the guided hand test, rotors off, again and again."""
+    """Whether a simulated user repeatedly carries the vehicle through the guided hand test, with the rotors off."""
     hand_t_s: NonNegative = 20.0
-    """World time at which the first test begins."""
+    """World time at which the first hand test begins."""
     hand_taps: Annotated[int, Field(ge=0, le=100)] = 0
-    """Number of taps on the frame per round. If above 0, the vehicle is only lifted and held, for the measurement of the latency."""
+    """Number of taps on the frame per round. If it is above 0, the vehicle is only lifted and held, for latency measurement."""
     hand_tap_n: Positive = 30.0
     """Peak force of a tap."""
     px4_params: Px4Params = Field(default={})
@@ -187,7 +190,9 @@ class World(Model):
 
     @property
     def thr_mdl_fac(self) -> float:
-        """Return PX4's THR_MDL_FAC: from `px4_params`, else from `rotors` if that effect is on, else 0 for linear rotors."""
+        """Return PX4's THR_MDL_FAC: from `px4_params` if set there; otherwise from `rotors` if that effect is on, or 0 for linear
+        rotors.
+        """
         return self.px4_params.get("THR_MDL_FAC", self.rotors.thr_mdl_fac if self.rotors.on else 0.0)
 
     def overridden_px4_params(self) -> dict[str, float | int]:

@@ -1,5 +1,5 @@
-"""A real PX4 as the autopilot of the simulated world: starts it, configures it over MAVLink, restarts it, flies it in lockstep and
-stops it.
+"""A real PX4 as the autopilot of the simulated world. This module starts PX4, configures it over MAVLink, restarts it, flies it in
+lockstep and stops it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from sitl.world.world import World
 BOOT_DEADLINE_S = 30.0
 END_DEADLINE_S = 6.0
 BY_HAND_DEADLINE_S = 10.0
-"""Deadline for a PX4 that was started by hand; it tries to connect twice per millisecond."""
+"""Deadline for the connection of a PX4 that was started by hand, which retries twice per millisecond."""
 USER_DEADLINE_S = 300.0
 SAMPLE_S = 0.004
 BATTERY_PERIOD_S = 0.1
@@ -42,17 +42,17 @@ STUB_ONLY_FAULTS: Mapping[FaultKind, str] = {
     "arming_refused": "makes PX4 refuse to arm",
     "battery_sag": "changes what PX4's power module measures",
 }
-"""Faults that only the stub can have, and why."""
+"""Faults that only the stub can simulate, each with the reason."""
 _LINK_FAULTS: frozenset[FaultKind] = frozenset({"link_loss", "link_delay"})
 
 Progress = Callable[[str], None]
 
 
 def refuse_stub_only_settings(config: WorldConfig) -> None:
-    """Reject a world that only the stub can simulate, before a real PX4 is started.
+    """Reject a world that only the stub can simulate; called before a real PX4 is started.
 
     Raises:
-        Px4Error: the world has such a fault, or a battery that does not start full without the effect `battery`.
+        Px4Error: the world has such a fault, or its battery does not start full although the effect `battery` is off.
     """
     for fault in config.faults:
         if fault.kind in STUB_ONLY_FAULTS and not (fault.kind == "battery_sag" and config.battery.on):
@@ -61,8 +61,8 @@ def refuse_stub_only_settings(config: WorldConfig) -> None:
             )
     if config.battery_start != 1.0 and not config.battery.on:
         raise Px4Error(
-            "world.battery_start: PX4's own battery simulator starts full, expected 1.0 with a real PX4; set world.battery.on, or run "
-            "with --sitl"
+            f"world.battery_start: expected 1.0 with a real PX4, because PX4's own battery simulator starts full, found "
+            f"{config.battery_start:g}; set world.battery.on, or run with --sitl"
         )
 
 
@@ -73,7 +73,7 @@ class RealPx4:
         airframe: airframe of the vehicle file.
         config: configuration of the world.
         folder: folder for PX4's parameters, logs and output.
-        progress: called with one line for the user.
+        progress: called with each progress message, one line for the user.
 
     Raises:
         Px4Error: the world needs the stub, PX4_SITL does not name a program, or no instance number is free.
@@ -97,7 +97,7 @@ class RealPx4:
         self._imu: ImuSample | None = None
         self._next_battery_s = 0.0
         self._flies = False
-        """Whether preparation is over, after which it is an error if PX4 disconnects."""
+        """Whether preparation is over; from then on, a disconnection of PX4 is an error."""
 
     @property
     def number(self) -> int:
@@ -111,7 +111,7 @@ class RealPx4:
 
     @property
     def down(self) -> bool:
-        """Whether PX4 is booting; always False in flight."""
+        """Whether PX4 is booting; always False, because a real PX4 does not restart in flight."""
         return False
 
     @property
@@ -120,12 +120,14 @@ class RealPx4:
         return _Faulty(self._control)
 
     def attach(self, world: World) -> None:
-        """Set the world that PX4's sensors measure."""
+        """Set the world that PX4's simulated sensors measure."""
         self._world = world
 
     @contextlib.asynccontextmanager
     async def wires(self) -> AsyncIterator[str]:
-        """Open the simulator and control links, start PX4 if an installation was found, and stop it on exit."""
+        """Open the simulator and control links and start PX4 if an installation was found; yield the companion's address. Stop PX4
+        on exit.
+        """
         async with contextlib.AsyncExitStack() as stack:
             stack.callback(self._instance.close)
             await stack.enter_async_context(self._link)
@@ -146,12 +148,12 @@ class RealPx4:
         """Wait for PX4 to boot, set the vehicle's parameters, restart PX4 if any changed, and check them again.
 
         Raises:
-            Px4Error: PX4 did not connect, or does not keep its parameters.
+            Px4Error: PX4 did not connect, or did not keep its parameters.
         """
         if self._process is None:
             self._progress(
-                f"px4 was not found: waiting up to {BY_HAND_DEADLINE_S:g} s for one that was started by hand, on TCP "
-                f"{self._link.port}: {self._by_hand()}"
+                f"px4 was not found; waiting up to {BY_HAND_DEADLINE_S:g} s on TCP {self._link.port} for a PX4 that was started by "
+                f"hand: {self._by_hand()}"
             )
         await self._boot(BOOT_DEADLINE_S if self._process is not None else BY_HAND_DEADLINE_S)
         self._version = await self._control.version()
@@ -162,31 +164,31 @@ class RealPx4:
             await self._restart(changed)
             left = await self._write_parameters(wanted)
             if left:
-                fix = f"see {self._folder}" if self._process is not None else "start it in the same folder both times"
+                fix = f"see {self._folder}" if self._process is not None else "start PX4 in the same folder both times"
                 raise Px4Error(
-                    f"PX4: expected its parameters to survive a restart, found {', '.join(left)} changed; {fix}"
+                    f"PX4: expected the parameters to survive a restart, found {', '.join(left)} changed; {fix}"
                 )
         await self._control.write(self._config.overridden_px4_params())
         await self._control.request_mode_stream()
         self._flies = True
 
     async def _boot(self, deadline_s: float) -> None:
-        """Wait until PX4 answers sensor samples: `deadline_s` for its connection, then `BOOT_DEADLINE_S` for its boot.
+        """Wait until PX4 answers sensor samples: up to `deadline_s` for its connection, then up to `BOOT_DEADLINE_S` for its boot.
 
         Raises:
-            Px4Error: it has ended, or a deadline has passed.
+            Px4Error: PX4 has ended, or a deadline has passed.
         """
-        found, end_s = "nobody there", time.monotonic() + deadline_s
+        found, end_s = "no connection", time.monotonic() + deadline_s
         while not await self._link.await_lockstep(0.2):
             if self._process is not None and not self._process.running:
                 raise Px4Error(self._process.exit_summary())
-            if self._link.connected and found == "nobody there":
-                found, deadline_s = "no answer to the world's sensors", BOOT_DEADLINE_S
+            if self._link.connected and found == "no connection":
+                found, deadline_s = "no answer to the simulated sensors", BOOT_DEADLINE_S
                 end_s = time.monotonic() + deadline_s
             if time.monotonic() > end_s:
                 how = f"see {self._process.log}" if self._process is not None else self._how()
                 raise Px4Error(
-                    f"PX4: expected it on TCP {self._link.port} within {deadline_s:g} s, found {found}; {how}"
+                    f"PX4: expected PX4 on TCP {self._link.port} within {deadline_s:g} s, found {found}; {how}"
                 )
         await self._control.await_heartbeat()
 
@@ -197,12 +199,12 @@ class RealPx4:
         return HOW_TO_START_IT.format(model=MODEL, number=self.number)
 
     async def _write_parameters(self, wanted: Mapping[str, Value]) -> dict[str, Value]:
-        """Write the parameters that differ and return them, in PX4's types."""
+        """Write the parameters that differ from the wanted values and return those that were written, in PX4's types."""
         have = await self._control.read(wanted)
         absent = [name for name in wanted if name not in have and name not in VERSION_DEPENDENT]
         if absent:
             raise Px4Error(
-                f"PX4 {self._version}: expected the parameter {absent[0]}, found no parameter of this name"
+                f"PX4 {self._version}: expected the parameter {absent[0]}, found no parameter with this name"
                 + (f" (nor {', '.join(absent[1:])})" if absent[1:] else "")
             )
         typed = {name: _as_type_of(have[name], value) for name, value in wanted.items() if name in have}
@@ -216,11 +218,11 @@ class RealPx4:
         """Restart PX4 in the same folder, or ask the user to restart it."""
         if self._process is None:
             self._progress(
-                "the vehicle's parameters are set and need a restart of PX4: stop it "
+                "the vehicle's parameters are set and take effect after a restart of PX4: stop PX4 "
                 "and start it again in the same folder, where it stores them"
             )
             if not await self._link.await_disconnect(USER_DEADLINE_S):
-                raise Px4Error(f"PX4: expected it to be restarted within {USER_DEADLINE_S:g} s, found it still running")
+                raise Px4Error(f"PX4: expected a restart within {USER_DEADLINE_S:g} s, found PX4 still running")
         else:
             store = await stored(self._folder, changed)
             self._process.terminate()
@@ -232,13 +234,13 @@ class RealPx4:
         await self._boot(BOOT_DEADLINE_S if self._process is not None else USER_DEADLINE_S)
 
     def sense(self, imu: ImuSample) -> None:
-        """Send HIL_SENSOR, with the present true height and attitude."""
+        """Send HIL_SENSOR with this IMU sample and the present true height and attitude."""
         self._imu = imu
         q = self._world.q
         self._link.send(imu, q[2], (q[3], q[4], q[5], q[6]))
 
     async def answered(self) -> None:
-        """Wait for HIL_ACTUATOR_CONTROLS.
+        """Wait for the HIL_ACTUATOR_CONTROLS that answers the newest sample.
 
         Raises:
             Px4Error: PX4 has ended, or has stopped answering.
@@ -250,8 +252,7 @@ class RealPx4:
 
     async def _exit_summary(self) -> str:
         if self._process is None:
-            return "PX4: expected it to run until the flight is over, "
-            "found that it has closed its simulator link"
+            return "PX4: expected PX4 to run until the end of the flight, found that it has closed its simulator link"
         await self._process.await_end(1.0)
         return self._process.exit_summary()
 
@@ -261,7 +262,9 @@ class RealPx4:
         return self._link.rotors
 
     def pump(self, t_s: float, battery: Battery) -> None:
-        """Send the battery's state if its effect is on; otherwise PX4 simulates its own. PX4 streams telemetry by itself."""
+        """Send the battery's state if its effect is on; otherwise PX4 simulates a battery itself. PX4 streams its telemetry on its
+        own.
+        """
         if self._config.battery.on and t_s >= self._next_battery_s:
             self._next_battery_s = t_s + BATTERY_PERIOD_S
             self._control.send_battery(battery)
@@ -272,14 +275,14 @@ class RealPx4:
             self._relay.down, self._relay.delay_s = down, delay_s
 
     def skip(self, paused_s: float) -> None:
-        """Do nothing: PX4's only clock is the world's, and a gap in its samples would disturb its estimate."""
+        """Do nothing: PX4 has no clock but world time, and a gap in its samples would disturb its estimate."""
 
     def observe(self) -> Observation:
-        """Return the mode; only PX4's own log shows its inputs."""
+        """Return PX4's mode; the other fields are None, because only PX4's own log shows its inputs."""
         return Observation(None, None, self._control.nav_state)
 
     def about(self) -> dict[str, Any]:
-        """Return kind, version, build, instance and clock of this PX4."""
+        """Return the kind, version, build, instance number, number of unanswered samples and clock origin of this PX4."""
         version = self._version
         return {
             "kind": "px4",
@@ -291,7 +294,7 @@ class RealPx4:
         }
 
     async def _end(self) -> None:
-        """Stop the PX4 that was started here; it needs samples until it has ended, because they drive its clock."""
+        """Stop the PX4 that was started here. It receives samples until it has ended, because they drive its clock."""
         self._flies = False
         process, imu = self._process, self._imu
         if process is None:
@@ -311,7 +314,7 @@ class RealPx4:
 
 
 class _Faulty:
-    """Faults that a real PX4 can have: a pilot who changes the mode."""
+    """Injects the one fault that a real PX4 can have: a pilot changes the mode."""
 
     refuses_offboard = False
     refuses_arming = False
@@ -320,7 +323,7 @@ class _Faulty:
         self._control = control
 
     def reboot(self, for_s: float) -> None:
-        """Reject the fault; `refuse_stub_only_settings` has done so before the flight.
+        """Reject the fault, which `refuse_stub_only_settings` has already rejected before the flight.
 
         Raises:
             Px4Error: always.

@@ -1,7 +1,7 @@
-"""The simulated world's own MAVLink link to a real PX4, in addition to the companion's: parameters, version, mode.
+"""The simulated world's own MAVLink link to a real PX4, in addition to the companion's, for parameters, version and mode.
 
-It uses PX4's camera link (UDP 14280 plus instance) and leaves the onboard link alone, because PX4 keeps sending to the first partner
-that contacts it.
+It uses PX4's camera link (UDP 14280 plus the instance number) and not the onboard link, because PX4 keeps sending to the first partner
+that contacts it on a link.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ PARAMS_DEADLINE_S = 20.0
 COMMAND_DEADLINE_S = 5.0
 HEARTBEAT_DEADLINE_S = 20.0
 MODE_PERIOD_S = 0.02
-"""Period of CURRENT_MODE on this link; heartbeats come once a second, too rarely to show when a mode changes."""
+"""Period of CURRENT_MODE on this link; heartbeats arrive once per second, too rarely to show when the mode changes."""
 _CELLS = 4
 _AT_ONCE = 20
-"""Parameters requested at a time; more would overflow PX4's receive buffer."""
+"""Number of parameters requested at a time; more would overflow PX4's receive buffer."""
 _OWN_SYSTEM, _OWN_COMPONENT = 254, mavlink.MAV_COMP_ID_SYSTEM_CONTROL
 _AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 _FORCE_DISARM = 21196.0
@@ -43,19 +43,19 @@ class Version:
     release: str
     """Release, such as 1.16.1."""
     build: str
-    """First eight digits of its commit, or empty if PX4 does not report it."""
+    """First eight hexadecimal digits of the commit; empty if PX4 does not report it."""
 
     def __str__(self) -> str:
         return f"{self.release} ({self.build})" if self.build else self.release
 
 
 class ControlLink(UdpEndpoint):
-    """The link: an async context manager on the socket of the instance."""
+    """The world's control link to PX4; an async context manager on the socket of the instance."""
 
     def __init__(self, instance: Instance) -> None:
         super().__init__()
         self.nav_state: NavState | None = None
-        """Mode of the newest HEARTBEAT or CURRENT_MODE."""
+        """Mode in the newest HEARTBEAT or CURRENT_MODE; None if it is unknown."""
         self._instance = instance
         self._system = instance.number + 1
         self._encoder = mavlink.MAVLink(None, srcSystem=_OWN_SYSTEM, srcComponent=_OWN_COMPONENT)
@@ -83,7 +83,7 @@ class ControlLink(UdpEndpoint):
                 handler(message)
 
     async def await_heartbeat(self) -> None:
-        """Wait for PX4's heartbeat.
+        """Wait for a heartbeat from PX4.
 
         Raises:
             Px4Error: no heartbeat arrived within HEARTBEAT_DEADLINE_S.
@@ -97,11 +97,11 @@ class ControlLink(UdpEndpoint):
         if heard is None:
             raise Px4Error(
                 f"PX4: expected a heartbeat on UDP {self._instance.control.getsockname()[1]} within "
-                f"{HEARTBEAT_DEADLINE_S:g} s, found none; check that it is PX4 SITL with its standard links"
+                f"{HEARTBEAT_DEADLINE_S:g} s, found none; check that this is PX4 SITL with its standard links"
             )
 
     async def version(self) -> Version:
-        """Request AUTOPILOT_VERSION.
+        """Request AUTOPILOT_VERSION and return the version of PX4.
 
         Raises:
             Px4Error: PX4 did not answer.
@@ -118,7 +118,7 @@ class ControlLink(UdpEndpoint):
         return Version(".".join(str(number >> shift & 0xFF) for shift in (24, 16, 8)), build)
 
     async def read(self, names: Iterable[str]) -> dict[str, Value]:
-        """Read parameters; names that PX4 does not have are left out.
+        """Return the values of parameters by name; names that PX4 does not have are omitted.
 
         Raises:
             Px4Error: PX4 stopped answering.
@@ -131,7 +131,7 @@ class ControlLink(UdpEndpoint):
             for i in range(0, len(missing), _AT_ONCE):
                 found |= await self._read_some(missing[i : i + _AT_ONCE])
         if wanted and not found:
-            raise Px4Error(f"PX4: expected values of {len(wanted)} parameters, found no answer")
+            raise Px4Error(f"PX4: expected the values of {len(wanted)} parameters, found no answer")
         return found
 
     async def _read_some(self, names: list[str]) -> dict[str, Value]:
@@ -155,10 +155,10 @@ class ControlLink(UdpEndpoint):
         """Set parameters and wait until PX4 confirms each of them.
 
         Args:
-            values: int for INT32, float for REAL32: PX4 ignores the other type.
+            values: int for INT32 and float for REAL32; PX4 ignores a value of the wrong type.
 
         Raises:
-            Px4Error: PX4 did not accept one of them.
+            Px4Error: PX4 did not confirm one of them.
         """
         left = dict(values)
 
@@ -187,7 +187,7 @@ class ControlLink(UdpEndpoint):
             )
 
     async def save(self) -> None:
-        """Make PX4 store its parameters now instead of a few seconds later.
+        """Make PX4 store its parameters immediately instead of a few seconds later.
 
         Raises:
             Px4Error: PX4 refused or did not answer.
@@ -195,10 +195,10 @@ class ControlLink(UdpEndpoint):
         await self.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 1.0)
 
     async def request_mode_stream(self) -> None:
-        """Request CURRENT_MODE every MODE_PERIOD_S; PX4 forgets the request when it restarts.
+        """Request CURRENT_MODE every MODE_PERIOD_S; a restart of PX4 ends the stream.
 
         Raises:
-            Px4Error: PX4 refused.
+            Px4Error: PX4 refused or did not answer.
         """
         await self.command(
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_CURRENT_MODE, MODE_PERIOD_S * 1e6
@@ -214,7 +214,7 @@ class ControlLink(UdpEndpoint):
         self._command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, _FORCE_DISARM)
 
     def send_battery(self, battery: Battery) -> None:
-        """Send BATTERY_STATUS as a battery of PX4's own system does, which PX4 uses in place of its power module
+        """Send BATTERY_STATUS with PX4's system id, so that PX4 uses it in place of its power module
         (MavlinkReceiver::handle_message_battery_status).
         """
         cells = [round(battery.voltage_v / _CELLS * 1e3)] * _CELLS + [0xFFFF] * (10 - _CELLS)
@@ -248,7 +248,9 @@ class ControlLink(UdpEndpoint):
         self._send(mavlink.MAVLink_command_long_message(self._system, _AUTOPILOT, command, 0, *numbers))
 
     async def _ask(self, send: Callable[[], None], answer: Callable[[Any], Any], deadline_s: float) -> Any:
-        """Call `send` every ASK_AGAIN_S until `answer` returns something for a message; return that, or None at the deadline."""
+        """Call `send` every ASK_AGAIN_S until `answer` returns a value for a received message; return that value, or None at the
+        deadline.
+        """
         answered: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
 
         def handle(message: Any) -> None:
@@ -281,7 +283,7 @@ def _parameter(message: Any) -> tuple[str, Value | None]:
 
 
 def same(a: Value, b: Value) -> bool:
-    """Return whether PX4 stores both as the same value; it stores numbers in single precision."""
+    """Return whether PX4 stores both numbers as the same value; it stores floating-point numbers in single precision."""
     if isinstance(a, int) != isinstance(b, int):
         return False
     return a == b or math.isclose(_single(a), _single(b), rel_tol=1e-6, abs_tol=1e-9)

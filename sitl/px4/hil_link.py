@@ -1,7 +1,8 @@
 """The world as PX4's external simulator: MAVLink 2 over TCP, HIL_SENSOR out, HIL_ACTUATOR_CONTROLS in, in lockstep.
 
-PX4 is the client. Its only clock is the `time_usec` of the newest HIL_SENSOR, so the two advance in turn: a sample, its answer, the
-next sample. The clock restarts with each PX4 that connects. Motion capture reaches PX4 over the companion's link instead.
+PX4 is the client. Its only clock is the `time_usec` of the newest HIL_SENSOR, so the world and PX4 advance in turn: a sample, its
+answer, the next sample. The clock restarts with each PX4 that connects. Motion capture reaches PX4 over the companion's link, not this
+one.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from companion.model.types import Quat, Vec3
 from sitl.autopilot.types import ImuSample, RotorCommands
 
 CLOCK_ORIGIN_S = 1.0
-"""PX4's clock at its first sample, at any world time. It must not start at zero; if it starts at several minutes, EKF2's first estimate
-is late (PX4 1.16.1: by about 10 s at 300 s, by more than the preflight waits at 1000 s).
+"""PX4's clock at its first sample, whatever the world time. It must not be zero, and not several minutes either, because EKF2's first
+estimate is then late (PX4 1.16.1: by about 10 s for 300 s; for 1000 s, by more than the preflight check waits).
 """
 ANSWER_PATIENCE_S = 2.0
-"""Timeout for the answer to one sample, after which the next sample is sent."""
+"""Timeout for the answer to one sample; then the next sample is sent."""
 ANSWER_DEADLINE_S = 10.0
 """Time without any answer after which PX4 counts as hung."""
 FIELD_EVERY, BARO_OFFSET = 5, 2
-"""Every fifth sample carries the magnetometer, and every fifth the barometer: 50 Hz each."""
+"""Every fifth sample includes the magnetometer, and every fifth, at this offset, the barometer: 50 Hz each."""
 
 _STOPPED: RotorCommands = (0.0, 0.0, 0.0, 0.0)
 _ACCEL_AND_GYRO, _MAG, _BARO = 0x07 | 0x38, 0x1C0, 0x200 | 0x800 | 0x1000
@@ -43,12 +44,12 @@ class Px4Error(Exception):
 
 
 def pressure_hpa(altitude_m: float) -> float:
-    """Return the pressure of the standard atmosphere at a height above sea level."""
+    """Return the pressure of the standard atmosphere in hPa at a height above sea level."""
     return 1013.25 * math.pow(1.0 - 2.25577e-5 * altitude_m, 5.25588)
 
 
 def field_frd_gauss(attitude_wxyz: Quat) -> Vec3:
-    """Return the magnetic field in the body frame (FRD), given the attitude (body FLU to world ENU)."""
+    """Return the magnetic field in gauss in the body frame (FRD), given the attitude (body FLU to world ENU)."""
     north, east, down = _FIELD_NED_GAUSS
     forward, left, up = quat_rotate(quat_conjugate(attitude_wxyz), (east, north, -down))
     return (forward, -left, -up)
@@ -66,10 +67,10 @@ class HilSensors:
         self._number = 0
 
     def message(self, imu: ImuSample, height_m: float, attitude_wxyz: Quat) -> Any:
-        """Build HIL_SENSOR.
+        """Return the HIL_SENSOR message of one sample.
 
         Args:
-            imu: IMU sample; its time counts from PX4's first sample.
+            imu: IMU sample, with its time counted from PX4's first sample.
             height_m: true height above the floor.
             attitude_wxyz: true attitude, body FLU to world ENU.
         """
@@ -96,15 +97,15 @@ class HilSensors:
 
 
 def clock_us(t_s: float) -> int:
-    """Return PX4's clock, given the world time since its first sample."""
+    """Return the time on PX4's clock in us, given the world time since PX4's first sample."""
     return round((t_s + CLOCK_ORIGIN_S) * 1e6)
 
 
 class SimulatorLink:
-    """The simulator's end of the TCP link, an async context manager. PX4 may disconnect and connect again.
+    """The simulator's end of the TCP link; an async context manager. PX4 may disconnect and reconnect.
 
     Args:
-        listener: listens where PX4 connects, 127.0.0.1:4560 plus its instance; closed with the link.
+        listener: listening socket to which PX4 connects, 127.0.0.1:4560 plus the instance number; closed with the link.
         sensors: builds the sensor messages.
     """
 
@@ -113,12 +114,12 @@ class SimulatorLink:
         """Rotor commands of the newest answer, 0 to 1, in PX4's quad-x order; 0 while disarmed."""
         self.armed = False
         self.answers = 0
-        """Number of HIL_ACTUATOR_CONTROLS since PX4 connected."""
+        """Number of HIL_ACTUATOR_CONTROLS received since PX4 connected."""
         self.unanswered = 0
         """Number of samples that PX4 did not answer."""
         self.connections = 0
         self.clock_begun_s: float | None = None
-        """World time of the first sample of the connected PX4, or None. PX4's clock is `CLOCK_ORIGIN_S` at it."""
+        """World time of the connected PX4's first sample, at which its clock is `CLOCK_ORIGIN_S`; None before that sample."""
         self._listener = listener
         self._sensors = sensors
         self._server: asyncio.Server | None = None
@@ -129,7 +130,7 @@ class SimulatorLink:
         self._change = asyncio.Event()
         self._silent_s = 0.0
         self._idle = False
-        """Whether PX4 is disarmed and does not answer: in OFFBOARD without setpoints, as after a flight, it computes no controls."""
+        """Whether PX4 is disarmed and does not answer. In OFFBOARD without setpoints, as after a flight, it computes no controls."""
 
     async def __aenter__(self) -> Self:
         self._server = await asyncio.get_running_loop().create_server(lambda: _Peer(self), sock=self._listener)
@@ -146,7 +147,7 @@ class SimulatorLink:
 
     @property
     def port(self) -> int:
-        """TCP port that PX4 connects to."""
+        """TCP port to which PX4 connects."""
         return int(self._listener.getsockname()[1])
 
     @property
@@ -156,15 +157,15 @@ class SimulatorLink:
 
     @property
     def in_step(self) -> bool:
-        """Whether it answers samples, so that its modules run."""
+        """Whether PX4 has begun to answer samples, which shows that its modules are running."""
         return self._peer is not None and self.answers > 0
 
     async def await_lockstep(self, deadline_s: float) -> bool:
-        """Wait for PX4's first answer while samples continue. Return False at the timeout."""
+        """Wait for PX4's first answer while samples are being sent; return False at the timeout."""
         return await self._until(lambda: self.in_step, deadline_s)
 
     async def await_disconnect(self, deadline_s: float) -> bool:
-        """Wait until PX4 has disconnected. Return False at the timeout."""
+        """Wait until PX4 has disconnected; return False at the timeout."""
         return await self._until(lambda: not self.connected, deadline_s)
 
     async def _until(self, reached: Any, deadline_s: float) -> bool:
@@ -193,8 +194,9 @@ class SimulatorLink:
         return self._awaited_us is not None
 
     async def answered(self) -> None:
-        """Wait until PX4 has answered the newest sample or has disconnected, `ANSWER_PATIENCE_S` at most. After that a PX4 that is not
-        armed is not waited for again until it answers.
+        """Wait until PX4 has answered the newest sample or has disconnected, but at most `ANSWER_PATIENCE_S`.
+
+        After such a timeout, answers of a disarmed PX4 are not awaited until it answers again.
 
         Raises:
             Px4Error: an armed PX4 has not answered for `ANSWER_DEADLINE_S`.
@@ -212,13 +214,13 @@ class SimulatorLink:
                 if self._silent_s >= ANSWER_DEADLINE_S:
                     raise Px4Error(
                         f"PX4: expected an answer to every HIL_SENSOR (lockstep), found none for {ANSWER_DEADLINE_S:g} s; "
-                        "PX4 hangs, or the computer is too slow for it"
+                        "PX4 hangs, or the computer is too slow for PX4"
                     ) from None
 
     # -- called by the peer --------------------------------------------------------------------------------------
 
     def attach(self, peer: _Peer) -> bool:
-        """Accept a connection of PX4; return False if another one is connected."""
+        """Accept a connection from PX4; return False if another PX4 is connected."""
         if self._peer is not None:
             return False
         self._peer = peer
@@ -231,7 +233,7 @@ class SimulatorLink:
         return True
 
     def detach(self, peer: _Peer) -> None:
-        """Handle the disconnection of PX4, and stop its rotors."""
+        """Handle the disconnection of PX4 and stop the rotors."""
         if self._peer is not peer:
             return
         self._peer = None
@@ -241,7 +243,7 @@ class SimulatorLink:
         self._change.set()
 
     def take(self, message: Any) -> None:
-        """Handle one message of PX4."""
+        """Handle one message from PX4."""
         if message.get_type() != "HIL_ACTUATOR_CONTROLS":
             return
         self.answers += 1
@@ -258,7 +260,7 @@ class SimulatorLink:
 
 
 class _Peer(asyncio.Protocol):
-    """One TCP connection of PX4."""
+    """One TCP connection from PX4."""
 
     def __init__(self, link: SimulatorLink) -> None:
         self.closed = asyncio.Event()
@@ -268,7 +270,7 @@ class _Peer(asyncio.Protocol):
         self._decoder.robust_parsing = True
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """A client connects."""
+        """Attach the new connection to the link, or abort it if another PX4 is connected."""
         self._transport = cast(asyncio.Transport, transport)
         connection = transport.get_extra_info("socket")
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -276,13 +278,13 @@ class _Peer(asyncio.Protocol):
             self._transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The client disconnected."""
+        """Detach the closed connection from the link."""
         self._transport = None
         self._link.detach(self)
         self.closed.set()
 
     def data_received(self, data: bytes) -> None:
-        """Decode messages, which may arrive in parts."""
+        """Decode the received messages, which may arrive in parts, and pass them to the link."""
         for message in self._decoder.parse_buffer(data) or ():
             self._link.take(message)
 

@@ -1,6 +1,6 @@
-"""The file in which a simulated PX4 stores its changed parameters: read while PX4 runs, and restored after its end.
+"""The file in which a simulated PX4 stores its changed parameters; it is read while PX4 runs and restored after PX4 has ended.
 
-PX4 writes the file some time after a change, in a separate thread. A SIGTERM during that time leaves an empty file.
+PX4 writes the file some time after a change, in a separate thread. A SIGTERM before the write is complete leaves an empty file.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _DOUBLE, _INT32, _END = 0x01, 0x10, 0x00
 def decode(data: bytes) -> dict[str, Value] | None:
     """Return the parameters of a BSON document of doubles and 32-bit integers, or None if it is incomplete.
 
-    Layout (bsonspec.org): int32 length of everything, then per element a type, a zero-terminated name and the value, then 0.
+    Layout (bsonspec.org): int32 length of the whole document; for each element a type, a zero-terminated name and a value; then 0.
     """
     if len(data) < 5 or struct.unpack_from("<i", data)[0] != len(data):
         return None
@@ -43,7 +43,7 @@ def decode(data: bytes) -> dict[str, Value] | None:
 
 
 async def stored(folder: Path, values: Mapping[str, Value]) -> bytes:
-    """Wait until the file holds these values, and return its bytes.
+    """Wait until the file contains these values, and return its bytes.
 
     Raises:
         Px4Error: PX4 did not store them within STORED_DEADLINE_S.
@@ -57,13 +57,11 @@ async def stored(folder: Path, values: Mapping[str, Value]) -> bytes:
         if held is not None and all(name in held and same(held[name], value) for name, value in values.items()):
             return data
         await asyncio.sleep(_LOOK_AGAIN_S)
-    raise Px4Error(
-        f"PX4: expected it to store its parameters in {file} within {STORED_DEADLINE_S:g} s, found other values"
-    )
+    raise Px4Error(f"PX4: expected the changed parameters in {file} within {STORED_DEADLINE_S:g} s, found other values")
 
 
 def restore(folder: Path, data: bytes) -> None:
-    """Restore the last complete content of the file; call it after PX4 has ended."""
+    """Restore the last complete content of the file; call this function after PX4 has ended."""
     file = folder / NAME
     if file.read_bytes() != data:
         file.write_bytes(data)

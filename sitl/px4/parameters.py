@@ -19,19 +19,19 @@ BEFORE_BOOT: Mapping[str, Value] = {
     "SENS_IMU_MODE": 1,
     "EKF2_MULTI_IMU": 0,
 }
-"""Logging from boot until disarming, at a high rate and with the estimator's inputs; one IMU."""
+"""Parameters set before PX4 boots: one IMU, and logging from boot until disarming, at a high rate and with the estimator's inputs."""
 ROLL_PITCH_SHARE = 1.0 / math.sqrt(2.0)
 """Fraction of a roll or pitch command that reaches each rotor of a quad-x, given by the scale of PX4's allocation matrix
 (ControlAllocationPseudoInverse::updateControlAllocationMatrixScale).
 """
 
 SIMULATED_MOCAP: Mapping[str, Value] = {"EKF2_EV_DELAY": 10.0}
-"""Delay from exposure to fusion in ms, measured on 1.16.1: 5 ms of latency, the links, and half a period each of lockstep and EKF2. The
-stub has only the latency, for which the 5 ms of configs/px4/indoor_mocap.params are correct.
+"""Delay from exposure to fusion in ms, measured on PX4 1.16.1: 5 ms of latency, the delay of the links, and half a period each of
+lockstep and EKF2. The stub has only the latency, for which the 5 ms in configs/px4/indoor_mocap.params are correct.
 """
 
 VERSION_DEPENDENT = frozenset(wanted.name for wanted in WANTED if wanted.only)
-"""Parameters that not every PX4 version has."""
+"""Names of the parameters that not every PX4 version has."""
 
 _GAINS = (
     "MC_ROLL_P", "MC_PITCH_P", "MC_YAW_P", "MC_YAW_WEIGHT", "MC_ROLLRATE_MAX", "MC_PITCHRATE_MAX", "MC_YAWRATE_MAX", "MC_YAWRATE_P",
@@ -43,7 +43,10 @@ _MIXED_GAINS = (
 
 
 def rotor_geometry(airframe: Airframe) -> dict[str, Value]:
-    """Return CA_ROTOR*: positions from the centre of mass (FRD, m) and yaw moment ratios, positive for counter-clockwise rotors."""
+    """Return the parameters CA_*: each rotor's position relative to the centre of mass (FRD, m) and its moment ratio.
+
+    The ratio (CA_ROTORn_KM) is positive for counter-clockwise rotors.
+    """
     found: dict[str, Value] = {"CA_AIRFRAME": 0, "CA_ROTOR_COUNT": 4}
     offset = rotor_offset_m(airframe)
     for i, (x, y, yaw) in enumerate(ROTORS):

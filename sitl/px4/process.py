@@ -1,6 +1,7 @@
-"""A real `px4` (SITL) as a child process: finds it, claims a free instance number, starts it in its own folder and stops it.
+"""A real `px4` (SITL) as a child process. This module finds the program, claims a free instance number, starts PX4 in a folder of its
+own and stops it.
 
-PX4 writes its parameters, its logs (`log/*.ulg`) and its output (`px4.log`) to that folder. Outside of it, it writes only
+PX4 writes its parameters, its logs (`log/*.ulg`) and its output (`px4.log`) to that folder. Outside the folder, it writes only
 `/tmp/px4_lock-N` and `/tmp/px4-sock-N`.
 """
 
@@ -26,15 +27,15 @@ from sitl.px4.hil_link import Px4Error
 VARIABLE = "PX4_SITL"
 """Environment variable that names the px4 binary or its build folder (build/px4_sitl_default)."""
 MODEL = "none_iris"
-"""Model: a quad-x with an external simulator, configured by parameters."""
+"""Value of PX4_SIM_MODEL: a quad-x with an external simulator, configured by parameters."""
 INSTANCES = range(10)
-"""Usable instance numbers; every PX4 with number 10 or above sends to the same port, UDP 14549."""
+"""Usable instance numbers; PX4 instances with a number of 10 or above all send to the same port, UDP 14549."""
 HOST = "127.0.0.1"
 HOW_TO_GET_IT = (
-    "set PX4_SITL to its build folder (make px4_sitl_default none in PX4-Autopilot), or install the px4 package"
+    "set PX4_SITL to the build folder of PX4 (make px4_sitl_default none in PX4-Autopilot), or install the px4 package"
 )
 HOW_TO_START_IT = (
-    "PX4_SIM_MODEL={model} px4 -i {number}, always in the same folder, where it keeps its parameters, or "
+    "PX4_SIM_MODEL={model} px4 -i {number}, always in the same folder, in which PX4 stores its parameters, or "
     "PX4_SIM_MODEL={model} make px4_sitl_default none"
 )
 """The two commands that start a PX4 by hand."""
@@ -52,11 +53,11 @@ class Installation:
 
     binary: Path
     etc: Path
-    """Folder of its start scripts (ROMFS)."""
+    """Folder of PX4's start scripts (ROMFS)."""
 
 
 def find(environment: Mapping[str, str] | None = None) -> Installation | None:
-    """Return the PX4 that PX4_SITL names, else the one on PATH, else None.
+    """Return the PX4 that PX4_SITL names; without PX4_SITL, the PX4 on PATH; None if neither is found.
 
     Raises:
         Px4Error: PX4_SITL does not name a program, or the program has no start scripts.
@@ -88,7 +89,7 @@ def _with_etc(binary: Path, origin: str) -> Installation:
 
 
 class Instance:
-    """A free instance number with the sockets that reserve it; a context manager, or closed with `close`.
+    """A reserved instance number with the sockets that reserve it; a context manager, or closed with `close`.
 
     The process that listens on the simulator's TCP port owns the number.
     """
@@ -96,7 +97,7 @@ class Instance:
     def __init__(self, number: int, simulator: socket.socket, control: socket.socket) -> None:
         self.number = number
         self.simulator = simulator
-        """Listening TCP socket that PX4 connects to."""
+        """Listening TCP socket to which PX4 connects."""
         self.control = control
         """UDP socket that receives PX4's camera link."""
 
@@ -122,7 +123,7 @@ class Instance:
 
     @classmethod
     def claim(cls, numbers: range = INSTANCES) -> Instance:
-        """Return the first free instance.
+        """Reserve and return the first free instance.
 
         Raises:
             Px4Error: every instance is in use.
@@ -176,8 +177,8 @@ class Px4Process:
     Args:
         installation: the program to start.
         instance: claimed instance.
-        folder: PX4's working folder, created if absent; PX4 keeps its parameters there from one start to the next.
-        settings: parameters to set before PX4's modules start (PX4_PARAM_* of its start script).
+        folder: PX4's working folder, created if it does not exist; PX4 keeps its parameters there between starts.
+        settings: parameters to set before PX4's modules start (PX4_PARAM_* in its start script).
 
     Raises:
         Px4Error: PX4 cannot be started.
@@ -206,7 +207,7 @@ class Px4Process:
                     preexec_fn=_before_exec,
                 )
         except OSError as error:
-            raise Px4Error(f"PX4: {installation.binary} cannot be started in {folder}: {error.strerror}") from None
+            raise Px4Error(f"PX4: cannot start {installation.binary} in {folder}: {error.strerror}") from None
 
     @property
     def pid(self) -> int:
@@ -219,19 +220,19 @@ class Px4Process:
         return self._process.poll() is None
 
     def exit_summary(self) -> str:
-        """Return one line on how PX4 ended."""
+        """Return one line that describes how PX4 ended."""
         code = self._process.poll()
         how = "is running" if code is None else how_it_ended(code)
         return f"PX4: px4 -i {self._number} {how}{self._last_error_line()}; see {self.log}"
 
     async def await_end(self, deadline_s: float) -> bool:
-        """Wait until PX4 has ended. Return False at the timeout."""
+        """Wait until PX4 has ended; return False at the timeout."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             await asyncio.to_thread(self._process.wait, deadline_s)
         return not self.running
 
     def terminate(self) -> None:
-        """Send SIGTERM. In lockstep PX4 needs samples until it has ended, because they drive its clock."""
+        """Send SIGTERM to PX4. In lockstep, PX4 needs samples until it has ended, because they drive its clock."""
         if self.running:
             self._process.terminate()
 
@@ -253,7 +254,9 @@ class Px4Process:
 
 
 def _before_exec() -> None:
-    """Prepare the child: it ends with the parent, because PX4 would wait for a simulator for ever, and gives up real-time priority."""
+    """Prepare the child process: it ends with its parent, because PX4 would otherwise wait forever for a simulator, and it gives up
+    real-time priority.
+    """
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 

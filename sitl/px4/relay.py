@@ -1,4 +1,4 @@
-"""A UDP relay between the companion and a real PX4 that injects link faults: lost, or delayed in both directions."""
+"""A UDP relay between the companion and a real PX4 that injects link faults: loss, or a delay in both directions."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from sitl.udp import Address, UdpEndpoint
 
 
 class Relay:
-    """Relays between the port to which PX4 sends and one for the companion.
+    """Relays datagrams between the port to which PX4 sends and a port for the companion.
 
     Args:
-        instance: claimed instance.
+        instance: the PX4 instance number that this process has reserved.
     """
 
     def __init__(self, instance: Instance) -> None:
         self.down = False
         self.delay_s = 0.0
         self.datagrams = 0
-        """Datagrams received from both sides."""
+        """Number of datagrams received from both sides."""
         self._instance = instance
         self._px4 = _Side(self, instance.onboard_address)
         self._companion = _Side(self, None)
@@ -50,7 +50,7 @@ class _Side(UdpEndpoint):
         self._relay = relay
         self._fixed = peer is not None
         self._peer = peer
-        """Destination of this side; without a fixed peer, the newest sender."""
+        """Address to which this side sends; without a fixed peer, the newest sender."""
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
         self._relay.datagrams += 1

@@ -262,14 +262,14 @@ def test_without_a_px4_the_flight_is_refused_within_seconds_with_how_to_get_one(
     with sandbox_in(tmp_path / "sandbox", nowhere) as sandbox:
         ended = sandbox.run("fly", HOVER, "--sitl=px4", "--out", "out")
         sandbox.assert_nobody_left()
-    assert "waiting up to 10 s for one that was started by hand, on TCP 456" in ended.out
+    assert "waiting up to 10 s on TCP 456" in ended.out
     waiting = ended.out.partition("started by hand")[2]
-    assert "same folder, where it keeps its parameters" in waiting
+    assert "same folder, in which PX4 stores its parameters" in waiting
     assert "make px4_sitl_default none" in waiting
     assert ended.code == EXIT_REFUSED, (ended.out, ended.err)
     assert len(ended.err_lines) == 1, ended.err
     for said in (
-        "within 10 s, found nobody there",
+        "within 10 s, found no connection",
         "PX4_SITL",
         "none_iris px4 -i ",
         "same folder",

@@ -1,5 +1,5 @@
 """Sections of the simulated world: one module per effect of a laboratory, with its switch and its parameters.
 
-A new section is also a key of `companion.sitl_config.world.World`. Its physics is in `sitl.world.effects`, which says where it acts;
-its values in the built-in worlds are in `configs/worlds`.
+To add a section, add its key to `companion.sitl_config.world.World`, its physics to `sitl.world.effects` (whose docstring says where an
+effect acts) and its values to the built-in worlds in `configs/worlds`.
 """

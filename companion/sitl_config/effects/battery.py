@@ -6,7 +6,7 @@ from companion.config.base import Model, NonNegative, Positive
 
 
 class Battery(Model):
-    """True battery: four lithium-polymer cells. Its capacity is the charge that a hover of `world.battery_life_s` draws."""
+    """True battery of four lithium-polymer cells. Its capacity is the charge that a hover of `world.battery_life_s` draws."""
 
     on: bool = False
     """Whether this effect acts."""
@@ -15,6 +15,8 @@ class Battery(Model):
     full_thrust_v: Positive = 16.0
     """Voltage at which the vehicle file's `thrust_max_n` is correct; thrust is proportional to the square of the voltage (e)."""
     power_w_n15: Positive = 3.9
-    """Electrical power of a rotor over thrust^1.5, W/N^1.5 (e: 0.56 of the ideal 2.19 of a 13-inch rotor; 9.5 g/W at 7.4 N)."""
+    """Electrical power of a rotor divided by thrust^1.5, W/N^1.5 (e: an efficiency of 0.56 against the ideal 2.19 for a 13-inch
+    rotor; 9.5 g/W at 7.4 N).
+    """
     electronics_w: NonNegative = 15.0
-    """Power of everything but the rotors (e: companion computer, autopilot, sensors, servos)."""
+    """Electrical power of everything but the rotors (e: companion computer, autopilot, sensors, servos)."""

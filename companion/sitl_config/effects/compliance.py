@@ -1,4 +1,4 @@
-"""Section `compliance` of the simulated world: the arm's links bend and its mount yields."""
+"""Section `compliance` of the simulated world: flexible arm links and a flexible arm mount."""
 
 from __future__ import annotations
 
@@ -18,10 +18,9 @@ class Compliance(Model):
     on: bool = False
     """Whether this effect acts."""
     mount_deg_per_nm: DegPerNm = 1.0
-    """Tilt of the shoulder servo with its mount under the shoulder's torque, deg per N m (e: 0.5 to 2)."""
+    """Tilt of the shoulder servo and its mount under the shoulder's torque, deg per N m (e: 0.5 to 2)."""
     link_deg_per_nm: DegPerNm = 1.0
-    """Rotation of the tool against the elbow's output shaft under the elbow's torque, deg per N m: horn and bending of link 2
-    (e: 0.5 to 2)."""
+    """Rotation of the tool relative to the elbow's output shaft under the elbow's torque, deg per N m: twist of the horn and bending of
+    link 2 (e: 0.5 to 2)."""
     relaxation_s: NonNegative = 0.0006
-    """Damping over stiffness of both springs, and of the gears with `servo_mechanics` (e: 2 to 4 % of critical damping at the arm's
-    frequencies of 10 to 20 Hz)."""
+    """Damping divided by stiffness of both springs (e: 2 to 4 % of critical damping at the arm's frequencies of 10 to 20 Hz)."""

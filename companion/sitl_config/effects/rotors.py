@@ -1,4 +1,4 @@
-"""Section `rotors` of the simulated world: thrust curve, spread, lag, drag and ground effect of the true rotors."""
+"""Section `rotors` of the simulated world: thrust curve, differences between rotors, lag, drag and ground effect."""
 
 from __future__ import annotations
 
@@ -13,23 +13,25 @@ class Rotors(Model):
     on: bool = False
     """Whether this effect acts."""
     thrust_curve: Fraction = 0.5
-    """f of the true static curve: thrust / full thrust = f s^2 + (1 - f) s at motor signal s. PX4's airframes for multirotors set 0.25
-    to 0.35 (p: ROMFS/px4fmu_common/init.d/airframes), ArduPilot's default for the same curve is 0.65 (p: MOT_THST_EXPO).
+    """f of the true static curve: thrust / full thrust = f s^2 + (1 - f) s at motor signal s. PX4's multirotor airframes set 0.25 to
+    0.35 (p: ROMFS/px4fmu_common/init.d/airframes); ArduPilot's default for the same curve is 0.65 (p: MOT_THST_EXPO).
     """
     thr_mdl_fac: Fraction = 0.3
-    """PX4's THR_MDL_FAC, whose curve PX4 inverts in place of the true one (p: 0.3 in PX4's airframes generic_250, qav250, px4vision).
+    """PX4's THR_MDL_FAC, the factor of the curve that PX4 assumes and inverts (p: 0.3 in PX4's airframes generic_250, qav250,
+    px4vision).
     """
     lag_up_s: Positive = 0.04
     """Time constant of a rotor that speeds up; replaces `world.rotor_lag_s` (e: 13-inch propellers, 0.03 to 0.05)."""
     lag_down_s: Positive = 0.07
-    """Time constant of a rotor that slows down, without active braking (e: 0.06 to 0.08; p: twice the lag up in RotorS and in PX4's
+    """Time constant of a rotor that slows down, without active braking (e: 0.06 to 0.08; p: twice `lag_up_s` in RotorS and in PX4's
     Gazebo x500)."""
     thrust_error: RotorErrors = (0.015, -0.02, 0.01, -0.005)
     """Relative error of each rotor's thrust at a given signal, in PX4's quad-x order (e: +-0.03)."""
     yaw_torque_error: RotorErrors = (0.05, -0.03, -0.05, 0.03)
     """Relative error of each rotor's yaw torque at a given thrust (e: +-0.1 for propellers and motor mounts)."""
     drag_s_m: NonNegative = 0.02
-    """Rotor drag (H-force) over thrust, per airspeed across the rotor axis (p: 0.0124 from the coefficients of PX4's Gazebo x500,
+    """Rotor drag (H-force) divided by thrust and by the airspeed across the rotor axis (p: 0.0124 from the coefficients of PX4's
+    Gazebo x500,
     0.0153 from PX4's default EKF2_MCOEF of 0.15 1/s, 0.039 and 0.055 from Faessler et al. 2018, 0.386 and 0.544 1/s)."""
     radius_m: Positive = 0.165
     """Radius of a rotor, for ground effect and downwash (m: 13-inch propellers of the Tarot 650 Sport)."""

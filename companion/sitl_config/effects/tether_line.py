@@ -6,11 +6,11 @@ from companion.config.base import Model, NonNegative
 
 
 class TetherLine(Model):
-    """The slack tether. Anchor, length and attachment are those of the vehicle file; the anchor is on the floor."""
+    """The slack tether. Its anchor, length and attachment are given by the vehicle file; the anchor is on the floor."""
 
     on: bool = False
     """Whether this effect acts."""
     mass_g_per_m: NonNegative = 16.0
     """Mass per length (p: 5 mm polyester rope, 16 g/m and 3.4 kN, engineeringtoolbox.com; 6 mm 24 to 29 g/m; e: 10 to 30)."""
     floor_friction: NonNegative = 0.3
-    """Coefficient of friction of the part that lies on the floor; when the vehicle moves it drags half of that part (e)."""
+    """Friction coefficient of the part that lies on the floor; a moving vehicle drags half of that part (e)."""

@@ -6,8 +6,8 @@ from companion.config.base import Model, NonNegative
 
 
 class Thrower(Model):
-    """A person who throws the payload. Every value is a standard deviation, drawn again for each throw. Without this effect each throw
-    meets the predicted position of the net with `throw_velocity_m_s`.
+    """A person who throws the payload. Every value is a standard deviation; the errors are drawn anew for each throw. Without this
+    effect, each throw meets the predicted position of the net with `throw_velocity_m_s`.
     """
 
     on: bool = False
@@ -17,8 +17,8 @@ class Thrower(Model):
     direction_error_deg: NonNegative = 1.3
     """Error of the release direction, sideways and in elevation. Skilled basketball players: 1.3 (p: Slegers et al. 2021)."""
     release_error_m: NonNegative = 0.05
-    """Scatter of the release point on each axis. The person aims from there, so it changes the payload's speed and direction at the
-    net, not the point of arrival (e).
+    """Scatter of the release point on each axis. The thrower aims from that point, so the scatter changes the payload's speed and
+    direction at the net, but not its point of arrival (e).
     """
     prediction_error_s: NonNegative = 0.05
     """Error of the time over which the person extrapolates the vehicle's motion (e)."""
