@@ -1,8 +1,8 @@
-"""The compiled build: a copy of `companion` and `sitl` in build/compiled, in which mypyc has compiled the modules that compute.
+"""The compiled build: a copy of `companion` and `sitl` in build/compiled, in which mypyc has compiled the computational modules.
 
-`python -m tools.compiled` makes it. Its results are identical to the bit with those of the source, and it runs instead of the source
-when it comes first on the module path: `PYTHONSAFEPATH=1 PYTHONPATH=$PWD/build/compiled .venv/bin/companion ...`. The source tree does
-not change.
+`python -m tools.compiled` makes it. The compiled build gives bit-identical results to the source. It runs in place of the source when
+it is first on the module path: `PYTHONSAFEPATH=1 PYTHONPATH=$PWD/build/compiled .venv/bin/companion ...`. The source tree is not
+changed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from companion.recorder.versions import REVISION_FILE, versions
 ROOT = Path(__file__).parent.parent
 BUILD = ROOT / "build" / "compiled"
 WORK = ROOT / "build" / "mypyc"
-"""Generated C, objects, and the cache of mypy."""
+"""Folder for the generated C code, the object files and mypy's cache."""
 PACKAGES = ("companion", "sitl")
 COMPILED = (
     "companion/core/*.py",
@@ -56,23 +56,23 @@ INTERPRETED = frozenset(
 )
 """Files that match `COMPILED` but stay plain Python."""
 FLAGS = "-O2 -ffp-contract=off"
-"""Fused multiply-add would change the last bits on processors that have it (aarch64)."""
+"""Compiler flags without fused multiply-add, which would change the last bits on processors that have it (aarch64)."""
 
 
 def sources() -> list[Path]:
-    """Return the files of the packages, relative to the root of the repository."""
+    """Return the paths of all files of the packages, relative to the root of the repository."""
     found = (path for package in PACKAGES for path in (ROOT / package).rglob("*"))
     return [path.relative_to(ROOT) for path in found if path.is_file() and path.parent.name != "__pycache__"]
 
 
 def modules() -> list[str]:
-    """Return the files to compile, relative to the root of the repository."""
+    """Return the paths of the files to compile, relative to the root of the repository."""
     found = {str(path.relative_to(ROOT)) for pattern in COMPILED for path in ROOT.glob(pattern)}
     return sorted(name for name in found - INTERPRETED if not name.endswith("__init__.py"))
 
 
 def is_current() -> bool:
-    """Return whether the compiled build exists and was made of the present source."""
+    """Return whether the compiled build exists and was made from the present source."""
     return next(BUILD.glob("*.so"), None) is not None and all(
         (BUILD / path).exists() and filecmp.cmp(ROOT / path, BUILD / path, shallow=False) for path in sources()
     )

@@ -1,1 +1,1 @@
-"""PX4's parameters that this project requires, and their files."""
+"""The PX4 parameters that this project requires, and their files."""

@@ -1,7 +1,7 @@
-"""Parameter files in QGroundControl's format: tab-separated Vehicle-Id, Component-Id, Name, Value, Type; `#` begins a comment.
+"""Parameter files in QGroundControl's format: tab-separated Vehicle-Id, Component-Id, Name, Value and Type; `#` begins a comment.
 
-Types are MAV_PARAM_TYPE: 6 is INT32, 9 is REAL32; PX4 has no others. The reader rejects everything that QGroundControl rejects and
-reports each error with file and line. Values are written so that they read back equal.
+The types are those of MAV_PARAM_TYPE: 6 is INT32 and 9 is REAL32; PX4 has no others. The reader rejects everything that QGroundControl
+rejects and reports each error with file and line. A written value is equal to the original when it is read back.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ class Entry:
 
     name: str
     value: Value
-    """The value, an int for INT32 and a float in single precision for REAL32."""
+    """Value of the parameter: an int for INT32, a float in single precision for REAL32."""
     line: int
     vehicle_id: int = VEHICLE_ID
     component_id: int = COMPONENT_ID
 
 
 def read(path: str | Path) -> dict[str, Value]:
-    """Return the values by name, in the file's order.
+    """Return the values in the file by name, in the file's order.
 
     Raises:
-        ConfigError: one line per problem, `file:line: problem`.
+        ConfigError: the file is unreadable or invalid; the exception has one line per problem, `file:line: problem`.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
@@ -59,7 +59,11 @@ def read(path: str | Path) -> dict[str, Value]:
 
 
 def parse(text: str, source: str) -> list[Entry]:
-    """Parse the text of a parameter file and return its entries. `source` is the file name used in messages."""
+    """Parse the text of a parameter file and return its entries. `source` is the file name used in messages.
+
+    Raises:
+        ConfigError: the text is invalid; the exception has one line per problem.
+    """
     entries: dict[str, Entry] = {}
     problems: list[str] = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -68,7 +72,7 @@ def parse(text: str, source: str) -> list[Entry]:
         try:
             entry = _entry(line, number)
             if entry.name in entries:
-                raise _WrongError(f"{entry.name} is a duplicate of line {entries[entry.name].line}")
+                raise _WrongError(f"{entry.name} is already set in line {entries[entry.name].line}")
         except _WrongError as error:
             problems.append(f"{source}:{number}: {error}")
         else:
@@ -81,20 +85,20 @@ def parse(text: str, source: str) -> list[Entry]:
 
 
 class _WrongError(Exception):
-    """A line is invalid; the text names the problem."""
+    """A line is invalid; the text states the problem."""
 
 
 def _entry(line: str, number: int) -> Entry:
     cells = line.split("\t")
     if len(cells) != 5:
-        hint = "; separate them by tabs, not spaces" if len(line.split()) == 5 else ""
+        hint = "; separate them with tabs, not spaces" if len(line.split()) == 5 else ""
         raise _WrongError(f"expected 5 fields (vehicle, component, name, value, type), found {len(cells)}{hint}")
     vehicle, component, name, value, kind = cells
     for title, cell in (("vehicle id", vehicle), ("component id", component)):
         if not (_INTEGER.fullmatch(cell) and 1 <= int(cell) <= 255):
             raise _WrongError(f"expected a {title} from 1 to 255, found {cell!r}")
     if _NAME.fullmatch(name) is None:
-        raise _WrongError(f"expected a name of up to 16 characters A-Z, 0-9 and _, found {name!r}")
+        raise _WrongError(f"expected a name with 1 to 16 of the characters A-Z, 0-9 and _, found {name!r}")
     if kind not in (str(INT32), str(REAL32)):
         raise _WrongError(f"{name}: expected type {INT32} (INT32) or {REAL32} (REAL32), found {kind!r}")
     number_of = _int32 if kind == str(INT32) else _real32
@@ -107,7 +111,7 @@ def _int32(name: str, cell: str) -> int:
     if _INTEGER.fullmatch(cell) is None:
         raise _WrongError(f"{name}: expected a whole number (type {INT32}), found {cell!r}")
     if not _INT32_MIN <= int(cell) <= _INT32_MAX:
-        raise _WrongError(f"{name}: expected a number of 32 bits, found {cell}")
+        raise _WrongError(f"{name}: expected a whole number that fits into 32 bits, found {cell}")
     return int(cell)
 
 
@@ -117,7 +121,7 @@ def _real32(name: str, cell: str) -> float:
     try:
         return single(float(cell))
     except OverflowError:
-        raise _WrongError(f"{name}: expected a number of single precision, found {cell}") from None
+        raise _WrongError(f"{name}: expected a number that fits into single precision, found {cell}") from None
 
 
 def single(value: float) -> float:
@@ -132,14 +136,14 @@ def single(value: float) -> float:
 
 
 def same(one: Value, other: Value) -> bool:
-    """Return whether both are the same parameter value: the same type, and equal as PX4 stores them."""
+    """Return whether two parameter values have the same type and are equal as PX4 stores them."""
     if isinstance(one, int) or isinstance(other, int):
         return isinstance(one, int) and isinstance(other, int) and one == other
     return single(one) == single(other)
 
 
 def value_text(value: Value) -> str:
-    """Return the value as text with the fewest digits that read back equal."""
+    """Return the value as text, with the fewest digits from which the same value is read back."""
     if isinstance(value, int):
         return str(value)
     stored = single(value)
@@ -159,7 +163,13 @@ def _is(text: str, stored: float) -> bool:
 def text(
     values: Mapping[str, Value], heading: Iterable[str] = (), comments: Mapping[str, Iterable[str]] | None = None
 ) -> str:
-    """Return the text of a file. `heading` and the `comments` before a name are lines without their `#`."""
+    """Return the text of a parameter file.
+
+    Args:
+        values: values by name.
+        heading: comment lines at the top of the file, without `#`.
+        comments: comment lines before a parameter, by its name, without `#`.
+    """
     lines = [_comment(line) for line in heading]
     lines.append(COLUMNS)
     for name, value in values.items():

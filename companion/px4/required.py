@@ -1,8 +1,8 @@
-"""PX4 parameters that a flight depends on: required value, and the consequence of any other value.
+"""PX4 parameters on which a flight depends: the required value of each, and the consequence of any other value.
 
-The preflight's rows, `companion px4 params`, configs/px4/indoor_mocap.params, the table of docs/px4.md and the stub's own settings come
-from this one table. Names, types and limits are those of PX4 1.16.1 and 1.18 (their parameter metadata); whether a change needs a
-reboot is taken from PX4's metadata.
+The rows of the preflight checks, `companion px4 params`, configs/px4/indoor_mocap.params, the table of docs/px4.md and the stub's
+settings come from this one table. Names, types, limits and whether a change needs a reboot are taken from the parameter metadata of
+PX4 1.16.1 and 1.18.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ Limits = Callable[[Vehicle], tuple[float, float]]
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """One parameter. The values of `ok` or those within `limits` are accepted; if neither is set, only `value`."""
+    """One parameter. The values in `ok` or within `limits` are accepted; if neither is set, only `value` is accepted."""
 
     name: str
     value: Value | None
-    """Value in the file, of PX4's type: int for INT32, float for REAL32. None if it is measured on each vehicle."""
+    """Value in the parameter file, in PX4's type: int for INT32, float for REAL32. None if it is measured on each vehicle."""
     why: str
     """Consequence of a wrong value, or meaning of the values."""
     level: Level = Level.REFUSE
@@ -41,17 +41,19 @@ class Wanted:
     ok: tuple[int, ...] = ()
     limits: Limits | None = None
     limits_text: str = ""
-    """Limits as text if they depend on the vehicle file."""
+    """Description of the limits, if they depend on the vehicle file."""
     fix: str = ""
-    """Remedy, if it is something other than setting the parameter."""
+    """Remedy, if it is not simply to set the parameter."""
     hardware: bool = False
-    """Whether it belongs to the serial port TELEM2. It is checked only on a serial link; PX4's simulator lacks some of them."""
+    """Whether the parameter belongs to the serial port TELEM2. Such parameters are checked only on a serial link, because PX4's
+    simulator lacks some of them.
+    """
     file: bool = True
-    """Whether it is part of configs/px4/indoor_mocap.params."""
+    """Whether the parameter is in configs/px4/indoor_mocap.params."""
     measured: bool = False
-    """Whether it is measured on each installation: a value within `limits` that is not PX4's own default is left unchanged."""
+    """Whether the value is measured on each installation. If so, a value within `limits` other than PX4's default is left unchanged."""
     only: str = ""
-    """The only PX4 version with the parameter; empty if all have it."""
+    """The only PX4 version that has the parameter; empty if all versions have it."""
 
     @property
     def integer(self) -> bool:
@@ -59,7 +61,7 @@ class Wanted:
         return isinstance(self.value, int)
 
     def accepts(self, value: Value, vehicle: Vehicle) -> bool:
-        """Return whether this vehicle can fly with PX4's value."""
+        """Return whether this vehicle can fly with the value in PX4."""
         if self.ok:
             return value in self.ok
         if self.limits is None:
@@ -71,7 +73,7 @@ class Wanted:
         return low - slack <= value <= high + slack
 
     def text(self, vehicle: Vehicle | None = None) -> str:
-        """Return the accepted values for display; without a vehicle file, limits that depend on it are named instead."""
+        """Return the accepted values for display. Without a vehicle, limits that depend on it are described in words."""
         if self.ok:
             return " or ".join(f"{value}" for value in self.ok)
         if self.limits is None:
@@ -110,36 +112,37 @@ def _above_abort(vehicle: Vehicle) -> tuple[float, float]:
 
 _WARN = Level.WARN
 _RAISES = (
-    "delay of a sensor that is not fused, ms; if it is larger, PX4 raises EKF2_DELAY_MAX to it, so it is written first"
+    "delay of a sensor that is not fused, ms; PX4 raises EKF2_DELAY_MAX to it if it is larger, so it is written first"
 )
-_FOLLOWS = (
-    "time constant with which the output follows the delayed filter, s; a larger one keeps IMU errors in it for longer"
-)
+_FOLLOWS = "time constant with which the output follows the delayed filter, s; with a larger value, IMU errors persist for longer"
 _CEILING = "0 to `room.z_m` minus 0.3"
 
 GROUPS: dict[str, tuple[Wanted, ...]] = {
-    "Estimator: motion capture alone": (
-        Wanted("EKF2_EN", 1, "without EKF2 there is no estimate at all"),
+    "Estimator: motion capture only": (
+        Wanted("EKF2_EN", 1, "without EKF2, PX4 has no estimate at all"),
         Wanted(
-            "EKF2_EV_CTRL", 11, "position, height and yaw come from vision; whatever did not would drift", ok=(11, 15)
+            "EKF2_EV_CTRL",
+            11,
+            "position, height and yaw come from vision; a quantity that did not would drift",
+            ok=(11, 15),
         ),
         Wanted(
             "EKF2_HGT_REF",
             3,
-            "height would follow the barometer, and rotor wash indoors shifts it by a metre",
+            "the height would follow the barometer, whose reading rotor wash shifts by a metre indoors",
             reboot=True,
         ),
         Wanted("EKF2_GPS_CTRL", 0, "a GPS fix through a window would shift the position estimate out of the room"),
         Wanted(
             "EKF2_BARO_CTRL",
             0,
-            "rotor wash and doors disturb the barometer, which is fused against motion capture",
+            "rotor wash and doors disturb the barometer, and its errors would be fused along with motion capture",
             _WARN,
         ),
         Wanted(
             "EKF2_MAG_TYPE",
             5,
-            "steel and motors disturb the compass; yaw would switch between it and motion capture",
+            "steel and motors disturb the compass; the yaw source would switch between the compass and motion capture",
             reboot=True,
         ),
         Wanted("EKF2_OF_CTRL", 0, "an optical flow sensor would mistake the arm's motion for the vehicle's", _WARN),
@@ -161,8 +164,8 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "EKF2_DELAY_MAX",
             50.0,
-            "lag of the filter, ms, over which its output is predicted forward: with PX4's 200, and 0.25 s for the next two, "
-            "the estimate drifts by 3 to 4 mm",
+            "lag of the filter, ms, over which its output is predicted forward: with PX4's defaults, 200 ms here and 0.25 s for "
+            "the next two parameters, the estimate drifts by 3 to 4 mm",
             _WARN,
             reboot=True,
             limits=_between(30.0, 60.0),
@@ -171,7 +174,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "EKF2_EVP_NOISE",
             0.01,
-            "noise of the position, m; if it is much larger, the estimate follows the IMU's drift, not motion capture",
+            "noise of the position, m; if it is much larger, the estimate follows the drift of the IMU instead of motion capture",
             _WARN,
             limits=_between(0.005, 0.05),
         ),
@@ -183,19 +186,21 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             limits=_between(0.01, 0.1),
         ),
         Wanted(
-            "EKF2_EV_QMIN", 0, "VISION_POSITION_ESTIMATE carries no quality: if the minimum is above 0 nothing is fused"
+            "EKF2_EV_QMIN",
+            0,
+            "VISION_POSITION_ESTIMATE contains no quality; if the minimum is above 0, nothing is fused",
         ),
         *(
             Wanted(
                 f"EKF2_EV_POS_{axis}",
                 0.0,
-                "offset of the body's pivot from PX4's centre of mass, m: it moves the estimate when the vehicle tilts",
+                "offset of the body's pivot from PX4's centre of mass, m; it shifts the estimate when the vehicle tilts",
                 limits=_between(-0.02, 0.02),
             )
             for axis in "XYZ"
         ),
         Wanted(
-            "SYS_HAS_GPS", 0, "PX4 waits for a GPS that is not used, and warns that it is missing", _WARN, reboot=True
+            "SYS_HAS_GPS", 0, "PX4 waits for a GPS that is not used and warns that it is missing", _WARN, reboot=True
         ),
         Wanted("SYS_HAS_MAG", 0, "PX4 refuses to arm if a compass is missing or disturbed by steel", reboot=True),
         Wanted("COM_ARM_WO_GPS", 1, "if 0, PX4 refuses to arm without GPS", ok=(1, 2)),
@@ -211,42 +216,46 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "COM_OBL_RC_ACT",
             4,
-            "4 lands; 0 to 2 give control to a radio without a pilot, 3 climbs and returns, 6 and 7 stop the motors",
+            "4 lands; 0 to 2 give control to a radio that has no pilot, 3 climbs and flies home, 6 and 7 stop the motors",
         ),
     ),
     "The pilot's radio": (
         Wanted(
             RADIO,
             NO_RADIO,
-            "4 disables the pilot's sticks and mode switch: only for a vehicle without a radio",
+            "4 disables the pilot's sticks and mode switch; it is only for a vehicle without a radio",
             ok=(0, 1, 2, 3, 4),
-            fix="set 4 without a radio (configs/px4/no_radio.params), else the one that fits the radio",
+            fix="without a radio set 4 (configs/px4/no_radio.params), otherwise the value for this radio",
             file=False,
         ),
         Wanted(
             "NAV_RCL_ACT",
             3,
-            "3 lands when the radio is lost; 2 climbs and returns across the tether, 5 and 6 stop the motors",
+            "3 lands when the radio is lost; 2 climbs and flies home, which can cross the tether; 5 and 6 stop the motors",
         ),
         Wanted(
             "COM_RCL_EXCEPT",
             0,
-            "if bit 2 is set, PX4 ignores a lost radio in OFFBOARD, and the pilot cannot take over",
+            "if bit 2 is set, PX4 ignores the loss of the radio in OFFBOARD, and the pilot cannot take over",
             _WARN,
         ),
     ),
     "Other failsafes": (
-        Wanted("NAV_DLL_ACT", 0, "any other value ends the flight when QGroundControl is closed, 2 with a climb"),
+        Wanted(
+            "NAV_DLL_ACT",
+            0,
+            "with any other value, PX4 ends the flight when QGroundControl is closed; with 2, it climbs first",
+        ),
         Wanted(
             "COM_LOW_BAT_ACT",
             2,
-            "2 lands on a critical battery if the vehicle has not landed before; 3 returns, 0 only warns",
+            "2 lands at critical battery charge if the vehicle has not landed before; 3 flies home, 0 only warns",
             _WARN,
         ),
         Wanted(
             "BAT_CRIT_THR",
             0.1,
-            "PX4's own landing must come after the companion's, which controls the position",
+            "the companion's landing, which controls the position, must begin before PX4's own landing",
             _WARN,
             limits=_below_own_landing,
             limits_text="0.05 to `safety.battery_min` minus 0.02",
@@ -254,14 +263,14 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "COM_FLTT_LOW_ACT",
             1,
-            "3 returns when PX4 estimates that the flight time is used up; with 0, PX4 has been seen to leave OFFBOARD for HOLD",
+            "3 flies home when PX4 estimates that the flight time is used up; with 0, PX4 was observed to leave OFFBOARD for HOLD",
             _WARN,
         ),
-        Wanted("GF_ACTION", 2, "3 climbs and returns at PX4's own fence, 4 stops the motors", ok=(0, 1, 2, 5)),
+        Wanted("GF_ACTION", 2, "3 climbs and flies home at PX4's own geofence, 4 stops the motors", ok=(0, 1, 2, 5)),
         Wanted(
             "RTL_RETURN_ALT",
             1.5,
-            "height to which every return of PX4 climbs first, m: into the ceiling, or until the tether stops it",
+            "height to which PX4 climbs before it flies home, m; if too large, the ceiling or the tether stops the vehicle",
             limits=_below_ceiling,
             limits_text=_CEILING,
         ),
@@ -276,7 +285,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             Wanted(
                 f"FD_FAIL_{axis}",
                 60,
-                "tilt, deg, beyond which PX4 stops the motors in the first seconds after take-off; must be well above "
+                "tilt beyond which PX4 stops the motors in the first seconds after take-off, deg; it must be well above "
                 "`safety.tilt_abort_deg`",
                 _WARN,
                 limits=_above_abort,
@@ -284,50 +293,50 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             )
             for axis in "RP"
         ),
-        Wanted("CBRK_SUPPLY_CHK", 0, "any other value switches the check of the supply voltage off", _WARN),
-        Wanted("SYS_FAILURE_EN", 0, "one stray message could switch off a motor", reboot=True),
-        Wanted("COM_THROW_EN", 0, "an armed vehicle that is picked up and moved fast would start its motors"),
+        Wanted("CBRK_SUPPLY_CHK", 0, "any other value disables the check of the supply voltage", _WARN),
+        Wanted("SYS_FAILURE_EN", 0, "if 1, one stray message could switch off a motor", reboot=True),
+        Wanted("COM_THROW_EN", 0, "if 1, an armed vehicle that is picked up and moved fast would start its motors"),
     ),
     "Arming, take-off and landing": (
         Wanted(
             HOVER,
             None,
-            "PX4 holds and lands with it, and the companion starts from it: if it is too large the vehicle jumps, if it is too "
-            "small it does not lift",
+            "PX4 holds and lands with this thrust, and the companion starts from it; if it is too large, the vehicle jumps at "
+            "take-off; if it is too small, the vehicle does not lift off",
             limits=_hover,
-            limits_text="within 35 % of `airframe.hover_thrust`, or of weight / `airframe.thrust_max_n`",
+            limits_text="within 35 % of `airframe.hover_thrust`, or of weight / `airframe.thrust_max_n` if that is not set",
             fix="measure it (companion hover fit) and set it, or correct airframe.mass_kg and airframe.thrust_max_n",
             file=False,
         ),
         Wanted(
             "COM_SPOOLUP_TIME",
             1.0,
-            "time after arming for which PX4 limits thrust, s, while the companion spools up",
+            "time after arming for which PX4 limits the thrust, s, while the companion spools up",
             limits=_between(0.0, SPOOL_S),
         ),
         Wanted(
             "COM_DISARM_LAND",
             2.0,
-            "time from PX4's own landing to its disarm, s; if 0 or less, the rotors continue to turn",
+            "time from PX4's own landing until it disarms, s; if it is 0 or less, the rotors continue to turn",
             limits=_between(0.1, 5.0),
         ),
         Wanted(
             "COM_DISARM_PRFLT",
             10.0,
-            "time after arming within which the vehicle must take off, s; if too short, PX4 disarms while the companion spools up",
+            "time after arming within which the vehicle must take off, s; if it is too short, PX4 disarms during spool-up",
             limits=_between(5.0, 60.0),
         ),
         Wanted(
             "MPC_LAND_SPEED",
             0.7,
-            "descent speed of PX4's own landing, m/s, in which the net touches down first",
+            "descent speed of PX4's own landing, m/s; the net touches down first",
             _WARN,
             limits=_between(0.3, 1.0),
         ),
         Wanted(
             "MIS_TAKEOFF_ALT",
             1.0,
-            "height to which a pilot's Takeoff mode climbs, m",
+            "height to which the vehicle climbs if a pilot selects the mode Takeoff, m",
             _WARN,
             limits=_below_ceiling,
             limits_text=_CEILING,
@@ -344,8 +353,8 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "MPC_ACC_HOR",
             8.0,
-            "acceleration, m/s^2; if smaller, LAND stops further ahead, 0.53 m after a takeover with PX4's 3; the flown "
-            "acceleration stays below it because of MPC_JERK_AUTO and MPC_TILTMAX_AIR",
+            "acceleration, m/s^2; if it is smaller, LAND stops further ahead (0.53 m after a takeover with PX4's default of 3); "
+            "MPC_JERK_AUTO and MPC_TILTMAX_AIR keep the actual acceleration below it",
             _WARN,
             limits=_between(5.0, 10.0),
         ),
@@ -372,14 +381,26 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         ),
     ),
     "Serial link to the companion: TELEM2": (
-        Wanted("MAV_1_CONFIG", 102, "any other value means no MAVLink on TELEM2", _WARN, reboot=True, hardware=True),
         Wanted(
-            "MAV_1_MODE", 2, "other modes send too few messages at too low rates", _WARN, reboot=True, hardware=True
+            "MAV_1_CONFIG",
+            102,
+            "with any other value, there is no MAVLink on TELEM2",
+            _WARN,
+            reboot=True,
+            hardware=True,
+        ),
+        Wanted(
+            "MAV_1_MODE",
+            2,
+            "the other modes send too few messages, and at rates that are too low",
+            _WARN,
+            reboot=True,
+            hardware=True,
         ),
         Wanted(
             "MAV_1_RATE",
             80000,
-            "data rate, B/s; 0 means half of the link's bandwidth, at which PX4 reduces the rate of every stream",
+            "data rate, B/s; 0 means half of the link's bandwidth, and PX4 then reduces the rate of every stream",
             _WARN,
             reboot=True,
             hardware=True,
@@ -395,14 +416,14 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         ),
     ),
 }
-"""Parameters by group, in the order of the documentation, which is also the order of writing."""
+"""Parameters by group, in the order in which they are documented and written."""
 
 WANTED: tuple[Wanted, ...] = tuple(one for group in GROUPS.values() for one in group)
 BY_NAME = {one.name: one for one in WANTED}
 
 
 def names() -> tuple[str, ...]:
-    """Return the names of all parameters that the preflight reads."""
+    """Return the names of all parameters that the preflight check reads."""
     return tuple(BY_NAME)
 
 
@@ -412,6 +433,6 @@ def file_values() -> dict[str, Value]:
 
 
 def simulated_values() -> dict[str, Value]:
-    """Return the parameters of a simulated PX4: the file without the serial port and without a radio."""
+    """Return the parameters of a simulated PX4 by name: those of the file, but without the serial port and for no radio."""
     values = {one.name: one.value for one in WANTED if one.file and not one.hardware and one.value is not None}
     return {**values, RADIO: NO_RADIO}

@@ -50,19 +50,19 @@ def test_a_file_of_qgroundcontrol_is_read() -> None:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("1 1 EKF2_EV_CTRL 11 6", "found 1; separate them by tabs, not spaces"),
+        ("1 1 EKF2_EV_CTRL 11 6", "found 1; separate them with tabs, not spaces"),
         ("1\t1\tEKF2_EV_CTRL\t11", "expected 5 fields"),
         ("0\t1\tEKF2_EV_CTRL\t11\t6", "a vehicle id from 1 to 255, found '0'"),
         ("1\tx\tEKF2_EV_CTRL\t11\t6", "a component id from 1 to 255, found 'x'"),
-        ("1\t1\tekf2\t11\t6", "a name of up to 16 characters A-Z, 0-9 and _, found 'ekf2'"),
-        ("1\t1\tEKF2_EV_CTRL_TOO_LONG\t11\t6", "a name of up to 16"),
+        ("1\t1\tekf2\t11\t6", "a name with 1 to 16 of the characters A-Z, 0-9 and _, found 'ekf2'"),
+        ("1\t1\tEKF2_EV_CTRL_TOO_LONG\t11\t6", "a name with 1 to 16"),
         ("1\t1\tEKF2_EV_CTRL\t11\t8", "type 6 (INT32) or 9 (REAL32), found '8'"),
         ("1\t1\tEKF2_EV_CTRL\t11.0\t6", "EKF2_EV_CTRL: expected a whole number (type 6), found '11.0'"),
-        ("1\t1\tEKF2_EV_CTRL\t2147483648\t6", "a number of 32 bits, found 2147483648"),
+        ("1\t1\tEKF2_EV_CTRL\t2147483648\t6", "a whole number that fits into 32 bits, found 2147483648"),
         ("1\t1\tEKF2_EVP_NOISE\tnan\t9", "expected a number (type 9), found 'nan'"),
-        ("1\t1\tEKF2_EVP_NOISE\t1e39\t9", "a number of single precision, found 1e39"),
-        ("1\t1\tEKF2_EVP_NOISE\t1e400\t9", "a number of single precision, found 1e400"),
-        ("1\t1\tA\t1\t6", "A is a duplicate of line 2"),
+        ("1\t1\tEKF2_EVP_NOISE\t1e39\t9", "a number that fits into single precision, found 1e39"),
+        ("1\t1\tEKF2_EVP_NOISE\t1e400\t9", "a number that fits into single precision, found 1e400"),
+        ("1\t1\tA\t1\t6", "A is already set in line 2"),
     ],
 )
 def test_a_mistake_is_reported_with_its_line(line: str, said: str) -> None:

@@ -1,4 +1,4 @@
-"""Writes tables and plots of docs/compare.md: `python -m tools.docs.compare docs/compare.md compare.json [compare.json ...]`."""
+"""Writes the tables and plots of docs/compare.md: `python -m tools.docs.compare docs/compare.md compare.json [compare.json ...]`."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from companion.config.loader import load_flight
 from tools.docs.tables import flown_by, markdown, write_page
 
 MISSION = Path(__file__).parents[2] / "configs/missions/catch.yaml"
-"""Mission of the loaded configuration, of which only the controller is used."""
+"""Mission with which a configuration is loaded; only the configuration's controller is used."""
 Results = dict[str, Any]
-"""A compare.json."""
+"""Content of a compare.json."""
 AS_PUBLISHED = ("paper", "paper_slow_leakage", "tuned")
 """Presets that contain only what the law's paper describes; all others have additional compensation."""
 IN_PAPER = {"adaptive/paper": "proposed", "psc/tuned": "PSC", "csc/tuned": "CSC"}
@@ -47,15 +47,15 @@ _ABLATION_FIGURES = (*_FIGURES[:3], ("e_alpha after, deg", "rms.post.e_alpha_deg
 
 
 def merged(files: Sequence[Results]) -> list[Row]:
-    """Return the rows of all files, each with the line `flown_by` that names its command and commit. A flight in several files
-    is taken from the last of them.
+    """Return the rows of all files, each with the line `flown_by` that names its command and commit. A flight that is in several files
+    is taken from the last one.
 
     Raises:
-        ValueError: the files were flown in different worlds, or no flight was flown.
+        ValueError: the flights of the files were flown in different worlds, or the files contain no flight.
     """
     worlds = sorted({results["settings"]["world"] for results in files})
     if len(worlds) > 1:
-        raise ValueError(f"flown in different worlds: {', '.join(worlds)}; expected one")
+        raise ValueError(f"flown in different worlds: {', '.join(worlds)}; expected one world")
     keys = ("controller", "preset", "payload_kg", "model_error", "seed")
     rows = {
         tuple(row[key] for key in keys): {**row, "flown_by": flown_by(results)}
@@ -63,12 +63,12 @@ def merged(files: Sequence[Results]) -> list[Row]:
         for row in results["rows"]
     }
     if not rows:
-        raise ValueError("no rows; expected those of at least one flight")
+        raise ValueError("found no rows; expected the rows of at least one flight")
     return list(rows.values())
 
 
 def laws_markdown(groups: Sequence[Group]) -> str:
-    """Return one line per payload and preset, with the paper's figures where there are any."""
+    """Return one line per payload and preset, with the figures from the paper where available."""
     head = ["payload", "law/preset", "completed", *(title for title, _, _ in _FIGURES), "e_q, deg"]
     rows = [
         [f"{group.payload_kg:g} kg", group.label, _completed(group), *_spreads(group, _FIGURES), _attitude(group)]
@@ -184,7 +184,7 @@ def _estimated(c: LawConfig) -> str:
 
 
 def _with_source(table: str, groups: Sequence[Group]) -> str:
-    """Return the table and below it the seeds, commands and commits of its flights."""
+    """Return the table followed by the seeds, commands and commits of its flights."""
     if not groups:
         return "Not flown."
     rows = [row for group in groups for row in group.rows]
@@ -245,7 +245,7 @@ def _against_print(group: Group, part: str) -> str:
 
 
 def tables(files: Sequence[Results]) -> dict[str, str]:
-    """Return every table, each with the commands and the commits of its figures."""
+    """Return every table by name, each with the commands and commits from which its figures come."""
     groups = by_payload(aggregate(merged(files)))
     whole = [group for group in groups if not is_ablation(group.preset)]
     first = [group for group in whole if group.model_error == min(one.model_error for one in groups)]
@@ -276,7 +276,7 @@ def tables(files: Sequence[Results]) -> dict[str, str]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Write the tables into a page, and its plots into `pictures/` next to it."""
+    """Write the tables into a page and its plots into `pictures/` next to the page; return the exit code."""
     parser = argparse.ArgumentParser(prog="tools.docs.compare")
     parser.add_argument("page", type=Path)
     parser.add_argument("results", type=Path, nargs="+", help="compare.json of companion compare")

@@ -1,6 +1,6 @@
 """Writes the tables of docs/faults.md: `python -m tools.docs.faults docs/faults.md [faults.json]`.
 
-The kinds come from the code; the outcomes are written if the results of a campaign are given.
+The kinds come from the code. The outcomes are written only if the results of a campaign are given.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ def kinds_markdown() -> str:
 
 
 def outcomes_markdown(rows: Sequence[Row]) -> str:
-    """Return one line per fault and size: outcome by phase with the time until detection, and the worst of all phases."""
+    """Return one line per fault and size: the outcome in each phase with the detection time in s, and the worst values over all
+    phases.
+    """
     phases = [phase for phase in PHASES if any(row["phase"] == phase for row in rows)]
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
@@ -56,7 +58,7 @@ def _outcome(row: Row) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Write the tables into a page."""
+    """Write the tables into a page; return the exit code."""
     parser = argparse.ArgumentParser(prog="tools.docs.faults")
     parser.add_argument("page", type=Path)
     parser.add_argument("results", type=Path, nargs="?", help="faults.json of a campaign")

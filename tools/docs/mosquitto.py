@@ -9,7 +9,7 @@ from companion.ground.broker.mosquitto_config import INSTALLED, acl_text, profil
 
 
 def example_files() -> dict[str, str]:
-    """Return file name and text of the examples in ``configs/mosquitto/``."""
+    """Return the texts of the example files in `configs/mosquitto/` by file name."""
     return {
         "secure.conf": profile_text(INSTALLED),
         "acl": acl_text(["tarot650-2r"], ["operator"], ["viewer"]),

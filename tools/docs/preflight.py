@@ -38,7 +38,7 @@ def tables() -> dict[str, str]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Write the tables into a page."""
+    """Write the tables into a page; return the exit code."""
     parser = argparse.ArgumentParser(prog="tools.docs.preflight", description=__doc__)
     parser.add_argument("page", type=Path)
     return write_page(parser.parse_args(argv).page, tables())

@@ -1,6 +1,6 @@
 """Generates the files of configs/px4/ and the table of docs/px4.md from `companion.px4.required`.
 
-`python -m tools.docs.px4 .` writes them below the repository's root.
+`python -m tools.docs.px4 .` writes them, given the repository's root.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ def indoor_mocap_text() -> str:
             only = f" PX4 {wanted.only} only." if wanted.only else ""
             comments[wanted.name] = above + textwrap.wrap(f"{wanted.name}: {wanted.why}.{also}{reboot}{only}", _WIDTH)
     heading = [
-        "PX4 1.16 and 1.18, a quadrotor indoors on motion capture, without GPS.",
+        "PX4 1.16 and 1.18, for a quadrotor that flies indoors on motion capture, without GPS.",
         "",
         "Load it in QGroundControl (Vehicle setup > Parameters > Tools > Load from file), or with",
-        "companion px4 params --write, which writes only differing values and saves the old ones in a file.",
+        "companion px4 params --write, which writes only values that differ and saves the old values in a file.",
         "",
         f"Not included: MPC_THR_HOVER, which is measured on each vehicle, and {RADIO}, because {NO_RADIO} switches the",
         f"pilot's radio off ({NO_RADIO_FILE}, for vehicles without a radio).",
@@ -48,7 +48,7 @@ def no_radio_text() -> str:
     """Return the text of configs/px4/no_radio.params."""
     return params_file.text(
         {RADIO: NO_RADIO},
-        ["Only for vehicles without a radio: PX4 then ignores sticks and mode switch.", ""],
+        ["Only for vehicles without a radio: with this value, PX4 ignores the sticks and the mode switch.", ""],
     )
 
 

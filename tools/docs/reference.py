@@ -1,4 +1,4 @@
-"""Generates the pages of docs/reference/ from the JSON Schemas of the models that check the files.
+"""Generates the pages of docs/reference/ from the JSON Schemas of the configuration models.
 
 `python -m tools.docs.reference docs/reference` writes them.
 """
@@ -22,9 +22,9 @@ _INTRO = {
     "`safety`.",
     "controller": "One control law with its gains; `law` selects one of three. [The control law](../control-law.md) describes the "
     "implementation.",
-    "world": "True parameters of the simulated world, unknown to the companion: a file for `--world`, or `--set "
-    "world.KEY=VALUE`. Any number may be a distribution, `{uniform: [low, high]}` or `{normal: [mean, sigma]}`, that the "
-    "seed draws. With examples: [the laboratory](../world.md), [the simulated world](../sitl.md#knobs).",
+    "world": "True parameters of the simulated world, which the companion does not know. Give a file with `--world`, or keys with "
+    "`--set world.KEY=VALUE`. Any number may be a distribution, `{uniform: [low, high]}` or `{normal: [mean, sigma]}`, from which the "
+    "seed draws it. With examples: [the laboratory](../world.md), [the simulated world](../sitl.md#knobs).",
 }
 _UNITS = {
     "kg_m2": "kg m^2", "nm_a": "N m/A", "n_per_m": "N/m", "per_s": "1/s", "m_s": "m/s", "m_s2": "m/s^2", "m_s3": "m/s^3",
@@ -33,11 +33,11 @@ _UNITS = {
     "counts": "counts", "count": "counts",
 }  # fmt: skip
 _NO_UNIT = {"row_weights_s"}
-"""Keys whose names end as if with a unit but have none."""
+"""Keys without a unit whose names nevertheless end like a unit."""
 
 
 def unit(key: str) -> str:
-    """Return the unit at the end of a key's name, or an empty text."""
+    """Return the unit that the end of a key's name denotes, or an empty string."""
     words = key.split("_")
     for first in range(1, len(words)):
         found = _UNITS.get("_".join(words[first:]))
@@ -60,8 +60,8 @@ def page(kind: str) -> str:
         "",
         "The name of a key contains its unit. `companion schema "
         + kind
-        + "` prints the same for editors. Conditions between",
-        "keys are checked when the file is read, and errors are reported with file, line and column.",
+        + "` prints the same information as a JSON Schema for",
+        "editors. Conditions between keys are checked when the file is read; errors are reported with file, line and column.",
     ]
     definitions: dict[str, Schema] = schema.get("$defs", {})
     queue: list[tuple[str, Schema]] = list(_members("", schema, definitions)) if _choices(schema) else [("", schema)]
@@ -74,7 +74,9 @@ def page(kind: str) -> str:
         ]
         lines += ["", *_section(path, model, definitions)]
         queue[:0] = inner
-    made = "Made by `python -m tools.docs.reference docs/reference`; a test checks that page and models agree."
+    made = (
+        "Made by `python -m tools.docs.reference docs/reference`; a test checks that this page agrees with the models."
+    )
     return "\n".join([*lines, "", made, ""])
 
 
@@ -84,7 +86,7 @@ def _choices(schema: Schema) -> list[Schema]:
 
 
 def _members(path: str, value: Schema, definitions: dict[str, Schema]) -> Iterator[tuple[str, Schema]]:
-    """Return the records below a key, each once, with their paths."""
+    """Yield the records below a key, each once, with their paths."""
     seen: set[str] = set()
     for reference, suffix in _references(value):
         name = reference.rpartition("/")[2]
@@ -214,7 +216,7 @@ def main(arguments: list[str]) -> int:
     try:
         write(Path(arguments[0]))
     except OSError as error:
-        print(f"{arguments[0]}: cannot be written: {error.strerror}; name a folder that exists", file=sys.stderr)
+        print(f"{arguments[0]}: cannot be written: {error.strerror}; give an existing folder", file=sys.stderr)
         return 2
     return 0
 

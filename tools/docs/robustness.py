@@ -1,4 +1,4 @@
-"""Writes the result into docs/robustness.md: `python -m tools.docs.robustness docs/robustness.md robustness.json`."""
+"""Writes the results of a campaign into docs/robustness.md: `python -m tools.docs.robustness docs/robustness.md robustness.json`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tools.docs.tables import flown_by, write_results
 
 
 def result_markdown(results: dict[str, Any]) -> str:
-    """Return the number of flights by outcome, and the distribution of the position error after the catch."""
+    """Return the number of flights by outcome and the distribution of the position error after the catch as text."""
     rows, settings, summary = results["rows"], results["settings"], results["summary"]
     errors_mm = [1000.0 * row["e_p_m"] for row in graded(rows)]
     outcomes = ", ".join(
@@ -32,7 +32,7 @@ def result_markdown(results: dict[str, Any]) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Write the result into a page."""
+    """Write the results into a page; return the exit code."""
     parser = argparse.ArgumentParser(prog="tools.docs.robustness")
     parser.add_argument("page", type=Path)
     parser.add_argument("results", type=Path, help="robustness.json of companion robustness")

@@ -23,7 +23,7 @@ _TIMES = LadderTimes(1.0, 1.0)
 
 
 def _default(key: str) -> str:
-    """Return a threshold as "`key` = default", or only the key if it has no default."""
+    """Return a threshold as "`key` = default", or as the key alone if it has no default."""
     section, _, name = key.rpartition(".")
     model = _SECTIONS.get(f"{section}." if section else "")
     default: Any = model.model_fields[name].default if model is not None else None
@@ -39,12 +39,12 @@ def _action(action: SafetyAction | None) -> str:
 
 
 def _message(rule: Rule) -> str:
-    """Return the message with `...` for its values."""
+    """Return the rule's message with `...` in place of its values."""
     return re.sub(r"\{[^}]*\}", "...", rule.message)
 
 
 def monitors_table() -> str:
-    """Return the table of rules: one row per rule, in the order of the code within each subject."""
+    """Return the table of rules by subject, with one row per rule in the order of the code."""
     rows = [
         "| id | what is found | thresholds | hold time | on the ground | in the air | message |",
         "|---|---|---|---|---|---|---|",
@@ -60,7 +60,7 @@ def monitors_table() -> str:
                     _hold_time(rule),
                     _action(rule.ground),
                     _action(rule.air)
-                    + (", only monitored: the pilot flies, PX4 gets no command" if rule.pilot_flies else ""),
+                    + ("; while the pilot is flying, only an event, no command to PX4" if rule.pilot_flies else ""),
                     _message(rule),
                 )
                 rows.append(f"| {' | '.join(cells)} |")
@@ -68,13 +68,13 @@ def monitors_table() -> str:
 
 
 def after(state: SafetyAction, event_id: str, asks: SafetyAction) -> SafetyAction:
-    """Return the safety state after an event, computed by the ladder itself."""
+    """Return the safety state after an event in the given state, as the supervisor computes it."""
     event = Event(t_s=0.0, id=event_id, severity=Severity.INFO, action=asks, text="")
     return update(SupervisorState(state, "before", 0.0), [event], 0.0, _TIMES).action
 
 
 def ladder_table() -> str:
-    """Return the table of the state after every event in every state in the air. Events with the same effect share a row."""
+    """Return the table of the safety state after each event in each state in the air. Events with the same effect share a row."""
     states = list(SafetyAction)
     events = [(rule.id, rule.air) for rule in RULES if rule.air is not None]
     events += [(notice.id, notice.action) for notice in (RETRACT_DONE, NO_ROOM_TO_STAY)]
@@ -100,7 +100,7 @@ def ladder_table() -> str:
 
 
 def notices_table() -> str:
-    """Return the table of notices, one row each."""
+    """Return the table of notices, with one row per notice."""
     return "\n".join(["| id | when |", "|---|---|", *(f"| `{notice.id}` | {notice.when} |" for notice in NOTICES)])
 
 
@@ -110,7 +110,7 @@ def tables() -> dict[str, str]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Write the tables into a page."""
+    """Write the tables into a page; return the exit code."""
     parser = argparse.ArgumentParser(prog="tools.docs.safety", description=__doc__)
     parser.add_argument("page", type=Path)
     return write_page(parser.parse_args(argv).page, tables())

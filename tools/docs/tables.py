@@ -14,14 +14,14 @@ def written(text: str, tables: Mapping[str, str]) -> str:
     """Return the page with these tables inserted.
 
     Raises:
-        ValueError: the page does not mark the location of a table.
+        ValueError: the page has no marks for one of the tables.
     """
     for name, table in tables.items():
         begin, end = f"<!-- table: {name} -->\n", f"<!-- end: {name} -->\n"
         head, found, rest = text.partition(begin)
         _, closed, tail = rest.partition(end)
         if not found or not closed:
-            raise ValueError(f"no place for the table '{name}': expected {begin.strip()} and {end.strip()}")
+            raise ValueError(f"the marks of the table '{name}' are missing: expected {begin.strip()} and {end.strip()}")
         text = f"{head}{begin}{table}\n{end}{tail}"
     return text
 
@@ -43,10 +43,10 @@ def write_page(page: Path, tables: Mapping[str, str]) -> int:
 
 
 def flown_by(results: Mapping[str, Any]) -> str:
-    """Return the line below a table that names the command and the commit from which its figures come.
+    """Return the line below a table that states the command and the commit with which its figures were produced.
 
     Args:
-        results: the JSON file of `companion compare`, `robustness` or `faults`.
+        results: content of the JSON file from `companion compare`, `robustness` or `faults`.
 
     Raises:
         KeyError: the file was written by a version that did not record its command.
@@ -58,7 +58,7 @@ def flown_by(results: Mapping[str, Any]) -> str:
 
 
 def write_results(page: Path, file: Path, tables_of: Callable[[dict[str, Any]], Mapping[str, str]]) -> int:
-    """Write the tables of a results file into the page.
+    """Write the tables made from a results file into the page.
 
     Args:
         page: page with marked locations of the tables.

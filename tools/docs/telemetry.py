@@ -1,4 +1,4 @@
-"""Writes the JSON Schemas of the telemetry messages: `python -m tools.docs.telemetry` writes one file per topic to docs/telemetry."""
+"""Writes the JSON Schemas of the telemetry messages, one file per topic in docs/telemetry: `python -m tools.docs.telemetry`."""
 
 from __future__ import annotations
 
