@@ -1,4 +1,4 @@
-"""Result of a preflight check: what was read, what was expected, why it matters, and how to fix it."""
+"""Result of a preflight check: the value found, the value expected, why it matters and how to fix it."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ class Row(Record, frozen=True, kw_only=True):
     """The result of one check."""
 
     id: str
-    """Stable dotted name for scripts, such as `px4.param.EKF2_EV_CTRL` or `mocap.rate`."""
+    """Stable dotted name on which scripts can rely, such as `px4.param.EKF2_EV_CTRL` or `mocap.rate`."""
     title: str
-    """Name of the check for the operator, a few words."""
+    """Name of the check for the operator, in a few words."""
     ok: bool
     read: str
     """Value that was found, with its unit."""
     wanted: str = ""
-    """Value that was expected; empty if the row only reports."""
+    """Value that was expected; empty if the row is for information only."""
     why: str = ""
     """Consequence of a wrong value, in one sentence."""
     fix: str = ""
@@ -44,13 +44,13 @@ class Row(Record, frozen=True, kw_only=True):
         return not self.ok and self.level is Level.REFUSE
 
     def line(self) -> str:
-        """Return the row as one line of text, as listed when the preflight refuses."""
+        """Return the row as one line of text, as it is listed when the preflight check refuses take-off."""
         wanted = f", wanted {self.wanted}" if self.wanted else ""
         fix = f"; {self.fix}" if self.fix else ""
         return f"{self.title}: {self.read}{wanted}{fix}"
 
     def as_json(self) -> dict[str, Any]:
-        """Return the row as nested data for `--json`, the log and the status channel."""
+        """Return the row as plain data for `--json`, the log and the status channel."""
         return {**msgspec.structs.asdict(self), "level": self.level.value}
 
 

@@ -1,14 +1,16 @@
 """The base class of frozen records, and the only codec for sending them between processes and writing them to logs.
 
-A record has two encodings, both by field name: * a *packet*: MessagePack, for another process on the same computer. Floats keep all 64
-    bits. * *JSON*: for logs and telemetry. The text restores every finite float exactly. JSON has no NaN or infinity; the text contains
-    them as the strings "nan", "inf" and "-inf".
+A record has two encodings, both by field name:
 
-Both leave out a field that is None, so that a log's JSON Schema needs no union types (viewers do not know them). Decoding rejects
-unknown fields, missing fields and wrong types.
+* A *packet* is MessagePack, for another process on the same computer. Floats keep all 64 bits. * *JSON* is for logs and telemetry. It
+restores every finite float exactly. JSON has no NaN or infinity, so the text contains them as the
+  strings "nan", "inf" and "-inf".
 
-A field that may be None has None as its default. No other field of an encoded record has a default: msgspec leaves out every field
-that equals its default.
+Both encodings omit a field that is None, so that a log's JSON Schema needs no union types, which viewers do not support. Decoding
+rejects unknown fields, missing fields and wrong types.
+
+A field that may be None has None as its default. No other field of an encoded record may have a default, because msgspec omits every
+field that equals its default.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ import msgspec
 class Record(msgspec.Struct, frozen=True, gc=False, omit_defaults=True, forbid_unknown_fields=True):
     """Base class of frozen records; subclasses inherit its settings.
 
-    `gc=False` keeps records out of the cyclic garbage collector. A record holds numbers, strings, enums, tuples and other records,
+    `gc=False` keeps records out of the cyclic garbage collector. A record contains numbers, strings, enums, tuples and other records,
     which cannot form a reference cycle.
     """
 
@@ -40,14 +42,14 @@ _ERROR_CHARACTERS = 200
 
 
 class RecordError(ValueError):
-    """The data does not fit the record class; the text names the field."""
+    """The data does not match the record class; the text names the field."""
 
 
 def to_packet(record: Any) -> bytes:
     """Return the record as MessagePack.
 
     Raises:
-        ValueError, TypeError, OverflowError: the record contains a value that a record may not hold.
+        ValueError, TypeError, OverflowError: the record contains a value of a type that records do not support.
     """
     try:
         return _PACKETS.encode(record)
@@ -56,7 +58,7 @@ def to_packet(record: Any) -> bytes:
 
 
 def from_packet(cls: Any, packet: bytes) -> Any:
-    """Decode the bytes of `to_packet` into a record of this class, or of one of this union's classes.
+    """Decode bytes from `to_packet` into a record of this class or, for a union, of one of its classes.
 
     Raises:
         RecordError: the bytes are corrupt or are not a record of this kind.
@@ -68,22 +70,21 @@ def from_packet(cls: Any, packet: bytes) -> Any:
 
 
 def to_json(record: Any) -> bytes:
-    """Return the record as compact JSON text in UTF-8, with its fields in declaration order.
+    """Return the record as compact JSON text in UTF-8, with the fields in declaration order.
 
     Raises:
-        ValueError, TypeError: the record contains a value that a record may not hold.
+        ValueError, TypeError: the record contains a value of a type that records do not support.
     """
     try:
         text = _JSON.encode(record)
     except UnicodeEncodeError:
         text = b"null"
-    # msgspec writes a float that is not finite as null. No other value is written as null, but a text may contain the
-    # word.
+    # msgspec writes a non-finite float as null. No other value is written as null, but a text may contain the word.
     return _JSON.encode(_mended(to_jsonable(record), spell_floats=True)) if b"null" in text else text
 
 
 def from_json(cls: type[R], text: bytes) -> R:
-    """Decode the text of `to_json` into a record.
+    """Decode text from `to_json` into a record.
 
     Raises:
         RecordError: the text is corrupt or is not a record of this class.
@@ -95,7 +96,7 @@ def from_json(cls: type[R], text: bytes) -> R:
 
 
 def to_jsonable(record: Any) -> Any:
-    """Return the record as nested dicts, lists and scalars. Fields that are None are left out; a NaN stays a float."""
+    """Return the record as nested dicts, lists and scalars. Fields that are None are omitted; NaN remains a float."""
     return msgspec.to_builtins(record, enc_hook=_from_numpy)
 
 
@@ -103,7 +104,7 @@ def from_jsonable(cls: type[R], data: Any) -> R:
     """Convert nested dicts, as `json.loads` returns them, into a record.
 
     Raises:
-        RecordError: a field is unknown or missing, or a value has the wrong type; a number must be a number, not a string.
+        RecordError: a field is unknown or missing, or a value has the wrong type; a string is not accepted as a number.
     """
     try:
         return msgspec.convert(data, cls)
@@ -112,7 +113,7 @@ def from_jsonable(cls: type[R], data: Any) -> R:
 
 
 def json_schema(cls: type[Record]) -> dict[str, Any]:
-    """Return the JSON Schema (2020-12) of `to_json`'s text; field names carry the units."""
+    """Return the JSON Schema (2020-12) of the text from `to_json`; the units are part of the field names."""
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         **_schema(cls),
@@ -121,15 +122,15 @@ def json_schema(cls: type[Record]) -> dict[str, Any]:
 
 
 def fingerprint(*classes: type[Record]) -> str:
-    """Return a short hash of the classes' fields: a log with a different hash cannot be replayed."""
+    """Return a short hash of the classes' fields; a log with a different hash cannot be replayed."""
     text = json.dumps([json_schema(cls) for cls in classes], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def differences(a: object, b: object, path: str = "") -> tuple[str, object, object] | None:
-    """Return the first field in which two values differ bit for bit, as (path, value in a, value in b), or None if they are the same.
+    """Return the first field in which two values are not identical, as (path, value in a, value in b); None if there is none.
 
-    Stricter than ``==``: 0.0 and -0.0 differ, 1 and 1.0 differ. A NaN equals a NaN.
+    Unlike with `==`, 0.0 and -0.0 differ, and so do 1 and 1.0, but any NaN is identical to any NaN.
     """
     if isinstance(a, Record) and type(a) is type(b):
         for name in a.__struct_fields__:
@@ -154,11 +155,11 @@ def _from_numpy(value: Any) -> Any:
     """Convert a NumPy scalar or array in a record to a Python number or list.
 
     Raises:
-        TypeError: the value has a type that no record may hold.
+        TypeError: the value has a type that records do not support.
     """
     tolist = getattr(value, "tolist", None)
     if tolist is None:
-        raise TypeError(f"a record cannot hold a {type(value).__name__}")
+        raise TypeError(f"a record cannot contain a {type(value).__name__}")
     return tolist()
 
 
@@ -177,14 +178,14 @@ def _json_decoder(cls: Hashable) -> msgspec.json.Decoder[Any]:
 
 
 def _refused(cls: Any, error: Exception) -> RecordError:
-    """Return the error as one printable line; it may quote the decoded data."""
+    """Return the error with its text as one printable line; the text may quote the decoded data."""
     text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(error)[:_ERROR_CHARACTERS])
     return RecordError(f"{getattr(cls, '__name__', 'packet')}: {text}")
 
 
 def _mended(value: Any, *, spell_floats: bool) -> Any:
-    """Return the same data in the form that every parser accepts: "?" replaces what has no UTF-8 form (half of a surrogate pair) and,
-    if `spell_floats`, strings replace floats that are not finite.
+    """Return the data in a form that every parser accepts: "?" replaces characters without a UTF-8 form (half of a surrogate pair) and,
+    if `spell_floats`, strings replace non-finite floats.
     """
     if isinstance(value, float) and spell_floats and not math.isfinite(value):
         return repr(value)

@@ -14,15 +14,15 @@ from companion.model.types import AutopilotStatus, FlightMode, LandedState
 
 WAIT_TIMEOUT_S = 15.0
 TARE_S = 1.0
-"""Duration of the force sensor's tare. A flight that waits for its start repeats it."""
+"""Duration of the force sensor's tare. A flight that waits for its start repeats the tare."""
 LOOK_AGAIN_S = 0.1
-"""Period at which a flight that waits for its start checks the estimate and the position."""
+"""Period with which a flight that waits for its start checks the estimate and the position."""
 STREAM_BEFORE_OFFBOARD_S = 0.8
 OFFBOARD_TIMEOUT_S = 8.0
 ARM_TIMEOUT_S = 10.0
 SPOOL_S = 1.2
 SPOOL_SHARE = 0.7
-"""Fraction of hover thrust at the end of spooling up, with which the plan begins."""
+"""Fraction of hover thrust at the end of spooling up, at which the plan begins."""
 SPOOL_TO_FULL_S = 0.4
 TOUCHDOWN_RAMP_S = 0.4
 DISARM_TIMEOUT_S = 8.0
@@ -51,13 +51,13 @@ BEFORE_ARMING = frozenset({Stage.WAIT, Stage.READY, Stage.OFFBOARD})
 LIFTING = frozenset({Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN, Stage.AUTOPILOT_LAND})
 DISARMING = frozenset({Stage.DISARM, Stage.STAND_DOWN})
 COMMANDING = frozenset({Stage.ARM, Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN})
-"""Stages in which the companion commands, so PX4 must be in OFFBOARD."""
+"""Stages in which the companion commands the vehicle, so that PX4 must be in OFFBOARD."""
 PILOT_FLIES = "a pilot flies"
-"""Name of the phase in which nothing is sent because a pilot has control."""
+"""Name of the phase in which the companion sends nothing because a pilot has control."""
 PILOT_MODES = frozenset({FlightMode.MANUAL, FlightMode.HOLD, FlightMode.RETURN, FlightMode.TAKEOFF})
-"""Modes that only a pilot chooses, or one of PX4's failsafes. While a pilot flies nothing is sent."""
+"""Modes that only a pilot or one of PX4's failsafes chooses. While a pilot is flying, the companion sends nothing."""
 FAILSAFE_STATES = frozenset({5, 6, 8})
-"""MAV_STATE_CRITICAL, EMERGENCY and FLIGHT_TERMINATION: HEARTBEAT.system_status while one of PX4's failsafes is active."""
+"""Values of HEARTBEAT.system_status while a PX4 failsafe is active: MAV_STATE_CRITICAL, EMERGENCY and FLIGHT_TERMINATION."""
 
 
 def in_offboard(status: AutopilotStatus | None) -> bool:
@@ -76,7 +76,7 @@ def on_ground(status: AutopilotStatus | None) -> bool:
 
 
 def failsafe_chose(status: AutopilotStatus) -> bool:
-    """Return whether a failsafe of PX4 is active and has chosen the mode. In MANUAL a pilot has control even during a failsafe."""
+    """Return whether a PX4 failsafe is active and has chosen the mode. In MANUAL, a pilot has control even during a failsafe."""
     return status.system_status in FAILSAFE_STATES and status.mode is not FlightMode.MANUAL
 
 
@@ -86,5 +86,5 @@ def chosen_by_pilot(status: AutopilotStatus) -> bool:
 
 
 def flown_by_pilot(status: AutopilotStatus | None) -> bool:
-    """Return whether a pilot flies: PX4 is armed and in a mode that a pilot has chosen."""
+    """Return whether a pilot is flying the vehicle: PX4 is armed and in a mode that a pilot has chosen."""
     return status is not None and status.armed and chosen_by_pilot(status)

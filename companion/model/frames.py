@@ -1,7 +1,7 @@
-"""Frames and rotations: world ENU-like / body FLU (companion) <-> NED / FRD (PX4).
+"""Rotations, and conversions between the companion's frames (world ENU-like, body FLU) and PX4's (NED, FRD).
 
-The companion's world shares its origin with PX4's local frame: x_enu = y_ned, y_enu = x_ned, z_enu = -z_ned. All quaternions are
-``(w, x, y, z)``. Functions work on tuples of floats and use `math` only: they run in the control tick.
+The companion's world frame shares its origin with PX4's local frame: x_enu = y_ned, y_enu = x_ned, z_enu = -z_ned. All quaternions are
+``(w, x, y, z)``. The functions work on tuples of floats and use only `math`, because they run in the control tick.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def quat_normalize(q: Quat) -> Quat:
 
 
 def quat_rotate(q: Quat, v: Vec3) -> Vec3:
-    """Rotate v by q (body vector into the world, if q is an attitude)."""
+    """Return v rotated by q; if q is an attitude, this converts a body vector to the world frame."""
     w, x, y, z = q
     vx, vy, vz = v
     tx = 2.0 * (y * vz - z * vy)
@@ -57,7 +57,7 @@ def quat_rotate(q: Quat, v: Vec3) -> Vec3:
 
 
 def body_z_component(q: Quat, v: Vec3) -> float:
-    """Return the z component of a world vector in the body frame: `quat_rotate(quat_conjugate(q), v)[2]`, to the last bit."""
+    """Return the z component of a world vector in the body frame; bit-identical to `quat_rotate(quat_conjugate(q), v)[2]`."""
     w, x, y, z = q
     vx, vy, vz = v
     tx = 2.0 * (z * vy - y * vz)
@@ -67,7 +67,7 @@ def body_z_component(q: Quat, v: Vec3) -> float:
 
 
 def body_x_z_axes_world(q: Quat) -> tuple[Vec3, Vec3]:
-    """Return the body's x and z axes in the world: the first and third columns of the rotation matrix."""
+    """Return the body's x and z axes in the world frame: the first and third columns of the rotation matrix."""
     w, x, y, z = q
     yy = y * y
     return (
@@ -77,7 +77,7 @@ def body_x_z_axes_world(q: Quat) -> tuple[Vec3, Vec3]:
 
 
 def quat_from_euler_zyx(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quat:
-    """Return the attitude from ZYX Euler angles (the paper's q = [roll, pitch, yaw])."""
+    """Return the attitude for ZYX Euler angles (q = [roll, pitch, yaw] in the paper)."""
     cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
     cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
     cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
@@ -90,7 +90,7 @@ def quat_from_euler_zyx(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Qu
 
 
 def euler_zyx_from_quat(q: Quat) -> Vec3:
-    """Return roll, pitch, yaw in rad; pitch in [-pi/2, pi/2]."""
+    """Return the ZYX Euler angles (roll, pitch, yaw) in rad, with pitch in [-pi/2, pi/2]."""
     w, x, y, z = q
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
@@ -99,7 +99,7 @@ def euler_zyx_from_quat(q: Quat) -> Vec3:
 
 
 def yaw_from_quat(q: Quat) -> float:
-    """Return only the yaw of `euler_zyx_from_quat`, rad."""
+    """Return the yaw in rad, as `euler_zyx_from_quat` does."""
     w, x, y, z = q
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
@@ -110,7 +110,7 @@ def wrap_rad(angle_rad: float) -> float:
 
 
 def tilt_rad(q: Quat) -> float:
-    """Return the angle between the body z axis and the vertical."""
+    """Return the angle in rad between the body z axis and the vertical."""
     return math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2]))))
 
 
@@ -125,12 +125,12 @@ def enu_from_ned(v: Vec3) -> Vec3:
 
 
 def flu_from_frd(v: Vec3) -> Vec3:
-    """Convert a body vector from FRD to FLU, or back."""
+    """Convert a body vector from FRD to FLU; the same conversion works from FLU to FRD."""
     return (v[0], -v[1], -v[2])
 
 
 def attitude_ned_frd_from_enu_flu(q: Quat) -> Quat:
-    """Convert an attitude FLU->ENU to FRD->NED, with w >= 0."""
+    """Convert an attitude from FLU->ENU to FRD->NED; the result has w >= 0."""
     # (0, s, s, 0) * q * (0, 1, 0, 0) with s = sqrt(1/2), up to the sign: rotation by pi about (1, 1, 0), then by pi about x.
     w, x, y, z = _SQRT_HALF * q[0], _SQRT_HALF * q[1], _SQRT_HALF * q[2], _SQRT_HALF * q[3]
     w, x, y, z = w + z, x + y, x - y, w - z
@@ -138,5 +138,5 @@ def attitude_ned_frd_from_enu_flu(q: Quat) -> Quat:
 
 
 def attitude_enu_flu_from_ned_frd(q: Quat) -> Quat:
-    """Convert an attitude FRD->NED to FLU->ENU, with w >= 0."""
+    """Convert an attitude from FRD->NED to FLU->ENU; the result has w >= 0."""
     return attitude_ned_frd_from_enu_flu(q)

@@ -1,4 +1,4 @@
-"""Computes the shape of a slack line between two points, for pictures of the tether. World frame, z up, metres."""
+"""Computes the shape of a slack line between two points, for drawings of the tether (world frame, z up, metres)."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from companion.model.types import Vec3
 
 _POINTS = 13
 _SAG_STEPS = 12
-"""Bisection steps: the sag is exact to a 4000th of the line's length."""
+"""Number of bisection steps; the error of the sag is below 1/4000 of the line's length."""
 _LEVEL_MIN_M = 0.02
-"""Smallest horizontal distance between the two ends that the computation uses."""
+"""Smallest horizontal distance between the ends with which the sag is computed."""
 
 
 def hanging_line_m(anchor: Vec3, end: Vec3, length_m: float, floor_m: float | None = None) -> list[Vec3]:
-    """Return 13 points of a line of a given length that sags between two points in a parabola.
+    """Return 13 points of a line of a given length that sags in a parabola between two points.
 
-    Points below the floor are moved up to it. A line that is too short to reach is drawn straight.
+    Points below the height `floor_m` are moved up to it. A line that is too short to connect the two points is drawn straight.
     """
     ax, ay, az = anchor
     dx, dy, dz = end[0] - ax, end[1] - ay, end[2] - az
@@ -34,8 +34,8 @@ def hanging_line_m(anchor: Vec3, end: Vec3, length_m: float, floor_m: float | No
 def _sag_m(level_m: float, rise_m: float, length_m: float) -> float:
     """Return how far the middle of the parabola lies below the middle of its chord.
 
-    z(u) = rise u - 4 sag u (1 - u) over the horizontal distance h has the slopes (rise -+ 4 sag) / h at its ends, and between the
-    slopes m0 and m1 the arc h^2 / (8 sag) (F(m1) - F(m0)), F(m) = (m sqrt(1 + m^2) + asinh m) / 2.
+    The parabola z(u) = rise u - 4 sag u (1 - u), u = 0 to 1 over the horizontal distance h, has the slopes m0 = (rise - 4 sag) / h and
+    m1 = (rise + 4 sag) / h at its ends. Its length is h^2 / (8 sag) (F(m1) - F(m0)) with F(m) = (m sqrt(1 + m^2) + asinh m) / 2.
     """
     h = max(level_m, _LEVEL_MIN_M)
     if length_m * length_m <= h * h + rise_m * rise_m:

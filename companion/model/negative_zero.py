@@ -1,4 +1,4 @@
-"""Removes the sign of rounded negative zeros from displayed text: `0.00` instead of `-0.00`."""
+"""Removes the sign of rounded negative zeros from displayed text, so that it shows `0.00` instead of `-0.00`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _NEGATIVE_ZERO = re.compile(
 
 
 def without_negative_zero(text: str) -> str:
-    """Return the text with the sign of every `-0`, `-0.0`, `-0.00` ... removed.
+    """Return the text without the sign of every negative zero (`-0`, `-0.0`, `-0.00` and so on).
 
     After two spaces, as in a table column, a space replaces the sign. Names that contain `-0` are not changed.
     """

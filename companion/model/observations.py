@@ -1,4 +1,6 @@
-"""What a preflight observes; `companion.preflight.observe` gathers it, the other modules of `companion.preflight` evaluate it."""
+"""Observations for the preflight check. `companion.preflight.observe` gathers them; other modules of `companion.preflight` evaluate
+them.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +17,17 @@ class EstimatorReport(Record, frozen=True, kw_only=True):
 
     stamp_s: float
     flags: int
-    """Bits of ESTIMATOR_STATUS_FLAGS."""
+    """Bit mask of ESTIMATOR_STATUS_FLAGS."""
     velocity_ratio: float
-    """Innovation test ratios: below 1 if the measurements are accepted, exactly 0 if nothing is fused. The next three fields are of the
-    same kind.
+    """Innovation test ratio of the velocity. Such a ratio is below 1 if the measurements are accepted, and exactly 0 if nothing is
+    fused.
     """
     position_horizontal_ratio: float
     position_vertical_ratio: float
     position_horizontal_accuracy_m: float
-    """Accuracies are one standard deviation."""
+    """Accuracy of the horizontal position, one standard deviation."""
     position_vertical_accuracy_m: float
+    """Accuracy of the vertical position, one standard deviation."""
 
 
 class ServoReport(Record, frozen=True, kw_only=True):
@@ -32,37 +35,38 @@ class ServoReport(Record, frozen=True, kw_only=True):
 
     servo_id: int
     model: int
-    """Register 0; 1030 is the XM430-W210."""
+    """Model number (register 0); 1030 is the XM430-W210."""
     firmware: int
-    """Register 6."""
+    """Firmware version (register 6)."""
     operating_mode: int
-    """Register 11; 0 is current control."""
+    """Operating mode (register 11); 0 is current control."""
     return_delay_us: int
-    """Register 9, times 2 us."""
+    """Return delay time (register 9, unit 2 us)."""
     current_limit_counts: int
-    """Register 38."""
+    """Current limit (register 38)."""
     watchdog_ms: int
-    """Register 98, times 20 ms."""
+    """Bus watchdog timeout (register 98, unit 20 ms)."""
     voltage_v: float
-    """Register 144."""
+    """Supply voltage (register 144)."""
 
 
 class Machine(Record, frozen=True, kw_only=True):
     """State of the onboard computer. A field is None if the system does not provide it."""
 
     disk_free_bytes: int | None
-    """Free space where the flight's files are written."""
+    """Free space in the file system to which the flight's files are written."""
     governors: tuple[str, ...]
     """Frequency governor of each core (/sys/devices/system/cpu/cpu*/cpufreq/scaling_governor); empty if unknown."""
     realtime: str | None
-    """Real-time priority that the system permits, as `companion.runtime.realtime` describes it; None if SCHED_FIFO is refused."""
+    """Real-time priority that the system allows, as described by `companion.runtime.realtime`; None if SCHED_FIFO is refused."""
     memory_lock: str | None
-    """Why memory must not be locked; None if it may be."""
+    """Reason why memory cannot be locked; None if it can be."""
     cpus: tuple[int, ...]
-    """Cores that a process may run on, in ascending order."""
+    """Cores on which a process may run, in ascending order."""
     arm_latency_ms: int | None
-    """FTDI latency timer of the arm's serial port; None if it is not an FTDI port. The next field is for the force sensor's port."""
+    """FTDI latency timer of the arm's serial port; None if that is not an FTDI port."""
     force_latency_ms: int | None
+    """FTDI latency timer of the force sensor's serial port; None if that is not an FTDI port."""
 
 
 class MocapCounts(Record, frozen=True, kw_only=True):
@@ -71,22 +75,22 @@ class MocapCounts(Record, frozen=True, kw_only=True):
     frames: int
     """Frames that yielded a pose."""
     superseded: int
-    """Frames that were read together with a newer one and therefore not delivered."""
+    """Frames that were read together with a newer frame and therefore not delivered."""
     out_of_order: int
     malformed: int
     foreign: int
-    """Datagrams from addresses other than the server's."""
+    """Datagrams from an address other than the server's."""
     problem: str | None
-    """Reason of the newest rejected datagram; None if none was rejected."""
+    """Reason why the newest rejected datagram was rejected; None if none was rejected."""
     callback_error: str | None
-    """First exception that `on_pose` raised."""
+    """First exception that `on_pose` raised; None if it raised none."""
 
 
 class MocapServer(Record, frozen=True):
     """The program that streams motion capture."""
 
     name: str
-    """Program, its version and the protocol, such as `Motive 3.1, NatNet 4.1`."""
+    """Name and version of the program and of the protocol, such as `Motive 3.1, NatNet 4.1`."""
     protocol_version: str
     """NatNet version, such as `4.1`."""
 
@@ -96,19 +100,19 @@ class ForceCounts(Record, frozen=True, kw_only=True):
 
     samples: int
     skipped_bytes: int
-    """Bytes that belong to no packet."""
+    """Bytes that belonged to no packet."""
     bad_sums: int
     lost: str | None
-    """Why the port is no longer read; None while it is."""
+    """Reason why the port is no longer being read; None if it still is."""
 
 
 class MocapStream(Record, frozen=True, kw_only=True):
-    """What the motion-capture driver counted during the observation."""
+    """Counts of the motion-capture driver during the observation, and properties of the stream."""
 
     frames: int
     """Frames that arrived, with or without the body in view."""
     lost: int
-    """Frames missing in the sequence of frame numbers."""
+    """Frames that are missing in the sequence of frame numbers."""
     application: str
     other_bodies: tuple[int, ...] = ()
     """Ids of the other rigid bodies in the stream."""
@@ -117,7 +121,7 @@ class MocapStream(Record, frozen=True, kw_only=True):
 
 
 class ForceStream(Record, frozen=True, kw_only=True):
-    """What the force sensor's driver counted during the observation."""
+    """Counts of the force sensor's driver during the observation, and the sensor's identity."""
 
     samples: int
     bad_sums: int
@@ -125,22 +129,22 @@ class ForceStream(Record, frozen=True, kw_only=True):
     product: str
     """Name and firmware version that the sensor reports."""
     lost: str | None = None
-    """Why the port is no longer read; None while it is."""
+    """Reason why the port is no longer being read; None if it still is."""
 
 
 class StateCounts(Record, frozen=True):
     """Number of state messages received from PX4 during the observation."""
 
     position: int
-    """Number of LOCAL_POSITION_NED."""
+    """Number of LOCAL_POSITION_NED messages."""
     attitude: int
-    """Number of ATTITUDE_QUATERNION."""
+    """Number of ATTITUDE_QUATERNION messages."""
     imu: int
-    """Number of HIGHRES_IMU."""
+    """Number of HIGHRES_IMU messages."""
 
 
 class Observations(Record, frozen=True, kw_only=True):
-    """Everything that was observed for `duration_s`, newest last. A field is empty or None if nothing was received."""
+    """Everything that was observed for `duration_s`; the newest entries are last. A field is empty or None if nothing was received."""
 
     start_s: float
     """Flight clock at the start of the observation."""
@@ -148,7 +152,7 @@ class Observations(Record, frozen=True, kw_only=True):
     firmware: str | None = None
     """PX4's version as `MavsdkAutopilot.firmware` returns it, such as `PX4 1.16.1 release (git ...)`."""
     params: Mapping[str, float | int] = msgspec.field(default_factory=dict)
-    """PX4's parameters by name, without those that PX4 does not have."""
+    """Values of PX4's parameters by name; a parameter that PX4 does not have is omitted."""
     vehicle: tuple[VehicleState, ...] = ()
     status: tuple[AutopilotStatus, ...] = ()
     estimator: tuple[EstimatorReport, ...] = ()
@@ -159,26 +163,26 @@ class Observations(Record, frozen=True, kw_only=True):
     force: tuple[ForceSample, ...] = ()
     machine: Machine | None = None
     broker: str | None = None
-    """Why the broker did not answer; empty if it did, None if no broker is configured."""
+    """Reason why the broker did not answer; empty if it did, None if no broker is configured."""
     hand_test: str | None = None
     """The recorded hand test of this setup; empty if there is none, None if no hand test is required."""
     hand_test_changed: str = ""
-    """Differences between this setup and the one that last passed the hand test; empty if none ever passed."""
+    """Differences between this setup and the setup that last passed the hand test; empty if no setup has passed it."""
     state_counts: StateCounts | None = None
     force_stream: ForceStream | None = None
     arm_reads: tuple[int, int] | None = None
-    """Number of bus cycles, and of cycles without an answer."""
+    """(number of bus cycles, number of cycles without an answer)."""
     mission_s: float | None = None
     plan: tuple[str, ...] | None = None
-    """Reasons why the mission cannot be flown, one line each; None if this was already checked."""
+    """Reasons why the mission cannot be flown, one line each; None if the mission was already checked."""
     recorder: str | None = None
-    """Why no log can be opened; empty if one can, None if this was not tried."""
+    """Reason why no log can be opened; empty if a log can be opened, None if this was not tried."""
     failures: Mapping[str, str] = msgspec.field(default_factory=dict)
-    """Error line of the driver, by device that could not be opened or read (`autopilot`, `mocap`, `arm`, `force`)."""
+    """Error message of the driver for each device that could not be opened or read (`autopilot`, `mocap`, `arm` or `force`)."""
 
 
 class Waiting(Record, frozen=True):
-    """A condition that the preflight should wait for after the observation."""
+    """A condition for which the preflight check should wait after the observation."""
 
     what: str
     longest_s: float

@@ -1,4 +1,4 @@
-"""Packets on the channel from the flight process to the recorder. The guardian and the telemetry also send `LogLine` on it."""
+"""Packets on the channel from the flight process to the recorder. The guardian and the telemetry process also send `LogLine` on it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class Tick(Record, frozen=True, kw_only=True, tag=True):
     """One control tick."""
 
     number: int
-    """Number of this packet, counted from 0 by the flight process; gaps show the recorder how many packets were dropped."""
+    """Number of this packet, counted from 0 by the flight process; from gaps, the recorder learns how many packets were dropped."""
     inputs: Inputs
     outputs: Outputs
     sent: Sent
@@ -20,7 +20,7 @@ class LogLine(Record, frozen=True, kw_only=True, tag=True):
     """A line for the log's `/log` channel."""
 
     number: int | None = None
-    """As in `Tick`; None from processes other than the flight process, which do not count packets."""
+    """Number of this packet, as in `Tick`; None from any process other than the flight process, because only that counts packets."""
     t_s: float
     severity: Severity
     source: str
@@ -40,15 +40,16 @@ class CommandAnswer(Record, frozen=True, kw_only=True, tag=True):
 
     number: int
     nonce: str
-    """Nonce of the command; `operator` is the name of the operator who signed it."""
+    """Nonce of the command."""
     operator: str
+    """Name of the operator who signed the command."""
     command: OperatorCommand
     accepted: bool
-    """The command took effect, or the requested state was reached before."""
+    """Whether the command took effect or the requested state had already been reached."""
     text: str
     """Effect of the command, or the reason why it was refused."""
     t_s: float
-    """Flight clock of the tick that answered; phase and action are from that tick's `Outputs`."""
+    """Flight clock of the tick that answered; `phase` and `action` are from that tick's `Outputs`."""
     phase: str
     action: SafetyAction
 
@@ -67,7 +68,7 @@ def read_packet(data: bytes) -> Packet:
     """Decode the bytes of `companion.model.codec.to_packet` into a packet.
 
     Raises:
-        RecordError: the bytes are damaged or hold something else.
+        RecordError: the bytes are corrupt or are not a packet.
     """
     packet: Packet = from_packet(Packet, data)
     return packet

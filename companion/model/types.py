@@ -1,9 +1,9 @@
 """Frozen records that pass between the packages of the companion.
 
-They hold floats, tuples of floats, enums and other records. They use tuples instead of arrays because tuples are immutable, compare
-with ``==`` and survive a JSON round trip exactly. Packages that do linear algebra convert them to arrays.
+The records contain floats, tuples of floats, enums and other records. They use tuples instead of arrays because tuples are immutable,
+compare with ``==`` and survive a JSON round trip exactly. Packages that do linear algebra convert the tuples to arrays.
 
-Conventions
+Conventions:
     * World frame: ENU-like, z up, metres. Body frame: FLU (x forward, y left, z up).
     * Quaternions are ``(w, x, y, z)``, unit norm, and rotate a body vector into the world.
     * ``*_stamp_s`` and ``t_s`` are seconds on the flight clock (monotonic, zero when the flight process starts).
@@ -26,7 +26,7 @@ IDENTITY_QUAT: Quat = (1.0, 0.0, 0.0, 0.0)
 
 
 class FlightMode(Enum):
-    """The autopilot's flight mode, as far as the companion distinguishes modes."""
+    """The autopilot's flight modes that the companion distinguishes."""
 
     UNKNOWN = "unknown"
     OFFBOARD = "offboard"
@@ -39,7 +39,7 @@ class FlightMode(Enum):
 
 
 class LandedState(Enum):
-    """EXTENDED_SYS_STATE.landed_state."""
+    """State of PX4's land detector (EXTENDED_SYS_STATE.landed_state)."""
 
     UNKNOWN = "unknown"
     ON_GROUND = "on_ground"
@@ -57,7 +57,7 @@ class Severity(Enum):
 
 
 class SafetyAction(Enum):
-    """Safety states in the order of escalation, and the actions that lead to them."""
+    """Safety states in order of escalation, and the actions that lead to them."""
 
     NOMINAL = "nominal"
     WARN = "warn"
@@ -69,7 +69,7 @@ class SafetyAction(Enum):
 
     @property
     def rank(self) -> int:
-        """Return the position in the order of escalation, 0 for NOMINAL."""
+        """Return the position of this state in the order of escalation; 0 for NOMINAL."""
         return _ACTION_RANK[self]
 
 
@@ -77,7 +77,7 @@ _ACTION_RANK = {action: rank for rank, action in enumerate(SafetyAction)}
 
 
 class AutopilotRequest(Enum):
-    """A request to the autopilot in addition to setpoints. The driver executes it; `AutopilotStatus` shows the effect."""
+    """A request to the autopilot in addition to setpoints. The driver sends it; `AutopilotStatus` shows its effect."""
 
     NONE = "none"
     OFFBOARD = "offboard"  # enter OFFBOARD; setpoints are already streaming
@@ -90,7 +90,7 @@ class AutopilotRequest(Enum):
 
 
 class Outcome(Enum):
-    """Outcome of a flight; the values of `outcome` in summary.json."""
+    """Outcome of a flight; also the value of `outcome` in summary.json."""
 
     COMPLETED = "completed"
     REFUSED = "refused"
@@ -100,7 +100,7 @@ class Outcome(Enum):
 
 
 class PhaseKind(Enum):
-    """Kind of a phase. Metrics and safety distinguish phases by their kind, the operator by their name."""
+    """Kind of a phase. Metrics and safety distinguish phases by kind, the operator by name."""
 
     GROUND = "ground"  # before the rotors lift
     TAKEOFF = "takeoff"
@@ -127,9 +127,9 @@ class GroundCommand(Record, frozen=True, kw_only=True):
     operator: str
     """Name of the operator whose key signed the command."""
     nonce: str
-    """Identifies the command; the answer repeats it."""
+    """Unique identifier of the command, which the answer repeats."""
     hold: int
-    """Number of the hold that a RESUME ends, as in `Sent.hold`; 0 in every other command."""
+    """Number of the hold that a RESUME ends, as in `Sent.hold`; 0 in all other commands."""
 
 
 class VehicleState(Record, frozen=True, kw_only=True):
@@ -143,9 +143,9 @@ class VehicleState(Record, frozen=True, kw_only=True):
     attitude_wxyz: Quat
     angular_rate_body_rad_s: Vec3
     specific_force_body_m_s2: Vec3
-    """Accelerometer reading: (0, 0, 9.81) at rest and level."""
+    """Accelerometer reading; (0, 0, 9.81) for a level vehicle at rest."""
     boot_s: float | None = None
-    """PX4's own clock, seconds since boot (time_boot_ms of ATTITUDE or ODOMETRY); None if unknown."""
+    """Time on PX4's own clock, s since boot (time_boot_ms of ATTITUDE or ODOMETRY); None if unknown."""
     imu_boot_s: float | None = None
     """End of the newest IMU sample's interval on PX4's clock (HIGHRES_IMU.time_usec), s; None in older logs."""
     delta_velocity_body_m_s: Vec3 | None = None
@@ -153,7 +153,7 @@ class VehicleState(Record, frozen=True, kw_only=True):
 
 
 class AutopilotStatus(Record, frozen=True, kw_only=True):
-    """State of the autopilot that changes slowly, from HEARTBEAT, EXTENDED_SYS_STATE and BATTERY_STATUS."""
+    """Slowly changing state of the autopilot, from HEARTBEAT, EXTENDED_SYS_STATE and BATTERY_STATUS."""
 
     heartbeat_stamp_s: float
     armed: bool
@@ -170,7 +170,7 @@ class MocapPose(Record, frozen=True, kw_only=True):
     """Pose of the vehicle's rigid body in one motion-capture frame, in the world frame of the mission."""
 
     stamp_s: float
-    """Flight clock when the datagram arrived."""
+    """Flight clock at the arrival of the datagram."""
     latency_s: float | None = None
     """Time from mid-exposure to transmission, measured by the server (NatNet >= 3.0); None if the server does not send it."""
     frame_number: int
@@ -179,31 +179,32 @@ class MocapPose(Record, frozen=True, kw_only=True):
     tracking_valid: bool
     marker_error_m: float
     exposure_server_s: float | None = None
-    """Mid-exposure on the server's clock (NatNet >= 3.0), s; None in older logs."""
+    """Time of mid-exposure on the server's clock (NatNet >= 3.0), s; None in older logs."""
 
 
 class ArmState(Record, frozen=True, kw_only=True):
-    """Joint state in the paper's angles: alpha_1 from body +x turning down, alpha_2 turning link 2 the other way."""
+    """Joint state in the paper's angles: alpha_1 is measured from body +x downwards, alpha_2 turns link 2 in the opposite direction."""
 
     stamp_s: float
-    """Flight clock when the joint read was complete."""
+    """Flight clock at the end of the joint read."""
     angle_rad: Vec2
     velocity_rad_s: Vec2
     torque_nm: Vec2
-    """Torque from the present current and the torque constant."""
+    """Joint torque, computed from the present current and the torque constant."""
     hardware_error: tuple[int, int]
-    """Register 70 of each servo, 0 if healthy. The companion sets bit 7 after the bus watchdog has tripped and was restarted."""
+    """Hardware error status (register 70) of each servo, 0 if healthy. The companion sets bit 7 after it has restarted a tripped bus
+    watchdog."""
     temperature_c: Vec2
     read_failures: int
-    """Number of consecutive bus cycles up to now in which not every servo answered."""
+    """Number of consecutive bus cycles, up to the newest one, in which not every servo answered."""
     written_s: float | None = None
-    """Flight clock when the bus thread had written the last currents before this read; None before the first write."""
+    """Flight clock at the end of the bus thread's last write of currents before this read; None before the first write."""
     asked_s: float | None = None
-    """Flight clock when the bus thread began this read."""
+    """Flight clock at which the bus thread began this read."""
 
 
 class ForceSample(Record, frozen=True, kw_only=True):
-    """One sample of the force-torque sensor, in the sensor's frame, without tare and without gravity compensation."""
+    """One sample of the force-torque sensor in the sensor frame, before tare and gravity compensation."""
 
     stamp_s: float
     force_sensor_n: Vec3
@@ -224,7 +225,7 @@ class Inputs(Record, frozen=True, kw_only=True):
     command: OperatorCommand
     recorder_dropped: int
     guardian_ready: bool | None = None
-    """Whether the guardian reported within the last second that it can take over; None if there is no guardian (fast loop)."""
+    """Whether the guardian has reported within the last second that it can take over; None without a guardian (fast loop)."""
 
 
 class Reference(Record, frozen=True, kw_only=True):
@@ -239,7 +240,7 @@ class Reference(Record, frozen=True, kw_only=True):
     arm_rate_rad_s: Vec2
     arm_acceleration_rad_s2: Vec2
     jerk_world_m_s3: Vec3
-    """Jerk, used by laws that feed the acceleration forward with a lead."""
+    """Reference jerk, used by laws whose acceleration feed-forward has a lead."""
 
 
 class AttitudeSetpoint(Record, frozen=True):
@@ -247,7 +248,7 @@ class AttitudeSetpoint(Record, frozen=True):
 
     attitude_wxyz: Quat
     thrust: float
-    """Collective thrust, normalised to 0..1."""
+    """Normalised collective thrust, 0 to 1."""
 
 
 class Event(Record, frozen=True, kw_only=True):
@@ -261,22 +262,24 @@ class Event(Record, frozen=True, kw_only=True):
 
 
 class ControlLog(Record, frozen=True, kw_only=True):
-    """Quantities that the control law computed in one tick. Vectors of 8 follow chi = [p; q; alpha]."""
+    """Quantities that the control law computed in one tick. The vectors of 8 are ordered as chi = [p; q; alpha]."""
 
     error: Vec8
     error_rate: Vec8
     sliding: Vec8
     gamma: Vec8
     tau: Vec8
-    """Generalised force after saturation: N in rows 0-2, N m in rows 6-7. Rows 3-5 are controlled by PX4 and are 0."""
+    """Generalised force after saturation: N in rows 0 to 2, N m in rows 6 and 7. Rows 3 to 5 are 0, because PX4 controls the
+    attitude.
+    """
     e_tau: Vec8
     h_hat: Vec4
     zeta: float
     rho: float
     force_ext_world_n: Vec3
-    """External force on the net: tared, without the net's weight, low-pass filtered."""
+    """External force on the net in the world frame: tared, without the net's weight, and low-pass filtered."""
     attitude_desired_rad: Vec3
-    """Roll, pitch, yaw (ZYX) of the filtered desired attitude."""
+    """Roll, pitch and yaw (ZYX) of the filtered desired attitude."""
     hover_thrust: float
     saturated: tuple[bool, bool, bool]
     """Whether vertical force, lateral force and joint torque were saturated."""
@@ -285,8 +288,10 @@ class ControlLog(Record, frozen=True, kw_only=True):
     load_estimate_n: Vec3 | None = None
     """Rotor force that compensates the adapted load, world frame. None if the law does not adapt loads."""
     moment_estimate_kg_m: Vec2 | None = None
-    """Adapted first moments of link 1 and 2 about their joints, in addition to the nominal ones."""
+    """Adapted first moments of links 1 and 2 about their joints, in addition to the nominal moments; None if the law does not adapt
+    them."""
     friction_estimate_nm: Vec2 | None = None
+    """Adapted friction of both joints; None if the law does not adapt it."""
 
 
 class TetherState(Record, frozen=True, kw_only=True):
@@ -295,26 +300,26 @@ class TetherState(Record, frozen=True, kw_only=True):
     range_m: float
     """Distance from the anchor to the attachment point."""
     slack_m: float
-    """Tether length minus range."""
+    """Tether length minus `range_m`."""
     stop_slack_m: float
-    """Slack at the predicted stop after a fault (`companion.safety.stop`)."""
+    """Slack at the position where the vehicle is predicted to stop after a fault (`companion.safety.stop`)."""
     elevation_rad: float
-    """Elevation of the straight line from the vehicle to the anchor, positive below the horizontal."""
+    """Elevation of the straight line from the vehicle to the anchor; positive if the anchor is below the vehicle."""
     clearance_m: float
-    """Smallest distance between the sagging line and rotor disks or arm, negative if they touch. The arm counts only if the
-    attachment point lies outside the arm's plane (`companion.safety.tether_shape.Clearance.judges_arm`)."""
+    """Smallest distance of the sagging line from the rotor disks and the arm; negative if they touch. The arm counts only if the
+    attachment point is outside the arm's plane (`companion.safety.tether_shape.Clearance.judges_arm`)."""
     turns: float
-    """Winding about the vertical through the anchor, in turns, positive counter-clockwise seen from above."""
+    """Winding of the tether about the vertical through the anchor, in turns; positive counter-clockwise as seen from above."""
     pull_n: float
-    """Force toward the anchor that rotors, gravity and tool do not explain, low-pass filtered; 0 if unknown, never negative."""
+    """Low-pass-filtered force toward the anchor that rotors, gravity and tool do not explain; 0 if unknown, never negative."""
     taut: bool
-    """Whether the slack is used up, or the tension grows with the range."""
+    """Whether the slack is used up or the tension increases with the range."""
     snagged: bool
-    """Whether there is tension toward the anchor or sideways although there is slack."""
+    """Whether there is tension, toward the anchor or sideways, although there is slack."""
     separated: bool
     """Whether the range exceeds the tether's length without tension."""
     vehicle_turns: float
-    """Always 0: `turns` is the larger of the windings about anchor and vehicle. Kept because logs contain the field."""
+    """Always 0, because `turns` is the larger of the windings about anchor and vehicle. The field is kept because logs contain it."""
 
 
 class Outputs(Record, frozen=True, kw_only=True):
@@ -323,16 +328,16 @@ class Outputs(Record, frozen=True, kw_only=True):
     tick: int
     t_s: float
     mission_t_s: float
-    """Time since take-off was commanded, 0 before."""
+    """Time since take-off was commanded; 0 before that."""
     phase: str
     phase_kind: PhaseKind
     progress: float
     """Elapsed fraction of the mission's planned duration, 0 to 1."""
     reference: Reference | None = None
     attitude: AttitudeSetpoint | None = None
-    """Setpoint to send; None if none may be sent to the autopilot in this tick."""
+    """Setpoint for the autopilot; None if no setpoint may be sent in this tick."""
     arm_torque_nm: Vec2 | None = None
-    """Joint torques to send; None if none may be sent to the arm in this tick. Without commands its bus watchdog trips."""
+    """Joint torques for the arm; None if none may be sent in this tick. Without commands, the servos' bus watchdog trips."""
     request: AutopilotRequest
     action: SafetyAction
     events: tuple[Event, ...]
@@ -340,33 +345,36 @@ class Outputs(Record, frozen=True, kw_only=True):
     outcome: Outcome | None = None
     """Outcome of the flight; None until it has ended."""
     mocap_trusted: bool
-    """Whether motion capture is trusted. While False no pose may be forwarded to PX4."""
+    """Whether motion capture is trusted. If not, no pose may be forwarded to PX4."""
     tether: TetherState | None = None
     limited_by: tuple[str, ...]
-    """Reasons for which the governor constrained the reference."""
+    """Reasons why the governor constrained the reference."""
     mocap_innovation_m: float | None = None
-    """Distance between the newest pose and the position predicted from the IMU; 0 while it is not evaluated, None in older logs."""
+    """Distance between the newest pose and the position predicted from the IMU; 0 if it is not evaluated, None in older logs."""
 
 
 class Sent(Record, frozen=True, kw_only=True):
-    """What the drivers sent in one tick, and at what time."""
+    """What the drivers sent in one tick, and when."""
 
     tick: int
     attitude_sent: bool
     arm_torque_sent_nm: Vec2 | None = None
-    """Torque after rounding to current counts and clipping; None if no currents were sent."""
+    """Torque sent, after rounding to current counts and clipping; None if no currents were sent."""
     start_s: float
-    """Flight clock when the tick began."""
+    """Flight clock at the beginning of the tick."""
     lateness_s: float
     """Delay of the tick's start after the motion-capture frame that triggered it, or after its deadline."""
     joint_read_s: float
+    """Flight clock after the joint state was read."""
     core_s: float
+    """Flight clock after the core step."""
     setpoint_sent_s: float
+    """Flight clock after the setpoint was sent."""
     current_sent_s: float
-    """Flight clock at four instants: joint state read, core step ended, setpoint sent, currents passed to the bus thread."""
+    """Flight clock after the currents were passed to the bus thread."""
     hold: int | None = None
-    """Number of the hold that is active after this tick, counted from 1 in each flight; None if none is. Each HOLD command starts a
-    new one, even during a hold."""
+    """Number of the hold that is active after this tick, counted from 1 in each flight; None if no hold is active. Each HOLD command
+    starts a new hold, even during a hold."""
 
 
 class LinkIdentity(Record, frozen=True, kw_only=True):
@@ -376,6 +384,6 @@ class LinkIdentity(Record, frozen=True, kw_only=True):
     own_system: int
     own_component: int
     local_port: int
-    """UDP port that MAVSDK sends from; 0 if it is unknown or the link is not UDP."""
+    """UDP port from which MAVSDK sends; 0 if it is unknown or the link is not UDP."""
     peer: tuple[str, int] | None = None
-    """PX4's IPv4 address and UDP port, the only ones that MAVSDK accepts; None if the link is not UDP."""
+    """PX4's IPv4 address and UDP port, the only sender that MAVSDK accepts; None if the link is not UDP."""
