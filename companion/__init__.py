@@ -3,4 +3,4 @@
 __version__ = "0.1.0"
 
 DISTRIBUTION = "companion-aerial-manipulation"
-"""Name for pip: on the package index, companion is another project."""
+"""Name of the distribution for pip; on the package index, `companion` is a different project."""

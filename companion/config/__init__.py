@@ -1,1 +1,1 @@
-"""Configuration files of the user: vehicle, mission, controller and SITL world, checked on reading."""
+"""The user's configuration files for vehicle, mission, controller and simulated world, which are checked when they are read."""

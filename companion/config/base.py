@@ -1,4 +1,4 @@
-"""Base of all configuration models: frozen; rejects unknown keys, NaN and implicit conversions."""
+"""Base class of all configuration models, which are frozen and reject unknown keys, NaN and implicit conversions."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class Model(BaseModel):
 
 
 def refuse(title: str, problems: list[tuple[Location, str]]) -> None:
-    """Raise the problems that a model validator has found, each at its own location, so that messages name the right line.
+    """Raise the problems that a model validator has found, each with its own location, so that the message names the right line.
 
     Raises:
-        ValidationError: there is any problem. Pydantic prepends the model's own location in the document.
+        ValidationError: there is at least one problem. Pydantic prepends the model's own location in the document.
     """
     if not problems:
         return
@@ -44,7 +44,7 @@ Positive3 = tuple[Positive, Positive, Positive]
 
 def _ordered(span: Vector2) -> Vector2:
     if not span[0] < span[1]:
-        raise ValueError(f"the first must be below the second, got {list(span)}")
+        raise ValueError(f"expected the first number to be below the second, got {list(span)}")
     return span
 
 

@@ -15,7 +15,7 @@ Cpu = Annotated[int, Field(ge=0, le=CPU_MAX)]
 def _each_once(cpus: tuple[int, ...]) -> tuple[int, ...]:
     double = next((cpu for index, cpu in enumerate(cpus) if cpu in cpus[:index]), None)
     if double is not None:
-        raise ValueError(f"each core once, got {double} twice in {list(cpus)}")
+        raise ValueError(f"expected each core once, got {double} twice in {list(cpus)}")
     return cpus
 
 
@@ -26,4 +26,4 @@ class Computer(Model):
     """Cores reserved for the flight process, numbered from 0; launcher, guardian, recorder and simulated world use the others. If it is
     empty, all processes share all cores."""
     lock_memory: bool = True
-    """Lock the memory of the flight process if that is permitted. If false, the system may page it out."""
+    """Whether the flight process locks its memory, if the system allows that. If false, the system may page the memory out."""

@@ -12,11 +12,11 @@ Data: TypeAlias = "bool | int | float | str | list[Data] | dict[str, Data] | Non
 
 
 LINE_MAX = 1000
-"""Largest length of a message; longer ones are cut off."""
+"""Maximum length of a message; a longer message is truncated."""
 
 
 class ConfigError(Exception):
-    """The input is invalid. `lines` holds one message per problem, the most important one first."""
+    """The input is invalid. `lines` contains one message per problem, the most important first."""
 
     def __init__(self, lines: Sequence[str]) -> None:
         self.lines = tuple(map(_shown, lines))
@@ -32,7 +32,7 @@ def _shown(line: str) -> str:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Origin:
-    """Origin of a value: file, line and column, counted from 1, or a command-line option, with line 0."""
+    """Origin of a value: a file with line and column, both counted from 1, or a command-line option, with line 0."""
 
     source: str
     line: int = 0
@@ -43,12 +43,12 @@ class Origin:
 
 
 RANK_KEY, RANK_VALUE, RANK_MISSING = range(3)
-"""Order of importance: a misspelt key comes first, because it causes the missing one."""
+"""Ranks of problems, the most important first. A misspelt key ranks before a missing key, because it often causes it."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Problem:
-    """One message for the user."""
+    """One problem of a file, shown to the user as one message."""
 
     rank: int
     origin: Origin
@@ -59,7 +59,7 @@ class Problem:
 
 
 def problem_lines(problems: Sequence[Problem]) -> list[str]:
-    """Return each problem once, the most important first, otherwise in the order of the file."""
+    """Return the message of each problem once, ordered by importance and then by position in the file."""
     return [str(problem) for problem in sorted(set(problems))]
 
 
@@ -73,17 +73,17 @@ def key_path(location: Location) -> str:
 
 @dataclass(slots=True)
 class Document:
-    """A file as read and overridden. It is mutable for the overrides, and used only while a configuration is loaded."""
+    """Content of a file. It is mutable so that overrides can be applied, and it is used only while a configuration is being loaded."""
 
     source: str
-    """Path of the file as given by the user."""
+    """Path of the file as the user gave it."""
     data: dict[str, Data]
     values: dict[Location, Origin] = field(default_factory=dict)
-    """Origins of values; a location that is not listed has the origin of its nearest parent."""
+    """Origins of values; a value whose location is not listed has the origin of its nearest parent."""
     keys: dict[Location, Origin] = field(default_factory=dict)
     """Origins of keys."""
     problems: list[Problem] = field(default_factory=list)
-    """Problems found while reading; validation adds its own."""
+    """Problems found while the file was read; validation adds further problems."""
 
     def origin(self, location: Location) -> Origin:
         """Return the origin of the value at a location."""
@@ -94,11 +94,15 @@ class Document:
         return Origin(self.source)
 
     def key_origin(self, location: Location) -> Origin:
-        """Return the origin of the key of a location."""
+        """Return the origin of the key at a location."""
         return self.keys.get(location) or self.origin(location)
 
     def replace(self, location: Location, value: Data, origin: Origin) -> None:
-        """Set a value given on the command line; its parent must exist."""
+        """Set a value given on the command line.
+
+        Raises:
+            KeyError, IndexError, TypeError: the location has no parent.
+        """
         parent: Data = self.data
         for step in location[:-1]:
             parent = _child(parent, step)
@@ -119,7 +123,7 @@ class Document:
         """Return the value at a location.
 
         Raises:
-            KeyError, IndexError: if there is none.
+            KeyError, IndexError: the location does not exist.
         """
         value: Data = self.data
         for step in location:

@@ -1,6 +1,6 @@
-"""Turns Pydantic's errors into one message per problem: origin, key, expected and found value, and a suggestion.
+"""Converts Pydantic's errors to one message per problem, with origin, key, expected value, value found and a suggestion.
 
-Expectations and known keys are read from the model's own JSON schema, so that they cannot differ from the checks.
+The expected values and the known keys are read from the model's own JSON Schema, so that they cannot differ from the checks.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ UNITS = {
 }  # fmt: skip
 """Units by key suffix, including units that no key uses."""
 MANY_OPTIONS = 12
-"""Largest number of options that a message lists."""
+"""Largest number of options that a message lists in full."""
 
 
 @functools.cache
 def schema_of(model: type[Model]) -> _Node:
-    """Return the model's JSON Schema; generating it takes longer than all other validation."""
+    """Return the model's JSON Schema. It is cached, because generating it takes longer than the rest of the validation."""
     return model.model_json_schema()
 
 
@@ -124,7 +124,7 @@ def problem(rank: int, origin: Origin, at: Location, text: str) -> Problem:
 
 
 def describe(node: _Node | None, schema: _Node) -> str:
-    """Describe the values that a node of a JSON schema accepts."""
+    """Return a description of the values that a node of a JSON Schema accepts."""
     node = _resolve(node or {}, schema)
     if "const" in node:
         return _show(node["const"])
@@ -171,7 +171,7 @@ def _plural(item: str) -> str:
 
 
 def _unknown(at: Location, parent: _Node | None, document: Document) -> tuple[str, str | None]:
-    """Return the message about an unknown key and the known key that was probably meant."""
+    """Return the message about an unknown key, and the known key that was probably meant or None."""
     key = str(at[-1])
     known = list((parent or {}).get("properties", {}))
     stem, unit = split_unit(key)
@@ -186,11 +186,11 @@ def _unknown(at: Location, parent: _Node | None, document: Document) -> tuple[st
         return f"unknown key; did you mean {close}?", close
     given = _get(document, at[:-1])
     free = [name for name in known if not (isinstance(given, dict) and name in given)]
-    return f"unknown key; known here: {', '.join(free or known)}", None
+    return f"unknown key; known keys: {', '.join(free or known)}", None
 
 
 def split_unit(key: str) -> tuple[str, str | None]:
-    """Split a key at its longest unit suffix: ("duration", "ms") for `duration_ms`. Without a unit, return (key, None)."""
+    """Split a key before its longest unit suffix: `duration_ms` gives ("duration", "ms"); a key without a unit gives (key, None)."""
     parts = key.split("_")
     for count in (3, 2, 1):
         suffix = "_".join(parts[-count:]).lower()
@@ -200,7 +200,7 @@ def split_unit(key: str) -> tuple[str, str | None]:
 
 
 def _hint(value: Data, node: _Node | None) -> str:
-    """Suggest how to correct a value of the wrong type; empty if there is no suggestion."""
+    """Return a suggestion how to correct a value of the wrong type, or an empty string."""
     wanted = node or {}
     options = wanted.get("enum", [])
     if options:
@@ -210,7 +210,7 @@ def _hint(value: Data, node: _Node | None) -> str:
     if isinstance(value, str) and wanted.get("type") in ("number", "integer"):
         number = re.match(r"\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([^\s0-9]*)", value)
         if number and number[2]:
-            return f" (write {number[1]}; the key's name holds the unit)"
+            return f" (write {number[1]}; the key's name contains the unit)"
         if number:
             return f" (write {number[1]} without quotes)"
     return ""
@@ -222,7 +222,7 @@ def _did_you_mean(word: str, options: list[str]) -> str:
 
 
 def _show(value: object) -> str:
-    """Return a value in YAML notation, shortened."""
+    """Return a value in YAML notation, shortened to at most 60 characters."""
     if isinstance(value, float) and value != value:
         return ".nan"
     if isinstance(value, float) and value in (float("inf"), float("-inf")):
@@ -243,7 +243,7 @@ def _get(document: Document, at: Location) -> Data:
 
 
 def _resolve(node: _Node, schema: _Node) -> _Node:
-    """Follow references, and choose the part of an optional value that is not null."""
+    """Return the node with references followed and, for an optional value, the alternative that is not null."""
     while True:
         if "$ref" in node:
             node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
@@ -262,8 +262,8 @@ def _step(node: _Node, step: str | int) -> _Node | None:
 
 
 def _walk(schema: _Node, loc: tuple[str | int, ...]) -> tuple[Location, _Node | None, _Node | None]:
-    """Convert pydantic's location to the document's, which has no union tags; also return the schema nodes of the value and of its
-    parent.
+    """Return the location in the document for Pydantic's location, which also contains union tags, and the schema nodes of the value
+    and of its parent.
     """
     node: _Node | None = _resolve(schema, schema)
     parent: _Node | None = None
@@ -283,13 +283,13 @@ def _walk(schema: _Node, loc: tuple[str | int, ...]) -> tuple[Location, _Node | 
 def values(
     node: _Node | None, data: Data, at: Location = (), root: _Node | None = None
 ) -> Iterator[tuple[Location, _Node | None, Data]]:
-    """Yield every value of a document, a container before its contents, with its location and its node of the model's JSON Schema.
+    """Yield (location, schema node, value) for every value of a document; a container comes before its contents.
 
     Args:
         node: schema node of the data; None for data that the schema does not know.
         data: plain data.
         at: location of the data.
-        root: the whole schema; None if `node` is it.
+        root: the whole schema; None if `node` is the whole schema.
     """
     root = root if root is not None else node or {}
     node = _resolve(node, root) if node is not None else None

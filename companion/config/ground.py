@@ -1,4 +1,4 @@
-"""Section `ground:` of the vehicle file: telemetry and commands."""
+"""Section `ground:` of the vehicle file: telemetry to ground stations and commands from them."""
 
 from __future__ import annotations
 
@@ -68,13 +68,13 @@ class Mqtt(Model):
     url: Annotated[str, AfterValidator(_a_broker)] = "mqtt://127.0.0.1:1883"
     """mqtt://HOST:PORT, or mqtts://HOST:PORT with TLS. A flight does not wait for its broker."""
     login_file: str | None = None
-    """YAML file with `username` and `password`, readable only by its owner. If it is absent, no login is used."""
+    """YAML file with `username` and `password` that only its owner can read. If it is absent, no login is used."""
     ca_file: str | None = None
     """CA certificates (PEM) to verify the broker's certificate. If it is absent, the system's CA certificates are used."""
     commands: bool = True
-    """Accept signed commands. They are never accepted over a connection to another computer without TLS."""
+    """Whether signed commands are accepted. Over a connection to another computer without TLS, they are never accepted."""
     operators_file: str | None = None
-    """YAML file of the operators and their keys. If it is absent, the file of this user on this computer is used."""
+    """YAML file with the operators and their keys. If it is absent, the current user's file on this computer is used."""
 
     @property
     def address(self) -> BrokerAddress:
@@ -83,27 +83,27 @@ class Mqtt(Model):
 
 
 class Ground(Model):
-    """Ground stations."""
+    """Connections to ground stations."""
 
     topic: str | None = None
     """Name of the vehicle in topics. If it is absent, the vehicle's name is used."""
     mqtt: Mqtt | None = Mqtt()
-    """null disables telemetry and commands over MQTT."""
+    """Connection to the MQTT broker; null disables telemetry and commands over MQTT."""
     qgroundcontrol: Annotated[str, AfterValidator(_a_station)] | None = None
-    """Address with which MAVLink is exchanged, udpout://HOST:14550. If it is absent, nothing is forwarded."""
+    """Address of QGroundControl, with which MAVLink is exchanged: udpout://HOST:14550. If it is absent, nothing is forwarded."""
     qgroundcontrol_while_armed: bool = False
-    """While PX4 is armed, also forward messages that can stop the rotors or change the flight: forced disarm, parameters,
-    missions, files."""
+    """Whether messages that can stop the rotors or change the flight (forced disarm, parameters, missions, files) are forwarded even
+    while PX4 is armed."""
     qgroundcontrol_console: bool = False
-    """Forward SERIAL_CONTROL (PX4's console) while PX4 is disarmed."""
+    """Whether SERIAL_CONTROL (PX4's console) is forwarded while PX4 is disarmed."""
 
     @model_validator(mode="after")
     def _speakable(self) -> Self:
         if self.topic is not None and VEHICLE_NAME.fullmatch(self.topic) is None:
-            refuse("ground", [(("topic",), "expected letters, digits, '_', '-' or '.', at most 40 of them")])
+            refuse("ground", [(("topic",), "expected at most 40 characters: letters, digits, '_', '-' or '.'")])
         return self
 
 
 def topic_name(topic: str | None, vehicle_name: str) -> str:
-    """Return the name of a vehicle in topics, with '-' in place of characters that MQTT does not allow."""
+    """Return the vehicle's name for MQTT topics: `topic` if given, otherwise its name with '-' in place of other characters."""
     return topic or (re.sub(r"[^A-Za-z0-9_.-]", "-", vehicle_name)[:40] or "vehicle")

@@ -40,9 +40,9 @@ class Sources(Model):
     vehicle: str
     controller: str
     phases: tuple[str, ...]
-    """file:line:col of each phase of the mission."""
+    """Origin of each phase of the mission as file:line:column."""
     overrides: tuple[str, ...]
-    """`--set` options as given, without those of the simulated world."""
+    """`--set` options as the user gave them, without those of the simulated world."""
 
 
 class FlightConfig(Model):
@@ -63,19 +63,20 @@ def load_flight(
     *,
     hardware: bool = False,
 ) -> FlightConfig:
-    """Read, override and check everything.
+    """Read all files of a flight, apply the overrides and check the result.
 
     Args:
         mission_path: mission file, or the name of a shipped one (`companion.config.shipped`).
         vehicle_path: vehicle file in place of the mission's, or the name of a shipped one.
         controller_law: control law in place of the mission's (a key of `PRESETS`).
         preset: built-in preset of that law in place of the mission's.
-        overrides: `--set` options, `section.key[index].key=value`, applied before anything is checked. Those of the section `world`
-            are not read: they belong to the simulated world (`companion.sitl_config`).
-        hardware: the vehicle file's addresses are used, not those of SITL; then `devices.mocap.interface` must name one network.
+        overrides: `--set` options, `section.key[index].key=value`, applied before anything is checked. Options of the section
+            `world` are ignored, because they belong to the simulated world (`companion.sitl_config`).
+        hardware: whether the vehicle file's device addresses are used instead of those of SITL. If so, `devices.mocap.interface`
+            must name one network.
 
     Raises:
-        ConfigError: one message per problem of all files.
+        ConfigError: the files have problems; the exception has one message per problem.
     """
     parsed = parse_overrides(overrides)
     lines: list[str] = []
@@ -120,10 +121,10 @@ def load_flight(
 
 
 def load_vehicle(path: str | Path, overrides: Sequence[str] = ()) -> Vehicle:
-    """Read and check a vehicle file, or the shipped one of that name, alone, with the `vehicle.` overrides.
+    """Read and check a single vehicle file, given by its path or by the name of a shipped one, with the `vehicle.` overrides.
 
     Raises:
-        ConfigError: one message per problem.
+        ConfigError: the file has problems; the exception has one message per problem.
     """
     lines: list[str] = []
     document = read_document(named_file("vehicles", path, "--vehicle"))
@@ -134,7 +135,7 @@ def load_vehicle(path: str | Path, overrides: Sequence[str] = ()) -> Vehicle:
 
 
 def logged_flight(config_json: str) -> FlightConfig:
-    """Return the configuration in a log. Older logs also contain that of the simulated world, which is left out.
+    """Return the flight configuration in a log, without the configuration of the simulated world, which older logs contain too.
 
     Raises:
         ValueError: the text is not JSON, or not a configuration of this version.
@@ -148,7 +149,7 @@ def logged_flight(config_json: str) -> FlightConfig:
 def check_document(
     model: type[M], document: Document, section: Section, overrides: list[Override], lines: list[str]
 ) -> M | None:
-    """Override and validate a document; one message per problem is appended to `lines`.
+    """Apply the overrides of a section to its document and validate it; append one message per problem to `lines`.
 
     Returns:
         The model, or None if the document has a problem.
@@ -158,7 +159,7 @@ def check_document(
 
 
 def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:
-    """Reject motion capture on all networks, because any sender there could claim Motive's address."""
+    """Return a message if motion capture is received from every network, where any sender could use Motive's address; else nothing."""
     interface = vehicle.devices.mocap.interface
     if interface != ANY_INTERFACE:
         return []
@@ -171,7 +172,7 @@ def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:
 
 
 def _check_controller(document: Document, overrides: list[Override], lines: list[str]) -> ControllerConfig | None:
-    """Override and validate a controller file; its law selects the model."""
+    """Apply the overrides to a controller file and validate it with the model of its law."""
     _override(document, "controller", overrides, lines)
     law = _value(document, ("law",))
     if isinstance(law, str) and law in LAWS:
@@ -204,7 +205,7 @@ def _validated(model: type[M], document: Document, lines: list[str]) -> M | None
 def _open_named(
     mission_file: Document, location: Location, given: str | Path | None, lines: list[str]
 ) -> Document | None:
-    """Read the file `given`, or else the one that the mission names, relative to the mission file."""
+    """Read the file `given` or, if that is None, the file that the mission names, relative to the mission file."""
     where = ""
     try:
         if given is not None:
@@ -222,7 +223,7 @@ def _open_named(
 
 
 def _controller_choice(mission_file: Document) -> ControllerChoice | None:
-    """Return the controller choice of a mission with other problems, so that problems of the controller file are reported too."""
+    """Return the controller choice of an otherwise invalid mission, so that problems of the controller file are reported too."""
     try:
         return ControllerChoice.model_validate(_value(mission_file, ("controller",)) or {})
     except ValidationError:

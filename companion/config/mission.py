@@ -1,6 +1,6 @@
 """The mission file: start pose of the vehicle, motion limits, and the phases of the flight.
 
-Positions are those of the body's origin in the world frame (z up, 0 on the floor); joint angles are as in the paper.
+Positions are those of the body origin in the world frame (z up, 0 on the floor); joint angles are defined as in the paper.
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ class Hold(Model):
 
 
 class Line(Model):
-    """Fly straight to a point, from rest to rest with minimum snap; the arm may move on the way."""
+    """Fly straight to a point, from rest to rest with minimum snap; the arm can move at the same time."""
 
     type: Literal["line"]
     name: Name | None = None
     to_m: Vector3
     duration_s: Duration | None = None
-    """Duration. If it is absent, the shortest one that the limits allow."""
+    """Duration. If it is absent, the shortest duration that the limits allow is used."""
     arm_deg: Vector2 | None = None
-    """Final joint angles. If they are absent the arm keeps its pose."""
+    """Final joint angles. If they are absent, the arm keeps its pose."""
     arm_delay_s: Delay | None = None
     """Time from the start of the line to the start of the arm's motion; 0 if it is absent."""
     arm_duration_s: Duration | None = None
-    """Duration of the arm's motion. If it is absent the motion ends with the line."""
+    """Duration of the arm's motion. If it is absent, the motion ends with the line."""
 
     @model_validator(mode="after")
     def _arm_moves_within_the_line(self) -> Self:
@@ -60,28 +60,28 @@ class Line(Model):
         if self.arm_deg is None:
             for key in ("arm_delay_s", "arm_duration_s"):
                 if getattr(self, key) is not None:
-                    problems.append(((key,), "gives the time of an arm motion, but its target arm_deg is missing"))
+                    problems.append(((key,), "sets the time of an arm motion, but its target, arm_deg, is missing"))
         else:
             end_s = (self.arm_delay_s or 0.0) + (self.arm_duration_s or 0.0)
             if self.duration_s is not None and (
                 end_s > self.duration_s or (self.arm_delay_s or 0.0) >= self.duration_s
             ):
                 key = "arm_delay_s" if self.arm_duration_s is None else "arm_duration_s"
-                text = f"the arm's move would end {end_s:g} s into a line of {self.duration_s:g} s; it must end within the line"
+                text = f"the arm's motion would end {end_s:g} s into a line of {self.duration_s:g} s; it must end within the line"
                 problems.append(((key,), text))
         refuse("line", problems)
         return self
 
 
 class Path(Model):
-    """Fly through points without a stop, from rest to rest with minimum snap; the arm keeps its pose."""
+    """Fly through points without stopping, from rest to rest with minimum snap; the arm keeps its pose."""
 
     type: Literal["path"]
     name: Name | None = None
     through_m: Annotated[tuple[Vector3, ...], Field(min_length=1, max_length=30)]
-    """Points in order up to the end of the path, without its start."""
+    """Points of the path in order, with its end but without its start."""
     duration_s: Duration | None = None
-    """Duration. If it is absent, the shortest one that the limits allow."""
+    """Duration. If it is absent, the shortest duration that the limits allow is used."""
 
 
 class ArmMove(Model):
@@ -91,7 +91,7 @@ class ArmMove(Model):
     name: Name | None = None
     arm_deg: Vector2
     duration_s: Duration | None = None
-    """Duration. If it is absent, the shortest one that the limits allow."""
+    """Duration. If it is absent, the shortest duration that the limits allow is used."""
 
 
 class Land(Model):
@@ -109,9 +109,9 @@ class Start(Model):
     """Pose of the vehicle before take-off, which the measured pose must match."""
 
     position_m: Vector2
-    """x, y."""
+    """x and y, world frame."""
     tolerance_m: Positive = 0.15
-    """Tolerance of the position and of the height, which is the vehicle's airframe.ground_clearance_m."""
+    """Tolerance of the position, and of the height, which must equal the vehicle's airframe.ground_clearance_m."""
     yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
     yaw_tolerance_deg: Positive = 15.0
     arm_deg: Vector2
@@ -137,7 +137,7 @@ class Catch(Model):
     """The expected payload. Checks and reports use it; the controller does not know it."""
 
     expected_at_m: Vector2
-    """x, y of the vehicle when the payload arrives."""
+    """x and y of the vehicle when the payload arrives."""
     payload_max_kg: NonNegative
 
 
@@ -156,7 +156,7 @@ class ControllerChoice(Model):
 
     law: Annotated[str, AfterValidator(_installed), Field(json_schema_extra=_laws)] = "adaptive"
     preset: str | None = None
-    """Built-in preset. If neither preset nor file is given, the law's default: recommended or tuned."""
+    """Built-in preset. If neither preset nor file is given, the law's default preset is used."""
     file: str | None = None
     """Path of a controller file, relative to the mission file."""
 
@@ -165,7 +165,7 @@ class ControllerChoice(Model):
         if self.file is not None and self.preset is not None:
             refuse("controller", [(("preset",), "give either a preset or a file, not both")])
         if self.preset is not None and self.preset not in PRESETS[self.law]:
-            text = f"no such preset of '{self.law}', got \"{self.preset}\"; available: {', '.join(PRESETS[self.law])}"
+            text = f"'{self.law}' has no preset \"{self.preset}\"; available: {', '.join(PRESETS[self.law])}"
             refuse("controller", [(("preset",), text)])
         return self
 

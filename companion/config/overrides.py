@@ -1,4 +1,4 @@
-"""`--set section.key[index].key=value` replaces one value of a file from the command line, before validation."""
+"""Parses and applies options `--set section.key[index].key=value`, each of which replaces one value of a file before validation."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def parse_overrides(texts: Iterable[str]) -> list[Override]:
     """Parse `--set` options.
 
     Raises:
-        ConfigError: one message per invalid option.
+        ConfigError: options are invalid; the exception has one message for each.
     """
     overrides: list[Override] = []
     lines: list[str] = []
@@ -48,10 +48,10 @@ def parse_overrides(texts: Iterable[str]) -> list[Override]:
 
 
 def apply_overrides(document: Document, section: Section, overrides: Iterable[Override]) -> None:
-    """Apply the overrides of one section to its document, in the order given; the document records their origins.
+    """Apply the overrides of one section to its document in the given order; the document records their origins.
 
     Raises:
-        ConfigError: one message per override of a location that does not exist. Keys are checked later, by the model.
+        ConfigError: locations do not exist; the exception has one message for each. The model checks the keys later.
     """
     lines: list[str] = []
     for override in overrides:
@@ -85,7 +85,7 @@ def _parse(text: str) -> Override:
     section = steps[0]
     if section not in SECTIONS:
         close = nearest(str(section), list(SECTIONS))
-        hint = f"did you mean {close}?" if close else f"known are {', '.join(SECTIONS)}"
+        hint = f"did you mean {close}?" if close else f"available: {', '.join(SECTIONS)}"
         raise ConfigError([f"{origin}: unknown section '{section}'; {hint}"])
     if len(steps) == 1:
         raise ConfigError([f"{origin}: the key names a whole document; {_EXAMPLE}"])
@@ -95,7 +95,9 @@ def _parse(text: str) -> Override:
 
 
 def _make_way(document: Document, override: Override) -> None:
-    """Create the parent mappings that the file leaves to their defaults; reject indices that do not exist."""
+    """Create the parent mappings that are missing in the file, which leaves them to their defaults; reject indices that do not
+    exist.
+    """
     value: Data = document.data
     for depth, step in enumerate(override.location):
         last = depth == len(override.location) - 1

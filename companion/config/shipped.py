@@ -20,23 +20,23 @@ def names(folder: str) -> tuple[str, ...]:
 
 
 def shipped_file(folder: str, name: str) -> Path:
-    """Return the path of a shipped YAML file as `near` does."""
+    """Return the path of a shipped YAML file, shortened by `near`."""
     return near(FILES / folder / f"{name}.yaml")
 
 
 def near(path: Path) -> Path:
-    """Return an absolute path relative to the current directory if it is below it."""
+    """Return an absolute path as a path relative to the current directory if it lies below that; otherwise unchanged."""
     here = Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path
 
 
 def named_file(folder: str, given: str | Path, option: str) -> Path:
-    """Return the path of the shipped file with a name, or else the user's path.
+    """Return the path of the shipped file whose name is given; if there is none, return `given` as a path.
 
     Args:
         folder: folder of `FILES`.
         given: name of a shipped file, or a path.
-        option: the command-line option that names it, for messages.
+        option: command-line option through which it was given, for messages.
 
     Raises:
         ConfigError: a word without a suffix is neither the name of a shipped file nor a file.

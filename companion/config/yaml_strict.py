@@ -1,7 +1,7 @@
 """Strict YAML: the 1.2 core schema, no duplicate keys, and the origin of every value.
 
-PyYAML implements YAML 1.1, where `1e3` is text, `on` is true, `12:30` is 750 and a duplicate key overwrites the first. Here the scalars
-are those of YAML 1.2's core schema (section 10.3.2); duplicate keys, aliases and tags are refused.
+PyYAML implements YAML 1.1, where `1e3` is text, `on` is true, `12:30` is 750 and a duplicate key overwrites the first. Here, scalars
+follow the core schema of YAML 1.2 (section 10.3.2); duplicate keys, aliases and tags are rejected.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class StrictLoader(yaml.SafeLoader):
         self._depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """Compose one node; refuse aliases and deep nesting early."""
+        """Compose one node; reject aliases, tags and deep nesting early."""
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
         mark: Any = event.start_mark
         if isinstance(event, yaml.AliasEvent):
@@ -74,8 +74,8 @@ def read_document(path: str | Path, shown_as: str | None = None) -> Document:
     """Read one YAML file whose top level is a mapping.
 
     Raises:
-        ConfigError: one line, if the file cannot be read or is not YAML. Duplicate keys do not raise; they are collected in
-            `Document.problems` and reported with the validation errors.
+        ConfigError: the file cannot be read or is not YAML; the exception has one line. Other problems, such as duplicate keys,
+            are collected in `Document.problems` and reported with the validation errors.
     """
     shown = shown_as or str(path)
     try:
@@ -112,10 +112,10 @@ def read_document(path: str | Path, shown_as: str | None = None) -> Document:
 
 
 def parse_value(text: str, origin: Origin) -> Data:
-    """Parse the value of a command-line override by the same rules.
+    """Parse the value of a command-line override by the rules of this module.
 
     Raises:
-        ConfigError: one line per problem.
+        ConfigError: the value is invalid; the exception has one line per problem.
     """
     if len(text) > SIZE_MAX_BYTES:
         raise ConfigError([f"{origin}: longer than {SIZE_MAX_BYTES // 1024} KiB"])
@@ -127,7 +127,9 @@ def parse_value(text: str, origin: Origin) -> Data:
 
 
 def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
-    """Convert text to plain data. If `fixed` is given (for an override), it is the origin of all values instead of their lines."""
+    """Convert text to plain data. If `fixed` is given, as for an override, it is the origin of all values in place of line and
+    column.
+    """
 
     def origin(mark: yaml.Mark | None) -> Origin:
         if fixed is not None or mark is None:
@@ -216,7 +218,9 @@ class _Builder:
 
 
 def _is_unicode(text: str) -> bool:
-    """Return False if an escape such as "\\uD800" left half of a UTF-16 pair, which JSON and terminals reject."""
+    """Return whether the text is valid Unicode. An escape such as "\\uD800" leaves half of a UTF-16 pair, which JSON and terminals
+    reject.
+    """
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -225,7 +229,11 @@ def _is_unicode(text: str) -> bool:
 
 
 def _scalar(text: str) -> Data:
-    """Resolve a plain scalar by YAML 1.2's core schema."""
+    """Return the value of a plain scalar by the core schema of YAML 1.2.
+
+    Raises:
+        ValueError: the scalar is a number with too many digits.
+    """
     if _NULL.fullmatch(text):
         return None
     if _BOOL.fullmatch(text):
@@ -233,7 +241,7 @@ def _scalar(text: str) -> Data:
     if len(text) > _DIGITS_MAX and (
         _INT.fullmatch(text) or _FLOAT.fullmatch(text) or _HEX.fullmatch(text) or _OCTAL.fullmatch(text)
     ):
-        raise ValueError(f"a number of {len(text)} digits")
+        raise ValueError(f"a number with {len(text)} digits; at most {_DIGITS_MAX} are accepted")
     if _INT.fullmatch(text):
         return int(text)
     if _OCTAL.fullmatch(text) or _HEX.fullmatch(text):

@@ -1,4 +1,4 @@
-"""Writes values as YAML text on one line, for files that a user continues to edit. Pure."""
+"""Writes values as YAML text on one line, for files that a user continues to edit."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./+-]*(?::[A-Za-z0-9_./+-]+)*")
 
 
 def flow_text(value: Any) -> str:
-    """Return a value in flow style, on one line, as `parse_value` reads it back.
+    """Return a value as one line of YAML in flow style, which `parse_value` reads back unchanged.
 
     Args:
         value: None, bool, int, float, str, or lists, tuples and dicts of them. A string that is not a plain word is quoted, and every
-            character that YAML would fold, break at or strip is escaped.
+            character that YAML would fold, break or strip is escaped.
     """
     if isinstance(value, dict):
         return "{" + ", ".join(f"{flow_text(key)}: {flow_text(item)}" for key, item in value.items()) + "}"
