@@ -1,4 +1,4 @@
-"""The configuration files that every installation contains: package data, in the repository also reached as `configs/`."""
+"""The configuration files that every installation contains as package data; in the repository, they are in `configs/`."""
 
 from __future__ import annotations
 

@@ -111,9 +111,7 @@ def _above_abort(vehicle: Vehicle) -> tuple[float, float]:
 
 
 _WARN = Level.WARN
-_RAISES = (
-    "delay of a sensor that is not fused, ms; PX4 raises EKF2_DELAY_MAX to it if it is larger, so it is written first"
-)
+_RAISES = "delay of a sensor that is not fused, ms; a value above EKF2_DELAY_MAX makes PX4 raise that, so this is written first"
 _FOLLOWS = "time constant with which the output follows the delayed filter, s; with a larger value, IMU errors persist for longer"
 _CEILING = "0 to `room.z_m` minus 0.3"
 

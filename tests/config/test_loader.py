@@ -66,12 +66,12 @@ BAD_MISSION = [
     (
         "height_m: 1.0",
         "height_m: 1.0\n    color: red",
-        [f"{CATCH}:31:5: phases[0].color: unknown key; known here: name"],
+        [f"{CATCH}:31:5: phases[0].color: unknown key; known keys: name"],
     ),
     (
         "height_m: 1.0",
         "height_m: 1 m",
-        [f'{CATCH}:30:15: phases[0].height_m: expected a number > 0, got "1 m" (write 1; the key\'s name holds the unit)'],
+        [f'{CATCH}:30:15: phases[0].height_m: expected a number > 0, got "1 m" (write 1; the key\'s name contains the unit)'],
     ),
     (
         "height_m: 1.0",
@@ -111,20 +111,20 @@ BAD_MISSION = [
         "arm_duration_s: 2.5",
         "arm_duration_s: 7",
         [
-            f"{CATCH}:40:21: phases[2].arm_duration_s: the arm's move would end 7 s into a line of 6 s; "
+            f"{CATCH}:40:21: phases[2].arm_duration_s: the arm's motion would end 7 s into a line of 6 s; "
             "it must end within the line"
         ],
     ),
     (
         "    arm_deg: [100.0, 60.0]      # unfolded by 6.0 s\n",
         "",
-        [f"{CATCH}:39:21: phases[2].arm_duration_s: gives the time of an arm motion, but its target arm_deg is missing"],
+        [f"{CATCH}:39:21: phases[2].arm_duration_s: sets the time of an arm motion, but its target, arm_deg, is missing"],
     ),
     (
         "preset: recommended",
         "preset: recomended",
         [
-            f"{CATCH}:9:37: controller.preset: no such preset of 'adaptive', got \"recomended\"; available: paper, "
+            f"{CATCH}:9:37: controller.preset: 'adaptive' has no preset \"recomended\"; available: paper, "
             "paper_slow_leakage, model_free, recommended"
         ],
     ),
@@ -185,14 +185,14 @@ BAD_VEHICLE = [
     ("sign: -1", "sign: 0", ["sign: expected one of -1, 1, got 0"]),
     ("baud: 3000000", "baud: 9600", ["baud: expected one of 57600, 115200, 1000000, 2000000, 3000000, 4000000, got 9600"]),
     ("rate_hz: 200.0", "rate_hz: 200.0\n    natnet_version: 3.0", ['expected one of "3.0", "3.1", "4.0", "4.1", "4.2", "4.3", "4.4", got 3.0 (put it in quotes)']),
-    ("x_m: [-2.2, 2.2]", "x_m: [2.2, -2.2]", ["room.x_m: the first must be below the second, got [2.2, -2.2]"]),
+    ("x_m: [-2.2, 2.2]", "x_m: [2.2, -2.2]", ["room.x_m: expected the first number to be below the second, got [2.2, -2.2]"]),
     ("link_com_m: [0.16, 0.08]", "link_com_m: [0.26, 0.08]", ["the centre of mass lies beyond the link's end: at 0.26 m on a link of 0.2 m"]),
     ("fold_arm_deg: [165.0, 140.0]", "fold_arm_deg: [165.0, 151.0]", ["fold_arm_deg[1]: 151 deg is outside the joint limits, -10 to 150 deg"]),
     ("mass_kg: 3.0 ", "mass_kg: 0.4 ", ["mass_kg: 0.4 kg is the whole vehicle, but arm and tool alone weigh 0.45 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 20.0", ["thrust_max_n: 20 N do not lift 3 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 60.0\n  inertia_kg_m2: [0.02, 0.02, 0.05]", ["inertia_kg_m2[2]: expected at most 0.04 kg m^2, the sum of the other two, as for every rigid body, got 0.05"]),
     ("servo_id: 2", "servo_id: 2.0", ["servo_id: expected a whole number from 0 to 252, got 2.0"]),
-    ("safety:", "computer:\n  cpus: [2, 3, 2]\nsafety:", ["computer.cpus: each core once, got 2 twice in [2, 3, 2]"]),
+    ("safety:", "computer:\n  cpus: [2, 3, 2]\nsafety:", ["computer.cpus: expected each core once, got 2 twice in [2, 3, 2]"]),
     ("safety:", "computer:\n  cpus: [-1]\nsafety:", ["computer.cpus[0]: expected a whole number from 0 to 1023, got -1"]),
 ]  # fmt: skip
 
@@ -213,12 +213,12 @@ def test_bad_vehicle_file(project: Path, old: str, new: str, expected: list[str]
 BAD_OVERRIDES = [
     ("world.paylod_kg=0.2", "--set world.paylod_kg: unknown key; did you mean payload_kg?"),
     ("wrld.payload_kg=0.2", "--set wrld.payload_kg: unknown section 'wrld'; did you mean world?"),
-    ("x.y=1", "--set x.y: unknown section 'x'; known are mission, vehicle, controller, world"),
+    ("x.y=1", "--set x.y: unknown section 'x'; available: mission, vehicle, controller, world"),
     ("world.payload_kg", "--set world.payload_kg: no '='; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("world.payload_kg=", "--set world.payload_kg: no value; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("world=1", "--set world: the key names a whole document; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("world..a=1", "--set world..a: cannot read the key from column 6; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
-    ("[0]=1", "--set [0]: unknown section '0'; known are mission, vehicle, controller, world"),
+    ("[0]=1", "--set [0]: unknown section '0'; available: mission, vehicle, controller, world"),
     ("world.payload_kg=3", "--set world.payload_kg: expected a number from 0 to 2, got 3"),
     ("world.seed=1.5", "--set world.seed: expected a whole number >= 0, got 1.5"),
     ("world.faults=[{kind: mocap_los, t_s: 5}]", '--set world.faults: faults[0].kind: expected one of 40 names ("mocap_loss", "mocap_occluded", "mocap_jump", ...), got "mocap_los" (did you mean mocap_loss?)'),
@@ -272,7 +272,7 @@ BAD_LAW_IN_MISSION = [
     ),
     (
         "{law: psc, preset: paper}",
-        "controller.preset: no such preset of 'psc', got \"paper\"; available: tuned_extras, tuned",
+        "controller.preset: 'psc' has no preset \"paper\"; available: tuned_extras, tuned",
     ),
     (
         "{preset: tuned}",
