@@ -17,10 +17,10 @@ from companion.control.thrust import (
     roll_pitch_from_force,
     saturate_force,
 )
-from companion.control.types import PlantState
+from companion.control.types import PlantState, Wrench
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import wrap_rad
-from companion.model.types import IDENTITY_QUAT, Quat, Reference, Vec2, Vec3, Vec8
+from companion.model.types import IDENTITY_QUAT, ControlLog, Quat, Reference, Vec2, Vec3, Vec8
 
 ZERO8: Vec8 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -153,3 +153,44 @@ class Actuation:
         self.arm_torque_nm = torque_nm
         self.clipped = (clipped_z, clipped_xy, clipped_arm)
         self.any_clipped = clipped_z or clipped_xy or clipped_arm
+
+
+def wrench_of(
+    sent: Actuation,
+    error: Vec8,
+    error_rate: Vec8,
+    e_tau: Vec8,
+    force_world_n: Vec3,
+    hover_thrust: float,
+    payload_estimate_kg: float | None = None,
+) -> Wrench:
+    """Return the command of a tick and its log record. Fields of adaptive laws are 0.
+
+    Args:
+        sent: the actuation after its step.
+        error, error_rate: results of `tracking_errors`.
+        e_tau: external force and torques that the law yields to, less the desired ones.
+        force_world_n: filtered external force; the catch is detected from it.
+        hover_thrust: normalised thrust that carries the vehicle without payload.
+        payload_estimate_kg: estimated mass of the payload; None if the law does not estimate it.
+    """
+    (fx, fy, fz), (t1, t2) = sent.force_world_n, sent.arm_torque_nm
+    log = ControlLog(
+        error=error,
+        error_rate=error_rate,
+        sliding=ZERO8,
+        gamma=ZERO8,
+        tau=(fx, fy, fz, 0.0, 0.0, 0.0, t1, t2),
+        e_tau=e_tau,
+        h_hat=(0.0, 0.0, 0.0, 0.0),
+        zeta=0.0,
+        rho=0.0,
+        force_ext_world_n=force_world_n,
+        attitude_desired_rad=sent.roll_pitch_yaw_rad,
+        hover_thrust=hover_thrust,
+        saturated=sent.clipped,
+        payload_estimate_kg=payload_estimate_kg,
+    )
+    return Wrench(
+        attitude_wxyz=sent.attitude_wxyz, collective_n=sent.collective_n, arm_torque_nm=sent.arm_torque_nm, log=log
+    )

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from companion.config.controller import LawConfig
 from companion.config.vehicle import Vehicle
-from companion.control.common import ZERO8, Actuation, DesiredForce, ForceFilter
+from companion.control.common import Actuation, DesiredForce, ForceFilter, wrench_of
 from companion.control.compensation import Compensation
 from companion.control.dynamics import Dynamics
 from companion.control.manipulator import Manipulator
 from companion.control.types import PlantState, Wrench
 from companion.model.frames import body_x_z_axes_world, quat_conjugate, quat_rotate
-from companion.model.types import ControlLog, Reference, Vec2, Vec3, Vec8
+from companion.model.types import Reference, Vec2, Vec3, Vec8
 
 
 class ModelBasedLaw:
@@ -83,24 +83,6 @@ class ModelBasedLaw:
     ) -> Wrench:
         """Advance F_d and return the tick's log record. Fields that only adaptive laws use are 0."""
         self._desired.advance(dt_s, force_world_n)
-        sent = self._actuation
-        (fx, fy, fz), (t1, t2) = sent.force_world_n, sent.arm_torque_nm
-        log = ControlLog(
-            error=error,
-            error_rate=error_rate,
-            sliding=ZERO8,
-            gamma=ZERO8,
-            tau=(fx, fy, fz, 0.0, 0.0, 0.0, t1, t2),
-            e_tau=e_tau,
-            h_hat=(0.0, 0.0, 0.0, 0.0),
-            zeta=0.0,
-            rho=0.0,
-            force_ext_world_n=force_world_n,
-            attitude_desired_rad=sent.roll_pitch_yaw_rad,
-            hover_thrust=self.hover_thrust,
-            saturated=sent.clipped,
-            payload_estimate_kg=payload_estimate_kg,
-        )
-        return Wrench(
-            attitude_wxyz=sent.attitude_wxyz, collective_n=sent.collective_n, arm_torque_nm=sent.arm_torque_nm, log=log
+        return wrench_of(
+            self._actuation, error, error_rate, e_tau, force_world_n, self.hover_thrust, payload_estimate_kg
         )

@@ -37,8 +37,10 @@ LOG, LAW = ROOT / "docs/log.md", ROOT / "docs/control-law.md"
 MADE_LATER = {
     "flight.mcap", "flight.log", "flight.pid", "guardian.log", "guardian.pid", "summary.json", "report.html", "config.json",
     "sitl_config.json", "sitl.log", "world.json", "preflight.json", "mine.yaml", "my_vehicle.yaml", "flights/",
-    "compare.json", "compare.html",
+    "compare.json", "compare.html", "LAW_PRESET.yaml",
 }  # fmt: skip
+EXAMPLE = ROOT / "examples/law"
+"""The folder that the reader of docs/own-law.md makes."""
 FOLDERS = ("companion", "sitl", "configs", "tests", "docs", "benchmarks")
 KNOWN_NAMES = {path.name for folder in FOLDERS for path in (ROOT / folder).rglob("*.*")}
 _FILE = re.compile(r"(?!/)[\w./-]*(?:\.(?:py|yaml|md|json|toml|txt|html|png|log|pid|mcap)|/)")
@@ -102,7 +104,7 @@ def test_links_and_file_names_exist(page: Path) -> None:
     for name in codes(prose(page)):
         if not _FILE.fullmatch(name) or name in MADE_LATER or name.startswith("DIR/"):
             continue
-        exists = (ROOT / name).exists() if "/" in name else name in KNOWN_NAMES or (ROOT / name).exists()
+        exists = (ROOT / name).exists() or (EXAMPLE / name).exists() or ("/" not in name and name in KNOWN_NAMES)
         if not exists:
             wrong.append(name)
     assert wrong == []

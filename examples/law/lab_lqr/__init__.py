@@ -1,0 +1,73 @@
+"""A control law in a package of its own: LQR with integral for the vehicle, PD with gravity compensation for the arm."""
+
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from companion.config.base import Positive2, Positive3
+from companion.config.controller import LawConfig
+from companion.config.vehicle import Vehicle
+from companion.control.common import ZERO8, Actuation, ForceFilter, tracking_errors, wrench_of
+from companion.control.manipulator import Manipulator
+from companion.control.types import PlantState, Wrench
+from companion.model.constants import GRAVITY_M_S2
+from companion.model.frames import body_x_z_axes_world, yaw_from_quat
+from companion.model.types import Reference, Vec2, Vec3
+
+
+class LqrConfig(LawConfig):
+    """LQR with integral for the vehicle, PD with gravity compensation for the arm."""
+
+    presets = ("tuned",)
+    law: Literal["lqr"]
+    cost_xy: Positive3
+    """Cost of the integral of the horizontal error (m s), the error (m) and its rate (m/s); that of the acceleration (m/s^2) is 1."""
+    cost_z: Positive3
+    arm_kp_nm_rad: Positive2
+    arm_kd_nms_rad: Positive2
+
+
+def lqr_gains(cost: Vec3) -> list[float]:
+    """Return K = B'P of the chain integral, position, velocity; P solves 0 = A'P + PA - PBB'P + diag(cost)."""
+    a, b = np.eye(3, k=1), np.array([[0.0], [0.0], [1.0]])
+    values, vectors = np.linalg.eig(np.block([[a, -b @ b.T], [-np.diag(cost), -a.T]]))
+    stable = vectors[:, values.real < 0.0]
+    gains: list[float] = (stable[3:] @ np.linalg.inv(stable[:3])).real[2].tolist()
+    return gains
+
+
+class LqrLaw:
+    """The law; each flight makes one."""
+
+    settings: ClassVar = LqrConfig
+
+    def __init__(self, config: LqrConfig, vehicle: Vehicle, hover_thrust: float) -> None:
+        self.hover_thrust = hover_thrust
+        self._config, self._mass_kg = config, vehicle.airframe.mass_kg
+        self._gains = [lqr_gains(cost) for cost in (config.cost_xy, config.cost_xy, config.cost_z)]
+        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self._force = ForceFilter(config.force_lowpass_hz)
+        self._actuation = Actuation(config, vehicle, hover_thrust)
+        self._integral_m_s = [0.0, 0.0, 0.0]
+
+    def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
+        """Run one tick; see `companion.control.types.Controller`."""
+        force = self._force.step(dt_s, state.force_ext_world_n)
+        error, rate = tracking_errors(state, reference, yaw_from_quat(state.attitude_wxyz))
+        x, y, z = (
+            self._mass_kg * (feed - ki * self._integral_m_s[i] - kp * error[i] - kd * rate[i])
+            for i, (feed, (ki, kp, kd)) in enumerate(zip(reference.acceleration_world_m_s2, self._gains, strict=True))
+        )
+        sent, body_z = self._actuation, body_x_z_axes_world(state.attitude_wxyz)[1]
+        wanted = (x, y, z + self._mass_kg * GRAVITY_M_S2)
+        sent.step(dt_s, wanted, self._arm(state, error[6:], rate[6:]), body_z, reference.yaw_rad, vertical_scale)
+        clipped_z, clipped_xy, _ = sent.clipped
+        for i, clipped in enumerate((clipped_xy, clipped_xy, clipped_z)):
+            if state.airborne and not clipped:
+                self._integral_m_s[i] += dt_s * error[i]
+        return wrench_of(sent, error, rate, ZERO8, force, self.hover_thrust)
+
+    def _arm(self, state: PlantState, error_rad: Vec2, rate_rad_s: Vec2) -> Vec2:
+        c, (g1, g2) = self._config, self._manipulator.gravity_torque_nm(state.arm_rad, state.attitude_wxyz)
+        (p1, p2), (d1, d2), (e1, e2), (r1, r2) = c.arm_kp_nm_rad, c.arm_kd_nms_rad, error_rad, rate_rad_s
+        return (g1 - p1 * e1 - d1 * r1, g2 - p2 * e2 - d2 * r2)
