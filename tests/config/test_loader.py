@@ -276,7 +276,7 @@ BAD_LAW_IN_MISSION = [
     ),
     (
         "{preset: tuned}",
-        "controller.preset: no such preset of 'adaptive', got \"tuned\"; available: paper, paper_slow_leakage, model_free, recommended",
+        "controller.preset: 'adaptive' has no preset \"tuned\"; available: paper, paper_slow_leakage, model_free, recommended",
     ),
 ]
 
