@@ -17,7 +17,8 @@ from typing import Any
 from companion import DISTRIBUTION, __version__
 
 CONTROL_LAWS = "companion.control_laws"
-KINDS = {CONTROL_LAWS: "control law"}
+MOCAP_SYSTEMS = "companion.mocap_systems"
+KINDS = {CONTROL_LAWS: "control law", MOCAP_SYSTEMS: "motion-capture system"}
 """Kind of part that each group of entry points announces."""
 _SOURCE_TREE = Path(__file__).parents[1]
 

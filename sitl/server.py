@@ -15,6 +15,7 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from typing import Any
 
+from companion.config.mocap import NATNET
 from companion.config.vehicle import Vehicle
 from companion.model.types import IDENTITY_QUAT, Vec2
 from companion.sitl_config.faults import FaultKind
@@ -150,7 +151,7 @@ class Sitl:
                 )
             )
             address = await stack.enter_async_context(self.autopilot.wires())
-            mocap = {
+            mocap: dict[str, Any] = {
                 "server": "127.0.0.1",
                 "interface": "127.0.0.1",
                 "transport": "multicast" if self._ports.multicast else "unicast",
@@ -158,6 +159,8 @@ class Sitl:
                 "up_axis": "z",
                 "rate_hz": self._config.mocap_rate_hz,
             }
+            if device.mocap.type != NATNET:
+                mocap |= {"type": NATNET, "options": {}}
             if self._ports.multicast:
                 mocap["data_port"] = self.mocap.data_port
             addresses: dict[str, dict[str, Any]] = {

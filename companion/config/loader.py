@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from pydantic import ValidationError
 
+from companion.config import mocap
 from companion.config.base import Location, Model
 from companion.config.controller import LAWS, AnyControllerConfig, ControllerConfig, preset_file
 from companion.config.controller import PRESETS as PRESETS
@@ -73,7 +74,7 @@ def load_flight(
         overrides: `--set` options, `section.key[index].key=value`, applied before anything is checked. Options of the section
             `world` are ignored, because they belong to the simulated world (`companion.sitl_config`).
         hardware: whether the vehicle file's device addresses are used instead of those of SITL. If so, `devices.mocap.interface`
-            must name one network.
+            must name one network and `devices.mocap.type` an installed system.
 
     Raises:
         ConfigError: the files have problems; the exception has one message per problem.
@@ -88,7 +89,7 @@ def load_flight(
     if vehicle_file is not None:
         vehicle = check_document(Vehicle, vehicle_file, "vehicle", parsed, lines)
         if hardware and vehicle is not None:
-            lines += _open_to_every_network(vehicle, vehicle_file)
+            lines += _open_to_every_network(vehicle, vehicle_file) + _unusable_mocap(vehicle, vehicle_file)
 
     controller: ControllerConfig | None = None
     controller_file: Document | None = None
@@ -129,7 +130,9 @@ def load_vehicle(path: str | Path, overrides: Sequence[str] = ()) -> Vehicle:
     lines: list[str] = []
     document = read_document(named_file("vehicles", path, "--vehicle"))
     vehicle = check_document(Vehicle, document, "vehicle", parse_overrides(overrides), lines)
-    if vehicle is None:
+    if vehicle is not None:
+        lines += _unusable_mocap(vehicle, document)
+    if vehicle is None or lines:
         raise ConfigError(lines)
     return vehicle
 
@@ -169,6 +172,13 @@ def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:
         "`ip -4 address` shows it, `companion mocap check` proposes it; flights with --sitl do not need it"
     )
     return problem_lines([Problem(RANK_VALUE, document.origin(location), text)])
+
+
+def _unusable_mocap(vehicle: Vehicle, document: Document) -> list[str]:
+    """Reject a motion-capture system that is not installed, and options that do not fit it. A log is read without this check."""
+    device = vehicle.devices.mocap
+    found = [(("devices", "mocap", *at), text) for at, text in mocap.problems(device.type, device.options)]
+    return problem_lines([Problem(RANK_VALUE, document.origin(at), f"{key_path(at)}: {text}") for at, text in found])
 
 
 def _check_controller(document: Document, overrides: list[Override], lines: list[str]) -> ControllerConfig | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, JsonValue, model_validator
 
 from companion.config.base import (
     Fraction,
@@ -21,6 +21,7 @@ from companion.config.base import (
 )
 from companion.config.computer import Computer
 from companion.config.ground import Ground
+from companion.config.mocap import NATNET
 from companion.model.constants import GRAVITY_M_S2
 
 
@@ -169,10 +170,12 @@ NatNetVersion = Literal["3.0", "3.1", "4.0", "4.1", "4.2", "4.3", "4.4"]
 
 
 class MocapDevice(Model):
-    """OptiTrack Motive over NatNet."""
+    """Motion capture: OptiTrack Motive over NatNet, or a system that a plug-in provides (docs/mocap-systems.md)."""
 
+    type: str = NATNET
+    """natnet, or the name of an installed motion-capture system, which `companion plugins` lists. With `--sitl` natnet is used."""
     server: str
-    """Address of the Motive computer."""
+    """Address of the Motive computer, or of the other system's."""
     interface: str = ANY_INTERFACE
     """This computer's address on the camera network. `fly` and `check` refuse 0.0.0.0 (all networks) without `--sitl`."""
     transport: Literal["multicast", "unicast"] = "multicast"
@@ -186,6 +189,8 @@ class MocapDevice(Model):
     """Up axis in Motive's streaming settings."""
     rate_hz: Positive = 200.0
     """Expected frame rate."""
+    options: dict[str, JsonValue] = Field(default={})
+    """Settings of a system that a plug-in provides; empty for natnet."""
 
 
 ServoBaud = Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000]

@@ -1,4 +1,4 @@
-"""The guardian's motion-capture client: the flight's NatNet client (`companion.io.mocap.client`) on plain sockets.
+"""The guardian's motion-capture client: the flight's NatNet client (`companion.io.mocap.client`) on plain sockets, or a plug-in's.
 
 In standby it keeps its connection to the server and reads only the newest frame. After a takeover it reads every frame.
 """
@@ -7,12 +7,16 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
-from companion.guardian.settings import MocapSettings
 from companion.io.mocap import natnet, sockets
 from companion.io.mocap.client import NatNetClient
 from companion.io.mocap.natnet import Message
+from companion.io.mocap.system import MocapSettings
 from companion.model.types import MocapPose
+
+if TYPE_CHECKING:
+    from companion.guardian.plugin_mocap import PluginClient
 
 
 class MocapProblem(Exception):
@@ -30,7 +34,8 @@ class MocapClient:
     """
 
     def __init__(self, settings: MocapSettings) -> None:
-        where = f"mocap {settings.server}:{settings.command_port}"
+        self.where = where = f"mocap {settings.server}:{settings.command_port}"
+        """Beginning of a text on this client."""
         try:
             self._server = (socket.gethostbyname(settings.server), settings.command_port)
         except OSError:
@@ -104,3 +109,19 @@ class MocapClient:
         if pose is not None and pose.tracking_valid:
             self.tracked_s = now_s
         return pose
+
+
+def open_client(settings: MocapSettings) -> MocapClient | PluginClient:
+    """Return a client of the vehicle's motion-capture system.
+
+    Raises:
+        MocapProblem: it cannot be opened.
+    """
+    if settings.type == "natnet":
+        return MocapClient(settings)
+    from companion.guardian.plugin_mocap import PluginClient  # imports what a guardian for NatNet does not need
+
+    try:
+        return PluginClient(settings)
+    except Exception as error:
+        raise MocapProblem(f"mocap {settings.type} {settings.server}: the client cannot be made: {error}") from None

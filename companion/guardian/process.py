@@ -17,11 +17,12 @@ import time
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from companion.guardian import heartbeat
 from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link, Wire, address_problem, is_udp, open_wire
-from companion.guardian.mocap import MocapClient, MocapProblem
+from companion.guardian.mocap import MocapClient, MocapProblem, open_client
 from companion.guardian.monitors import StallWatch
 from companion.guardian.settings import Settings, read_settings
 from companion.guardian.takeover_landing import Notice, TakeoverLanding
@@ -30,6 +31,9 @@ from companion.model.packets import LogLine
 from companion.model.types import SafetyAction, Severity
 from companion.runtime import ipc
 from companion.runtime.realtime import GUARDIAN_PRIORITY, claim_realtime
+
+if TYPE_CHECKING:
+    from companion.guardian.plugin_mocap import PluginClient
 
 PERIOD_S = 0.01
 MOCAP_FRESH_S = 0.5
@@ -114,7 +118,7 @@ class Guardian:
         self._heartbeats = heartbeats
         self._channel = channel
         self._flight = flight
-        self._mocap: MocapClient | None = None
+        self._mocap: MocapClient | PluginClient | None = None
         self._problem = address_problem(settings.autopilot_address)
         self._status_s = float("-inf")
         self._errors: set[str] = set()
@@ -130,7 +134,7 @@ class Guardian:
         """Run until the flight has ended or the vehicle has landed; return the exit code."""
         try:
             try:
-                self._mocap = MocapClient(self._settings.mocap)
+                self._mocap = open_client(self._settings.mocap)
             except MocapProblem as problem:
                 self._problem = self._problem or str(problem)
             reason = self._stand_by()
@@ -186,10 +190,9 @@ class Guardian:
             return None
         if last is not None and last.lifting and now_s - last.origin_s - last.pose_stamp_s > MOCAP_FRESH_S:
             return None
-        mocap = self._settings.mocap
         wrong = f" ({self._mocap.problem})" if self._mocap.problem else ""
-        where = f"mocap {mocap.server}:{mocap.command_port}"
-        return f"{where}: the guardian's client does not track rigid body {mocap.rigid_body_id}{wrong}"
+        body_id = self._settings.mocap.rigid_body_id
+        return f"{self._mocap.where}: the guardian's client does not track rigid body {body_id}{wrong}"
 
     # -- take-over -------------------------------------------------------------------------------------------------
 

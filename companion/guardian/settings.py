@@ -7,19 +7,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-
-@dataclass(frozen=True, slots=True)
-class MocapSettings:
-    """`devices.mocap` of the vehicle file, with the same keys."""
-
-    server: str
-    interface: str
-    transport: str
-    multicast_group: str
-    command_port: int
-    data_port: int
-    rigid_body_id: int
-    up_axis: str
+from companion.io.mocap.system import MocapSettings
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from companion.config.loader import FlightConfig
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.force_torque.driver import RobotousForceTorque
-from companion.io.mocap.driver import NatNetMocap
+from companion.io.mocap.plugin_driver import open_mocap
 from companion.io.protocols import Arm, Autopilot, DeviceError, ForceTorque, GroundLink, Mocap
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.io.qgroundcontrol.station import GroundStation, check_address
@@ -178,7 +178,7 @@ def _force(config: FlightConfig, clock: Clock) -> RobotousForceTorque | None:
     return RobotousForceTorque(device, clock) if device is not None else None
 
 
-def _mocap(config: FlightConfig, clock: Clock, available: AvailableDevices) -> NatNetMocap:
+def _mocap(config: FlightConfig, clock: Clock, available: AvailableDevices) -> Mocap:
     vision = available.vision
 
     def forward(pose: MocapPose) -> None:
@@ -196,7 +196,7 @@ def _mocap(config: FlightConfig, clock: Clock, available: AvailableDevices) -> N
         if vision.watch is not None:
             vision.watch(pose)
 
-    return NatNetMocap(config.vehicle.devices.mocap, clock, on_pose)
+    return open_mocap(config.vehicle.devices.mocap, clock, on_pose)
 
 
 def _ground(config: FlightConfig, address: str, autopilot: MavsdkAutopilot) -> GroundStation:

@@ -92,7 +92,7 @@ class MocapServer(Record, frozen=True):
     name: str
     """Name and version of the program and of the protocol, such as `Motive 3.1, NatNet 4.1`."""
     protocol_version: str
-    """NatNet version, such as `4.1`."""
+    """NatNet version, such as `4.1`, or the type of another motion-capture system."""
 
 
 class ForceCounts(Record, frozen=True, kw_only=True):

@@ -16,7 +16,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.guardian.mocap import MocapClient
-from companion.guardian.settings import MocapSettings
+from companion.io.mocap.system import MocapSettings
 from companion.model.types import MocapPose
 from sitl.natnet import BodyPose, encode_frame
 from tests.guardian.rig import ARMED, ATTITUDE, DISARMED, LAND_MODE, OFFBOARD_MODE, Cameras, Rig

@@ -10,15 +10,18 @@ from pathlib import Path
 from companion import plugins
 from companion.config.controller import law_class
 from companion.config.explain import schema_of
+from companion.config.mocap import system_class
 from companion.config.shipped import FILES
 
 
-def write_distribution(site: Path, name: str, version: str, entry_points: Mapping[str, str]) -> None:
-    """Write the metadata of a distribution with these control laws, NAME: MODULE:ATTRIBUTE."""
+def write_distribution(
+    site: Path, name: str, version: str, entry_points: Mapping[str, str], group: str = plugins.CONTROL_LAWS
+) -> None:
+    """Write the metadata of a distribution with these plug-ins, NAME: MODULE:ATTRIBUTE."""
     info = site / f"{name.replace('-', '_')}-{version}.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
-    lines = [f"[{plugins.CONTROL_LAWS}]", *(f"{law} = {target}" for law, target in entry_points.items())]
+    lines = [f"[{group}]", *(f"{plugin} = {target}" for plugin, target in entry_points.items())]
     (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
 
 
@@ -42,6 +45,7 @@ def _forget() -> None:
     plugins.installed.cache_clear()
     law_class.cache_clear()
     schema_of.cache_clear()
+    system_class.cache_clear()
 
 
 LAW = """

@@ -82,13 +82,13 @@ class Measured:
 async def measure(session: Session) -> Measured:
     """Open motion capture and PX4, wait for the taps, and write the parameter on request."""
     from companion.commissioning.latency.link import LatencyLink  # imports MAVSDK
-    from companion.io.mocap.driver import NatNetMocap
+    from companion.io.mocap.plugin_driver import open_mocap
 
     arguments, vehicle = session.arguments, session.vehicle
     clock, devices = flight_clock(), vehicle.devices
     poses: list[MocapPose] = []
     async with (
-        NatNetMocap(devices.mocap, clock, poses.append),
+        open_mocap(devices.mocap, clock, poses.append),
         LatencyLink(devices.autopilot, clock) as link,
     ):
         _refuse_armed(link, devices.autopilot.address)

@@ -18,6 +18,7 @@ from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.loader import load_flight
 from companion.config.mission import Start
+from companion.config.mocap import NATNET
 from companion.config.vehicle import MocapDevice, NatNetVersion, Vehicle
 from companion.io.mocap.natnet import ServerInfo
 from companion.io.protocols import DeviceError
@@ -45,8 +46,16 @@ class NotStreaming:
 
 
 async def watch(session: Session) -> Watched | NotStreaming:
-    """Watch the stream of the vehicle file's server; look for another server if it does not answer."""
+    """Watch the stream of the vehicle file's server; look for another server if it does not answer.
+
+    Raises:
+        DeviceError: the motion-capture system is not NatNet.
+    """
     arguments, device = session.arguments, session.vehicle.devices.mocap
+    if device.type != NATNET:
+        raise DeviceError(
+            f"mocap {device.type} {device.server}: companion mocap check reads NatNet only; companion check observes this stream"
+        )
     clock = flight_clock()
     frames: list[FrameSeen] = []
     driver = watcher(device, clock, frames.append)
@@ -125,7 +134,7 @@ class Carried:
 async def guide_hand_test(session: Session) -> Carried:
     """Guide the user through the hand test, with poses forwarded to PX4."""
     from companion.io.devices import AvailableDevices, VisionFilter  # imports MAVSDK
-    from companion.io.mocap.driver import NatNetMocap
+    from companion.io.mocap.plugin_driver import open_mocap
     from companion.io.px4.driver import MavsdkAutopilot
     from companion.preflight.hand_test.command import ENDED_BY_HAND, perform
 
@@ -142,7 +151,7 @@ async def guide_hand_test(session: Session) -> Carried:
     )
     try:
         async with (
-            NatNetMocap(devices.mocap, clock, forward) as opened.mocap,
+            open_mocap(devices.mocap, clock, forward) as opened.mocap,
             MavsdkAutopilot(devices.autopilot, clock) as opened.autopilot,
         ):
             outcome = await perform(opened, config, session.console, arguments.json)

@@ -1,0 +1,224 @@
+"""A motion-capture system of another package: its settings, its poses in the flight process and in the guardian, and its failures."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import socket
+import struct
+import tomllib
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+from pydantic import JsonValue
+
+from companion.config.document import ConfigError
+from companion.config.loader import load_flight, load_vehicle, logged_flight
+from companion.config.vehicle import MocapDevice
+from companion.guardian.mocap import MocapProblem, open_client
+from companion.io.mocap.plugin_driver import PluginMocap, open_mocap
+from companion.io.mocap.system import MocapSettings
+from companion.io.protocols import DeviceError
+from companion.model.frames import quat_rotate
+from companion.model.types import MocapPose
+from companion.plugins import MOCAP_SYSTEMS
+from companion.runtime.clock import flight_clock
+from tests.plugins.installed import on_path, write_distribution
+from tests.support import ROOT
+
+EXAMPLE = ROOT / "examples/mocap_vicon"
+VEHICLE = (ROOT / "configs/vehicles/tarot650_2r.yaml").read_text(encoding="utf-8")
+FAILING = '''
+from companion.config.base import Model
+class Options(Model):
+    """Fails."""
+class Failing:
+    options, server_name, sockets, problem = Options, "Failing 1.0", [], None
+    def __init__(self, settings): pass
+    def keep_connected(self, now_s): raise OSError("network\\nis down")
+    def poses(self, now_s): raise RuntimeError("no pose")
+    def close(self): raise RuntimeError("no close")
+class Absent(Failing):
+    def __init__(self, settings): raise OSError("no licence")
+class NoOptions(Failing):
+    options = None
+class Nonsense(Failing):
+    def keep_connected(self, now_s): pass
+    def poses(self, now_s): return ["a pose"]
+'''
+
+
+@pytest.fixture(autouse=True)
+def installed(tmp_path: Path) -> Iterator[None]:
+    """Install the example, and a package whose systems fail."""
+    (tmp_path / "companion_vicon.py").write_text((EXAMPLE / "companion_vicon.py").read_text())
+    (tmp_path / "lab_mocap.py").write_text(FAILING)
+    announced = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]["entry-points"][MOCAP_SYSTEMS]
+    write_distribution(tmp_path, "companion-vicon", "0.1.0", announced, MOCAP_SYSTEMS)
+    failing = {name.lower(): f"lab_mocap:{name}" for name in ("Failing", "Absent", "NoOptions", "Nonsense")}
+    write_distribution(tmp_path, "lab-mocap", "1.0", failing, MOCAP_SYSTEMS)
+    with on_path(tmp_path):
+        yield
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        return int(probe.getsockname()[1])
+
+
+def vicon(port: int) -> MocapDevice:
+    options: dict[str, JsonValue] = {"object_name": "quad", "port": port}
+    return MocapDevice(type="vicon", server="127.0.0.1", interface="127.0.0.1", rigid_body_id=1, options=options)
+
+
+def datagram(number: int, *objects: tuple[str, tuple[float, ...]]) -> bytes:
+    items = b"".join(struct.pack("<BH24s6d", 0, 72, name.encode(), *values) for name, values in objects)
+    return struct.pack("<IB", number, len(objects)) + items + bytes(100)
+
+
+STRANGER = ("wand", (1.0, 2.0, 3.0, 0.0, 0.0, 0.0))
+QUAD = ("quad", (-1250.0, 500.0, 1000.0, 0.1, 0.2, 0.3))
+
+
+@asynccontextmanager
+async def broadcasting(port: int, *objects: tuple[str, tuple[float, ...]]) -> AsyncIterator[None]:
+    """Broadcast frames as Tracker does, 200 per second, on the loopback interface."""
+
+    async def send() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            sender.bind(("127.0.0.1", 0))
+            number = 0
+            while True:
+                number += 1
+                sender.sendto(datagram(number, *objects), ("127.255.255.255", port))
+                await asyncio.sleep(0.005)
+
+    sending = asyncio.create_task(send())
+    try:
+        yield
+    finally:
+        sending.cancel()
+        await asyncio.gather(sending, return_exceptions=True)
+
+
+def check_pose(pose: MocapPose) -> None:
+    """Check a pose against `QUAD`: the rotation matrix of Euler XYZ is Rx Ry Rz."""
+    assert pose.position_world_m == pytest.approx((-1.25, 0.5, 1.0))
+    cy, sy, cz = math.cos(0.2), math.sin(0.2), math.cos(0.3)
+    cx, sx, sz = math.cos(0.1), math.sin(0.1), math.sin(0.3)
+    assert quat_rotate(pose.attitude_wxyz, (0.0, 0.0, 1.0)) == pytest.approx((sy, -sx * cy, cx * cy))
+    x_axis = (cy * cz, cx * sz + sx * sy * cz, sx * sz - cx * sy * cz)
+    assert quat_rotate(pose.attitude_wxyz, (1.0, 0.0, 0.0)) == pytest.approx(x_axis)
+    assert pose.tracking_valid
+
+
+def settings_of(device: MocapDevice) -> MocapSettings:
+    return MocapSettings(**{name: getattr(device, name) for name in MocapSettings.__slots__})
+
+
+def test_flight_and_guardian_receive_the_same_poses() -> None:
+    async def run() -> None:
+        port, clock = free_port(), flight_clock()
+        device = vicon(port)
+        poses: list[MocapPose] = []
+        client = open_client(settings_of(device))
+        async with (
+            broadcasting(port, STRANGER, QUAD),
+            open_mocap(device, clock, poses.append) as driver,
+        ):
+            pose = driver.latest()
+            assert pose is not None and pose is poses[-1] and 0.0 <= clock() - pose.stamp_s < 1.0
+            check_pose(pose)
+            assert driver.server is not None and driver.server.name == "Vicon Tracker, UDP object stream"
+            assert driver.counts().problem is None
+            client.keep_connected(100.0)
+            seen = client.poses(100.0, origin_s=60.0)
+            assert seen and client.tracked_s == 100.0 and 39.0 < seen[-1].stamp_s <= 40.0
+            check_pose(seen[-1])
+        client.close()
+
+    asyncio.run(run())
+
+
+def test_an_object_that_is_not_tracked_is_reported() -> None:
+    async def run() -> None:
+        port = free_port()
+        device = vicon(port)
+        driver = PluginMocap(device, flight_clock(), lambda _: None, body_timeout_s=0.3)
+        async with broadcasting(port, ("quad", (0.0,) * 6)):
+            with pytest.raises(DeviceError, match="rigid body 1 was not tracked within"):
+                await driver.__aenter__()
+
+    asyncio.run(run())
+
+
+def test_damaged_datagrams_are_rejected() -> None:
+    client = open_client(settings_of(vicon(free_port())))
+    whole = datagram(7, STRANGER, QUAD)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for size in range(5 + 2 * 75):
+            sender.sendto(whole[:size], ("127.0.0.1", client.sockets[0].getsockname()[1]))
+    assert client.poses(0.0) == []
+    assert client.problem is not None and "ends early" in client.problem
+    client.close()
+
+
+@pytest.mark.parametrize(
+    ("system", "in_guardian", "in_flight"),
+    [
+        ("failing", "OSError: network", "RuntimeError: no pose"),
+        ("nonsense", "AttributeError: ", r"TypeError: poses\(\) returned \['a pose'\], expected a list of MocapPose"),
+    ],
+)
+def test_exceptions_of_a_client_are_contained(system: str, in_guardian: str, in_flight: str) -> None:
+    device = MocapDevice(type=system, server="server", rigid_body_id=1)
+    client = open_client(settings_of(device))
+    client.keep_connected(0.0)
+    assert client.poses(0.0) == [] and client.tracked_s < 0.0
+    client.close()
+    assert client.problem is not None and client.problem.startswith(in_guardian)
+
+    async def run() -> None:
+        driver = PluginMocap(device, flight_clock(), lambda _: None, body_timeout_s=0.1)
+        with pytest.raises(DeviceError, match=f"rigid body 1 was never seen .* the newest problem: {in_flight}"):
+            await driver.__aenter__()
+        assert driver.counts().malformed >= 2
+
+    asyncio.run(run())
+
+
+def test_a_client_that_cannot_be_made_refuses_the_flight() -> None:
+    device = MocapDevice(type="absent", server="server", rigid_body_id=1)
+    with pytest.raises(MocapProblem, match="mocap absent server: the client cannot be made: no licence"):
+        open_client(settings_of(device))
+    with pytest.raises(DeviceError, match="mocap absent server: the client cannot be made: OSError: no licence"):
+        asyncio.run(open_mocap(device, flight_clock(), lambda _: None).__aenter__())
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        ("type: vicon\n    options: {object_name: 3}", "options.object_name: Input should be a valid string"),
+        ("type: vicon\n    options: {object_nam: quad}", "options.object_nam: Extra inputs are not permitted"),
+        ("type: qualisys", "type: motion-capture system 'qualisys': is not installed; installed: absent, failing, nonsense"),
+        ("type: nooptions", "(lab-mocap 1.0): its attribute 'options' is not a subclass"),
+        ("options: {a: 1}", "options: must be empty for natnet"),
+    ],
+)  # fmt: skip
+def test_settings_are_checked_with_the_vehicle_file(tmp_path: Path, lines: str, expected: str) -> None:
+    path = tmp_path / "vehicle.yaml"
+    path.write_text(VEHICLE.replace("  mocap:\n", f"  mocap:\n    {lines}\n", 1), encoding="utf-8")
+    with pytest.raises(Exception, match=r"vehicle\.yaml:\d+:\d+: devices\.mocap") as refused:
+        load_vehicle(path)
+    assert expected in str(refused.value)
+
+
+def test_a_log_is_read_without_the_system(tmp_path: Path) -> None:
+    logged = load_flight("hover", overrides=["vehicle.devices.mocap.type=qualisys"])
+    assert logged_flight(logged.model_dump_json()).vehicle.devices.mocap.type == "qualisys"
+    with pytest.raises(ConfigError, match="'qualisys': is not installed"):
+        load_flight("hover", overrides=["vehicle.devices.mocap.type=qualisys"], hardware=True)
