@@ -45,7 +45,7 @@ class Frame:
 
     shapes: list[Shape]
     curves_to_px: float
-    """Column up to which the curves are drawn."""
+    """Pixel column up to which the curves are drawn."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -68,7 +68,7 @@ class Campaign(ABC):
 
     @property
     def world(self) -> str:
-        """Name of the world that is flown."""
+        """Name of the world in which the campaign flies."""
         return self.configs[0].laboratory.name
 
     def job(self) -> Message:
@@ -170,7 +170,7 @@ def run(campaign: Campaign, out: Path, console: Console | None) -> int:
 
 
 def fly(campaign: Campaign, out: Path) -> Flown:
-    """Fly the campaign and show a progress bar. Ctrl-C and SIGTERM end it; flights that have ended are kept."""
+    """Fly the campaign and show a progress bar. Ctrl-C and SIGTERM end it; the results of flights that have ended are kept."""
     results: dict[int, Message] = {}
     notes: list[str] = []
     code, whole, bad = EXIT_OK, len(campaign.flights), 0

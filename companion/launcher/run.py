@@ -102,8 +102,8 @@ def autopilot_of(log: FlightLog | None, world: dict[str, Any]) -> dict[str, Any]
 
 
 def report_of(log: FlightLog, summary: dict[str, Any], out: Path) -> Path | None:
-    """Write report.html with its plots and return its path. Return None if matplotlib is not installed, which a flight does not
-    need.
+    """Write report.html with its plots and return its path. Return None if matplotlib, which a flight does not need, is not
+    installed.
     """
     try:
         from companion.analysis.report import write_report

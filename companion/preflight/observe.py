@@ -72,8 +72,8 @@ async def observe(
     progress: Progress,
     known: Observations | None = None,
 ) -> Observations:
-    """Observe all devices for `safety.preflight_s`, and longer while a check may still pass. At the same time read PX4's version
-    and parameters, and read the servo bus as in flight, which keeps its watchdogs from tripping.
+    """Observe all devices for `safety.preflight_s`, and longer while a check may still pass; return the data. At the same time read
+    PX4's version and parameters, and read the servo bus as in flight, which keeps its watchdogs from tripping.
 
     Args:
         devices: open devices; for a device that could not be opened, only the failure is reported.

@@ -40,7 +40,7 @@ def is_ablation(preset: str) -> bool:
 
 
 def short_label(controller: str, preset: str) -> str:
-    """Return ` - F_d off` for an ablation, otherwise `law/preset`."""
+    """Return only the removed part for an ablation, such as ` - F_d off`, otherwise `law/preset`."""
     _, less, what = preset.partition(LESS)
     return f"{less}{what}" if less else f"{controller}/{preset}"
 
@@ -51,7 +51,7 @@ class Variant:
 
     controller: str
     preset: str
-    """Name in the table: a preset, or a preset with the removed part."""
+    """Name in the table: a preset, or a preset and the part that is removed from it."""
     base_preset: str
     """The preset to load."""
     overrides: tuple[str, ...] = ()

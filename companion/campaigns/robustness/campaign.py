@@ -100,7 +100,7 @@ class Robustness(Campaign):
         return [Picture(path, title, caption)] if write_distribution(rows, title, path) else []
 
     def write_extra_files(self, rows: Sequence[Row], out: Path) -> None:
-        """Write the worst flights to `worst.yaml`, and the flights to keep to `--keep`, as cases."""
+        """Write the worst flights to `worst.yaml`, and the flights to keep to the file of `--keep`, as cases."""
         self._write_cases(worst(rows), out / "worst.yaml")
         if self.keep is not None:
             self._write_cases(rows if self.cases else worst(rows), Path(self.keep))
@@ -184,7 +184,7 @@ def thirds_table(rows: Sequence[Row]) -> Table:
 
 
 def flights_table(rows: Sequence[Row], cases: Sequence[Case] = ()) -> Table:
-    """Return one line per flight with its result and the drawn values.
+    """Return a table with one line per flight: its result and the drawn values.
 
     Args:
         rows: rows of the flights.

@@ -35,7 +35,7 @@ class Figure:
     differences: tuple[float | None, ...]
     """Differences from the first flight."""
     verdicts: tuple[str | None, ...]
-    """`better` or `worse` than the first flight, for metrics of which a smaller value is certainly better."""
+    """`better` or `worse` than the first flight, for metrics for which a smaller value is certainly better."""
 
 
 @dataclass(frozen=True)

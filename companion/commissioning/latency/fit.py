@@ -31,7 +31,7 @@ TAPS_MIN: Final = 5
 STRENGTH_MIN_M_S2: Final = 1.5
 """Minimum peak of the specific force without its slow part."""
 NOISE_FACTOR: Final = 7.0
-"""Minimum ratio of a tap to the IMU's noise."""
+"""Minimum ratio of a tap's strength to the IMU's noise."""
 CORRELATION_MIN: Final = 0.5
 TAP_ERROR_MAX_S: Final = 0.004
 """Largest standard error of a usable tap's delay."""
@@ -67,7 +67,7 @@ class TapDelay:
     error_s: float
     """Standard error from the curvature of the residual."""
     correlation: float
-    """Correlation without the slow part; 1 if the shifted IMU explains all motion."""
+    """Correlation without the slow part; 1 if the shifted IMU data explain all of the motion."""
     problem: str
     """Why the tap is not used; empty if it is used."""
 

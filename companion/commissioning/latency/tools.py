@@ -156,7 +156,7 @@ async def _tapped(session: Session, link: LatencyLink, clock: Clock, poses: list
 async def _count(
     session: Session, link: LatencyLink, clock: Clock, from_s: float, end_s: float, wanted: int
 ) -> list[Tap]:
-    """Return the taps since `from_s` once there are `wanted` of them and the last is complete; fewer if the time is over."""
+    """Return the taps since `from_s` once there are `wanted` of them and the last is complete; fewer if time runs out."""
     felt: list[Tap] = []
     while clock() < end_s and (len(felt) < wanted or clock() < felt[-1].t_s + SETTLE_S):
         await asyncio.sleep(_LOOK_S)
@@ -199,7 +199,7 @@ def rows(m: Measured, max_ms: float) -> list[Row]:
         TAPS.good(f"{len(m.delay.used)} of {len(m.taps)}, {1e3 * m.delay.spread_s:.1f} ms from tap to tap"),
         DELAY.row(
             right,
-            f"measured {m.total_ms:.1f} +- {1e3 * m.delay.error_s:.1f} ms, PX4 has {has}",
+            f"measured {m.total_ms:.1f} +- {1e3 * m.delay.error_s:.1f} ms; PX4 has {has}",
             f"within {TOLERANCE_MS:g} ms",
             set_it,
         ),

@@ -230,7 +230,7 @@ def _server(info: ServerInfo, read: str) -> Row:
     if info.natnet_version[:2] <= NEWEST_DESCRIBED_VERSION:
         return SERVER.good(read)
     newest = ".".join(map(str, NEWEST_DESCRIBED_VERSION))
-    fix = "compare the poses with those that Motive shows; a latency that is not reported means an unknown suffix"
+    fix = "compare the poses with those that Motive shows; if no latency is reported, the end of these frames has an unknown layout"
     return SERVER.doubtful(read, f"NatNet {newest} or older", fix)
 
 
@@ -289,7 +289,7 @@ def _own(seen: Sequence[BodyMotion], own_id: int, moving: bool, changes: dict[Lo
 def _rate(t: Timing, expected_hz: float, changes: dict[Location, Data]) -> Row:
     wanted = f"{expected_hz:g} Hz"
     camera_hz = t.server_rate_hz or 1.0 / t.period_s
-    read = f"{t.rate_hz:.1f} Hz, the cameras run at {camera_hz:.1f} Hz"
+    read = f"{t.rate_hz:.1f} Hz; the cameras run at {camera_hz:.1f} Hz"
     if abs(t.rate_hz / expected_hz - 1.0) <= RATE_TOLERANCE:
         return preflight.RATE.good(read, wanted)
     fix = "frames are being lost on the network: use a cable, a separate network or a less busy computer"

@@ -66,7 +66,7 @@ class Motion:
 def measure(
     poses: Sequence[PoseAt], imu: Sequence[ImuAt], start_s: float, end_s: float, gyro_bias_rad_s: Vec3
 ) -> Motion:
-    """Compare a motion that begins and ends at rest.
+    """Measure a motion that begins and ends at rest, both with the IMU and with motion capture.
 
     Args:
         poses: poses in order of time, from before `start_s` until after `end_s`.
