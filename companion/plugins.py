@@ -1,4 +1,4 @@
-"""Plug-ins: parts of the companion that any installed distribution may provide. Entry points (`importlib.metadata`) announce them.
+"""Plug-ins: parts of the companion that any installed distribution can provide and announces by entry points (`importlib.metadata`).
 
 The companion announces its own parts in the same way, in pyproject.toml.
 """
@@ -19,12 +19,12 @@ from companion import DISTRIBUTION, __version__
 CONTROL_LAWS = "companion.control_laws"
 MOCAP_SYSTEMS = "companion.mocap_systems"
 KINDS = {CONTROL_LAWS: "control law", MOCAP_SYSTEMS: "motion-capture system"}
-"""Kind of part that each group of entry points announces."""
+"""Kind of part, in words, that each group of entry points announces."""
 _SOURCE_TREE = Path(__file__).parents[1]
 
 
 class PluginError(Exception):
-    """A plug-in cannot be used. The text is one line that names the plug-in and the reason."""
+    """A plug-in cannot be used; the text is one line that names the plug-in and the reason."""
 
     def __init__(self, plugin: object, reason: str) -> None:
         super().__init__(f"{plugin}: {reason}")
@@ -39,7 +39,7 @@ class Plugin:
     distribution: str
     version: str
     others: list[Plugin] = field(default_factory=list)
-    """Parts of other distributions with the same name; then none of them can be used."""
+    """Parts with the same name from other distributions; if there are any, none of the parts can be used."""
 
     def __str__(self) -> str:
         return f"{KINDS[self.entry.group]} '{self.entry.name}' ({self.distribution} {self.version})"
@@ -58,18 +58,20 @@ class Plugin:
             raise self.error(f"{self.entry.value} cannot be imported: {one_line(error)}") from error
 
     def error(self, reason: str) -> PluginError:
-        """Return the error that this plug-in cannot be used for a reason."""
+        """Return an error which states that this plug-in cannot be used, and the reason."""
         return PluginError(self, reason)
 
 
 def one_line(error: BaseException) -> str:
-    """Return type and text of an exception as one line."""
+    """Return the type of an exception and the first line of its text as one line."""
     return ": ".join([type(error).__name__, *str(error).splitlines()[:1]])
 
 
 @functools.cache
 def installed(group: str) -> dict[str, Plugin]:
-    """Return the installed plug-ins of a group by name: the companion's own first, then those of other distributions by name."""
+    """Return the installed plug-ins of a group by name: first the companion's own, then those of other distributions in order of
+    name.
+    """
     found: dict[str, Plugin] = {}
     for plugin in [*_own(group), *sorted(_of_others(group), key=lambda plugin: plugin.entry.name)]:
         first = found.setdefault(plugin.entry.name, plugin)
@@ -82,7 +84,7 @@ def find(group: str, name: str) -> Plugin:
     """Return an installed plug-in.
 
     Raises:
-        PluginError: it is not installed.
+        PluginError: no plug-in of this name is installed.
     """
     plugins = installed(group)
     if name not in plugins:
@@ -91,8 +93,8 @@ def find(group: str, name: str) -> Plugin:
 
 
 def _own(group: str) -> Iterator[Plugin]:
-    """Yield the companion's own parts: in a source tree those of pyproject.toml, because an editable installation keeps the entry
-    points of the day on which it was made.
+    """Yield the companion's own parts. In a source tree they are read from pyproject.toml, because an editable installation keeps the
+    entry points of the day on which it was made.
     """
     path = _SOURCE_TREE / "pyproject.toml"
     source = tomllib.loads(path.read_text(encoding="utf-8")) if path.exists() else {}

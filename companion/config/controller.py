@@ -1,7 +1,7 @@
-"""The controller file: a control law and its gains. `companion.control` implements the laws and the estimates that they start with.
+"""The controller file: a control law and its gains. `companion.control` implements the laws and their initial estimates.
 
-Control laws are plug-ins (`companion.plugins.CONTROL_LAWS`). An entry point names the class of a law, as `companion.control.types.Law`
-describes it, and the class names its settings: a subclass of `ControllerConfig`.
+Control laws are plug-ins (`companion.plugins.CONTROL_LAWS`). An entry point names the class of a law, which implements
+`companion.control.types.Law`; the class names the model of its settings, a subclass of `ControllerConfig`.
 """
 
 from __future__ import annotations
@@ -26,10 +26,12 @@ Positive4 = tuple[Positive, Positive, Positive, Positive]
 
 
 class ControllerConfig(Model):
-    """Settings of any control law. A subclass narrows `law` to `Literal[NAME]`, names its presets and adds the law's own settings."""
+    """Settings that every control law has. A subclass narrows `law` to `Literal[NAME]`, names its presets and adds its own settings."""
 
     presets: ClassVar[tuple[str, ...]] = ()
-    """Names of the built-in presets, the default last. They are files/controllers/LAW_PRESET.yaml beside the module of the class."""
+    """Names of the built-in presets, with the default last. Their files are files/controllers/LAW_PRESET.yaml next to the class's
+    module.
+    """
 
     schema_version: Literal[1]
     law: str
@@ -37,25 +39,29 @@ class ControllerConfig(Model):
 
 
 class LawConfig(ControllerConfig):
-    """Settings that the companion's own laws share: measured force, additional compensation, and the limits of their commands."""
+    """Settings that the companion's own laws share: for the measured force, additional compensation and limits of the commands."""
 
     force_lowpass_hz: Positive
     desired_force_time_s: Positive | None = None
-    """T_d of F_d = lowpass(F_ext) on the joint rows. If absent, F_d = 0 and the arm sags under a carried payload."""
+    """Time constant T_d of F_d = lowpass(F_ext) on the joint rows. If it is absent, F_d = 0 and the arm sags under a carried
+    payload.
+    """
     force_feedforward_xyz: NonNegative3 = (0.0, 0.0, 0.0)
     """Fraction of the measured F_ext that is fed forward to the base, per world axis."""
     disturbance_time_xyz_s: NonNegative3 = (0.0, 0.0, 0.0)
-    """Time constant of the disturbance observer, per world axis. It estimates and compensates the forces on the base that are neither
-    commanded nor fed forward. 0 switches it off, as in the paper.
+    """Time constant of the disturbance observer, per world axis; 0 disables it, as in the paper. The observer estimates and compensates
+    the forces on the base that are neither commanded nor fed forward.
     """
     disturbance_lag_s: NonNegative = 0.1
-    """Lag from the commanded to the actual force that the observer assumes."""
+    """Lag between commanded and actual force that the observer assumes."""
     disturbance_max_n: NonNegative = 6.0
     """Bound of the observer's estimate, per axis."""
     feedforward_lead_s: NonNegative = 0.0
-    """Lead of the feedforward of the reference's horizontal acceleration (a + lead times jerk), for the delay of the attitude loop."""
+    """Lead of the feedforward of the reference's horizontal acceleration (a + lead * jerk), which compensates the attitude loop's
+    delay.
+    """
     arm_friction_share: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Fraction of the vehicle file's `arm.joint_friction_nm` that is fed forward along the wanted joint rate."""
+    """Fraction of the vehicle file's `arm.joint_friction_nm` that is fed forward in the direction of the reference joint rate."""
     lateral_force_max_n: Positive = 12.0
     attitude_filter_rad_s: Positive = 30.0
     attitude_filter_damping: Annotated[float, Field(ge=0.5, le=2)] = 1.0
@@ -71,51 +77,52 @@ class AdaptiveConfig(LawConfig):
 
     law: Literal["adaptive"]
     inertia_md: Positive8
-    """M_d: kg and kg m^2."""
+    """M_d of the paper, kg and kg m^2."""
     lambda_gain: Positive8
     """Lambda of the paper."""
     phi: Positive8
-    """Phi, 1/s."""
+    """Phi of the paper, 1/s."""
     damping_kd: Positive8
     """K_d of the paper."""
     stiffness_kp: Positive8
-    """K_p; must equal (K_d - M_d Phi) Phi (gain_cond)."""
+    """K_p of the paper; must equal (K_d - M_d Phi) Phi (gain_cond)."""
     row_weights_s: NonNegative8
-    """S: weight of each row in ||s||, ||xi||, ||chi_dd||; 0 masks a row that another loop controls."""
+    """S: weight of each row in ||s||, ||xi|| and ||chi_dd||; 0 masks a row that another loop controls."""
     h_initial: Positive4
-    """H_0(0) .. H_3(0)."""
+    """Initial values H_0(0) to H_3(0)."""
     zeta_initial: Positive
     nu: Positive4
-    """Leakage of H, 1/s."""
+    """Leakage of H_0 to H_3, 1/s."""
     epsilon: Positive
     boundary_layer: Positive
     """varpi of the paper."""
     rho_max: Positive
     acceleration_cap: NonNegative
-    """Largest ||S chi_dd|| that may enter rho; 0 switches H_3 off."""
+    """Largest ||S chi_dd|| that may enter rho; 0 disables H_3."""
     acceleration_lowpass_hz: Positive
     h_max: Positive4 | None = None
-    """Bound of H_0 .. H_3 (projection); if null, only the leakage bounds them, as in the paper."""
+    """Upper bounds of H_0 to H_3 (projection); if null, only the leakage bounds them, as in the paper."""
     load_rate_xyz: NonNegative3 = (0.0, 0.0, 0.0)
-    """Gamma of the adaptive load on x, y and z, kg/s^2; 0 switches it off, as in the paper."""
+    """Adaptation rate Gamma of the adaptive load on x, y and z, kg/s^2; 0 disables it, as in the paper."""
     load_leakage: NonNegative = 0.0
     """Leakage of every adaptive load, 1/s."""
     load_max_n: NonNegative = 8.0
     """Bound of the adaptive load on x, y and z (projection)."""
     moment_rate: NonNegative = 0.0
-    """Gamma of the adaptive first moments of the links, kg s^2; 0 switches them off."""
+    """Adaptation rate Gamma of the adaptive first moments of the links, kg s^2; 0 disables them."""
     moment_max_kg_m: NonNegative = 0.3
     """Bound of the adaptive first moments (projection)."""
     friction_rate: NonNegative = 0.0
-    """Gamma of the adaptive joint friction, kg m^2/s^2; 0 switches it off."""
+    """Adaptation rate Gamma of the adaptive joint friction, kg m^2/s^2; 0 disables it."""
     friction_max_nm: NonNegative = 0.3
     """Bound of the adaptive joint friction (projection)."""
     arm_gravity_nominal: bool = True
-    """Feed the arm's gravity torque forward with the vehicle file's masses."""
+    """Whether the arm's gravity torque, computed with the masses in the vehicle file, is fed forward."""
     base_compliance_xyz: NonNegative3 = (0.0, 0.0, 0.0)
-    """Fraction of the measured F_ext that enters e_tau on the base rows (0: as in the paper)."""
+    """Fraction of the measured F_ext that enters e_tau on the base rows; 0 as in the paper."""
     arm_inertia_nominal: bool = False
-    """Feed the arm's nominal inertia and Coriolis torque forward in place of M_d. The vehicle and the coupling stay unmodelled."""
+    """Whether the arm's nominal inertia and Coriolis torque are fed forward in place of M_d. The vehicle and the coupling remain
+    unmodelled."""
 
     @model_validator(mode="after")
     def _conditions(self) -> Self:
@@ -146,21 +153,21 @@ class CscConfig(LawConfig):
 
     law: Literal["csc"]
     inertia_md: Positive8
-    """M_d: kg and kg m^2."""
+    """Desired inertia M_d, kg and kg m^2."""
     damping_kd: Positive8
     """K_d. On the attitude rows it describes the damping of PX4's attitude loop and has no effect on commands."""
     stiffness_kp: Positive8
     """K_p. On the attitude rows it describes the stiffness of PX4's attitude loop and has no effect on commands."""
     external_xyz: NonNegative3 = (1.0, 1.0, 1.0)
-    """Fraction of the measured F_ext, per world axis, that enters the base's impedance and is cancelled through the model."""
+    """Fraction of the measured F_ext, per world axis, that acts on the base's impedance and is cancelled by means of the model."""
     desired_force_xyz: NonNegative3 = (0.0, 0.0, 0.0)
-    """Fraction of F_d that the base carries. If 0, the base also yields to a carried payload."""
+    """Fraction of F_d, per world axis, that the base carries. If it is 0, the base also yields to a carried payload."""
     model_mass_scale: Positive = 1.0
-    """Factor on the masses and inertias of the vehicle file, for studies of model errors."""
+    """Factor by which the law multiplies the masses and inertias of the vehicle file, for studies of model errors."""
 
 
 class PscConfig(LawConfig):
-    """Partitioned compliance (after Wang et al., RA-L 2024): impedance of the arm alone, position control of the vehicle alone."""
+    """Partitioned compliance (after Wang et al., RA-L 2024): an impedance for the arm only and position control of the vehicle."""
 
     presets = ("tuned_extras", "tuned")
 
@@ -170,27 +177,27 @@ class PscConfig(LawConfig):
     position_kd_xyz: Positive3
     """Velocity gain per world axis, 1/s."""
     position_ki_xyz: NonNegative3
-    """Integral gain per world axis, 1/s^3; 0 switches the integral part off."""
+    """Integral gain per world axis, 1/s^3; 0 disables the integral term."""
     integral_max_m_s2: NonNegative = 1.5
-    """Largest acceleration of the integral part, per axis."""
+    """Largest acceleration of the integral term, per axis."""
     arm_inertia_md: Positive2
     """M_d of the joints, kg m^2."""
     arm_damping_kd: Positive2
     arm_stiffness_kp: Positive2
     payload_time_s: Positive
-    """Time constant of the payload's mass estimate."""
+    """Time constant of the estimate of the payload's mass."""
     payload_max_kg: NonNegative = 1.0
-    """Upper bound of the estimate; 0 switches it off."""
+    """Upper bound of the mass estimate; 0 disables the estimate."""
     thrust_lag_s: NonNegative = 0.05
-    """Lag from the commanded to the actual thrust that the estimate assumes."""
+    """Lag between commanded and actual thrust that the mass estimate assumes."""
 
 
 @functools.cache
 def law_class(law: str) -> Any:
-    """Return the class of an installed control law; `companion.control.types.Law` describes its instances.
+    """Return the class of an installed control law, whose instances implement `companion.control.types.Law`.
 
     Raises:
-        PluginError: the law is not installed, cannot be imported, or its settings do not fit.
+        PluginError: the law is not installed or cannot be imported, or its settings or presets are invalid.
     """
     plugin = plugins.find(plugins.CONTROL_LAWS, law)
     found = plugin.load()
@@ -208,7 +215,7 @@ def law_class(law: str) -> Any:
 
 
 def preset_file(law: str, preset: str) -> Path:
-    """Return the path of a preset, one of `PRESETS[law]`."""
+    """Return the path of the file of a preset, which is one of `PRESETS[law]`."""
     return _preset_file(LAWS[law], law, preset)
 
 
@@ -221,7 +228,11 @@ T = TypeVar("T")
 
 
 class _OfLaws(Mapping[str, T]):
-    """A value for each installed law, read from its class when it is asked for; raises PluginError if the law cannot be used."""
+    """A mapping from each installed law to a value, which is read from the law's class on access.
+
+    Raises:
+        PluginError: on access, the law cannot be used.
+    """
 
     def __init__(self, read: Callable[[Any], T]) -> None:
         self._read = read
@@ -244,7 +255,7 @@ class _OfLaws(Mapping[str, T]):
 LAWS: Mapping[str, type[ControllerConfig]] = _OfLaws(lambda law: law.settings)
 """Settings of each installed law."""
 PRESETS: Mapping[str, tuple[str, ...]] = _OfLaws(lambda law: law.settings.presets)
-"""Built-in presets of each installed law, the default last."""
+"""Built-in presets of each installed law, with the default last."""
 
 
 def _of_its_law(value: Any) -> Any:
@@ -252,4 +263,4 @@ def _of_its_law(value: Any) -> Any:
 
 
 AnyControllerConfig = Annotated[SerializeAsAny[ControllerConfig], BeforeValidator(_of_its_law)]
-"""Settings of the law that their key `law` names, as the field of another model."""
+"""Type for a field of another model: settings of the law that their key `law` names."""

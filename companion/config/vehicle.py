@@ -31,32 +31,34 @@ class Airframe(Model):
     mass_kg: Positive
     """Mass of the whole vehicle ready to fly, with arm and net, without payload."""
     inertia_kg_m2: Positive3 = (0.045, 0.045, 0.075)
-    """Moments of inertia of the base without arm and tool about the body's x, y, z at its origin; used by the model-based laws and the
-    simulated airframe. The default is the Tarot 650's."""
+    """Moments of inertia of the base, without arm and tool, about the body's x, y and z axes; used by the model-based laws and the
+    simulated airframe. The default is that of the Tarot 650."""
     rotor_arm_m: Positive = 0.325
     """Distance of each of the four rotors from the body's z axis, in the X layout (45 deg from the body's x axis); used by the
-    simulated airframe and its CA_ROTOR parameters in PX4. The default is the Tarot 650's."""
+    simulated airframe and its CA_ROTOR parameters in PX4. The default is that of the Tarot 650."""
     yaw_torque_per_thrust_m: Positive = 0.025
     """Yaw torque of one rotor divided by its thrust, N m/N; used by the simulated airframe and its CA_ROTOR parameters in PX4. The
-    default is the Tarot 650's."""
+    default is that of the Tarot 650."""
     thrust_max_n: Positive
     """Thrust of all rotors at full command with a charged battery."""
     hover_thrust: Fraction | None = None
-    """Normalised thrust that carries `mass_kg`. If it is absent, PX4's MPC_THR_HOVER is used."""
+    """Normalised thrust that carries `mass_kg` in hover. If it is absent, PX4's MPC_THR_HOVER is used."""
     hover_thrust_adapt: bool = True
-    """Estimate the hover thrust in flight from the thrust sent, the IMU and the force sensor. If false it stays constant."""
+    """Whether the hover thrust is estimated in flight from the thrust sent, the IMU and the force sensor. If false, it stays
+    constant.
+    """
     tilt_max_deg: Annotated[float, Field(gt=0, le=45)] = 20.0
     """Largest tilt of an attitude setpoint."""
     ground_clearance_m: Positive
     """Height of the body origin above the floor when the vehicle rests on its landing gear."""
     radius_m: Positive = 0.45
-    """Horizontal radius around the body origin, rotor disks included."""
+    """Horizontal radius around the body origin, including the rotor disks."""
     payload_max_kg: NonNegative = 0.4
-    """Payload that the check of a mission without `catch:` assumes."""
+    """Payload that is assumed when a mission without `catch:` is checked."""
 
 
 class Joint(Model):
-    """One servo and its joint; angles as in the paper."""
+    """One servo and its joint, with angles as defined in the paper."""
 
     servo_id: Annotated[int, Field(ge=0, le=252)]
     sign: Literal[-1, 1]
@@ -64,24 +66,24 @@ class Joint(Model):
     zero_count: Annotated[int, Field(ge=-1048575, le=1048575)]
     """Present Position (register 132) at joint angle 0."""
     angle_deg: Span
-    """Joint limits, lower and upper."""
+    """Lower and upper joint limit."""
     torque_max_nm: Annotated[float, Field(gt=0, le=3.0)]
     velocity_max_deg_s: Positive = 300.0
 
 
 class Arm(Model):
-    """The 2R arm. Link 1 begins at the shoulder, link 2 carries sensor and net."""
+    """The 2R arm. Link 1 begins at the shoulder; link 2 carries sensor and net."""
 
     shoulder_body_m: Vector3
     link_lengths_m: Positive2
-    """Lengths from shoulder to elbow, and from elbow to the centre of the net, or without a tool to the end of link 2."""
+    """Lengths from shoulder to elbow, and from elbow to the centre of the net or, without a tool, to the end of link 2."""
     link_masses_kg: Positive2
-    """Masses of link 1 with the elbow servo, and of link 2 without sensor and net."""
+    """Mass of link 1 with the elbow servo, and mass of link 2 without sensor and net."""
     link_com_m: Positive2
     """Distance of each link's centre of mass from its joint."""
     torque_per_amp_nm_a: Positive = 1.3
     joint_armature_kg_m2: NonNegative = 0.008
-    """Inertia of a servo's rotor and gears at the joint; used by the model-based laws and the simulated arm."""
+    """Inertia of a servo's rotor and gears, referred to the joint; used by the model-based laws and the simulated arm."""
     joint_friction_nm: NonNegative = 0.04
     """Dry friction of one joint, for laws with friction feedforward."""
     joints: tuple[Joint, Joint]
@@ -97,14 +99,16 @@ class Tool(Model):
     sensor_mass_kg: NonNegative
     """Mass of sensor and mount on the arm's side, which the sensor does not measure."""
     net_mass_kg: NonNegative
-    """Mass of all parts on the tool side of the sensor; its weight is subtracted from the readings."""
+    """Mass of all parts on the tool side of the sensor; their weight is subtracted from the readings."""
     net_radius_m: Positive
     sensor_rpy_deg: Vector3 = (0.0, 0.0, 0.0)
-    """Sensor frame in the frame of link 2 (x outwards along the link, y along the joint axis), ZYX roll, pitch, yaw."""
+    """Attitude of the sensor frame in the frame of link 2 (x outwards along the link, y along the joint axis): roll, pitch, yaw
+    (ZYX).
+    """
 
 
 REACT_TIME_S, STOP_DECELERATION_M_S2 = 0.18, 2.0
-"""Defaults of the stop model, also for a vehicle without a tether."""
+"""Defaults of the stop model, which also apply to a vehicle without a tether."""
 
 
 class Tether(Model):
@@ -116,35 +120,37 @@ class Tether(Model):
     margin_m: NonNegative = 0.25
     """Smallest slack at every planned point and at every point where the vehicle could stop."""
     load_rating_n: Positive = 300.0
-    """Working load of the whole tether from anchor to attachment; it must hold the rotors at full command."""
+    """Working load of the whole tether, from anchor to attachment; it must withstand the full thrust of the rotors."""
     weight_n_per_m: NonNegative = 0.1
-    """Weight per length; the vehicle carries the part that hangs from it."""
+    """Weight per length; the vehicle carries the part of the tether that hangs from it."""
     react_time_s: NonNegative = REACT_TIME_S
     """Time from a fault to PX4's LAND mode; 0.07 to 0.18 s were measured with the guardian."""
     stop_deceleration_m_s2: Positive = STOP_DECELERATION_M_S2
-    """Deceleration of the reference by the governor. Stopping distances assume the slower of this and PX4's LAND at that speed."""
+    """Deceleration with which the governor stops the reference. Stopping distances assume the slower of this stop and a stop in PX4's
+    LAND
+    mode from the same speed."""
     turns_max: Positive = 1.5
-    """Largest number of turns about the anchor's vertical, and of the tether about the vehicle, in either direction."""
+    """Largest number of turns, in either direction, of the tether about the vertical through the anchor and about the vehicle."""
     taut_slack_m: NonNegative = 0.05
-    """The tether is taut below this slack."""
+    """Slack below which the tether counts as taut."""
     pull_min_n: Positive = 3.0
-    """Smallest pull that is detected. Gusts, downwash and a force sensor that has drifted reached 2.8 N for a moment in simulated
-    laboratories without faults; a pull of 3 N tilts a vehicle of 3 kg by 6 deg.
+    """Smallest pull that is detected. In simulated laboratories without faults, gusts, downwash and a drifted force sensor briefly
+    produced 2.8 N. A pull of 3 N tilts a vehicle of 3 kg by 6 deg.
     """
     pull_filter_s: Positive = 0.1
-    """Time constant of the low-pass of the force that rotors, gravity and tool do not explain."""
+    """Time constant of the low-pass filter on the force that rotors, gravity and tool do not explain."""
     pull_time_s: NonNegative = 0.8
-    """Shortest pull that is not treated as an impact."""
+    """Duration from which a pull is not treated as an impact."""
     separation_m: Positive = 0.3
-    """Distance beyond the length without a pull at which the tether is considered separated."""
+    """Distance beyond the tether's length at which, without a pull, the tether counts as separated."""
     rotor_inner_radius_m: NonNegative = 0.15
-    """Radius around the body's z axis without rotor blades, where the tether may hang down."""
+    """Radius around the body's z axis that is free of rotor blades, so that the tether may hang down there."""
     clearance_min_m: NonNegative = 0.01
-    """Smallest distance between the tether and the rotor disks or the space swept by the arm."""
+    """Smallest distance of the tether from the rotor disks and from the space that the arm sweeps."""
 
 
 class Room(Model):
-    """The flying volume; everything that moves stays inside."""
+    """The flying volume; no part of the vehicle may leave it."""
 
     x_m: Span
     y_m: Span
@@ -158,8 +164,9 @@ class AutopilotDevice(Model):
     """MAVSDK connection, such as udpin://0.0.0.0:14540 or serial:///dev/ttyAMA0:921600."""
     discovery_timeout_s: Positive = 10.0
     setpoint_path: Literal["direct", "offboard"] = "direct"
-    """Path of SET_ATTITUDE_TARGET: direct (MAVSDK's MavlinkDirect, only when the flight loop sends) or offboard (MAVSDK's Offboard
-    plugin, whose thread repeats the last setpoint at 20 Hz, even while the flight loop hangs)."""
+    """How SET_ATTITUDE_TARGET is sent: direct (MAVSDK's MavlinkDirect, which sends only when the flight loop does) or offboard
+    (MAVSDK's
+    Offboard plugin, whose thread repeats the last setpoint at 20 Hz, even while the flight loop hangs)."""
 
 
 ANY_INTERFACE = "0.0.0.0"
@@ -194,8 +201,8 @@ class MocapDevice(Model):
 
 
 ServoBaud = Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000]
-"""Baud rates of the arm's servos, in the order of register 8. The tools and the simulated servos have the same and those too slow or
-too fast for a flight."""
+"""Baud rates of the arm's servos, in the order of the values of register 8. The tools and the simulated servos also support rates that
+are too slow or too fast for a flight."""
 
 
 class ArmDevice(Model):
@@ -204,14 +211,16 @@ class ArmDevice(Model):
     port: str
     baud: ServoBaud = 3000000
     watchdog_ms: Annotated[int, Field(ge=20, le=2540)] = 100
-    """Bus watchdog (register 98), a multiple of 20 ms; the servos release torque after this time without an instruction."""
+    """Timeout of the bus watchdog (register 98), a multiple of 20 ms; after this time without an instruction, the servos release
+    torque.
+    """
 
     @model_validator(mode="after")
     def _watchdog_steps(self) -> Self:
         if self.watchdog_ms % 20:
             refuse(
                 "arm device",
-                [(("watchdog_ms",), f"must be a multiple of 20 (the register's unit), got {self.watchdog_ms}")],
+                [(("watchdog_ms",), f"must be a multiple of 20 (the unit of the register), got {self.watchdog_ms}")],
             )
         return self
 
@@ -226,7 +235,7 @@ class ForceDevice(Model):
 
 
 class Devices(Model):
-    """Addresses of the devices."""
+    """Addresses and settings of the devices."""
 
     autopilot: AutopilotDevice
     mocap: MocapDevice
@@ -236,78 +245,81 @@ class Devices(Model):
 
 
 class Safety(Model):
-    """Limits of the safety rules, and times of the reactions. docs/safety.md describes the rules."""
+    """Thresholds of the safety rules, and limits of the reactions. docs/safety.md describes the rules."""
 
     preflight_s: Annotated[float, Field(ge=1, le=60)] = 5.0
-    """Time for which all devices are observed before arming."""
+    """Time for which the preflight check observes all devices before arming."""
 
     # Motion capture
     mocap_timeout_s: Positive = 0.2
-    """Max age of a mocap pose; beyond it the arm folds and PX4 lands using its own estimate. Until then the vehicle follows PX4's dead
-    reckoning: with an acceleration error of 0.5 m/s^2 it is 10 mm off after 0.2 s and 31 mm after 0.35 s. PX4 stops fusing after 0.55
-        s. Hidden markers interrupt tracking for up to 0.1 s in a simulated laboratory without faults."""
+    """Max age of a motion-capture pose; beyond it, the arm folds and PX4 lands using its own estimate. Until then, the vehicle
+    follows PX4's dead reckoning: with an acceleration error of 0.5 m/s^2, it is off by 10 mm after 0.2 s and by 31 mm after 0.35 s.
+    After 0.55 s,
+    PX4's fusion flags are cleared. In a simulated laboratory without faults, hidden markers interrupt tracking for up to 0.1 s."""
     mocap_rate_min_hz: Positive = 50.0
     """Rate of poses below which a warning is raised."""
     mocap_latency_warn_s: Positive = 0.05
-    """Time from mid-exposure to transmission, by Motive's clock, above which a warning is raised."""
+    """Time from mid-exposure to transmission, on the server's clock, above which a warning is raised."""
     mocap_latency_max_s: Positive = 0.12
-    """Latency above which PX4 lands: PX4 fuses a pose at its arrival minus EKF2_EV_DELAY, so at 1 m/s a pose that is 0.12 s late is
-    0.11 m off, as far as `mocap_jump_m` allows."""
+    """Latency above which PX4 lands. PX4 fuses a pose at its arrival time minus EKF2_EV_DELAY, so at 1 m/s a pose that is 0.12 s late
+    is
+    off by 0.11 m, about as much as `mocap_jump_m` allows."""
     mocap_jump_m: Positive = 0.10
-    """Largest distance between a pose and the position predicted from PX4's velocity; a pose beyond it is ignored."""
+    """Largest distance between a pose and the position predicted from PX4's velocity; a more distant pose is ignored."""
     mocap_jump_deg: Positive = 20.0
-    """Largest change of a pose's attitude beyond what the angular rates explain."""
+    """Largest change of a pose's attitude in excess of the change that the angular rates explain."""
     mocap_frozen_s: Positive = 0.10
-    """Longest time with new frames but an identical pose while the vehicle moves."""
+    """Longest time with new frames but an identical pose while the vehicle is moving."""
     mocap_inertial_m: Positive = 0.04
-    """Largest distance between a pose and the position predicted from the IMU; above it PX4 lands without motion capture. With one IMU
-    sample in ten lost it reaches 0.024 at 10 m/s2 of vibration, and 0.036 at 15 m/s2. 0.015 detects drags that begin at 0.2 m/s or
-    faster, 0.025 at 0.3 m/s, 0.04 at 0.5 m/s; a vehicle that vibrates less should use a smaller value.
+    """Largest distance between a pose and the position predicted from the IMU; above it, PX4 lands without motion capture. If one IMU
+    sample in ten is lost, the distance reaches 0.024 at a vibration of 10 m/s^2 and 0.036 at 15 m/s^2. A limit of 0.015 detects poses
+    that drift away at 0.2 m/s or faster, 0.025 at 0.3 m/s and 0.04 at 0.5 m/s; a vehicle that vibrates less should use a smaller
+    value.
     """
     mocap_inertial_s: NonNegative = 0.05
     """Hold time of `mocap_inertial_m`."""
     estimate_disagreement_m: Positive = 0.30
-    """Largest distance between PX4's position and mocap."""
+    """Largest distance between PX4's position estimate and the motion-capture position."""
     yaw_disagreement_deg: Positive = 15.0
-    """Largest difference between PX4's yaw and mocap's."""
+    """Largest difference between PX4's yaw and the motion-capture yaw."""
 
     # PX4 and battery
     vehicle_timeout_s: Positive = 0.25
-    """Max age of PX4's attitude and position."""
+    """Max age of PX4's attitude and position estimates."""
     link_lag_max_s: Positive = 0.07
-    """Largest delay of PX4's messages above their smallest delay; beyond it the link is too slow for control."""
+    """Largest delay of PX4's messages relative to their smallest delay; above it, the link is too slow for control."""
     heartbeat_timeout_s: Positive = 2.5
     battery_min: Fraction = 0.2
     battery_warn: Fraction = 0.3
     battery_voltage_min_v: Positive | None = 13.2
-    """Lowest voltage under load; 3.3 V per cell of a 4S battery. null disables the rule."""
+    """Lowest permitted voltage under load; the default is 3.3 V per cell of a 4S battery. null disables the rule."""
 
     # Arm and force sensor
     arm_timeout_s: Positive = 0.10
-    """Max age of the joint state; beyond it the vehicle lands."""
+    """Max age of the joint state; beyond it, the vehicle lands."""
     arm_read_failures_max: Annotated[int, Field(ge=1)] = 5
     """Largest number of consecutive bus cycles without an answer."""
     servo_warn_c: Positive = 65.0
     servo_max_c: Positive = 75.0
-    """The servos shut down at 80."""
+    """Temperature above which the vehicle lands; the servos shut down at 80 degC."""
     servo_overload_s: Positive = 1.0
-    """Longest time that a joint may be at its torque limit."""
+    """Longest time for which a joint may be at its torque limit."""
     joint_jump_deg: Positive = 15.0
-    """Largest change between two reads beyond what the joint's largest speed explains."""
+    """Largest change of a joint angle between two reads in excess of the change at the joint's largest speed."""
     joint_rate_max_deg_s: Positive = 700.0
-    """Largest plausible joint rate: no servo of this type reaches it, even if an external force drives it."""
+    """Largest plausible joint rate; no servo of this type reaches it, even when driven by an external force."""
     joint_limit_warn_deg: Positive = 3.0
     joint_limit_max_deg: Positive = 10.0
-    """Largest angle by which a joint may exceed its limits; beyond it the vehicle lands."""
+    """Largest angle by which a joint may exceed its limits; beyond it, the vehicle lands."""
     servo_current_max_a: Positive = 2.3
-    """Largest commanded current: the stall current."""
+    """Largest commanded current; the default is the stall current."""
     force_timeout_s: Positive = 0.25
-    """Max age of a force sample; beyond it the controller continues without force and a warning is raised."""
+    """Max age of a force sample; beyond it, the controller continues without the force and a warning is raised."""
     force_stuck_s: Positive = 0.25
-    """Time with new but identical samples after which the controller continues without force."""
+    """Time with new but identical samples after which the controller continues without the force."""
     force_drift_n: Positive = 2.0
-    """Largest lasting force on the net before the catch. Drift and the rotors' wake on the net reached 1.5 N in simulated laboratories
-    without faults.
+    """Largest lasting force on the net before the catch. In simulated laboratories without faults, drift and the rotors' wake on the
+    net reached 1.5 N.
     """
 
     # The flight itself
@@ -316,36 +328,36 @@ class Safety(Model):
     loop_stalled_s: Positive = 0.3
     """Delay of a control tick above which the vehicle lands."""
     command_state_age_max_s: Positive = 0.10
-    """Max age of the attitude from which a setpoint was computed; an older one is not sent to PX4."""
+    """Max age of the attitude from which a setpoint is computed; a setpoint computed from an older attitude is not sent to PX4."""
     thrust_slew_max_per_s: Positive = 100.0
-    """Largest rate of change of the normalised thrust, far above that of a catch."""
+    """Largest rate of change of the normalised thrust, far above the rate during a catch."""
     tilt_abort_deg: Annotated[float, Field(gt=0, le=80)] = 40.0
     tracking_error_warn_m: Positive = 0.45
     tracking_error_hold_m: Positive = 0.6
     tracking_error_abort_m: Positive = 0.8
     thrust_saturated_s: Positive = 1.0
-    """Largest excess of the time at the upper thrust limit over the time below it."""
+    """Largest difference between the time at the upper thrust limit and the time below it."""
     speed_max_m_s: Positive = 2.0
-    """Largest horizontal speed; a mission's limits must stay below."""
+    """Largest horizontal speed; a mission's speed limit must be lower."""
     climb_max_m_s: Positive = 1.5
     sink_max_m_s: Positive = 1.5
     geofence_tolerance_m: NonNegative = 0.10
-    """Distance by which the rotors may leave the room: a mission may use all of it, and tracking has errors."""
+    """Distance by which the rotors may leave the room, because a mission may use the whole room and tracking is not exact."""
     tether_stop_slack_min_m: NonNegative = 0.10
-    """Smallest slack at the predicted stop."""
+    """Smallest tether slack at the position where the vehicle is predicted to stop."""
 
     # Reactions
     guardian_timeout_s: Positive = 0.1
-    """Time without a heartbeat from the flight process, with turning rotors, after which the guardian kills it, takes over and lands.
-    If the guardian takes over, this time is part of `tether.react_time_s`, which must grow with it.
+    """Time without a heartbeat from the flight process, while the rotors turn, after which the guardian kills that process, takes over
+    and lands. In such a takeover this time is part of `tether.react_time_s`, which must be increased with it.
     """
     hold_max_s: Positive = 20.0
-    """Longest HOLD; then the vehicle lands."""
+    """Longest duration of a HOLD, after which the vehicle lands."""
     retract_max_s: Positive = 12.0
-    """Longest RETRACT; then the vehicle lands where it is."""
+    """Longest duration of a RETRACT, after which the vehicle lands where it is."""
     retract_speed_m_s: Positive = 0.3
     retract_slack_m: Positive = 0.6
-    """Slack at the end of a RETRACT."""
+    """Tether slack at the end of a RETRACT."""
     land_speed_m_s: Positive = 0.35
     fold_arm_deg: Vector2 = (165.0, 140.0)
 
@@ -358,7 +370,7 @@ class Vehicle(Model):
     airframe: Airframe
     arm: Arm
     tool: Tool | None = None
-    """Net, and the force-torque sensor before it. If it is absent, nothing can be caught (docs/parts.md)."""
+    """Net, with the force-torque sensor between link 2 and the net. If it is absent, nothing can be caught (docs/parts.md)."""
     tether: Tether | None = None
     """Safety tether. If it is absent, only the room limits the flight, and no tether rule is evaluated (docs/parts.md)."""
     room: Room
@@ -369,12 +381,12 @@ class Vehicle(Model):
 
     @property
     def tip_radius_m(self) -> float:
-        """Radius around the end of link 2: that of the net, or half the thickness of the link without a tool."""
+        """Radius around the end of link 2, m: the radius of the net or, without a tool, half the thickness of the link."""
         return self.tool.net_radius_m if self.tool is not None else LINK_RADIUS_M
 
     @property
     def tool_mass_kg(self) -> float:
-        """Mass of sensor and net; 0 without a tool."""
+        """Mass of sensor and net, kg; 0 without a tool."""
         return self.tool.sensor_mass_kg + self.tool.net_mass_kg if self.tool is not None else 0.0
 
     @model_validator(mode="after")
@@ -383,11 +395,14 @@ class Vehicle(Model):
         first, second = self.arm.joints
         if first.servo_id == second.servo_id:
             problems.append(
-                (("arm", "joints", 1, "servo_id"), f"both servos have the id {second.servo_id}; give each its own")
+                (
+                    ("arm", "joints", 1, "servo_id"),
+                    f"both servos have the id {second.servo_id}; give each servo its own id",
+                )
             )
         for index, (com_m, length_m) in enumerate(zip(self.arm.link_com_m, self.arm.link_lengths_m, strict=True)):
             if com_m > length_m:
-                text = f"the centre of mass lies beyond the link's end: at {com_m:g} m on a link of {length_m:g} m"
+                text = f"the centre of mass is beyond the end of the link: at {com_m:g} m on a link of {length_m:g} m"
                 problems.append((("arm", "link_com_m", index), text))
         for index, (joint, angle_deg) in enumerate(zip(self.arm.joints, self.safety.fold_arm_deg, strict=True)):
             low_deg, high_deg = joint.angle_deg
@@ -397,16 +412,14 @@ class Vehicle(Model):
         for axis, own in enumerate(self.airframe.inertia_kg_m2):
             others = sum(self.airframe.inertia_kg_m2) - own
             if own > others * (1.0 + 1e-9):
-                text = f"expected at most {others:g} kg m^2, the sum of the other two, as for every rigid body, got {own:g}"
+                text = f"expected at most {others:g} kg m^2 (no moment of a rigid body exceeds the sum of the other two), got {own:g}"
                 problems.append((("airframe", "inertia_kg_m2", axis), text))
         if self.tool is None and self.devices.force is not None:
-            text = (
-                "the force-torque sensor is mounted in the tool, but tool is absent; add tool, or remove devices.force"
-            )
+            text = "the force-torque sensor is part of the tool, but tool is absent; add tool, or remove devices.force"
             problems.append((("devices", "force"), text))
         carried_kg = sum(self.arm.link_masses_kg) + self.tool_mass_kg
         if carried_kg >= self.airframe.mass_kg:
-            text = f"{self.airframe.mass_kg:g} kg is the whole vehicle, but arm and tool alone weigh {carried_kg:g} kg"
+            text = f"{self.airframe.mass_kg:g} kg is the mass of the whole vehicle, but arm and tool alone have {carried_kg:g} kg"
             problems.append((("airframe", "mass_kg"), text))
         if self.airframe.thrust_max_n <= GRAVITY_M_S2 * self.airframe.mass_kg:
             text = f"{self.airframe.thrust_max_n:g} N do not lift {self.airframe.mass_kg:g} kg"

@@ -180,17 +180,17 @@ def test_bad_mission_file(project: Path, old: str, new: str, expected: list[str]
 
 
 BAD_VEHICLE = [
-    ("servo_id: 2", "servo_id: 1", ["arm.joints[1].servo_id: both servos have the id 1; give each its own"]),
-    ("watchdog_ms: 100", "watchdog_ms: 90", ["watchdog_ms: must be a multiple of 20 (the register's unit), got 90"]),
+    ("servo_id: 2", "servo_id: 1", ["arm.joints[1].servo_id: both servos have the id 1; give each servo its own id"]),
+    ("watchdog_ms: 100", "watchdog_ms: 90", ["watchdog_ms: must be a multiple of 20 (the unit of the register), got 90"]),
     ("sign: -1", "sign: 0", ["sign: expected one of -1, 1, got 0"]),
     ("baud: 3000000", "baud: 9600", ["baud: expected one of 57600, 115200, 1000000, 2000000, 3000000, 4000000, got 9600"]),
     ("rate_hz: 200.0", "rate_hz: 200.0\n    natnet_version: 3.0", ['expected one of "3.0", "3.1", "4.0", "4.1", "4.2", "4.3", "4.4", got 3.0 (put it in quotes)']),
     ("x_m: [-2.2, 2.2]", "x_m: [2.2, -2.2]", ["room.x_m: expected the first number to be below the second, got [2.2, -2.2]"]),
-    ("link_com_m: [0.16, 0.08]", "link_com_m: [0.26, 0.08]", ["the centre of mass lies beyond the link's end: at 0.26 m on a link of 0.2 m"]),
+    ("link_com_m: [0.16, 0.08]", "link_com_m: [0.26, 0.08]", ["the centre of mass is beyond the end of the link: at 0.26 m on a link of 0.2 m"]),
     ("fold_arm_deg: [165.0, 140.0]", "fold_arm_deg: [165.0, 151.0]", ["fold_arm_deg[1]: 151 deg is outside the joint limits, -10 to 150 deg"]),
-    ("mass_kg: 3.0 ", "mass_kg: 0.4 ", ["mass_kg: 0.4 kg is the whole vehicle, but arm and tool alone weigh 0.45 kg"]),
+    ("mass_kg: 3.0 ", "mass_kg: 0.4 ", ["mass_kg: 0.4 kg is the mass of the whole vehicle, but arm and tool alone have 0.45 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 20.0", ["thrust_max_n: 20 N do not lift 3 kg"]),
-    ("thrust_max_n: 60.0", "thrust_max_n: 60.0\n  inertia_kg_m2: [0.02, 0.02, 0.05]", ["inertia_kg_m2[2]: expected at most 0.04 kg m^2, the sum of the other two, as for every rigid body, got 0.05"]),
+    ("thrust_max_n: 60.0", "thrust_max_n: 60.0\n  inertia_kg_m2: [0.02, 0.02, 0.05]", ["inertia_kg_m2[2]: expected at most 0.04 kg m^2 (no moment of a rigid body exceeds the sum of the other two), got 0.05"]),
     ("servo_id: 2", "servo_id: 2.0", ["servo_id: expected a whole number from 0 to 252, got 2.0"]),
     ("safety:", "computer:\n  cpus: [2, 3, 2]\nsafety:", ["computer.cpus: expected each core once, got 2 twice in [2, 3, 2]"]),
     ("safety:", "computer:\n  cpus: [-1]\nsafety:", ["computer.cpus[0]: expected a whole number from 0 to 1023, got -1"]),

@@ -79,4 +79,4 @@ def test_a_force_sensor_without_a_tool_is_refused() -> None:
     with pytest.raises(ConfigError) as refused:
         load_sitl(SHORT_CATCH, overrides=[NO_TOOL])
     (line,) = refused.value.lines
-    assert "devices.force: the force-torque sensor is mounted in the tool, but tool is absent" in line
+    assert "devices.force: the force-torque sensor is part of the tool, but tool is absent" in line
