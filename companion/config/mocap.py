@@ -1,4 +1,4 @@
-"""Motion-capture systems other than NatNet: plug-ins that `devices.mocap.type` names (`companion.plugins.MOCAP_SYSTEMS`)."""
+"""Motion-capture systems other than NatNet, which are plug-ins (`companion.plugins.MOCAP_SYSTEMS`); `devices.mocap.type` names one."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from companion import plugins
 from companion.config.base import Location, Model
 
 NATNET = "natnet"
-"""The built-in system, OptiTrack Motive over NatNet; it is no plug-in."""
+"""Name of the built-in system, OptiTrack Motive over NatNet, which is not a plug-in."""
 
 
 @functools.cache
 def system_class(name: str) -> Any:
-    """Return the class of an installed system; `companion.io.mocap.system.PoseClient` describes it.
+    """Return the class of an installed system, which implements `companion.io.mocap.system.PoseClient`.
 
     Raises:
-        PluginError: the system is not installed, cannot be imported, or has no model of its options.
+        PluginError: the system is not installed, cannot be imported or has no model for its options.
     """
     plugin = plugins.find(plugins.MOCAP_SYSTEMS, name)
     found = plugin.load()
@@ -31,7 +31,7 @@ def system_class(name: str) -> Any:
 
 
 def problems(name: str, options: Mapping[str, Any]) -> list[tuple[Location, str]]:
-    """Return what is wrong with `type` and `options` of `devices.mocap`, by key."""
+    """Return the problems of `type` and `options` in `devices.mocap`, each with the key to which it belongs."""
     if name == NATNET:
         return (
             [(("options",), f"must be empty for {NATNET}, whose settings are keys of devices.mocap")] if options else []
@@ -60,4 +60,4 @@ class _OptionsOfSystems(Mapping[str, type[Model]]):
 
 
 SYSTEMS: Mapping[str, type[Model]] = _OptionsOfSystems()
-"""Model of `devices.mocap.options` of each installed system; raises PluginError if the system cannot be used."""
+"""Model of `devices.mocap.options` for each installed system. Access raises PluginError if the system cannot be used."""

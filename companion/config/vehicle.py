@@ -173,31 +173,31 @@ ANY_INTERFACE = "0.0.0.0"
 
 
 NatNetVersion = Literal["3.0", "3.1", "4.0", "4.1", "4.2", "4.3", "4.4"]
-"""Versions of the NatNet bitstream that its SDK describes: those of Motive 2.0, 2.1, 3.0, 3.1, 3.2, 3.3 and 3.4."""
+"""Versions of the NatNet bitstream that the NatNet SDK describes: those of Motive 2.0, 2.1, 3.0, 3.1, 3.2, 3.3 and 3.4."""
 
 
 class MocapDevice(Model):
     """Motion capture: OptiTrack Motive over NatNet, or a system that a plug-in provides (docs/mocap-systems.md)."""
 
     type: str = NATNET
-    """natnet, or the name of an installed motion-capture system, which `companion plugins` lists. With `--sitl` natnet is used."""
+    """natnet, or the name of an installed motion-capture system (`companion plugins` lists them). With `--sitl`, natnet is used."""
     server: str
-    """Address of the Motive computer, or of the other system's."""
+    """Address of the computer that runs Motive or the other system."""
     interface: str = ANY_INTERFACE
-    """This computer's address on the camera network. `fly` and `check` refuse 0.0.0.0 (all networks) without `--sitl`."""
+    """This computer's address on the camera network. Without `--sitl`, `fly` and `check` refuse 0.0.0.0 (all networks)."""
     transport: Literal["multicast", "unicast"] = "multicast"
     multicast_group: str = "239.255.42.99"
     command_port: Annotated[int, Field(gt=0, le=65535)] = 1510
     data_port: Annotated[int, Field(gt=0, le=65535)] = 1511
     natnet_version: NatNetVersion | None = None
-    """Version that the server must speak. If it is absent, all of them are accepted, and later ones too."""
+    """Version that the server must use. If it is absent, all these versions and later ones are accepted."""
     rigid_body_id: Annotated[int, Field(ge=0)]
     up_axis: Literal["y", "z"] = "z"
     """Up axis in Motive's streaming settings."""
     rate_hz: Positive = 200.0
     """Expected frame rate."""
     options: dict[str, JsonValue] = Field(default={})
-    """Settings of a system that a plug-in provides; empty for natnet."""
+    """Settings of the system that a plug-in provides; must be empty for natnet."""
 
 
 ServoBaud = Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000]
