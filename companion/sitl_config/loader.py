@@ -88,7 +88,10 @@ def _faults_of_absent_parts(world: World, vehicle: Vehicle) -> Iterator[str]:
     for number, fault in enumerate(world.faults):
         key = absent_part(fault.kind, vehicle)
         if key is not None:
-            yield f"world.faults[{number}].kind: {fault.kind} needs {key}, which the vehicle file of '{vehicle.name}' does not have"
+            yield (
+                f"world.faults[{number}].kind: {fault.kind} needs {key}, which vehicle '{vehicle.name}' does not have; "
+                "remove the fault (--set world.faults=[])"
+            )
 
 
 def load_world(overrides: Sequence[str] = (), world: str = DEFAULT_WORLD) -> tuple[World, Laboratory]:

@@ -110,3 +110,17 @@ def test_poses_that_are_dragged_are_found_and_px4_lands_it(tmp_path_factory: pyt
     assert summary["outcome"] == "aborted"
     wanted = ["takeoff", "mocap_dragged", "autopilot_landing"]
     assert [event["id"] for event in summary["events"] if event["id"] in wanted] == wanted
+
+
+def test_it_flies_without_force_sensor_tether_and_net(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The simulated world then opens no port for the force sensor, and the flight waits for none."""
+    with sandbox_in(tmp_path_factory.mktemp("parts")) as sandbox:
+        absent = set_options(**{"vehicle.devices.force": None, "vehicle.tether": None, "vehicle.tool": None})
+        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *absent, report=True)
+        sandbox.assert_nobody_left()
+        summary = read_summary(sandbox.cwd / "out")
+        rows = json.loads((sandbox.cwd / "out/preflight.json").read_text(encoding="utf-8"))["rows"]
+    assert ended.code == EXIT_OK, ended
+    assert [event["id"] for event in summary["events"]] == ["takeoff", "touchdown"]
+    assert {"force.device", "tether.line"} <= {row["id"] for row in rows if row["level"] == "warn" and not row["ok"]}
+    assert not any(row["id"].startswith(("force.", "tether.")) for row in rows if row["ok"])
