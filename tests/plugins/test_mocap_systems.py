@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from pydantic import JsonValue
 
+from companion.cli.main import main
 from companion.config.document import ConfigError
 from companion.config.loader import load_flight, load_vehicle, logged_flight
 from companion.config.vehicle import MocapDevice
@@ -21,6 +22,7 @@ from companion.guardian.mocap import MocapProblem, open_client
 from companion.io.mocap.plugin_driver import PluginMocap, open_mocap
 from companion.io.mocap.system import MocapSettings
 from companion.io.protocols import DeviceError
+from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.model.frames import quat_rotate
 from companion.model.types import MocapPose
 from companion.plugins import MOCAP_SYSTEMS
@@ -222,3 +224,10 @@ def test_a_log_is_read_without_the_system(tmp_path: Path) -> None:
     assert logged_flight(logged.model_dump_json()).vehicle.devices.mocap.type == "qualisys"
     with pytest.raises(ConfigError, match="'qualisys': is not installed"):
         load_flight("hover", overrides=["vehicle.devices.mocap.type=qualisys"], hardware=True)
+
+
+def test_the_list_of_plug_ins_names_each_system(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plugins"]) == EXIT_BAD_INPUT
+    lines = {line.split("  ")[0]: line for line in capsys.readouterr().out.splitlines()}
+    assert "companion-vicon" in lines["vicon"] and "Vicon Tracker over its UDP object stream." in lines["vicon"]
+    assert "cannot be used: its attribute 'options' is not a subclass" in lines["nooptions"]
