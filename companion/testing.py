@@ -1,7 +1,7 @@
-"""The contract of control laws, as checks that the author of a law runs in his own tests.
+"""The contract of control laws, as checks for the tests of a law's author.
 
-`check_law("NAME")` runs all of them; `sitl.testing.check_catch` flies the law. A law has no reset: each flight and each check makes a
-new instance.
+`check_law("NAME")` runs all checks; `sitl.testing.check_catch` flies the law. A law has no reset, so each flight and each check builds
+a new instance.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from companion.model.types import Reference, Vec2, Vec3
 
 RANDOM_TICKS = 300
 THRUST_TOLERANCE = 0.03
-"""Largest error of the thrust at hover as a fraction of the weight."""
+"""Largest error of the hover thrust, as a fraction of the weight."""
 HELD_S = 5.0
 TILT_TOLERANCE_RAD = math.radians(1.0)
 Tick = tuple[float, PlantState, Reference, float]
-"""Arguments of one step of a law."""
+"""Arguments of one call of a law's `step`."""
 
 
 def check_law(law: str, preset: str | None = None, vehicle: str | Path | None = None) -> None:
@@ -38,11 +38,11 @@ def check_law(law: str, preset: str | None = None, vehicle: str | Path | None = 
 
     Args:
         law: name of the law.
-        preset: one of its presets; None for all of them, one after the other.
-        vehicle: vehicle file, or the name of a shipped one; None for that of the shipped catch mission.
+        preset: one of the law's presets; None to check all of them in turn.
+        vehicle: vehicle file, or the name of a shipped one; None for the vehicle of the shipped catch mission.
 
     Raises:
-        AssertionError: a check fails; the text names the preset and what was found.
+        AssertionError: a check fails; the text states the preset and what was found.
         PluginError: the law cannot be used at all, or fails the trial that precedes every flight.
         ConfigError: a preset does not fit the law's settings.
     """
@@ -56,7 +56,7 @@ def check_law(law: str, preset: str | None = None, vehicle: str | Path | None = 
 
 
 def _check_random_inputs(config: FlightConfig, label: str) -> None:
-    """Check that commands can be sent, depend on nothing but the inputs, and that the law does not change what it is given."""
+    """Check that the law's commands can be sent and depend only on its inputs, and that the law does not change its inputs."""
     ticks = list(_random_ticks(config.vehicle))
     settings, inputs = config.model_dump_json(), to_packet(ticks)
     first = _commands(config, ticks)
@@ -78,13 +78,15 @@ def _check_random_inputs(config: FlightConfig, label: str) -> None:
 
 
 def _check_hover(config: FlightConfig, label: str, arm_rad: Vec2) -> None:
-    """Check that a law hovers level with hover thrust, and that its integrators do not change while the ground or a limit of the
-    actuators keeps the vehicle from its reference: the time spent there has no effect on later commands.
+    """Check that a law hovers level with hover thrust, and that its integrators do not wind up: time during which the ground or an
+    actuator limit keeps the vehicle from its reference must have no effect on later commands.
     """
     weight_n = config.vehicle.airframe.mass_kg * GRAVITY_M_S2
 
     def hovering(offset_m: Vec3, airborne: bool, duration_s: float) -> tuple[float, float]:
-        """Return thrust as a fraction of the weight, and tilt, after 2 s at the reference that follow `duration_s` away from it."""
+        """Return the thrust (fraction of the weight) and the tilt (rad) after `duration_s` away from the reference and then 2 s at
+        it.
+        """
         law = build_law(config.controller, config.vehicle)
         wrench = _held(law, config.vehicle, arm_rad, offset_m, airborne, duration_s, None)
         wrench = _held(law, config.vehicle, arm_rad, (0.0, 0.0, 0.0), True, 2.0, wrench)
@@ -100,7 +102,7 @@ def _check_hover(config: FlightConfig, label: str, arm_rad: Vec2) -> None:
         ("at the tilt limit", (-20.0, 0.0, 0.0), True),
     ):
         (share, tilt), (once, tilt_once) = (hovering(offset_m, airborne, s) for s in (HELD_S, TICK_PERIOD_S))
-        found = f"{label}: after {HELD_S:g} s {what} the command at hover differs from that after one tick of it"
+        found = f"{label}: after {HELD_S:g} s {what}, the command at hover differs from the command after one such tick"
         assert abs(share - once) <= THRUST_TOLERANCE, f"{found}: thrust {share:.3f} and {once:.3f} of the weight"
         degrees = f"{math.degrees(tilt):.1f} and {math.degrees(tilt_once):.1f} deg"
         assert abs(tilt - tilt_once) <= TILT_TOLERANCE_RAD, f"{found}: tilt {degrees}"
@@ -115,7 +117,9 @@ def _held(
     duration_s: float,
     wrench: Wrench | None,
 ) -> Wrench | None:
-    """Run the law with a constant error of the position. The acceleration in the air is that of its last command."""
+    """Run the law with a constant position error and return its last command. In the air, the acceleration follows from the last
+    command.
+    """
     x, y, z = AT_REST.position_world_m
     position: Vec3 = (x + offset_m[0], y + offset_m[1], z + offset_m[2])
     reference = replace(HOVER, arm_rad=arm_rad)
@@ -136,7 +140,7 @@ def _commands(config: FlightConfig, ticks: list[Tick]) -> list[Wrench]:
 
 
 def _random_ticks(vehicle: Vehicle) -> Iterator[Tick]:
-    """Yield the same random inputs every time: states within the limits of a flight, and short and long ticks."""
+    """Yield random inputs, the same on every call: states within the limits of a flight, and short and long ticks."""
     draw = random.Random(1)
 
     def three(most: float) -> Vec3:

@@ -1,4 +1,4 @@
-"""An emulated NatNet server (Motive): multicast and unicast, any bitstream version since 3.0.
+"""An emulated NatNet server (Motive): multicast and unicast, with any bitstream version from 3.0 on.
 
 The packet layouts follow the NatNet SDK (`NatNetTypes.h`, packet client). This module shares only the message ids with the companion's
 parser, so that an error in either becomes visible. The caller adds latency and noise.
@@ -23,7 +23,7 @@ CLOCK_FREQUENCY_HZ: Final = 10_000_000
 _CLOCK_ORIGIN_S: Final = 1000.0  # the server has been running; tick 0 means "no stamp"
 _APPLICATION = b"Motive"
 _OLDEST, _SELECTABLE, _MARKER_NAMES, _SIZES, _PIVOT_ROTATION, _NEWEST = (3, 0), (4, 0), (4, 0), (4, 1), (4, 2), (4, 4)
-"""Versions since which a server has a property, and the newest that the SDK describes."""
+"""Versions from which a server has the named property, and the oldest and newest version that the SDK describes."""
 _CLIENT_TIMEOUT_S: Final = 5.0
 _MARKERS_BODY_M: Final[tuple[Vec3, ...]] = (
     (0.16, 0.0, 0.05),
@@ -61,7 +61,7 @@ class NatNetServer:
     """Streams motion-capture frames and answers clients; an async context manager on the running event loop.
 
     A client becomes a unicast client when it connects or, with a multicast group, when it sends a keep-alive. A unicast client of a
-    server since 4.0 may choose an older bitstream ("Bitstream,3.0").
+    server from version 4.0 on may choose an older bitstream ("Bitstream,3.0").
 
     Args:
         version: NatNet bitstream version, such as "4.1". One later than 4.4 has an additional section of unknown content.
@@ -370,7 +370,7 @@ def encode_model_definitions(version: str, bodies: Sequence[tuple[int, str]]) ->
 
 
 def _numbers(version: str) -> tuple[int, int]:
-    """Return major and minor number, or zeros if the text is no version."""
+    """Return the major and minor number of a version, or zeros if the text is not a version."""
     major, _, minor = version.partition(".")
     return (int(major), int(minor)) if major.isdecimal() and minor.isdecimal() else (0, 0)
 

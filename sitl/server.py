@@ -107,7 +107,7 @@ class Sitl:
         if config.faults:
             self.plant.faults = self.faults
         self.force: ForceTorqueServer | None = None
-        """None if the vehicle has no force sensor, and before the links are open."""
+        """The emulated force sensor; None if the vehicle has none, or while the links are not open."""
         other = config.mocap_other_id
         self._others = () if other is None else ((other, OTHER_BODY),)
         self._arm_handling = ArmHandling(vehicle.arm, pose[2]) if config.arm_hand else None

@@ -1,4 +1,4 @@
-"""The flight that a control law must complete, as a check that the author of the law runs in his own tests."""
+"""The flight that a control law must complete, as a check for the tests of the law's author."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def check_catch(law: str, preset: str | None = None, mission: str | Path = DEFAU
         mission: mission file with a catch, or the name of a shipped one.
 
     Raises:
-        AssertionError: the payload was not caught, or the mission not completed.
-        ConfigError: the files cannot be used.
+        AssertionError: the payload was not caught, or the mission was not completed.
+        ConfigError: a configuration file is invalid.
         PluginError: the law cannot be used.
     """
     flown = fly_to_end(load_sitl(mission, controller_law=law, preset=preset))

@@ -200,7 +200,7 @@ def split_unit(key: str) -> tuple[str, str | None]:
 
 
 def _hint(value: Data, node: _Node | None) -> str:
-    """Return a suggestion how to correct a value of the wrong type, or an empty string."""
+    """Return a suggestion for correcting a value of the wrong type, or an empty string."""
     wanted = node or {}
     options = wanted.get("enum", [])
     if options:

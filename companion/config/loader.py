@@ -175,7 +175,7 @@ def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:
 
 
 def _unusable_mocap(vehicle: Vehicle, document: Document) -> list[str]:
-    """Reject a motion-capture system that is not installed, and options that do not fit it. A log is read without this check."""
+    """Return messages if the motion-capture system is not installed or its options are invalid. Logs are read without this check."""
     device = vehicle.devices.mocap
     found = [(("devices", "mocap", *at), text) for at, text in mocap.problems(device.type, device.options)]
     return problem_lines([Problem(RANK_VALUE, document.origin(at), f"{key_path(at)}: {text}") for at, text in found])

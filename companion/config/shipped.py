@@ -25,7 +25,7 @@ def shipped_file(folder: str, name: str) -> Path:
 
 
 def near(path: Path) -> Path:
-    """Return an absolute path as a path relative to the current directory if it lies below that; otherwise unchanged."""
+    """Return an absolute path, made relative to the current directory if it lies within that directory."""
     here = Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path
 

@@ -206,7 +206,7 @@ are too slow or too fast for a flight."""
 
 
 class ArmDevice(Model):
-    """The Dynamixel bus behind a U2D2."""
+    """The Dynamixel bus, connected by a U2D2 adapter."""
 
     port: str
     baud: ServoBaud = 3000000

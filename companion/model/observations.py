@@ -13,7 +13,7 @@ from companion.model.types import ArmState, AutopilotStatus, ForceSample, MocapP
 
 
 class EstimatorReport(Record, frozen=True, kw_only=True):
-    """ESTIMATOR_STATUS (MAVLink 230), stamped on arrival with the flight clock."""
+    """Content of ESTIMATOR_STATUS (MAVLink message 230), stamped with the flight clock on arrival."""
 
     stamp_s: float
     flags: int

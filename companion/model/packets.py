@@ -20,7 +20,7 @@ class LogLine(Record, frozen=True, kw_only=True, tag=True):
     """A line for the log's `/log` channel."""
 
     number: int | None = None
-    """Number of this packet, as in `Tick`; None from any process other than the flight process, because only that counts packets."""
+    """Number of this packet, as in `Tick`; None if another process sent it, because only the flight process counts packets."""
     t_s: float
     severity: Severity
     source: str

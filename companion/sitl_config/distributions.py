@@ -170,7 +170,7 @@ def check_world(document: Document, ranges: Sequence[Range], seed: int) -> World
     """Draw and validate a world. Both ends of every range must be valid, so that acceptance of a file does not depend on the seed.
 
     Raises:
-        ConfigError: one message per problem.
+        ConfigError: the world has problems; the exception has one message per problem.
     """
     if ranges:
         at_ends = []

@@ -267,7 +267,7 @@ KINDS: dict[FaultKind, Kind] = {
 
 
 def absent_part(kind: FaultKind, vehicle: Vehicle) -> str | None:
-    """Return the key of the part that a kind of fault needs and the vehicle does not have; None if nothing is missing."""
+    """Return the vehicle-file key of the part that this kind of fault needs but the vehicle lacks; None if no part is missing."""
     if kind.startswith("force_") and vehicle.devices.force is None:
         return "devices.force"
     if kind.startswith("tether_") and vehicle.tether is None:

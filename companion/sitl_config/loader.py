@@ -84,7 +84,7 @@ def load_sitl(
 
 
 def _faults_of_absent_parts(world: World, vehicle: Vehicle) -> Iterator[str]:
-    """Yield one line for each fault of a part that the vehicle does not have."""
+    """Yield one message for each fault that acts on a part which the vehicle does not have."""
     for number, fault in enumerate(world.faults):
         key = absent_part(fault.kind, vehicle)
         if key is not None:
@@ -102,7 +102,7 @@ def load_world(overrides: Sequence[str] = (), world: str = DEFAULT_WORLD) -> tup
         world: name of a built-in world, or path of a file.
 
     Raises:
-        ConfigError: one message per problem.
+        ConfigError: the world has problems; the exception has one message per problem.
     """
     document = read_document(named_file("worlds", world, "--world"))
     apply_overrides(document, "world", parse_overrides(overrides))

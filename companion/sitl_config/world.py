@@ -142,8 +142,7 @@ class World(Model):
     model_error: Annotated[float, Field(ge=0, le=0.3)] = 0.0
     """Relative difference of base mass, inertia, link masses and torque constants between the vehicle file and the true vehicle, in
     addition to the other errors. Each is multiplied by 1 plus or minus this value, with a sign drawn from the seed (the moments of
-    inertia share
-    one sign)."""
+    inertia share one sign)."""
     battery_start: Fraction = 1.0
     battery_life_s: Positive = 900.0
     """Time from arming until a full battery is empty; with `battery.on`, the hover time with a full battery."""

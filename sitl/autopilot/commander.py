@@ -20,7 +20,7 @@ OFFBOARD_LOSS_EXTRA_S = 0.05
 
 
 class Result(IntEnum):
-    """MAV_RESULT."""
+    """Result of a command (MAV_RESULT)."""
 
     ACCEPTED = 0
     TEMPORARILY_REJECTED = 1
@@ -44,7 +44,7 @@ class Command(IntEnum):
 
 
 class Severity(IntEnum):
-    """MAV_SEVERITY."""
+    """Severity of a STATUSTEXT (MAV_SEVERITY)."""
 
     CRITICAL = 2
     ERROR = 3

@@ -58,7 +58,7 @@ from sitl.world.world import Layout, Snapshot, Truth
 LINK_DELAY_S = 0.002
 """Time from sending a setpoint to its arrival at PX4."""
 POSITION_PERIOD_S = 1.0 / 124.0
-"""PX4's fastest position stream; attitude and IMU arrive with every tick."""
+"""Period of PX4's fastest position stream; attitude and IMU data arrive with every tick."""
 _NO_COMMAND, _LAND = OperatorCommand.NONE, OperatorCommand.LAND
 _ON_GROUND, _IN_AIR = LandedState.ON_GROUND, LandedState.IN_AIR
 _NO_REQUEST = AutopilotRequest.NONE

@@ -224,7 +224,7 @@ class Faults:
         self._world.wind_m_s = (wx + speed_m_s * x / away_m, wy + speed_m_s * y / away_m, wz)
 
     def _shut_down_servo(self, index: int, error: int) -> None:
-        """Shut a servo down as its own protection does."""
+        """Shut a servo down as its own protection would."""
         if self._servos and error == OVERLOAD:
             self._servos[index].trip_overload()
         elif not self._servos:

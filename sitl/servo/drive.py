@@ -31,19 +31,19 @@ class ServoDrive:
 
     def __init__(self, shaft_angle_rad: float = 0.0) -> None:
         self.torque_on = False
-        """Register 64."""
+        """Whether torque is enabled (register 64)."""
         self.mode = MODE_POSITION
-        """Register 11."""
+        """Operating mode (register 11)."""
         self.direction = 1
-        """-1 in reverse mode (register 10)."""
+        """1, or -1 in reverse mode (register 10)."""
         self.current_limit_counts = 1193
-        """Register 38."""
+        """Current limit (register 38)."""
         self.homing_counts = 0
-        """Register 20."""
+        """Homing offset (register 20)."""
         self.goal_position_counts = 0
-        """Register 116."""
+        """Goal position (register 116)."""
         self.position_gain = 1.0
-        """Register 84 divided by its default."""
+        """Position P gain (register 84) divided by its default."""
         self.watchdog_tripped = False
         """Whether the watchdog has switched the motor off; `start_watchdog` clears it."""
         self.goal_delay_s = 0.0

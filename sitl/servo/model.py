@@ -36,7 +36,7 @@ _PRESENT = struct.Struct("<hii")
 
 
 class ServoRefusal(Exception):
-    """An instruction that the servo refuses with an error number."""
+    """The servo refuses an instruction; `error` is the error number of its status packet."""
 
     def __init__(self, error: StatusError) -> None:
         super().__init__(error.name)
@@ -47,9 +47,9 @@ class ServoModel:
     """A servo with factory settings except for id and baud rate.
 
     Args:
-        servo_id: register 7.
+        servo_id: servo id (register 7).
         baud_bps: baud rate (register 8); the servo receives only packets sent at this rate.
-        firmware: register 6.
+        firmware: firmware version (register 6).
         model: model number (register 0).
         shaft_angle_rad: shaft angle before the first `update`.
 
@@ -139,12 +139,12 @@ class ServoModel:
 
     @property
     def servo_id(self) -> int:
-        """Register 7."""
+        """Servo id (register 7)."""
         return self._memory[7]
 
     @property
     def secondary_id(self) -> int:
-        """Register 12; values above 252 disable it."""
+        """Secondary id (register 12); a value above 252 disables it."""
         return self._memory[12]
 
     @property
@@ -154,12 +154,12 @@ class ServoModel:
 
     @property
     def model(self) -> int:
-        """Register 0."""
+        """Model number (register 0)."""
         return self._get(reg.MODEL_NUMBER)
 
     @property
     def firmware(self) -> int:
-        """Register 6."""
+        """Firmware version (register 6)."""
         return self._memory[6]
 
     @property
@@ -174,7 +174,7 @@ class ServoModel:
 
     @property
     def status_return_level(self) -> int:
-        """Register 68: with 0 the servo answers pings only, with 1 also reads, with 2 every instruction."""
+        """Status return level (register 68): with 0 the servo answers only pings, with 1 also reads, with 2 every instruction."""
         return self._memory[68]
 
     @property

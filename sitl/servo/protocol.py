@@ -37,7 +37,7 @@ class Instruction(IntEnum):
 
 
 class StatusError(IntEnum):
-    """Error number of a status packet (its bits 0 to 6)."""
+    """Error number of a status packet (bits 0 to 6 of its error byte)."""
 
     NONE = 0
     RESULT_FAIL = 1

@@ -69,7 +69,7 @@ class Layout:
     force: int
     torque: int
     tether: int | None
-    """None without a tether."""
+    """Index of the tether's tension; None without a tether."""
 
     def truth(self, snapshot: Snapshot) -> Truth:
         """Return the true state that a snapshot contains."""

@@ -54,12 +54,12 @@ BROKEN = [
     (
         INTEGRAL.format(when="state.airborne", axis=2)
         + "; wrench = replace(wrench, collective_n=max(0.0, wrench.collective_n + self.i))",
-        "after 5 s of saturated thrust the command at hover differs from that after one tick of it: thrust ",
+        "after 5 s of saturated thrust, the command at hover differs from the command after one such tick: thrust ",
     ),
     (
         INTEGRAL.format(when="state.airborne", axis=0)
         + "; half = 0.5 * math.atan(0.01 * self.i); wrench = replace(wrench, attitude_wxyz=(math.cos(half), 0.0, math.sin(half), 0.0))",
-        "after 5 s at the tilt limit the command at hover differs from that after one tick of it: thrust ",
+        "after 5 s at the tilt limit, the command at hover differs from the command after one such tick: thrust ",
     ),
 ]  # fmt: skip
 

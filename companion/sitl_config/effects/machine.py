@@ -23,7 +23,7 @@ class Machine(Model):
     (e) within 0.01 on each axis: battery and cables are placed by hand, the motion-capture pivot according to a drawing.
     """
     inertia_error: tuple[RelativeError, RelativeError, RelativeError] = (0.12, -0.08, 0.1)
-    """Relative deviations of the true moments of inertia about the body's x, y and z axes from the vehicle file. No true moment
+    """Relative deviations, from the vehicle file, of the true moments of inertia about the body's x, y and z axes. No true moment
     exceeds the sum of the other two. (e) within 0.2: moments from a drawing or from a swing test without battery."""
     shoulder_offset_m: tuple[LengthError, LengthError, LengthError] = (0.002, -0.001, 0.002)
     """True position of the shoulder minus its position in the vehicle file, body frame. (e) within 0.003."""

@@ -24,7 +24,7 @@ class ForceSensor:
     """Errors of the force-torque sensor.
 
     Args:
-        config: the section `force_sensor`.
+        config: section `force_sensor`.
         seed: seed of the world; determines the cross-talk.
     """
 

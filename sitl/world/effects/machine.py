@@ -46,6 +46,6 @@ def shoulder_ypr_rad(machine: Machine) -> Vec3:
 
 
 def _inertia_kg_m2(nominal: Vec3, machine: Machine) -> Vec3:
-    """Return the true moments of inertia, each limited to the sum of the other two because no rigid body exceeds it."""
+    """Return the true moments of inertia, each limited to the sum of the other two, which no moment of a rigid body exceeds."""
     x, y, z = (moment * (1.0 + error) for moment, error in zip(nominal, machine.inertia_error, strict=True))
     return (min(x, y + z), min(y, x + z), min(z, x + y))

@@ -84,7 +84,7 @@ class Rotors:
         return cls(config, rotor_arm_m, dt_s) if config.on else None
 
     def step(self, signals: Vec4, full_n: float) -> Vec4:
-        """Advance by one physics step and return the thrust of each rotor in N, as it is far from the ground.
+        """Advance by one physics step and return the thrust of each rotor in N, without the ground effect.
 
         Args:
             signals: motor signals, 0 to 1.
