@@ -34,6 +34,10 @@ from companion.config.yaml_strict import read_document
 M = TypeVar("M", bound=Model)
 
 
+MOVED_TO_SAFETY = frozenset({"react_time_s", "stop_deceleration_m_s2"})
+"""Keys of `safety` that version 0.1 has below `tether`, where they are still accepted."""
+
+
 class Sources(Model):
     """Origins of the parts of a `FlightConfig`, for messages and for the log."""
 
@@ -146,6 +150,8 @@ def logged_flight(config_json: str) -> FlightConfig:
     data = json.loads(config_json)
     if isinstance(data, dict):
         data.pop("world", None)
+        if isinstance(data.get("vehicle"), dict):
+            _move_keys(Document("log", data["vehicle"]))
     return FlightConfig.model_validate_json(json.dumps(data))
 
 
@@ -158,7 +164,18 @@ def check_document(
         The model, or None if the document has a problem.
     """
     _override(document, section, overrides, lines)
+    if section == "vehicle":
+        _move_keys(document)
     return _validated(model, document, lines)
+
+
+def _move_keys(document: Document) -> None:
+    """Move keys that older vehicle files and logs have below `tether` to `safety`, unless they are there too."""
+    tether, safety = document.data.get("tether"), document.data.setdefault("safety", {})
+    if isinstance(tether, dict) and isinstance(safety, dict):
+        for key in (MOVED_TO_SAFETY & tether.keys()) - safety.keys():
+            document.replace(("safety", key), tether[key], document.origin(("tether", key)))
+            del tether[key]
 
 
 def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:

@@ -107,10 +107,6 @@ class Tool(Model):
     """
 
 
-REACT_TIME_S, STOP_DECELERATION_M_S2 = 0.18, 2.0
-"""Defaults of the stop model, which also apply to a vehicle without a tether."""
-
-
 class Tether(Model):
     """The safety tether."""
 
@@ -123,12 +119,6 @@ class Tether(Model):
     """Working load of the whole tether, from anchor to attachment; it must withstand the full thrust of the rotors."""
     weight_n_per_m: NonNegative = 0.1
     """Weight per length; the vehicle carries the part of the tether that hangs from it."""
-    react_time_s: NonNegative = REACT_TIME_S
-    """Time from a fault to PX4's LAND mode; 0.07 to 0.18 s were measured with the guardian."""
-    stop_deceleration_m_s2: Positive = STOP_DECELERATION_M_S2
-    """Deceleration with which the governor stops the reference. Stopping distances assume the slower of this stop and a stop in PX4's
-    LAND
-    mode from the same speed."""
     turns_max: Positive = 1.5
     """Largest number of turns, in either direction, of the tether about the vertical through the anchor and about the vehicle."""
     taut_slack_m: NonNegative = 0.05
@@ -347,9 +337,14 @@ class Safety(Model):
     """Smallest tether slack at the position where the vehicle is predicted to stop."""
 
     # Reactions
+    react_time_s: NonNegative = 0.18
+    """Time from a fault to PX4's LAND mode; 0.07 to 0.18 s were measured with the guardian."""
+    stop_deceleration_m_s2: Positive = 2.0
+    """Deceleration with which the governor stops the reference. Stopping distances assume the slower of this stop and a stop in PX4's
+    LAND mode from the same speed."""
     guardian_timeout_s: Positive = 0.1
     """Time without a heartbeat from the flight process, while the rotors turn, after which the guardian kills that process, takes over
-    and lands. In such a takeover this time is part of `tether.react_time_s`, which must be increased with it.
+    and lands. In such a takeover this time is part of `react_time_s`, which must be increased with it.
     """
     hold_max_s: Positive = 20.0
     """Longest duration of a HOLD, after which the vehicle lands."""

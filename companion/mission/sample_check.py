@@ -62,7 +62,7 @@ class SampleCheck:
         self._vehicle = vehicle
         self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
         self._safe = SafeSet(vehicle)
-        self._stop_model = StopModel(vehicle.tether)
+        self._stop_model = StopModel(vehicle.safety)
         self._watch = TetherWatch.of(vehicle)
         airframe, tether = vehicle.airframe, vehicle.tether
         self._payload_kg = airframe.payload_max_kg if mission.catch is None else mission.catch.payload_max_kg

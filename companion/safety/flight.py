@@ -32,7 +32,7 @@ class FlightTracker:
         self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
         self._radius_m = vehicle.airframe.radius_m
         self._room = vehicle.room
-        self._stop = StopModel(vehicle.tether)
+        self._stop = StopModel(vehicle.safety)
         self._inputs: Inputs | None = None
         self.vehicle: VehicleState | None = None
         self.tilt_rad = 0.0

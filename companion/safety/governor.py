@@ -124,7 +124,7 @@ class Governor:
 
     def __init__(self, vehicle: Vehicle, limits: Limits) -> None:
         self._set = SafeSet(vehicle)
-        self._stop = StopModel(vehicle.tether)
+        self._stop = StopModel(vehicle.safety)
         self.stop_deceleration_m_s2 = self._stop.deceleration_m_s2
         self.acceleration_max_m_s2 = max(limits.acceleration_max_m_s2, self.stop_deceleration_m_s2)
         self.speed_max_m_s = max(limits.speed_max_m_s, vehicle.safety.land_speed_m_s)

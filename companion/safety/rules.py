@@ -328,7 +328,7 @@ RULES: tuple[Rule, ...] = (
     Rule(
         id="geofence_near", subject=Subject.FLIGHT, what="the vehicle would stop with its rotors outside the room",
         predicate=flight.geofence_near, thresholds=("geofence_tolerance_m",),
-        tracked_by=("tether.react_time_s", "tether.stop_deceleration_m_s2"), hold_time=0.05, ground=None, air=_HOLD,
+        tracked_by=("react_time_s", "stop_deceleration_m_s2"), hold_time=0.05, ground=None, air=_HOLD,
         message="the vehicle would stop at ({:.2f}, {:.2f}, {:.2f}) m with its rotors outside the room",
     ),
     Rule(

@@ -2,7 +2,7 @@
 
 PX4's LAND, requested by the flight process or by the guardian, first sets a stop point `v (0.6 s + v / (2 MPC_ACC_HOR))` ahead
 (Navigator::preproject_stop_point and computeBrakingDistanceFromVelocity of PX4 1.16; the 0.6 s is a constant there) and flies to
-it. The governor brakes the reference at `tether.stop_deceleration_m_s2`. At every speed the model assumes the slower of the two
+it. The governor brakes the reference at `safety.stop_deceleration_m_s2`. At every speed the model assumes the slower of the two
 decelerations: its stopping distance D(v) is never shorter than that of either, and because dD/dv >= v / a, braking at
 `stop_deceleration_m_s2` never moves the predicted stop outward. Mission check, governor, tether watch and geofence monitor use it.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from companion.config.vehicle import REACT_TIME_S, STOP_DECELERATION_M_S2, Tether
+from companion.config.vehicle import Safety
 
 LAND_AHEAD_S = 0.6
 """PX4 sets the stop point of LAND this far ahead, in addition to the braking distance. Confirmed by measurement: docs/px4.md."""
@@ -23,15 +23,15 @@ class StopModel:
     """Stopping distance as a function of speed.
 
     Args:
-        tether: provides `react_time_s` (time from a fault to LAND mode) and `stop_deceleration_m_s2` (braking deceleration of the
-            governor). If it is None, their defaults hold.
+        safety: provides `react_time_s` (time from a fault to LAND mode) and `stop_deceleration_m_s2` (braking deceleration of the
+            governor).
     """
 
     __slots__ = ("_half_per_a", "_half_per_land", "_knee_ahead_m", "_knee_m_s", "_react_s", "deceleration_m_s2")
 
-    def __init__(self, tether: Tether | None) -> None:
-        self._react_s = REACT_TIME_S if tether is None else tether.react_time_s
-        self.deceleration_m_s2 = STOP_DECELERATION_M_S2 if tether is None else tether.stop_deceleration_m_s2
+    def __init__(self, safety: Safety) -> None:
+        self._react_s = safety.react_time_s
+        self.deceleration_m_s2 = safety.stop_deceleration_m_s2
         """Deceleration with which the governor brakes the reference."""
         self._half_per_a = 0.5 / self.deceleration_m_s2
         self._half_per_land = 0.5 / LAND_DECELERATION_M_S2

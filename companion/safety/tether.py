@@ -85,7 +85,7 @@ class TetherWatch:
         self._anchor = tether.anchor_world_m
         self._attachment = tether.attachment_body_m
         self._length_m = tether.length_m
-        self._stop = StopModel(tether)
+        self._stop = StopModel(vehicle.safety)
         self._taut_slack_m = tether.taut_slack_m
         self._separation_m = tether.separation_m
         self._clearance = Clearance(vehicle, tether)

@@ -155,7 +155,7 @@ def assert_stopped_as_modelled(sandbox: Sandbox, kind: str) -> None:
     drifts_m = [math.dist(seen["course"][0][1][:2], position[:2]) for _, position, *_ in seen["course"]]
     speed_m_s = drifts_m[1] / (times_s[1] - times_s[0])
     assert speed_m_s > 0.3
-    assert max(drifts_m) <= StopModel(load_flight(HOVER).vehicle.tether).distance_m(speed_m_s)
+    assert max(drifts_m) <= StopModel(load_flight(HOVER).vehicle.safety).distance_m(speed_m_s)
     assert fault["worst_tilt_deg"] < 30.0
 
 

@@ -537,7 +537,7 @@ def scaled(key: str, factor: float) -> Vehicle:
 
 ELSEWHERE = {
     *("tether.taut_slack_m", "tether.pull_min_n", "tether.separation_m"),  # TetherWatch: test_tether.py
-    *("tether.react_time_s", "tether.stop_deceleration_m_s2"),  # StopModel: test_stop.py
+    *("react_time_s", "stop_deceleration_m_s2"),  # StopModel: test_stop.py
     "arm.joints.torque_max_nm",
     "arm.joints.angle_deg",
 }

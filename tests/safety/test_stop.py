@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.config.vehicle import Tether
+from companion.config.vehicle import Safety
 from companion.safety.stop import LAND_AHEAD_S, LAND_DECELERATION_M_S2, StopModel
 
 SPEEDS_M_S = st.floats(0.0, 3.0)
@@ -16,18 +16,7 @@ DECELERATIONS_M_S2 = st.floats(0.1, 20.0)
 
 
 def model(react_s: float = 0.18, deceleration_m_s2: float = 2.0) -> StopModel:
-    return StopModel(
-        Tether(
-            anchor_world_m=(0.0, 0.0, 0.0),
-            length_m=3.0,
-            react_time_s=react_s,
-            stop_deceleration_m_s2=deceleration_m_s2,
-        )
-    )
-
-
-def test_without_a_tether_the_defaults_hold() -> None:
-    assert [StopModel(None).distance_m(v) for v in (0.5, 3.0)] == [model().distance_m(v) for v in (0.5, 3.0)]
+    return StopModel(Safety(react_time_s=react_s, stop_deceleration_m_s2=deceleration_m_s2))
 
 
 @pytest.mark.parametrize(

@@ -66,7 +66,7 @@ def test_range_slack_and_elevation() -> None:
 def test_slack_at_the_stop_counts_outward_speed_only() -> None:
     outward: Vec3 = (0.0, 0.6, 0.8)  # along the line: anchor at (0, -0.6, -0.8) * 2 from here
     state = once((0.0, 0.0, 1.6), outward)
-    assert state.stop_slack_m == pytest.approx(1.0 - StopModel(vehicle().tether).distance_m(1.0))
+    assert state.stop_slack_m == pytest.approx(1.0 - StopModel(vehicle().safety).distance_m(1.0))
     assert once((0.0, 0.0, 1.6), (0.0, -0.6, -0.8)).stop_slack_m == pytest.approx(1.0)
     assert once((0.0, 0.0, 1.6), (1.0, 0.0, 0.0)).stop_slack_m == pytest.approx(1.0)
 

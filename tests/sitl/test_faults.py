@@ -233,7 +233,7 @@ def test_mocap_lost_in_the_middle_of_the_line(duration_s: float | None) -> None:
     row = flown("mocap_loss", "line", None, duration_s, config=CONFIG)
     assert row["outcome"] == "landed"
     assert row["reacted_s"] <= CONFIG.vehicle.safety.mocap_timeout_s + 0.03
-    assert row["drift_m"] <= StopModel(CONFIG.vehicle.tether).distance_m(LINE_M_S)
+    assert row["drift_m"] <= StopModel(CONFIG.vehicle.safety).distance_m(LINE_M_S)
 
 
 def test_poses_dragged_at_0_3_m_s_are_found_and_px4_lands_before_they_moved_it_0_6_m() -> None:
