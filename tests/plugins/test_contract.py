@@ -49,7 +49,7 @@ BROKEN = [
     ),
     (
         INTEGRAL.format(when="True", axis=2) + "; wrench = replace(wrench, collective_n=max(0.0, wrench.collective_n + 2.0 * self.i))",
-        "after 5 s on the ground, 0.3 m from the reference on each axis the command at hover differs",
+        "after 5 s on the ground, 0.3 m from the reference on each axis, the command at hover differs",
     ),
     (
         INTEGRAL.format(when="state.airborne", axis=2)
