@@ -191,10 +191,18 @@ class Mission(Model):
         last = len(self.phases) - 1
         for index, phase in enumerate(self.phases):
             if (phase.type == "takeoff") != (index == 0):
-                text = "the first phase must be a takeoff" if index == 0 else "only the first phase can be a takeoff"
+                text = (
+                    "the first phase must be of type takeoff"
+                    if index == 0
+                    else "only the first phase can be of type takeoff"
+                )
                 problems.append((("phases", index, "type"), text))
             elif (phase.type == "land") != (index == last):
-                text = "the last phase must be a land" if index == last else "only the last phase can be a land"
+                text = (
+                    "the last phase must be of type land"
+                    if index == last
+                    else "only the last phase can be of type land"
+                )
                 problems.append((("phases", index, "type"), text))
         if self.repeat > 1 and last < 2:
             problems.append((("repeat",), "there is nothing between take-off and landing to repeat"))

@@ -107,7 +107,7 @@ def _make_way(document: Document, override: Override) -> None:
                 raise ConfigError([f"{override.origin}: {here} is not a list"])
             if step >= len(value):
                 known = f"0 to {len(value) - 1}" if value else "none"
-                raise ConfigError([f"{override.origin}: {here} has no [{step}]; indices there: {known}"])
+                raise ConfigError([f"{override.origin}: {here} has no index {step}; available: {known}"])
             value = value[step]
         else:
             if not isinstance(value, dict):

@@ -43,7 +43,7 @@ def _px4_has_them(params: dict[str, float]) -> dict[str, float]:
             hint = f" (did you mean {close.upper()}?)" if close else ""
             raise ValueError(f"the simulated PX4 has no parameter {json.dumps(name)}{hint}")
         if isinstance(PX4_DEFAULTS[name], int) and value != int(value):
-            raise ValueError(f"{name} is an INT32, got {value:g}")
+            raise ValueError(f"expected a whole number for {name}, an INT32, got {value:g}")
         if abs(value) >= (2**31 if isinstance(PX4_DEFAULTS[name], int) else REAL32_MAX):
             raise ValueError(f"{name} cannot hold {value:g}")
     return params

@@ -88,10 +88,10 @@ class Params:
         if not math.isfinite(value):
             raise ValueError(f"{name}: {value} is not finite")
         if integer and value != int(value):
-            raise ValueError(f"{name} is INT32, got {value}")
+            raise ValueError(f"{name}: expected a whole number (INT32), got {value}")
         stored: Value = int(value) if integer else _single(float(value))
         if integer and not -(2**31) <= stored < 2**31:
-            raise ValueError(f"{name} is INT32, got {value}")
+            raise ValueError(f"{name}: expected a number in the range of INT32, got {value}")
         self._values[name] = stored
         self.revision += 1
         return stored
@@ -132,7 +132,7 @@ class Params:
             ValueError: the message's type differs from the parameter's, or the value is not finite.
         """
         if mav_type != self.mav_type(name):
-            raise ValueError(f"{name}: MAV_PARAM_TYPE {mav_type} sent, {self.mav_type(name)} expected")
+            raise ValueError(f"{name}: expected MAV_PARAM_TYPE {self.mav_type(name)}, got {mav_type}")
         return self.set(name, decode_bytewise(wire, mav_type))
 
     def hash_check(self) -> float:

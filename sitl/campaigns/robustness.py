@@ -88,7 +88,7 @@ def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
         found.append(Throw((x_m, later.position_world_m[1]), (slowest, fastest)))
     if not found:
         raise CampaignError(
-            f"mission '{mission.name}' never flies in the direction of +x, so no payload can be thrown to it",
+            f"mission '{mission.name}' never flies in the +x direction, so no payload can be thrown to the vehicle",
             bad_input=True,
         )
     return found

@@ -56,7 +56,7 @@ def _over_cores(tasks: Sequence[tuple[Fly, int, str, Data]], jobs: int) -> Gener
             yield from Parallel(return_as="generator_unordered", batch_size=1)(delayed(_fly)(*task) for task in tasks)
         except TerminatedWorkerError:
             raise CampaignError(
-                "a worker process died (killed, or out of memory?); fewer --jobs need less memory"
+                "a worker process died (killed, or out of memory?); fewer --jobs use less memory"
             ) from None
 
 
@@ -77,17 +77,18 @@ def _over_machines(tasks: Sequence[tuple[Fly, int, str, Data]], scheduler: str) 
             client.wait_for_workers(1, timeout=WORKERS_TIMEOUT_S)
         except TimeoutError:
             raise CampaignError(
-                f"--scheduler {scheduler}: no worker has joined it; start some: dask worker {scheduler}", bad_input=True
+                f"--scheduler {scheduler}: no worker has joined it; start one with: dask worker {scheduler}",
+                bad_input=True,
             ) from None
         futures = [client.submit(_fly, *task, pure=False) for task in tasks]
         try:
             for _, result in as_completed(futures, with_results=True):
                 yield result
         except KilledWorker:
-            raise CampaignError(f"--scheduler {scheduler}: its workers die repeatedly; see their logs") from None
+            raise CampaignError(f"--scheduler {scheduler}: its workers keep dying; see their logs") from None
         except ImportError as error:
             raise CampaignError(
-                f"--scheduler {scheduler}: a worker lacks the program ({error}); install {DISTRIBUTION}[sitl,cluster] there"
+                f"--scheduler {scheduler}: a worker cannot import the program ({error}); install {DISTRIBUTION}[sitl,cluster] there"
             ) from None
 
 

@@ -65,7 +65,7 @@ def _plan_time_s(phase: FlightPhase, config: SitlConfig) -> float:
     def within(segments: list[Segment], index: int, share: float) -> float:
         if not segments:
             raise FaultError(
-                f"world.faults: mission '{config.mission.name}' has no {phase}; give t_s instead of the phase"
+                f"world.faults: mission '{config.mission.name}' has no phase '{phase}'; give t_s instead of the phase"
             )
         segment = segments[index]
         return segment.start_s + share * (segment.end_s - segment.start_s)

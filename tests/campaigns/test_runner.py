@@ -244,8 +244,8 @@ def test_bad_input_is_one_line_and_nothing_flies(tmp_path: Path, words: tuple[st
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (("robustness",), "mission 'hover' never flies in the direction of +x"),
-        (("faults", "--kinds", "gust", "--phases", "return"), "mission 'hover' has no return"),
+        (("robustness",), "mission 'hover' never flies in the +x direction"),
+        (("faults", "--kinds", "gust", "--phases", "return"), "mission 'hover' has no phase 'return'"),
     ],
 )
 def test_a_mission_that_cannot_be_flown_so_is_refused_by_the_campaign(

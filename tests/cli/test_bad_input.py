@@ -140,7 +140,7 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "set to something negative": ((*FLY, "--set", "world.seed=-1"), (r"world\.seed: .*>= 0, got -1",)),
     "set past the end of a list": (
         (*FLY, "--set", "mission.phases[9].duration_s=1"),
-        (r"phases has no \[9\]; indices there: 0 to 6",),
+        (r"phases has no index 9; available: 0 to 6",),
     ),
     "two values behind one set, both wrong": (
         (*FLY, "--set", "world.payload_kg=9", "world.seed=-1"),

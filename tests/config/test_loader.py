@@ -106,7 +106,7 @@ BAD_MISSION = [
         "height_m: 1.0",
         [f"{CATCH}:29:5: phases[0].type: missing; expected one of arm, hold, land, line, path, takeoff"],
     ),
-    ("  - type: land                  # 18.0 s\n    speed_m_s: 0.35\n", "", [f"{CATCH}:51:11: phases[5].type: the last phase must be a land"]),
+    ("  - type: land                  # 18.0 s\n    speed_m_s: 0.35\n", "", [f"{CATCH}:51:11: phases[5].type: the last phase must be of type land"]),
     (
         "arm_duration_s: 2.5",
         "arm_duration_s: 7",
@@ -225,7 +225,7 @@ BAD_OVERRIDES = [
     ("world.throw_velocity_m_s=[1, 2", "--set world.throw_velocity_m_s: not YAML: expected ',' or ']', but got '<stream end>' while parsing a flow sequence"),
     ("world.wind_m_s={a: 1, a: 2}", "--set world.wind_m_s: a: duplicate key, already given; remove one of the two"),
     ("vehicle.safty.mocap_timeout_s=0.2", "--set vehicle.safty.mocap_timeout_s: safty: unknown key; did you mean safety?"),
-    ("mission.phases[9].duration_s=3", "--set mission.phases[9].duration_s: mission.phases has no [9]; indices there: 0 to 6"),
+    ("mission.phases[9].duration_s=3", "--set mission.phases[9].duration_s: mission.phases has no index 9; available: 0 to 6"),
     ("mission.phases.duration_s=3", "--set mission.phases.duration_s: mission.phases has no keys; it is a list"),
     ("mission.name.x=3", "--set mission.name.x: mission.name has no keys; it is a single value"),
     ("mission.name[0]=3", "--set mission.name[0]: mission.name is not a list"),

@@ -183,7 +183,7 @@ def test_a_wrong_parameter_over_real_mavlink_gives_its_row() -> None:
     ("override", "said"),
     [
         ("{EKF2_EV_CTL: 1}", 'the simulated PX4 has no parameter "EKF2_EV_CTL" (did you mean EKF2_EV_CTRL?)'),
-        ("{EKF2_EV_CTRL: 1.5}", "EKF2_EV_CTRL is an INT32, got 1.5"),
+        ("{EKF2_EV_CTRL: 1.5}", "expected a whole number for EKF2_EV_CTRL, an INT32, got 1.5"),
         ("{EKF2_EVP_NOISE: 1.0e+39}", "EKF2_EVP_NOISE cannot hold 1e+39"),
     ],
 )

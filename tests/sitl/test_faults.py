@@ -77,7 +77,7 @@ def test_a_heavy_payload_is_the_one_that_is_thrown() -> None:
 
 
 def test_a_mission_without_a_way_back_has_no_such_phase() -> None:
-    with pytest.raises(FaultError, match="mission 'hover' has no return; give t_s instead"):
+    with pytest.raises(FaultError, match="mission 'hover' has no phase 'return'; give t_s instead"):
         with_fault_times(with_faults({"kind": "mocap_loss", "phase": "return"}, mission=HOVER))
     with pytest.raises(CampaignError) as refused:
         prepare({"flights": [{"phase": "return"}]}, [load_sitl(HOVER)])

@@ -20,7 +20,7 @@ _INTRO = {
     "the phases.",
     "vehicle": "One vehicle: masses and dimensions, devices, tether, room and limits. [Safety](../safety.md) explains the limits of "
     "`safety`.",
-    "controller": "One control law with its gains; `law` selects one of three. [The control law](../control-law.md) describes the "
+    "controller": "One control law with its gains; `law` names the law. [The control law](../control-law.md) describes the "
     "implementation.",
     "world": "True parameters of the simulated world, which the companion does not know. Give a file with `--world`, or keys with "
     "`--set world.KEY=VALUE`. Any number may be a distribution, `{uniform: [low, high]}` or `{normal: [mean, sigma]}`, from which the "
