@@ -35,7 +35,7 @@ M = TypeVar("M", bound=Model)
 
 
 MOVED_TO_SAFETY = frozenset({"react_time_s", "stop_deceleration_m_s2"})
-"""Keys of `safety` that version 0.1 has below `tether`, where they are still accepted."""
+"""Keys of `safety` that were keys of `tether` in version 0.1 and are still accepted there."""
 
 
 class Sources(Model):
@@ -170,7 +170,7 @@ def check_document(
 
 
 def _move_keys(document: Document) -> None:
-    """Move keys that older vehicle files and logs have below `tether` to `safety`, unless they are there too."""
+    """Move the keys that older vehicle files and logs have in `tether` to `safety`, unless `safety` has them too."""
     tether, safety = document.data.get("tether"), document.data.setdefault("safety", {})
     if isinstance(tether, dict) and isinstance(safety, dict):
         for key in (MOVED_TO_SAFETY & tether.keys()) - safety.keys():

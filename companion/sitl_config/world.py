@@ -68,9 +68,9 @@ class Servo(Model):
     """
 
     id: Annotated[int, Field(ge=0, le=252)] | None = None
-    """Register 7; null for the vehicle file's id. The answers of two servos with the same id collide."""
+    """Servo id (register 7); null for the id in the vehicle file. The answers of two servos with the same id collide."""
     baud: Literal[9600, ServoBaud] | None = None
-    """Register 8; null for the vehicle file's baud rate."""
+    """Baud rate (register 8); null for the baud rate in the vehicle file."""
     firmware: Annotated[int, Field(ge=0, le=255)] = 48
     return_delay_us: Annotated[int, Field(ge=0, le=508, multiple_of=2)] = 500
     operating_mode: Literal[0, 3, 5] = 3
@@ -167,7 +167,7 @@ class World(Model):
     hand_tap_n: Positive = 30.0
     """Peak force of a tap."""
     px4_params: Px4Params = Field(default={})
-    """PX4 parameters by name; they override those of the simulated vehicle."""
+    """PX4 parameters by name; they override the parameters of the simulated vehicle."""
     faults: tuple[Fault, ...] = ()
     air: Air = Air()
     downwash: Downwash = Downwash()

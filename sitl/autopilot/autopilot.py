@@ -142,7 +142,7 @@ class Px4Stub:
         """Fault: PX4 leaves OFFBOARD and refuses to enter it."""
         self.refuses_arming = False
         self.booted_at_s = 0.0
-        """World time of the last boot. PX4 does not run before this time, and its own clock is zero at it."""
+        """World time of the last boot, at which PX4's own clock starts. PX4 does not run before this time."""
         self.clock_ahead_s = 0.0
         """Total duration of the world's pauses, during which PX4's own clock continues."""
         self.since_sample_s = 0.0

@@ -55,7 +55,7 @@ def _timed(fault: Fault, config: SitlConfig) -> Fault:
 
 
 def _plan_time_s(phase: FlightPhase, config: SitlConfig) -> float:
-    """Return the time since the start of the plan. "line" and "catch" lie in the first sideways segment, "return" in the last one."""
+    """Return the time since the start of the plan. "line" and "catch" are in the first sideways segment, "return" in the last one."""
     plan = Plan.build(config.mission, config.vehicle)
 
     def way_m(segment: Segment) -> float:

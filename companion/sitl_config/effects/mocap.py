@@ -32,8 +32,8 @@ class Mocap(Model):
     """Standard deviation per axis of the position error while some markers are hidden. (p) Merriaux et al., "A Study of Vicon System
     Positioning Performance", Sensors 17 (2017): below 2 mm in motion, 0.15 mm at rest."""
     wobble_deg: NonNegative = 0.3
-    """Standard deviation per axis of the attitude error at the same time: the position error divided by the distance between the
-    markers, 0.2 to 0.4 m. (e)
+    """Standard deviation per axis of the attitude error while some markers are hidden: the position error divided by the distance
+    between the markers, 0.2 to 0.4 m. (e)
     """
     wobble_s: Positive = 1.0
     """Time for which markers are hidden; the error rises and falls as sin^2. (e)"""
