@@ -19,6 +19,8 @@ from tests.plugins.installed import on_path
 from tests.support import HOVER, ROOT, SHORT_CATCH, sandbox_in
 
 EXAMPLE = ROOT / "examples" / "law"
+pytestmark = pytest.mark.xdist_group("the example of a control law")
+"""One process, and so pip, once."""
 FILES = ("pyproject.toml", "lab_lqr/__init__.py", "lab_lqr/files/controllers/lqr_tuned.yaml", "test_lab_lqr.py")
 
 
