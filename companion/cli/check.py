@@ -30,6 +30,7 @@ from companion.mission.plan import Plan
 from companion.model.check_row import Level, Row, refusals
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.model.observations import Observations
+from companion.plugins import CONTROL_LAWS, find
 from companion.preflight import run as preflight
 from companion.preflight.hand_test.command import run_hand_test
 from companion.preflight.hand_test.record import record_path
@@ -193,7 +194,8 @@ def show(console: Console, rows: list[Row], task: Task) -> None:
     """Print one table per device with a remedy below each failed row, then the verdict."""
     where = " (SITL)" if task.sitl is not None else ""
     build = ", compiled build" if COMPILED else ""
-    title = f"{task.config.vehicle.name}{where}, mission '{task.config.mission.name}'{build}"
+    law = find(CONTROL_LAWS, task.config.controller.law)
+    title = f"{task.config.vehicle.name}{where}, mission '{task.config.mission.name}', {law}{build}"
     console.print(Text(title, style="bold"))
     for prefix, heading in GROUPS.items():
         group = [row for row in rows if row.id.partition(".")[0] == prefix]

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
+import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from companion import DISTRIBUTION, __version__
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.replay import check_replayable
+from companion.cli.check import Task, show
 from companion.cli.main import main
 from companion.cli.schema import schema_json
 from companion.config.loader import load_flight, logged_flight
+from companion.ground.station.replay_log import read_for_page
 from companion.model.codec import fingerprint
-from companion.model.types import Inputs, Outputs, Sent
+from companion.model.types import Inputs, OperatorCommand, Outputs, Sent
 from companion.plugins import PluginError
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import fly_to_end, row_of
@@ -64,6 +69,13 @@ def test_it_is_listed_with_its_distribution(capsys: pytest.CaptureFixture[str]) 
     assert [(row[0], row[3]) for row in rows[:-1]] == [(law, DISTRIBUTION) for law in ("adaptive", "csc", "psc")]
 
 
+@pytest.mark.usefixtures("site")
+def test_a_check_names_it_with_its_distribution() -> None:
+    out, config = io.StringIO(), load_sitl("hover", controller_law="lift")
+    show(Console(file=out, width=200), [], Task(config=config, mission="hover", sitl=None, hand=False, json=False))
+    assert out.getvalue().startswith("tarot650-2r, mission 'hover', control law 'lift' (lab-a 1.0)")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "reason"),
     [
@@ -93,6 +105,9 @@ def test_one_that_cannot_be_used_is_refused_by_name_and_does_not_disturb_the_oth
         assert "cannot be used: " in capsys.readouterr().out
 
 
+AN_INPUT = Inputs(tick=0, t_s=0.0, recorder_dropped=0, command=OperatorCommand.NONE)
+
+
 def log_by(distribution: str, version: str) -> FlightLog:
     """The head of a log that the law `lift` flew."""
     about = {"version_companion": __version__, "records": fingerprint(Inputs, Outputs, Sent)}
@@ -116,7 +131,7 @@ def test_a_log_is_not_replayed_by_another_version_of_the_law(other: tuple[str, s
         check_replayable(log_by("lab-a", "1.0"))
 
 
-def test_a_log_is_not_replayed_without_its_law(tmp_path: Path) -> None:
+def test_a_log_is_neither_replayed_nor_shown_without_its_law(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_law(tmp_path)
     with on_path(tmp_path):
         config_json = load_flight("hover", controller_law="lift").model_dump_json()
@@ -124,6 +139,10 @@ def test_a_log_is_not_replayed_without_its_law(tmp_path: Path) -> None:
         check_replayable(log_by("lab-a", "1.0"))
     with pytest.raises(PluginError, match=r"^control law 'lift': is not installed"):
         logged_flight(config_json)
+    log = dataclasses.replace(log_by("lab-a", "1.0"), inputs=(AN_INPUT,), metadata={"config": {"json": config_json}})
+    monkeypatch.setattr(FlightLog, "read", lambda *_, **__: log)
+    with pytest.raises(LogError, match=r"^flight\.mcap: control law 'lift': is not installed"):
+        read_for_page(log.path, 0)
 
 
 REPLACE = "from msgspec.structs import replace\n"
