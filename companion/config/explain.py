@@ -82,7 +82,10 @@ def _problems(error: ValidationError, schema: _Node, document: Document) -> list
             if isinstance(at[-1], int):  # a list that is too short is one problem of the list
                 at, node, _ = _walk(schema, detail["loc"][:-1])
             else:
-                missing.append((at, describe(node, schema)))
+                _, parent, _ = _walk(schema, detail["loc"][:-1])
+                options = (parent or {}).get("properties", {}).get(at[-1], {}).get("anyOf", ())
+                or_null = ", or null if there is none" if {"type": "null"} in options else ""
+                missing.append((at, describe(node, schema) + or_null))
                 continue
         if at not in reported:
             reported.add(at)

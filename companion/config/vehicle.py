@@ -230,8 +230,9 @@ class Devices(Model):
     autopilot: AutopilotDevice
     mocap: MocapDevice
     arm: ArmDevice
-    force: ForceDevice | None = None
-    """Force-torque sensor. If it is absent, the control law runs without a measured force and no catch is detected (docs/parts.md)."""
+    force: ForceDevice | None
+    """Force-torque sensor; null states that there is none: the control law then runs without a measured force, and no catch is detected
+    (docs/parts.md)."""
 
 
 class Safety(Model):
@@ -364,10 +365,12 @@ class Vehicle(Model):
     name: str
     airframe: Airframe
     arm: Arm
-    tool: Tool | None = None
-    """Net, with the force-torque sensor between link 2 and the net. If it is absent, nothing can be caught (docs/parts.md)."""
-    tether: Tether | None = None
-    """Safety tether. If it is absent, only the room limits the flight, and no tether rule is evaluated (docs/parts.md)."""
+    tool: Tool | None
+    """Net, with the force-torque sensor between link 2 and the net; null states that there is none, and nothing can be caught
+    (docs/parts.md)."""
+    tether: Tether | None
+    """Safety tether; null states that there is none: only the room then limits the flight, and no tether rule is evaluated
+    (docs/parts.md)."""
     room: Room
     devices: Devices
     computer: Computer = Computer()
@@ -410,7 +413,7 @@ class Vehicle(Model):
                 text = f"expected at most {others:g} kg m^2 (no moment of a rigid body exceeds the sum of the other two), got {own:g}"
                 problems.append((("airframe", "inertia_kg_m2", axis), text))
         if self.tool is None and self.devices.force is not None:
-            text = "the force-torque sensor is part of the tool, but tool is absent; add tool, or remove devices.force"
+            text = "the force-torque sensor is part of the tool, but tool is absent; add tool, or set devices.force to null"
             problems.append((("devices", "force"), text))
         carried_kg = sum(self.arm.link_masses_kg) + self.tool_mass_kg
         if carried_kg >= self.airframe.mass_kg:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import yaml
 
 from companion.config.controller import LAWS, AdaptiveConfig
 from companion.config.document import ConfigError
@@ -419,6 +420,17 @@ def test_vehicle_and_world_load_alone(project: Path) -> None:
         "--set vehicle.airframe"
     )
     assert lines_of(lambda: load_world(["world.sed=7"])) == ["--set world.sed: unknown key; did you mean seed?"]
+
+
+@pytest.mark.parametrize("key", ["tether", "tool", "devices.force"])
+def test_a_part_that_may_be_absent_is_not_left_out_by_mistake(project: Path, key: str) -> None:
+    data = yaml.safe_load((project / VEHICLE).read_text(encoding="utf-8"))
+    room = data["devices"] if key == "devices.force" else data
+    del room[key.rpartition(".")[2]]
+    (project / VEHICLE).write_text(yaml.safe_dump(data), encoding="utf-8")
+    (line,) = lines_of(lambda: load_vehicle(VEHICLE, []))
+    assert f"{key}: missing; expected a mapping with the keys" in line
+    assert line.endswith(", or null if there is none")
 
 
 def test_a_flights_configuration_holds_nothing_of_the_simulated_world(project: Path) -> None:

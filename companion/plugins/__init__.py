@@ -20,7 +20,7 @@ CONTROL_LAWS = "companion.control_laws"
 MOCAP_SYSTEMS = "companion.mocap_systems"
 KINDS = {CONTROL_LAWS: "control law", MOCAP_SYSTEMS: "motion-capture system"}
 """Kind of part, in words, that each group of entry points announces."""
-_SOURCE_TREE = Path(__file__).parents[1]
+_SOURCE_TREE = Path(__file__).parents[2]
 
 
 class PluginError(Exception):
