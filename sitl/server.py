@@ -182,7 +182,7 @@ class Sitl:
         self._end_s = -math.inf
 
     def leave(self) -> None:
-        """End `run` as soon as the vehicle is disarmed, but at the latest `_LEAVE_S` from now."""
+        """End `run` as soon as the vehicle is disarmed, or after `_LEAVE_S` if it is still armed."""
         self._leaving = True
         self._end_s = min(self._end_s, self.plant.t_s + _LEAVE_S)
 

@@ -105,7 +105,7 @@ def build() -> None:
 
 
 def main() -> int:
-    """Build, print how to use the result, and return the exit code."""
+    """Make the compiled build, print how to use it, and return the exit code."""
     compiler = str(sysconfig.get_config_var("CC")).split()[0]
     if shutil.which(compiler) is None:
         print(f"no C compiler ({compiler}): on Debian, apt install gcc python3-dev", file=sys.stderr)

@@ -121,7 +121,7 @@ def effective_config(log: FlightLog, summary: dict[str, Any]) -> dict[str, Any]:
 
 
 def world_text(world: dict[str, Any] | None) -> str:
-    """Return name, seed and model error of a simulated world on one line; empty for a flight on hardware.
+    """Return the name, seed and model error of a simulated world on one line; empty for a flight on hardware.
 
     Args:
         world: world of a summary or of an effective configuration; those of older versions have no name.

@@ -154,7 +154,7 @@ def run(campaign: Campaign, out: Path, console: Console | None) -> int:
     Args:
         campaign: campaign to fly.
         out: an existing folder; stays empty if no flight ended.
-        console: output of the tables; None to print the rows and their summary as JSON instead.
+        console: where to print the tables; None to print the rows and their summary as JSON instead.
 
     Returns:
         The exit code.

@@ -29,8 +29,8 @@ def add_parser(commands: Any) -> None:
     align = add_tool(
         parts, "align", _TOOLS,
         help="find the axes by moving the vehicle: lift, forward, turn left",
-        description="Run the guided hand test and name the setting that explains its result. Battery connected, "
-        "disarmed, propellers off. Exit 0: the axes are right; 3: they are not; 4: cancelled.",
+        description="Run the guided hand test and report what is wrong with the axes. The battery must be connected, "
+        "the vehicle disarmed and the propellers removed. Exit 0: the axes are right; 3: they are not; 4: cancelled.",
     )  # fmt: skip
     align.add_argument(
         "mission",

@@ -41,7 +41,7 @@ def add_world(parser: argparse.ArgumentParser, default: str | None = COMMAND_LIN
 
 
 def add_seed(parser: argparse.ArgumentParser) -> None:
-    """Add `--seed`, which is short for an override of `world.seed`."""
+    """Add `--seed`, a shorthand for `--set world.seed=N`."""
     parser.add_argument(
         "--seed",
         dest="overrides",
@@ -49,7 +49,7 @@ def add_seed(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=_seed_override,
         metavar="N",
-        help="seed of the simulated world: another seed draws another laboratory and other noise (short for --set world.seed=N)",
+        help="seed of the simulated world: another seed draws another laboratory and other noise (shorthand for --set world.seed=N)",
     )
 
 

@@ -66,10 +66,10 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compare, write if requested, and print; return the exit code.
+    """Compare PX4's parameters with the file, write the differences if requested, and print the result; return the exit code.
 
     Raises:
-        ConfigError: the parameter or the vehicle file is wrong.
+        ConfigError: the parameter file, the vehicle file or --address is invalid.
     """
     path = arguments.file or PACKAGED
     wanted = params_file.read(path)

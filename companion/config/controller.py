@@ -50,15 +50,15 @@ class LawConfig(ControllerConfig):
     """Fraction of the measured F_ext that is fed forward to the base, per world axis."""
     disturbance_time_xyz_s: NonNegative3 = (0.0, 0.0, 0.0)
     """Time constant of the disturbance observer, per world axis; 0 disables it, as in the paper. The observer estimates and compensates
-    the forces on the base that are neither commanded nor fed forward.
+    for the forces on the base that are neither commanded nor fed forward.
     """
     disturbance_lag_s: NonNegative = 0.1
     """Lag between commanded and actual force that the observer assumes."""
     disturbance_max_n: NonNegative = 6.0
     """Bound of the observer's estimate, per axis."""
     feedforward_lead_s: NonNegative = 0.0
-    """Lead of the feedforward of the reference's horizontal acceleration (a + lead * jerk), which compensates the attitude loop's
-    delay.
+    """Lead of the feedforward of the reference's horizontal acceleration (a + lead * jerk), which compensates for the attitude
+    loop's delay.
     """
     arm_friction_share: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Fraction of the vehicle file's `arm.joint_friction_nm` that is fed forward in the direction of the reference joint rate."""

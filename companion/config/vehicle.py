@@ -29,7 +29,7 @@ class Airframe(Model):
     """The flying base."""
 
     mass_kg: Positive
-    """Mass of the whole vehicle ready to fly, with arm and net, without payload."""
+    """Mass of the whole vehicle ready to fly, with the arm and the net, without a payload."""
     inertia_kg_m2: Positive3 = (0.045, 0.045, 0.075)
     """Moments of inertia of the base, without arm and tool, about the body's x, y and z axes; used by the model-based laws and the
     simulated airframe. The default is that of the Tarot 650."""
@@ -128,7 +128,7 @@ class Tether(Model):
     produced 2.8 N. A pull of 3 N tilts a vehicle of 3 kg by 6 deg.
     """
     pull_filter_s: Positive = 0.1
-    """Time constant of the low-pass filter on the force that rotors, gravity and tool do not explain."""
+    """Time constant of the low-pass filter on the force that is not due to the rotors, gravity or the tool."""
     pull_time_s: NonNegative = 0.8
     """Duration from which a pull is not treated as an impact."""
     separation_m: Positive = 0.3
@@ -258,7 +258,7 @@ class Safety(Model):
     mocap_jump_m: Positive = 0.10
     """Largest distance between a pose and the position predicted from PX4's velocity; a more distant pose is ignored."""
     mocap_jump_deg: Positive = 20.0
-    """Largest change of a pose's attitude in excess of the change that the angular rates explain."""
+    """Largest change of a pose's attitude in excess of the change computed from the angular rates."""
     mocap_frozen_s: Positive = 0.10
     """Longest time with new frames but an identical pose while the vehicle is moving."""
     mocap_inertial_m: Positive = 0.04

@@ -46,7 +46,7 @@ def tracking_errors(state: PlantState, reference: Reference, yaw_rad: float) -> 
 class ForceFilter:
     """First-order low-pass filter of the external force, exact for a held input.
 
-    It returns zero while there is no valid sample and restarts at the next valid one.
+    It returns zero while there is no valid sample, and then starts from zero. Only a sample in the first step is returned unfiltered.
     """
 
     def __init__(self, cutoff_hz: float) -> None:

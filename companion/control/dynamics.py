@@ -259,7 +259,7 @@ def chi_rate_from_body_rate(roll_pitch_yaw_rad: Vec3, rate_body_rad_s: Vec3) -> 
 
 
 def rotation_matrix(attitude_wxyz: Quat) -> Mat3:
-    """Return the rotation from body to world of a unit quaternion."""
+    """Return the body-to-world rotation matrix of a unit quaternion."""
     w, x, y, z = attitude_wxyz
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),

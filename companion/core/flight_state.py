@@ -29,7 +29,9 @@ class Tare(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """State while the vehicle waits on the ground for inputs, estimate, tare and, if the mission requires it, a start command."""
+    """State while the vehicle waits on the ground for the inputs, the estimate, the tare and, if the mission requires it, a start
+    command.
+    """
 
     tare_start_s: float | None = None
     was_ready: bool = False

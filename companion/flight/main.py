@@ -89,7 +89,7 @@ class Flight:
         """State of the link to ground stations that was last reported to the launcher."""
 
     async def run(self) -> Outcome:
-        """Run ticks until the core reports the end."""
+        """Run ticks until the flight ends; return its outcome."""
         ticker = Ticker(self._period_s, self._clock, self._mocap_rate_hz)
         self._devices.vision.on_frame = ticker.frame
         arm = self._devices.arm

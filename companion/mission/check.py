@@ -1,6 +1,7 @@
-"""Checks before arming, from geometry and mechanics, whether a mission can be flown as written.
+"""Before arming, checks from geometry and mechanics whether a mission can be flown as written. No I/O.
 
-Pure: the plan is sampled finely and every sample is checked against room, tether, joint limits, floor, motion limits and thrust.
+The plan is sampled finely, and every sample is checked against the room, the tether, the joint limits, the floor, the motion limits and
+the thrust.
 """
 
 from __future__ import annotations

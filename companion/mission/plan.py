@@ -114,7 +114,7 @@ class Plan:
 
     @classmethod
     def of(cls, name: str, builder: PlanBuilder, repeats: Repeats | None = None) -> Plan:
-        """Return the plan of a builder's segments and tracks. Its second repetition stands in for all later ones."""
+        """Return the plan of a builder's segments and tracks. Its second repetition is replayed in place of all later ones."""
         segments, left_out_s = builder.segments, 0.0
         starts_s = tuple(segment.start_s for segment in segments)
         if repeats is not None:
@@ -157,7 +157,7 @@ class Plan:
         return self.segments[index - 1 if index else 0]
 
     def _repeated(self, t_s: float, repeats: Repeats) -> Segment:
-        """Return the segment at a time within one of the repetitions that the second one stands in for."""
+        """Return the segment at a time within a repetition after the second."""
         before = repeats.before(t_s)
         shift_s = before * repeats.period_s
         # The shift is rounded: just after the seam the shifted time may lie just before it.

@@ -104,12 +104,12 @@ class PlanBuilder:
         return duration_s
 
     def turn(self, to_yaw_rad: float, duration_s: float) -> None:
-        """Append a turn to a yaw, in the shorter direction."""
+        """Append a turn to the given yaw in the shorter direction."""
         yaw_rad = self._at[1][0]
         self._go(1, (yaw_rad + wrap_rad(to_yaw_rad - yaw_rad),), self.t_s, duration_s, rest_to_rest)
 
     def least_arm_s(self, to_rad: Vec2, limits: ArmLimits) -> float:
-        """Return the shortest duration of a move of the arm, s."""
+        """Return the shortest time in which the arm can move to the given pose, s."""
         delta_rad = self._arm_delta(to_rad)
         return plan_arm(delta_rad, limits).duration_s if any(delta_rad) else ARM_LEAST_S
 
@@ -171,7 +171,7 @@ class PlanBuilder:
         return t_s
 
     def tracks(self) -> tuple[Track, Track, Track]:
-        """Return position, yaw and arm."""
+        """Return the tracks of the position, the yaw and the arm."""
         position, yaw, arm = (
             Track(initial, tuple(moves)) for initial, moves in zip(self._initial, self._moves, strict=True)
         )

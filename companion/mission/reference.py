@@ -94,7 +94,7 @@ class Move:
         return tuple(origin + delta * share for origin, delta in zip(self.origin, self.delta, strict=True))
 
     def at(self, t_s: float) -> Sample:
-        """Return value and derivatives between start and end."""
+        """Return the value and its derivatives between start and end."""
         duration_s = self.duration_s
         f, df, ddf, dddf = self.profile((t_s - self.start_s) / duration_s)
         df /= duration_s
@@ -139,7 +139,7 @@ class Curve:
         return self.start_s + self.duration_s
 
     def at(self, t_s: float) -> Sample:
-        """Return value and derivatives between start and end."""
+        """Return the value and its derivatives between start and end."""
         scale_s = self.scale_s
         t = (t_s - self.start_s) / scale_s
         index = min(len(self.pieces), max(1, bisect_right(self.knots, t))) - 1
@@ -186,7 +186,7 @@ class Track:
                 )
 
     def at(self, t_s: float) -> Sample:
-        """Return value and derivatives at any time."""
+        """Return the value and its derivatives at any time."""
         index = bisect_right(self._starts_s, t_s)
         if index == 0 or t_s >= self._ends_s[index - 1]:
             return self._rests[index]

@@ -1,4 +1,4 @@
-"""Checks one instant of a plan against every limit: room, tether, floor, joints, motion, thrust.
+"""Checks one instant of a plan against every limit: the room, the tether, the floor, the joints, the motion and the thrust.
 
 Pure. A position is checked with the expected tracking error (`TRACKING_M`, more around a catch), and so is the position where the
 vehicle would come to rest after a fault. The check uses the governor's own `SafeSet` and is stricter, so the governor never constrains

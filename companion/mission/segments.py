@@ -1,4 +1,6 @@
-"""Phases on a plan's clock. At most two repetitions of a repeated mission are planned; the second stands in for all later ones."""
+"""Phases on a plan's clock. At most two repetitions of a repeated mission are planned; the second is replayed in place of all
+later ones.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class Repeats:
-    """Later repetitions that the second one stands in for: each starts where the one before it ended and has the same motion."""
+    """Repetitions after the second. They are not planned: the second is replayed in their place, each time from where the previous
+    repetition ended.
+    """
 
     count: int
     """Number of all repetitions, 3 or more."""
@@ -39,7 +43,9 @@ class Repeats:
 
     @property
     def left_out_s(self) -> float:
-        """Return the duration of the repetitions that the second one stands in for, s."""
+        """Return the total duration of the repetitions after the second, s. They are not planned: the second is replayed in their
+        place.
+        """
         return (self.count - 2) * self.period_s
 
     @property
@@ -48,14 +54,16 @@ class Repeats:
         return self.begin_s + self.period_s + self.left_out_s
 
     def before(self, t_s: float) -> int:
-        """Return how many of the repetitions that the second one stands in for are complete at this time."""
+        """Return how many periods to subtract from this time to obtain the corresponding time in the second repetition: 0 before the
+        third, `count` - 2 after the last.
+        """
         whole = int((t_s - self.begin_s) / self.period_s)
         return 0 if whole < 1 else min(whole, self.count - 2)
 
 
 def flown_phases(mission: Mission) -> list[tuple[int, int]]:
-    """Return (phase index, repetition) in planned order. At most two repetitions are planned; the second stands in for all later ones.
-    The repetition is 0 for a phase that is flown once.
+    """Return (phase index, repetition) in planned order. At most two repetitions are planned; the second is replayed in place of all
+    later ones. The repetition is 0 for a phase that is flown once.
     """
     last = len(mission.phases) - 1
     middle = range(1, last)
@@ -65,7 +73,7 @@ def flown_phases(mission: Mission) -> list[tuple[int, int]]:
 
 
 def repeats_of(mission: Mission, segments: Sequence[Segment], names: tuple[str, ...]) -> Repeats | None:
-    """Return the repetitions that the second one stands in for, or None if there are none."""
+    """Return the repetitions after the second, or None if there are none."""
     if mission.repeat < 3:
         return None
     second = [number for number, segment in enumerate(segments) if segment.repetition == 2]

@@ -286,7 +286,7 @@ class ControlLog(Record, frozen=True, kw_only=True):
     payload_estimate_kg: float | None = None
     """Estimated mass of the payload; None if the law does not estimate it."""
     load_estimate_n: Vec3 | None = None
-    """Rotor force that compensates the adapted load, world frame. None if the law does not adapt loads."""
+    """Rotor force that compensates for the adapted load, world frame. None if the law does not adapt loads."""
     moment_estimate_kg_m: Vec2 | None = None
     """Adapted first moments of links 1 and 2 about their joints, in addition to the nominal moments; None if the law does not adapt
     them."""
@@ -311,7 +311,7 @@ class TetherState(Record, frozen=True, kw_only=True):
     turns: float
     """Winding of the tether about the vertical through the anchor, in turns; positive counter-clockwise as seen from above."""
     pull_n: float
-    """Low-pass-filtered force toward the anchor that rotors, gravity and tool do not explain; 0 if unknown, never negative."""
+    """Low-pass-filtered force toward the anchor that is not due to the rotors, gravity or the tool; 0 if unknown, never negative."""
     taut: bool
     """Whether the slack is used up or the tension increases with the range."""
     snagged: bool

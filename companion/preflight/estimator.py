@@ -175,7 +175,7 @@ def vision(o: Observations) -> Row:
 
 
 def missing_evidence(o: Observations) -> str | None:
-    """Return the missing evidence that EKF2 fuses vision, or None if the evidence is complete throughout the observation."""
+    """Return why the observation does not show that EKF2 fuses vision throughout, or None if it does."""
     if not o.vehicle:
         return "no LOCAL_POSITION_NED"
     if not o.estimator:

@@ -210,7 +210,7 @@ def standing(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> Iterat
 
 
 def explanation(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> str:
-    """Return one line with the axis permutation that explains every wrong value at rest, and its remedy; empty if none does or
+    """Return one line with the axis permutation that accounts for every wrong value at rest, and its remedy; empty if none does or
     nothing is wrong. Likelier permutations are tried first; only the hand test distinguishes those that look alike at rest.
     """
 

@@ -230,7 +230,7 @@ class TelemetrySession:
         Args:
             now_s: CLOCK_MONOTONIC.
             wall_s: seconds since 1970.
-            dropped: records that the recorder lost.
+            dropped: number of records that the recorder has lost.
             recorder_error: why recording stopped, or None.
         """
         self._presence(now_s)

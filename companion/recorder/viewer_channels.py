@@ -265,8 +265,8 @@ def timestamp(stamp_ns: int) -> Timestamp:
 
 
 def _vehicle_pose(inputs: Inputs) -> tuple[Vec3, Quat] | None:
-    """Return position and attitude from motion capture, or from PX4 if motion capture is stale, untracked or not finite. None if
-    neither is usable.
+    """Return the position and the attitude from motion capture, or from PX4 if motion capture is stale, untracked or not finite. None
+    if neither is usable.
     """
     mocap, vehicle = inputs.mocap, inputs.vehicle
     if mocap is not None and mocap.tracking_valid and inputs.t_s - mocap.stamp_s <= _FRESH_S:

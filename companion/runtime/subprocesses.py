@@ -152,7 +152,9 @@ def holds_traceback(path: Path) -> bool:
 
 
 def last_line(path: Path) -> str:
-    """Return the last line of a log in the form ` (ValueError: text)`, or an empty string."""
+    """Return the last non-empty line of a log, truncated, in parentheses after a space, for example ` (ValueError: text)`; empty if
+    there is none.
+    """
     lines = _tail(path).split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip()), "")
     return f" ({last[:_LINE_CHARACTERS]})" if last else ""

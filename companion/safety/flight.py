@@ -173,7 +173,7 @@ def tether_snagged(f: FlightTracker, _: None) -> Values | None:
 
 
 def tether_near(f: FlightTracker, clearance_min_m: float) -> Values | None:
-    """Fires if the tether is nearer to rotors or arm than the threshold."""
+    """Fires if the tether is nearer to the rotors or the arm than the threshold."""
     t = f.tether
     return (t.clearance_m, clearance_min_m) if t is not None and t.clearance_m < clearance_min_m else None
 

@@ -87,11 +87,11 @@ class SafeSet:
             )
 
     def holds(self, p: Vec3) -> bool:
-        """Return whether the point lies in both ball and box."""
+        """Return whether the point is inside both the ball and the box."""
         return self.holds_within(p, self.radius_m, self.high_m[2])
 
     def holds_within(self, p: Vec3, radius_m: float, top_m: float) -> bool:
-        """Return whether the point lies in a ball of this radius and in the box below this ceiling."""
+        """Return whether the point is within this distance of the anchor and inside the box with this ceiling."""
         low, high, (ax, ay, az) = self.low_m, self.high_m, self.anchor_m
         x, y, z = p
         return (
@@ -295,7 +295,7 @@ class Governor:
         return ((self._v[0] - v[0]) / dt_s, (self._v[1] - v[1]) / dt_s, (self._v[2] - v[2]) / dt_s)
 
     def _braked(self, dt_s: float) -> tuple[Vec3, Vec3]:
-        """Return position and velocity after straight braking; exact even if the reference comes to rest within the step."""
+        """Return the position and the velocity after straight braking; exact even if the reference comes to rest within the step."""
         assert self._p is not None
         (px, py, pz), (vx, vy, vz) = self._p, self._v
         speed = math.sqrt(vx * vx + vy * vy + vz * vz)
@@ -308,7 +308,7 @@ class Governor:
         return (px + vx * way, py + vy * way, pz + vz * way), (vx * keep, vy * keep, vz * keep)
 
     def _wished(self, dt_s: float, target: Vec3, follow: Vec3, feed: Vec3) -> tuple[Vec3, Vec3]:
-        """Return position and velocity after a step towards the target, within the limits of speed and acceleration."""
+        """Return the position and the velocity after a step towards the target, within the speed and acceleration limits."""
         assert self._p is not None
         (px, py, pz), (vx, vy, vz) = self._p, self._v
         ex, ey, ez = target[0] - px, target[1] - py, target[2] - pz

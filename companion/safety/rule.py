@@ -71,7 +71,7 @@ class Rule:
     """Whether the rule is also evaluated while inputs are still missing on the ground."""
 
     def verdict(self, airborne: bool) -> tuple[SafetyAction, Severity]:
-        """Return action and severity of the event; the action is NOMINAL if the rule is not evaluated."""
+        """Return the action and the severity of the event; the action is NOMINAL if the rule is not evaluated."""
         action = (self.air if airborne else self.ground) or SafetyAction.NOMINAL
         if self.severity is not None:
             return action, self.severity

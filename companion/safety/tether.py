@@ -1,4 +1,4 @@
-"""The safety tether: slack now and at the predicted stop, clearance from rotors and arm, winding, pull, separation. Pure.
+"""The safety tether: slack now and at the predicted stop, clearance from the rotors and the arm, winding, pull, separation. No I/O.
 
 The tether is a line, no longer than `tether.length_m`, between its anchor and an attachment point on the vehicle. Unmeasured
 quantities are bounded: the shape of the line (`companion.safety.tether_shape`) and its pull (`companion.safety.tether_pull`). Plain
@@ -120,7 +120,7 @@ class TetherWatch:
             t_s: flight clock.
             position_world_m: position of the body's origin.
             velocity_world_m_s: velocity of the body's origin.
-            attitude_wxyz: rotation from body to world.
+            attitude_wxyz: body-to-world rotation.
             arm_rad: joint angles as in the paper; if None, the arm is assumed to be anywhere within its reach.
             disturbance_world_n: force on the vehicle other than rotor thrust and gravity, N; None if unknown or on the ground.
             tool_force_world_n: the part of this force that acts on the net, with the bias removed, N; None if unknown.

@@ -2,8 +2,8 @@
 
 A line that hangs still lies in the vertical plane through its two ends, below their chord, and above its own tangent at the vehicle: a
 hanging line is convex. It is therefore bounded by two rays from the attachment, the chord and the steepest tangent that its slack
-allows; its shape beyond a metre from the vehicle is irrelevant for rotors and arm. The tangent is that of the parabola of the same
-length, which with much slack goes straight down, as the line does. `clearance_min_m` covers wind and rotor wash on the line.
+allows; its shape beyond a metre from the vehicle does not affect the rotors and the arm. The tangent is taken from the parabola of the
+same length, which with much slack goes straight down, as the line does. `clearance_min_m` covers wind and rotor wash on the line.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class Clearance:
         return min(math.hypot(inner - off, pz), (-pz - max(in_s * dz, out_s * dz)) * flat)
 
     def _arm_reach_m(self, arm_rad: Vec2) -> float:
-        """Return the distance of the farthest point of arm and net from the shoulder, m."""
+        """Return the distance of the farthest point of the arm and the net from the shoulder, m."""
         l1, l2 = self._l1, self._l2
         net_m = math.sqrt(max(0.0, l1 * l1 + l2 * l2 + 2.0 * l1 * l2 * math.cos(arm_rad[1])))
         return max(l1, net_m + self._net_m)

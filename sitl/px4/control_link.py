@@ -276,7 +276,7 @@ class ControlLink(UdpEndpoint):
 
 
 def _parameter(message: Any) -> tuple[str, Value | None]:
-    """Return name and value of a PARAM_VALUE, or ("", None) for another message."""
+    """Return the name and the value in a PARAM_VALUE, or ("", None) for another message."""
     if message.get_type() != "PARAM_VALUE":
         return "", None
     return message.param_id, decode_bytewise(message.param_value, message.param_type)

@@ -134,7 +134,7 @@ class ServoDrive:
         self._silent_until_s = self._heard_s + self._watchdog_s
 
     def present(self) -> tuple[int, int, int]:
-        """Return current, velocity and position in counts at the last `update` (registers 126, 128 and 132)."""
+        """Return the current, velocity and position in counts at the last `update` (registers 126, 128 and 132)."""
         direction = self.direction
         position = (
             direction * round(self.angle_rad / RAD_PER_COUNT) - self.turn_counts + self.homing_counts + self.slip_counts

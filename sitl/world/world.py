@@ -1,4 +1,4 @@
-"""The MuJoCo physics of quadrotor, 2R arm, net, tether, floor and thrown payload. `plant` adds the sensor noise."""
+"""MuJoCo physics of the quadrotor, its 2R arm and net, the tether, the floor and the thrown payload. `plant` adds the sensor noise."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ def _top(messages: Sequence[Message], key: str) -> float:
 
 
 def distributions(groups: Sequence[Group]) -> list[tuple[str, str, str, Figure]]:
-    """Return name, title, caption and figure of every plot of position errors for which there is data."""
+    """Return the name, title, caption and figure of each plot of position errors that has data."""
     figures = []
     errors = sorted({group.model_error for group in groups})
     whole = [group for group in groups if not is_ablation(group.preset)]
@@ -139,14 +139,14 @@ def distributions(groups: Sequence[Group]) -> list[tuple[str, str, str, Figure]]
         if any(_finite(group, part) for group in shown for part in PARTS):
             caption = (
                 "RMS of ‖e_p‖ of every flight, on a logarithmic axis. Long mark: p50, short mark: p95; a failed flight counts as worse "
-                "than all others. Diamonds: printed in the paper."
+                "than all others. Diamonds: values printed in the paper."
             )
             figures.append((name, title, caption, _strips(title, shown)))
     if len(errors) > 1 and any(_finite(group, "post") for group in whole):
         figures.append((
             "model_error",
             "Error against model error",
-            "RMS of ‖e_p‖ after the catch: line p50, band up to p95; the band is open where more than 5 % of the flights failed.",
+            "RMS of ‖e_p‖ after the catch. Line: p50; band: up to p95, open where more than 5 % of the flights failed.",
             _against_model_error(whole),
         ))  # fmt: skip
     pairs = adaptation_pairs(groups)

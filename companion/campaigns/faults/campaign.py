@@ -49,7 +49,7 @@ class Faults(Campaign):
         return f"{row['fault']} {shown_size(row)}".strip() + f" in {row['phase']}"
 
     def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """Return outcomes and extreme values."""
+        """Return the outcomes and the extreme values of all flights."""
         return {
             "summary": {
                 "flights": len(rows),
@@ -104,7 +104,9 @@ def extreme(rows: Sequence[Row], key: str, pick: Callable[[list[float]], float])
 
 
 def shown_size(row: Row) -> str:
-    """Return the size with its unit, and the duration if the fault has both."""
+    """Return a fault's size with its unit, followed by its duration if it has one that is not the size itself; empty if the fault has
+    no size.
+    """
     if row["size"] is None:
         return ""
     text = f"{row['size']:g} {row['unit']}".strip()

@@ -52,7 +52,7 @@ class Estimate:
     standard_error: float
 
     def text(self, digits: int) -> str:
-        """Return value and error, such as `1.30 ± 0.02`."""
+        """Return the value and its error, such as `1.30 ± 0.02`."""
         return f"{self.value:.{digits}f} ± {self.standard_error:.{digits}f}"
 
 

@@ -1,6 +1,6 @@
 """Slow, bounded motion of one joint at a time on the ground, and the conditions that stop it. No I/O: joint states in, torques out.
-The controller is `companion.control.arm_hold` behind a speed-limited reference; a small integral compensates friction and wrong
-masses. Angles are defined as in the paper; the body is assumed to be level.
+The controller is `companion.control.arm_hold` behind a speed-limited reference; a small integral term compensates for friction
+and mass errors. Angles are defined as in the paper; the body is assumed to be level.
 """
 
 from __future__ import annotations

@@ -36,9 +36,9 @@ POSE = Check(
 SCALE_TOLERANCE: Final = 0.05
 DIRECTION_MAX_DEG: Final = 8.0
 EXPLAINED_MAX_DEG: Final = 20.0
-"""Largest remaining angle at which a right-angle turn is accepted as the explanation of a direction."""
+"""Largest remaining angle at which a rotation by multiples of 90 deg is accepted as the cause of a wrong direction."""
 APART_MIN_DEG: Final = 12.0
-"""Smallest difference in angle between the best and the next explanation."""
+"""Smallest difference between the remaining angles of the best and the second-best rotation at which the mounting counts as certain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +52,13 @@ class WeightFit:
     off_deg: float
     """Angle between the measured weight and its direction according to the vehicle file."""
     turn: AxisMap
-    """Right-angle turn of the sensor, on top of the vehicle file's mounting, that explains the weight best."""
+    """Rotation of the sensor by multiples of 90 deg, relative to the vehicle file's mounting, that best fits the weight's direction."""
     rest_deg: float
-    """Remaining angle after that turn."""
+    """Remaining angle after that rotation."""
     others: tuple[AxisMap, ...]
-    """Other turns that explain the weight nearly as well."""
+    """Other rotations that fit the weight's direction nearly as well."""
     rpy_deg: Vec3
-    """Value of `tool.sensor_rpy_deg` with that turn."""
+    """Value of `tool.sensor_rpy_deg` with that rotation."""
 
 
 def down_in_link2(arm_rad: Vec2) -> Vec3:
@@ -68,8 +68,8 @@ def down_in_link2(arm_rad: Vec2) -> Vec3:
 
 
 def fit_weight(empty_n: Vec3, loaded_n: Vec3, arm_rad: Vec2, weight_kg: float, sensor_rpy_deg: Vec3) -> WeightFit:
-    """Return the scale and the mounting of the sensor: of the 24 right-angle turns, the one that explains the weight best. The
-    configured mounting is preferred.
+    """Return the sensor's scale and mounting. The mounting is the one of the 24 rotations by multiples of 90 deg that best fits the
+    direction of the weight; the configured mounting is kept if it is within 1 deg of the best.
 
     Args:
         empty_n: mean reading with the net empty, sensor frame.
@@ -117,7 +117,7 @@ def rows(fit: WeightFit) -> Iterator[Row]:
             f"the sensor is mounted rotated: set tool.sensor_rpy_deg: [{rpy}] (remaining error {fit.rest_deg:.0f} deg)"
         )
     yield DIRECTION.row(fit.off_deg <= DIRECTION_MAX_DEG, read, f"within {DIRECTION_MAX_DEG:g} deg", fix)
-    read = f"{len(fit.others) or 'no'} other right-angle turns explain the weight as well"
+    read = f"{len(fit.others) or 'no'} other rotations by multiples of 90 deg fit the weight as well"
     yield POSE.row(not fit.others, read, "none", "repeat with link 2 about 20 to 35 deg below level, not straight down")
 
 

@@ -1,4 +1,6 @@
-"""Devices of `companion ft`: the sensor's own bias, detection of a weight on the net, the arm's angles. I/O only."""
+"""Device access of `companion ft`: sets the force sensor's own bias, detects a weight on the net and reads the arm's angles. I/O
+only.
+"""
 
 from __future__ import annotations
 

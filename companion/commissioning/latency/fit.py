@@ -67,7 +67,7 @@ class TapDelay:
     error_s: float
     """Standard error from the curvature of the residual."""
     correlation: float
-    """Correlation without the slow part; 1 if the shifted IMU data explain all of the motion."""
+    """Correlation without the slow part; 1 if the shifted IMU data match all of the motion."""
     problem: str
     """Why the tap is not used; empty if it is used."""
 

@@ -1,5 +1,5 @@
-"""Finds the one setting that explains a hand test: up axis, yaw of the rigid body, yaw of the world, or a mirrored stream. Pure
-functions.
+"""Finds from a hand test what is wrong with the axes of motion capture: the up axis, the yaw of the rigid body, the yaw of the world,
+or a mirrored stream. Pure functions.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from companion.preflight.hand_test.evaluation import LEVEL_MAX_DEG, YAW_MAX_DEG,
 from companion.preflight.hand_test.motion import angle_rad
 from companion.preflight.hand_test.steps import HandResult
 
-WORLD_YAW = Check("align.world_yaw", "world's yaw", why="room, tether and mission are given in these axes")
+WORLD_YAW = Check("align.world_yaw", "world's yaw", why="the room, the tether and the mission are given in these axes")
 _UP: Final[Vec3] = (0.0, 0.0, 1.0)
 
 

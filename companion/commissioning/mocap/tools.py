@@ -132,7 +132,7 @@ class Carried:
 
 
 async def guide_hand_test(session: Session) -> Carried:
-    """Guide the user through the hand test, with poses forwarded to PX4."""
+    """Guide the user through the hand test while poses are forwarded to PX4; return its result."""
     from companion.io.devices import AvailableDevices, VisionFilter  # imports MAVSDK
     from companion.io.mocap.plugin_driver import open_mocap
     from companion.io.px4.driver import MavsdkAutopilot
@@ -163,7 +163,7 @@ async def guide_hand_test(session: Session) -> Carried:
 
 
 def judge_axes(carried: Carried, vehicle: Vehicle) -> Report:
-    """Return the report on the hand test, with the one setting that explains all errors."""
+    """Return the report on the hand test, which names what is wrong with the axes of motion capture."""
     outcome, start, up_axis = carried.outcome, carried.start, vehicle.devices.mocap.up_axis
     if isinstance(outcome, str):
         return Report([hand_evaluation.ended(outcome, "companion mocap align")], {"alignment": None})

@@ -1,4 +1,6 @@
-"""Devices of `companion mocap`: every rigid body of every frame, the route to the server, servers found by broadcast. I/O only."""
+"""Device access of `companion mocap`: records every rigid body of every frame, finds the route to the server, and searches for servers
+by broadcast. I/O only.
+"""
 
 from __future__ import annotations
 

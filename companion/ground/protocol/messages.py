@@ -75,7 +75,7 @@ class HealthLevel(Enum):
 
 
 class State(Record, frozen=True, kw_only=True):
-    """``state``, retained; also the last will."""
+    """Retained message on topic ``state``; also the last will."""
 
     v: int
     vehicle: str
@@ -97,7 +97,7 @@ class State(Record, frozen=True, kw_only=True):
 
 
 class Scene(Record, frozen=True, kw_only=True):
-    """``scene``, retained: geometry and limits for drawing the vehicle in its room."""
+    """Retained message on topic ``scene``: geometry and limits for drawing the vehicle in its room."""
 
     v: int
     session: str
@@ -137,7 +137,7 @@ class PreflightRow(Record, frozen=True):
 
 
 class Preflight(Record, frozen=True):
-    """``preflight``, retained."""
+    """Retained message on topic ``preflight``."""
 
     v: int
     session: str
@@ -161,7 +161,7 @@ EVENTS_KEPT = 100
 
 
 class Events(Record, frozen=True, kw_only=True):
-    """``events``, retained: the newest `EVENTS_KEPT`, oldest first."""
+    """Retained message on topic ``events``: the newest `EVENTS_KEPT` events, oldest first."""
 
     v: int
     session: str
@@ -225,7 +225,9 @@ class Timing(Record, frozen=True, kw_only=True):
 
 
 class Stream(Record, frozen=True, kw_only=True):
-    """``stream``, 20 Hz. Position and attitude come from motion capture, or from PX4 while motion capture is lost."""
+    """Message on topic ``stream``, published at 20 Hz. Position and attitude come from motion capture, or from PX4 while motion
+    capture is lost.
+    """
 
     v: int
     session: str
@@ -282,7 +284,7 @@ class CommandName(Enum):
 
 
 class Command(Record, frozen=True, kw_only=True):
-    """``command``: signed with the operator's key over every other field (`companion.ground.protocol.commands`)."""
+    """Message on topic ``command``, signed with the operator's key over every other field (`companion.ground.protocol.commands`)."""
 
     v: int
     vehicle: str
@@ -300,7 +302,7 @@ class Command(Record, frozen=True, kw_only=True):
 
 
 class Ack(Record, frozen=True, kw_only=True):
-    """``ack``: sent for every correctly signed command, and for no other."""
+    """Message on topic ``ack``, sent in answer to every correctly signed command and to nothing else."""
 
     v: int
     session: str

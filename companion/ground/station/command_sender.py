@@ -122,7 +122,7 @@ class CommandSender:
         Args:
             vehicle: name of the vehicle.
             command: command to send.
-            notify: called with every sent and every failed attempt.
+            notify: called when an attempt is sent, and when one fails.
             hold: number of the hold that a RESUME ends, as the operator saw it; None for the hold of the newest message.
 
         Returns:

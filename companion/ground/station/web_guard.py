@@ -43,7 +43,7 @@ def same_token(given: object, token: str) -> bool:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this computer can reach the name or address."""
+    """Return whether only this computer can reach the name or address."""
     if host.lower() == "localhost":
         return True
     address = _address(host)
@@ -51,12 +51,12 @@ def is_loopback(host: str) -> bool:
 
 
 def host_allowed(host_header: str | None, listens_on: str) -> bool:
-    """Whether a Host header names this server.
+    """Return whether a Host header names this server; a loopback name or address always does.
 
     Args:
         host_header: received Host header.
-        listens_on: value of --host. If it means every address (0.0.0.0, ::), any address and this computer's own name are allowed:
-            an attacker's page can only use its own host name.
+        listens_on: value of --host. With 0.0.0.0 or ::, any IP address and this computer's own name are also allowed. This still stops
+            DNS rebinding, because the browser then sends the host name of the attacker's page.
     """
     match = None if host_header is None else _HOST.fullmatch(host_header)
     if match is None:
@@ -71,7 +71,7 @@ def host_allowed(host_header: str | None, listens_on: str) -> bool:
 
 
 def origin_allowed(origin: str | None, host_header: str | None, *, tls: bool) -> bool:
-    """Whether a WebSocket request comes from a page of this server. Programs other than browsers must send the same header."""
+    """Return whether a WebSocket request comes from a page of this server. Programs other than browsers must send the same header."""
     if origin is None or host_header is None:
         return False
     try:

@@ -134,7 +134,7 @@ class StreamBuilder:
 
         Args:
             wall_s: seconds since 1970.
-            dropped: records that the recorder lost.
+            dropped: number of records that the recorder has lost.
             recorder_error: why recording stopped, or None.
 
         Raises:

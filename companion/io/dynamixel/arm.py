@@ -169,7 +169,7 @@ class DynamixelArm:
         """Pass one command to the bus thread.
 
         Args:
-            torque_nm: joint torques, paper's signs.
+            torque_nm: joint torques with the paper's signs, N m.
 
         Returns:
             The torques that will be sent, after rounding to current counts and clipping, N m.

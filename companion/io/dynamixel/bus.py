@@ -56,7 +56,7 @@ class ArmBus:
         """Open the port, check both servos, set them up and switch torque on with goal current 0.
 
         Raises:
-            DeviceError: a servo or the port is not as required; the text is one line.
+            DeviceError: a servo or the port does not meet the requirements; the text is one line.
         """
         self._deadline_s = time.monotonic() + timeout_s
         self._open_port()

@@ -237,7 +237,8 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         self._taken_bytes = 0
 
     def clearPort(self) -> None:
-        """Discard what has arrived (called by the SDK before each request), after a timeout also what arrives late.
+        """Discard the bytes that have arrived; after a timeout, also wait for a late reply and discard it. The SDK calls this before
+        each request.
 
         Raises:
             OSError: the port is gone.

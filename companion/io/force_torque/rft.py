@@ -105,7 +105,7 @@ def _count(value: float, per_unit: float) -> int:
 
 
 def decode_wrench(data: bytes) -> Wrench:
-    """Return force (N) and torque (N m) from the 16 data bytes of a READ_ONCE or START response."""
+    """Return the force (N) and the torque (N m) from the 16 data bytes of a READ_ONCE or START response."""
     fx, fy, fz, tx, ty, tz, bits = _WRENCH.unpack_from(data, 1)
     return Wrench(
         force_n=(fx / FORCE_PER_N, fy / FORCE_PER_N, fz / FORCE_PER_N),
@@ -115,7 +115,9 @@ def decode_wrench(data: bytes) -> Wrench:
 
 
 def decode_text(data: bytes) -> str:
-    """Return name, serial number or firmware version: the printable ASCII that starts at data byte 1."""
+    """Return the name, serial number or firmware version in a response: the ASCII text from data byte 1 to the first zero byte, with
+    unprintable characters replaced by "?".
+    """
     text = data[1:].partition(b"\0")[0].decode("ascii", "replace")
     return "".join(character if character.isprintable() else "?" for character in text).strip()
 

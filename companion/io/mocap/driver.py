@@ -86,7 +86,7 @@ class NatNetMocap:
 
     @property
     def server(self) -> MocapServer | None:
-        """Return name and protocol of the server, or None before it has answered."""
+        """Return the server's name and protocol version, or None before it has answered."""
         info = self._client.info
         return None if info is None else MocapServer(name=info.name, protocol_version=info.version)
 

@@ -110,7 +110,7 @@ def _check_serial(address: str, path: str) -> None:
 
 
 def bind_alone(address: str, host: str, port: int, kind: socket.SocketKind) -> socket.socket:
-    """Bind a local port that no other socket uses.
+    """Return a socket bound to a local port that no other socket uses.
 
     Raises:
         DeviceError: the port is busy, or the host is not this computer.

@@ -178,7 +178,7 @@ def attitude_target_json(setpoint: AttitudeSetpoint, time_boot_ms: int, target_s
 
 
 def vision_ned(pose: MocapPose) -> tuple[Vec3, Vec3]:
-    """Return position NED (m) and roll, pitch, yaw (ZYX, FRD -> NED, rad) for VISION_POSITION_ESTIMATE.
+    """Return the NED position (m) and the roll, pitch and yaw (ZYX, FRD -> NED, rad) for VISION_POSITION_ESTIMATE.
 
     Raises:
         ValueError: a value is not finite or the quaternion is zero.

@@ -44,7 +44,7 @@ Value = float | int
 
 
 class ParamQueries:
-    """Decides when to request which name. Pure: time is an argument, names are the result."""
+    """Decides when to request which name. No I/O: time is an argument, names are the result."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self.answered: set[str] = set()
@@ -92,7 +92,7 @@ class ParamQueries:
 
 
 def value_of(fields: dict[str, Any]) -> tuple[str, Value | None]:
-    """Return name and value of a PARAM_VALUE's fields, an int where PX4 stores one.
+    """Return the name and the value in a PARAM_VALUE's fields; the value is an int where PX4 stores one.
 
     PX4 sends the bytes of an INT32 in place of the float. The value is None if those bytes are a NaN (as for small negative
     numbers), which JSON cannot represent.

@@ -23,7 +23,7 @@ class ParamLink(Protocol):
         """Return values by name; absent names are left out."""
 
     async def write_param(self, name: str, value: Value) -> Value:
-        """Write, read back and return the value that PX4 now holds."""
+        """Write a value, read it back and return the value that PX4 now holds."""
 
 
 @dataclass(frozen=True, slots=True)

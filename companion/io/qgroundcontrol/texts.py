@@ -126,8 +126,8 @@ def value_messages(time_boot_ms: int, named: Mapping[str, float]) -> list[Any]:
 
 
 def heartbeat_message() -> Any:
-    """Return a HEARTBEAT with MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID, MAV_STATE_ACTIVE, which no ground station shows as a
-    vehicle.
+    """Return a HEARTBEAT with MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID and MAV_STATE_ACTIVE, so that ground stations do not
+    show the companion as a vehicle.
     """
     return mavlink.MAVLink_heartbeat_message(
         mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3

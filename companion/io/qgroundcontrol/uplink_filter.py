@@ -55,7 +55,7 @@ _LOITER, _LAND = 3, 6
 """PX4's sub-modes of AUTO."""
 _ARMED_MODES = frozenset({(_AUTO, _LOITER), (_AUTO, _LAND), (_POSCTL, 0), (_ALTCTL, 0), (_STABILIZED, 0)})
 _COMMAND_BYTES = 33
-"""Size of the payload of COMMAND_LONG; that of COMMAND_INT is longer, with param1 to param4 at the same place."""
+"""Size of COMMAND_LONG's payload. COMMAND_INT's payload is longer and has param1 to param4 in the same place."""
 _SET_MODE_BYTES = 6
 
 
@@ -72,7 +72,7 @@ class ArmedState:
         self._arming_s = -math.inf
 
     def hear(self, datagram: bytes, now_s: float) -> None:
-        """Update from messages that MAVSDK forwards from PX4."""
+        """Update the state from a datagram of PX4's that MAVSDK forwards; only PX4's HEARTBEAT has an effect."""
         heard = autopilot_heartbeat(datagram)
         if heard is not None and heard.system == self._vehicle_system:
             self._disarmed_s = None if heard.armed else now_s

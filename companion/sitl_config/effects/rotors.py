@@ -8,7 +8,7 @@ RotorErrors = tuple[RelativeError, RelativeError, RelativeError, RelativeError]
 
 
 class Rotors(Model):
-    """True rotors. Thrust at full signal is the vehicle file's `thrust_max_n`."""
+    """The rotors of the simulated world. At full signal, their nominal total thrust is the vehicle file's `thrust_max_n`."""
 
     on: bool = False
     """Whether this effect acts."""

@@ -38,7 +38,7 @@ def centre_of_mass_m(machine: Machine) -> Vec3:
 
 
 def shoulder_ypr_rad(machine: Machine) -> Vec3:
-    """Return yaw, pitch and roll of the shoulder mount in the body frame, in the order of MuJoCo's ZYX angles."""
+    """Return the yaw, pitch and roll of the shoulder mount in the body frame, in the order of MuJoCo's ZYX angles."""
     if not machine.on:
         return (0.0, 0.0, 0.0)
     roll, pitch, yaw = machine.shoulder_rpy_deg
