@@ -91,7 +91,7 @@ def _results(summary: dict[str, Any], stride: int) -> list[Table]:
     if summary.get("catch_confirmed") is False:
         flight.insert(1, ("catch confirmed", "no, the flight ended too soon after the impact"))
     if stride > 1:
-        flight.append(("long flight: evaluated and drawn", f"one tick in {stride}"))
+        flight.append(("ticks evaluated and drawn", f"one in {stride} (long flight)"))
     timing = [
         (name, *(_number(figures[key], 2) for key in ("p50", "p99", "max")))
         for name, figures in (

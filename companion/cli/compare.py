@@ -45,7 +45,8 @@ def add_parser(commands: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--adaptation", type=_adaptation, default=ADAPTATION[:1], metavar="on,off",
-        help="fly the presets of the adaptive law with their adaptation, without it (off), or both ways (default: on)",
+        help="whether the presets of the adaptive law fly with their adaptation (on), without it (off) or both ways (on,off) "
+        "(default: on)",
     )  # fmt: skip
     parser.add_argument(
         "--ablation", action="store_true", help="also fly adaptive/recommended with one part removed at a time"

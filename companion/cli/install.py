@@ -271,7 +271,7 @@ def _afterwards(settings: Settings, live: bool) -> Iterator[str]:
         yield "Log in again before you fly from a shell: limits and groups are set at login."
     boot = " (it also starts at boot)" if settings.at_boot else ""
     yield f"Start the service with: systemctl start companion{boot}. It then waits for an operator's START."
-    yield "Stop it with: systemctl stop companion; a flying vehicle lands first. To undo everything: companion install --undo"
+    yield "Stop it with: systemctl stop companion (a flying vehicle lands first). To undo everything: companion install --undo"
 
 
 def _as_json(wanted: Plan, found: Changes, live: bool, *, done: bool) -> dict[str, Any]:

@@ -88,7 +88,7 @@ def _parse(text: str) -> Override:
         hint = f"did you mean {close}?" if close else f"available: {', '.join(SECTIONS)}"
         raise ConfigError([f"{origin}: unknown section '{section}'; {hint}"])
     if len(steps) == 1:
-        raise ConfigError([f"{origin}: the key names a whole document; {_EXAMPLE}"])
+        raise ConfigError([f"{origin}: the key names a whole section; {_EXAMPLE}"])
     if not value_text.strip():
         raise ConfigError([f"{origin}: no value; {_EXAMPLE}"])
     return Override(section, tuple(steps[1:]), parse_value(value_text, origin), origin)

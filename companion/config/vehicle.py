@@ -210,7 +210,7 @@ class ArmDevice(Model):
         if self.watchdog_ms % 20:
             refuse(
                 "arm device",
-                [(("watchdog_ms",), f"must be a multiple of 20 (the unit of the register), got {self.watchdog_ms}")],
+                [(("watchdog_ms",), f"must be a multiple of 20 ms (the register's unit), got {self.watchdog_ms} ms")],
             )
         return self
 

@@ -190,7 +190,9 @@ def undo(root: Path, report: Report) -> bool:
             back.append(path)
     if live:
         if _service_active(SERVICE):
-            raise InstallError(f"{SERVICE} is running; first run: systemctl stop companion (a flying vehicle lands)")
+            raise InstallError(
+                f"{SERVICE} is running; first run: systemctl stop companion (a flying vehicle lands first)"
+            )
         if PERFORMANCE in " ".join(back):
             _run(Command(("systemctl", "stop", PERFORMANCE), "restores the CPU clock"), report)
     try:

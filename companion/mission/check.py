@@ -181,8 +181,9 @@ def _speed(mission: Mission, vehicle: Vehicle) -> Iterator[str]:
     planned, stopped = mission.limits.speed_max_m_s, vehicle.safety.speed_max_m_s
     if planned > SPEED_SHARE_MAX * stopped:
         yield (
-            f"mission '{mission.name}': limits.speed_max_m_s is {planned:g} m/s, but the flight is stopped at {stopped:g} m/s "
-            f"(safety.speed_max_m_s) and needs a margin of one fifth; lower it to {SPEED_SHARE_MAX * stopped:.2f} m/s or less"
+            f"mission '{mission.name}': limits.speed_max_m_s is {planned:g} m/s, but must be at least one fifth below "
+            f"safety.speed_max_m_s ({stopped:g} m/s), above which the vehicle holds; lower limits.speed_max_m_s to "
+            f"{SPEED_SHARE_MAX * stopped:.2f} m/s or less"
         )
 
 

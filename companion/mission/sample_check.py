@@ -149,7 +149,7 @@ class SampleCheck:
                         limit=f"room {name} {edge}",
                         excess=excess,
                         what="leaves the room",
-                        detail=f"rotors, arm and net reach {name} = {reach:.2f} m; "
+                        detail=f"the rotors, the arm and the net reach {name} = {reach:.2f} m; "
                         f"the room is {span[0]:g} to {span[1]:g} m, reduced at each end by {why}",
                         advice="move the waypoint inwards",
                     )
@@ -204,7 +204,7 @@ class SampleCheck:
         if self._repetition == 2:
             self._windings.append(watch.windings)
         if abs(state.turns) > tether.turns_max:
-            detail = f"{abs(state.turns):.2f} turns about anchor or vehicle (tether.turns_max is {tether.turns_max:g})"
+            detail = f"{abs(state.turns):.2f} turns about the anchor or the vehicle (tether.turns_max is {tether.turns_max:g})"
             yield Violation(
                 limit="turns",
                 excess=abs(state.turns),
@@ -214,8 +214,9 @@ class SampleCheck:
             )
         if state.clearance_m < tether.clearance_min_m:
             detail = (
-                f"{state.clearance_m:.3f} m between line and rotors or arm (tether.clearance_min_m is {tether.clearance_min_m:g}; "
-                f"the anchor is seen {math.degrees(state.elevation_rad):.0f} deg below the horizon)"
+                f"{state.clearance_m:.3f} m between the line and the rotors or the arm "
+                f"(tether.clearance_min_m is {tether.clearance_min_m:g}; the anchor is seen "
+                f"{math.degrees(state.elevation_rad):.0f} deg below the horizon)"
             )
             advice = "fly higher or nearer to the anchor, accelerate less, or tie the tether elsewhere"
             yield Violation(

@@ -32,7 +32,7 @@ HAND_TEST = Check(
 REST = Check("frames.rest", "at rest", "no motion during the observation", "gravity can only be measured at rest")
 GRAVITY = Check(
     "frames.gravity",
-    "gravity in motion capture's axes",
+    "gravity in the motion-capture axes",
     "specific force, rotated by motion capture's attitude, points up within 5 deg",
     "the thrust would be tilted by this angle",
 )
@@ -44,13 +44,13 @@ HEIGHT = Check(
 )
 PLACE = Check(
     "frames.place",
-    "start position in motion capture's axes",
+    "start position in the motion-capture axes",
     "the mission's `start.position_m`",
-    "room, tether and path are given in these axes",
+    "the room, the tether and the path are given in these axes",
 )
 YAW = Check(
     "frames.yaw",
-    "start yaw in motion capture's axes",
+    "start yaw in the motion-capture axes",
     "the mission's `start.yaw_deg`",
     "PX4 fuses this yaw and cannot detect that it is wrong: the vehicle would circle or fly away",
 )

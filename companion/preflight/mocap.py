@@ -138,7 +138,7 @@ def _lost(stream: MocapStream) -> Row:
     read, wanted = f"{stream.lost} of {stream.frames + stream.lost} frames, {share:.1%}", f"{LOST_GOOD:.1%}"
     if share <= LOST_GOOD:
         return LOST.good(read, wanted)
-    fix = "use a cable on a separate network; on Wi-Fi use unicast (devices.mocap.transport)"
+    fix = "connect by cable on a separate network; on Wi-Fi, use unicast (devices.mocap.transport)"
     return (LOST.doubtful if share <= LOST_MAX else LOST.bad)(read, wanted, fix)
 
 

@@ -144,7 +144,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             reboot=True,
         ),
         Wanted("EKF2_OF_CTRL", 0, "an optical flow sensor would mistake the arm's motion for the vehicle's", _WARN),
-        Wanted("EKF2_RNG_CTRL", 0, "a range finder would mistake arm and net for the floor", _WARN),
+        Wanted("EKF2_RNG_CTRL", 0, "a range finder would mistake the arm or the net for the floor", _WARN),
         Wanted(
             "EKF2_EV_DELAY",
             5.0,
@@ -162,8 +162,8 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "EKF2_DELAY_MAX",
             50.0,
-            "lag of the filter, ms, over which its output is predicted forward: with PX4's defaults, 200 ms here and 0.25 s for "
-            "the next two parameters, the estimate drifts by 3 to 4 mm",
+            "lag of the filter, ms, over which its output is predicted forward; with PX4's defaults (200 ms here, 0.25 s for "
+            "EKF2_TAU_POS and EKF2_TAU_VEL), the estimate drifts by 3 to 4 mm",
             _WARN,
             reboot=True,
             limits=_between(30.0, 60.0),
@@ -287,7 +287,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
                 "`safety.tilt_abort_deg`",
                 _WARN,
                 limits=_above_abort,
-                limits_text="`safety.tilt_abort_deg` plus 10 to 180",
+                limits_text="at least `safety.tilt_abort_deg` + 10, at most 180",
             )
             for axis in "RP"
         ),

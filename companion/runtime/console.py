@@ -243,7 +243,7 @@ def print_result(console: Console, summary: dict[str, Any], out: Path, report: P
     every = summary.get("graded_every", 1)
     if every > 1:
         facts.add_row("graded", f"one tick in {every} of a long flight; loop and latencies: every tick")
-    facts.add_row("report", str(report) if report else f"none; any other files are in {out}")
+    facts.add_row("report", str(report) if report else f"none; the flight's other files, if any, are in {out}")
     console.print()
     console.print(facts, highlight=False, soft_wrap=True)
     if outcome != "refused":

@@ -27,11 +27,14 @@ def found_armed(i: Inputs, clearance_m: float) -> tuple[bool, str]:
     stands = low and on_ground(i.status) and i.status is not None and i.status.mode in OWN_MODES
     if height_m is None and vehicle is not None:
         height_m = vehicle.position_world_m[2]
-    where = "at an unknown height" if height_m is None else f"at a height of {height_m:.2f} m"
+    height = "unknown height" if height_m is None else f"height {height_m:.2f} m"
     mode = i.status.mode.value.upper() if i.status is not None else "?"
-    found = f"PX4 is armed, but the companion did not arm it: {where}, in {mode}"
+    found = f"({height}, mode {mode}), but not by the companion"
     if flown_by_pilot(i.status):
-        return True, f"{found}, which a pilot has chosen: only motion capture is sent to PX4"
+        return True, f"PX4 is armed {found}; a pilot has chosen the mode, so only motion capture is sent to PX4"
     if stands:
-        return False, f"{found}, on the ground: the companion disarms it; find out who armed it, then restart"
-    return True, f"{found}: PX4 lands; the mission is not flown"
+        return (
+            False,
+            f"PX4 is armed on the ground {found}; the companion disarms it; find out who armed it, then restart",
+        )
+    return True, f"PX4 is armed {found}; PX4 lands; the mission is not flown"

@@ -219,7 +219,7 @@ RULES: tuple[Rule, ...] = (
         message="a servo's bus watchdog had switched its torque off; it is on again",
     ),
     Rule(
-        id="joint_jump", subject=Subject.ARM, what="a joint angle changed between two reads by more than a joint can turn",
+        id="joint_jump", subject=Subject.ARM, what="a joint angle changed more between two reads than the joint can turn in that time",
         predicate=arm.joint_jump, thresholds=("joint_jump_deg", "joint_rate_max_deg_s"), ground=_LAND, air=_LAND,
         message="joint {} jumped by {:.0f} deg between two reads",
     ),
@@ -368,9 +368,9 @@ RULES: tuple[Rule, ...] = (
         message="the tether pulls with {:.0f} N although {:.2f} m are left: the tether is snagged",
     ),
     Rule(
-        id="tether_near", subject=Subject.TETHER, what="the tether is close to rotors or arm",
+        id="tether_near", subject=Subject.TETHER, what="the tether is close to the rotors or the arm",
         predicate=flight.tether_near, thresholds=("tether.clearance_min_m",), hold_time=0.2, ground=None, air=_WARN,
-        message="the tether is {:.2f} m from rotors or arm (limit {:.2f} m)",
+        message="the tether is {:.2f} m from the rotors or the arm (limit {:.2f} m)",
     ),
     Rule(
         id="tether_wound", subject=Subject.TETHER, what="the tether is wound about its anchor", predicate=flight.tether_wound,

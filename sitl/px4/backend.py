@@ -152,8 +152,8 @@ class RealPx4:
         """
         if self._process is None:
             self._progress(
-                f"px4 was not found; waiting up to {BY_HAND_DEADLINE_S:g} s on TCP {self._link.port} for a PX4 that was started by "
-                f"hand: {self._by_hand()}"
+                f"px4 was not found; waiting up to {BY_HAND_DEADLINE_S:g} s on TCP {self._link.port} for a PX4 that is started by "
+                f"hand with {self._by_hand()}"
             )
         await self._boot(BOOT_DEADLINE_S if self._process is not None else BY_HAND_DEADLINE_S)
         self._version = await self._control.version()
@@ -193,7 +193,7 @@ class RealPx4:
         await self._control.await_heartbeat()
 
     def _how(self) -> str:
-        return f"{HOW_TO_GET_IT}; or start PX4 by hand, then this command again: {self._by_hand()}"
+        return f"{HOW_TO_GET_IT}; or start PX4 by hand with {self._by_hand()} and run this command again"
 
     def _by_hand(self) -> str:
         return HOW_TO_START_IT.format(model=MODEL, number=self.number)

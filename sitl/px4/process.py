@@ -35,8 +35,8 @@ HOW_TO_GET_IT = (
     "set PX4_SITL to the build folder of PX4 (make px4_sitl_default none in PX4-Autopilot), or install the px4 package"
 )
 HOW_TO_START_IT = (
-    "PX4_SIM_MODEL={model} px4 -i {number}, always in the same folder, in which PX4 stores its parameters, or "
-    "PX4_SIM_MODEL={model} make px4_sitl_default none"
+    "`PX4_SIM_MODEL={model} px4 -i {number}` (always in the same folder, because PX4 stores its parameters there) or "
+    "`PX4_SIM_MODEL={model} make px4_sitl_default none`"
 )
 """The two commands that start a PX4 by hand."""
 _SIMULATOR, _ONBOARD, _ONBOARD_OWN, _GROUND_OWN = 4560, 14540, 14580, 18570

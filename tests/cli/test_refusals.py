@@ -198,7 +198,7 @@ def test_refuses_a_start_other_than_the_missions(sandbox: Sandbox, fresh_world: 
     assert len(ended.err_lines) == 2, ended.err
     for pattern in (
         r"^arm at the start: \(165, 140\) deg, wanted \(150, 140\) ± 10 deg; move the arm there by hand",
-        r"^start position in motion capture's axes: \(-1\.0\d, -?0\.0\d\) m, 0\.50 m away, wanted \(-0\.5, 0\) m, .*; carry the",
+        r"^start position in the motion-capture axes: \(-1\.0\d, -?0\.0\d\) m, 0\.50 m away, wanted \(-0\.5, 0\) m, .*; carry the",
     ):
         assert [line for line in ended.err_lines if re.search(pattern, line)], (pattern, ended.err)
 

@@ -182,7 +182,7 @@ def test_bad_mission_file(project: Path, old: str, new: str, expected: list[str]
 
 BAD_VEHICLE = [
     ("servo_id: 2", "servo_id: 1", ["arm.joints[1].servo_id: both servos have the id 1; give each servo its own id"]),
-    ("watchdog_ms: 100", "watchdog_ms: 90", ["watchdog_ms: must be a multiple of 20 (the unit of the register), got 90"]),
+    ("watchdog_ms: 100", "watchdog_ms: 90", ["watchdog_ms: must be a multiple of 20 ms (the register's unit), got 90 ms"]),
     ("sign: -1", "sign: 0", ["sign: expected one of -1, 1, got 0"]),
     ("baud: 3000000", "baud: 9600", ["baud: expected one of 57600, 115200, 1000000, 2000000, 3000000, 4000000, got 9600"]),
     ("rate_hz: 200.0", "rate_hz: 200.0\n    natnet_version: 3.0", ['expected one of "3.0", "3.1", "4.0", "4.1", "4.2", "4.3", "4.4", got 3.0 (put it in quotes)']),
@@ -217,7 +217,7 @@ BAD_OVERRIDES = [
     ("x.y=1", "--set x.y: unknown section 'x'; available: mission, vehicle, controller, world"),
     ("world.payload_kg", "--set world.payload_kg: no '='; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("world.payload_kg=", "--set world.payload_kg: no value; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
-    ("world=1", "--set world: the key names a whole document; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
+    ("world=1", "--set world: the key names a whole section; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("world..a=1", "--set world..a: cannot read the key from column 6; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("[0]=1", "--set [0]: unknown section '0'; available: mission, vehicle, controller, world"),
     ("world.payload_kg=3", "--set world.payload_kg: expected a number from 0 to 2, got 3"),

@@ -317,7 +317,7 @@ def test_a_px4_started_by_hand_that_comes_late_flies(tmp_path: Path, autopilot: 
         number = free.number  # the world will find the same
     with sandbox_in(tmp_path / "sandbox", by_hand) as sandbox:
         with sandbox.start("fly", HOVER, f"--sitl={autopilot}", "--out", "out") as running:
-            running.wait_for(f"by hand, on TCP 456{number}")
+            running.wait_for(f"on TCP 456{number} for a PX4")
             with px4_by_hand(number, tmp_path / "rootfs") as px4:
                 running.wait_for("start it again in the same folder")
                 px4.terminate()

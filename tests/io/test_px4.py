@@ -455,7 +455,7 @@ def test_parameters_and_firmware_are_read_from_the_wire() -> None:
                 assert (await autopilot.firmware()).startswith("PX4 1.16.1 release (git 01234567")
                 with pytest.raises(DeviceError, match=r"expected PX4's parameter NO_SUCH_ONE, found no such parameter"):
                     await autopilot.read_param("NO_SUCH_ONE")
-                with pytest.raises(DeviceError, match="up to 16 characters A-Z"):
+                with pytest.raises(DeviceError, match="1 to 16 of the characters A-Z"):
                     await autopilot.read_params(["MPC_THR_HOVER", "lower case"])
 
     asyncio.run(fly())

@@ -100,7 +100,7 @@ def at(x: float, y: float, z: float, vx: float = 0.05, vy: float = 0.0, vz: floa
     return change
 
 
-FOUND = "PX4 is armed, but the companion did not arm it"
+FOUND = "PX4 is armed (height 1.00 m, mode OFFBOARD), but not by the companion"
 
 
 @dataclass(frozen=True)

@@ -105,8 +105,8 @@ def _turn(joint: Joint, from_deg: float, index: int) -> tuple[float, bool]:
     by_deg = min(SWING_DEG, high - from_deg) if high - from_deg >= from_deg - low else -min(SWING_DEG, from_deg - low)
     if abs(by_deg) < SWING_MIN_DEG:
         raise ConfigError(
-            [f"arm.joints[{index}].angle_deg: from {from_deg:g} deg the limits allow a turn of {abs(by_deg):.0f} deg; at least "
-             f"{SWING_MIN_DEG:g} deg are needed to find which way the servo counts"]
+            [f"arm.joints[{index}].angle_deg: from {from_deg:g} deg, the limits allow a turn of only {abs(by_deg):.0f} deg; at "
+             f"least {SWING_MIN_DEG:g} deg is needed to determine which way the servo counts"]
         )  # fmt: skip
     return by_deg, False
 

@@ -194,7 +194,9 @@ def rows(m: Measured, max_ms: float) -> list[Row]:
     has = "no such parameter" if m.px4_ms is None else f"{m.px4_ms:g} ms"
     right = m.px4_ms is not None and abs(m.px4_ms - m.total_ms) <= TOLERANCE_MS
     set_it = f"set {PARAMETER} to {round(m.total_ms, _DIGITS):g} (companion latency --write, or QGroundControl), then restart PX4"
-    relieve = "reduce Motive's load (no video, fewer bodies) and use a cable on a separate network; then measure again"
+    relieve = (
+        "reduce Motive's load (no video, fewer bodies) and connect by cable on a separate network; then measure again"
+    )
     return [
         TAPS.good(f"{len(m.delay.used)} of {len(m.taps)}, {1e3 * m.delay.spread_s:.1f} ms from tap to tap"),
         DELAY.row(

@@ -215,7 +215,7 @@ class HealthEvaluator:
         if abs(state.turns) > tether.turns_max:
             return HealthLevel.BAD, f"wound: {state.turns:+.1f} turns, {left}"
         if state.clearance_m < tether.clearance_min_m:
-            return HealthLevel.WARN, f"{state.clearance_m * 100:.0f} cm from rotors or arm, {left}"
+            return HealthLevel.WARN, f"{state.clearance_m * 100:.0f} cm from the rotors or the arm, {left}"
         return HealthLevel.WARN if state.stop_slack_m < tether.margin_m else HealthLevel.OK, left
 
 

@@ -210,7 +210,7 @@ class RobotousForceTorque:
         try:
             os.write(self._serial.fileno(), rft.encode_command(command, parameter))
         except BlockingIOError:
-            _LOG.warning("%s: command %s was not accepted by the port", self._where, command.name)
+            _LOG.warning("%s: command %s was not sent: the port's output buffer is full", self._where, command.name)
         except OSError as error:
             self._lose(str(error))
 

@@ -127,7 +127,7 @@ class ParamTransfer:
         wanted = tuple(dict.fromkeys(names))
         for name in wanted:
             if _NAME.fullmatch(name) is None:
-                expected = "a parameter name of up to 16 characters A-Z, 0-9 and _"
+                expected = "a parameter name with 1 to 16 of the characters A-Z, 0-9 and _"
                 raise device_error(self._address, expected, repr(name), "correct the name")
         queries, got = ParamQueries(wanted), dict[str, Value | None]()
         loop, changed = asyncio.get_running_loop(), asyncio.Event()
@@ -199,7 +199,7 @@ class ParamTransfer:
         try:
             return single(float(value))
         except OverflowError:
-            expected = f"a number of single precision for {name}, a REAL32"
+            expected = f"a number that fits into single precision for {name}, a REAL32"
             raise device_error(self._address, expected, f"{value}", "correct the value") from None
 
     def _ask(self, name: str) -> None:
