@@ -64,7 +64,7 @@ def _planned_s(count: int) -> float:
 
 
 def fly(minutes: float, overrides: Sequence[str], folder: Path, console: Console) -> int:
-    """Fly, write samples and logs to the folder, and return the flight's exit code."""
+    """Fly the soak flight, write its samples and logs to the folder, and return its exit code."""
     count, planned_s = repetitions(minutes)
     folder.mkdir(parents=True)
     settings = [

@@ -63,7 +63,7 @@ class _Sampled:
 
 
 def measure(folder: Path, hover_s: float, say: Callable[[str], None]) -> Figures:
-    """Fly, watch, and read the log.
+    """Fly a hover while a viewer watches, read the log, and return the figures.
 
     Args:
         folder: folder for logs; must exist and be empty.

@@ -14,7 +14,7 @@ from benchmarks.soaking.lateness import Minute
 
 MEMORY_GROWTH_MAX = 1.05
 LATENESS_GROWTH_MAX = 1.2
-"""Largest growth beyond that of the empty loop, because other processes share the computer."""
+"""Largest growth relative to the growth of the empty loop, because other processes share the computer."""
 EARLY, LATE = (5.0 / 60.0, 15.0 / 60.0), (50.0 / 60.0, 1.0)
 """Shares of the flight: minutes 5 to 15 and the last 10 of an hour."""
 ROLES = ("flight", "recorder", "guardian", "world", "launcher")
@@ -107,7 +107,9 @@ def thirds(minutes: Sequence[Minute], value: str) -> tuple[float, float] | None:
 
 
 def lateness_problems(flight: Sequence[Minute], empty: Sequence[Minute]) -> list[str]:
-    """Return growth of the flight's lateness that the computer does not explain."""
+    """Return one line for each percentile of the flight's lateness that grew more than the empty loop's lateness permits, or the reason
+    why the growth cannot be judged.
+    """
     found = []
     for value in ("p50", "p99"):
         of_flight, of_empty = thirds(flight, value), thirds(empty, value)

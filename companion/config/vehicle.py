@@ -97,7 +97,7 @@ class Tool(Model):
     """Force-torque sensor and net at the end of link 2."""
 
     sensor_mass_kg: NonNegative
-    """Mass of sensor and mount on the arm's side, which the sensor does not measure."""
+    """Mass of the sensor and the mount on the arm's side, which the sensor does not measure."""
     net_mass_kg: NonNegative
     """Mass of all parts on the tool side of the sensor; their weight is subtracted from the readings."""
     net_radius_m: Positive

@@ -14,7 +14,7 @@ from companion.model.types import PhaseKind, Vec2, Vec3
 LEAST_WAY_M = 0.5
 """Minimum distance inward, because a tether under tension is shorter than configured or is caught."""
 BESIDE_ANCHOR_M = 0.3
-"""Distance between rotors and the anchor's vertical, so that the vehicle does not land on the anchor."""
+"""Distance between the rotors and the vertical through the anchor, so that the vehicle does not land on the anchor."""
 RETURN_MIN_S = 1.0
 
 

@@ -94,7 +94,7 @@ def find(group: str, name: str) -> Plugin:
 
 def _own(group: str) -> Iterator[Plugin]:
     """Yield the companion's own parts. In a source tree they are read from pyproject.toml, because an editable installation keeps the
-    entry points of the day on which it was made.
+    entry points that existed when it was made.
     """
     path = _SOURCE_TREE / "pyproject.toml"
     source = tomllib.loads(path.read_text(encoding="utf-8")) if path.exists() else {}

@@ -23,7 +23,7 @@ from companion.model.types import Reference, TetherState, Vec3
 from companion.safety.stop import StopModel
 
 BODY_TOP_M = 0.15
-"""Height of rotors and markers above the body's origin."""
+"""Height of the rotors and the markers above the body's origin."""
 BELOW_STANDING_M = 0.75
 """The set reaches this far below standing height: a landing's reference continues below the floor until touchdown is detected, and its
 predicted stop lies lower still."""

@@ -96,7 +96,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         id="mocap_jump", subject=Subject.MOCAP,
-        what="a pose further from the previous one than PX4's velocity and rates explain; it is ignored",
+        what="a pose is further from the previous one than PX4's velocity and angular rates allow; it is ignored",
         predicate=mocap.mocap_jump, thresholds=("mocap_timeout_s",), tracked_by=("mocap_jump_m", "mocap_jump_deg"),
         ground=_WARN, air=_WARN, message="motion capture jumped by {:.2f} m and {:.0f} deg; the pose is ignored",
     ),

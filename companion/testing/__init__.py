@@ -1,7 +1,7 @@
-"""The contract of control laws, as checks for the tests of a law's author.
+"""Checks of the contract of control laws, which the author of a law calls from their own tests.
 
-`check_law("NAME")` runs all checks; `sitl.testing.check_catch` flies the law. A law has no reset, so each flight and each check builds
-a new instance.
+`check_law("NAME")` runs all checks; `sitl.testing.check_catch` flies the law. A law has no reset method, so each flight and each
+check builds a new instance.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ def _check_hover(config: FlightConfig, label: str, arm_rad: Vec2) -> None:
     weight_n = config.vehicle.airframe.mass_kg * GRAVITY_M_S2
 
     def hovering(offset_m: Vec3, airborne: bool, duration_s: float) -> tuple[float, float]:
-        """Return the thrust (fraction of the weight) and the tilt (rad) after `duration_s` away from the reference and then 2 s at
-        it.
+        """Hold the vehicle `offset_m` from the reference for `duration_s`, then at the reference for 2 s; return the thrust (fraction
+        of the weight) and the tilt (rad).
         """
         law = build_law(config.controller, config.vehicle)
         wrench = _held(law, config.vehicle, arm_rad, offset_m, airborne, duration_s, None)
@@ -140,7 +140,7 @@ def _commands(config: FlightConfig, ticks: list[Tick]) -> list[Wrench]:
 
 
 def _random_ticks(vehicle: Vehicle) -> Iterator[Tick]:
-    """Yield random inputs, the same on every call: states within the limits of a flight, and short and long ticks."""
+    """Yield random inputs, which are the same on every call: states within the limits of a flight, and short and long ticks."""
     draw = random.Random(1)
 
     def three(most: float) -> Vec3:

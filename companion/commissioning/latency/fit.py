@@ -156,7 +156,7 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
     error_s = math.sqrt(2.0 * scatter / curvature) if curvature > 0.0 else math.inf
     problem = ""
     if correlation < CORRELATION_MIN:
-        problem = f"too weak: the IMU explains too little of the motion that motion capture measured (correlation {correlation:.2f})"
+        problem = f"too weak: the IMU data match too little of the motion that motion capture measured (correlation {correlation:.2f})"
     elif error_s > TAP_ERROR_MAX_S:
         problem = f"too weak: its time is known only to within {1e3 * error_s:.1f} ms"
     return TapDelay(tap=tap, delay_s=delay_s, error_s=error_s, correlation=correlation, problem=problem)

@@ -257,7 +257,7 @@ class Stream(Record, frozen=True, kw_only=True):
     reference_arm_rad: Vec2 | None = None
     e_p_m: float | None = None
     e_q_deg: float | None = None
-    """Angle between attitude and setpoint."""
+    """Angle between the attitude and its setpoint."""
     thrust: float | None = None
     """Normalised thrust as sent."""
     battery_v: float | None = None
