@@ -264,7 +264,7 @@ def test_without_a_px4_the_flight_is_refused_within_seconds_with_how_to_get_one(
         sandbox.assert_nobody_left()
     assert "waiting up to 10 s on TCP 456" in ended.out
     waiting = ended.out.partition("started by hand")[2]
-    assert "same folder, in which PX4 stores its parameters" in waiting
+    assert "same folder, because PX4 stores its parameters there" in waiting
     assert "make px4_sitl_default none" in waiting
     assert ended.code == EXIT_REFUSED, (ended.out, ended.err)
     assert len(ended.err_lines) == 1, ended.err
