@@ -34,7 +34,13 @@ from companion.config.yaml_strict import read_document
 M = TypeVar("M", bound=Model)
 
 
-MOVED_TO_SAFETY = frozenset({"react_time_s", "stop_deceleration_m_s2"})
+MOVED = {
+    ("tether", "react_time_s"): ("safety", "react_time_s"),
+    ("tether", "stop_deceleration_m_s2"): ("safety", "stop_deceleration_m_s2"),
+    ("safety", "joint_wall_warn_deg"): ("safety", "joint_limit_warn_deg"),
+    ("safety", "joint_wall_max_deg"): ("safety", "joint_limit_max_deg"),
+}
+"""Keys of vehicle files and logs of version 0.1.0, and their present place."""
 """Keys of `safety` that were keys of `tether` in version 0.1 and are still accepted there."""
 
 
@@ -170,12 +176,12 @@ def check_document(
 
 
 def _move_keys(document: Document) -> None:
-    """Move the keys that older vehicle files and logs have in `tether` to `safety`, unless `safety` has them too."""
-    tether, safety = document.data.get("tether"), document.data.setdefault("safety", {})
-    if isinstance(tether, dict) and isinstance(safety, dict):
-        for key in (MOVED_TO_SAFETY & tether.keys()) - safety.keys():
-            document.replace(("safety", key), tether[key], document.origin(("tether", key)))
-            del tether[key]
+    """Move the keys of older vehicle files and logs to their present place, unless that has a value too."""
+    for (old_part, old_key), (part, key) in MOVED.items():
+        old, new = document.data.get(old_part), document.data.setdefault(part, {})
+        if isinstance(old, dict) and isinstance(new, dict) and old_key in old and key not in new:
+            document.replace((part, key), old[old_key], document.origin((old_part, old_key)))
+            del old[old_key]
 
 
 def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:

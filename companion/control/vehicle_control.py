@@ -154,6 +154,10 @@ class VehicleControl:
         ex, ey, ez, *_ = wrench.log.error
         self.tracking_error_m = math.hypot(ex, ey, ez)
         thrust = wrench.collective_n * hover / self._weight_n
+        if not math.isfinite(
+            thrust + self.tracking_error_m
+        ):  # NaN passes `thrust < 1.0` below and every limit on the error
+            raise ValueError("the control law's thrust or tracking error is not finite")
         self._thrust_sent = thrust if thrust < 1.0 else 1.0
         torque = wrench.arm_torque_nm if arm is not None else None
         return Command(

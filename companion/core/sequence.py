@@ -64,7 +64,7 @@ def _wait_for_readiness(t: Transition, elapsed_s: float) -> None:
     tare_start_s = t.state.waiting.tare_start_s
     assert tare_start_s is not None
     if i.t_s - tare_start_s < seq.TARE_S:
-        t.change_waiting(unready="the force sensor's tare is not complete")
+        t.change_waiting(unready="the vehicle has not stood still for long enough; meanwhile a force sensor is tared")
         return
     wanders = t.state.waiting.settled.problem(i.t_s)
     if wanders is not None:

@@ -433,6 +433,11 @@ def test_a_part_that_may_be_absent_is_not_left_out_by_mistake(project: Path, key
     assert line.endswith(", or null if there is none")
 
 
+def test_the_configuration_in_a_log_of_version_0_1_opens() -> None:
+    config = logged_flight((Path(__file__).parent / "data" / "logged_0.1.0.json").read_text(encoding="utf-8"))
+    assert (config.vehicle.safety.joint_limit_max_deg, config.vehicle.safety.react_time_s) == (10.0, 0.18)
+
+
 def test_a_flights_configuration_holds_nothing_of_the_simulated_world(project: Path) -> None:
     config = load_sitl(CATCH, overrides=["world.payload_kg=0.37", "vehicle.name=other"])
     text = config.flight.model_dump_json()

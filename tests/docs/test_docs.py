@@ -231,8 +231,8 @@ def test_preset_table_matches() -> None:
         preset: load_flight(ROOT / "configs/missions/catch.yaml", preset=preset).controller
         for preset in PRESETS["adaptive"]
     }
-    for key, *cells in table(LAW, "key", "paper", "recommended"):
-        for preset, cell in zip(("paper", "recommended"), cells, strict=True):
+    for key, *cells in table(LAW, "key", "paper", "recommended", "model_free"):
+        for preset, cell in zip(("paper", "recommended", "model_free"), cells, strict=True):
             law = laws[preset]
             assert isinstance(law, AdaptiveConfig)
             assert cell == preset_text(law, key), f"{key}, {preset}"

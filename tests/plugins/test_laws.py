@@ -194,11 +194,26 @@ def test_one_that_fails_its_trial_is_refused_before_anything_is_started(
     assert [path for path in sorted(tmp_path.iterdir()) if path.name != "__pycache__"] == before
 
 
-def test_one_that_raises_in_the_air_ends_the_flight_as_every_exception_of_the_core_does(tmp_path: Path) -> None:
+NOT_FINITE = "ValueError: the control law's thrust or tracking error is not finite"
+BROKEN = "(float('nan'), *wrench.log.error[1:])"
+
+
+@pytest.mark.parametrize(
+    ("broken", "lost"),
+    [
+        ("raise RuntimeError('stuck')", "RuntimeError: stuck"),
+        ("return replace(wrench, collective_n=float('nan'))", NOT_FINITE),
+        ("return replace(wrench, collective_n=float('inf'))", NOT_FINITE),
+        (f"return replace(wrench, log=replace(wrench.log, error={BROKEN}))", NOT_FINITE),
+    ],
+)
+def test_one_that_fails_in_the_air_ends_the_flight_as_every_exception_of_the_core_does(
+    tmp_path: Path, broken: str, lost: str
+) -> None:
     """A campaign reports the flight as lost. Over the wires the guardian lands: tests/flights/test_guardian.py."""
-    code = "if 0.5 < state.position_world_m[2] < 0.9:\n            raise RuntimeError('stuck')\n        return wrench\n"
+    code = f"if 0.5 < state.position_world_m[2] < 0.9:\n            from dataclasses import replace; {broken}\n        return wrench\n"
     write_law(tmp_path, LAW + STEP + code)
     with on_path(tmp_path):
         flown = fly_to_end(load_sitl("hover", controller_law="lift"))
         row, _ = row_of(flown.config, flown.result, None, flown.error)
-    assert (row["outcome"], row["error"]) == ("lost", "RuntimeError: stuck")
+    assert (row["outcome"], row["error"]) == ("lost", lost)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from companion.config.document import ConfigError
-from companion.config.loader import MOVED_TO_SAFETY, load_flight, logged_flight
+from companion.config.loader import MOVED, load_flight, logged_flight
 from tests.support import CATCH
 
 ROOT = Path(__file__).parents[2]
@@ -48,20 +48,20 @@ def test_a_tether_that_is_not_known_is_not_loaded(mission: Path, old: str, new: 
     assert re.fullmatch(rf".*tarot650_2r\.yaml:\d+:\d+: {line}", found), found
 
 
-def test_a_file_without_a_tether_is_a_vehicle_without_one(mission: Path) -> None:
+def test_a_file_states_that_a_vehicle_has_no_tether(mission: Path) -> None:
     path = mission.parents[1] / "vehicles" / "tarot650_2r.yaml"
     before, _, rest = path.read_text(encoding="utf-8").partition("tether:\n")
-    path.write_text(before + rest.partition("\n\n")[2], encoding="utf-8")
+    path.write_text(before + "tether: null\n" + rest.partition("\n\n")[2], encoding="utf-8")
     assert load_flight(mission).vehicle.tether is None
 
 
-def test_times_of_the_stop_are_still_read_below_tether() -> None:
+def test_keys_of_version_0_1_are_still_read() -> None:
     below = "vehicle.tether.react_time_s=0.4", "vehicle.tether.stop_deceleration_m_s2=1.5"
     config = load_flight(CATCH, overrides=below)
     assert (config.vehicle.safety.react_time_s, config.vehicle.safety.stop_deceleration_m_s2) == (0.4, 1.5)
     logged = json.loads(config.model_dump_json())
-    for key in MOVED_TO_SAFETY:
-        logged["vehicle"]["tether"][key] = logged["vehicle"]["safety"].pop(key)
+    for (old_part, old_key), (part, key) in MOVED.items():
+        logged["vehicle"][old_part][old_key] = logged["vehicle"][part].pop(key)
     assert logged_flight(json.dumps(logged)) == config
     with pytest.raises(ConfigError) as twice:
         load_flight(CATCH, overrides=["vehicle.safety.react_time_s=0.3", below[0]])

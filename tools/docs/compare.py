@@ -69,7 +69,7 @@ def merged(files: Sequence[Results]) -> list[Row]:
 
 def laws_markdown(groups: Sequence[Group]) -> str:
     """Return one line per payload and preset, with the figures from the paper where available."""
-    head = ["payload", "law/preset", "completed", *(title for title, _, _ in _FIGURES), "e_q, deg"]
+    head = ["payload", "law/preset", "with the payload", *(title for title, _, _ in _FIGURES), "e_q, deg"]
     rows = [
         [f"{group.payload_kg:g} kg", group.label, _completed(group), *_spreads(group, _FIGURES), _attitude(group)]
         for group in groups
@@ -111,7 +111,7 @@ def adaptation_markdown(groups: Sequence[Group]) -> str:
 
 def ablation_markdown(groups: Iterable[Group]) -> str:
     """Return one line per ablation with `ABLATION_KG`."""
-    head = ("taken away", "completed", *(title for title, _, _ in _ABLATION_FIGURES))
+    head = ("taken away", "with the payload", *(title for title, _, _ in _ABLATION_FIGURES))
     rows = [
         (group.preset.partition(LESS)[2], _completed(group), *_spreads(group, _ABLATION_FIGURES)) for group in groups
     ]
