@@ -211,8 +211,8 @@ def test_one_that_fails_in_the_air_ends_the_flight_as_every_exception_of_the_cor
     tmp_path: Path, broken: str, lost: str
 ) -> None:
     """A campaign reports the flight as lost. Over the wires the guardian lands: tests/flights/test_guardian.py."""
-    code = f"if 0.5 < state.position_world_m[2] < 0.9:\n            from dataclasses import replace; {broken}\n        return wrench\n"
-    write_law(tmp_path, LAW + STEP + code)
+    code = f"if 0.5 < state.position_world_m[2] < 0.9:\n            {broken}\n        return wrench\n"
+    write_law(tmp_path, REPLACE + LAW + STEP + code)
     with on_path(tmp_path):
         flown = fly_to_end(load_sitl("hover", controller_law="lift"))
         row, _ = row_of(flown.config, flown.result, None, flown.error)
