@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TypeVar
 
 from msgspec.structs import replace
 
 from companion import plugins
-from companion.io.mocap.system import MocapSettings, PoseClient
+from companion.io.mocap.system import MocapSettings, PoseClient, valid_poses
 from companion.model.types import MocapPose
 
 T = TypeVar("T")
@@ -32,30 +32,31 @@ class PluginClient:
         self.tracked_s = float("-inf")
         """`time.monotonic` of the newest frame in which the body was tracked."""
         self._failure: str | None = None
-
-    @property
-    def sockets(self) -> Sequence[socket.socket]:
-        """Return the sockets to wait on."""
-        return self._client.sockets
+        self._rejected: str | None = None
+        self.sockets: tuple[socket.socket, ...] = ()
+        """No sockets to wait on: the plug-in may close its own at any time, and one that raises may leave its datagrams unread."""
 
     @property
     def problem(self) -> str | None:
-        """Return the plug-in's first exception, or why its newest rejected datagram was invalid; None if there is neither."""
-        return self._failure or self._client.problem
+        """Return the plug-in's first exception, or why its newest rejected pose or datagram was invalid; None if there is none."""
+        found = self._contained(lambda: str(self._client.problem or ""), "")
+        return self._failure or self._rejected or found or None
 
     def keep_connected(self, now_s: float) -> None:
         """Send what the server needs to go on streaming; call every 10 to 50 ms."""
         self._contained(lambda: self._client.keep_connected(now_s), None)
 
     def poses(self, now_s: float, origin_s: float = 0.0) -> list[MocapPose]:
-        """Return the body's poses that have arrived, in order, stamped with their arrival less `origin_s`."""
+        """Return the body's valid poses that have arrived, in order, stamped with their arrival less `origin_s`."""
         return self._contained(lambda: self._poses(now_s, origin_s), [])
 
     def _poses(self, now_s: float, origin_s: float) -> list[MocapPose]:
-        poses = [replace(pose, stamp_s=pose.stamp_s - origin_s) for pose in self._client.poses(now_s)]
+        poses, rejected = valid_poses(self._client.poses(now_s), now_s)
+        if rejected:
+            self._rejected = rejected[-1]
         if any(pose.tracking_valid for pose in poses):
             self.tracked_s = now_s
-        return poses
+        return [replace(pose, stamp_s=pose.stamp_s - origin_s) for pose in poses]
 
     def poll_newest(self, now_s: float) -> None:
         """Read what has arrived; used in standby."""

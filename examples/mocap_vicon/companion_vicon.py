@@ -45,7 +45,6 @@ class ViconTracker:
         self._broadcasts = open_udp(
             "", options.port, shared=True
         )  # the flight and the guardian both receive a broadcast
-        self.sockets = [self._broadcasts]
         self.problem: str | None = None
 
     def keep_connected(self, now_s: float) -> None:
@@ -59,8 +58,8 @@ class ViconTracker:
                 continue
             try:
                 pose = self._pose(datagram.data, arrived_s(datagram.ancillary, lambda: now_s))
-            except struct.error as error:
-                self.problem = f"datagram of {len(datagram.data)} bytes ends early ({error})"
+            except (struct.error, ValueError) as error:
+                self.problem = f"datagram of {len(datagram.data)} bytes: {error}"
                 continue
             if pose is not None:
                 found.append(pose)
@@ -79,6 +78,8 @@ class ViconTracker:
             name, *values = _OBJECT.unpack_from(data, offset)
             offset += size
             if kind == 0 and name.partition(b"\0")[0] == self._name:
+                if not all(map(math.isfinite, values)):
+                    raise ValueError(f"position and angles {values} are not finite")
                 x_mm, y_mm, z_mm, *angles_rad = values
                 half = [0.5 * angle for angle in angles_rad]
                 about_x = (math.cos(half[0]), math.sin(half[0]), 0.0, 0.0)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import math
+import re
 import socket
 import struct
 import tomllib
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
+from itertools import count
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from pydantic import JsonValue
@@ -17,7 +20,9 @@ from pydantic import JsonValue
 from companion.cli.main import main
 from companion.config.document import ConfigError
 from companion.config.loader import load_flight, load_vehicle, logged_flight
+from companion.config.mocap import system_class
 from companion.config.vehicle import MocapDevice
+from companion.guardian import process
 from companion.guardian.mocap import MocapProblem, open_client
 from companion.io.mocap.plugin_driver import PluginMocap, open_mocap
 from companion.io.mocap.system import MocapSettings
@@ -26,18 +31,21 @@ from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.model.frames import quat_rotate
 from companion.model.types import MocapPose
 from companion.plugins import MOCAP_SYSTEMS
+from companion.runtime import event_loop
 from companion.runtime.clock import flight_clock
 from tests.plugins.installed import on_path, write_distribution
-from tests.support import ROOT
+from tests.support import DEADLINE_S, ROOT
 
 EXAMPLE = ROOT / "examples/mocap_vicon"
 VEHICLE = (ROOT / "configs/vehicles/tarot650_2r.yaml").read_text(encoding="utf-8")
 FAILING = '''
+import socket
 from companion.config.base import Model
+from companion.model.types import MocapPose
 class Options(Model):
     """Fails."""
 class Failing:
-    options, server_name, sockets, problem = Options, "Failing 1.0", [], None
+    options, server_name, problem = Options, "Failing 1.0", None
     def __init__(self, settings): pass
     def keep_connected(self, now_s): raise OSError("network\\nis down")
     def poses(self, now_s): raise RuntimeError("no pose")
@@ -49,6 +57,57 @@ class NoOptions(Failing):
 class Nonsense(Failing):
     def keep_connected(self, now_s): pass
     def poses(self, now_s): return ["a pose"]
+class Nameless(Failing):
+    closed = 0
+    @property
+    def server_name(self): raise ValueError("no name")
+    def close(self): Nameless.closed += 1
+class NoProblem(Failing):
+    def keep_connected(self, now_s): pass
+    def poses(self, now_s): return []
+    @property
+    def problem(self): raise ValueError("not connected")
+class Scripted(Failing):
+    number = 0
+    def __init__(self, settings):
+        self.given = {"stamped_after_now_s": 0.0, "x_m": 0.0, "w": 1.0, "tracking_valid": True}
+        for key, value in settings.options.items():
+            self.given[key] = float(value) if isinstance(value, str) else value  # settings have no NaN
+    def keep_connected(self, now_s): pass
+    def close(self): pass
+    def poses(self, now_s):
+        self.number += 1
+        return [MocapPose(
+            stamp_s=now_s + self.given["stamped_after_now_s"], frame_number=self.number,
+            position_world_m=(self.given["x_m"], 0.0, 1.0), attitude_wxyz=(self.given["w"], 0.0, 0.0, 0.0),
+            tracking_valid=self.given["tracking_valid"], marker_error_m=0.0)]
+class Reconnecting(Scripted):
+    """Replaces its socket whenever it is called, and raises now and then."""
+    def __init__(self, settings):
+        super().__init__(settings)
+        self.sockets = ()
+        self.connect()
+    def connect(self):
+        before, pair = self.sockets, socket.socketpair()
+        pair[1].send(b"unread")
+        self.sockets = pair[:1]
+        self.peer = pair[1]
+        for old in before:
+            old.close()
+    def keep_connected(self, now_s): self.reconnect()
+    def poses(self, now_s):
+        self.reconnect()
+        if self.number % 3 == 1:
+            self.number += 1
+            raise OSError("connection reset")
+        return super().poses(now_s)
+    def reconnect(self):
+        peer = self.peer
+        self.connect()
+        peer.close()
+    def close(self):
+        self.sockets[0].close()
+        self.peer.close()
 '''
 
 
@@ -59,7 +118,8 @@ def installed(tmp_path: Path) -> Iterator[None]:
     (tmp_path / "lab_mocap.py").write_text(FAILING)
     announced = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]["entry-points"][MOCAP_SYSTEMS]
     write_distribution(tmp_path, "companion-vicon", "0.1.0", announced, MOCAP_SYSTEMS)
-    failing = {name.lower(): f"lab_mocap:{name}" for name in ("Failing", "Absent", "NoOptions", "Nonsense")}
+    names = ("Failing", "Absent", "NoOptions", "Nonsense", "Nameless", "NoProblem", "Scripted", "Reconnecting")
+    failing = {name.lower(): f"lab_mocap:{name}" for name in names}
     write_distribution(tmp_path, "lab-mocap", "1.0", failing, MOCAP_SYSTEMS)
     with on_path(tmp_path):
         yield
@@ -136,7 +196,7 @@ def test_flight_and_guardian_receive_the_same_poses() -> None:
             assert pose is not None and pose is poses[-1] and 0.0 <= clock() - pose.stamp_s < 1.0
             check_pose(pose)
             assert driver.server is not None and driver.server.name == "Vicon Tracker, UDP object stream"
-            assert driver.counts().problem is None
+            assert driver.counts().malformed == 0
             client.keep_connected(100.0)
             seen = client.poses(100.0, origin_s=60.0)
             assert seen and client.tracked_s == 100.0 and 39.0 < seen[-1].stamp_s <= 40.0
@@ -159,21 +219,152 @@ def test_an_object_that_is_not_tracked_is_reported() -> None:
 
 
 def test_damaged_datagrams_are_rejected() -> None:
-    client = open_client(settings_of(vicon(free_port())))
+    port = free_port()
+    client = open_client(settings_of(vicon(port)))
     whole = datagram(7, STRANGER, QUAD)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for size in range(5 + 2 * 75):
-            sender.sendto(whole[:size], ("127.0.0.1", client.sockets[0].getsockname()[1]))
+            sender.sendto(whole[:size], ("127.0.0.1", port))
     assert client.poses(0.0) == []
-    assert client.problem is not None and "ends early" in client.problem
+    assert client.problem is not None and "unpack" in client.problem
     client.close()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("at", [0, 4])
+def test_a_vicon_object_that_is_not_finite_does_not_stop_the_others(value: float, at: int) -> None:
+    port = free_port()
+    tracker = system_class("vicon")(settings_of(vicon(port)))
+    broken = list(QUAD[1])
+    broken[at] = value
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for number, values in enumerate((tuple(broken), QUAD[1])):
+            sender.sendto(datagram(number, ("quad", values)), ("127.0.0.1", port))
+    (pose,) = tracker.poses(0.0)
+    check_pose(pose)
+    assert pose.frame_number == 1 and "are not finite" in tracker.problem
+    tracker.close()
+
+
+def scripted(**options: JsonValue) -> MocapDevice:
+    return MocapDevice(type="scripted", server="server", rigid_body_id=1, options=options)
+
+
+INVALID: list[tuple[dict[str, JsonValue], str]] = [
+    ({"x_m": "nan"}, r"frame \d+: position \(nan, 0\.0, 1\.0\) m"),
+    ({"x_m": "-inf"}, r"frame \d+: position \(-inf, "),
+    ({"x_m": 1001.0}, "expected finite values, at most 1000 m"),
+    ({"x_m": [1.0]}, "ValidationError: Expected `float`, got `array`"),
+    ({"w": "nan"}, "quaternion of norm nan"),
+    ({"w": 0.97}, "quaternion of norm 0.97, expected .* norm 1"),
+    ({"stamped_after_now_s": "inf"}, "stamped inf s"),
+    ({"stamped_after_now_s": "nan"}, "stamped nan s"),
+    ({"stamped_after_now_s": 0.01}, "expected at most 1 s before now_s"),
+    ({"stamped_after_now_s": -1.01}, "expected at most 1 s before now_s"),
+]
+
+
+@pytest.mark.parametrize(("options", "expected"), INVALID)
+def test_the_flight_rejects_invalid_poses(options: dict[str, JsonValue], expected: str) -> None:
+    async def run() -> None:
+        delivered: list[MocapPose] = []
+        driver = PluginMocap(scripted(**options), flight_clock(), delivered.append, body_timeout_s=0.01)
+        with pytest.raises(DeviceError, match=f"rigid body 1 was never seen .* the newest problem: .*{expected}"):
+            await driver.__aenter__()
+        assert not delivered and driver.counts().malformed >= 1
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize(("options", "expected"), INVALID)
+def test_the_guardian_rejects_invalid_poses(options: dict[str, JsonValue], expected: str) -> None:
+    client = open_client(settings_of(scripted(**options)))
+    assert client.poses(100.0, origin_s=60.0) == [] and client.tracked_s < 0.0
+    assert client.problem is not None and re.search(expected, client.problem)
+
+
+def test_a_pose_that_is_not_tracked_may_have_any_values() -> None:
+    device = scripted(tracking_valid=False, x_m="nan", w=0.0)
+    (pose,) = open_client(settings_of(device)).poses(100.0)
+    assert pose.position_world_m == (0.0, 0.0, 0.0) and pose.attitude_wxyz == (1.0, 0.0, 0.0, 0.0)
+    assert not pose.tracking_valid
+    (pose,) = open_client(settings_of(scripted(w=0.99))).poses(100.0)
+    assert pose.attitude_wxyz == (1.0, 0.0, 0.0, 0.0) and pose.tracking_valid
+
+
+def test_the_flight_receives_poses_while_a_client_replaces_its_socket() -> None:
+    async def run() -> None:
+        poses: asyncio.Queue[MocapPose] = asyncio.Queue()
+        device = MocapDevice(type="reconnecting", server="server", rigid_body_id=1)
+        async with open_mocap(device, flight_clock(), poses.put_nowait) as driver, asyncio.timeout(DEADLINE_S):
+            for _ in range(20):
+                await poses.get()
+            assert driver.counts().problem is not None and driver.counts().malformed
+
+    event_loop.run(run())
+
+
+def test_the_guardian_lands_while_a_client_replaces_its_socket(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Landing:
+        """Has landed once it has taken 3 poses."""
+
+        landed: bool | None = None
+        pose = None
+        overturned = False
+
+        def __init__(self, *_: object) -> None:
+            self.poses = 0
+
+        def take_poses(self, poses: list[MocapPose]) -> None:
+            self.poses += len(poses)
+            self.landed = True if self.poses >= 3 else None
+
+        def take_messages(self, *_: object) -> None:
+            pass
+
+        def step(self, t_s: float) -> None:
+            pass
+
+    monkeypatch.setattr(process, "TakeoverLanding", Landing)
+    link = Mock(poses_sent=0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire, socket.socket() as channel:
+        link.wire.fileno, link.wire.lost = wire.fileno, False
+        guardian = process.Guardian(Mock(autopilot_address="udpin://127.0.0.1:1"), Mock(), channel, Mock())
+        client = open_client(settings_of(MocapDevice(type="reconnecting", server="server", rigid_body_id=1)))
+        client.close()
+        guardian._mocap = client
+        assert guardian._land(Mock(origin_s=0.0, position_world_m=(0.0, 0.0, 0.0)), link)
+        client.close()
+
+
+def test_a_client_without_a_name_refuses_the_flight_and_is_closed() -> None:
+    driver = PluginMocap(MocapDevice(type="nameless", server="server", rigid_body_id=1), flight_clock(), lambda _: None)
+    with pytest.raises(DeviceError, match="mocap nameless server: the client cannot be made: ValueError: no name"):
+        asyncio.run(driver.__aenter__())
+    assert system_class("nameless").closed == 1
+
+
+def test_a_problem_that_raises_is_reported_by_the_guardian() -> None:
+    client = open_client(settings_of(MocapDevice(type="noproblem", server="server", rigid_body_id=1)))
+    assert client.problem == "ValueError: not connected"
+
+
+def test_a_call_that_waits_is_reported() -> None:
+    times_s = count(step=0.02)
+    driver = PluginMocap(scripted(), lambda: next(times_s), lambda _: None)
+
+    async def run() -> None:
+        async with driver:
+            assert driver.counts().problem == "keep_connected() took 20 ms, limit 10 ms; no call of a client may wait"
+
+    asyncio.run(run())
 
 
 @pytest.mark.parametrize(
     ("system", "in_guardian", "in_flight"),
     [
         ("failing", "OSError: network", "RuntimeError: no pose"),
-        ("nonsense", "AttributeError: ", r"TypeError: poses\(\) returned \['a pose'\], expected a list of MocapPose"),
+        ("nonsense", "TypeError: ", r"TypeError: poses\(\) returned \['a pose'\], expected a list of MocapPose"),
     ],
 )
 def test_exceptions_of_a_client_are_contained(system: str, in_guardian: str, in_flight: str) -> None:
@@ -206,7 +397,7 @@ def test_a_client_that_cannot_be_made_refuses_the_flight() -> None:
     [
         ("type: vicon\n    options: {object_name: 3}", "options.object_name: Input should be a valid string"),
         ("type: vicon\n    options: {object_nam: quad}", "options.object_nam: Extra inputs are not permitted"),
-        ("type: qualisys", "type: motion-capture system 'qualisys': is not installed; installed: absent, failing, nonsense"),
+        ("type: qualisys", "type: motion-capture system 'qualisys': is not installed; installed: absent, failing, nameless"),
         ("type: nooptions", "(lab-mocap 1.0): its attribute 'options' is not a subclass"),
         ("options: {a: 1}", "options: must be empty for natnet"),
     ],

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import socket
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import fields
 from types import TracebackType
-from typing import Final, Self
+from typing import Final, Self, TypeVar
 
 from companion.config.mocap import NATNET, system_class
 from companion.config.vehicle import MocapDevice
 from companion.io.mocap.driver import NatNetMocap
-from companion.io.mocap.system import MocapSettings, PoseClient
+from companion.io.mocap.system import MocapSettings, PoseClient, valid_poses
 from companion.io.protocols import DeviceError, Mocap
 from companion.model.observations import MocapCounts, MocapServer
 from companion.model.types import MocapPose
@@ -22,8 +21,14 @@ from companion.plugins import PluginError, one_line
 from companion.runtime.clock import Clock
 
 _LOG: Final = logging.getLogger(__name__)
-_POLL_PERIOD_S: Final = 0.005
-"""Period of `poses` for a client without sockets, and of `keep_connected`."""
+_T = TypeVar("_T")
+_POLL_PERIOD_S: Final = 0.001
+"""Period of `poses`. The event loop does not wait on a client's sockets, because it would fail if the client closed one; the poses are
+up to this time late.
+"""
+_KEEP_CONNECTED_PERIOD_S: Final = 0.01
+_CALL_MAX_S: Final = 0.01
+"""Longest permitted time of one call of the client."""
 
 
 def open_mocap(device: MocapDevice, clock: Clock, on_pose: Callable[[MocapPose], None]) -> Mocap:
@@ -40,8 +45,8 @@ def open_mocap(device: MocapDevice, clock: Clock, on_pose: Callable[[MocapPose],
 class PluginMocap:
     """Poses of a plug-in's client; implements `companion.io.protocols.Mocap`.
 
-    Of several poses that have arrived only the newest is delivered. An exception of the client is counted as a malformed datagram and
-    logged once: without poses the safety rules land the vehicle.
+    Of several poses that have arrived only the newest is delivered. An exception of the client and an invalid pose are each counted as
+    a malformed datagram, and the first exception is logged: without poses the safety rules land the vehicle.
 
     Args:
         device: `devices.mocap` of the vehicle file.
@@ -58,13 +63,15 @@ class PluginMocap:
         self._on_pose = on_pose
         self._body_timeout_s = body_timeout_s
         self._client: PoseClient | None = None
-        self._watched: list[socket.socket] = []
-        """The client's sockets, unless it has raised: one that raises may leave its datagrams unread, and is called by the timer."""
+        self._server_name = ""
         self._timer: asyncio.TimerHandle | None = None
+        self._keep_connected_s = float("-inf")
+        """Earliest flight clock of the next `keep_connected`."""
         self._tracked = asyncio.Event()
         self._latest: MocapPose | None = None
         self._frames = self._superseded = self._malformed = 0
         self._problem: str | None = None
+        self._failure_logged = False
         self._callback_error: str | None = None
 
     def latest(self) -> MocapPose | None:
@@ -76,7 +83,7 @@ class PluginMocap:
         """Return the system's name and type, or None before a pose has arrived."""
         if self._client is None or self._latest is None:
             return None
-        return MocapServer(name=self._client.server_name, protocol_version=self._device.type)
+        return MocapServer(name=self._server_name, protocol_version=self._device.type)
 
     @property
     def bodies(self) -> dict[int, str]:
@@ -104,13 +111,12 @@ class PluginMocap:
         try:
             settings = MocapSettings(**{each.name: getattr(self._device, each.name) for each in fields(MocapSettings)})
             self._client = client = system_class(self._device.type)(settings)
+            self._server_name = str(client.server_name)
         except PluginError as error:
             raise DeviceError(f"{self._where}: {error}") from error
         except Exception as error:
+            self._close()
             raise DeviceError(f"{self._where}: the client cannot be made: {one_line(error)}") from error
-        self._watched = list(client.sockets)
-        for opened in self._watched:
-            asyncio.get_running_loop().add_reader(opened.fileno(), self._receive)
         self._poll()
         try:
             async with asyncio.timeout(self._body_timeout_s):
@@ -139,24 +145,23 @@ class PluginMocap:
 
     def _poll(self) -> None:
         assert self._client is not None
+        client = self._client
         self._timer = asyncio.get_running_loop().call_later(_POLL_PERIOD_S, self._poll)
-        try:
-            self._client.keep_connected(self._clock())
-        except Exception as error:
-            self._failed(error)
-        if not self._watched:
-            self._receive()
+        if self._clock() >= self._keep_connected_s:
+            self._keep_connected_s = self._clock() + _KEEP_CONNECTED_PERIOD_S
+            self._call("keep_connected()", client.keep_connected, None)
+        self._deliver(self._call("poses()", self._receive, []))
 
-    def _receive(self) -> None:
+    def _receive(self, now_s: float) -> list[MocapPose]:
         assert self._client is not None
-        try:
-            poses = self._client.poses(self._clock())
-            if not all(isinstance(pose, MocapPose) for pose in poses):
-                raise TypeError(f"poses() returned {poses!r:.80}, expected a list of MocapPose")
-            self._problem = self._client.problem or self._problem
-        except Exception as error:
-            self._failed(error)
-            return
+        poses, rejected = valid_poses(self._client.poses(now_s), now_s)
+        self._problem = str(self._client.problem or "") or self._problem
+        if rejected:
+            self._malformed += len(rejected)
+            self._problem = rejected[-1]
+        return poses
+
+    def _deliver(self, poses: list[MocapPose]) -> None:
         if not poses:
             return
         self._superseded += len(poses) - 1
@@ -171,23 +176,29 @@ class PluginMocap:
                 self._callback_error = one_line(error)
                 _LOG.exception("%s: on_pose failed; reception goes on, further failures are not logged", self._where)
 
-    def _failed(self, error: Exception) -> None:
-        self._malformed += 1
-        if self._problem is None:
-            _LOG.error("%s: the client failed; further failures are not logged", self._where, exc_info=error)
-        self._problem = one_line(error)
-        self._unwatch()
-
-    def _unwatch(self) -> None:
-        for opened in self._watched:
-            asyncio.get_running_loop().remove_reader(opened.fileno())
-        self._watched.clear()
+    def _call(self, what: str, call: Callable[[float], _T], otherwise: _T) -> _T:
+        """Call the client with the present time; return `otherwise` if it raises. Report an exception or a call that has waited."""
+        now_s = self._clock()
+        try:
+            return call(now_s)
+        except Exception as error:
+            self._malformed += 1
+            if not self._failure_logged:
+                self._failure_logged = True
+                _LOG.error("%s: the client failed; further failures are not logged", self._where, exc_info=error)
+            self._problem = one_line(error)
+            return otherwise
+        finally:
+            took_s = self._clock() - now_s
+            if took_s > _CALL_MAX_S and self._problem is None:
+                self._problem = (
+                    f"{what} took {took_s * 1e3:.0f} ms, limit {_CALL_MAX_S * 1e3:g} ms; no call of a client may wait"
+                )
 
     def _close(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        self._unwatch()
         if self._client is not None:
             with suppress(Exception):
                 self._client.close()
