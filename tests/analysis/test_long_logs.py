@@ -80,7 +80,7 @@ def test_the_summary_says_that_it_is_thinned_out_and_grades_nearly_the_same(whol
 
 def test_the_report_says_so_too(thin: FlightLog, tmp_path: Path) -> None:
     summary = summarise(thin, outcome="completed", controller="adaptive", preset="recommended")
-    assert f"one tick in {thin.stride}" in write_report(thin, summary, tmp_path).read_text()
+    assert f"one in {thin.stride} (long flight)" in write_report(thin, summary, tmp_path).read_text()
 
 
 def test_a_log_that_fits_is_read_whole(path: Path, whole: FlightLog) -> None:

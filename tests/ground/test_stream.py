@@ -359,7 +359,7 @@ def test_a_light_warns_from_half_its_limit_on(name_aged: tuple[str, Callable[[fl
         ("tether", tether(), HealthLevel.OK, "1.00 m left"),
         ("tether", tether(stop_slack_m=0.2), HealthLevel.WARN, "m left"),
         ("tether", tether(stop_slack_m=0.05), HealthLevel.BAD, "0.05 m where it could stop"),
-        ("tether", tether(clearance_m=0.0), HealthLevel.WARN, "cm from rotors"),
+        ("tether", tether(clearance_m=0.0), HealthLevel.WARN, "cm from the rotors"),
         ("tether", tether(turns=-1.6), HealthLevel.BAD, "-1.6 turns"),
         ("tether", tether(taut=True, pull_n=12.0), HealthLevel.BAD, "taut: pulls with 12 N"),
         ("tether", tether(snagged=True), HealthLevel.BAD, "snagged"),
