@@ -10,7 +10,7 @@ import os
 import resource
 import sys
 import threading
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,6 +76,25 @@ def claim_realtime(priority: int, *, cpus: Collection[int] = (), lock_memory: bo
         memory_locked=locked,
         refused=tuple(refused),
     )
+
+
+@contextlib.contextmanager
+def realtime_thread(priority: int) -> Iterator[None]:
+    """Run the calling thread, and the threads that it starts meanwhile, with SCHED_FIFO during a `with` block, if that is permitted.
+
+    Args:
+        priority: SCHED_FIFO priority, 1 to 99.
+    """
+    try:
+        before = os.sched_getscheduler(0), os.sched_getparam(0)
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except (OSError, AttributeError):
+        yield
+        return
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, *before)
 
 
 def realtime_permitted(priority: int) -> str | None:

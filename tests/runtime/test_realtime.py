@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from companion.runtime.realtime import FLIGHT_PRIORITY, memory_lock_refused, realtime_permitted
+from companion.runtime.realtime import FLIGHT_PRIORITY, memory_lock_refused, realtime_permitted, realtime_thread
 
 
 def schedulers() -> set[int]:
@@ -49,6 +49,21 @@ def test_the_permission_is_tried_on_a_thread_of_its_own() -> None:
     assert schedulers() == before
     assert threading.active_count() == threads
     assert gc.isenabled() == collects
+
+
+def test_a_motion_has_real_time_priority_until_its_end() -> None:
+    def of_this_thread() -> int:
+        return os.sched_getscheduler(0)
+
+    permitted = realtime_permitted(FLIGHT_PRIORITY) is not None
+    with realtime_thread(FLIGHT_PRIORITY):
+        assert of_this_thread() == (os.SCHED_FIFO if permitted else os.SCHED_OTHER)
+        inherited: list[int] = []
+        thread = threading.Thread(target=lambda: inherited.append(of_this_thread()))
+        thread.start()
+        thread.join()
+        assert inherited == [of_this_thread()]
+    assert of_this_thread() == os.SCHED_OTHER
 
 
 def test_children_of_a_process_at_real_time_priority_are_not() -> None:

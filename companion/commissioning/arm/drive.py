@@ -14,6 +14,7 @@ from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.protocols import DeviceError
 from companion.model.types import ArmState, Vec2
 from companion.runtime.clock import flight_clock
+from companion.runtime.realtime import FLIGHT_PRIORITY, realtime_thread
 from companion.runtime.terminal import Bars
 
 PERIOD_S: Final = 0.005
@@ -50,11 +51,16 @@ class Driven:
 
 async def drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
     """Open the arm's bus, move the arm as `leader` decides, and then make the arm limp. After a cancellation the arm is limp within
-    a few ms.
+    a few ms. The thread has real-time priority meanwhile, if that is permitted: a late step leaves the arm at an outdated torque.
 
     Raises:
         DeviceError: the bus cannot be opened, or gravity exceeds the torque limit in a pose that `leader` announces.
     """
+    with realtime_thread(FLIGHT_PRIORITY):
+        return await _drive(vehicle, leader, bars)
+
+
+async def _drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
     clock = flight_clock()
     limits = [joint.angle_deg for joint in vehicle.arm.joints]
     async with DynamixelArm(vehicle.devices.arm, gentle(vehicle.arm), clock) as arm:
