@@ -114,7 +114,7 @@ def test_the_catch(sandbox: Sandbox, autopilot: str) -> None:
     summary = read_summary(sandbox.cwd / "out")
     assert summary["autopilot"]["kind"] == autopilot
     assert re.fullmatch(r"1\.\d+(\.\d+)?", summary["autopilot"]["version"])
-    assert event_ids(summary)[:2] == ["takeoff", "catch"]
+    assert [event for event in event_ids(summary) if event in {"takeoff", "catch"}] == ["takeoff", "catch"]
     assert summary["rms"]["post"]["e_p_m"] < E_P_MAX_M
     assert summary["rms"]["post"]["e_q_deg"] < E_Q_MAX_DEG
 
