@@ -17,7 +17,7 @@ from typing import Any
 
 from companion.config.mocap import NATNET
 from companion.config.vehicle import Vehicle
-from companion.model.types import IDENTITY_QUAT, Vec2
+from companion.model.types import IDENTITY_QUAT, Joints, Vec2
 from companion.sitl_config.faults import FaultKind
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.backend import AutopilotBackend, StubBackend
@@ -62,7 +62,7 @@ class Start:
 
     position_m: Vec2
     yaw_rad: float
-    arm_rad: Vec2
+    arm_rad: Joints
 
 
 class Sitl:
@@ -355,6 +355,6 @@ class Sitl:
         }
 
 
-def start_of(position_m: Vec2, yaw_deg: float, arm_deg: Vec2) -> Start:
+def start_of(position_m: Vec2, yaw_deg: float, arm_deg: Joints) -> Start:
     """Return a start pose, given a mission's angles in degrees."""
-    return Start(position_m, math.radians(yaw_deg), (math.radians(arm_deg[0]), math.radians(arm_deg[1])))
+    return Start(position_m, math.radians(yaw_deg), tuple(map(math.radians, arm_deg)))

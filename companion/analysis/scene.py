@@ -15,7 +15,7 @@ import numpy as np
 from companion.analysis.log import Array
 from companion.model.frames import quat_rotate
 from companion.model.hanging_line import hanging_line_m
-from companion.model.types import Quat, Vec2, Vec3
+from companion.model.types import Joints, Quat, Vec2, Vec3
 
 FRAME, LEG, ROTOR, FRONT, LINK, NET, BALL, TETHER = (
     "#2d3a45", "#a3afba", "#7d8c99", "#1f6fb4", "#e07b22", "#8f7a1e", "#c2255c", "#2e9d6b"
@@ -48,7 +48,7 @@ class Pose:
 
     position_world_m: Vec3
     attitude_wxyz: Quat
-    arm_rad: Vec2
+    arm_rad: Joints
     ball_world_m: tuple[Vec3, ...]
     """Centre of the flying payload and its earlier positions, newest first; empty before the throw and after the catch."""
     caught: bool
@@ -153,7 +153,7 @@ class Scene:
     def _world(self, pose: Pose, body: Array) -> Array:
         return np.array(pose.position_world_m) + body @ _rotation(pose.attitude_wxyz).T
 
-    def _arm_body_m(self, arm_rad: Vec2) -> tuple[Array, Array]:
+    def _arm_body_m(self, arm_rad: Joints) -> tuple[Array, Array]:
         """Return the positions of the elbow and of the centre of the net, body frame, m."""
         a, b = arm_rad[0], arm_rad[0] - arm_rad[1]
         elbow = self._shoulder + self._links_m[0] * np.array([math.cos(a), 0.0, -math.sin(a)])

@@ -25,7 +25,7 @@ from companion.control.types import PlantState, Wrench
 from companion.control.zero_order_hold import HoldTable
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import body_x_z_axes_world
-from companion.model.types import ControlLog, Reference, Vec2, Vec3, Vec4, Vec8
+from companion.model.types import Chi, ControlLog, Joints, Reference, Vec3, Vec4
 
 
 def active(rows: tuple[float, ...]) -> Rows:
@@ -88,7 +88,7 @@ class AccelerationFilter:
 
     def __init__(self, cutoff_hz: float) -> None:
         self._w = 2.0 * math.pi * cutoff_hz
-        self._arm_rate_rad_s: Vec2 | None = None
+        self._arm_rate_rad_s: Joints | None = None
         self._value: Rows | None = None
 
     def step(self, dt_s: float, state: PlantState) -> Rows:
@@ -139,7 +139,7 @@ class AdaptiveController:
         self._compensation = Compensation(config, vehicle, self._compliance, self._inertia[:2])
         self._arm_inertia = ArmInertia(vehicle) if config.arm_inertia_nominal else None
         self._gravity_nominal = config.arm_gravity_nominal
-        self._up_m_s2: Vec2 = (0.0, GRAVITY_M_S2)
+        self._up_m_s2: Joints = (0.0, GRAVITY_M_S2)
         self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
         self.hover_thrust = hover_thrust
         """Normalised hover thrust, for the log. The hover-thrust estimator sets it before every step."""
@@ -194,7 +194,7 @@ class AdaptiveController:
             attitude_wxyz=sent.attitude_wxyz, collective_n=sent.collective_n, arm_torque_nm=sent.arm_torque_nm, log=log
         )
 
-    def _torque_error(self, arm_rad: Vec2, body_x: Vec3, body_z: Vec3, force: Vec3) -> tuple[Vec8, Vec2, Vec2]:
+    def _torque_error(self, arm_rad: Joints, body_x: Vec3, body_z: Vec3, force: Vec3) -> tuple[Chi, Joints, Joints]:
         """Return e_tau = tau_ext - tau_d (8 rows), tau_d of the joints, and the joint torques that hold the arm against gravity."""
         (xx, xy, xz), (zx, zy, zz) = body_x, body_z
         self._up_m_s2 = (GRAVITY_M_S2 * xz, GRAVITY_M_S2 * zz)
@@ -218,7 +218,7 @@ class AdaptiveController:
             (g6, g7),
         )
 
-    def _norms(self, s: Vec8, error: Vec8, error_rate: Vec8, acceleration: Rows) -> Vec3:
+    def _norms(self, s: Chi, error: Chi, error_rate: Chi, acceleration: Rows) -> Vec3:
         """Return ||S s||, ||S [e; e']|| and ||S chi_dd||."""
         s0, s1, s2, _, _, _, s6, s7 = s
         e0, e1, e2, _, _, _, e6, e7 = error
@@ -237,7 +237,7 @@ class AdaptiveController:
             math.sqrt(w0 * a0 * a0 + w1 * a1 * a1 + w2 * a2 * a2 + w6 * a6 * a6 + w7 * a7 * a7),
         )
 
-    def _tau(self, s: Vec8, robust: float, error_rate: Vec8, tau_d: Vec2, reference: Reference) -> Rows:
+    def _tau(self, s: Chi, robust: float, error_rate: Chi, tau_d: Joints, reference: Reference) -> Rows:
         """Return tau (eq. tau) with - D gamma and dtau = -rho S^2 s / max(||S s||, varpi). `robust` is rho over that maximum. Row by
         row:
 
@@ -270,13 +270,13 @@ class AdaptiveController:
     def _arm_torque(
         self,
         tau: Rows,
-        gravity: Vec2,
-        s: Vec8,
-        e_tau: Vec8,
-        error_rate: Vec8,
+        gravity: Joints,
+        s: Chi,
+        e_tau: Chi,
+        error_rate: Chi,
         state: PlantState,
         reference: Reference,
-    ) -> Vec2:
+    ) -> Joints:
         """Return the joint torques: tau and gravity, plus the configured (M_arm - M_d) alpha''* + C alpha' and friction at alpha'*.
 
         The star marks what the target impedance requests at this instant: alpha''* = alpha''_d - Phi e' + gamma' and alpha'* = alpha'_d

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from companion.control.manipulator import Manipulator
-from companion.model.types import Quat, Vec2
+from companion.model.types import Joints, Quat
 
 STIFFNESS_NM_RAD = 5.0
 DAMPING_NMS_RAD = 0.45
@@ -11,12 +11,12 @@ DAMPING_NMS_RAD = 0.45
 
 def hold_torque_nm(
     manipulator: Manipulator,
-    angle_rad: Vec2,
-    rate_rad_s: Vec2,
-    target_rad: Vec2,
-    target_rate_rad_s: Vec2,
+    angle_rad: Joints,
+    rate_rad_s: Joints,
+    target_rad: Joints,
+    target_rate_rad_s: Joints,
     attitude: Quat,
-) -> Vec2:
+) -> Joints:
     """Return the joint torques towards the target, N m, with nominal gravity compensation."""
     gravity = manipulator.gravity_torque_nm(angle_rad, attitude)
     torque = [

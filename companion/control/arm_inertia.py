@@ -12,7 +12,7 @@ import math
 
 from companion.config.vehicle import Vehicle
 from companion.control.dynamics import Dynamics
-from companion.model.types import Vec2
+from companion.model.types import Joints
 
 
 class ArmInertia:
@@ -20,14 +20,14 @@ class ArmInertia:
 
     def __init__(self, vehicle: Vehicle) -> None:
         dynamics, armature = Dynamics(vehicle), vehicle.arm.joint_armature_kg_m2
-        at_rest: Vec2 = (0.0, 0.0)
+        at_rest: Joints = (0.0, 0.0)
         stretched, bent = (dynamics.arm_terms((0.0, beta), at_rest).mass for beta in (0.0, math.pi / 2))
         self._outer = stretched[1][1] - armature
         self._cross = -stretched[0][1] - self._outer
         self._inner = bent[0][0] - armature - self._outer
         self._armature = armature
 
-    def torque_nm(self, angle_rad: Vec2, rate_rad_s: Vec2, acceleration_rad_s2: Vec2) -> Vec2:
+    def torque_nm(self, angle_rad: Joints, rate_rad_s: Joints, acceleration_rad_s2: Joints) -> Joints:
         """Return M alpha'' + C alpha', N m."""
         beta = angle_rad[1]
         v1, v2 = rate_rad_s

@@ -20,12 +20,12 @@ from companion.control.thrust import (
 from companion.control.types import PlantState, Wrench
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import wrap_rad
-from companion.model.types import IDENTITY_QUAT, ControlLog, Quat, Reference, Vec2, Vec3, Vec8
+from companion.model.types import IDENTITY_QUAT, Chi, ControlLog, Joints, Quat, Reference, Vec3
 
-ZERO8: Vec8 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+ZERO8: Chi = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def tracking_errors(state: PlantState, reference: Reference, yaw_rad: float) -> tuple[Vec8, Vec8]:
+def tracking_errors(state: PlantState, reference: Reference, yaw_rad: float) -> tuple[Chi, Chi]:
     """Return e = chi - chi_d and e', 8 rows each. Rows 3 and 4 (roll, pitch) are 0 because their reference is the law's own output."""
     px, py, pz = state.position_world_m
     vx, vy, vz = state.velocity_world_m_s
@@ -111,7 +111,7 @@ class Actuation:
         self.collective_n = 0.0
         self.force_world_n: Vec3 = (0.0, 0.0, 0.0)
         """Force after saturation, world frame, N."""
-        self.arm_torque_nm: Vec2 = (0.0, 0.0)
+        self.arm_torque_nm: Joints = (0.0, 0.0)
         self.clipped = (False, False, False)
         """Whether vertical force, lateral force and joint torque were saturated."""
         self.any_clipped = False
@@ -120,7 +120,7 @@ class Actuation:
         self,
         dt_s: float,
         force_world_n: Vec3,
-        torque_nm: Vec2,
+        torque_nm: Joints,
         body_z_world: Vec3,
         yaw_rad: float,
         vertical_scale: float,
@@ -157,9 +157,9 @@ class Actuation:
 
 def wrench_of(
     sent: Actuation,
-    error: Vec8,
-    error_rate: Vec8,
-    e_tau: Vec8,
+    error: Chi,
+    error_rate: Chi,
+    e_tau: Chi,
     force_world_n: Vec3,
     hover_thrust: float,
     payload_estimate_kg: float | None = None,

@@ -12,7 +12,7 @@ from companion.config.vehicle import Vehicle
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.types import PlantState
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import Reference, Vec2, Vec3
+from companion.model.types import Joints, Reference, Vec3
 
 FRICTION_RATE_RAD_S = 0.1
 """Joint rate below which the friction torque fades out, so that a joint at rest does not shake."""
@@ -65,7 +65,7 @@ class Compensation:
             y += my * lead_s * jerk[1]
         return (x, y, z)
 
-    def joint_torque_nm(self, torque_nm: Vec2, wanted_rate_rad_s: Vec2) -> Vec2:
+    def joint_torque_nm(self, torque_nm: Joints, wanted_rate_rad_s: Joints) -> Joints:
         """Return the torques with friction added along the wanted joint rates. Measured rates would shake a joint at rest."""
         if self._friction_nm == 0.0:
             return torque_nm

@@ -22,7 +22,7 @@ from companion.control.dynamics import chi_rate_from_body_rate, rotation_matrix
 from companion.control.model_based import ModelBasedLaw
 from companion.control.types import PlantState, Wrench
 from companion.model.frames import euler_zyx_from_quat, yaw_from_quat
-from companion.model.types import Reference, Vec3, Vec8
+from companion.model.types import Chi, Reference, Vec3
 
 
 class CscController(ModelBasedLaw):
@@ -51,7 +51,7 @@ class CscController(ModelBasedLaw):
         )
         return self._end(dt_s, error, error_rate, e_tau, force)
 
-    def _external(self, state: PlantState, force: Vec3) -> tuple[Vec8, Vec8]:
+    def _external(self, state: PlantState, force: Vec3) -> tuple[Chi, Chi]:
         """Return tau_ext and tau_ext - tau_d. The configuration sets which fraction acts on the base."""
         ext, desired = self._joint_torques_nm(state, force)
         x, y, z = (share * f for share, f in zip(self._c.external_xyz, force, strict=True))
@@ -61,7 +61,7 @@ class CscController(ModelBasedLaw):
             (x - dx, y - dy, z - dz, 0.0, 0.0, 0.0, ext[0] - desired[0], ext[1] - desired[1]),
         )
 
-    def _tau(self, state: PlantState, reference: Reference, error: Vec8, error_rate: Vec8, e_tau: Vec8) -> list[float]:
+    def _tau(self, state: PlantState, reference: Reference, error: Chi, error_rate: Chi, e_tau: Chi) -> list[float]:
         """Return M chi''_cmd + C chi' + g, 8 rows."""
         rpy = euler_zyx_from_quat(state.attitude_wxyz)
         q_rate = chi_rate_from_body_rate(rpy, state.angular_rate_body_rad_s)
@@ -74,7 +74,7 @@ class CscController(ModelBasedLaw):
             feed[i] - (c.damping_kd[i] * e_rate[i] + c.stiffness_kp[i] * e[i] - e_tau[i]) / c.inertia_md[i]
             for i in range(8)
         ]
-        chi_rate: Vec8 = (*state.velocity_world_m_s, *q_rate, *state.arm_rate_rad_s)
+        chi_rate: Chi = (*state.velocity_world_m_s, *q_rate, *state.arm_rate_rad_s)
         terms = self._dynamics.terms(rotation_matrix(state.attitude_wxyz), rpy, state.arm_rad, chi_rate)
         return [
             sum(m * a for m, a in zip(row, chi_dd, strict=True)) + coriolis + gravity

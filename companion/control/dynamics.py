@@ -15,11 +15,11 @@ from dataclasses import dataclass
 
 from companion.config.vehicle import Vehicle
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import Quat, Vec2, Vec3, Vec8
+from companion.model.types import Chi, Joints, Quat, Vec3
 
-Mat2 = tuple[Vec2, Vec2]
+Mat2 = tuple[Joints, Joints]
 Mat3 = tuple[Vec3, Vec3, Vec3]
-Mat8 = tuple[Vec8, Vec8, Vec8, Vec8, Vec8, Vec8, Vec8, Vec8]
+Mat8 = tuple[Chi, Chi, Chi, Chi, Chi, Chi, Chi, Chi]
 _Vec4 = tuple[float, float, float, float]
 
 ROD_AXIAL_SHARE = 0.1
@@ -34,9 +34,9 @@ class DynamicsTerms:
     """The terms M, C chi' and g of the equation of motion at one state. `mass` is M as a tuple of rows."""
 
     mass: Mat8
-    coriolis: Vec8
+    coriolis: Chi
     """C(chi, chi') chi'."""
-    gravity: Vec8
+    gravity: Chi
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class ArmTerms:
     """M and C alpha' of the arm on a fixed base, without gravity (see `Manipulator.gravity_torque_nm`)."""
 
     mass: Mat2
-    coriolis: Vec2
+    coriolis: Joints
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +58,11 @@ class _Part:
     mass_kg: float
     x: float
     z: float
-    jx: Vec2
-    jz: Vec2
+    jx: Joints
+    jz: Joints
     kx: float
     kz: float
-    turn: Vec2
+    turn: Joints
     rate: float
     xx: float
     yy: float
@@ -91,7 +91,7 @@ class Dynamics:
         self._base_inertia = (mass_scale * ix, mass_scale * iy, mass_scale * iz)
         self._armature = mass_scale * arm.joint_armature_kg_m2
 
-    def arm_terms(self, angle_rad: Vec2, rate_rad_s: Vec2) -> ArmTerms:
+    def arm_terms(self, angle_rad: Joints, rate_rad_s: Joints) -> ArmTerms:
         """Return M (kg m^2) and C alpha' (N m) of the arm alone."""
         m11 = m12 = m22 = c1 = c2 = 0.0
         for part in self._parts(angle_rad, rate_rad_s):
@@ -103,7 +103,7 @@ class Dynamics:
             c2 += m * (jx[1] * part.kx + jz[1] * part.kz)
         return ArmTerms(((m11 + self._armature, m12), (m12, m22 + self._armature)), (c1, c2))
 
-    def terms(self, rotation: Mat3, roll_pitch_yaw_rad: Vec3, angle_rad: Vec2, chi_rate: Vec8) -> DynamicsTerms:
+    def terms(self, rotation: Mat3, roll_pitch_yaw_rad: Vec3, angle_rad: Joints, chi_rate: Chi) -> DynamicsTerms:
         """Return M, C chi' and g at a state. They do not depend on the position.
 
         Args:
@@ -202,11 +202,11 @@ class Dynamics:
             (*p_a1, *q_a1, m11 + self._armature, m12),
             (*p_a2, *q_a2, m12, m22 + self._armature),
         )
-        coriolis: Vec8 = (*c_p, *c_q, c1, c2)
-        gravity: Vec8 = (0.0, 0.0, mt * GRAVITY_M_S2, *g_q, g1, g2)
+        coriolis: Chi = (*c_p, *c_q, c1, c2)
+        gravity: Chi = (0.0, 0.0, mt * GRAVITY_M_S2, *g_q, g1, g2)
         return DynamicsTerms(mass, coriolis, gravity)
 
-    def _parts(self, angle_rad: Vec2, rate_rad_s: Vec2) -> tuple[_Part, _Part, _Part]:
+    def _parts(self, angle_rad: Joints, rate_rad_s: Joints) -> tuple[_Part, _Part, _Part]:
         """Return link 1, link 2, and sensor with net at the end of link 2."""
         a1 = angle_rad[0]
         b = a1 - angle_rad[1]
@@ -275,7 +275,7 @@ def _rod(mass_kg: float, length_m: float, c: float, s: float, scale: float) -> _
     return (axial * c * c + across * s * s, across, axial * s * s + across * c * c, (across - axial) * c * s)
 
 
-def _euler_rate_matrices(rpy: Vec3, chi_rate: Vec8) -> tuple[Mat3, Mat3]:
+def _euler_rate_matrices(rpy: Vec3, chi_rate: Chi) -> tuple[Mat3, Mat3]:
     """Return W, with omega_body = W q', and dW/dt."""
     roll, pitch, _ = rpy
     sr, cr, sp, cp = math.sin(roll), math.cos(roll), math.sin(pitch), math.cos(pitch)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from companion.config.controller import AdaptiveConfig
 from companion.control.zero_order_hold import HoldTable
-from companion.model.types import Vec8
+from companion.model.types import Chi
 
 
 class Impedance:
@@ -33,7 +33,7 @@ class Impedance:
         """e^{-M_d^-1 D T} of every row, then (1 - e^{-M_d^-1 D T}) / D."""
         self.gamma = [0.0] * 8
 
-    def sliding(self, error: Sequence[float], error_rate: Sequence[float]) -> Vec8:
+    def sliding(self, error: Sequence[float], error_rate: Sequence[float]) -> Chi:
         """Return s = e' + Phi e - gamma (eq. s_general)."""
         e0, e1, e2, e3, e4, e5, e6, e7 = error
         v0, v1, v2, v3, v4, v5, v6, v7 = error_rate
@@ -50,12 +50,12 @@ class Impedance:
             v7 + p7 * e7 - g7,
         )
 
-    def advance(self, dt_s: float, e_tau: Sequence[float]) -> Vec8:
+    def advance(self, dt_s: float, e_tau: Sequence[float]) -> Chi:
         """Integrate gamma over one step with e_tau held (eq. adaptive_1, corrected; exact)."""
         k0, k1, k2, k3, k4, k5, k6, k7, b0, b1, b2, b3, b4, b5, b6, b7 = self._held[dt_s]
         t0, t1, t2, t3, t4, t5, t6, t7 = e_tau
         g0, g1, g2, g3, g4, g5, g6, g7 = self.gamma
-        gamma: Vec8 = (
+        gamma: Chi = (
             k0 * g0 + b0 * t0,
             k1 * g1 + b1 * t1,
             k2 * g2 + b2 * t2,

@@ -17,7 +17,7 @@ import math
 from companion.config.controller import AdaptiveConfig
 from companion.control.compensation import FRICTION_RATE_RAD_S
 from companion.control.zero_order_hold import HoldTable
-from companion.model.types import Vec2, Vec3
+from companion.model.types import Joints, Vec3
 
 Rows = tuple[float, float, float, float, float]
 
@@ -43,14 +43,14 @@ class LoadAdaptation:
         self._held = HoldTable(held)
         self.force_n: Vec3 = (0.0, 0.0, 0.0)
         """Estimated additional force that the rotors must produce, world frame."""
-        self.moments_kg_m: Vec2 = (0.0, 0.0)
+        self.moments_kg_m: Joints = (0.0, 0.0)
         """Estimated first moments of the links about their joints, in addition to the nominal ones."""
-        self.friction_nm: Vec2 = (0.0, 0.0)
-        self._levers: Vec2 = (0.0, 0.0)
-        self._turning: Vec2 = (0.0, 0.0)
-        self._wanted_rate_rad_s: Vec2 = (0.0, 0.0)
+        self.friction_nm: Joints = (0.0, 0.0)
+        self._levers: Joints = (0.0, 0.0)
+        self._turning: Joints = (0.0, 0.0)
+        self._wanted_rate_rad_s: Joints = (0.0, 0.0)
 
-    def joint_torque_nm(self, levers_m_s2: Vec2, wanted_rate_rad_s: Vec2) -> Vec2:
+    def joint_torque_nm(self, levers_m_s2: Joints, wanted_rate_rad_s: Joints) -> Joints:
         """Return the torque of the estimated gravity and friction.
 
         Args:

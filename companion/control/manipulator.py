@@ -12,7 +12,7 @@ import math
 from companion.config.vehicle import Arm, Tool
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
-from companion.model.types import Quat, Vec2, Vec3
+from companion.model.types import Joints, Quat, Vec3
 
 
 class Manipulator:
@@ -32,7 +32,7 @@ class Manipulator:
         )
         self._sensor_in_link2: Quat = quat_from_euler_zyx(roll, pitch, yaw)
 
-    def net_body_m(self, angle_rad: Vec2) -> Vec3:
+    def net_body_m(self, angle_rad: Joints) -> Vec3:
         """Return the centre of the net in the body frame, m."""
         a1 = angle_rad[0]
         b = a1 - angle_rad[1]
@@ -43,12 +43,12 @@ class Manipulator:
             sz - self._l1 * math.sin(a1) - self._l2 * math.sin(b),
         )
 
-    def elbow_body_m(self, angle_rad: Vec2) -> Vec3:
+    def elbow_body_m(self, angle_rad: Joints) -> Vec3:
         """Return the elbow joint in the body frame, m."""
         sx, sy, sz = self._shoulder
         return (sx + self._l1 * math.cos(angle_rad[0]), sy, sz - self._l1 * math.sin(angle_rad[0]))
 
-    def jacobian_body_m(self, angle_rad: Vec2) -> tuple[Vec2, Vec2]:
+    def jacobian_body_m(self, angle_rad: Joints) -> tuple[Joints, Joints]:
         """Return rows x and z of d net_body / d alpha, m/rad (the y row is zero): the paper's J_alpha."""
         a1 = angle_rad[0]
         b = a1 - angle_rad[1]
@@ -56,15 +56,15 @@ class Manipulator:
         s2, c2 = self._l2 * math.sin(b), self._l2 * math.cos(b)
         return ((-s1 - s2, s2), (-c1 - c2, c2))
 
-    def joint_torque_from_force(self, angle_rad: Vec2, force_body_n: Vec3) -> Vec2:
+    def joint_torque_from_force(self, angle_rad: Joints, force_body_n: Vec3) -> Joints:
         """Return J' F: the joint torques of a force on the net, N m."""
         (jx1, jx2), (jz1, jz2) = self.jacobian_body_m(angle_rad)
         fx, _, fz = force_body_n
         return (jx1 * fx + jz1 * fz, jx2 * fx + jz2 * fz)
 
     def gravity_torque_nm(
-        self, angle_rad: Vec2, attitude_wxyz: Quat, specific_force_m_s2: float = GRAVITY_M_S2
-    ) -> Vec2:
+        self, angle_rad: Joints, attitude_wxyz: Quat, specific_force_m_s2: float = GRAVITY_M_S2
+    ) -> Joints:
         """Return the motor torques that hold the arm against gravity at the given attitude, N m, payload excluded."""
         # Upward direction in the body frame: the arm must push that way.
         up_x, _, up_z = quat_rotate(
@@ -77,7 +77,7 @@ class Manipulator:
         return (about_1 + about_2, -about_2)
 
     def joint_terms(
-        self, angle_rad: Vec2, up_x_m_s2: float, up_z_m_s2: float
+        self, angle_rad: Joints, up_x_m_s2: float, up_z_m_s2: float
     ) -> tuple[float, float, float, float, float, float]:
         """Return rows x and z of the Jacobian (m/rad) and the gravity torques (N m): `jacobian_body_m` and `gravity_torque_nm` in
         one call.
@@ -97,7 +97,7 @@ class Manipulator:
         c2 *= l2
         return -l1 * s1 - s2, s2, -l1 * c1 - c2, c2, about_1 + about_2, -about_2
 
-    def gravity_levers_m_s2(self, angle_rad: Vec2, up_x_m_s2: float, up_z_m_s2: float) -> Vec2:
+    def gravity_levers_m_s2(self, angle_rad: Joints, up_x_m_s2: float, up_z_m_s2: float) -> Joints:
         """Return, for each link, the torque about its own joint that holds a first moment of 1 kg m against gravity; arguments as for
         `joint_terms`.
         """
@@ -108,7 +108,7 @@ class Manipulator:
             -math.sin(b) * up_x_m_s2 - math.cos(b) * up_z_m_s2,
         )
 
-    def sensor_attitude_body(self, angle_rad: Vec2) -> Quat:
+    def sensor_attitude_body(self, angle_rad: Joints) -> Quat:
         """Return the rotation from the force-torque sensor's frame to the body frame."""
         half = 0.5 * (angle_rad[0] - angle_rad[1])
         return quat_multiply((math.cos(half), 0.0, math.sin(half), 0.0), self._sensor_in_link2)

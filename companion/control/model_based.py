@@ -10,7 +10,7 @@ from companion.control.dynamics import Dynamics
 from companion.control.manipulator import Manipulator
 from companion.control.types import PlantState, Wrench
 from companion.model.frames import body_x_z_axes_world, quat_conjugate, quat_rotate
-from companion.model.types import Reference, Vec2, Vec3, Vec8
+from companion.model.types import Chi, Joints, Reference, Vec3
 
 
 class ModelBasedLaw:
@@ -48,7 +48,7 @@ class ModelBasedLaw:
         state: PlantState,
         reference: Reference,
         wanted_n: Vec3,
-        torque_nm: Vec2,
+        torque_nm: Joints,
         force_world_n: Vec3,
         vertical_scale: float,
     ) -> None:
@@ -65,7 +65,7 @@ class ModelBasedLaw:
         )
         compensation.remember(sent.force_world_n, force_world_n)
 
-    def _joint_torques_nm(self, state: PlantState, force_world_n: Vec3) -> tuple[Vec2, Vec2]:
+    def _joint_torques_nm(self, state: PlantState, force_world_n: Vec3) -> tuple[Joints, Joints]:
         """Return J'F and J'F_d, N m."""
         to_body = quat_conjugate(state.attitude_wxyz)
         ext = self._manipulator.joint_torque_from_force(state.arm_rad, quat_rotate(to_body, force_world_n))
@@ -75,9 +75,9 @@ class ModelBasedLaw:
     def _end(
         self,
         dt_s: float,
-        error: Vec8,
-        error_rate: Vec8,
-        e_tau: Vec8,
+        error: Chi,
+        error_rate: Chi,
+        e_tau: Chi,
         force_world_n: Vec3,
         payload_estimate_kg: float | None = None,
     ) -> Wrench:

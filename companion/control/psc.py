@@ -23,7 +23,7 @@ from companion.control.thrust import collective_n
 from companion.control.types import PlantState, Wrench
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import body_x_z_axes_world
-from companion.model.types import Reference, Vec2, Vec3, Vec8
+from companion.model.types import Chi, Joints, Reference, Vec3
 
 
 class PscController(ModelBasedLaw):
@@ -58,7 +58,7 @@ class PscController(ModelBasedLaw):
         rows = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *e_tau)
         return self._end(dt_s, error, error_rate, rows, force, payload_kg)
 
-    def _vehicle(self, reference: Reference, error: Vec8, error_rate: Vec8, mass_kg: float) -> Vec3:
+    def _vehicle(self, reference: Reference, error: Chi, error_rate: Chi, mass_kg: float) -> Vec3:
         """Return the force on the vehicle, world frame, N."""
         c = self._c
         x, y, z = (
@@ -69,7 +69,7 @@ class PscController(ModelBasedLaw):
         )
         return (x, y, z + mass_kg * GRAVITY_M_S2)
 
-    def _integrate(self, dt_s: float, error: Vec8, airborne: bool, clipped: tuple[bool, bool, bool]) -> None:
+    def _integrate(self, dt_s: float, error: Chi, airborne: bool, clipped: tuple[bool, bool, bool]) -> None:
         """Integrate the position error, except on the ground and while the actuators are saturated."""
         limit = self._c.integral_max_m_s2
         for i, held in enumerate((clipped[1], clipped[1], clipped[0])):
@@ -78,12 +78,12 @@ class PscController(ModelBasedLaw):
                 self._integral_m_s2[i] = max(-limit, min(limit, grown))
 
     def _arm(
-        self, state: PlantState, reference: Reference, error: Vec8, error_rate: Vec8, force: Vec3
-    ) -> tuple[Vec2, Vec2]:
+        self, state: PlantState, reference: Reference, error: Chi, error_rate: Chi, force: Vec3
+    ) -> tuple[Joints, Joints]:
         """Return tau_ext - tau_d and the motor torques, N m."""
         c = self._c
         ext, desired = self._joint_torques_nm(state, force)
-        e_tau: Vec2 = (ext[0] - desired[0], ext[1] - desired[1])
+        e_tau: Joints = (ext[0] - desired[0], ext[1] - desired[1])
         a1, a2 = (
             reference.arm_acceleration_rad_s2[i]
             - (c.arm_damping_kd[i] * error_rate[6 + i] + c.arm_stiffness_kp[i] * error[6 + i] - e_tau[i])

@@ -8,7 +8,7 @@ from companion.config.vehicle import Tool
 from companion.control.manipulator import Manipulator
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_conjugate, quat_multiply, quat_rotate
-from companion.model.types import ForceSample, Quat, Vec2, Vec3, VehicleState
+from companion.model.types import ForceSample, Joints, Quat, Vec3, VehicleState
 
 
 def acceleration_world_m_s2(vehicle: VehicleState) -> Vec3:
@@ -66,7 +66,7 @@ class ForceSensing:
         """Discard the collected samples. The bias stays until `finish_tare`."""
         self._sum, self._count = [0.0, 0.0, 0.0], 0
 
-    def collect(self, sample: ForceSample, attitude_wxyz: Quat, arm_rad: Vec2) -> None:
+    def collect(self, sample: ForceSample, attitude_wxyz: Quat, arm_rad: Joints) -> None:
         """Add one sample at rest to the tare. A repeated sample is counted once."""
         if sample.stamp_s == self._last_stamp_s:
             return
@@ -87,7 +87,7 @@ class ForceSensing:
             )
         return self._count
 
-    def external_world_n(self, sample: ForceSample | None, attitude_wxyz: Quat, arm_rad: Vec2) -> Vec3 | None:
+    def external_world_n(self, sample: ForceSample | None, attitude_wxyz: Quat, arm_rad: Joints) -> Vec3 | None:
         """Return the external force on the net, world frame, N, or None without a sample or a tare."""
         if sample is None or self.bias_sensor_n is None:
             return None
@@ -95,7 +95,7 @@ class ForceSensing:
         x, y, z = quat_rotate(self._to_world(attitude_wxyz, arm_rad), (f[0] - b[0], f[1] - b[1], f[2] - b[2]))
         return (x, y, z + self._net_weight_n)
 
-    def _to_world(self, attitude_wxyz: Quat, arm_rad: Vec2) -> Quat:
+    def _to_world(self, attitude_wxyz: Quat, arm_rad: Joints) -> Quat:
         return quat_multiply(attitude_wxyz, self._manipulator.sensor_attitude_body(arm_rad))
 
 

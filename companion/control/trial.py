@@ -17,7 +17,7 @@ from companion.config.controller import ControllerConfig, law_class
 from companion.config.vehicle import Vehicle
 from companion.control.types import Law, PlantState, Wrench
 from companion.model.constants import TICK_PERIOD_S
-from companion.model.types import IDENTITY_QUAT, Reference, Vec2, Vec3
+from companion.model.types import IDENTITY_QUAT, Joints, Reference, Vec3
 from companion.plugins import CONTROL_LAWS, find, one_line
 
 HOVER_THRUST = 0.5
@@ -60,7 +60,7 @@ def build_law(config: ControllerConfig, vehicle: Vehicle) -> Law:
     return law
 
 
-def try_law(config: ControllerConfig, vehicle: Vehicle, start_arm_rad: Vec2) -> None:
+def try_law(config: ControllerConfig, vehicle: Vehicle, start_arm_rad: Joints) -> None:
     """Build the law and run it for some ticks at hover: on the ground and in the air, with and without a force sample.
 
     Raises:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from companion.model.codec import Record
-from companion.model.types import ControlLog, Quat, Reference, Vec2, Vec3
+from companion.model.types import ControlLog, Joints, Quat, Reference, Vec3
 
 
 class PlantState(Record, frozen=True, kw_only=True):
@@ -17,8 +17,8 @@ class PlantState(Record, frozen=True, kw_only=True):
     """Acceleration from the IMU, gravity removed."""
     attitude_wxyz: Quat
     angular_rate_body_rad_s: Vec3
-    arm_rad: Vec2
-    arm_rate_rad_s: Vec2
+    arm_rad: Joints
+    arm_rate_rad_s: Joints
     force_ext_world_n: Vec3 | None = None
     """Force on the net, tared, without the net's weight, not filtered; None without a valid sample."""
     airborne: bool = True
@@ -30,7 +30,7 @@ class Wrench(Record, frozen=True, kw_only=True):
 
     attitude_wxyz: Quat
     collective_n: float
-    arm_torque_nm: Vec2
+    arm_torque_nm: Joints
     log: ControlLog
 
 

@@ -15,7 +15,7 @@ from companion.control.types import Controller, Law, PlantState
 from companion.model.codec import Record
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_from_euler_zyx, quat_rotate
-from companion.model.types import AttitudeSetpoint, ControlLog, Inputs, Reference, Vec2, Vec3
+from companion.model.types import AttitudeSetpoint, ControlLog, Inputs, Joints, Reference, Vec3
 
 FOLD_RATE_RAD_S = 1.2
 PULL_TIME_S, PULL_LAG_S, PULL_MAX_N = 0.1, 0.05, 100.0
@@ -26,7 +26,7 @@ class Command(Record, frozen=True):
     """Command of one tick, before the gate."""
 
     attitude: AttitudeSetpoint | None = None
-    arm_torque_nm: Vec2 | None = None
+    arm_torque_nm: Joints | None = None
     log: ControlLog | None = None
 
 
@@ -60,8 +60,8 @@ class VehicleControl:
         self._law: Law = law_class(config.controller.law)(config.controller, vehicle, hover_thrust)
         self._controller: Controller = self._law
         fold = vehicle.safety.fold_arm_deg
-        self.fold_rad: Vec2 = (math.radians(fold[0]), math.radians(fold[1]))
-        self._arm_target_rad: Vec2 | None = None
+        self.fold_rad: Joints = (math.radians(fold[0]), math.radians(fold[1]))
+        self._arm_target_rad: Joints | None = None
         self.tracking_error_m: float | None = None
         """Distance from the reference in the last tick in which the law ran, m."""
         self._pull = DisturbanceObserver(
@@ -115,7 +115,7 @@ class VehicleControl:
         )
         return Command(attitude=None, arm_torque_nm=self._hold(i))
 
-    def _hold(self, i: Inputs) -> Vec2 | None:
+    def _hold(self, i: Inputs) -> Joints | None:
         if i.arm is None or i.vehicle is None:
             return None
         target = self._arm_target_rad or i.arm.angle_rad

@@ -14,7 +14,7 @@ from companion.mission.plan import Plan
 from companion.model import flight_stage as seq
 from companion.model.flight_stage import Stage
 from companion.model.negative_zero import without_negative_zero
-from companion.model.types import Event, Outcome, SafetyAction, Severity, Vec2
+from companion.model.types import Event, Joints, Outcome, SafetyAction, Severity
 from companion.safety.autopilot_landing import AutopilotLanding
 from companion.safety.notices import Notice
 from companion.safety.rotor_stop import RotorStop
@@ -32,7 +32,7 @@ class Parameters:
     """Height of the body's origin when the vehicle is on the ground."""
     tilt_max_rad: float
     """`safety.tilt_abort_deg`, in rad."""
-    fold_rad: Vec2
+    fold_rad: Joints
     times: LadderTimes
     waits_for_start: bool
     """Whether the take-off waits for the operator's start command."""

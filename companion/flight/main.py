@@ -37,13 +37,13 @@ from companion.model.types import (
     Event,
     GroundCommand,
     Inputs,
+    Joints,
     OperatorCommand,
     Outcome,
     Outputs,
     SafetyAction,
     Sent,
     Severity,
-    Vec2,
 )
 from companion.recorder.client import RecorderProcess, epoch_offset_ns
 from companion.runtime import ipc
@@ -142,7 +142,7 @@ class Flight:
         # The setpoint first: passing the currents wakes the bus thread, which competes for the interpreter.
         attitude_sent = devices.autopilot.send_attitude(outputs.attitude)
         setpoint_s = self._clock()
-        torque_sent: Vec2 | None = None
+        torque_sent: Joints | None = None
         if outputs.arm_torque_nm is not None and devices.arm is not None:
             torque_sent = devices.arm.write_torque(outputs.arm_torque_nm)
         current_s = self._clock()

@@ -25,10 +25,10 @@ from companion.model.types import (
     AutopilotStatus,
     ForceSample,
     Inputs,
+    Joints,
     LinkIdentity,
     MocapPose,
     Outputs,
-    Vec2,
     VehicleState,
 )
 
@@ -139,7 +139,7 @@ class Arm(Device, Protocol):
     async def read(self, timeout_s: float) -> ArmState | None:
         """Return the newest joint state, whose `read_failures` counts failed reads, or None before the first."""
 
-    def write_torque(self, torque_nm: Vec2) -> Vec2:
+    def write_torque(self, torque_nm: Joints) -> Joints:
         """Command both joint torques, N m. Return the torques that are sent, clipped and rounded to counts."""
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import ruckig
 
 from companion.mission.reference import Shape
-from companion.model.types import Vec2
+from companion.model.types import Joints
 
 _DECIMALS = 12
 """Decimal places to which the times of the profile are rounded, so that a replay on another computer, whose roots differ in the
@@ -30,7 +30,7 @@ JERK_BOUND = 32.0
 class ArmLimits:
     """Limits of the planned joint motion."""
 
-    speed_max_rad_s: Vec2
+    speed_max_rad_s: Joints
     acceleration_max_rad_s2: float
     jerk_max_rad_s3: float
 
@@ -74,7 +74,7 @@ class ArmMotion:
     """Duration planned by Ruckig: the shortest possible, or the requested one if that is longer."""
 
 
-def plan_arm(delta_rad: Vec2, limits: ArmLimits, duration_s: float = 0.0) -> ArmMotion:
+def plan_arm(delta_rad: Joints, limits: ArmLimits, duration_s: float = 0.0) -> ArmMotion:
     """Plan one move; takes a few microseconds.
 
     Args:

@@ -16,7 +16,7 @@ from companion.mission.plan import Plan
 from companion.mission.sample_check import CATCH_NEAR_M, STOP, SampleCheck, Violation
 from companion.mission.segments import Segment
 from companion.model.frames import wrap_rad
-from companion.model.types import PhaseKind, Reference, Vec2, Vec3
+from companion.model.types import Joints, PhaseKind, Reference, Vec3
 from companion.safety.governor import SafeSet
 
 SAMPLE_S = 0.02
@@ -34,7 +34,7 @@ def check_mission(
     *,
     start_position_world_m: Vec3 | None = None,
     start_yaw_rad: float | None = None,
-    start_arm_rad: Vec2 | None = None,
+    start_arm_rad: Joints | None = None,
     phase_origins: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> list[str]:
@@ -135,7 +135,7 @@ def _samples(segment: Segment) -> Iterator[float]:
 
 
 def check_start(
-    mission: Mission, vehicle: Vehicle, position_world_m: Vec3, yaw_rad: float, arm_rad: Vec2 | None
+    mission: Mission, vehicle: Vehicle, position_world_m: Vec3, yaw_rad: float, arm_rad: Joints | None
 ) -> list[str]:
     """Return only the reasons that depend on the measured start; fast enough for a control tick. The arguments are those of
     `check_mission`.
@@ -144,7 +144,7 @@ def check_start(
     return [f"mission '{mission.name}': {text}" for text in found]
 
 
-def _start(mission: Mission, vehicle: Vehicle, position: Vec3, yaw_rad: float, arm_rad: Vec2 | None) -> Iterator[str]:
+def _start(mission: Mission, vehicle: Vehicle, position: Vec3, yaw_rad: float, arm_rad: Joints | None) -> Iterator[str]:
     """Check the vehicle's position, yaw and arm against the mission's start."""
     start = mission.start
     x_m, y_m = start.position_m

@@ -16,7 +16,7 @@ from companion.mission.minsnap import Progress, VehicleLimits, least_line_s
 from companion.mission.plan_builder import PlanBuilder
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED, Track, reference_at
 from companion.mission.segments import Repeats, Segment, counted, flown_phases, phase_name, repeats_of
-from companion.model.types import PhaseKind, Reference, Vec2, Vec3
+from companion.model.types import Joints, PhaseKind, Reference, Vec3
 
 BELOW_GROUND_M = 0.4
 """A landing's reference continues below the floor, so that the vehicle is pressed down until touchdown is detected. A soft controller
@@ -48,7 +48,7 @@ class Plan:
         vehicle: Vehicle,
         start_position_world_m: Vec3 | None = None,
         start_yaw_rad: float | None = None,
-        start_arm_rad: Vec2 | None = None,
+        start_arm_rad: Joints | None = None,
         progress: Progress | None = None,
     ) -> Plan:
         """Plan a mission from the measured start.
@@ -139,7 +139,7 @@ class Plan:
             t_s -= self._repeats.before(t_s) * self._repeats.period_s
         return reference_at(self._position, self._yaw, self._arm, t_s)
 
-    def jerks(self, t_s: float) -> tuple[Vec3, Vec2]:
+    def jerks(self, t_s: float) -> tuple[Vec3, Joints]:
         """Return the third derivatives of position (world frame, m/s^3) and joint angles (rad/s^3), for checks."""
         if self._repeats is not None:
             t_s -= self._repeats.before(t_s) * self._repeats.period_s
@@ -184,8 +184,8 @@ def landing_from(
     position_world_m: Vec3,
     velocity_world_m_s: Vec3,
     yaw_rad: float,
-    arm_rad: Vec2,
-    arm_fold_rad: Vec2,
+    arm_rad: Joints,
+    arm_fold_rad: Joints,
     speed_m_s: float,
     vehicle: Vehicle,
 ) -> Plan:
@@ -259,5 +259,5 @@ def _part(progress: Progress | None, done: int, count: int) -> Progress | None:
     return None if progress is None else lambda share: progress((done + share) / count)
 
 
-def _radians(angle_deg: Vec2) -> Vec2:
+def _radians(angle_deg: Joints) -> Joints:
     return (math.radians(angle_deg[0]), math.radians(angle_deg[1]))

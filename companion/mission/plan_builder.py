@@ -24,7 +24,7 @@ from companion.mission.reference import (
 )
 from companion.mission.segments import Segment
 from companion.model.frames import wrap_rad
-from companion.model.types import Vec2, Vec3
+from companion.model.types import Joints, Vec3
 
 LAND_SPEED_UP_S = 1.0
 LAND_SLOW_DOWN_S = 0.5
@@ -48,7 +48,7 @@ def stopping(velocity_world_m_s: Vec3) -> tuple[Vec3, float]:
 class PlanBuilder:
     """Builder that appends moves to the three tracks. `t_s` is the start of the next phase."""
 
-    def __init__(self, position_world_m: Vec3, yaw_rad: float, arm_rad: Vec2) -> None:
+    def __init__(self, position_world_m: Vec3, yaw_rad: float, arm_rad: Joints) -> None:
         self.t_s = 0.0
         self.segments: list[Segment] = []
         self._initial = (position_world_m, (yaw_rad,), arm_rad)
@@ -108,19 +108,19 @@ class PlanBuilder:
         yaw_rad = self._at[1][0]
         self._go(1, (yaw_rad + wrap_rad(to_yaw_rad - yaw_rad),), self.t_s, duration_s, rest_to_rest)
 
-    def least_arm_s(self, to_rad: Vec2, limits: ArmLimits) -> float:
+    def least_arm_s(self, to_rad: Joints, limits: ArmLimits) -> float:
         """Return the shortest time in which the arm can move to the given pose, s."""
         delta_rad = self._arm_delta(to_rad)
         return plan_arm(delta_rad, limits).duration_s if any(delta_rad) else ARM_LEAST_S
 
-    def move_arm(self, to_rad: Vec2, delay_s: float, duration_s: float, limits: ArmLimits) -> None:
+    def move_arm(self, to_rad: Joints, delay_s: float, duration_s: float, limits: ArmLimits) -> None:
         """Append a move of the arm planned by Ruckig with the given duration."""
         delta_rad = self._arm_delta(to_rad)
         if any(delta_rad):
             profile = plan_arm(delta_rad, limits, duration_s).profile
             self._go(2, to_rad, self.t_s + delay_s, duration_s, profile)
 
-    def fold_arm(self, to_rad: Vec2, duration_s: float) -> None:
+    def fold_arm(self, to_rad: Joints, duration_s: float) -> None:
         """Append a move of the arm without Ruckig, for emergencies."""
         self._go(2, to_rad, self.t_s, duration_s, rest_to_rest)
 
@@ -177,7 +177,7 @@ class PlanBuilder:
         )
         return position, yaw, arm
 
-    def _arm_delta(self, to_rad: Vec2) -> Vec2:
+    def _arm_delta(self, to_rad: Joints) -> Joints:
         first_rad, second_rad = self._at[2]
         return (to_rad[0] - first_rad, to_rad[1] - second_rad)
 

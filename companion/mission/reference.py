@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeAlias
 
-from companion.model.types import Reference, Vec2, Vec3
+from companion.model.types import Joints, Reference, Vec3
 
 Shape: TypeAlias = tuple[float, float, float, float]
 """f, f', f'', f''' of a profile at u in [0, 1]."""
@@ -211,7 +211,7 @@ def reference_at(position: Track, yaw: Track, arm: Track, t_s: float) -> Referen
     )
 
 
-def at_rest(position_world_m: Vec3, yaw_rad: float, arm_rad: Vec2) -> Reference:
+def at_rest(position_world_m: Vec3, yaw_rad: float, arm_rad: Joints) -> Reference:
     """Return a constant reference."""
     zero3: Vec3 = (0.0, 0.0, 0.0)
     return Reference(

@@ -9,7 +9,7 @@ from companion.mission.plan import FOLD_MIN_S, FOLD_SPEED_RAD_S, Plan
 from companion.mission.plan_builder import PlanBuilder, stopping
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED
 from companion.mission.segments import Segment
-from companion.model.types import PhaseKind, Vec2, Vec3
+from companion.model.types import Joints, PhaseKind, Vec2, Vec3
 
 LEAST_WAY_M = 0.5
 """Minimum distance inward, because a tether under tension is shorter than configured or is caught."""
@@ -36,8 +36,8 @@ def retract_from(
     position_world_m: Vec3,
     velocity_world_m_s: Vec3,
     yaw_rad: float,
-    arm_rad: Vec2,
-    arm_fold_rad: Vec2,
+    arm_rad: Joints,
+    arm_fold_rad: Joints,
     vehicle: Vehicle,
     tether: Tether,
 ) -> Plan:

@@ -16,7 +16,7 @@ from companion.config.vehicle import LINK_RADIUS_M, Vehicle
 from companion.control.manipulator import Manipulator
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx
-from companion.model.types import PhaseKind, Quat, Reference, Vec2, Vec3
+from companion.model.types import Joints, PhaseKind, Quat, Reference, Vec3
 from companion.safety.governor import BODY_TOP_M, SafeSet
 from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
@@ -93,7 +93,7 @@ class SampleCheck:
         return most
 
     def violations(
-        self, t_s: float, reference: Reference, jerks: tuple[Vec3, Vec2], kind: PhaseKind
+        self, t_s: float, reference: Reference, jerks: tuple[Vec3, Joints], kind: PhaseKind
     ) -> Iterator[Violation]:
         """Return the violations at one instant. Instants must be passed in chronological order.
 
@@ -254,7 +254,7 @@ class SampleCheck:
                     advice="fly higher or fold the arm first",
                 )
 
-    def _motion(self, reference: Reference, jerks: tuple[Vec3, Vec2]) -> Iterator[Violation]:
+    def _motion(self, reference: Reference, jerks: tuple[Vec3, Joints]) -> Iterator[Violation]:
         limits = self._limits
         speed = math.hypot(*reference.velocity_world_m_s)
         acceleration = math.hypot(*reference.acceleration_world_m_s2)

@@ -19,8 +19,11 @@ from companion.model.codec import Record
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 Vec4 = tuple[float, float, float, float]
-Vec8 = tuple[float, float, float, float, float, float, float, float]
 Quat = tuple[float, float, float, float]
+Joints = tuple[float, ...]
+"""One value for each joint of the arm, from the shoulder outwards; empty if there is no arm."""
+Chi = tuple[float, ...]
+"""Rows of chi = [x y z | roll pitch yaw | joints]: 6 and one for each joint."""
 
 IDENTITY_QUAT: Quat = (1.0, 0.0, 0.0, 0.0)
 
@@ -187,14 +190,14 @@ class ArmState(Record, frozen=True, kw_only=True):
 
     stamp_s: float
     """Flight clock at the end of the joint read."""
-    angle_rad: Vec2
-    velocity_rad_s: Vec2
-    torque_nm: Vec2
+    angle_rad: Joints
+    velocity_rad_s: Joints
+    torque_nm: Joints
     """Joint torque, computed from the present current and the torque constant."""
     hardware_error: tuple[int, int]
     """Hardware error status (register 70) of each servo, 0 if healthy. The companion sets bit 7 after it has restarted a tripped bus
     watchdog."""
-    temperature_c: Vec2
+    temperature_c: Joints
     read_failures: int
     """Number of consecutive bus cycles, up to the newest one, in which not every servo answered."""
     written_s: float | None = None
@@ -236,9 +239,9 @@ class Reference(Record, frozen=True, kw_only=True):
     acceleration_world_m_s2: Vec3
     yaw_rad: float
     yaw_rate_rad_s: float
-    arm_rad: Vec2
-    arm_rate_rad_s: Vec2
-    arm_acceleration_rad_s2: Vec2
+    arm_rad: Joints
+    arm_rate_rad_s: Joints
+    arm_acceleration_rad_s2: Joints
     jerk_world_m_s3: Vec3
     """Reference jerk, used by laws whose acceleration feed-forward has a lead."""
 
@@ -264,15 +267,15 @@ class Event(Record, frozen=True, kw_only=True):
 class ControlLog(Record, frozen=True, kw_only=True):
     """Quantities that the control law computed in one tick. The vectors of 8 are ordered as chi = [p; q; alpha]."""
 
-    error: Vec8
-    error_rate: Vec8
-    sliding: Vec8
-    gamma: Vec8
-    tau: Vec8
+    error: Chi
+    error_rate: Chi
+    sliding: Chi
+    gamma: Chi
+    tau: Chi
     """Generalised force after saturation: N in rows 0 to 2, N m in rows 6 and 7. Rows 3 to 5 are 0, because PX4 controls the
     attitude.
     """
-    e_tau: Vec8
+    e_tau: Chi
     h_hat: Vec4
     zeta: float
     rho: float
@@ -287,10 +290,10 @@ class ControlLog(Record, frozen=True, kw_only=True):
     """Estimated mass of the payload; None if the law does not estimate it."""
     load_estimate_n: Vec3 | None = None
     """Rotor force that compensates for the adapted load, world frame. None if the law does not adapt loads."""
-    moment_estimate_kg_m: Vec2 | None = None
+    moment_estimate_kg_m: Joints | None = None
     """Adapted first moments of links 1 and 2 about their joints, in addition to the nominal moments; None if the law does not adapt
     them."""
-    friction_estimate_nm: Vec2 | None = None
+    friction_estimate_nm: Joints | None = None
     """Adapted friction of both joints; None if the law does not adapt it."""
 
 
@@ -336,7 +339,7 @@ class Outputs(Record, frozen=True, kw_only=True):
     reference: Reference | None = None
     attitude: AttitudeSetpoint | None = None
     """Setpoint for the autopilot; None if no setpoint may be sent in this tick."""
-    arm_torque_nm: Vec2 | None = None
+    arm_torque_nm: Joints | None = None
     """Joint torques for the arm; None if none may be sent in this tick. Without commands, the servos' bus watchdog trips."""
     request: AutopilotRequest
     action: SafetyAction
@@ -358,7 +361,7 @@ class Sent(Record, frozen=True, kw_only=True):
 
     tick: int
     attitude_sent: bool
-    arm_torque_sent_nm: Vec2 | None = None
+    arm_torque_sent_nm: Joints | None = None
     """Torque sent, after rounding to current counts and clipping; None if no currents were sent."""
     start_s: float
     """Flight clock at the beginning of the tick."""

@@ -11,7 +11,7 @@ from companion.control.manipulator import Manipulator
 from companion.control.sensing import ForceSensing
 from companion.model.check_row import Row
 from companion.model.observations import ForceStream, Observations
-from companion.model.types import ForceSample, Quat, Vec2, Vec3
+from companion.model.types import ForceSample, Joints, Quat, Vec3
 from companion.preflight.arm import usb_latency
 from companion.preflight.checks import Check
 
@@ -94,7 +94,7 @@ def stream_rows(
     duration_s: float,
     vehicle: Vehicle,
     device: ForceDevice,
-    pose: tuple[Quat, Vec2] | None,
+    pose: tuple[Quat, Joints] | None,
 ) -> Iterator[Row]:
     """Return the rows of a sensor that was recorded at rest.
 
@@ -166,7 +166,7 @@ def _tare(bias_n: Vec3, net_kg: float, device: ForceDevice) -> Row:
     return (TARE.doubtful if size_n <= TARE_MAX * full_n else TARE.bad)(read, wanted, fix)
 
 
-def tare_bias_n(samples: Sequence[ForceSample], vehicle: Vehicle, attitude: Quat, arm_rad: Vec2) -> Vec3:
+def tare_bias_n(samples: Sequence[ForceSample], vehicle: Vehicle, attitude: Quat, arm_rad: Joints) -> Vec3:
     """Return the bias that a flight's tare would find: the mean reading minus the weight of the net, in the sensor frame."""
     sensing = ForceSensing(vehicle.tool, Manipulator(vehicle.arm, vehicle.tool))
     for sample in samples:

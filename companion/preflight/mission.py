@@ -12,7 +12,7 @@ from companion.config.mission import Start
 from companion.config.vehicle import Room
 from companion.model.check_row import Row
 from companion.model.observations import Observations
-from companion.model.types import Vec2, Vec3
+from companion.model.types import Joints, Vec3
 from companion.preflight.checks import Check
 
 PLAN = Check(
@@ -54,7 +54,7 @@ def rows(o: Observations, config: FlightConfig) -> Iterator[Row]:
         yield _room(pose.position_world_m, vehicle.room, vehicle.airframe.radius_m)
 
 
-def _arm(angle_rad: Vec2, start: Start) -> Row:
+def _arm(angle_rad: Joints, start: Start) -> Row:
     first, second = (math.degrees(angle) for angle in angle_rad)
     off_deg = max(abs(first - start.arm_deg[0]), abs(second - start.arm_deg[1]))
     read = f"({first:.0f}, {second:.0f}) deg"

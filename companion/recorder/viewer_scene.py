@@ -25,7 +25,7 @@ from foxglove.messages import (
     Vector3,
 )
 
-from companion.model.types import Vec2, Vec3
+from companion.model.types import Joints, Vec3
 
 _GREY = Color(r=0.55, g=0.60, b=0.65, a=0.8)
 _DARK = Color(r=0.20, g=0.24, b=0.28, a=1.0)
@@ -49,7 +49,7 @@ class ArmShape:
     """The 2R arm and its net."""
 
     shoulder_body_m: Vec3
-    link_lengths_m: Vec2
+    link_lengths_m: Joints
     net_radius_m: float | None
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from companion.model.types import ArmState, ForceSample, Inputs, Vec2, Vec3
+from companion.model.types import ArmState, ForceSample, Inputs, Joints, Vec2, Vec3
 from companion.safety.situation import HOLDS, Age, Situation, Values
 
 WATCHDOG_RESTARTED = 0x80
@@ -110,7 +110,7 @@ def servo_hot(a: ArmTracker, thresholds: Vec2) -> Values | None:
     return (a.hottest_c, max(thresholds))
 
 
-def servo_overload(a: ArmTracker, torque_max_nm: Vec2) -> Values | None:
+def servo_overload(a: ArmTracker, torque_max_nm: Joints) -> Values | None:
     """Fires if a joint is at its torque limit."""
     if a.arm is None:
         return None

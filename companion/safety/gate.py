@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from companion.config.vehicle import Vehicle
 from companion.model.codec import Record
 from companion.model.frames import tilt_rad
-from companion.model.types import AttitudeSetpoint, Vec2
+from companion.model.types import AttitudeSetpoint, Joints
 
 SLEW_MEMORY_S = 0.1
 """After this time without a setpoint, when PX4 has discarded the previous one, the next may have any value."""
@@ -33,7 +33,7 @@ class Verdict(Record, frozen=True):
     """Commands that may be sent, and the reasons for all rejections and changes."""
 
     attitude: AttitudeSetpoint | None
-    arm_torque_nm: Vec2 | None
+    arm_torque_nm: Joints | None
     refused: tuple[Refusal, ...]
 
 
@@ -56,13 +56,13 @@ class Gate:
     def check(
         self,
         attitude: AttitudeSetpoint | None,
-        arm_torque_nm: Vec2 | None,
-        arm_rad: Vec2 | None,
+        arm_torque_nm: Joints | None,
+        arm_rad: Joints | None,
         arm_fresh: bool,
         *,
         t_s: float = 0.0,
         state_age_s: float = 0.0,
-        arm_rate_rad_s: Vec2 = (0.0, 0.0),
+        arm_rate_rad_s: Joints = (0.0, 0.0),
     ) -> Verdict:
         """Return the commands that may be sent.
 
@@ -128,7 +128,7 @@ class Gate:
         self._last = (t_s, thrust)
         return setpoint
 
-    def _is_free(self, first_nm: float, second_nm: float, arm_rad: Vec2, arm_rate_rad_s: Vec2) -> bool:
+    def _is_free(self, first_nm: float, second_nm: float, arm_rad: Joints, arm_rate_rad_s: Joints) -> bool:
         """Return whether torques, joint angles and speeds are within their limits, as in nearly every tick."""
         (a1, a2), (w1, w2), (most1, most2) = arm_rad, arm_rate_rad_s, self._torque_max_nm
         ((low1, high1), (low2, high2)), (fast1, fast2) = self._limits_rad, self._speed_max_rad_s

@@ -11,7 +11,7 @@ import math
 
 from companion.config.vehicle import Tether, Vehicle
 from companion.model.frames import quat_rotate
-from companion.model.types import Quat, TetherState, Vec2, Vec3
+from companion.model.types import Joints, Quat, TetherState, Vec3
 from companion.safety.stop import StopModel
 from companion.safety.tether_pull import PullEstimate
 from companion.safety.tether_shape import Clearance, steepest_slope
@@ -110,7 +110,7 @@ class TetherWatch:
         position_world_m: Vec3,
         velocity_world_m_s: Vec3,
         attitude_wxyz: Quat,
-        arm_rad: Vec2 | None,
+        arm_rad: Joints | None,
         disturbance_world_n: Vec3 | None,
         tool_force_world_n: Vec3 | None,
     ) -> TetherState:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Tether, Vehicle
-from companion.model.types import Vec2, Vec3
+from companion.model.types import Joints, Vec2, Vec3
 
 _NEVER = 1.0
 """Length, m, over which a line that does not leave the disk is followed."""
@@ -60,7 +60,7 @@ class Clearance:
         self.needs_hanging = self.judges_arm or not self._below
         """False if `least_m` does not use the hanging direction."""
 
-    def least_m(self, straight_body: Vec3, hanging_body: Vec3 | None, arm_rad: Vec2 | None) -> float:
+    def least_m(self, straight_body: Vec3, hanging_body: Vec3 | None, arm_rad: Joints | None) -> float:
         """Return the smallest distance, m; negative if the line touches.
 
         Args:
@@ -103,7 +103,7 @@ class Clearance:
         in_s = (math.sqrt(b * b - flat_2 * (c - inner * inner)) - b) / flat_2
         return min(math.hypot(inner - off, pz), (-pz - max(in_s * dz, out_s * dz)) * flat)
 
-    def _arm_reach_m(self, arm_rad: Vec2) -> float:
+    def _arm_reach_m(self, arm_rad: Joints) -> float:
         """Return the distance of the farthest point of the arm and the net from the shoulder, m."""
         l1, l2 = self._l1, self._l2
         net_m = math.sqrt(max(0.0, l1 * l1 + l2 * l2 + 2.0 * l1 * l2 * math.cos(arm_rad[1])))

@@ -22,7 +22,7 @@ from companion.control.types import Law, PlantState, Wrench
 from companion.model.codec import differences, to_packet
 from companion.model.constants import GRAVITY_M_S2, TICK_PERIOD_S
 from companion.model.frames import quat_from_euler_zyx, quat_rotate, tilt_rad
-from companion.model.types import Reference, Vec2, Vec3
+from companion.model.types import Joints, Reference, Vec3
 
 RANDOM_TICKS = 300
 THRUST_TOLERANCE = 0.03
@@ -77,7 +77,7 @@ def _check_random_inputs(config: FlightConfig, label: str) -> None:
     )
 
 
-def _check_hover(config: FlightConfig, label: str, arm_rad: Vec2) -> None:
+def _check_hover(config: FlightConfig, label: str, arm_rad: Joints) -> None:
     """Check that a law hovers level with hover thrust, and that its integrators do not wind up: time during which the ground or an
     actuator limit keeps the vehicle from its reference must have no effect on later commands.
     """
@@ -111,7 +111,7 @@ def _check_hover(config: FlightConfig, label: str, arm_rad: Vec2) -> None:
 def _held(
     law: Law,
     vehicle: Vehicle,
-    arm_rad: Vec2,
+    arm_rad: Joints,
     offset_m: Vec3,
     airborne: bool,
     duration_s: float,
@@ -146,10 +146,10 @@ def _random_ticks(vehicle: Vehicle) -> Iterator[Tick]:
     def three(most: float) -> Vec3:
         return (draw.uniform(-most, most), draw.uniform(-most, most), draw.uniform(-most, most))
 
-    def two(most: float) -> Vec2:
+    def two(most: float) -> Joints:
         return (draw.uniform(-most, most), draw.uniform(-most, most))
 
-    def angles() -> Vec2:
+    def angles() -> Joints:
         first, second = (draw.uniform(*joint.angle_deg) for joint in vehicle.arm.joints)
         return (math.radians(first), math.radians(second))
 

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from companion.config.vehicle import Joint, Vehicle
 from companion.io.dynamixel.registers import WATCHDOG_ERROR, JointScale, joint_scale
-from companion.model.types import ArmState, Vec2
+from companion.model.types import ArmState, Joints
 from sitl.faults.injector import COOL_C, Faults
 from sitl.servo import registers as reg
 from sitl.servo.bus import ServoLine
@@ -97,7 +97,7 @@ class FastBus:
             if t_s - self._goal_s > self._watchdog_s:
                 drive.set_goal_current(0)
 
-    def write(self, t_s: float, torque_nm: Vec2 | None) -> None:
+    def write(self, t_s: float, torque_nm: Joints | None) -> None:
         """Write the currents for these joint torques. If `torque_nm` is None, only set stale currents to zero."""
         faults = self._faults
         if torque_nm is not None and self._scales is not None:

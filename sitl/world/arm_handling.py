@@ -6,7 +6,7 @@ from typing import Final
 
 from companion.commissioning.arm.poses import steps_of
 from companion.config.vehicle import Arm
-from companion.model.types import Vec2
+from companion.model.types import Joints
 
 MOVE_S: Final = 2.0
 FORGET_S: Final = 1.5
@@ -21,7 +21,7 @@ class ArmHandling:
         angle_rad: joint angles at the start.
     """
 
-    def __init__(self, arm: Arm, angle_rad: Vec2) -> None:
+    def __init__(self, arm: Arm, angle_rad: Joints) -> None:
         self._poses = [step.hand_rad for step in steps_of(arm)]
         self._from = self._to = self._at = angle_rad
         self._moved_s = -MOVE_S
@@ -29,7 +29,7 @@ class ArmHandling:
         self._seen = self._next = 0
         self._limp = True
 
-    def angles_rad(self, t_s: float, limp: bool, angle_rad: Vec2, lights: int, lit: bool) -> Vec2 | None:
+    def angles_rad(self, t_s: float, limp: bool, angle_rad: Joints, lights: int, lit: bool) -> Joints | None:
         """Return the joint angles to hold now, or None while the servos hold the arm.
 
         Args:

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 from companion.config.vehicle import Joint, Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_normalize
-from companion.model.types import Quat, Vec2, Vec3, Vec4
+from companion.model.types import Joints, Quat, Vec2, Vec3, Vec4
 from companion.sitl_config.distributions import with_model_error
 from companion.sitl_config.faults import Fault, FaultKind
 from companion.sitl_config.world import Push, Servo
@@ -94,7 +94,7 @@ class Plant:
         config: WorldConfig,
         px4: Px4,
         drives: Sequence[JointDrive],
-        start: tuple[Vec2, float, Vec2],
+        start: tuple[Vec2, float, Joints],
         *,
         between_steps: bool = False,
     ) -> None:

@@ -11,7 +11,7 @@ import mujoco
 
 from companion.config.vehicle import Vehicle
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import Quat, Vec2, Vec3, Vec4
+from companion.model.types import Joints, Quat, Vec2, Vec3, Vec4
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.air import Air
 from sitl.world.effects.battery import BatteryPack
@@ -41,8 +41,8 @@ class Truth:
     attitude_wxyz: Quat
     angular_rate_body_rad_s: Vec3
     specific_force_body_m_s2: Vec3
-    joint_angle_rad: Vec2
-    joint_velocity_rad_s: Vec2
+    joint_angle_rad: Joints
+    joint_velocity_rad_s: Joints
     force_sensor_n: Vec3
     """Force on the tool side of the sensor, including the weight and inertia of the net, sensor frame."""
     torque_sensor_nm: Vec3
@@ -118,7 +118,7 @@ class World:
     """The physics; `step` advances it by `PHYSICS_DT_S`."""
 
     def __init__(
-        self, vehicle: Vehicle, config: WorldConfig, start_position_m: Vec2, start_yaw_rad: float, arm_rad: Vec2
+        self, vehicle: Vehicle, config: WorldConfig, start_position_m: Vec2, start_yaw_rad: float, arm_rad: Joints
     ):
         self._vehicle = vehicle
         self._config = config
@@ -183,7 +183,7 @@ class World:
         )
         return tuple(effect for effect in effects if effect is not None)
 
-    def _place(self, position_m: Vec2, yaw_rad: float, arm_rad: Vec2) -> None:
+    def _place(self, position_m: Vec2, yaw_rad: float, arm_rad: Joints) -> None:
         q = self.data.qpos
         q[0:3] = (*position_m, self._vehicle.airframe.ground_clearance_m)
         q[3:7] = (math.cos(yaw_rad / 2), 0, 0, math.sin(yaw_rad / 2))
@@ -236,7 +236,7 @@ class World:
         ratio = 1.0 if self.battery is None else self.battery.thrust_ratio(self.battery.hover_v)
         return self._rotors.hover_command(self.weight_n / 4.0, self._rotor_max_n * ratio, self._config.thr_mdl_fac)
 
-    def step(self, rotor_commands: Vec4, joint_torque_nm: Vec2, airborne: bool = True, *, drag: bool = True) -> None:
+    def step(self, rotor_commands: Vec4, joint_torque_nm: Joints, airborne: bool = True, *, drag: bool = True) -> None:
         """Advance by one physics step.
 
         Args:
@@ -293,7 +293,7 @@ class World:
         self.parked = False
         self.data.eq_active[self._park] = 0
 
-    def hold_arm(self, angle_rad: Vec2) -> None:
+    def hold_arm(self, angle_rad: Joints) -> None:
         """Hold both joints at these angles until `release_arm`."""
         self.parked = True
         self.data.eq_active[self._park] = 1

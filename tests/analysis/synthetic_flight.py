@@ -21,6 +21,7 @@ from companion.model.types import (
     FlightMode,
     ForceSample,
     Inputs,
+    Joints,
     LandedState,
     MocapPose,
     OperatorCommand,
@@ -31,7 +32,6 @@ from companion.model.types import (
     SafetyAction,
     Sent,
     Severity,
-    Vec2,
     Vec3,
     VehicleState,
 )
@@ -43,8 +43,8 @@ TAKEOFF_S = 3.0
 CATCH_S = 6.5
 FLIGHT_END_S = 18.0
 LANDED_S = 21.0
-FOLDED_RAD: Vec2 = (math.radians(165), math.radians(140))
-CATCH_RAD: Vec2 = (math.radians(100), math.radians(60))
+FOLDED_RAD: Joints = (math.radians(165), math.radians(140))
+CATCH_RAD: Joints = (math.radians(100), math.radians(60))
 
 CONFIG: dict[str, Any] = {
     "vehicle": {
@@ -84,7 +84,7 @@ def phase_at(mission_t_s: float) -> tuple[str, PhaseKind]:
     return ("land", PhaseKind.LANDING) if mission_t_s < LANDED_S else ("done", PhaseKind.DONE)
 
 
-def reference_at(t_s: float) -> tuple[Vec3, Vec2]:
+def reference_at(t_s: float) -> tuple[Vec3, Joints]:
     up = _blend(t_s / TAKEOFF_S) - _blend((t_s - FLIGHT_END_S) / (LANDED_S - FLIGHT_END_S))
     x = -1.0 + 2.0 * _blend((t_s - 3.5) / 6.0) - 2.0 * _blend((t_s - 10.5) / 6.0)
     open_ = _blend((t_s - 3.5) / 2.0) - _blend((t_s - 15.0) / 2.0)
@@ -235,7 +235,7 @@ def synthetic_flight(
         )
         late_s = abs(noise.gauss(0, 6e-4))
         start_s = t_s + late_s
-        written: Vec2 | None = (
+        written: Joints | None = (
             None if outputs.arm_torque_nm is None else (round(0.35 + kick, 2), round(0.1 - 0.5 * kick, 2))
         )
         core_s = start_s + 9e-4 + abs(noise.gauss(0, 1e-4))

@@ -19,7 +19,7 @@ from companion.analysis.scene import NET, TETHER, Camera, Pose, Scene
 from companion.config.loader import load_vehicle
 from companion.control.manipulator import Manipulator
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
-from companion.model.types import Vec2
+from companion.model.types import Joints
 from tests.analysis.synthetic_flight import CATCH_S, CONFIG, synthetic_flight
 from tests.ground.page_browser import chromium
 from tests.support import ROOT
@@ -75,7 +75,7 @@ def test_a_log_without_geometry_has_no_animation() -> None:
 
 
 @pytest.mark.parametrize("arm_rad", [(math.radians(165), math.radians(140)), (1.2, -0.1)])
-def test_the_net_is_where_the_control_law_has_it(arm_rad: Vec2) -> None:
+def test_the_net_is_where_the_control_law_has_it(arm_rad: Joints) -> None:
     attitude = quat_from_euler_zyx(0.1, -0.2, 2.0)
     pose = Pose(
         position_world_m=(1.0, -0.5, 1.2), attitude_wxyz=attitude, arm_rad=arm_rad, ball_world_m=(), caught=False

@@ -14,7 +14,7 @@ from companion.commissioning.arm.sweep import HANGING_DEG, REACH_DEG, SPEEDS_DEG
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
-from companion.model.types import IDENTITY_QUAT, Vec2
+from companion.model.types import IDENTITY_QUAT, Joints
 from tests.commissioning.arm_rig import SHIPPED
 
 RATE_HZ = 200.0
@@ -46,7 +46,7 @@ def swept(
         for tick in range(int(abs(end_deg - begin_deg) / speed_deg_s * RATE_HZ)):
             angle = [math.radians(deg) for deg in HANGING_DEG]
             angle[joint] = math.radians(begin_deg) + rate * tick / RATE_HZ
-            true: Vec2 = (angle[0] + math.radians(off_deg), angle[1])
+            true: Joints = (angle[0] + math.radians(off_deg), angle[1])
             gravity = manipulator.gravity_torque_nm(true, IDENTITY_QUAT)[joint]
             wander = 0.97 * wander + math.sqrt(1.0 - 0.97**2) * noise_a * rng.standard_normal()
             current = (gravity + way * dry_nm + viscous_nms * rate) / k[joint] + wander

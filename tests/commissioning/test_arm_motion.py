@@ -15,7 +15,7 @@ from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
-from companion.model.types import IDENTITY_QUAT, ArmState, Vec2
+from companion.model.types import IDENTITY_QUAT, ArmState, Joints
 from tests.commissioning.arm_rig import SHIPPED
 from tests.support import tool_of
 
@@ -33,7 +33,7 @@ def vehicle() -> Vehicle:
 class Bench:
     """Two joints with inertia, gravity and dry friction, led by a `Motion`."""
 
-    def __init__(self, vehicle: Vehicle, at_deg: Vec2 = (90.0, 10.0)) -> None:
+    def __init__(self, vehicle: Vehicle, at_deg: Joints = (90.0, 10.0)) -> None:
         self.vehicle = vehicle
         self.manipulator = Manipulator(vehicle.arm, vehicle.tool)
         self.angle = [math.radians(deg) for deg in at_deg]
@@ -42,8 +42,8 @@ class Bench:
         self.temperature_c = 40.0
         self.errors = (0, 0)
         self.sign = (1.0, 1.0)
-        self.disturbance: Callable[[list[float]], Vec2] = lambda _: (0.0, 0.0)
-        self.torque = (0.0, 0.0)
+        self.disturbance: Callable[[list[float]], Joints] = lambda _: (0.0, 0.0)
+        self.torque: Joints = (0.0, 0.0)
         self.motion = Motion(vehicle, self.state())
         self.fastest_deg_s = 0.0
         self.strongest_nm = [0.0, 0.0]
@@ -86,7 +86,7 @@ class Bench:
         raise AssertionError("it never came to an end")
 
     @property
-    def degrees(self) -> Vec2:
+    def degrees(self) -> Joints:
         return math.degrees(self.angle[0]), math.degrees(self.angle[1])
 
 

@@ -16,15 +16,15 @@ from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Arm
 from companion.io.dynamixel.registers import COUNTS_PER_TURN, RAD_PER_COUNT
-from companion.model.types import Vec2
+from companion.model.types import Joints
 from tests.commissioning.arm_rig import SHIPPED
 
 STEP_S = 0.02
-FOLDED: Vec2 = (165.0, 140.0)
+FOLDED: Joints = (165.0, 140.0)
 
 
 @cache
-def arm_with(limits: tuple[Vec2, Vec2] = ((60.0, 175.0), (-10.0, 150.0))) -> Arm:
+def arm_with(limits: tuple[Joints, Joints] = ((60.0, 175.0), (-10.0, 150.0))) -> Arm:
     return load_vehicle(SHIPPED, [f"vehicle.arm.joints[{i}].angle_deg={list(limits[i])}" for i in (0, 1)]
                         + [f"vehicle.safety.fold_arm_deg={[sum(limit) / 2 for limit in limits]}"]).arm  # fmt: skip
 
@@ -47,7 +47,7 @@ class Bench:
         self.t_s += STEP_S
         return self.guide.update(self.t_s, self.counts(), accept)
 
-    def move(self, to: Vec2, steps: int = 40) -> ZeroView:
+    def move(self, to: Joints, steps: int = 40) -> ZeroView:
         begin = list(self.at)
         for i in range(1, steps + 1):
             self.at = [a + i / steps * (b - a) for a, b in zip(begin, to, strict=True)]
@@ -78,7 +78,7 @@ class Bench:
     ),
 )
 def test_every_sign_zero_and_plug_is_reported(
-    signs: Vec2, zeros: Vec2, swapped: bool, limits: tuple[Vec2, Vec2]
+    signs: Joints, zeros: Joints, swapped: bool, limits: tuple[Joints, Joints]
 ) -> None:
     arm = arm_with(limits)
     bench = Bench(arm, [int(s) for s in signs], [int(z) for z in zeros], (1, 0) if swapped else (0, 1))
@@ -156,7 +156,7 @@ def test_an_arm_that_sways_is_not_held() -> None:
 
 
 @pytest.mark.parametrize("limits", [((100.0, 175.0), (-10.0, 150.0)), ((85.0, 100.0), (-10.0, 150.0))])
-def test_joint_limits_that_leave_no_pose_are_one_line(limits: tuple[Vec2, Vec2]) -> None:
+def test_joint_limits_that_leave_no_pose_are_one_line(limits: tuple[Joints, Joints]) -> None:
     with pytest.raises(ConfigError) as caught:
         steps_of(arm_with(limits))
     assert len(caught.value.lines) == 1 and caught.value.lines[0].startswith("arm.joints[")

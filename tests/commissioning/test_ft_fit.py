@@ -12,7 +12,7 @@ from companion.commissioning.force_torque.fit import WeightFit
 from companion.config.loader import load_vehicle
 from companion.control.manipulator import Manipulator
 from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
-from companion.model.types import ForceSample, Quat, Vec2, Vec3
+from companion.model.types import ForceSample, Joints, Quat, Vec3
 from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
 from companion.sitl_config.world import World
 from sitl.world.handling import HungWeight
@@ -20,8 +20,8 @@ from tests.support import ROOT
 
 VEHICLE = load_vehicle(ROOT / "configs/vehicles/tarot650_2r.yaml")
 WEIGHT_KG = 0.5
-FOLDED: Vec2 = (math.radians(165.0), math.radians(140.0))
-HANGING: Vec2 = (math.radians(90.0), 0.0)
+FOLDED: Joints = (math.radians(165.0), math.radians(140.0))
+HANGING: Joints = (math.radians(90.0), 0.0)
 TURNS = sorted(ROTATIONS, key=lambda turn: turn.names)
 
 
@@ -34,7 +34,7 @@ def fitted(
     truth: Quat,
     sensor_rpy_deg: Vec3 = (0.0, 0.0, 0.0),
     *,
-    arm_rad: Vec2 = FOLDED,
+    arm_rad: Joints = FOLDED,
     scale: float = 1.0,
     off_n: Vec3 = (0.0, 0.0, 0.0),
 ) -> WeightFit:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 
 from companion.control.types import PlantState
-from companion.model.types import IDENTITY_QUAT, Vec2, Vec3
+from companion.model.types import IDENTITY_QUAT, Joints, Vec3
 
-POSE: Vec2 = (math.radians(100), math.radians(60))
+POSE: Joints = (math.radians(100), math.radians(60))
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 
 def at(
     position: Vec3 = (0.0, 0.0, 1.0),
     velocity: Vec3 = ZERO,
-    arm: Vec2 = POSE,
-    arm_rate: Vec2 = (0.0, 0.0),
+    arm: Joints = POSE,
+    arm_rate: Joints = (0.0, 0.0),
     force: Vec3 | None = ZERO,
 ) -> PlantState:
     return PlantState(

@@ -14,9 +14,9 @@ from companion.config.loader import FlightConfig, load_flight
 from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.impedance import Impedance
 from companion.control.types import PlantState, Wrench
-from companion.model.types import IDENTITY_QUAT, Reference, Vec2, Vec3
+from companion.model.types import IDENTITY_QUAT, Joints, Reference, Vec3
 
-FOLD: Vec2 = (math.radians(165), math.radians(140))
+FOLD: Joints = (math.radians(165), math.radians(140))
 HOVER = 0.49
 
 
@@ -30,7 +30,7 @@ def law(config: FlightConfig) -> AdaptiveConfig:
     return config.controller
 
 
-def reference(position: Vec3 = (0.0, 0.0, 1.0), arm: Vec2 = FOLD) -> Reference:
+def reference(position: Vec3 = (0.0, 0.0, 1.0), arm: Joints = FOLD) -> Reference:
     zero: Vec3 = (0.0, 0.0, 0.0)
     return Reference(
         position_world_m=position,
@@ -48,8 +48,8 @@ def reference(position: Vec3 = (0.0, 0.0, 1.0), arm: Vec2 = FOLD) -> Reference:
 def state(
     position: Vec3 = (0.0, 0.0, 1.0),
     velocity: Vec3 = (0.0, 0.0, 0.0),
-    arm: Vec2 = FOLD,
-    arm_rate: Vec2 = (0.0, 0.0),
+    arm: Joints = FOLD,
+    arm_rate: Joints = (0.0, 0.0),
     force: Vec3 | None = (0.0, 0.0, 0.0),
 ) -> PlantState:
     zero: Vec3 = (0.0, 0.0, 0.0)

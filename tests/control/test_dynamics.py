@@ -13,7 +13,7 @@ from companion.config.vehicle import Vehicle
 from companion.control.dynamics import Dynamics, DynamicsTerms, chi_rate_from_body_rate, rotation_matrix
 from companion.control.manipulator import Manipulator
 from companion.model.frames import quat_from_euler_zyx
-from companion.model.types import Vec2, Vec3, Vec8
+from companion.model.types import Chi, Joints, Vec3
 from tests.pinocchio_or_skip import pin
 from tests.sitl.test_world_dynamics import oracle
 
@@ -29,7 +29,7 @@ def vehicle() -> Vehicle:
     )
 
 
-def random_state(rng: np.random.Generator) -> tuple[Vec3, Vec2, Vec8]:
+def random_state(rng: np.random.Generator) -> tuple[Vec3, Joints, Chi]:
     """Roll, pitch, yaw; joints; chi'."""
     roll, pitch, yaw = rng.uniform(-1.2, 1.2, 3).tolist()
     a1, a2 = rng.uniform(-3, 3, 2).tolist()
@@ -37,7 +37,7 @@ def random_state(rng: np.random.Generator) -> tuple[Vec3, Vec2, Vec8]:
     return (roll, pitch, yaw), (a1, a2), (a, b, c, d, e, f, g, h)
 
 
-def terms(dynamics: Dynamics, rpy: Vec3, arm: Vec2, rate: Vec8) -> DynamicsTerms:
+def terms(dynamics: Dynamics, rpy: Vec3, arm: Joints, rate: Chi) -> DynamicsTerms:
     return dynamics.terms(rotation_matrix(quat_from_euler_zyx(*rpy)), rpy, arm, rate)
 
 
@@ -62,7 +62,7 @@ def to_twist(rpy: Vec3) -> Array:
     return out
 
 
-def to_twist_rate(rpy: Vec3, rate: Vec8) -> Array:
+def to_twist_rate(rpy: Vec3, rate: Chi) -> Array:
     """d/dt of `to_twist`, by a complex-free fourth-order difference."""
 
     def at(h: float) -> Array:
@@ -106,7 +106,7 @@ def test_mass_is_symmetric_and_positive_and_changes_as_twice_coriolis_power(vehi
         np.testing.assert_allclose(mass, mass.T, atol=1e-14)
         assert np.linalg.eigvalsh(mass).min() > 0
 
-        def power(step: float, rpy: Vec3 = rpy, arm: Vec2 = arm, rate: Vec8 = rate) -> float:
+        def power(step: float, rpy: Vec3 = rpy, arm: Joints = arm, rate: Chi = rate) -> float:
             moved = (rpy[0] + step * rate[3], rpy[1] + step * rate[4], rpy[2] + step * rate[5])
             joints = (arm[0] + step * rate[6], arm[1] + step * rate[7])
             return float(np.array(rate) @ np.array(terms(dynamics, moved, joints, rate).mass) @ np.array(rate))
@@ -121,7 +121,7 @@ def test_arm_alone_is_the_arm_block_at_rest(vehicle: Vehicle) -> None:
     rng = np.random.default_rng(6)
     for _ in range(20):
         rpy, arm, rate = random_state(rng)
-        still: Vec8 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, rate[6], rate[7])
+        still: Chi = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, rate[6], rate[7])
         whole, alone = terms(dynamics, rpy, arm, still), dynamics.arm_terms(arm, (rate[6], rate[7]))
         np.testing.assert_allclose(np.array(whole.mass)[6:, 6:], np.array(alone.mass), atol=1e-14)
         np.testing.assert_allclose(whole.coriolis[6:], alone.coriolis, atol=1e-12)

@@ -17,7 +17,7 @@ from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.load_adaptation import LoadAdaptation
 from companion.control.manipulator import Manipulator
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import IDENTITY_QUAT, ControlLog, Reference, Vec2
+from companion.model.types import IDENTITY_QUAT, ControlLog, Joints, Reference
 from tests.control.states import POSE, ZERO, at
 from tests.support import tool_of
 
@@ -72,8 +72,8 @@ def test_moments_and_friction_are_found_while_the_arm_moves() -> None:
     s = np.zeros(2)
     for tick in range(12000):
         t_s = tick * DT_S
-        angle: Vec2 = (1.9 + 0.6 * math.sin(0.9 * t_s), 1.2 + 0.6 * math.sin(1.3 * t_s))
-        rate: Vec2 = (0.54 * math.cos(0.9 * t_s), 0.78 * math.cos(1.3 * t_s))
+        angle: Joints = (1.9 + 0.6 * math.sin(0.9 * t_s), 1.2 + 0.6 * math.sin(1.3 * t_s))
+        rate: Joints = (0.54 * math.cos(0.9 * t_s), 0.78 * math.cos(1.3 * t_s))
         u1, u2 = manipulator.gravity_levers_m_s2(angle, 0.0, GRAVITY_M_S2)
         turning = np.tanh(np.array(rate) / 0.1)
         needed = np.array([moments[0] * u1 + moments[1] * u2, -moments[1] * u2]) + friction * turning

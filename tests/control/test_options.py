@@ -15,9 +15,9 @@ from companion.control.arm_inertia import ArmInertia
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.dynamics import Dynamics
 from companion.control.types import PlantState
-from companion.model.types import IDENTITY_QUAT, Reference, Vec2, Vec3
+from companion.model.types import IDENTITY_QUAT, Joints, Reference, Vec3
 
-POSE: Vec2 = (math.radians(100), math.radians(60))
+POSE: Joints = (math.radians(100), math.radians(60))
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 OFF: dict[str, Any] = {
     "disturbance_time_xyz_s": ZERO,
@@ -32,7 +32,7 @@ def config() -> FlightConfig:
     return load_flight("configs/missions/catch.yaml", preset="recommended")
 
 
-def tau(config: FlightConfig, option: dict[str, Any], reference: Reference, rate: Vec2 = (0.0, 0.0)) -> list[float]:
+def tau(config: FlightConfig, option: dict[str, Any], reference: Reference, rate: Joints = (0.0, 0.0)) -> list[float]:
     assert isinstance(config.controller, AdaptiveConfig)
     controller = AdaptiveController(config.controller.model_copy(update=OFF | option), config.vehicle, 0.49)
     state = PlantState(
@@ -49,7 +49,7 @@ def tau(config: FlightConfig, option: dict[str, Any], reference: Reference, rate
 
 
 def difference(
-    config: FlightConfig, option: dict[str, Any], reference: Reference, rate: Vec2 = (0.0, 0.0)
+    config: FlightConfig, option: dict[str, Any], reference: Reference, rate: Joints = (0.0, 0.0)
 ) -> list[float]:
     with_it, without = tau(config, option, reference, rate), tau(config, {}, reference, rate)
     return [a - b for a, b in zip(with_it, without, strict=True)]

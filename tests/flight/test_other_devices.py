@@ -31,11 +31,11 @@ from companion.model.types import (
     AutopilotStatus,
     FlightMode,
     ForceSample,
+    Joints,
     LandedState,
     LinkIdentity,
     MocapPose,
     Outcome,
-    Vec2,
     Vec3,
     VehicleState,
 )
@@ -57,7 +57,7 @@ class Standing:
         start = config.mission.start
         self.clock = clock
         self.position_m: Vec3 = (*start.position_m, config.vehicle.airframe.ground_clearance_m)
-        self.arm_rad: Vec2 = (math.radians(start.arm_deg[0]), math.radians(start.arm_deg[1]))
+        self.arm_rad: Joints = (math.radians(start.arm_deg[0]), math.radians(start.arm_deg[1]))
 
     async def __aenter__(self) -> Self:
         return self
@@ -182,7 +182,7 @@ class OtherArm(Standing):
     async def read(self, timeout_s: float) -> ArmState | None:
         return self.latest()
 
-    def write_torque(self, torque_nm: Vec2) -> Vec2:
+    def write_torque(self, torque_nm: Joints) -> Joints:
         return torque_nm
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from companion.mission.arm_motion import ArmLimits, plan_arm
 from companion.mission.reference import Move
-from companion.model.types import Vec2
+from companion.model.types import Joints
 
 LIMITS = ArmLimits((math.radians(90.0), math.radians(90.0)), math.radians(180.0), math.radians(600.0))
 limit = st.floats(0.1, 20.0)
@@ -18,7 +18,7 @@ limits_of_any_kind = st.builds(ArmLimits, st.tuples(limit, limit), limit, st.flo
 delta = st.floats(-3.2, 3.2)
 
 
-def used(delta_rad: Vec2, limits: ArmLimits, move: Move) -> list[float]:
+def used(delta_rad: Joints, limits: ArmLimits, move: Move) -> list[float]:
     """Largest share of each limit: speed, acceleration, jerk."""
     worst = [0.0, 0.0, 0.0]
     for index in range(1000):
@@ -33,7 +33,7 @@ def used(delta_rad: Vec2, limits: ArmLimits, move: Move) -> list[float]:
 
 
 @given(st.tuples(delta, delta), limits_of_any_kind, st.one_of(st.just(0.0), st.floats(0.1, 60.0)))
-def test_any_move_keeps_its_limits_and_ends_at_rest(delta_rad: Vec2, limits: ArmLimits, duration_s: float) -> None:
+def test_any_move_keeps_its_limits_and_ends_at_rest(delta_rad: Joints, limits: ArmLimits, duration_s: float) -> None:
     assume(max(map(abs, delta_rad)) > 1e-6)
     motion = plan_arm(delta_rad, limits, duration_s)
     assert motion.duration_s >= duration_s
@@ -50,7 +50,7 @@ def test_any_move_keeps_its_limits_and_ends_at_rest(delta_rad: Vec2, limits: Arm
 
 
 @given(st.tuples(delta, delta), limits_of_any_kind, st.floats(0.1, 60.0))
-def test_value_speed_and_acceleration_do_not_jump(delta_rad: Vec2, limits: ArmLimits, duration_s: float) -> None:
+def test_value_speed_and_acceleration_do_not_jump(delta_rad: Joints, limits: ArmLimits, duration_s: float) -> None:
     assume(max(map(abs, delta_rad)) > 1e-6)
     profile = plan_arm(delta_rad, limits, duration_s).profile
     for knot in profile.knots[1:]:

@@ -27,7 +27,7 @@ from companion.mission.reference import (
     speed_up,
     steady,
 )
-from companion.model.types import PhaseKind, Reference, Vec2, Vec3
+from companion.model.types import Joints, PhaseKind, Reference, Vec3
 from tests.support import tool_of
 
 ROOT = Path(__file__).parents[2]
@@ -36,7 +36,7 @@ CIRCUIT = load_flight(ROOT / "configs/missions/circuit.yaml").mission
 VEHICLE = CONFIG.vehicle
 CLEARANCE_M = VEHICLE.airframe.ground_clearance_m
 START: Vec3 = (-1.0, 0.0, CLEARANCE_M)
-FOLD: Vec2 = (math.radians(165.0), math.radians(140.0))
+FOLD: Joints = (math.radians(165.0), math.radians(140.0))
 
 length = st.floats(-5.0, 5.0)
 duration = st.floats(0.2, 20.0)
@@ -113,7 +113,7 @@ def missions(draw: st.DrawFn) -> Mission:
 
 @given(missions(), point, angle, st.one_of(st.none(), st.tuples(angle, angle)))
 def test_any_plan_is_smooth_and_without_gaps(
-    mission: Mission, start: Vec3, yaw_rad: float, arm_rad: Vec2 | None
+    mission: Mission, start: Vec3, yaw_rad: float, arm_rad: Joints | None
 ) -> None:
     plan = Plan.build(mission, VEHICLE, start, yaw_rad, arm_rad)
     assert_smooth(plan)
@@ -126,7 +126,7 @@ def test_any_plan_is_smooth_and_without_gaps(
 
 @given(point, st.tuples(length, length, length), angle, st.tuples(angle, angle), st.floats(0.05, 1.0))
 def test_any_landing_is_smooth_and_ends_folded_below_the_floor(
-    position: Vec3, velocity: Vec3, yaw_rad: float, arm_rad: Vec2, speed_m_s: float
+    position: Vec3, velocity: Vec3, yaw_rad: float, arm_rad: Joints, speed_m_s: float
 ) -> None:
     plan = landing_from(position, velocity, yaw_rad, arm_rad, FOLD, speed_m_s, VEHICLE)
     start, end = plan.reference(0.0), plan.reference(plan.duration_s)

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from companion.config.loader import load_vehicle
 from companion.mission.plan_builder import STOP_SPEED_MAX_M_S
 from companion.mission.retract import BESIDE_ANCHOR_M, inward_only, retract_from
-from companion.model.types import Vec2, Vec3
+from companion.model.types import Joints, Vec3
 from tests.support import tether_of
 
 VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
 ANCHOR = tether_of(VEHICLE).anchor_world_m
-FOLD: Vec2 = (math.radians(165.0), math.radians(140.0))
+FOLD: Joints = (math.radians(165.0), math.radians(140.0))
 RADIUS_M = VEHICLE.airframe.radius_m
 ROOM = VEHICLE.room
 
@@ -34,7 +34,7 @@ def away_m(p: Vec3) -> float:
 
 
 @given(inside, velocity, angle, st.tuples(angle, angle))
-def test_from_anywhere(position: Vec3, speed: Vec3, yaw_rad: float, arm_rad: Vec2) -> None:
+def test_from_anywhere(position: Vec3, speed: Vec3, yaw_rad: float, arm_rad: Joints) -> None:
     plan = retract_from(position, speed, yaw_rad, arm_rad, FOLD, VEHICLE, tether_of(VEHICLE))
     before = plan.reference(0.0)
     assert before.position_world_m == pytest.approx(position)

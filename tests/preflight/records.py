@@ -21,16 +21,16 @@ from companion.model.types import (
     AutopilotStatus,
     FlightMode,
     ForceSample,
+    Joints,
     LandedState,
     MocapPose,
-    Vec2,
     VehicleState,
 )
 from companion.px4 import required
 from tests.support import CATCH
 
 START_S, SPAN_S = 2.0, 5.0
-ARM_RAD: Vec2 = (math.radians(165.0), math.radians(140.0))
+ARM_RAD: Joints = (math.radians(165.0), math.radians(140.0))
 PARAMS = {**{one.name: one.value for one in required.WANTED if one.value is not None}, required.HOVER: 0.49}
 FLAGS = 447
 """As PX4 1.16 says it of a machine that stands and fuses motion capture, with a global origin."""

@@ -12,6 +12,7 @@ from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import (
     ArmState,
     AutopilotStatus,
+    Chi,
     ControlLog,
     Event,
     FlightMode,
@@ -21,7 +22,6 @@ from companion.model.types import (
     MocapPose,
     OperatorCommand,
     TetherState,
-    Vec8,
     VehicleState,
 )
 from companion.safety.monitors import Monitors
@@ -30,7 +30,7 @@ from companion.safety.situation import Situation
 TICK_S = 0.005
 START_S = 10.0
 ZERO3 = (0.0, 0.0, 0.0)
-ZERO8: Vec8 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+ZERO8: Chi = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 SLOW = TetherState(
     range_m=1.8,
     slack_m=1.2,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_from_euler_zyx, tilt_rad
-from companion.model.types import AttitudeSetpoint, Vec2
+from companion.model.types import AttitudeSetpoint, Joints
 from companion.safety.gate import Gate
 
 NAN = math.nan
@@ -64,7 +64,9 @@ def test_a_good_setpoint_leaves_as_it_is(vehicle: Vehicle) -> None:
         ((0.2, -1.0), (2.0, math.radians(-11)), True, (0.2, 0.0)),  # past the lower wall of joint 2
     ],
 )
-def test_joint_torques(vehicle: Vehicle, torque: Vec2, angle: Vec2 | None, fresh: bool, leaves: Vec2 | None) -> None:
+def test_joint_torques(
+    vehicle: Vehicle, torque: Joints, angle: Joints | None, fresh: bool, leaves: Joints | None
+) -> None:
     assert Gate(vehicle).check(None, torque, angle, fresh).arm_torque_nm == leaves
 
 
@@ -78,9 +80,9 @@ def test_joint_torques(vehicle: Vehicle, torque: Vec2, angle: Vec2 | None, fresh
     ],
 )
 def test_a_joint_that_is_too_fast_is_only_braked(
-    vehicle: Vehicle, torque: Vec2, rate_deg_s: Vec2, leaves: Vec2
+    vehicle: Vehicle, torque: Joints, rate_deg_s: Joints, leaves: Joints
 ) -> None:
-    rate: Vec2 = (math.radians(rate_deg_s[0]), math.radians(rate_deg_s[1]))
+    rate: Joints = (math.radians(rate_deg_s[0]), math.radians(rate_deg_s[1]))
     assert Gate(vehicle).check(None, torque, (2.0, 1.0), True, arm_rate_rad_s=rate).arm_torque_nm == leaves
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_from_euler_zyx
-from companion.model.types import Outcome, Outputs, PhaseKind, Quat, SafetyAction, TetherState, Vec2, Vec3
+from companion.model.types import Joints, Outcome, Outputs, PhaseKind, Quat, SafetyAction, TetherState, Vec3
 from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
 from companion.safety.tether_shape import Clearance, steepest_slope
@@ -23,8 +23,8 @@ from tests.support import tether_of
 
 LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
 STILL: Vec3 = (0.0, 0.0, 0.0)
-FOLDED: Vec2 = (math.radians(165.0), math.radians(140.0))
-DOWN: Vec2 = (math.radians(90.0), 0.0)
+FOLDED: Joints = (math.radians(165.0), math.radians(140.0))
+DOWN: Joints = (math.radians(90.0), 0.0)
 DT_S = 0.005
 ANCHOR: Vec3 = (0.0, -1.2, 0.0)
 LENGTH_M = 3.0
@@ -181,7 +181,7 @@ def test_the_arm_counts_when_the_line_is_tied_beside_it() -> None:
     assert clearance(machine).judges_arm
     watch = watch_of(machine)
 
-    def clear(p: Vec3, yaw_deg: float, arm: Vec2 | None) -> float:
+    def clear(p: Vec3, yaw_deg: float, arm: Joints | None) -> float:
         q = quat_from_euler_zyx(0.0, 0.0, math.radians(yaw_deg))
         return watch.update(0.0, p, STILL, q, arm, None, None).clearance_m
 

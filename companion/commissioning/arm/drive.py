@@ -12,7 +12,7 @@ from companion.commissioning.arm.motion import Motion, Moved, gentle
 from companion.config.vehicle import Vehicle
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.protocols import DeviceError
-from companion.model.types import ArmState, Vec2
+from companion.model.types import ArmState, Joints
 from companion.runtime.clock import flight_clock
 from companion.runtime.realtime import FLIGHT_PRIORITY, realtime_thread
 from companion.runtime.terminal import Bars
@@ -25,7 +25,7 @@ _READ_TIMEOUT_S: Final = 0.03
 class Leader(Protocol):
     """Decides the motion of the arm."""
 
-    def begin(self, state: ArmState) -> Sequence[Vec2]:
+    def begin(self, state: ArmState) -> Sequence[Joints]:
         """Return the poses (rad) that the arm will move to, as far as they are known."""
         ...
 
@@ -44,8 +44,8 @@ class Driven:
 
     stop: str
     """Why the motion ended early, one line; empty if the leader ended it."""
-    angle_deg: Vec2
-    load_max_nm: Vec2
+    angle_deg: Joints
+    load_max_nm: Joints
     """Largest torque of each joint in addition to gravity."""
 
 
@@ -97,7 +97,7 @@ async def _drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
             await asyncio.sleep(due_s - clock())
 
 
-def _show(bars: Bars, limits_deg: Sequence[Vec2], state: ArmState, moved: Moved) -> None:
+def _show(bars: Bars, limits_deg: Sequence[Joints], state: ArmState, moved: Moved) -> None:
     degrees = [math.degrees(angle) for angle in state.angle_rad]
     bars.show(
         [(deg - low) / (high - low) for deg, (low, high) in zip(degrees, limits_deg, strict=True)],

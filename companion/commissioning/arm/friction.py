@@ -20,7 +20,7 @@ from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
-from companion.model.types import IDENTITY_QUAT, Vec2
+from companion.model.types import IDENTITY_QUAT, Joints
 
 BIN_S: Final = 0.25
 """Samples are averaged over this time, because the samples of neighbouring control ticks are not independent."""
@@ -179,7 +179,7 @@ def _binned(samples: Sequence[Sample], vehicle: Vehicle, joint: int) -> tuple[_A
     began: dict[int, float] = {}
     for one in samples:
         since = one.t_s - began.setdefault(one.leg, one.t_s)
-        turned: Vec2 = (one.angle_rad[0] + small, one.angle_rad[1])
+        turned: Joints = (one.angle_rad[0] + small, one.angle_rad[1])
         gravity = manipulator.gravity_torque_nm(one.angle_rad, IDENTITY_QUAT)[joint]
         slope = (manipulator.gravity_torque_nm(turned, IDENTITY_QUAT)[joint] - gravity) / small
         row = (gravity, float(one.direction), one.velocity_rad_s, slope, one.current_a)

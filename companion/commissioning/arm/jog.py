@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Final
 
 from companion.commissioning.arm.motion import SPEED_MAX_DEG_S, Motion, Moved
-from companion.model.types import ArmState, Vec2
+from companion.model.types import ArmState, Joints
 
 STEP_DEG: Final = 2.0
 """Motion per key press; a held key repeats before the motion ends."""
@@ -42,7 +42,7 @@ class ByKeys:
         self._ends_s = math.inf
         self._moving = False
 
-    def begin(self, state: ArmState) -> list[Vec2]:
+    def begin(self, state: ArmState) -> list[Joints]:
         """Return the current pose of the arm."""
         self._ends_s = state.stamp_s + IDLE_S
         return [state.angle_rad]

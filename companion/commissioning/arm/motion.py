@@ -14,7 +14,7 @@ from companion.config.vehicle import Arm, Vehicle
 from companion.control.arm_hold import hold_torque_nm
 from companion.control.manipulator import Manipulator
 from companion.io.dynamixel.registers import WATCHDOG_ERROR, hardware_error_text
-from companion.model.types import IDENTITY_QUAT, ArmState, Vec2
+from companion.model.types import IDENTITY_QUAT, ArmState, Joints
 
 SPEED_MAX_DEG_S: Final = 20.0
 ACCELERATION_DEG_S2: Final = 60.0
@@ -51,10 +51,10 @@ def limits_deg(arm: Arm, joint: int) -> tuple[float, float]:
 class Moved:
     """Result of one control step."""
 
-    torque_nm: Vec2
-    reference_rad: Vec2
-    reference_rate_rad_s: Vec2
-    load_nm: Vec2
+    torque_nm: Joints
+    reference_rad: Joints
+    reference_rate_rad_s: Joints
+    load_nm: Joints
     """Torque beyond gravity."""
     reached: bool
     """Whether reference and joint are at the goal."""
@@ -85,7 +85,7 @@ class Motion:
         """Largest torque beyond gravity so far."""
 
     @property
-    def reference_rad(self) -> Vec2:
+    def reference_rad(self) -> Joints:
         """The reference of both joints."""
         return (self._reference[0], self._reference[1])
 
@@ -108,7 +108,7 @@ class Motion:
         self._goal = list(self._reference)
         self._rate = [0.0, 0.0]
 
-    def refusal(self, poses_rad: Sequence[Vec2]) -> str:
+    def refusal(self, poses_rad: Sequence[Joints]) -> str:
         """Return why the arm must not move to these poses (rad); empty if it may."""
         for pose in poses_rad:
             gravity = self._manipulator.gravity_torque_nm(pose, IDENTITY_QUAT)
@@ -181,7 +181,7 @@ class Motion:
         self._integral[joint] = max(-_INTEGRAL_MAX_NM, min(_INTEGRAL_MAX_NM, grown))
         return max(-most, min(most, held_nm + self._integral[joint]))
 
-    def _stop(self, state: ArmState, load: Vec2) -> str:
+    def _stop(self, state: ArmState, load: Joints) -> str:
         safety = self._vehicle.safety
         for joint in (0, 1):
             name = f"joint {joint + 1}"

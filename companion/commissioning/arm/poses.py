@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from companion.config.document import ConfigError
 from companion.config.vehicle import Arm, Joint
-from companion.model.types import Vec2
+from companion.model.types import Joints
 
 SWING_DEG, SWING_MIN_DEG = 45.0, 25.0
 """Swing of a joint whose limits exclude a turn to an exact direction."""
@@ -36,11 +36,11 @@ class Step:
     """Angle by which the joint moves."""
     exact: bool
     """Whether the step ends in a direction that can be held exactly; if not, only the direction of the motion is used."""
-    pose_deg: Vec2
+    pose_deg: Joints
     """Both joints at the end; approximate if not exact."""
 
     @property
-    def hand_rad(self) -> Vec2:
+    def hand_rad(self) -> Joints:
         """Return the angles of both joints at the end of the step."""
         return (math.radians(self.pose_deg[0]), math.radians(self.pose_deg[1]))
 

@@ -10,7 +10,7 @@ from typing import Final
 from companion.commissioning.arm.motion import Motion, Moved, limits_deg
 from companion.config.document import ConfigError
 from companion.config.vehicle import Arm
-from companion.model.types import ArmState, Vec2
+from companion.model.types import ArmState, Joints
 
 HANGING_DEG: Final = (90.0, 0.0)
 SPEEDS_DEG_S: Final = (9.0, 18.0)
@@ -42,7 +42,7 @@ class Sample:
     joint: int
     direction: int
     t_s: float
-    angle_rad: Vec2
+    angle_rad: Joints
     velocity_rad_s: float
     current_a: float
     """Motor current, positive in the direction of the joint angle."""
@@ -72,7 +72,7 @@ def legs_of(arm: Arm) -> tuple[Leg, ...]:
     return tuple(legs)
 
 
-def duration_s(legs: Sequence[Leg], start_deg: Vec2) -> float:
+def duration_s(legs: Sequence[Leg], start_deg: Joints) -> float:
     """Return the approximate duration of the legs, s."""
     at = list(start_deg)
     total = 0.0
@@ -98,7 +98,7 @@ class Sweeper:
         self._steady_since_s: float | None = None
         self._stamp_s = 0.0
 
-    def begin(self, state: ArmState) -> list[Vec2]:
+    def begin(self, state: ArmState) -> list[Joints]:
         """Return every pose from here to the end of the last leg."""
         at, poses = list(state.angle_rad), [state.angle_rad]
         for leg in self.legs:

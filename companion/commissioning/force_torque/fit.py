@@ -18,7 +18,7 @@ from companion.config.vehicle import Vehicle
 from companion.model.check_row import Row
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
-from companion.model.types import ForceSample, Quat, Vec2, Vec3
+from companion.model.types import ForceSample, Joints, Quat, Vec3
 from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
 from companion.preflight.checks import Check
 from companion.preflight.hand_test.motion import angle_rad, norm
@@ -61,13 +61,13 @@ class WeightFit:
     """Value of `tool.sensor_rpy_deg` with that rotation."""
 
 
-def down_in_link2(arm_rad: Vec2) -> Vec3:
+def down_in_link2(arm_rad: Joints) -> Vec3:
     """Return gravity's direction in link 2's frame for a level vehicle."""
     half = 0.5 * (arm_rad[0] - arm_rad[1])
     return quat_rotate((math.cos(half), 0.0, -math.sin(half), 0.0), (0.0, 0.0, -1.0))
 
 
-def fit_weight(empty_n: Vec3, loaded_n: Vec3, arm_rad: Vec2, weight_kg: float, sensor_rpy_deg: Vec3) -> WeightFit:
+def fit_weight(empty_n: Vec3, loaded_n: Vec3, arm_rad: Joints, weight_kg: float, sensor_rpy_deg: Vec3) -> WeightFit:
     """Return the sensor's scale and mounting. The mounting is the one of the 24 rotations by multiples of 90 deg that best fits the
     direction of the weight; the configured mounting is kept if it is within 1 deg of the best.
 

@@ -27,7 +27,7 @@ from companion.io.protocols import DeviceError
 from companion.model.check_row import Row
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.observations import ForceStream
-from companion.model.types import IDENTITY_QUAT, ForceSample, Vec2
+from companion.model.types import IDENTITY_QUAT, ForceSample, Joints
 from companion.preflight import force as preflight
 from companion.preflight.arm import usb_latency
 from companion.preflight.checks import Check
@@ -56,14 +56,14 @@ class Watched:
     """Measurement of the sensor at rest and, if requested, with a known weight."""
 
     empty: Sequence[ForceSample]
-    arm_rad: Vec2
+    arm_rad: Joints
     stream: ForceStream
     usb_latency_ms: int | None
     weight_kg: float | None
     """Known weight given by the user; None if none was given."""
     loaded: Sequence[ForceSample] = ()
     """Samples with the weight on the net; empty if no weight was detected."""
-    loaded_arm_rad: Vec2 = (0.0, 0.0)
+    loaded_arm_rad: Joints = (0.0, 0.0)
     problem: str = ""
     """Why a device failed after the measurement at rest; empty if none did."""
 
@@ -165,7 +165,7 @@ class Tared:
     samples: Sequence[ForceSample]
     first: Sequence[ForceSample]
     """The first samples, as many as the tare of a flight uses."""
-    arm_rad: Vec2
+    arm_rad: Joints
     zeroed: Sequence[ForceSample] = ()
     """Samples after the sensor's own zero was set; empty if it was not."""
 

@@ -16,7 +16,7 @@ from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.force_torque.driver import RobotousForceTorque
 from companion.io.force_torque.rft import Command
 from companion.io.protocols import DeviceError
-from companion.model.types import Vec2, Vec3
+from companion.model.types import Joints, Vec3
 from companion.preflight.force import mean_force_n
 from companion.runtime.clock import Clock
 
@@ -63,7 +63,7 @@ def tool_of(vehicle: Vehicle) -> Tool:
     return vehicle.tool
 
 
-def pose_rad(text: str | None, vehicle: Vehicle) -> Vec2 | None:
+def pose_rad(text: str | None, vehicle: Vehicle) -> Joints | None:
     """Parse `--arm-pose`.
 
     Raises:
@@ -84,19 +84,19 @@ def pose_rad(text: str | None, vehicle: Vehicle) -> Vec2 | None:
 
 @contextlib.asynccontextmanager
 async def arm_angles(
-    vehicle: Vehicle, clock: Clock, given_rad: Vec2 | None
-) -> AsyncIterator[Callable[[], Awaitable[Vec2]]]:
+    vehicle: Vehicle, clock: Clock, given_rad: Joints | None
+) -> AsyncIterator[Callable[[], Awaitable[Joints]]]:
     """Yield a function that returns the given joint angles, or reads them from the servos without torque.
 
     Raises:
         DeviceError: the arm's bus cannot be opened, or the servos stop answering.
     """
 
-    async def given() -> Vec2:
+    async def given() -> Joints:
         assert given_rad is not None
         return given_rad
 
-    async def read() -> Vec2:
+    async def read() -> Joints:
         state = await arm.read(0.5)
         if state is None or state.read_failures:
             raise DeviceError(f"arm: the servos no longer answer; {arm.problem or 'check their cable'}")

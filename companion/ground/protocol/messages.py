@@ -25,7 +25,7 @@ from typing import TypeVar
 
 from companion.ground.protocol.strict_json import StrictJsonError, parse
 from companion.model.codec import Record, RecordError, from_jsonable, to_json
-from companion.model.types import Quat, Vec2, Vec3, Vec4
+from companion.model.types import Joints, Quat, Vec3, Vec4
 
 VERSION = 2
 ROOT = "companion"
@@ -112,11 +112,11 @@ class Scene(Record, frozen=True, kw_only=True):
     """Horizontal reach including the rotor disks."""
     ground_clearance_m: float
     shoulder_body_m: Vec3
-    link_lengths_m: Vec2
+    link_lengths_m: Joints
     net_radius_m: float | None = None
     """None without a net."""
-    joint_min_rad: Vec2
-    joint_max_rad: Vec2
+    joint_min_rad: Joints
+    joint_max_rad: Joints
     tilt_abort_rad: float
     tracking_warn_m: float
     tracking_abort_m: float
@@ -197,7 +197,7 @@ class ControlView(Record, frozen=True, kw_only=True):
     h_hat: Vec4
     tau: Vec3
     """Force on the vehicle, world, N."""
-    arm_torque_nm: Vec2
+    arm_torque_nm: Joints
     force_ext_world_n: Vec3 | None = None
     """External force on the net, world frame, N; None without a force sensor."""
     hover_thrust: float
@@ -251,10 +251,10 @@ class Stream(Record, frozen=True, kw_only=True):
     position_world_m: Vec3 | None = None
     attitude_wxyz: Quat | None = None
     velocity_world_m_s: Vec3 | None = None
-    arm_rad: Vec2 | None = None
+    arm_rad: Joints | None = None
     reference_world_m: Vec3 | None = None
     reference_yaw_rad: float | None = None
-    reference_arm_rad: Vec2 | None = None
+    reference_arm_rad: Joints | None = None
     e_p_m: float | None = None
     e_q_deg: float | None = None
     """Angle between the attitude and its setpoint."""

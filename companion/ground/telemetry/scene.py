@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from companion.config.loader import FlightConfig
 from companion.ground.protocol.messages import VERSION, Scene
 from companion.mission.segments import phase_name
-from companion.model.types import Vec2, Vec3
+from companion.model.types import Joints, Vec3
 
 PATH_POINTS_MAX = 300
 
@@ -59,5 +59,5 @@ def thinned(path_world_m: Sequence[Vec3]) -> tuple[Vec3, ...]:
     return tuple(path_world_m[round(k * (count - 1) / last)] for k in range(PATH_POINTS_MAX))
 
 
-def _radians(pair_deg: Vec2) -> Vec2:
+def _radians(pair_deg: Joints) -> Joints:
     return (math.radians(pair_deg[0]), math.radians(pair_deg[1]))

@@ -335,8 +335,8 @@ def _control(control: ControlLog | None, has_force: bool) -> ControlView | None:
     return ControlView(
         rho=single[0],
         h_hat=h_hat,
-        tau=tau[0:3],
-        arm_torque_nm=tau[6:8],
+        tau=(tau[0], tau[1], tau[2]),
+        arm_torque_nm=tau[6:],
         force_ext_world_n=force if has_force else None,
         hover_thrust=single[1],
         saturated=any(control.saturated),

@@ -21,7 +21,7 @@ from companion.io.dynamixel.bus import SETUP_ATTEMPTS, ArmBus, Pair
 from companion.io.dynamixel.registers import WATCHDOG_ERROR, WATCHDOG_TRIPPED, Block, JointScale
 from companion.io.protocols import DeviceError
 from companion.model.observations import ServoReport
-from companion.model.types import ArmState, Vec2
+from companion.model.types import ArmState, Joints
 from companion.runtime.clock import Clock
 
 _OPEN_TIMEOUT_S = 8.0
@@ -165,7 +165,7 @@ class DynamixelArm:
         self._reading = None
         return self._state
 
-    def write_torque(self, torque_nm: Vec2) -> Vec2:
+    def write_torque(self, torque_nm: Joints) -> Joints:
         """Pass one command to the bus thread.
 
         Args:

@@ -12,7 +12,7 @@ from companion.control.manipulator import Manipulator
 from companion.control.types import PlantState, Wrench
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import body_x_z_axes_world, yaw_from_quat
-from companion.model.types import Reference, Vec2, Vec3
+from companion.model.types import Joints, Reference, Vec3
 
 
 class LqrConfig(LawConfig):
@@ -67,7 +67,7 @@ class LqrLaw:
                 self._integral_m_s[i] += dt_s * error[i]
         return wrench_of(sent, error, rate, ZERO8, force, self.hover_thrust)
 
-    def _arm(self, state: PlantState, error_rad: Vec2, rate_rad_s: Vec2) -> Vec2:
+    def _arm(self, state: PlantState, error_rad: Joints, rate_rad_s: Joints) -> Joints:
         c, (g1, g2) = self._config, self._manipulator.gravity_torque_nm(state.arm_rad, state.attitude_wxyz)
         (p1, p2), (d1, d2), (e1, e2), (r1, r2) = c.arm_kp_nm_rad, c.arm_kd_nms_rad, error_rad, rate_rad_s
         return (g1 - p1 * e1 - d1 * r1, g2 - p2 * e2 - d2 * r2)

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Vehicle
-from companion.model.types import Vec2
+from companion.model.types import Joints
 from companion.sitl_config.effects.servo_mechanics import ServoMechanics
 from companion.sitl_config.world import World
 
@@ -137,7 +137,7 @@ def acts(world: World) -> bool:
 
 
 def transmissions_of(
-    vehicle: Vehicle, world: World, start_rad: Vec2, dt_s: float
+    vehicle: Vehicle, world: World, start_rad: Joints, dt_s: float
 ) -> tuple[Transmission, Transmission] | None:
     """Return the transmission of each joint, starting at the joint angles `start_rad`; None if neither effect is on.
 
