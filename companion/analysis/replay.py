@@ -14,6 +14,9 @@ from companion.model.codec import differences, fingerprint, from_packet, to_pack
 from companion.model.types import Inputs, Outputs, Sent
 from companion.plugins import CONTROL_LAWS, installed
 
+PAIRS_FINGERPRINT = "1e7b00d5cd62de28"
+"""Fingerprint of the records of versions up to 0.2.0, which differ only in that every arm has two joints."""
+
 
 class Core(Protocol):
     """The part of `companion.core.flight_core.FlightCore` that replay needs."""
@@ -88,7 +91,7 @@ def check_replayable(log: FlightLog) -> str:
         raise LogError(
             f"{log.path}: was recorded by {found}, but this is companion {__version__}; replay it with the version that recorded it"
         )
-    if about.get("records") != fingerprint(Inputs, Outputs, Sent):
+    if about.get("records") not in {fingerprint(Inputs, Outputs, Sent), PAIRS_FINGERPRINT}:
         raise LogError(
             f"{log.path}: the fields of its records differ from those of this version; it was written by "
             f"{writer(log.metadata)}; replay it with that version"
