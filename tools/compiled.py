@@ -23,7 +23,7 @@ WORK = ROOT / "build" / "mypyc"
 PACKAGES = ("companion", "sitl")
 COMPILED = (
     "companion/core/*.py",
-    "companion/control/*.py",
+    "companion/control/**/*.py",
     "companion/safety/*.py",
     "companion/mission/*.py",
     "companion/model/*.py",

@@ -15,12 +15,11 @@ from typing import ClassVar
 
 from companion.config.controller import AdaptiveConfig
 from companion.config.vehicle import Vehicle
-from companion.control.arm_inertia import ArmInertia
+from companion.control.arm_model import dynamics_of, manipulator_of
 from companion.control.common import Actuation, DesiredForce, ForceFilter, tracking_errors
 from companion.control.compensation import Compensation
 from companion.control.impedance import Impedance
 from companion.control.load_adaptation import LoadAdaptation, Rows
-from companion.control.manipulator import Manipulator
 from companion.control.types import PlantState, Wrench
 from companion.control.zero_order_hold import HoldTable
 from companion.model.constants import GRAVITY_M_S2
@@ -114,10 +113,10 @@ class AdaptiveController:
     settings: ClassVar = AdaptiveConfig
 
     def __init__(self, config: AdaptiveConfig, vehicle: Vehicle, hover_thrust: float) -> None:
-        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self._manipulator = manipulator_of(vehicle)
         self._impedance = Impedance(config)
         self._adaptation = Adaptation(config)
-        self._load = LoadAdaptation(config)
+        self._load = LoadAdaptation(config, self._manipulator)
         weights = active(config.row_weights_s)
         self._weights_squared: Rows = (
             weights[0] ** 2,
@@ -137,9 +136,9 @@ class AdaptiveController:
         self._actuation = Actuation(config, vehicle, hover_thrust)
         self._compliance = config.base_compliance_xyz
         self._compensation = Compensation(config, vehicle, self._compliance, self._inertia[:2])
-        self._arm_inertia = ArmInertia(vehicle) if config.arm_inertia_nominal else None
+        self._arm_dynamics = dynamics_of(vehicle) if config.arm_inertia_nominal else None
         self._gravity_nominal = config.arm_gravity_nominal
-        self._up_m_s2: Joints = (0.0, GRAVITY_M_S2)
+        self._up_body_m_s2: Vec3 = (0.0, 0.0, GRAVITY_M_S2)
         self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
         self.hover_thrust = hover_thrust
         """Normalised hover thrust, for the log. The hover-thrust estimator sets it before every step."""
@@ -197,8 +196,9 @@ class AdaptiveController:
     def _torque_error(self, arm_rad: Joints, body_x: Vec3, body_z: Vec3, force: Vec3) -> tuple[Chi, Joints, Joints]:
         """Return e_tau = tau_ext - tau_d (8 rows), tau_d of the joints, and the joint torques that hold the arm against gravity."""
         (xx, xy, xz), (zx, zy, zz) = body_x, body_z
-        self._up_m_s2 = (GRAVITY_M_S2 * xz, GRAVITY_M_S2 * zz)
-        jx6, jx7, jz6, jz7, g6, g7 = self._manipulator.joint_terms(arm_rad, GRAVITY_M_S2 * xz, GRAVITY_M_S2 * zz)
+        up = (GRAVITY_M_S2 * xz, GRAVITY_M_S2 * (zx * xy - zy * xx), GRAVITY_M_S2 * zz)
+        self._up_body_m_s2 = up
+        ((jx6, jx7), _, (jz6, jz7)), gravity = self._manipulator.joint_terms(arm_rad, up)
         (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = force, self._desired.world_n, self._compliance
         f_x, f_z = xx * f0 + xy * f1 + xz * f2, zx * f0 + zy * f1 + zz * f2
         d_x, d_z = xx * d0 + xy * d1 + xz * d2, zx * d0 + zy * d1 + zz * d2
@@ -215,7 +215,7 @@ class AdaptiveController:
                 jx7 * f_x + jz7 * f_z - tau_d7,
             ),
             (tau_d6, tau_d7),
-            (g6, g7),
+            gravity,
         )
 
     def _norms(self, s: Chi, error: Chi, error_rate: Chi, acceleration: Rows) -> Vec3:
@@ -288,17 +288,17 @@ class AdaptiveController:
             t6, t7 = t6 + gravity[0], t7 + gravity[1]
         wanted_rate = (rates[0] - s[6], rates[1] - s[7])
         if self._load.on:
-            levers = self._manipulator.gravity_levers_m_s2(state.arm_rad, *self._up_m_s2)
+            levers = self._manipulator.gravity_levers_m_s2(state.arm_rad, self._up_body_m_s2)
             first, second = self._load.joint_torque_nm(levers, wanted_rate)
             t6, t7 = t6 + first, t7 + second
-        if self._arm_inertia is not None:
+        if self._arm_dynamics is not None:
             _, _, _, m6, m7 = self._inertia
             _, _, _, p6, p7 = self._phi
             _, _, _, d6, d7 = self._d
             gamma, feed = self._impedance.gamma, reference.arm_acceleration_rad_s2
             a6 = feed[0] - p6 * error_rate[6] + (e_tau[6] - d6 * gamma[6]) / m6
             a7 = feed[1] - p7 * error_rate[7] + (e_tau[7] - d7 * gamma[7]) / m7
-            first, second = self._arm_inertia.torque_nm(state.arm_rad, rates, (a6, a7))
+            first, second = self._arm_dynamics.arm_torque_nm(state.arm_rad, rates, (a6, a7))
             t6 += first - m6 * a6
             t7 += second - m7 * a7
         return self._compensation.joint_torque_nm((t6, t7), wanted_rate)

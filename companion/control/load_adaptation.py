@@ -16,8 +16,9 @@ import math
 
 from companion.config.controller import AdaptiveConfig
 from companion.control.compensation import FRICTION_RATE_RAD_S
+from companion.control.manipulator import Manipulator
 from companion.control.zero_order_hold import HoldTable
-from companion.model.types import Joints, Vec3
+from companion.model.types import Joints, Matrix, Vec3
 
 Rows = tuple[float, float, float, float, float]
 
@@ -27,9 +28,11 @@ class LoadAdaptation:
 
     Args:
         config: rates, leakage and bounds.
+        manipulator: relates the moments of the links to joint torques.
     """
 
-    def __init__(self, config: AdaptiveConfig) -> None:
+    def __init__(self, config: AdaptiveConfig, manipulator: Manipulator) -> None:
+        self._manipulator = manipulator
         leakage = config.load_leakage
         self._rate_xyz = config.load_rate_xyz
         self._rate_moment, self._rate_friction = config.moment_rate, config.friction_rate
@@ -46,23 +49,24 @@ class LoadAdaptation:
         self.moments_kg_m: Joints = (0.0, 0.0)
         """Estimated first moments of the links about their joints, in addition to the nominal ones."""
         self.friction_nm: Joints = (0.0, 0.0)
-        self._levers: Joints = (0.0, 0.0)
+        self._levers: Matrix = ((0.0, 0.0), (0.0, 0.0))
         self._turning: Joints = (0.0, 0.0)
         self._wanted_rate_rad_s: Joints = (0.0, 0.0)
 
-    def joint_torque_nm(self, levers_m_s2: Joints, wanted_rate_rad_s: Joints) -> Joints:
+    def joint_torque_nm(self, levers_m_s2: Matrix, wanted_rate_rad_s: Joints) -> Joints:
         """Return the torque of the estimated gravity and friction.
 
         Args:
-            levers_m_s2: gravity times the cosine of each link's elevation (`Manipulator.gravity_levers_m_s2`).
+            levers_m_s2: joint torques of gravity per first moment of each link (`Manipulator.gravity_levers_m_s2`).
             wanted_rate_rad_s: joint rates that the target impedance requests.
         """
         if not self.on:
             return (0.0, 0.0)
-        (m1, m2), (u1, u2), (f1, f2), (r1, r2) = self.moments_kg_m, levers_m_s2, self.friction_nm, wanted_rate_rad_s
+        (f1, f2), (r1, r2) = self.friction_nm, wanted_rate_rad_s
+        g1, g2 = self._manipulator.moment_torque_nm(levers_m_s2, self.moments_kg_m)
         t1, t2 = self._turning = (math.tanh(r1 / FRICTION_RATE_RAD_S), math.tanh(r2 / FRICTION_RATE_RAD_S))
         self._levers, self._wanted_rate_rad_s = levers_m_s2, wanted_rate_rad_s
-        return (m1 * u1 + m2 * u2 + f1 * t1, f2 * t2 - m2 * u2)
+        return (g1 + f1 * t1, g2 + f2 * t2)
 
     def advance(self, dt_s: float, s: Rows, learn: bool) -> None:
         """Integrate one step with s held. Without `learn` the estimates do not change: on the ground and in saturation.
@@ -74,7 +78,7 @@ class LoadAdaptation:
             return
         decay, step = self._held[dt_s]
         s0, s1, s2, s6, s7 = s
-        (u1, u2), (t1, t2) = self._levers, self._turning
+        t1, t2 = self._turning
 
         def updated(value: float, rate: float, error: float, low: float, high: float) -> float:
             new = decay * value - step * rate * error
@@ -84,10 +88,8 @@ class LoadAdaptation:
         (x, y, z), (rx, ry, rz), n = self.force_n, self._rate_xyz, self._max_n
         self.force_n = (updated(x, rx, s0, -n, n), updated(y, ry, s1, -n, n), updated(z, rz, s2, -n, n))
         (m1, m2), rate, most = self.moments_kg_m, self._rate_moment, self._max_kg_m
-        self.moments_kg_m = (
-            updated(m1, rate, s6 * u1, -most, most),
-            updated(m2, rate, (s6 - s7) * u2, -most, most),
-        )
+        p1, p2 = self._manipulator.projected_on_moments(self._levers, (s6, s7))
+        self.moments_kg_m = (updated(m1, rate, p1, -most, most), updated(m2, rate, p2, -most, most))
         (f1, f2), (r1, r2), rate, most = self.friction_nm, self._wanted_rate_rad_s, self._rate_friction, self._max_nm
         if (r1 + s6) * t1 > FRICTION_RATE_RAD_S * abs(t1):  # r + s is the measured rate
             f1 = updated(f1, rate, s6 * t1, 0.0, most)

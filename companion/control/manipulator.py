@@ -1,114 +1,73 @@
-"""Kinematics and nominal gravity torques of the 2R arm.
+"""Kinematics and nominal gravity torques of the arm, for an arm of any number of joints.
 
-Angles are those of the paper: alpha_1 is the angle of link 1 from body +x, positive downwards (about body +y); alpha_2 rotates link 2
-in the opposite direction, so that link 2 points along alpha_1 - alpha_2. The arm moves in the body's x-z plane. The module uses floats
-and tuples only, because it runs in the control tick.
+`companion.control.arm_model.manipulator_of` builds the implementation that fits the arm. Joint angles are ordered from the shoulder
+outwards; the signs of the planar arm's angles are those of the paper (`companion.control.arm_model.planar_manipulator`). Everything
+here runs in the control tick and uses floats and tuples only.
 """
 
 from __future__ import annotations
 
-import math
+from abc import ABC, abstractmethod
 
-from companion.config.vehicle import Arm, Tool
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
-from companion.model.types import Joints, Quat, Vec3
+from companion.model.frames import quat_rotate
+from companion.model.types import Joints, Matrix, Quat, Vec3
 
 
-class Manipulator:
-    """Geometry and nominal masses of arm and tool, payload excluded."""
+class Manipulator(ABC):
+    """Geometry and nominal masses of arm and tool, payload excluded. Without an arm, tuples are empty and the tip is the origin."""
 
-    def __init__(self, arm: Arm, tool: Tool | None) -> None:
-        self._shoulder = arm.shoulder_body_m
-        self._l1, self._l2 = arm.link_lengths_m
-        m1, m2 = arm.link_masses_kg
-        c1, c2 = arm.link_com_m
-        tool_mass = 0.0 if tool is None else tool.sensor_mass_kg + tool.net_mass_kg
-        # First moments about each joint's axis, kg m.
-        self._moment_1 = m1 * c1 + (m2 + tool_mass) * self._l1
-        self._moment_2 = m2 * c2 + tool_mass * self._l2
-        roll, pitch, yaw = (
-            math.radians(angle) for angle in (tool.sensor_rpy_deg if tool is not None else (0.0, 0.0, 0.0))
-        )
-        self._sensor_in_link2: Quat = quat_from_euler_zyx(roll, pitch, yaw)
+    joint_count: int
+    """Number of joints, 0 to 7."""
 
+    @abstractmethod
     def net_body_m(self, angle_rad: Joints) -> Vec3:
-        """Return the centre of the net in the body frame, m."""
-        a1 = angle_rad[0]
-        b = a1 - angle_rad[1]
-        sx, sy, sz = self._shoulder
-        return (
-            sx + self._l1 * math.cos(a1) + self._l2 * math.cos(b),
-            sy,
-            sz - self._l1 * math.sin(a1) - self._l2 * math.sin(b),
-        )
+        """Return the tip in the body frame, m: the centre of the net or, without a tool, the end of the arm."""
 
-    def elbow_body_m(self, angle_rad: Joints) -> Vec3:
-        """Return the elbow joint in the body frame, m."""
-        sx, sy, sz = self._shoulder
-        return (sx + self._l1 * math.cos(angle_rad[0]), sy, sz - self._l1 * math.sin(angle_rad[0]))
+    @abstractmethod
+    def joints_body_m(self, angle_rad: Joints) -> tuple[Vec3, ...]:
+        """Return the position of every joint in the body frame, m."""
 
-    def jacobian_body_m(self, angle_rad: Joints) -> tuple[Joints, Joints]:
-        """Return rows x and z of d net_body / d alpha, m/rad (the y row is zero): the paper's J_alpha."""
-        a1 = angle_rad[0]
-        b = a1 - angle_rad[1]
-        s1, c1 = self._l1 * math.sin(a1), self._l1 * math.cos(a1)
-        s2, c2 = self._l2 * math.sin(b), self._l2 * math.cos(b)
-        return ((-s1 - s2, s2), (-c1 - c2, c2))
+    @abstractmethod
+    def jacobian_body_m(self, angle_rad: Joints) -> Matrix:
+        """Return rows x, y and z of d net_body / d alpha, m/rad: the paper's J_alpha."""
+
+    @abstractmethod
+    def joint_terms(self, angle_rad: Joints, up_body_m_s2: Vec3) -> tuple[Matrix, Joints]:
+        """Return the Jacobian (m/rad) and the gravity torques (N m): `jacobian_body_m` and `gravity_torque_nm` in one call.
+
+        Args:
+            angle_rad: joint angles.
+            up_body_m_s2: reaction to gravity, which is 9.81 m/s^2 upwards, in the body frame.
+        """
+
+    @abstractmethod
+    def gravity_levers_m_s2(self, angle_rad: Joints, up_body_m_s2: Vec3) -> Matrix:
+        """Return a row for each joint with an element for each link: the joint torque that holds a first moment of 1 kg m of that link,
+        which points from the link's joint to the next one, against gravity. Arguments as for `joint_terms`.
+        """
+
+    @abstractmethod
+    def moment_torque_nm(self, levers_m_s2: Matrix, moment_kg_m: Joints) -> Joints:
+        """Return the joint torques that hold one first moment per link against gravity: levers times moments."""
+
+    @abstractmethod
+    def projected_on_moments(self, levers_m_s2: Matrix, joint_values: Joints) -> Joints:
+        """Return the transposed levers times one value per joint: the direction in which each link's moment acts on that value."""
+
+    @abstractmethod
+    def sensor_attitude_body(self, angle_rad: Joints) -> Quat:
+        """Return the rotation from the force-torque sensor's frame to the body frame."""
 
     def joint_torque_from_force(self, angle_rad: Joints, force_body_n: Vec3) -> Joints:
-        """Return J' F: the joint torques of a force on the net, N m."""
-        (jx1, jx2), (jz1, jz2) = self.jacobian_body_m(angle_rad)
-        fx, _, fz = force_body_n
-        return (jx1 * fx + jz1 * fz, jx2 * fx + jz2 * fz)
+        """Return J' F: the joint torques of a force on the tip, N m."""
+        jx, jy, jz = self.jacobian_body_m(angle_rad)
+        fx, fy, fz = force_body_n
+        return tuple([x * fx + y * fy + z * fz for x, y, z in zip(jx, jy, jz, strict=True)])
 
     def gravity_torque_nm(
         self, angle_rad: Joints, attitude_wxyz: Quat, specific_force_m_s2: float = GRAVITY_M_S2
     ) -> Joints:
         """Return the motor torques that hold the arm against gravity at the given attitude, N m, payload excluded."""
-        # Upward direction in the body frame: the arm must push that way.
-        up_x, _, up_z = quat_rotate(
-            (attitude_wxyz[0], -attitude_wxyz[1], -attitude_wxyz[2], -attitude_wxyz[3]), (0.0, 0.0, specific_force_m_s2)
-        )
-        a1 = angle_rad[0]
-        b = a1 - angle_rad[1]
-        about_1 = self._moment_1 * (-math.sin(a1) * up_x - math.cos(a1) * up_z)
-        about_2 = self._moment_2 * (-math.sin(b) * up_x - math.cos(b) * up_z)
-        return (about_1 + about_2, -about_2)
-
-    def joint_terms(
-        self, angle_rad: Joints, up_x_m_s2: float, up_z_m_s2: float
-    ) -> tuple[float, float, float, float, float, float]:
-        """Return rows x and z of the Jacobian (m/rad) and the gravity torques (N m): `jacobian_body_m` and `gravity_torque_nm` in
-        one call.
-
-        Args:
-            angle_rad: both joint angles.
-            up_x_m_s2: body x component of the reaction to gravity, which is 9.81 m/s^2 upwards.
-            up_z_m_s2: body z component of that reaction.
-        """
-        a1, a2 = angle_rad
-        b = a1 - a2
-        s1, c1, s2, c2 = math.sin(a1), math.cos(a1), math.sin(b), math.cos(b)
-        about_1 = self._moment_1 * (-s1 * up_x_m_s2 - c1 * up_z_m_s2)
-        about_2 = self._moment_2 * (-s2 * up_x_m_s2 - c2 * up_z_m_s2)
-        l1, l2 = self._l1, self._l2
-        s2 *= l2
-        c2 *= l2
-        return -l1 * s1 - s2, s2, -l1 * c1 - c2, c2, about_1 + about_2, -about_2
-
-    def gravity_levers_m_s2(self, angle_rad: Joints, up_x_m_s2: float, up_z_m_s2: float) -> Joints:
-        """Return, for each link, the torque about its own joint that holds a first moment of 1 kg m against gravity; arguments as for
-        `joint_terms`.
-        """
-        a1, a2 = angle_rad
-        b = a1 - a2
-        return (
-            -math.sin(a1) * up_x_m_s2 - math.cos(a1) * up_z_m_s2,
-            -math.sin(b) * up_x_m_s2 - math.cos(b) * up_z_m_s2,
-        )
-
-    def sensor_attitude_body(self, angle_rad: Joints) -> Quat:
-        """Return the rotation from the force-torque sensor's frame to the body frame."""
-        half = 0.5 * (angle_rad[0] - angle_rad[1])
-        return quat_multiply((math.cos(half), 0.0, math.sin(half), 0.0), self._sensor_in_link2)
+        w, x, y, z = attitude_wxyz
+        return self.joint_terms(angle_rad, quat_rotate((w, -x, -y, -z), (0.0, 0.0, specific_force_m_s2)))[1]

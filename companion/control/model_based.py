@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from companion.config.controller import LawConfig
 from companion.config.vehicle import Vehicle
+from companion.control.arm_model import dynamics_of, manipulator_of
 from companion.control.common import Actuation, DesiredForce, ForceFilter, wrench_of
 from companion.control.compensation import Compensation
-from companion.control.dynamics import Dynamics
-from companion.control.manipulator import Manipulator
 from companion.control.types import PlantState, Wrench
 from companion.model.frames import body_x_z_axes_world, quat_conjugate, quat_rotate
 from companion.model.types import Chi, Joints, Reference, Vec3
@@ -32,8 +31,8 @@ class ModelBasedLaw:
         answered_xyz: Vec3 = (0.0, 0.0, 0.0),
         model_mass_scale: float = 1.0,
     ) -> None:
-        self._dynamics = Dynamics(vehicle, model_mass_scale)
-        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self._dynamics = dynamics_of(vehicle, model_mass_scale)
+        self._manipulator = manipulator_of(vehicle)
         self._force = ForceFilter(config.force_lowpass_hz)
         self._desired = DesiredForce(config.desired_force_time_s)
         self._actuation = Actuation(config, vehicle, hover_thrust)

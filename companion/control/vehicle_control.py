@@ -7,9 +7,9 @@ import math
 from companion.config.controller import law_class
 from companion.config.loader import FlightConfig
 from companion.control.arm_hold import hold_torque_nm
+from companion.control.arm_model import manipulator_of
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.hover_thrust import HoverThrust, off_the_ground
-from companion.control.manipulator import Manipulator
 from companion.control.sensing import CatchDetector, ForceSensing, MeanAcceleration
 from companion.control.types import Controller, Law, PlantState
 from companion.model.codec import Record
@@ -51,7 +51,7 @@ class VehicleControl:
         self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
         self._thrust_sent = 0.0
         self._force_timeout_s = vehicle.safety.force_timeout_s
-        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self._manipulator = manipulator_of(vehicle)
         self._sensing = ForceSensing(vehicle.tool, self._manipulator)
         self._acceleration = MeanAcceleration()
         self._catch = CatchDetector()

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from companion.config.mission import Mission
 from companion.config.vehicle import LINK_RADIUS_M, Vehicle
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import manipulator_of
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import Joints, PhaseKind, Quat, Reference, Vec3
@@ -60,7 +60,7 @@ class SampleCheck:
         self._limits = mission.limits
         self._catch = mission.catch
         self._vehicle = vehicle
-        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self._manipulator = manipulator_of(vehicle)
         self._safe = SafeSet(vehicle)
         self._stop_model = StopModel(vehicle.safety)
         self._watch = TetherWatch.of(vehicle)
@@ -240,7 +240,7 @@ class SampleCheck:
                     limit=f"joint {number}", excess=excess, what=what, detail=detail, advice="change arm_deg"
                 )
         net_z_m = position[2] + self._manipulator.net_body_m(reference.arm_rad)[2] - self._vehicle.tip_radius_m
-        elbow_z_m = position[2] + self._manipulator.elbow_body_m(reference.arm_rad)[2] - LINK_RADIUS_M
+        elbow_z_m = position[2] + self._manipulator.joints_body_m(reference.arm_rad)[1][2] - LINK_RADIUS_M
         tip = "net" if self._vehicle.tool is not None else "end of the arm"
         for part, lowest_m in ((tip, net_z_m), ("elbow", elbow_z_m)):
             if lowest_m < FLOOR_GAP_M:

@@ -25,6 +25,11 @@ Joints = tuple[float, ...]
 Chi = tuple[float, ...]
 """Rows of chi = [x y z | roll pitch yaw | joints]: 6 and one for each joint."""
 
+Mat3 = tuple[Vec3, Vec3, Vec3]
+"""3x3 matrix as a tuple of rows."""
+Matrix = tuple[tuple[float, ...], ...]
+"""Matrix of any size as a tuple of rows."""
+
 IDENTITY_QUAT: Quat = (1.0, 0.0, 0.0, 0.0)
 
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 from companion.config.vehicle import ForceDevice, Vehicle
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import manipulator_of
 from companion.control.sensing import ForceSensing
 from companion.model.check_row import Row
 from companion.model.observations import ForceStream, Observations
@@ -168,7 +168,7 @@ def _tare(bias_n: Vec3, net_kg: float, device: ForceDevice) -> Row:
 
 def tare_bias_n(samples: Sequence[ForceSample], vehicle: Vehicle, attitude: Quat, arm_rad: Joints) -> Vec3:
     """Return the bias that a flight's tare would find: the mean reading minus the weight of the net, in the sensor frame."""
-    sensing = ForceSensing(vehicle.tool, Manipulator(vehicle.arm, vehicle.tool))
+    sensing = ForceSensing(vehicle.tool, manipulator_of(vehicle))
     for sample in samples:
         sensing.collect(sample, attitude, arm_rad)
     sensing.finish_tare()

@@ -19,7 +19,7 @@ from companion.campaigns.process import CampaignError
 from companion.campaigns.robustness.draws import DRAWN
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import manipulator_of
 from companion.mission.plan import Plan
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Outcome, PhaseKind, SafetyAction
@@ -61,7 +61,7 @@ def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
         CampaignError: the mission has no such pass.
     """
     plan = Plan.build(mission, vehicle)
-    manipulator = Manipulator(vehicle.arm, vehicle.tool)
+    manipulator = manipulator_of(vehicle)
     times = [n * _STEP_S for n in range(int(plan.duration_s / _STEP_S))]
     forwards = [t_s for t_s in times if plan.reference(t_s).velocity_world_m_s[0] > 0.0]
     begun_s = next((t_s for t_s in forwards if plan.segment(t_s).kind is PhaseKind.FLIGHT), math.inf)

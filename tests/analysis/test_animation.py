@@ -17,7 +17,7 @@ from companion.analysis.animation import FRAMES_PER_S, Movie, movie_of, player_h
 from companion.analysis.log import FlightLog
 from companion.analysis.scene import NET, TETHER, Camera, Pose, Scene
 from companion.config.loader import load_vehicle
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import manipulator_of
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.types import Joints
 from tests.analysis.synthetic_flight import CATCH_S, CONFIG, synthetic_flight
@@ -80,9 +80,7 @@ def test_the_net_is_where_the_control_law_has_it(arm_rad: Joints) -> None:
     pose = Pose(
         position_world_m=(1.0, -0.5, 1.2), attitude_wxyz=attitude, arm_rad=arm_rad, ball_world_m=(), caught=False
     )
-    expected = np.add(
-        pose.position_world_m, quat_rotate(attitude, Manipulator(VEHICLE.arm, VEHICLE.tool).net_body_m(arm_rad))
-    )
+    expected = np.add(pose.position_world_m, quat_rotate(attitude, manipulator_of(VEHICLE).net_body_m(arm_rad)))
     assert Scene(json.loads(VEHICLE.model_dump_json())).net_world_m(pose) == pytest.approx(expected)
 
 

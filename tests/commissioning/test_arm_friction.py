@@ -13,7 +13,7 @@ from companion.commissioning.arm.friction import FrictionFit, JointFit, fit
 from companion.commissioning.arm.sweep import HANGING_DEG, REACH_DEG, SPEEDS_DEG_S, Sample
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import manipulator_of
 from companion.model.types import IDENTITY_QUAT, Joints
 from tests.commissioning.arm_rig import SHIPPED
 
@@ -38,7 +38,7 @@ def swept(
 ) -> list[Sample]:
     """What the sweeps of an arm with these properties give; noise that wanders, as a control loop's does."""
     rng = np.random.default_rng(seed)
-    manipulator = Manipulator(vehicle.arm, vehicle.tool)
+    manipulator = manipulator_of(vehicle)
 
     def leg(number: int, joint: int, begin_deg: float, end_deg: float, speed_deg_s: float) -> Iterator[Sample]:
         way = math.copysign(1.0, end_deg - begin_deg)

@@ -14,7 +14,7 @@ from companion.commissioning.arm.sweep import Leg, Sweeper, legs_of
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import manipulator_of
 from companion.model.types import IDENTITY_QUAT, ArmState, Joints
 from tests.commissioning.arm_rig import SHIPPED
 from tests.support import tool_of
@@ -35,7 +35,7 @@ class Bench:
 
     def __init__(self, vehicle: Vehicle, at_deg: Joints = (90.0, 10.0)) -> None:
         self.vehicle = vehicle
-        self.manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self.manipulator = manipulator_of(vehicle)
         self.angle = [math.radians(deg) for deg in at_deg]
         self.rate = [0.0, 0.0]
         self.t_s = 0.0

@@ -10,7 +10,7 @@ import pytest
 from companion.commissioning.force_torque import fit as ft_fit
 from companion.commissioning.force_torque.fit import WeightFit
 from companion.config.loader import load_vehicle
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import manipulator_of
 from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.types import ForceSample, Joints, Quat, Vec3
 from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
@@ -46,7 +46,7 @@ def fitted(
 
 
 def test_down_in_link_2_is_what_the_arm_says() -> None:
-    arm = Manipulator(VEHICLE.arm, VEHICLE.tool)
+    arm = manipulator_of(VEHICLE)
     for arm_rad in (FOLDED, HANGING, (1.3, -0.1)):
         body = quat_rotate(arm.sensor_attitude_body(arm_rad), ft_fit.down_in_link2(arm_rad))
         assert body == pytest.approx((0.0, 0.0, -1.0), abs=1e-12)

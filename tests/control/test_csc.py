@@ -10,8 +10,9 @@ import pytest
 
 from companion.config.controller import CscConfig
 from companion.config.loader import FlightConfig
+from companion.control.arm_model import dynamics_of
 from companion.control.csc import CscController
-from companion.control.dynamics import Dynamics, rotation_matrix
+from companion.control.dynamics import rotation_matrix
 from companion.control.types import PlantState, Wrench
 from companion.core.flight_core import FlightCore
 from companion.model.frames import quat_rotate
@@ -57,7 +58,7 @@ def stepped(config: SitlConfig, state: PlantState, acceleration: Vec3 = ZERO, ve
 
 def acceleration(config: SitlConfig, state: PlantState, wrench: Wrench) -> np.ndarray:
     """chi'' of position and joints that the nominal machine has under the wrench, the attitude being held level."""
-    terms = Dynamics(config.vehicle).terms(
+    terms = dynamics_of(config.vehicle).terms(
         rotation_matrix(IDENTITY_QUAT),
         ZERO,
         state.arm_rad,

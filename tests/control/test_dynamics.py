@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
+from companion.control.arm_model import dynamics_of, manipulator_of
 from companion.control.dynamics import Dynamics, DynamicsTerms, chi_rate_from_body_rate, rotation_matrix
-from companion.control.manipulator import Manipulator
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import Chi, Joints, Vec3
 from tests.pinocchio_or_skip import pin
@@ -73,7 +73,7 @@ def to_twist_rate(rpy: Vec3, rate: Chi) -> Array:
 
 
 def test_mass_coriolis_and_gravity_agree_with_pinocchio(vehicle: Vehicle) -> None:
-    dynamics, model = Dynamics(vehicle), oracle(vehicle)
+    dynamics, model = dynamics_of(vehicle), oracle(vehicle)
     data = model.createData()
     rng = np.random.default_rng(11)
     for _ in range(200):
@@ -97,7 +97,7 @@ def test_mass_coriolis_and_gravity_agree_with_pinocchio(vehicle: Vehicle) -> Non
 
 def test_mass_is_symmetric_and_positive_and_changes_as_twice_coriolis_power(vehicle: Vehicle) -> None:
     """chi' (M' - 2 C) chi' = 0 (passivity), with M' by differences."""
-    dynamics = Dynamics(vehicle)
+    dynamics = dynamics_of(vehicle)
     rng = np.random.default_rng(5)
     h = 1e-4
     for _ in range(50):
@@ -117,7 +117,7 @@ def test_mass_is_symmetric_and_positive_and_changes_as_twice_coriolis_power(vehi
 
 
 def test_arm_alone_is_the_arm_block_at_rest(vehicle: Vehicle) -> None:
-    dynamics, manipulator = Dynamics(vehicle), Manipulator(vehicle.arm, vehicle.tool)
+    dynamics, manipulator = dynamics_of(vehicle), manipulator_of(vehicle)
     rng = np.random.default_rng(6)
     for _ in range(20):
         rpy, arm, rate = random_state(rng)
@@ -131,7 +131,7 @@ def test_arm_alone_is_the_arm_block_at_rest(vehicle: Vehicle) -> None:
 
 def test_a_scaled_model_is_scaled_throughout(vehicle: Vehicle) -> None:
     rpy, arm, rate = random_state(np.random.default_rng(8))
-    one, scaled = terms(Dynamics(vehicle), rpy, arm, rate), terms(Dynamics(vehicle, 0.85), rpy, arm, rate)
+    one, scaled = terms(dynamics_of(vehicle), rpy, arm, rate), terms(dynamics_of(vehicle, 0.85), rpy, arm, rate)
     np.testing.assert_allclose(np.array(scaled.mass), 0.85 * np.array(one.mass), rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(scaled.coriolis, 0.85 * np.array(one.coriolis), rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(scaled.gravity, 0.85 * np.array(one.gravity), rtol=1e-12, atol=1e-15)

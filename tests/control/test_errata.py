@@ -17,8 +17,8 @@ import pytest
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import FlightConfig, load_flight
 from companion.control.adaptive import Adaptation, AdaptiveController
+from companion.control.arm_model import manipulator_of
 from companion.control.impedance import Impedance
-from companion.control.manipulator import Manipulator
 from companion.control.types import PlantState
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import IDENTITY_QUAT, Reference, Vec3
@@ -77,7 +77,7 @@ class Machine:
     """A steady pull on the net: the force low-pass, which starts at its first sample, then adds nothing."""
 
     def __post_init__(self) -> None:
-        self.manipulator = Manipulator(self.config.vehicle.arm, self.config.vehicle.tool)
+        self.manipulator = manipulator_of(self.config.vehicle)
 
     def state(self) -> PlantState:
         x, y, z, a1, a2 = self.chi.tolist()

@@ -14,14 +14,15 @@ from msgspec.structs import replace
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import load_flight
 from companion.control.adaptive import Adaptation, AdaptiveController
+from companion.control.arm_model import manipulator_of
 from companion.control.load_adaptation import LoadAdaptation
-from companion.control.manipulator import Manipulator
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import IDENTITY_QUAT, ControlLog, Joints, Reference
 from tests.control.states import POSE, ZERO, at
 from tests.support import tool_of
 
 CONFIG = load_flight("configs/missions/catch.yaml", preset="recommended")
+MANIPULATOR = manipulator_of(CONFIG.vehicle)
 DT_S = 0.005
 MASS_KG, DAMPING = 3.0, 9.0
 """A row M s' = -Lambda s + load - theta."""
@@ -44,7 +45,7 @@ def law(**changes: Any) -> AdaptiveConfig:
 
 
 def test_a_constant_force_is_cancelled_and_s_returns_to_zero() -> None:
-    load = LoadAdaptation(law(load_rate_xyz=(5.0, 5.0, 20.0)))
+    load = LoadAdaptation(law(load_rate_xyz=(5.0, 5.0, 20.0)), MANIPULATOR)
     s = np.zeros(3)
     pull_n = np.array([0.5, -0.3, -2.0])
     for _ in range(4000):
@@ -56,7 +57,7 @@ def test_a_constant_force_is_cancelled_and_s_returns_to_zero() -> None:
 
 def test_leakage_leaves_the_error_that_its_balance_says() -> None:
     """At rest theta = -(Gamma / nu) s and Lambda s = load + theta, so s = load / (Lambda + Gamma / nu)."""
-    load = LoadAdaptation(law(load_rate_xyz=(0.0, 0.0, 20.0), load_leakage=0.5))
+    load = LoadAdaptation(law(load_rate_xyz=(0.0, 0.0, 20.0), load_leakage=0.5), MANIPULATOR)
     s = 0.0
     for _ in range(8000):
         s += DT_S / MASS_KG * (-2.0 + load.force_n[2] - DAMPING * s)
@@ -66,18 +67,17 @@ def test_leakage_leaves_the_error_that_its_balance_says() -> None:
 
 def test_moments_and_friction_are_found_while_the_arm_moves() -> None:
     """A 2R arm with unknown link moments and friction, swinging: the torque error goes to zero and the estimates to the truth."""
-    load = LoadAdaptation(law(moment_rate=0.05, friction_rate=0.5))
-    manipulator = Manipulator(CONFIG.vehicle.arm, CONFIG.vehicle.tool)
+    load = LoadAdaptation(law(moment_rate=0.05, friction_rate=0.5), MANIPULATOR)
     moments, friction = np.array([0.06, 0.05]), np.array([0.08, 0.05])
     s = np.zeros(2)
     for tick in range(12000):
         t_s = tick * DT_S
         angle: Joints = (1.9 + 0.6 * math.sin(0.9 * t_s), 1.2 + 0.6 * math.sin(1.3 * t_s))
         rate: Joints = (0.54 * math.cos(0.9 * t_s), 0.78 * math.cos(1.3 * t_s))
-        u1, u2 = manipulator.gravity_levers_m_s2(angle, 0.0, GRAVITY_M_S2)
+        levers = MANIPULATOR.gravity_levers_m_s2(angle, (0.0, 0.0, GRAVITY_M_S2))
         turning = np.tanh(np.array(rate) / 0.1)
-        needed = np.array([moments[0] * u1 + moments[1] * u2, -moments[1] * u2]) + friction * turning
-        given_nm = np.array(load.joint_torque_nm((u1, u2), rate))
+        needed = np.array(levers) @ moments + friction * turning
+        given_nm = np.array(load.joint_torque_nm(levers, rate))
         s += DT_S / 0.1 * (given_nm - needed - 1.0 * s)
         load.advance(DT_S, (0.0, 0.0, 0.0, float(s[0]), float(s[1])), True)
     np.testing.assert_allclose(load.moments_kg_m, moments, rtol=0.05)
@@ -87,32 +87,34 @@ def test_moments_and_friction_are_found_while_the_arm_moves() -> None:
 
 def test_the_levers_of_gravity_times_the_moments_are_the_gravity_torque() -> None:
     arm, tool = CONFIG.vehicle.arm, tool_of(CONFIG.vehicle)
-    manipulator = Manipulator(arm, tool)
     carried_kg = tool.sensor_mass_kg + tool.net_mass_kg
     first = arm.link_masses_kg[0] * arm.link_com_m[0] + (arm.link_masses_kg[1] + carried_kg) * arm.link_lengths_m[0]
     second = arm.link_masses_kg[1] * arm.link_com_m[1] + carried_kg * arm.link_lengths_m[1]
-    u1, u2 = manipulator.gravity_levers_m_s2((1.7, 1.0), 0.0, GRAVITY_M_S2)
-    expected = manipulator.gravity_torque_nm((1.7, 1.0), IDENTITY_QUAT)
-    assert (first * u1 + second * u2, -second * u2) == pytest.approx(expected, rel=1e-12)
+    levers = MANIPULATOR.gravity_levers_m_s2((1.7, 1.0), (0.0, 0.0, GRAVITY_M_S2))
+    expected = MANIPULATOR.gravity_torque_nm((1.7, 1.0), IDENTITY_QUAT)
+    np.testing.assert_allclose(np.array(levers) @ (first, second), expected, rtol=1e-12)
+    np.testing.assert_allclose(MANIPULATOR.moment_torque_nm(levers, (first, second)), expected, rtol=1e-12)
+    transposed = np.array(levers).T @ (0.3, -0.8)
+    np.testing.assert_allclose(MANIPULATOR.projected_on_moments(levers, (0.3, -0.8)), transposed, rtol=1e-12)
 
 
 @pytest.mark.parametrize("held_nm", [0.15, -0.15])
 def test_static_friction_that_holds_a_joint_with_an_error_does_not_raise_the_friction_estimate(held_nm: float) -> None:
     """At rest s = Phi e is constant and the wanted rate is -s, so that s times tanh(wanted rate) has one sign for either error."""
-    load = LoadAdaptation(law(friction_rate=0.5))
+    load = LoadAdaptation(law(friction_rate=0.5), MANIPULATOR)
     s = held_nm
     for _ in range(400):
-        load.joint_torque_nm((0.0, 0.0), (-s, -s))
+        load.joint_torque_nm(((0.0, 0.0), (0.0, 0.0)), (-s, -s))
         load.advance(DT_S, (0.0, 0.0, 0.0, s, s), True)
     assert load.friction_nm == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("rate_rad_s", [0.4, -0.4])
 def test_friction_of_a_joint_that_turns_slower_than_wanted_grows_by_the_integral_of_its_lag(rate_rad_s: float) -> None:
-    load = LoadAdaptation(law(friction_rate=0.5))
+    load = LoadAdaptation(law(friction_rate=0.5), MANIPULATOR)
     s = -0.05 * math.copysign(1.0, rate_rad_s)
     for _ in range(200):
-        load.joint_torque_nm((0.0, 0.0), (rate_rad_s - s, rate_rad_s - s))
+        load.joint_torque_nm(((0.0, 0.0), (0.0, 0.0)), (rate_rad_s - s, rate_rad_s - s))
         load.advance(DT_S, (0.0, 0.0, 0.0, s, s), True)
     grown_nm = 0.5 * 200 * DT_S * 0.05 * math.tanh(0.45 / 0.1)
     assert load.friction_nm == pytest.approx((grown_nm, grown_nm), rel=1e-9)
@@ -124,9 +126,9 @@ row = st.floats(-1e3, 1e3)
 @given(st.lists(st.tuples(row, row, row, row, row, row, row), max_size=40))
 def test_estimates_stay_inside_their_bounds_for_any_input(inputs: list[tuple[float, ...]]) -> None:
     config = law(load_rate_xyz=(5.0, 5.0, 20.0), moment_rate=1.0, friction_rate=1.0)
-    load = LoadAdaptation(config)
+    load = LoadAdaptation(config, MANIPULATOR)
     for s0, s1, s2, s6, s7, lever, rate in inputs:
-        load.joint_torque_nm((lever, -lever), (rate, -rate))
+        load.joint_torque_nm(((lever, -lever), (0.0, lever)), (rate, -rate))
         load.advance(DT_S, (s0, s1, s2, s6, s7), True)
         assert max(map(abs, load.force_n)) <= config.load_max_n
         assert max(map(abs, load.moments_kg_m)) <= config.moment_max_kg_m
@@ -154,15 +156,15 @@ def test_adaptive_loads_and_observer_hold_while_the_ground_may_carry_a_part_of_t
 
 
 def test_nothing_is_learned_in_saturation() -> None:
-    load = LoadAdaptation(law(load_rate_xyz=(5.0, 5.0, 20.0), moment_rate=1.0, friction_rate=1.0))
-    load.joint_torque_nm((1.0, 1.0), (1.0, 1.0))
+    load = LoadAdaptation(law(load_rate_xyz=(5.0, 5.0, 20.0), moment_rate=1.0, friction_rate=1.0), MANIPULATOR)
+    load.joint_torque_nm(((1.0, 1.0), (0.0, -1.0)), (1.0, 1.0))
     load.advance(DT_S, (1.0, 1.0, 1.0, 1.0, 1.0), False)
     assert (load.force_n, load.moments_kg_m, load.friction_nm) == ((0.0, 0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
 
 
 def test_a_sample_that_is_not_a_number_leaves_the_estimates() -> None:
-    load = LoadAdaptation(law(load_rate_xyz=(5.0, 5.0, 20.0), moment_rate=1.0, friction_rate=1.0))
-    load.joint_torque_nm((1.0, 1.0), (1.0, 1.0))
+    load = LoadAdaptation(law(load_rate_xyz=(5.0, 5.0, 20.0), moment_rate=1.0, friction_rate=1.0), MANIPULATOR)
+    load.joint_torque_nm(((1.0, 1.0), (0.0, -1.0)), (1.0, 1.0))
     load.advance(DT_S, (-1.0, -1.0, -1.0, -1.0, -1.0), True)
     before = (load.force_n, load.moments_kg_m, load.friction_nm)
     load.advance(DT_S, (math.nan,) * 5, True)

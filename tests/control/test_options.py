@@ -11,9 +11,8 @@ import pytest
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import FlightConfig, load_flight
 from companion.control.adaptive import AdaptiveController
-from companion.control.arm_inertia import ArmInertia
+from companion.control.arm_model import dynamics_of
 from companion.control.disturbance import DisturbanceObserver
-from companion.control.dynamics import Dynamics
 from companion.control.types import PlantState
 from companion.model.types import IDENTITY_QUAT, Joints, Reference, Vec3
 
@@ -115,7 +114,7 @@ def test_the_arms_inertia_takes_the_place_of_m_d(config: FlightConfig) -> None:
         jerk_world_m_s3=(0.0, 0.0, 0.0),
     )
     added = difference(config, {"arm_inertia_nominal": True}, reference)
-    (m11, m12), (m21, m22) = Dynamics(config.vehicle).arm_terms(POSE, (0.0, 0.0)).mass
+    (m11, m12), (m21, m22) = dynamics_of(config.vehicle).arm_terms(POSE, (0.0, 0.0)).mass
     assert isinstance(config.controller, AdaptiveConfig)
     first, second = config.controller.inertia_md[6:8]
     assert added[6:] == pytest.approx([(m11 - first) * 2.0 + m12, m21 * 2.0 + m22 - second])
@@ -123,7 +122,7 @@ def test_the_arms_inertia_takes_the_place_of_m_d(config: FlightConfig) -> None:
 
 def test_the_closed_form_of_the_arm_is_the_dynamics(config: FlightConfig) -> None:
     draw = random.Random(1)
-    closed, dynamics = ArmInertia(config.vehicle), Dynamics(config.vehicle)
+    dynamics = dynamics_of(config.vehicle)
     for _ in range(200):
         angle, rate, acceleration = ((draw.gauss(0, 3), draw.gauss(0, 3)) for _ in range(3))
         terms = dynamics.arm_terms(angle, rate)
@@ -132,7 +131,7 @@ def test_the_closed_form_of_the_arm_is_the_dynamics(config: FlightConfig) -> Non
             m11 * acceleration[0] + m12 * acceleration[1] + terms.coriolis[0],
             m21 * acceleration[0] + m22 * acceleration[1] + terms.coriolis[1],
         )
-        assert closed.torque_nm(angle, rate, acceleration) == pytest.approx(wanted, abs=1e-12)
+        assert dynamics.arm_torque_nm(angle, rate, acceleration) == pytest.approx(wanted, abs=1e-12)
 
 
 def test_the_observer_finds_a_steady_force_whatever_is_asked_for() -> None:

@@ -12,8 +12,7 @@ from msgspec.structs import replace
 from companion.analysis.log import FlightLog
 from companion.analysis.replay import flight_core, replay
 from companion.config.controller import PscConfig
-from companion.control.dynamics import Dynamics
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import dynamics_of, manipulator_of
 from companion.control.payload_mass import PayloadEstimator
 from companion.control.psc import PscController
 from companion.control.types import PlantState, Wrench
@@ -87,8 +86,8 @@ def test_the_arm_on_a_still_base_moves_as_its_target_impedance() -> None:
     c = law(config)
     state = at(arm=(POSE[0] + 0.05, POSE[1] - 0.04), arm_rate=(0.2, -0.1), force=(0.3, 0.0, -0.5))
     wrench = stepped(config, state)
-    manipulator = Manipulator(config.vehicle.arm, config.vehicle.tool)
-    terms = Dynamics(config.vehicle).arm_terms(state.arm_rad, state.arm_rate_rad_s)
+    manipulator = manipulator_of(config.vehicle)
+    terms = dynamics_of(config.vehicle).arm_terms(state.arm_rad, state.arm_rate_rad_s)
     external = np.array(manipulator.joint_torque_from_force(state.arm_rad, (0.3, 0.0, -0.5)))
     gravity = np.array(manipulator.gravity_torque_nm(state.arm_rad, IDENTITY_QUAT))
     applied = np.array(wrench.arm_torque_nm)

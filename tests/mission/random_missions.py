@@ -16,7 +16,7 @@ import random
 from dataclasses import dataclass, field
 from typing import Any
 
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import manipulator_of
 from companion.mission.check import check_mission
 from companion.mission.sample_check import TRACKING_M
 from companion.model.frames import quat_rotate
@@ -168,7 +168,7 @@ def fly(number: int, phases_max: int = 4) -> Row:
 def margins_m(config: SitlConfig, result: FastResult) -> tuple[float, float]:
     """Return the true minimum in flight of the slack beyond the margin, and of the distance to walls and ceiling."""
     vehicle, room = config.vehicle, config.vehicle.room
-    manipulator = Manipulator(vehicle.arm, vehicle.tool)
+    manipulator = manipulator_of(vehicle)
     reach_m, net_reach_m = vehicle.airframe.radius_m, tool_of(vehicle).net_radius_m
     tether_m = fence_m = math.inf
     for outputs, truth in zip(result.outputs, result.truth, strict=True):

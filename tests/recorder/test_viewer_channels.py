@@ -16,7 +16,7 @@ from msgspec.structs import fields, replace
 
 from companion.analysis.log import FlightLog
 from companion.config.loader import load_flight
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import manipulator_of
 from companion.model.codec import Record, differences
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.hanging_line import hanging_line_m
@@ -89,7 +89,7 @@ def in_world(transforms: list[dict[str, Any]], frame: str) -> tuple[Vec3, Quat]:
 
 def test_the_frames_are_where_the_arm_s_kinematics_have_them(tmp_path: Path) -> None:
     vehicle = load_flight("configs/missions/catch.yaml").vehicle
-    arm = Manipulator(vehicle.arm, vehicle.tool)
+    arm = manipulator_of(vehicle)
     chance = random.Random(5)
     for case in range(6):
         at = (chance.uniform(-1, 1), chance.uniform(-1, 1), chance.uniform(0.5, 1.5))
@@ -98,7 +98,7 @@ def test_the_frames_are_where_the_arm_s_kinematics_have_them(tmp_path: Path) -> 
         viewed = written(tmp_path / f"{case}.mcap", [moved(still()[0], at, attitude, angles)])
         (body,), (joints,) = viewed.by_topic["/tf"], viewed.by_topic["/tf_arm"]
         frames = [body.data, *joints.data["transforms"]]
-        for frame, body_m in (("link2", arm.elbow_body_m(angles)), ("net", arm.net_body_m(angles))):
+        for frame, body_m in (("link2", arm.joints_body_m(angles)[1]), ("net", arm.net_body_m(angles))):
             x, y, z = quat_rotate(attitude, body_m)
             position, turn = in_world(frames, frame)
             assert position == pytest.approx((at[0] + x, at[1] + y, at[2] + z), abs=1e-12)

@@ -16,7 +16,7 @@ import pytest
 
 from companion.config.controller import AdaptiveConfig
 from companion.config.mission import ArmMove, Hold, Takeoff
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import manipulator_of
 from companion.model.flight_stage import SPOOL_S
 from companion.model.types import Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
@@ -83,7 +83,7 @@ def ideal_deflection(config: SitlConfig, force_world_n: Vec3, t_s: Array) -> Def
     law = config.controller
     assert isinstance(law, AdaptiveConfig)
     m_d, k_d, k_p = (np.array(gain)[[0, 1, 2, 6, 7]] for gain in (law.inertia_md, law.damping_kd, law.stiffness_kp))
-    manipulator = Manipulator(config.vehicle.arm, config.vehicle.tool)
+    manipulator = manipulator_of(config.vehicle)
     pose = np.radians(CATCH_POSE_DEG)
     e, rate, desired = np.zeros(5), np.zeros(5), np.zeros(3)
     rows = []

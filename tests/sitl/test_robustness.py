@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from companion.campaigns.process import CampaignError
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import manipulator_of
 from companion.mission.plan import Plan
 from companion.model.types import PhaseKind
 from companion.sitl_config.loader import SitlConfig, load_sitl
@@ -75,7 +75,7 @@ def test_the_file_of_the_world_draws_the_rest_by_the_seed_of_the_draw() -> None:
 
 def test_every_throw_starts_above_the_floor_and_misses_the_rotors() -> None:
     plan = Plan.build(CONFIG.mission, CONFIG.vehicle)
-    manipulator = Manipulator(CONFIG.vehicle.arm, CONFIG.vehicle.tool)
+    manipulator = manipulator_of(CONFIG.vehicle)
     line = [t * 0.01 for t in range(1200) if plan.segment(t * 0.01).name == "catch"]
     for knobs in DRAWS:
         x_m, descent = knobs["catch_at_m"][0], -knobs["throw_velocity_m_s"][2]

@@ -19,7 +19,7 @@ from companion.commissioning.arm.sweep import Sample
 from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.vehicle import Vehicle
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import manipulator_of
 from companion.model.types import IDENTITY_QUAT, Joints
 
 BIN_S: Final = 0.25
@@ -173,7 +173,7 @@ def _huber(residual: _Array) -> _Array:
 
 def _binned(samples: Sequence[Sample], vehicle: Vehicle, joint: int) -> tuple[_Array, _Array, list[int]]:
     """Return the rows of the design matrix, the currents, and the leg of each row."""
-    manipulator = Manipulator(vehicle.arm, vehicle.tool)
+    manipulator = manipulator_of(vehicle)
     small = 1e-3
     bins: dict[tuple[int, int], list[tuple[float, ...]]] = {}
     began: dict[int, float] = {}

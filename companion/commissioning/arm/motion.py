@@ -12,7 +12,7 @@ from typing import Final
 
 from companion.config.vehicle import Arm, Vehicle
 from companion.control.arm_hold import hold_torque_nm
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import manipulator_of
 from companion.io.dynamixel.registers import WATCHDOG_ERROR, hardware_error_text
 from companion.model.types import IDENTITY_QUAT, ArmState, Joints
 
@@ -73,7 +73,7 @@ class Motion:
     def __init__(self, vehicle: Vehicle, state: ArmState) -> None:
         self._vehicle = vehicle
         self._arm = vehicle.arm
-        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self._manipulator = manipulator_of(vehicle)
         self._limit_nm = tuple(TORQUE_SHARE * joint.torque_max_nm for joint in vehicle.arm.joints)
         self._reference = list(state.angle_rad)
         self._rate = [0.0, 0.0]

@@ -7,8 +7,8 @@ import numpy as np
 from companion.config.base import Positive2, Positive3
 from companion.config.controller import LawConfig
 from companion.config.vehicle import Vehicle
+from companion.control.arm_model import manipulator_of
 from companion.control.common import ZERO8, Actuation, ForceFilter, tracking_errors, wrench_of
-from companion.control.manipulator import Manipulator
 from companion.control.types import PlantState, Wrench
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import body_x_z_axes_world, yaw_from_quat
@@ -45,7 +45,7 @@ class LqrLaw:
         self.hover_thrust = hover_thrust
         self._config, self._mass_kg = config, vehicle.airframe.mass_kg
         self._gains = [lqr_gains(cost) for cost in (config.cost_xy, config.cost_xy, config.cost_z)]
-        self._manipulator = Manipulator(vehicle.arm, vehicle.tool)
+        self._manipulator = manipulator_of(vehicle)
         self._force = ForceFilter(config.force_lowpass_hz)
         self._actuation = Actuation(config, vehicle, hover_thrust)
         self._integral_m_s = [0.0, 0.0, 0.0]

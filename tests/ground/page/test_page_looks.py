@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from companion.config.loader import load_flight
-from companion.control.manipulator import Manipulator
+from companion.control.arm_model import manipulator_of
 from companion.model.codec import to_jsonable
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from tests.ground.monitor_stub import BROKER, MonitorStub, event, flown, hello, relayed, retained
@@ -198,14 +198,14 @@ def test_the_camera_moves_by_mouse_wheel_and_keys(page: Page) -> None:
 
 def test_the_arm_is_drawn_as_the_controller_knows_it(geometry: Page) -> None:
     vehicle = load_flight(CATCH).vehicle
-    arm = Manipulator(vehicle.arm, vehicle.tool)
+    arm = manipulator_of(vehicle)
     angles = list(itertools.product((-0.5, 0.4, 1.7, 2.9), (-0.2, 0.0, 1.0, 2.4)))
     script = "const { armBody } = await import('/geometry.js'); return a.map((q) => armBody(scene, q));"
     drawn = geometry.tab.evaluate(
         f"async ([scene, a]) => {{ {script} }}", [to_jsonable(flown().scene), [list(pair) for pair in angles]]
     )
     for pair, parts in zip(angles, drawn, strict=True):
-        assert parts["elbow"] == pytest.approx(arm.elbow_body_m(pair), abs=1e-12)
+        assert parts["elbow"] == pytest.approx(arm.joints_body_m(pair)[1], abs=1e-12)
         assert parts["net"] == pytest.approx(arm.net_body_m(pair), abs=1e-12)
 
 

@@ -1,0 +1,42 @@
+"""Products of vectors and 3x3 matrices that are tuples of floats, in a fixed order of summation."""
+
+from __future__ import annotations
+
+from companion.model.types import Mat3, Vec3
+
+
+def dot(a: Vec3, b: Vec3) -> float:
+    """Return a' b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Vec3, b: Vec3) -> Vec3:
+    """Return a x b."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return (ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
+
+
+def mat_vec(m: Mat3, v: Vec3) -> Vec3:
+    """Return M v."""
+    (a, b, c), (d, e, f), (g, h, i) = m
+    x, y, z = v
+    return (a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z)
+
+
+def vec_mat(v: Vec3, m: Mat3) -> Vec3:
+    """Return v' M."""
+    (a, b, c), (d, e, f), (g, h, i) = m
+    x, y, z = v
+    return (a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z)
+
+
+def mat_mat(m: Mat3, n: Mat3) -> Mat3:
+    """Return M N."""
+    return (vec_mat(m[0], n), vec_mat(m[1], n), vec_mat(m[2], n))
+
+
+def transpose(m: Mat3) -> Mat3:
+    """Return M'."""
+    (a, b, c), (d, e, f), (g, h, i) = m
+    return ((a, d, g), (b, e, h), (c, f, i))
