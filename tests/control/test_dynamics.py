@@ -51,12 +51,12 @@ def rotation_of(rpy: Array) -> Array:
     return axis_rotation(2, rpy[2]) @ axis_rotation(1, rpy[1]) @ axis_rotation(0, rpy[0])
 
 
-def to_twist(rpy: Vec3) -> Array:
+def to_twist(rpy: Vec3, joints: int = 2) -> Array:
     """chi' to Pinocchio's velocity (origin velocity in body axes, body rate, joints), from the axes that the angles turn about."""
     yaw_pitch = axis_rotation(2, rpy[2]) @ axis_rotation(1, rpy[1])
     axes = np.column_stack([yaw_pitch[:, 0], axis_rotation(2, rpy[2])[:, 1], [0.0, 0.0, 1.0]])
     rotation = rotation_of(np.array(rpy))
-    out = np.eye(8)
+    out = np.eye(6 + joints)
     out[:3, :3] = rotation.T
     out[3:6, 3:6] = rotation.T @ axes
     return out
@@ -66,7 +66,7 @@ def to_twist_rate(rpy: Vec3, rate: Chi) -> Array:
     """d/dt of `to_twist`, by a complex-free fourth-order difference."""
 
     def at(h: float) -> Array:
-        return to_twist((rpy[0] + h * rate[3], rpy[1] + h * rate[4], rpy[2] + h * rate[5]))
+        return to_twist((rpy[0] + h * rate[3], rpy[1] + h * rate[4], rpy[2] + h * rate[5]), len(rate) - 6)
 
     h = 1e-3
     return (8.0 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12.0 * h)

@@ -11,19 +11,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from companion.config.vehicle import Vehicle
 from companion.control.arm_model.algebra import mat_mat, mat_vec, transpose, vec_mat
 from companion.control.dynamics import ArmTerms, Dynamics, DynamicsTerms, euler_rate_matrices
+from companion.model.arm_chain import ROD_AXIAL_KG_M2, ROD_AXIAL_SHARE, ArmChain
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Chi, Joints, Mat3, Matrix, Vec3
 
 _Vec4 = tuple[float, float, float, float]
-
-ROD_AXIAL_SHARE = 0.1
-ROD_AXIAL_KG_M2 = 1e-5
-"""Inertia of a link about its own axis: a fraction of the transverse inertia plus this constant."""
-TOOL_PART_INERTIA_KG_M2 = 1e-4
-"""Inertia of the sensor and of the net about any axis, kg m^2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,25 +44,27 @@ class _Part:
 
 
 class PlanarDynamics(Dynamics):
-    """The nominal model of a vehicle with a planar 2R arm; arguments as for `dynamics_of`."""
+    """The nominal model of a vehicle with a planar 2R arm; arguments as for `ChainDynamics`."""
 
-    def __init__(self, vehicle: Vehicle, mass_scale: float = 1.0) -> None:
-        arm = vehicle.arm
+    def __init__(self, chain: ArmChain, mass_kg: float, base_inertia_kg_m2: Vec3, mass_scale: float) -> None:
+        first, second = chain.links
         self._scale = mass_scale
-        self._l1, self._l2 = arm.link_lengths_m
-        self._m1, self._m2 = (mass_scale * mass for mass in arm.link_masses_kg)
-        self._c1, self._c2 = arm.link_com_m
-        self._tool_kg = mass_scale * vehicle.tool_mass_kg
-        self._total_kg = mass_scale * vehicle.airframe.mass_kg
-        self._shoulder = arm.shoulder_body_m
-        ix, iy, iz = vehicle.airframe.inertia_kg_m2
+        self._l1, self._l2 = second.position_m[0], chain.tip_m[0]
+        self._m1, self._m2 = mass_scale * first.mass_kg, mass_scale * second.mass_kg
+        self._c1, self._c2 = first.com_m[0], second.com_m[0]
+        self._tool_kg = mass_scale * chain.tool_mass_kg
+        self._tool_inertia = mass_scale * chain.tool_inertia_kg_m2
+        self._total_kg = mass_scale * mass_kg
+        self._shoulder = first.position_m
+        ix, iy, iz = base_inertia_kg_m2
         self._base_inertia = (mass_scale * ix, mass_scale * iy, mass_scale * iz)
-        self._armature = mass_scale * arm.joint_armature_kg_m2
+        self._armature_1 = mass_scale * first.armature_kg_m2
+        self._armature_2 = mass_scale * second.armature_kg_m2
         at_rest: Joints = (0.0, 0.0)
         stretched, bent = (self.arm_terms((0.0, beta), at_rest).mass for beta in (0.0, math.pi / 2))
-        self._outer = stretched[1][1] - self._armature
+        self._outer = stretched[1][1] - self._armature_2
         self._cross = -stretched[0][1] - self._outer
-        self._inner = bent[0][0] - self._armature - self._outer
+        self._inner = bent[0][0] - self._armature_1 - self._outer
 
     def arm_terms(self, angle_rad: Joints, rate_rad_s: Joints) -> ArmTerms:
         """See `Dynamics`."""
@@ -80,7 +76,7 @@ class PlanarDynamics(Dynamics):
             m22 += m * (jx[1] * jx[1] + jz[1] * jz[1]) + part.yy * t2 * t2
             c1 += m * (jx[0] * part.kx + jz[0] * part.kz)
             c2 += m * (jx[1] * part.kx + jz[1] * part.kz)
-        return ArmTerms(((m11 + self._armature, m12), (m12, m22 + self._armature)), (c1, c2))
+        return ArmTerms(((m11 + self._armature_1, m12), (m12, m22 + self._armature_2)), (c1, c2))
 
     def arm_torque_nm(self, angle_rad: Joints, rate_rad_s: Joints, acceleration_rad_s2: Joints) -> Joints:
         """See `Dynamics`; the closed form costs a tenth of `arm_terms`."""
@@ -89,10 +85,10 @@ class PlanarDynamics(Dynamics):
         a1, a2 = acceleration_rad_s2
         cross, coriolis = self._cross * math.cos(beta), self._cross * math.sin(beta)
         m12 = -(self._outer + cross)
-        m11 = self._inner + self._outer + 2.0 * cross + self._armature
+        m11 = self._inner + self._outer + 2.0 * cross + self._armature_1
         return (
             m11 * a1 + m12 * a2 + coriolis * v2 * (v2 - 2.0 * v1),
-            m12 * a1 + (self._outer + self._armature) * a2 + coriolis * v1 * v1,
+            m12 * a1 + (self._outer + self._armature_2) * a2 + coriolis * v1 * v1,
         )
 
     def terms(self, rotation: Mat3, roll_pitch_yaw_rad: Vec3, angle_rad: Joints, chi_rate: Chi) -> DynamicsTerms:
@@ -184,8 +180,8 @@ class PlanarDynamics(Dynamics):
             (p_q[0][0], p_q[1][0], p_q[2][0], *q_q[0], q_a1[0], q_a2[0]),
             (p_q[0][1], p_q[1][1], p_q[2][1], *q_q[1], q_a1[1], q_a2[1]),
             (p_q[0][2], p_q[1][2], p_q[2][2], *q_q[2], q_a1[2], q_a2[2]),
-            (*p_a1, *q_a1, m11 + self._armature, m12),
-            (*p_a2, *q_a2, m12, m22 + self._armature),
+            (*p_a1, *q_a1, m11 + self._armature_1, m12),
+            (*p_a2, *q_a2, m12, m22 + self._armature_2),
         )
         coriolis: Chi = (*c_p, *c_q, c1, c2)
         gravity: Chi = (0.0, 0.0, mt * GRAVITY_M_S2, *g_q, g1, g2)
@@ -212,7 +208,7 @@ class PlanarDynamics(Dynamics):
             rate_1,
             *_rod(self._m1, length, c1, s1, self._scale),
         )
-        ball = 2.0 * self._scale * TOOL_PART_INERTIA_KG_M2
+        ball = self._tool_inertia
         link2, tool = (
             _Part(
                 mass,

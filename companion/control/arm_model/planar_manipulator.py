@@ -8,12 +8,26 @@ from __future__ import annotations
 
 import math
 
-from companion.config.vehicle import Arm, Tool
 from companion.control.manipulator import Manipulator
-from companion.model.frames import quat_from_euler_zyx, quat_multiply
-from companion.model.types import Joints, Matrix, Quat, Vec3
+from companion.model.arm_chain import ArmChain, rod_inertia_kg_m2
+from companion.model.frames import quat_multiply
+from companion.model.types import IDENTITY_QUAT, Joints, Matrix, Quat, Vec3
 
 _ROW_Y: Joints = (0.0, 0.0)
+
+
+def is_planar_2r(chain: ArmChain) -> bool:
+    """Return whether a chain is a planar 2R arm: two rods along x, the first turning about +y and the second about -y."""
+    if len(chain.links) != 2:
+        return False
+    first, second = chain.links
+    for link, end, axis in ((first, second.position_m, (0.0, 1.0, 0.0)), (second, chain.tip_m, (0.0, -1.0, 0.0))):
+        xx, yy, zz = rod_inertia_kg_m2(link.mass_kg, end[0])
+        rod = ((xx, 0.0, 0.0), (0.0, yy, 0.0), (0.0, 0.0, zz))
+        along_x = end[0] > 0.0 and end[1:] == link.com_m[1:] == (0.0, 0.0)
+        if not along_x or (link.attitude_wxyz, link.axis, link.inertia_kg_m2) != (IDENTITY_QUAT, axis, rod):
+            return False
+    return True
 
 
 class PlanarManipulator(Manipulator):
@@ -21,19 +35,17 @@ class PlanarManipulator(Manipulator):
 
     joint_count = 2
 
-    def __init__(self, arm: Arm, tool: Tool | None) -> None:
-        self._shoulder = arm.shoulder_body_m
-        self._l1, self._l2 = arm.link_lengths_m
-        m1, m2 = arm.link_masses_kg
-        c1, c2 = arm.link_com_m
-        tool_mass = 0.0 if tool is None else tool.sensor_mass_kg + tool.net_mass_kg
+    def __init__(self, chain: ArmChain) -> None:
+        first, second = chain.links
+        self._shoulder = first.position_m
+        self._l1, self._l2 = second.position_m[0], chain.tip_m[0]
+        m1, m2 = first.mass_kg, second.mass_kg
+        c1, c2 = first.com_m[0], second.com_m[0]
+        tool_mass = chain.tool_mass_kg
         # First moments about each joint's axis, kg m.
         self._moment_1 = m1 * c1 + (m2 + tool_mass) * self._l1
         self._moment_2 = m2 * c2 + tool_mass * self._l2
-        roll, pitch, yaw = (
-            math.radians(angle) for angle in (tool.sensor_rpy_deg if tool is not None else (0.0, 0.0, 0.0))
-        )
-        self._sensor_in_link2: Quat = quat_from_euler_zyx(roll, pitch, yaw)
+        self._sensor_in_link2: Quat = chain.sensor_wxyz
 
     def net_body_m(self, angle_rad: Joints) -> Vec3:
         """See `Manipulator`."""
