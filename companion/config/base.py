@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchemaHandler, ValidationError
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError
 
 Location = tuple[str | int, ...]
 """Keys and indices that lead from a model to a value."""
@@ -48,4 +49,20 @@ def _ordered(span: Vector2) -> Vector2:
     return span
 
 
+JOINTS_MAX = 7
+PerJoint = Annotated[tuple[float, ...], Field(max_length=JOINTS_MAX)]
+"""One value for each joint, from the shoulder outwards."""
+PositivePerJoint = Annotated[tuple[Positive, ...], Field(max_length=JOINTS_MAX)]
+
+
 Span = Annotated[Vector2, AfterValidator(_ordered)]
+
+
+class OrElse:
+    """Annotation that adds an alternative to a field's JSON Schema, for a value that is replaced before the field is validated."""
+
+    def __init__(self, alternative: dict[str, str]) -> None:
+        self._alternative = alternative
+
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        return {"anyOf": [handler(core), self._alternative]}

@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
 from companion import plugins
-from companion.config.base import Location, Model, NonNegative, Positive, Positive2, Positive3, refuse
+from companion.config.base import Location, Model, NonNegative, Positive, Positive3, PositivePerJoint, refuse
 
 Positive8 = tuple[Positive, Positive, Positive, Positive, Positive, Positive, Positive, Positive]
 NonNegative8 = tuple[
@@ -180,10 +180,10 @@ class PscConfig(LawConfig):
     """Integral gain per world axis, 1/s^3; 0 disables the integral term."""
     integral_max_m_s2: NonNegative = 1.5
     """Largest acceleration of the integral term, per axis."""
-    arm_inertia_md: Positive2
+    arm_inertia_md: PositivePerJoint
     """M_d of the joints, kg m^2."""
-    arm_damping_kd: Positive2
-    arm_stiffness_kp: Positive2
+    arm_damping_kd: PositivePerJoint
+    arm_stiffness_kp: PositivePerJoint
     payload_time_s: Positive
     """Time constant of the estimate of the payload's mass."""
     payload_max_kg: NonNegative = 1.0

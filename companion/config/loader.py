@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 from collections.abc import Sequence
@@ -28,7 +29,7 @@ from companion.config.explain import nearest, validate
 from companion.config.mission import ControllerChoice, Mission
 from companion.config.overrides import Override, Section, apply_overrides, parse_overrides
 from companion.config.shipped import named_file, near
-from companion.config.vehicle import ANY_INTERFACE, Vehicle
+from companion.config.vehicle import ANY_INTERFACE, NO_ARM, Vehicle
 from companion.config.yaml_strict import read_document
 
 M = TypeVar("M", bound=Model)
@@ -91,15 +92,19 @@ def load_flight(
     """
     parsed = parse_overrides(overrides)
     lines: list[str] = []
+    of_vehicle: list[str] = []
     mission_file = read_document(named_file("missions", mission_path, "mission"))
-    mission = check_document(Mission, mission_file, "mission", parsed, lines)
+    _override(mission_file, "mission", parsed, lines)
 
     vehicle: Vehicle | None = None
-    vehicle_file = _open_named(mission_file, ("vehicle",), vehicle_path, lines)
+    vehicle_file = _open_named(mission_file, ("vehicle",), vehicle_path, of_vehicle)
     if vehicle_file is not None:
-        vehicle = check_document(Vehicle, vehicle_file, "vehicle", parsed, lines)
+        vehicle = check_document(Vehicle, vehicle_file, "vehicle", parsed, of_vehicle)
         if hardware and vehicle is not None:
-            lines += _open_to_every_network(vehicle, vehicle_file) + _unusable_mocap(vehicle, vehicle_file)
+            of_vehicle += _open_to_every_network(vehicle, vehicle_file) + _unusable_mocap(vehicle, vehicle_file)
+    _place_arm(mission_file, vehicle)
+    mission = _validated(Mission, mission_file, lines)
+    lines += of_vehicle
 
     controller: ControllerConfig | None = None
     controller_file: Document | None = None
@@ -172,6 +177,8 @@ def check_document(
     _override(document, section, overrides, lines)
     if section == "vehicle":
         _move_keys(document)
+        if document.data.get("arm", NO_ARM) is None:
+            document.replace(("arm",), copy.deepcopy(NO_ARM), document.origin(("arm",)))
     return _validated(model, document, lines)
 
 
@@ -182,6 +189,26 @@ def _move_keys(document: Document) -> None:
         if isinstance(old, dict) and isinstance(new, dict) and old_key in old and key not in new:
             document.replace((part, key), old[old_key], document.origin((old_part, old_key)))
             del old[old_key]
+
+
+def _place_arm(document: Document, vehicle: Vehicle | None) -> None:
+    """Replace the names of poses in a mission by the vehicle's joint angles, and check the number of angles; without a valid vehicle,
+    a name is replaced by an empty pose.
+    """
+    phases = _value(document, ("phases",))
+    places: list[Location] = [("start", "arm_deg")]
+    places += [("phases", index, "arm_deg") for index in range(len(phases) if isinstance(phases, list) else 0)]
+    for place in places:
+        given = _value(document, place)
+        if isinstance(given, str):
+            poses_deg = vehicle.poses_deg if vehicle is not None else {given: ()}
+            if given not in poses_deg:
+                text = f'{key_path(place)}: expected joint angles or a pose of the vehicle ({", ".join(poses_deg)}), got "{given}"'
+                document.problems.append(Problem(RANK_VALUE, document.origin(place), text))
+            document.replace(place, list(poses_deg.get(given, ())), document.origin(place))
+        elif isinstance(given, list) and vehicle is not None and len(given) != len(vehicle.arm.joints):
+            text = f"{key_path(place)}: expected {len(vehicle.arm.joints)} joint angles, as many as the vehicle has, got {len(given)}"
+            document.problems.append(Problem(RANK_VALUE, document.origin(place), text))
 
 
 def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:

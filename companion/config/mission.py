@@ -11,9 +11,11 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from companion.config.base import Location, Model, NonNegative, Positive, Vector2, Vector3, refuse
+from companion.config.base import Location, Model, NonNegative, OrElse, PerJoint, Positive, Vector2, Vector3, refuse
 from companion.config.controller import PRESETS
 
+ArmPose = Annotated[PerJoint, OrElse({"type": "string"})]
+"""Joint angles. A mission file may name a pose of its vehicle file instead, which the loader replaces by its angles."""
 Duration = Annotated[float, Field(gt=0, le=600)]
 Delay = Annotated[float, Field(ge=0, le=600)]
 POINTS_APART_M = 0.01
@@ -47,8 +49,8 @@ class Line(Model):
     to_m: Vector3
     duration_s: Duration | None = None
     """Duration. If it is absent, the shortest duration that the limits allow is used."""
-    arm_deg: Vector2 | None = None
-    """Final joint angles. If they are absent, the arm keeps its pose."""
+    arm_deg: ArmPose | None = None
+    """Final joint angles, or the name of a pose of the vehicle file. If they are absent, the arm keeps its pose."""
     arm_delay_s: Delay | None = None
     """Time from the start of the line to the start of the arm's motion; 0 if it is absent."""
     arm_duration_s: Duration | None = None
@@ -89,7 +91,7 @@ class ArmMove(Model):
 
     type: Literal["arm"]
     name: Name | None = None
-    arm_deg: Vector2
+    arm_deg: ArmPose
     duration_s: Duration | None = None
     """Duration. If it is absent, the shortest duration that the limits allow is used."""
 
@@ -114,7 +116,7 @@ class Start(Model):
     """Tolerance of the position, and of the height, which must equal the vehicle's airframe.ground_clearance_m."""
     yaw_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
     yaw_tolerance_deg: Positive = 15.0
-    arm_deg: Vector2
+    arm_deg: ArmPose
     arm_tolerance_deg: Positive = 10.0
     takeoff: Literal["at_once", "by_operator"] = "at_once"
     """at_once: take off as soon as everything is ready. by_operator: wait on the ground until an operator commands `start`."""

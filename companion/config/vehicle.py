@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, JsonValue, model_validator
 
 from companion.config.base import (
+    JOINTS_MAX,
     Fraction,
     Location,
     Model,
     NonNegative,
+    OrElse,
+    PerJoint,
     Positive,
-    Positive2,
     Positive3,
+    PositivePerJoint,
     Span,
-    Vector2,
     Vector3,
     refuse,
 )
@@ -23,6 +26,7 @@ from companion.config.computer import Computer
 from companion.config.ground import Ground
 from companion.config.mocap import NATNET
 from companion.model.constants import GRAVITY_M_S2
+from companion.model.types import Joints
 
 
 class Airframe(Model):
@@ -57,6 +61,10 @@ class Airframe(Model):
     """Payload that is assumed when a mission without `catch:` is checked."""
 
 
+FOLDED, UNFOLDED = "folded", "unfolded"
+"""Names of poses that the shipped missions use."""
+
+
 class Joint(Model):
     """One servo and its joint, with angles as defined in the paper."""
 
@@ -72,21 +80,59 @@ class Joint(Model):
 
 
 class Arm(Model):
-    """The 2R arm. Link 1 begins at the shoulder; link 2 carries sensor and net."""
+    """A serial arm of up to 7 joints. Link 1 begins at the shoulder; the last link carries sensor and net."""
 
     shoulder_body_m: Vector3
-    link_lengths_m: Positive2
-    """Lengths from shoulder to elbow, and from elbow to the centre of the net or, without a tool, to the end of link 2."""
-    link_masses_kg: Positive2
-    """Mass of link 1 with the elbow servo, and mass of link 2 without sensor and net."""
-    link_com_m: Positive2
+    link_lengths_m: PositivePerJoint
+    """Length of each link, from its joint to the next one; of the last link, to the centre of the net or, without a tool, to the link's
+    end.
+    """
+    link_masses_kg: PositivePerJoint
+    """Mass of each link with the servo of the next joint; of the last link, without sensor and net."""
+    link_com_m: PositivePerJoint
     """Distance of each link's centre of mass from its joint."""
     torque_per_amp_nm_a: Positive = 1.3
     joint_armature_kg_m2: NonNegative = 0.008
     """Inertia of a servo's rotor and gears, referred to the joint; used by the model-based laws and the simulated arm."""
     joint_friction_nm: NonNegative = 0.04
     """Dry friction of one joint, for laws with friction feedforward."""
-    joints: tuple[Joint, Joint]
+    joints: Annotated[tuple[Joint, ...], Field(max_length=JOINTS_MAX)]
+    poses: dict[str, PerJoint] = Field(default={})
+    """Joint angles, in degrees, that missions refer to by name. Always defined are `folded` (safety.fold_arm_deg) and, for two joints,
+    `unfolded` (100, 60 unless given here).
+    """
+
+    @model_validator(mode="after")
+    def _one_value_per_joint(self) -> Self:
+        problems: list[tuple[Location, str]] = []
+        count = len(self.joints)
+        lists: dict[Location, Joints] = {
+            (key,): getattr(self, key) for key in ("link_lengths_m", "link_masses_kg", "link_com_m")
+        }
+        lists |= {("poses", name): angles_deg for name, angles_deg in self.poses.items()}
+        for location, values in lists.items():
+            if len(values) != count:
+                problems.append((location, f"expected {count} values, one for each of arm.joints, got {len(values)}"))
+        if FOLDED in self.poses:
+            problems.append((("poses", FOLDED), "is defined by safety.fold_arm_deg; give this pose another name"))
+        for index, joint in enumerate(self.joints):
+            for earlier in range(index):
+                if self.joints[earlier].servo_id == joint.servo_id:
+                    text = f"joint {earlier + 1} has the servo id {joint.servo_id} too; give each servo its own id"
+                    problems.append((("joints", index, "servo_id"), text))
+                    break
+        refuse("arm", problems)
+        return self
+
+
+NO_ARM: dict[str, JsonValue] = {
+    "shoulder_body_m": [0.0, 0.0, 0.0],
+    "link_lengths_m": [],
+    "link_masses_kg": [],
+    "link_com_m": [],
+    "joints": [],
+}
+"""What `arm: null` in a file stands for; the loader replaces it."""
 
 
 LINK_RADIUS_M = 0.03
@@ -229,7 +275,8 @@ class Devices(Model):
 
     autopilot: AutopilotDevice
     mocap: MocapDevice
-    arm: ArmDevice
+    arm: ArmDevice | None = None
+    """Bus of the arm's servos; absent if and only if the vehicle has no arm."""
     force: ForceDevice | None
     """Force-torque sensor; null states that there is none: the control law then runs without a measured force, and no catch is detected
     (docs/parts.md)."""
@@ -355,7 +402,8 @@ class Safety(Model):
     retract_slack_m: Positive = 0.6
     """Tether slack at the end of a RETRACT."""
     land_speed_m_s: Positive = 0.35
-    fold_arm_deg: Vector2 = (165.0, 140.0)
+    fold_arm_deg: PerJoint = (165.0, 140.0)
+    """Joint angles of the folded arm, the pose `folded` of missions. The default is for an arm of two joints."""
 
 
 class Vehicle(Model):
@@ -364,9 +412,10 @@ class Vehicle(Model):
     schema_version: Literal[1]
     name: str
     airframe: Airframe
-    arm: Arm
+    arm: Annotated[Arm, OrElse({"type": "null"})]
+    """Arm; null states that there is none, and `arm.joints` is then empty (docs/parts.md)."""
     tool: Tool | None
-    """Net, with the force-torque sensor between link 2 and the net; null states that there is none, and nothing can be caught
+    """Net, with the force-torque sensor between the last link and the net; null states that there is none, and nothing can be caught
     (docs/parts.md)."""
     tether: Tether | None
     """Safety tether; null states that there is none: only the room then limits the flight, and no tether rule is evaluated
@@ -376,6 +425,23 @@ class Vehicle(Model):
     computer: Computer = Computer()
     safety: Safety = Safety()
     ground: Ground = Ground()
+
+    @property
+    def fold_arm_deg(self) -> Joints:
+        """Joint angles of the folded arm, deg."""
+        return self.safety.fold_arm_deg[: len(self.arm.joints)]
+
+    @property
+    def arm_device(self) -> ArmDevice:
+        """Bus of the arm's servos; may be read only if there is an arm."""
+        assert self.devices.arm is not None, "the vehicle has no arm"
+        return self.devices.arm
+
+    @property
+    def poses_deg(self) -> dict[str, Joints]:
+        """Joint angles of each named pose, deg."""
+        usual = {UNFOLDED: (100.0, 60.0)} if len(self.arm.joints) == 2 else {}
+        return {FOLDED: self.fold_arm_deg, **usual, **self.arm.poses}
 
     @property
     def tip_radius_m(self) -> float:
@@ -390,23 +456,11 @@ class Vehicle(Model):
     @model_validator(mode="after")
     def _parts_fit(self) -> Self:
         problems: list[tuple[Location, str]] = []
-        first, second = self.arm.joints
-        if first.servo_id == second.servo_id:
-            problems.append(
-                (
-                    ("arm", "joints", 1, "servo_id"),
-                    f"both servos have the id {second.servo_id}; give each servo its own id",
-                )
-            )
         for index, (com_m, length_m) in enumerate(zip(self.arm.link_com_m, self.arm.link_lengths_m, strict=True)):
             if com_m > length_m:
                 text = f"the centre of mass is beyond the end of the link: at {com_m:g} m on a link of {length_m:g} m"
                 problems.append((("arm", "link_com_m", index), text))
-        for index, (joint, angle_deg) in enumerate(zip(self.arm.joints, self.safety.fold_arm_deg, strict=True)):
-            low_deg, high_deg = joint.angle_deg
-            if not low_deg <= angle_deg <= high_deg:
-                text = f"{angle_deg:g} deg is outside the joint limits, {low_deg:g} to {high_deg:g} deg"
-                problems.append((("safety", "fold_arm_deg", index), text))
+        problems += self._poses_within_limits()
         for axis, own in enumerate(self.airframe.inertia_kg_m2):
             others = sum(self.airframe.inertia_kg_m2) - own
             if own > others * (1.0 + 1e-9):
@@ -415,6 +469,16 @@ class Vehicle(Model):
         if self.tool is None and self.devices.force is not None:
             text = "the force-torque sensor is part of the tool, but tool is absent; add tool, or set devices.force to null"
             problems.append((("devices", "force"), text))
+        if self.tool is not None and not self.arm.joints:
+            text = "the tool is mounted on the arm's last link, but arm is null; set tool to null"
+            problems.append((("tool",), text))
+        if (self.devices.arm is None) != (not self.arm.joints):
+            text = (
+                "missing; the arm's servos need a bus"
+                if self.devices.arm is None
+                else "must be null, because arm is null"
+            )
+            problems.append((("devices", "arm"), text))
         carried_kg = sum(self.arm.link_masses_kg) + self.tool_mass_kg
         if carried_kg >= self.airframe.mass_kg:
             text = f"{self.airframe.mass_kg:g} kg is the mass of the whole vehicle, but arm and tool alone have {carried_kg:g} kg"
@@ -424,3 +488,19 @@ class Vehicle(Model):
             problems.append((("airframe", "thrust_max_n"), text))
         refuse("vehicle", problems)
         return self
+
+    def _poses_within_limits(self) -> Iterator[tuple[Location, str]]:
+        joints, fold = self.arm.joints, self.safety.fold_arm_deg
+        given = "fold_arm_deg" in self.safety.model_fields_set
+        if len(fold) != len(joints) and (given or len(joints) > len(fold)):
+            text = f"expected {len(joints)} angles, one for each of arm.joints, got {len(fold)}"
+            yield ("safety", "fold_arm_deg"), text
+            return
+        poses: list[tuple[Location, Joints]] = [(("safety", "fold_arm_deg"), self.fold_arm_deg)]
+        poses += [(("arm", "poses", name), at) for name, at in self.arm.poses.items()]
+        for location, angles_deg in poses:
+            for index, (joint, angle_deg) in enumerate(zip(joints, angles_deg, strict=True)):
+                low_deg, high_deg = joint.angle_deg
+                if not low_deg <= angle_deg <= high_deg:
+                    text = f"{angle_deg:g} deg is outside the joint limits, {low_deg:g} to {high_deg:g} deg"
+                    yield (*location, index), text

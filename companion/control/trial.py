@@ -83,15 +83,17 @@ def try_law(config: ControllerConfig, vehicle: Vehicle, start_arm_rad: Joints) -
         except Exception as error:
             raise plugin.error(f"step raises {one_line(error)}") from error
         fastest_s = min(fastest_s, time.perf_counter() - begin_s)
-        problem = problem_of(wrench)
+        problem = problem_of(wrench, joints=len(start_arm_rad))
         if problem is not None:
             raise plugin.error(f"step returns {problem}")
     if fastest_s > TICK_PERIOD_S:
         raise plugin.error(f"step takes {fastest_s * 1e3:.1f} ms or more (limit {TICK_PERIOD_S * 1e3:g} ms, one tick)")
 
 
-def problem_of(wrench: object) -> str | None:
-    """Return why a command cannot be sent (wrong type or shape, a non-finite number, or no attitude), or None if it can."""
+def problem_of(wrench: object, joints: int) -> str | None:
+    """Return why a command cannot be sent to a vehicle with this number of joints (wrong type or shape, a non-finite number, or no
+    attitude), or None if it can.
+    """
     if not isinstance(wrench, Wrench):
         return f"a {type(wrench).__name__}, not a companion.control.types.Wrench"
     try:
@@ -104,6 +106,12 @@ def problem_of(wrench: object) -> str | None:
             return f"{path} = {value}, which is not finite"
     if converted != wrench:
         return "a Wrench with a list in place of a tuple"
+    log = wrench.log
+    torque, rows = wrench.arm_torque_nm, (log.error, log.error_rate, log.sliding, log.gamma, log.tau, log.e_tau)
+    if len(torque) != joints:
+        return f"arm_torque_nm of length {len(torque)}, expected {joints}, one value for each joint"
+    if any(len(one) != 6 + joints for one in rows):
+        return f"a log with rows of another length than {6 + joints} (6 and one for each joint)"
     norm = math.hypot(*wrench.attitude_wxyz)
     if abs(norm - 1.0) > 1e-6:
         return f"attitude_wxyz of norm {norm:g}, expected 1"

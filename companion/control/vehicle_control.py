@@ -59,8 +59,7 @@ class VehicleControl:
         """State in the last tick in which the law ran."""
         self._law: Law = law_class(config.controller.law)(config.controller, vehicle, hover_thrust)
         self._controller: Controller = self._law
-        fold = vehicle.safety.fold_arm_deg
-        self.fold_rad: Joints = (math.radians(fold[0]), math.radians(fold[1]))
+        self.fold_rad: Joints = tuple(map(math.radians, vehicle.fold_arm_deg))
         self._arm_target_rad: Joints | None = None
         self.tracking_error_m: float | None = None
         """Distance from the reference in the last tick in which the law ran, m."""

@@ -46,7 +46,7 @@ class Parameters:
             vehicle=vehicle,
             clearance_m=vehicle.airframe.ground_clearance_m,
             tilt_max_rad=math.radians(safety.tilt_abort_deg),
-            fold_rad=(math.radians(safety.fold_arm_deg[0]), math.radians(safety.fold_arm_deg[1])),
+            fold_rad=tuple(map(math.radians, vehicle.fold_arm_deg)),
             times=LadderTimes.of(safety),
             waits_for_start=config.mission.start.takeoff == "by_operator",
         )

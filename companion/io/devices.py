@@ -102,7 +102,7 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
             except DeviceError as error:
                 failures.append(str(error))
             except TimeoutError:
-                failures.append(f"arm {config.vehicle.devices.arm.port}: not open within {ARM_TIMEOUT_S:g} s")
+                failures.append(f"arm {config.vehicle.arm_device.port}: not open within {ARM_TIMEOUT_S:g} s")
             if ground_address is not None:
                 failures.append(
                     f"ground.qgroundcontrol {ground_address}: MAVLink is not forwarded because PX4 was found armed"
@@ -215,4 +215,4 @@ def _autopilot(config: FlightConfig, clock: Clock) -> MavsdkAutopilot:
 
 
 def _arm(config: FlightConfig, clock: Clock) -> DynamixelArm:
-    return DynamixelArm(config.vehicle.devices.arm, config.vehicle.arm, clock)
+    return DynamixelArm(config.vehicle.arm_device, config.vehicle.arm, clock)

@@ -114,7 +114,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     if failure is not None:
         yield DEVICE.bad(failure, "", "")
         return
-    yield DEVICE.good(f"{vehicle.devices.arm.port} at {vehicle.devices.arm.baud} baud")
+    yield DEVICE.good(f"{vehicle.arm_device.port} at {vehicle.arm_device.baud} baud")
     if o.servos:
         yield from _settings(o.servos, vehicle)
     if o.arm:
@@ -150,7 +150,7 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
         "another program has changed it: close that program, then start again",
     )
     watchdogs_ms = [servo.watchdog_ms for servo in servos]
-    wanted_ms = vehicle.devices.arm.watchdog_ms
+    wanted_ms = vehicle.arm_device.watchdog_ms
     yield _equal(
         WATCHDOG, watchdogs_ms, wanted_ms, "{} ms".format, "cycle the servos' power; check for a loose supply cable"
     )

@@ -303,6 +303,6 @@ def machine_of(config: FlightConfig, out: Path) -> Machine:
         realtime=realtime_permitted(FLIGHT_PRIORITY),
         memory_lock=memory_lock_refused(),
         cpus=usable_cpus(),
-        arm_latency_ms=usb_latency_ms(devices.arm.port),
+        arm_latency_ms=usb_latency_ms(devices.arm.port) if devices.arm is not None else None,
         force_latency_ms=usb_latency_ms(devices.force.port) if devices.force is not None else None,
     )

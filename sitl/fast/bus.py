@@ -34,7 +34,7 @@ def scales_of(vehicle: Vehicle, servos: Sequence[ServoModel]) -> tuple[JointScal
         for `torque_max_nm`.
     """
     line, arm = ServoLine(servos), vehicle.arm
-    first, second = (_current_limit_counts(line, joint, vehicle.devices.arm.baud) for joint in arm.joints)
+    first, second = (_current_limit_counts(line, joint, vehicle.arm_device.baud) for joint in arm.joints)
     if first is None or second is None:
         return None
     try:

@@ -163,7 +163,7 @@ class FastFlight:
         self.core = FlightCore(config.flight)
         scales = scales_of(vehicle, plugged_in(servos, world))
         self._bus = FastBus(
-            drives, scales, vehicle.devices.arm.watchdog_ms * 1e-3, self.faults if world.faults else None
+            drives, scales, vehicle.arm_device.watchdog_ms * 1e-3, self.faults if world.faults else None
         )
         self._mocap: MocapPose | None = None
         self._has_force = vehicle.devices.force is not None

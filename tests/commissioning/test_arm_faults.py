@@ -174,8 +174,8 @@ def test_an_adapter_with_the_factory_latency_timer_is_found(tmp_path: Path) -> N
             timer = tmp_path / os.path.basename(bus.path) / "device/latency_timer"
             timer.parent.mkdir(parents=True, exist_ok=True)
             timer.write_text(latency, encoding="utf-8")
-            vehicle = load_vehicle(SHIPPED, [f"vehicle.devices.arm.port={bus.path}"])
-            found = await asyncio.to_thread(scan, vehicle.devices.arm, sysfs=tmp_path, only=int(FILES))
+            vehicle = load_vehicle(SHIPPED, [f"vehicle.arm_device.port={bus.path}"])
+            found = await asyncio.to_thread(scan, vehicle.arm_device, sysfs=tmp_path, only=int(FILES))
             return {row.id: row.fix for row in judge(found, vehicle).rows if not row.ok and row.read.endswith(" ms")}
 
     slow = asyncio.run(look("16\n"))
@@ -188,7 +188,7 @@ def test_a_port_that_is_not_there_is_one_line(tmp_path: Path, tool: str, capsys:
     words = ["--joint", "1", "--to", "90"] if tool == "jog" else []
     yes = ["--yes"] if tool in ("setup", "jog", "friction") else []
     code = main(
-        ["arm", tool, *words, *yes, "--vehicle", str(SHIPPED), "--set", f"vehicle.devices.arm.port={tmp_path}/none"]
+        ["arm", tool, *words, *yes, "--vehicle", str(SHIPPED), "--set", f"vehicle.arm_device.port={tmp_path}/none"]
     )
     err = capsys.readouterr().err.splitlines()
     assert code == EXIT_REFUSED and len(err) == 1 and f"{tmp_path}/none: no such port" in err[0]

@@ -81,7 +81,7 @@ def test_ctrl_c_leaves_the_arm_limp(held: Rig) -> None:
         running.signal(signal.SIGINT)
         ended = running.end()
     assert ended.code == EXIT_ABORTED and ended.err_lines == ["companion arm: interrupted"], ended
-    limp = scan(load_vehicle(held.vehicle, held.overrides()).devices.arm, only=int(FILES))
+    limp = scan(load_vehicle(held.vehicle, held.overrides()).arm_device, only=int(FILES))
     assert [servo.as_json()["torque_on"] for servo in limp.servos] == [False, False]
     assert [servo.as_json()["watchdog"] for servo in limp.servos] == ["off", "off"]
     held.sandbox.assert_nobody_left()

@@ -80,7 +80,7 @@ def test_a_list_keeps_its_comment(mine: Path) -> None:
     ("location", "value", "words"),
     [
         (("arm", "joints", 0, "sign"), 0, "arm.joints[0].sign"),
-        (("arm", "joints", 1, "servo_id"), 1, "both servos have the id 1"),
+        (("arm", "joints", 1, "servo_id"), 1, "joint 1 has the servo id 1 too"),
         (("arm", "jonits"), 1, "unknown key"),
         (("arm", "joints", 2, "sign"), 1, "there is no such key"),
         (("arm", "joints"), [], "a different structure"),

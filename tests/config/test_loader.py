@@ -181,7 +181,7 @@ def test_bad_mission_file(project: Path, old: str, new: str, expected: list[str]
 
 
 BAD_VEHICLE = [
-    ("servo_id: 2", "servo_id: 1", ["arm.joints[1].servo_id: both servos have the id 1; give each servo its own id"]),
+    ("servo_id: 2", "servo_id: 1", ["arm.joints[1].servo_id: joint 1 has the servo id 1 too; give each servo its own id"]),
     ("watchdog_ms: 100", "watchdog_ms: 90", ["watchdog_ms: must be a multiple of 20 ms (the register's unit), got 90 ms"]),
     ("sign: -1", "sign: 0", ["sign: expected one of -1, 1, got 0"]),
     ("baud: 3000000", "baud: 9600", ["baud: expected one of 57600, 115200, 1000000, 2000000, 3000000, 4000000, got 9600"]),
@@ -320,7 +320,7 @@ def test_unknown_law_in_a_controller_file(project: Path, law: str, end: str) -> 
 BAD_COMPARISON_OVERRIDES = [
     ("csc", "controller.model_mass_scale=0", "expected a number > 0, got 0"),
     ("csc", "controller.stiffness=4", "unknown key; did you mean stiffness_kp?"),
-    ("psc", "controller.arm_inertia_md=[0.1]", "expected a list of 2 numbers > 0, got [0.1]"),
+    ("psc", "controller.arm_inertia_md=[0]", "arm_inertia_md[0]: expected a number > 0, got 0"),
     ("psc", "controller.payload_time_ms=100", "unknown key; write payload_time_s, in s (not in ms)"),
 ]
 

@@ -157,7 +157,7 @@ REPLACE = "from msgspec.structs import replace\n"
         ("\n    step = None\n", "step raises TypeError: 'NoneType' object is not callable"),
         (STEP + "return wrench.collective_n\n", "step returns a float, not a companion.control.types.Wrench"),
         (STEP + "return replace(wrench, collective_n=float('nan'))\n", "step returns collective_n = nan, which is not finite"),
-        (STEP + "return replace(wrench, arm_torque_nm=(0.0,))\n", "of length 2, got 1 - at `$.arm_torque_nm`"),
+        (STEP + "return replace(wrench, arm_torque_nm=(0.0,))\n", "arm_torque_nm of length 1, expected 2"),
         (STEP + "return replace(wrench, arm_torque_nm=[0.0, 0.0])\n", "step returns a Wrench with a list in place of a tuple"),
         (STEP + "return replace(wrench, log=replace(wrench.log, rho=float('inf')))\n", "step returns log.rho = inf, which"),
         (STEP + "return replace(wrench, attitude_wxyz=(0.0, 0.0, 0.0, 0.0))\n", "attitude_wxyz of norm 0, expected 1"),

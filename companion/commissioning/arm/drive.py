@@ -63,7 +63,7 @@ async def drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
 async def _drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
     clock = flight_clock()
     limits = [joint.angle_deg for joint in vehicle.arm.joints]
-    async with DynamixelArm(vehicle.devices.arm, gentle(vehicle.arm), clock) as arm:
+    async with DynamixelArm(vehicle.arm_device, gentle(vehicle.arm), clock) as arm:
         state = arm.latest()
         assert state is not None, "the driver reads once while it opens"
         motion = Motion(vehicle, state)

@@ -54,7 +54,7 @@ class Judgement:
 
 def scan_for(session: Session, only: int | None = None) -> Scan:
     """Scan the vehicle file's port and show the progress. `only`: as in `scan`."""
-    device = session.vehicle.devices.arm
+    device = session.vehicle.arm_device
     where = "every baud rate" if only is None else f"{only} baud only"
     session.say(f"{device.port}: searching for servos at {where}; nothing is written, and torque stays off")
     with session.console.status("searching for servos") as status:
@@ -108,7 +108,7 @@ def _read(talk: ServoTalk, servo_id: int, model: int, firmware: int) -> FoundSer
 
 def judge(found: Scan, vehicle: Vehicle) -> Judgement:
     """Compare a scan with the vehicle file."""
-    arm, device = vehicle.arm, vehicle.devices.arm
+    arm, device = vehicle.arm, vehicle.arm_device
     who = assign(found.servos, arm)
     present = [(index, servo) for index, servo in enumerate(who.joints) if servo is not None]
     rows = [_collision(found), _ids(found, who, arm), *_models(found), *_bauds(found, device)]

@@ -205,7 +205,7 @@ def set_up(session: Session) -> Done:
 
 
 def _plan(session: Session, joint: int | None) -> SetupPlan:
-    return plan(scan_for(session), session.vehicle.arm, session.vehicle.devices.arm, joint)
+    return plan(scan_for(session), session.vehicle.arm, session.vehicle.arm_device, joint)
 
 
 def _set_up(session: Session, wanted: SetupPlan) -> Done:
@@ -225,7 +225,7 @@ def _set_up(session: Session, wanted: SetupPlan) -> Done:
         return Done(wanted, "not written", ("nothing was written; --yes writes without asking",), right=False)
     if not answer:
         raise Cancelled("nothing was written")
-    carry_out(vehicle.devices.arm.port, needed, lambda text: session.say(f"  {text}"))
+    carry_out(vehicle.arm_device.port, needed, lambda text: session.say(f"  {text}"))
     session.say("reading back")
     lines = _left(vehicle, wanted)
     right = not lines and not wanted.absent
@@ -236,7 +236,7 @@ def _set_up(session: Session, wanted: SetupPlan) -> Done:
 
 def _left(vehicle: Vehicle, wanted: SetupPlan) -> list[str]:
     """Scan again and return the settings that differ, one line each."""
-    arm, device = vehicle.arm, vehicle.devices.arm
+    arm, device = vehicle.arm, vehicle.arm_device
     servos = {servo.servo_id: servo for servo in scan(device, only=device.baud).servos if servo.is_xm430}
     lines: list[str] = []
     for one in wanted.servos:

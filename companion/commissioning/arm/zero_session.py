@@ -29,7 +29,7 @@ def hold(vehicle: Vehicle, guide: ZeroGuide, console: Console) -> ZeroResult:
     Raises:
         DeviceError: a servo does not answer or is not set up, a pose was not held in time, or the poses contradict each other.
     """
-    device, ids = vehicle.devices.arm, [joint.servo_id for joint in vehicle.arm.joints]
+    device, ids = vehicle.arm_device, [joint.servo_id for joint in vehicle.arm.joints]
     names = [*(f"servo {servo_id}" for servo_id in ids), "held"]
     with ServoTalk(device.port) as talk, raw_keys() as keys, Bars(console, names) as bars:
         talk.open(device.baud)

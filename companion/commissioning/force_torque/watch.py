@@ -105,7 +105,7 @@ async def arm_angles(
     if given_rad is not None:
         yield given
         return
-    arm = DynamixelArm(vehicle.devices.arm, vehicle.arm, clock)
+    arm = DynamixelArm(vehicle.arm_device, vehicle.arm, clock)
     try:
         await arm.__aenter__()
     except DeviceError as error:
