@@ -73,8 +73,7 @@ def load_sitl(
         lines += [line for line in error.lines if line not in lines]
     if flight is None or simulated is None:
         raise ConfigError(lines)
-    first_deg, second_deg = flight.mission.start.arm_deg
-    try_law(flight.controller, flight.vehicle, (math.radians(first_deg), math.radians(second_deg)))
+    try_law(flight.controller, flight.vehicle, tuple(map(math.radians, flight.mission.start.arm_deg)))
     truth, laboratory = simulated
     if lines := list(_faults_of_absent_parts(truth, flight.vehicle)):
         raise ConfigError(lines)
