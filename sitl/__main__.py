@@ -110,7 +110,7 @@ def _print_addresses(devices: dict[str, dict[str, Any]], px4: RealPx4 | None) ->
         "                ground stations on 14550; it arms once motion capture arrives as VISION_POSITION_ESTIMATE\n"
         f"  mocap         NatNet on 127.0.0.1, command port {mocap['command_port']}, multicast, data port "
         f"{mocap.get('data_port')}\n"
-        f"  arm bus       {devices['arm']['port']}\n"
+        f"  arm bus       {devices['arm']['port'] if 'arm' in devices else 'none on this vehicle'}\n"
         f"  force sensor  {devices['force']['port'] if 'force' in devices else 'none on this vehicle'}",
         flush=True,
     )

@@ -106,11 +106,13 @@ class Sitl:
         )
         if config.faults:
             self.plant.faults = self.faults
+        self.bus: ServoBus | None = None
+        """The servo bus; None if the vehicle has no arm, or while the links are not open."""
         self.force: ForceTorqueServer | None = None
         """The emulated force sensor; None if the vehicle has none, or while the links are not open."""
         other = config.mocap_other_id
         self._others = () if other is None else ((other, OTHER_BODY),)
-        self._arm_handling = ArmHandling(vehicle.arm, pose[2]) if config.arm_hand else None
+        self._arm_handling = ArmHandling(vehicle.arm, pose[2]) if config.arm_hand and self.servos else None
         self.flight = ProcessFaults()
         self.course: list[Sample] = []
         """True position, tilt and tether of the vehicle, sampled from the first fault."""
@@ -137,7 +139,8 @@ class Sitl:
         """Open every link and yield the addresses in the form of a vehicle file's `devices` settings."""
         device = self._vehicle.devices
         async with contextlib.AsyncExitStack() as stack:
-            self.bus = await stack.enter_async_context(ServoBus(self._on_bus))
+            if device.arm is not None:
+                self.bus = await stack.enter_async_context(ServoBus(self._on_bus))
             if device.force is not None:
                 self.force = await stack.enter_async_context(ForceTorqueServer())
             self.mocap = await stack.enter_async_context(
@@ -166,8 +169,9 @@ class Sitl:
             addresses: dict[str, dict[str, Any]] = {
                 "autopilot": {"address": address},
                 "mocap": mocap,
-                "arm": {"port": self.bus.path},
             }
+            if self.bus is not None:
+                addresses["arm"] = {"port": self.bus.path}
             if self.force is not None:
                 addresses["force"] = {"port": self.force.port}
             yield addresses
@@ -261,11 +265,10 @@ class Sitl:
 
     def _hold_arm(self, hand: ArmHandling) -> None:
         servos, world = self.servos, self.plant.world
-        first, second = world.layout.joint_q
         held = hand.angles_rad(
             self.plant.t_s,
             not any(servo.drive.torque_on for servo in servos),
-            (world.q[first], world.q[second]),
+            tuple(world.q[index] for index in world.layout.joint_q),
             max(servo.lights for servo in servos),
             any(servo.lit for servo in servos),
         )
@@ -289,7 +292,8 @@ class Sitl:
         self._record_course()
         down = plant.fault("link_loss") is not None or self.autopilot.down
         self.autopilot.set_link(down, self.faults.size("link_delay"))
-        self.bus.damaged = self.faults.packet_lost
+        if self.bus is not None:
+            self.bus.damaged = self.faults.packet_lost
         if self.force is not None:
             self.force.silent = plant.fault("force_loss") is not None
         fault = plant.fault("servo_loss")

@@ -199,7 +199,7 @@ class ArmState(Record, frozen=True, kw_only=True):
     velocity_rad_s: Joints
     torque_nm: Joints
     """Joint torque, computed from the present current and the torque constant."""
-    hardware_error: tuple[int, int]
+    hardware_error: tuple[int, ...]
     """Hardware error status (register 70) of each servo, 0 if healthy. The companion sets bit 7 after it has restarted a tripped bus
     watchdog."""
     temperature_c: Joints

@@ -6,6 +6,7 @@ The rows of these rules, with the actions and the texts for the operator, are in
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from companion.model.types import ArmState, ForceSample, Inputs, Joints, Vec2, Vec3
 from companion.safety.situation import HOLDS, Age, Situation, Values
@@ -21,8 +22,8 @@ DRIFT_TIME_S = 1.0
 _NO_FORCE: Vec3 = (0.0, 0.0, 0.0)
 
 
-def error_text(errors: tuple[int, int]) -> str:
-    """Return the hardware errors of both servos by name: "servo 2: overload, overheating"."""
+def error_text(errors: Sequence[int]) -> str:
+    """Return the hardware errors of the servos by name: "servo 2: overload, overheating"."""
     parts = []
     for index, error in enumerate(errors):
         bits = [bit for bit in range(7) if error >> bit & 1]

@@ -16,6 +16,7 @@ from companion.config.base import Location, Model, Vector2
 from companion.config.document import RANK_VALUE, ConfigError, Document, key_path, problem_lines
 from companion.config.explain import nearest, problem, schema_of, validate, values
 from companion.sitl_config.effects.machine import Machine
+from companion.sitl_config.per_joint import of_joints
 from companion.sitl_config.world import World
 
 if TYPE_CHECKING:
@@ -122,8 +123,10 @@ def draw(data: dict[str, Any], ranges: Sequence[Range], seed: int) -> dict[str, 
     return _filled(data, [(one.at, one.sample(seed)) for one in ranges])
 
 
-def with_model_error(world: World) -> World:
-    """Return the world with `model_error` added to the errors of base mass, inertia, link masses and torque constants."""
+def with_model_error(world: World, joints: int) -> World:
+    """Return the world of an arm with this number of joints, with `model_error` added to the errors of base mass, inertia, link masses
+    and torque constants.
+    """
     if world.model_error == 0.0:
         return world
 
@@ -131,13 +134,13 @@ def with_model_error(world: World) -> World:
         sign = 1.0 if _generator(world.seed, f"model_error.{key}").random() < 0.5 else -1.0
         return (1.0 + error) * (1.0 + sign * world.model_error) - 1.0
 
-    machine, servos = world.machine if world.machine.on else _FAULTLESS, (world.servo(0), world.servo(1))
-    link1, link2 = world.link_mass_error
+    machine, links = world.machine if world.machine.on else _FAULTLESS, of_joints(world.link_mass_error, joints)
+    servos = [world.servo(joint) for joint in range(joints)]
     x, y, z = machine.inertia_error
     return world.model_copy(
         update={
             "mass_error": off(world.mass_error, "mass"),
-            "link_mass_error": (off(link1, "link1"), off(link2, "link2")),
+            "link_mass_error": tuple(off(error, f"link{number}") for number, error in enumerate(links, start=1)),
             "machine": machine.model_copy(
                 update={"inertia_error": (off(x, "inertia"), off(y, "inertia"), off(z, "inertia"))}
             ),

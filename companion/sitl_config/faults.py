@@ -7,11 +7,11 @@ The world, `companion faults --list` and docs/faults.md use the same table. `sit
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Self, get_args
+from typing import Annotated, Literal, Self, get_args
 
 from pydantic import Field, model_validator
 
-from companion.config.base import Location, Model, NonNegative, Positive, refuse
+from companion.config.base import JOINTS_MAX, Location, Model, NonNegative, Positive, refuse
 from companion.config.vehicle import Vehicle
 
 FaultKind = Literal[
@@ -272,6 +272,8 @@ def absent_part(kind: FaultKind, vehicle: Vehicle) -> str | None:
         return "devices.force"
     if kind.startswith("tether_") and vehicle.tether is None:
         return "tether"
+    if (kind.startswith("servo_") or kind == "bus_noise") and not vehicle.arm.joints:
+        return "arm"
     if kind.startswith("payload_") and vehicle.tool is None:
         return "tool"
     return None
@@ -291,8 +293,8 @@ class Fault(Model):
     """Duration. If it is absent, the fault is permanent."""
     size: float | None = Field(default=None)
     """Size, with the meaning and unit of the kind. If it is absent, the kind's default is used."""
-    servo: Literal[1, 2] = 1
-    """The servo on which the fault acts, for faults of one servo."""
+    servo: Annotated[int, Field(ge=1, le=JOINTS_MAX)] = 1
+    """The servo on which the fault acts, for faults of one servo: 1 is the shoulder's."""
 
     @property
     def magnitude(self) -> float:

@@ -15,6 +15,7 @@ from companion.config.yaml_strict import read_document
 from companion.control.trial import try_law
 from companion.sitl_config.distributions import Laboratory, check_world, take_ranges
 from companion.sitl_config.faults import absent_part
+from companion.sitl_config.per_joint import repeat_for_joints
 from companion.sitl_config.world import World
 
 WORLDS = names("worlds")
@@ -68,7 +69,7 @@ def load_sitl(
     except ConfigError as error:
         lines += error.lines
     try:
-        simulated = load_world(overrides, world)
+        simulated = load_world(overrides, world, len(flight.vehicle.arm.joints) if flight is not None else 0)
     except ConfigError as error:
         lines += [line for line in error.lines if line not in lines]
     if flight is None or simulated is None:
@@ -83,7 +84,8 @@ def load_sitl(
 
 
 def _faults_of_absent_parts(world: World, vehicle: Vehicle) -> Iterator[str]:
-    """Yield one message for each fault that acts on a part which the vehicle does not have."""
+    """Yield one message for each fault that acts on a part or a servo which the vehicle does not have."""
+    servos = len(vehicle.arm.joints)
     for number, fault in enumerate(world.faults):
         key = absent_part(fault.kind, vehicle)
         if key is not None:
@@ -91,20 +93,24 @@ def _faults_of_absent_parts(world: World, vehicle: Vehicle) -> Iterator[str]:
                 f"world.faults[{number}].kind: {fault.kind} needs {key}, which vehicle '{vehicle.name}' does not have; "
                 "remove the fault (--set world.faults=[])"
             )
+        elif fault.kind.startswith("servo_") and fault.servo > servos:
+            yield f"world.faults[{number}].servo: vehicle '{vehicle.name}' has {servos} servos, got servo {fault.servo}"
 
 
-def load_world(overrides: Sequence[str] = (), world: str = DEFAULT_WORLD) -> tuple[World, Laboratory]:
+def load_world(overrides: Sequence[str] = (), world: str = DEFAULT_WORLD, joints: int = 0) -> tuple[World, Laboratory]:
     """Return a simulated world, drawn from its seed, and the laboratory from which it was drawn.
 
     Args:
         overrides: `--set` options; options of other sections are ignored. They override ranges before the draw.
         world: name of a built-in world, or path of a file.
+        joints: number of joints of the arm. A list with one value for each joint that is shorter is extended by its last value.
 
     Raises:
         ConfigError: the world has problems; the exception has one message per problem.
     """
     document = read_document(named_file("worlds", world, "--world"))
     apply_overrides(document, "world", parse_overrides(overrides))
+    repeat_for_joints(document, joints)
     ranges = take_ranges(document)
     return check_world(document, ranges, _seed_of(document.data)), Laboratory(name=world, ranges=ranges)
 

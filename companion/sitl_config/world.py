@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from companion.config.base import Fraction, Model, NonNegative, Positive, RelativeError, Vector2, Vector3
+from companion.config.base import JOINTS_MAX, Fraction, Model, NonNegative, Positive, RelativeError, Vector2, Vector3
 from companion.config.explain import nearest
 from companion.config.vehicle import NatNetVersion, ServoBaud
 from companion.px4.defaults import PX4_DEFAULTS
@@ -25,6 +25,7 @@ from companion.sitl_config.effects.servo_mechanics import ServoMechanics
 from companion.sitl_config.effects.tether_line import TetherLine
 from companion.sitl_config.effects.thrower import Thrower
 from companion.sitl_config.faults import Fault as Fault
+from companion.sitl_config.per_joint import RelativeErrors
 
 REAL32_MAX = 3.4e38
 SignedAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -128,8 +129,10 @@ class World(Model):
     """Constant friction of each joint; with `servo_mechanics.on`, the friction of that section applies instead."""
     joint_damping_nms: NonNegative = 0.02
     """Viscous friction of each joint, N m s/rad; with `servo_mechanics.on`, the friction of that section applies instead."""
-    servos: tuple[Servo, Servo] | None = None
-    """Settings of both servos; null for the defaults of `Servo`."""
+    servos: Annotated[tuple[Servo, ...], Field(max_length=JOINTS_MAX)] | None = None
+    """Settings of the servos, from the shoulder outwards. Servos that are not listed have the defaults of `Servo`; surplus settings are
+    ignored. null for the defaults.
+    """
     arm_hand: bool = False
     """Whether a simulated user holds the limp arm and, whenever a servo's LED is switched on, moves it as `companion arm zero`
     requests.
@@ -137,8 +140,9 @@ class World(Model):
     wind_m_s: Vector3 = (0.0, 0.0, 0.0)
     mass_error: RelativeError = 0.0
     """Relative deviation of the true mass of the base (without arm and tool) from the vehicle file."""
-    link_mass_error: tuple[RelativeError, RelativeError] = (0.0, 0.0)
-    """Relative deviations of the true link masses from the vehicle file; the mass of the base does not change."""
+    link_mass_error: RelativeErrors = (0.0, 0.0)
+    """Relative deviations of the true link masses from the vehicle file, from the shoulder outwards. The last value also holds for
+    further links, and surplus values are ignored. The mass of the base does not change."""
     model_error: Annotated[float, Field(ge=0, le=0.3)] = 0.0
     """Relative difference of base mass, inertia, link masses and torque constants between the vehicle file and the true vehicle, in
     addition to the other errors. Each is multiplied by 1 plus or minus this value, with a sign drawn from the seed (the moments of
@@ -184,8 +188,8 @@ class World(Model):
     compliance: Compliance = Compliance()
 
     def servo(self, joint: int) -> Servo:
-        """Return the servo of joint 0 or 1."""
-        return Servo() if self.servos is None else self.servos[joint]
+        """Return the settings of a joint's servo; joints are counted from 0."""
+        return self.servos[joint] if self.servos is not None and joint < len(self.servos) else Servo()
 
     @property
     def thr_mdl_fac(self) -> float:

@@ -16,13 +16,11 @@ from sitl.servo.drive import MODE_CURRENT, ServoDrive
 from sitl.servo.model import ServoModel
 from sitl.servo.protocol import Instruction, packet, status
 
-_HEALTHY = (0, 0)
-_COOL = (COOL_C, COOL_C)
 _LIMIT = reg.CURRENT_LIMIT
 _READ_LIMIT = bytes((Instruction.READ, *_LIMIT.address.to_bytes(2, "little"), *_LIMIT.size.to_bytes(2, "little")))
 
 
-def scales_of(vehicle: Vehicle, servos: Sequence[ServoModel]) -> tuple[JointScale, JointScale] | None:
+def scales_of(vehicle: Vehicle, servos: Sequence[ServoModel]) -> tuple[JointScale, ...] | None:
     """Return the scale of each joint, or None if the companion's set-up of the bus fails.
 
     Args:
@@ -34,16 +32,16 @@ def scales_of(vehicle: Vehicle, servos: Sequence[ServoModel]) -> tuple[JointScal
         for `torque_max_nm`.
     """
     line, arm = ServoLine(servos), vehicle.arm
-    first, second = (_current_limit_counts(line, joint, vehicle.arm_device.baud) for joint in arm.joints)
-    if first is None or second is None:
-        return None
-    try:
-        return (
-            joint_scale(arm.joints[0], arm.torque_per_amp_nm_a, first),
-            joint_scale(arm.joints[1], arm.torque_per_amp_nm_a, second),
-        )
-    except ValueError:  # the current limit is too low
-        return None
+    scales: list[JointScale] = []
+    for joint in arm.joints:
+        limit_counts = _current_limit_counts(line, joint, vehicle.arm_device.baud)
+        if limit_counts is None:
+            return None
+        try:
+            scales.append(joint_scale(joint, arm.torque_per_amp_nm_a, limit_counts))
+        except ValueError:  # the current limit is too low
+            return None
+    return tuple(scales)
 
 
 def _current_limit_counts(line: ServoLine, joint: Joint, baud_bps: int) -> int | None:
@@ -56,11 +54,12 @@ def _current_limit_counts(line: ServoLine, joint: Joint, baud_bps: int) -> int |
 
 
 class FastBus:
-    """The companion's cycle of reads and writes on the bus of two servos.
+    """The companion's cycle of reads and writes on the servo bus.
 
     Args:
         drives: motors of the servos; they are set to current mode.
-        scales: scale of each joint; None if the bus set-up failed, in which case the arm never answers.
+        scales: scale of each joint; None if the bus set-up failed, in which case the arm never answers. It does not answer either if
+            there are no joints.
         watchdog_s: timeout of the servos' bus watchdog.
         faults: faults of the world; None if it has none.
     """
@@ -68,11 +67,12 @@ class FastBus:
     def __init__(
         self,
         drives: Sequence[ServoDrive],
-        scales: tuple[JointScale, JointScale] | None,
+        scales: tuple[JointScale, ...] | None,
         watchdog_s: float,
         faults: Faults | None,
     ) -> None:
         self._drives, self._scales, self._watchdog_s, self._faults = drives, scales, watchdog_s, faults
+        self._healthy, self._cool = (0,) * len(drives), (COOL_C,) * len(drives)
         self._goal_s = 0.0
         self._arm: ArmState | None = None
         for drive in drives:
@@ -102,19 +102,15 @@ class FastBus:
         faults = self._faults
         if torque_nm is not None and self._scales is not None:
             self._goal_s = t_s
-            (drive1, drive2), (scale1, scale2) = self._drives, self._scales
-            counts = (scale1.current_counts(torque_nm[0]), scale2.current_counts(torque_nm[1]))
-            if faults is None:
-                drive1.set_goal_current(counts[0])
-                drive2.set_goal_current(counts[1])
-            elif not faults.packet_lost():
+            counts = [scale.current_counts(nm) for scale, nm in zip(self._scales, torque_nm, strict=True)]
+            if faults is None or not faults.packet_lost():
                 self._set(faults, counts)
         elif faults is not None and t_s - self._goal_s > self._watchdog_s and not faults.packet_lost():
             # As the bus thread does with a stale goal; a servo that is lost has its own watchdog.
-            self._set(faults, (0, 0))
+            self._set(faults, [0] * len(self._drives))
 
-    def _set(self, faults: Faults, counts: tuple[int, int]) -> None:
-        lost = faults.active.get("servo_loss")
+    def _set(self, faults: Faults | None, counts: Sequence[int]) -> None:
+        lost = None if faults is None else faults.active.get("servo_loss")
         for number, (drive, goal) in enumerate(zip(self._drives, counts, strict=True), start=1):
             if lost is None or lost.servo != number:
                 drive.set_goal_current(goal)
@@ -126,32 +122,34 @@ class FastBus:
         if lost is None:
             return damaged
         if not damaged:
-            self._drives[2 - lost.servo].heard_instruction()
+            for number, drive in enumerate(self._drives, start=1):
+                if number != lost.servo:
+                    drive.heard_instruction()
         return True
 
     def _state(self, t_s: float) -> ArmState | None:
-        if self._scales is None:
+        drives, scales = self._drives, self._scales
+        if not scales:
             return None
-        (drive1, drive2), (scale1, scale2) = self._drives, self._scales
-        current1, speed1, position1 = drive1.present()
-        current2, speed2, position2 = drive2.present()
-        errors, temperatures_c = _HEALTHY, _COOL
+        present = [drive.present() for drive in drives]
+        errors, temperatures_c = self._healthy, self._cool
         if self._faults is not None:
-            (e1, e2), (c1, c2) = self._faults.errors, self._faults.temperatures_c
-            errors, temperatures_c = (e1, e2), (c1, c2)
-        if drive1.watchdog_tripped or drive2.watchdog_tripped:
+            errors, temperatures_c = tuple(self._faults.errors), tuple(self._faults.temperatures_c)
+        if any(drive.watchdog_tripped for drive in drives):
             # As in the driver, a tripped watchdog is reported in one state and then restarted with zero current.
-            tripped = (drive1.watchdog_tripped * WATCHDOG_ERROR, drive2.watchdog_tripped * WATCHDOG_ERROR)
-            errors = (errors[0] | tripped[0], errors[1] | tripped[1])
-            drive1.start_watchdog(self._watchdog_s)
-            drive2.start_watchdog(self._watchdog_s)
-        drive1.heard_instruction()
-        drive2.heard_instruction()
+            errors = tuple(
+                error | drive.watchdog_tripped * WATCHDOG_ERROR for error, drive in zip(errors, drives, strict=True)
+            )
+            for drive in drives:
+                drive.start_watchdog(self._watchdog_s)
+        for drive in drives:
+            drive.heard_instruction()
+        read = list(zip(scales, present, strict=True))
         return ArmState(
             stamp_s=t_s,
-            angle_rad=(scale1.angle_rad(position1), scale2.angle_rad(position2)),
-            velocity_rad_s=(scale1.velocity_rad_s(speed1), scale2.velocity_rad_s(speed2)),
-            torque_nm=(scale1.torque_nm(current1), scale2.torque_nm(current2)),
+            angle_rad=tuple([scale.angle_rad(position) for scale, (_, _, position) in read]),
+            velocity_rad_s=tuple([scale.velocity_rad_s(speed) for scale, (_, speed, _) in read]),
+            torque_nm=tuple([scale.torque_nm(current) for scale, (current, _, _) in read]),
             hardware_error=errors,
             temperature_c=temperatures_c,
             read_failures=0,

@@ -162,9 +162,8 @@ class FastFlight:
         self.config = config
         self.core = FlightCore(config.flight)
         scales = scales_of(vehicle, plugged_in(servos, world))
-        self._bus = FastBus(
-            drives, scales, vehicle.arm_device.watchdog_ms * 1e-3, self.faults if world.faults else None
-        )
+        watchdog_s = vehicle.arm_device.watchdog_ms * 1e-3 if drives else 0.0
+        self._bus = FastBus(drives, scales, watchdog_s, self.faults if world.faults else None)
         self._mocap: MocapPose | None = None
         self._has_force = vehicle.devices.force is not None
         self._force: ForceSample | None = None

@@ -69,9 +69,9 @@ class Faults:
         config: configuration of the world; every fault has a time (`with_fault_times`).
         world: simulated physics.
         px4: the autopilot.
-        drives: motors of both servos.
+        drives: motors of the servos.
         tether: the vehicle's tether, or None if it has none.
-        servos: control tables of both servos; empty in the fast closed loop.
+        servos: control tables of the servos; empty in the fast closed loop.
     """
 
     def __init__(
@@ -96,9 +96,9 @@ class Faults:
         """World time at which the first fault began, or None."""
         self.sag_v = 0.0
         """Voltage drop of the battery caused by a fault."""
-        self.errors = [0, 0]
+        self.errors = [0] * len(drives)
         """Register 70 (hardware error status) of each servo, if the servos have no control tables."""
-        self.temperatures_c = [COOL_C, COOL_C]
+        self.temperatures_c = [COOL_C] * len(drives)
         self._frozen: tuple[Vec3, Quat] | None = None
         self._other: tuple[Vec3, Quat] | None = None
         self._stuck: tuple[Vec3, Vec3] | None = None

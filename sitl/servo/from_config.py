@@ -12,8 +12,8 @@ from sitl.servo.model import ServoModel
 
 def servos_of(vehicle: Vehicle, config: World) -> list[ServoModel]:
     """Return the servo of each joint, whether or not it is plugged in."""
-    joints, device, mechanics = vehicle.arm.joints, vehicle.arm_device, config.servo_mechanics
-    servos = [servo_of(joint, device, config.servo(index)) for index, joint in enumerate(joints)]
+    joints, mechanics = vehicle.arm.joints, config.servo_mechanics
+    servos = [servo_of(joint, vehicle.arm_device, config.servo(index)) for index, joint in enumerate(joints)]
     for servo in servos:
         servo.drive.current_loop_s = mechanics.current_loop_s if mechanics.on else 0.0
     return servos

@@ -14,7 +14,7 @@ FORGET_S: Final = 1.5
 
 
 class ArmHandling:
-    """Computes the angles at which both joints are held.
+    """Computes the angles at which the joints are held.
 
     Args:
         arm: arm of the vehicle file; its joint limits define the poses.
@@ -34,7 +34,7 @@ class ArmHandling:
 
         Args:
             t_s: world time.
-            limp: whether torque is off on both servos.
+            limp: whether torque is off on all servos.
             angle_rad: joint angles.
             lights: number of times that an LED was switched on; each time, the arm is moved to the next pose.
             lit: whether an LED is on.
@@ -54,6 +54,5 @@ class ArmHandling:
             self._lit_s = t_s
         s = min(1.0, (t_s - self._moved_s) / MOVE_S)
         s = s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
-        (a1, a2), (b1, b2) = self._from, self._to
-        self._at = (a1 + s * (b1 - a1), a2 + s * (b2 - a2))
+        self._at = tuple(a + s * (b - a) for a, b in zip(self._from, self._to, strict=True))
         return self._at

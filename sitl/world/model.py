@@ -6,6 +6,8 @@ import math
 
 from companion.config.vehicle import Airframe, Vehicle
 from companion.model.constants import GRAVITY_M_S2
+from companion.model.types import Joints, Vec3
+from companion.sitl_config.per_joint import of_joints
 from companion.sitl_config.world import World
 from sitl.world.effects import machine, transmission
 
@@ -32,18 +34,65 @@ def base_mass_kg(vehicle: Vehicle, world: World) -> float:
     return (vehicle.airframe.mass_kg - rest) * (1.0 + world.mass_error)
 
 
-def link_masses_kg(vehicle: Vehicle, world: World) -> tuple[float, float]:
-    """Return the true masses of both links, without sensor and net, whose masses in the vehicle file are taken as true."""
-    first, second = vehicle.arm.link_masses_kg
-    return first * (1.0 + world.link_mass_error[0]), second * (1.0 + world.link_mass_error[1])
+def link_masses_kg(vehicle: Vehicle, world: World) -> Joints:
+    """Return the true masses of the links, without sensor and net, whose masses in the vehicle file are taken as true."""
+    masses_kg = vehicle.arm.link_masses_kg
+    errors = of_joints(world.link_mass_error, len(masses_kg))
+    return tuple(mass_kg * (1.0 + error) for mass_kg, error in zip(masses_kg, errors, strict=True))
+
+
+def _xyz(values: Vec3) -> str:
+    return " ".join(str(value) for value in values)
+
+
+def _rod(mass_kg: float, com_m: float, length_m: float) -> str:
+    inertia = mass_kg * length_m * length_m / 12.0
+    return f'<inertial pos="{com_m} 0 0" mass="{mass_kg}" diaginertia="{0.1 * inertia + 1e-5} {inertia} {inertia}"/>'
+
+
+def _links(vehicle: Vehicle, world: World) -> str:
+    """Return the bodies of the links, the sensor and the net, each inside the previous one.
+
+    Without an arm, sensor and net are massless bodies at the origin of the base, so that every model has a body with that name.
+    """
+    arm, tool = vehicle.arm, vehicle.tool
+    sensor_kg, net_kg, (roll, pitch, yaw) = 0.0, 0.0, (0.0, 0.0, 0.0)
+    if tool is not None:
+        sensor_kg, net_kg, (roll, pitch, yaw) = tool.sensor_mass_kg, tool.net_mass_kg, tool.sensor_rpy_deg
+    if arm.joints:
+        sensor, net = (
+            f'<inertial pos="0 0 0" mass="{max(mass_kg, 1e-4)}" diaginertia="1e-4 1e-4 1e-4"/>'
+            for mass_kg in (sensor_kg, net_kg)
+        )
+    else:
+        sensor = net = ""
+    places = [_xyz(arm.shoulder_body_m), *(f"{length_m} 0 0" for length_m in arm.link_lengths_m)]
+    bodies = f"""<body name="sensor" pos="{places[-1]}">
+        {sensor}
+        <body name="net" euler="{math.radians(yaw)} {math.radians(pitch)} {math.radians(roll)}">
+          {net}
+          <site name="net"/>
+        </body>
+      </body>"""
+    friction_nm, damping_nms, armature = world.joint_friction_nm, world.joint_damping_nms, arm.joint_armature_kg_m2
+    if transmission.acts(world):
+        friction_nm = damping_nms = armature = 0.0
+    rods = list(map(_rod, link_masses_kg(vehicle, world), arm.link_com_m, arm.link_lengths_m))
+    for index in reversed(range(len(arm.joints))):
+        turn = f'euler="{_xyz(machine.shoulder_ypr_rad(world.machine))}"' if index == 0 else ""
+        bodies = f"""<body name="link{index + 1}" pos="{places[index]}" {turn}>
+        <joint name="alpha{index + 1}" axis="0 {-1 if index else 1} 0" frictionloss="{friction_nm}" damping="{damping_nms}"
+               armature="{armature}"/>
+        {rods[index]}
+        {bodies}
+      </body>"""
+    return bodies
 
 
 def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     """Return the MuJoCo model of the true vehicle as MJCF text."""
     vehicle = machine.as_built(vehicle, world.machine)
-    airframe, arm, tool = vehicle.airframe, vehicle.arm, vehicle.tool
-    l1, l2 = arm.link_lengths_m
-    m1, m2 = link_masses_kg(vehicle, world)
+    airframe, joints = vehicle.airframe, range(1, len(vehicle.arm.joints) + 1)
     offset = rotor_offset_m(airframe)
     clearance = airframe.ground_clearance_m
     rotors = "\n".join(
@@ -60,23 +109,9 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
         f'conaffinity="2" friction="0.8 0.02 0.001" solref="0.02 1"/>'
         for i, (x, y, _) in enumerate(ROTORS)
     )
-
-    def rod(mass: float, com: float, length: float) -> str:
-        inertia = mass * length * length / 12.0
-        return f'<inertial pos="{com} 0 0" mass="{mass}" diaginertia="{0.1 * inertia + 1e-5} {inertia} {inertia}"/>'
-
-    def xyz(values: tuple[float, float, float]) -> str:
-        return " ".join(str(value) for value in values)
-
-    friction_nm, damping_nms, armature = world.joint_friction_nm, world.joint_damping_nms, arm.joint_armature_kg_m2
-    if transmission.acts(world):
-        friction_nm = damping_nms = armature = 0.0
-    sensor_kg, net_kg, (roll, pitch, yaw) = 0.0, 0.0, (0.0, 0.0, 0.0)
-    if tool is not None:
-        sensor_kg, net_kg, (roll, pitch, yaw) = tool.sensor_mass_kg, tool.net_mass_kg, tool.sensor_rpy_deg
     anchor = tendon = tension = ""
     if vehicle.tether is not None:
-        anchor = f'<site name="anchor" pos="{xyz(vehicle.tether.anchor_world_m)}"/>'
+        anchor = f'<site name="anchor" pos="{_xyz(vehicle.tether.anchor_world_m)}"/>'
         tendon = f"""<tendon>
     <spatial name="tether" limited="true" range="0 {vehicle.tether.length_m}" solreflimit="0.02 1">
       <site site="anchor"/><site site="tether"/>
@@ -108,40 +143,22 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     {anchor}
     <body name="base" pos="0 0 {clearance}">
       <freejoint name="base"/>
-      <inertial pos="{xyz(machine.centre_of_mass_m(world.machine))}" mass="{base_mass_kg(vehicle, world)}"
-                diaginertia="{xyz(airframe.inertia_kg_m2)}"/>
+      <inertial pos="{_xyz(machine.centre_of_mass_m(world.machine))}" mass="{base_mass_kg(vehicle, world)}"
+                diaginertia="{_xyz(airframe.inertia_kg_m2)}"/>
       <site name="imu"/>
-      <site name="tether" pos="{xyz(vehicle.tether.attachment_body_m if vehicle.tether is not None else (0.0, 0.0, 0.0))}"/>
+      <site name="tether" pos="{_xyz(vehicle.tether.attachment_body_m if vehicle.tether is not None else (0.0, 0.0, 0.0))}"/>
       {rotors}
       {feet}
-      <body name="link1" pos="{xyz(arm.shoulder_body_m)}" euler="{xyz(machine.shoulder_ypr_rad(world.machine))}">
-        <joint name="alpha1" axis="0 1 0" frictionloss="{friction_nm}" damping="{damping_nms}"
-               armature="{armature}"/>
-        {rod(m1, arm.link_com_m[0], l1)}
-        <body name="link2" pos="{l1} 0 0">
-          <joint name="alpha2" axis="0 -1 0" frictionloss="{friction_nm}" damping="{damping_nms}"
-                 armature="{armature}"/>
-          {rod(m2, arm.link_com_m[1], l2)}
-          <body name="sensor" pos="{l2} 0 0">
-            <inertial pos="0 0 0" mass="{max(sensor_kg, 1e-4)}" diaginertia="1e-4 1e-4 1e-4"/>
-            <body name="net" euler="{math.radians(yaw)} {math.radians(pitch)} {math.radians(roll)}">
-              <inertial pos="0 0 0" mass="{max(net_kg, 1e-4)}" diaginertia="1e-4 1e-4 1e-4"/>
-              <site name="net"/>
-            </body>
-          </body>
-        </body>
-      </body>
+      {_links(vehicle, world)}
     </body>{payload}
   </worldbody>
   <equality>
-    <joint name="park1" joint1="alpha1" solref="0.01 1"/>
-    <joint name="park2" joint1="alpha2" solref="0.01 1"/>{connect}
+    {"".join(f'<joint name="park{i}" joint1="alpha{i}" solref="0.01 1"/>' for i in joints)}{connect}
   </equality>
   {tendon}
   <actuator>
     {motors}
-    <motor name="alpha1" joint="alpha1"/>
-    <motor name="alpha2" joint="alpha2"/>
+    {"".join(f'<motor name="alpha{i}" joint="alpha{i}"/>' for i in joints)}
   </actuator>
   <sensor>
     <accelerometer name="accel" site="imu"/>

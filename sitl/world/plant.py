@@ -15,6 +15,7 @@ from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_norm
 from companion.model.types import Joints, Quat, Vec2, Vec3, Vec4
 from companion.sitl_config.distributions import with_model_error
 from companion.sitl_config.faults import Fault, FaultKind
+from companion.sitl_config.per_joint import of_joints
 from companion.sitl_config.world import Push, Servo
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery
@@ -23,7 +24,7 @@ from sitl.faults.injector import Faults
 from sitl.world.effects.force_sensor import ForceSensor
 from sitl.world.effects.imu import ImuErrors
 from sitl.world.effects.mocap import MocapErrors
-from sitl.world.effects.transmission import transmissions_of
+from sitl.world.effects.transmission import Transmission, transmissions_of
 from sitl.world.handling import Handling, HungWeight
 from sitl.world.mocap_misalignment import MocapMisalignment
 from sitl.world.noise import noise
@@ -50,6 +51,19 @@ class JointDrive(Protocol):
 
     def update(self, t_s: float, shaft_angle_rad: float, shaft_velocity_rad_s: float) -> float:
         """Process the shaft's state and return the motor current in A."""
+
+
+class _JointServo(NamedTuple):
+    """The servo of one joint."""
+
+    drive: JointDrive
+    sign: int
+    """1 if the shaft angle increases with the joint angle, -1 if it decreases."""
+    zero_rad: float
+    """Shaft angle at joint angle 0."""
+    torque_per_amp_nm_a: float
+    gear: Transmission | None
+    """Gear and mount between the servo and its link; None if they are rigid."""
 
 
 class MocapFrame(NamedTuple):
@@ -83,7 +97,7 @@ class Plant:
         vehicle: vehicle file.
         config: configuration of the world.
         px4: the autopilot.
-        drives: motors of both joints.
+        drives: motor of each joint.
         start: horizontal position in m, yaw in rad and joint angles in rad at the start.
         between_steps: whether the cameras expose at the exact time between physics steps instead of at the end of a step.
     """
@@ -100,26 +114,26 @@ class Plant:
     ) -> None:
         self._between_steps = between_steps
         position_m, yaw_rad, arm_rad = start
-        config = with_model_error(config)
+        joints = vehicle.arm.joints
+        config = with_model_error(config, len(joints))
         self._config = config
         self._px4 = px4
-        self._drives = (drives[0], drives[1])
         for drive in drives:
             drive.goal_delay_s = config.arm_delay_s
-        first, second = vehicle.arm.joints
-        servo1, servo2 = config.servo(0), config.servo(1)
-        self._joint_signs = (
-            -first.sign if servo1.reversed else first.sign,
-            -second.sign if servo2.reversed else second.sign,
+        servos = [config.servo(joint) for joint in range(len(joints))]
+        mechanics = config.servo_mechanics
+        more = of_joints(mechanics.torque_per_amp_error if mechanics.on else (0.0,), len(joints))
+        gears = transmissions_of(vehicle, config, arm_rad, PHYSICS_DT_S) or (None,) * len(joints)
+        self._servos = tuple(
+            _JointServo(
+                drive,
+                -joint.sign if servo.reversed else joint.sign,
+                _zero_rad(joint, servo),
+                vehicle.arm.torque_per_amp_nm_a / (1.0 + servo.torque_per_amp_error) / (1.0 + error),
+                gear,
+            )
+            for drive, joint, servo, error, gear in zip(drives, joints, servos, more, gears, strict=True)
         )
-        self._servo_zeros_rad = (_zero_rad(first, servo1), _zero_rad(second, servo2))
-        k = vehicle.arm.torque_per_amp_nm_a
-        more1, more2 = config.servo_mechanics.torque_per_amp_error if config.servo_mechanics.on else (0.0, 0.0)
-        self._torque_per_amp_nm_a = (
-            k / (1.0 + servo1.torque_per_amp_error) / (1.0 + more1),
-            k / (1.0 + servo2.torque_per_amp_error) / (1.0 + more2),
-        )
-        self._transmissions = transmissions_of(vehicle, config, arm_rad, PHYSICS_DT_S)
         self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
         self._imu_errors = ImuErrors.of(config.imu, IMU_EVERY * PHYSICS_DT_S, self.world.weight_n / 4.0)
         self._mocap_errors = MocapErrors.of(config.mocap, config.seed)
@@ -194,21 +208,20 @@ class Plant:
         if self.faults is not None:
             self.faults.step(t_s, self.armed_t_s)
         q, v, layout = world.q, world.v, world.layout
-        (q1, q2), (v1, v2) = layout.joint_q, layout.joint_v
-        (sign1, sign2), (zero1, zero2) = self._joint_signs, self._servo_zeros_rad
-        drive1, drive2 = self._drives
-        k1, k2 = self._torque_per_amp_nm_a
-        angle1, angle2, rate1, rate2 = q[q1], q[q2], v[v1], v[v2]
-        transmissions = self._transmissions
-        if transmissions is not None:
-            angle1, rate1 = transmissions[0].encoder(angle1, rate1)
-            angle2, rate2 = transmissions[1].encoder(angle2, rate2)
-        torque1 = sign1 * drive1.update(t_s, zero1 + sign1 * angle1, sign1 * rate1) * k1
-        torque2 = sign2 * drive2.update(t_s, zero2 + sign2 * angle2, sign2 * rate2) * k2
-        if world.parked and torque1 and torque2:
+        torques_nm = []
+        for (drive, sign, zero_rad, k_nm_a, gear), at_q, at_v in zip(
+            self._servos, layout.joint_q, layout.joint_v, strict=True
+        ):
+            angle_rad, rate_rad_s = q[at_q], v[at_v]
+            if gear is not None:
+                angle_rad, rate_rad_s = gear.encoder(angle_rad, rate_rad_s)
+            torques_nm.append(sign * drive.update(t_s, zero_rad + sign * angle_rad, sign * rate_rad_s) * k_nm_a)
+        if world.parked and (all(torques_nm) or (armed and any(torques_nm))):
             world.release_arm()
-        if transmissions is not None:
-            torque1, torque2 = transmissions[0].step(torque1), transmissions[1].step(torque2)
+        torques_nm = [
+            torque_nm if servo.gear is None else servo.gear.step(torque_nm)
+            for servo, torque_nm in zip(self._servos, torques_nm, strict=True)
+        ]
         if self._tick % IMU_EVERY == 0:
             self._rotors = self._px4.step(self._imu_sample or self._imu())
             self._imu_sample = None
@@ -217,7 +230,7 @@ class Plant:
             world.push(self._load_on_net(config.push, self._weight))
         if self._handling is not None:
             world.hold(None if armed else self._handling.wrench(t_s, q, v))
-        world.step(self._rotors, (torque1, torque2), armed)
+        world.step(self._rotors, tuple(torques_nm), armed)
         if world.t_s >= self._mocap_next_s - 1e-9:
             self._expose_mocap(min(world.t_s, self._mocap_next_s) if self._between_steps else world.t_s)
 

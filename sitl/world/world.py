@@ -1,4 +1,4 @@
-"""MuJoCo physics of the quadrotor, its 2R arm and net, the tether, the floor and the thrown payload. `plant` adds the sensor noise."""
+"""MuJoCo physics of the quadrotor, its arm and net, the tether, the floor and the thrown payload. `plant` adds the sensor noise."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ class Snapshot(NamedTuple):
 class Layout:
     """Indices into a `Snapshot`. The base comes first in q and v; each sensor has three values, except the tether, which has one."""
 
-    joint_q: tuple[int, int]
-    joint_v: tuple[int, int]
+    joint_q: tuple[int, ...]
+    joint_v: tuple[int, ...]
     accel: int
     gyro: int
     force: int
@@ -74,7 +74,6 @@ class Layout:
     def truth(self, snapshot: Snapshot) -> Truth:
         """Return the true state that a snapshot contains."""
         t_s, q, v, s = snapshot
-        (q1, q2), (v1, v2) = self.joint_q, self.joint_v
         a, g, f, tq = self.accel, self.gyro, self.force, self.torque
         return Truth(
             t_s=t_s,
@@ -83,8 +82,8 @@ class Layout:
             attitude_wxyz=(q[3], q[4], q[5], q[6]),
             angular_rate_body_rad_s=(s[g], s[g + 1], s[g + 2]),
             specific_force_body_m_s2=(s[a], s[a + 1], s[a + 2]),
-            joint_angle_rad=(q[q1], q[q2]),
-            joint_velocity_rad_s=(v[v1], v[v2]),
+            joint_angle_rad=tuple([q[index] for index in self.joint_q]),
+            joint_velocity_rad_s=tuple([v[index] for index in self.joint_v]),
             force_sensor_n=(-s[f], -s[f + 1], -s[f + 2]),
             torque_sensor_nm=(-s[tq], -s[tq + 1], -s[tq + 2]),
             tether_tension_n=self.tension_n(s),
@@ -125,10 +124,10 @@ class World:
         self.model = mujoco.MjModel.from_xml_string(mjcf(vehicle, config, PHYSICS_DT_S))
         self.data = mujoco.MjData(self.model)
         m = self.model
-        joints = (m.joint("alpha1").id, m.joint("alpha2").id)
+        joints = [m.joint(f"alpha{number + 1}").id for number in range(len(arm_rad))]
         self.layout = Layout(
-            (int(m.jnt_qposadr[joints[0]]), int(m.jnt_qposadr[joints[1]])),
-            (int(m.jnt_dofadr[joints[0]]), int(m.jnt_dofadr[joints[1]])),
+            tuple(int(m.jnt_qposadr[joint]) for joint in joints),
+            tuple(int(m.jnt_dofadr[joint]) for joint in joints),
             accel=int(m.sensor("accel").adr[0]),
             gyro=int(m.sensor("gyro").adr[0]),
             force=int(m.sensor("force").adr[0]),
@@ -137,7 +136,7 @@ class World:
         )
         self._base = m.body("base").id
         self._net = m.body("net").id
-        self._park = [m.equality(name).id for name in ("park1", "park2")]
+        self._park = [m.equality(name).id for name in (f"park{number + 1}" for number in range(len(arm_rad)))]
         self.parked = True
         """Whether a support holds the arm."""
         self._rotor_max_n = vehicle.airframe.thrust_max_n / 4.0
@@ -241,7 +240,7 @@ class World:
 
         Args:
             rotor_commands: motor signals, 0 to 1, in PX4's quad-x order.
-            joint_torque_nm: torque on both joints, from the motors or from their gears.
+            joint_torque_nm: torque on each joint, from the motors or from their gears.
             airborne: whether a payload may be thrown.
             drag: whether aerodynamic drag and wind act.
         """
@@ -294,7 +293,7 @@ class World:
         self.data.eq_active[self._park] = 0
 
     def hold_arm(self, angle_rad: Joints) -> None:
-        """Hold both joints at these angles until `release_arm`."""
+        """Hold the joints at these angles until `release_arm`."""
         self.parked = True
         self.data.eq_active[self._park] = 1
         for park, angle in zip(self._park, angle_rad, strict=True):

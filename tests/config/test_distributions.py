@@ -19,6 +19,7 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.sitl_config.distributions import Normal, Range, Uniform, with_model_error
 from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.loader import WORLDS, SitlConfig, load_sitl, load_world
+from companion.sitl_config.per_joint import of_joints
 from companion.sitl_config.world import World
 from sitl.campaigns.flights import with_world
 from sitl.fast.loop import FastFlight
@@ -159,6 +160,38 @@ def test_the_schema_knows_distributions(file: str) -> None:
             schema.validate(wrong)
 
 
+def test_each_joint_of_a_longer_arm_draws_its_own_number_from_the_last_distribution_of_a_list() -> None:
+    two, _ = load_world(["world.seed=3"], "lab", 2)
+    five, laboratory = load_world(["world.seed=3"], "lab", 5)
+    for of_two, of_five in zip(_per_joint(two), _per_joint(five), strict=True):
+        assert of_five[:2] == of_two, "the numbers of two joints do not depend on further joints"
+        assert len(set(of_five)) == 5
+    assert laboratory.drawn(five)["link_mass_error[4]"] == five.link_mass_error[4]
+    assert load_world(["world.seed=3"], "lab", 1)[0] == two, "surplus values of a file stay"
+
+
+def test_a_list_with_one_value_for_each_joint_holds_for_any_number_of_joints() -> None:
+    assert of_joints((0.1, 0.2), 4) == (0.1, 0.2, 0.2, 0.2)
+    assert of_joints((0.1, 0.2), 1) == (0.1,)
+    assert of_joints((0.1, 0.2), 0) == ()
+    world = World.model_validate({"servos": [{"id": 7}], "model_error": 0.2})
+    assert [world.servo(joint).id for joint in range(3)] == [7, None, None]
+    off = with_model_error(world, 3)
+    errors = (*off.link_mass_error, *(off.servo(joint).torque_per_amp_error for joint in range(3)))
+    assert {abs(round(error, 9)) for error in errors} == {0.2} and len(errors) == 6
+    assert with_model_error(world, 0).link_mass_error == ()
+
+
+def _per_joint(world: World) -> tuple[tuple[float, ...], ...]:
+    machine, mechanics = world.machine, world.servo_mechanics
+    return (
+        world.link_mass_error,
+        machine.link_length_error_m,
+        machine.link_com_error_m,
+        mechanics.torque_per_amp_error,
+    )
+
+
 # -- the model error ---------------------------------------------------------------------------------------------------
 
 
@@ -167,8 +200,8 @@ def test_a_model_error_multiplies_what_the_laboratory_errs_by_already() -> None:
     usual = World.model_validate({"mass_error": 0.03, "link_mass_error": (0.05, -0.05), "machine": machine})
     factors = set()
     for seed in range(20):
-        off = with_model_error(usual.model_copy(update={"seed": seed, "model_error": 0.2}))
-        assert off == with_model_error(usual.model_copy(update={"seed": seed, "model_error": 0.2}))
+        off = with_model_error(usual.model_copy(update={"seed": seed, "model_error": 0.2}), 2)
+        assert off == with_model_error(usual.model_copy(update={"seed": seed, "model_error": 0.2}), 2)
         before = (0.03, 0.05, -0.05, 0.1, -0.1, 0.0, 0.0, 0.0)
         torque = [off.servo(joint).torque_per_amp_error for joint in range(2)]
         after = (off.mass_error, *off.link_mass_error, *off.machine.inertia_error, *torque)
@@ -177,11 +210,11 @@ def test_a_model_error_multiplies_what_the_laboratory_errs_by_already() -> None:
         assert len(set(factor[3:6])) == 1, "a body's moments stay possible"
         factors.add(tuple(factor))
     assert len(factors) > 10, "signs are drawn one by one"
-    assert with_model_error(usual) is usual
+    assert with_model_error(usual, 2) is usual
 
 
 def test_a_model_error_without_the_section_machine_changes_nothing_else_of_the_machine() -> None:
-    off = with_model_error(World(model_error=0.3)).machine
+    off = with_model_error(World(model_error=0.3), 2).machine
     assert {abs(round(error, 9)) for error in off.inertia_error} == {0.3}
     assert off.model_copy(update={"inertia_error": (0.0, 0.0, 0.0)}) == Machine(
         on=True,
@@ -201,7 +234,7 @@ def test_both_loops_fly_the_machine_with_the_model_error() -> None:
         config.vehicle, config.world, start_of((0.0, 0.0), 0.0, (90.0, 90.0)), Ports(), lambda message: None
     ).plant
     assert plant.world.weight_n == true
-    tool, errs = tool_of(config.vehicle), with_model_error(config.world)
+    tool, errs = tool_of(config.vehicle), with_model_error(config.world, 2)
     links_kg = link_masses_kg(config.vehicle, errs)
     true_kg = base_mass_kg(config.vehicle, errs) + sum(links_kg) + tool.sensor_mass_kg + tool.net_mass_kg
     assert true == pytest.approx(GRAVITY_M_S2 * true_kg, rel=1e-6)

@@ -134,6 +134,7 @@ class Partner:
 
     def __init__(self, sitl: Sitl, devices: dict[str, dict[str, Any]]) -> None:
         autopilot, mocap = urlsplit(devices["autopilot"]["address"]), devices["mocap"]
+        assert sitl.bus is not None
         self._bus, self._sensor = sitl.bus, sitl.force
         self._sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
         link, frames = self._sockets

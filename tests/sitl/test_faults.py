@@ -11,6 +11,7 @@ import pytest
 from companion.campaigns.faults.judge import good
 from companion.campaigns.process import CampaignError
 from companion.campaigns.runner import Row
+from companion.config.document import ConfigError
 from companion.mission.plan import Plan
 from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.model.flight_stage import SPOOL_S
@@ -104,10 +105,15 @@ def test_a_fault_that_means_nothing_is_refused(
     assert told in capsys.readouterr().err
 
 
+def test_a_fault_of_a_servo_that_the_arm_does_not_have_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"world\.faults\[0\]\.servo: .* has 2 servos, got servo 3"):
+        with_faults({"kind": "servo_loss", "t_s": 1.0, "servo": 3})
+
+
 def test_faults_that_are_over_leave_the_world_as_it_was() -> None:
     over = [{"kind": kind, "after": "start", "t_s": 0.0, "duration_s": 0.4} for kind in KINDS if kind not in _FOR_GOOD]
     flight = FastFlight(with_faults(*over))
-    world, drives = flight.plant.world, flight.plant._drives
+    world, drives = flight.plant.world, [servo.drive for servo in flight.plant._servos]
     while flight.plant.t_s < 0.2:
         flight.plant.step(False)
     assert len(flight.faults.active) == len(over)

@@ -15,6 +15,7 @@ import numpy as np
 
 from companion.campaigns.runner import Row
 from companion.model.types import Outcome
+from companion.sitl_config.per_joint import of_joints
 
 WORST = 10
 """Number of worst flights that are kept."""
@@ -52,7 +53,7 @@ def drivers(world: Mapping[str, Any]) -> dict[str, float | None]:
     """
     vx, vy, vz = world.get("throw_velocity_m_s", (math.nan,) * 3)
     wx, wy, _ = world.get("wind_m_s", (math.nan,) * 3)
-    link1, link2 = world.get("link_mass_error", (math.nan,) * 2)
+    link1, link2 = of_joints(world.get("link_mass_error", (math.nan,)), 2)
     values: dict[str, float | None] = {
         "throw_speed_m_s": math.hypot(vx, vy),
         # 0: from ahead, 180: from behind.

@@ -13,14 +13,14 @@ DegPerNm = Annotated[float, Field(ge=GEAR_MIN_DEG_PER_NM, le=10)]
 
 
 class Compliance(Model):
-    """Springs in the plane of the arm, one in series with each joint, whose deflection the servos' encoders do not measure."""
+    """Springs about the joints' axes, one in series with each joint, whose deflection the servos' encoders do not measure."""
 
     on: bool = False
     """Whether this effect acts."""
     mount_deg_per_nm: DegPerNm = 1.0
     """Tilt of the shoulder servo and its mount under the shoulder's torque, deg per N m (e: 0.5 to 2)."""
     link_deg_per_nm: DegPerNm = 1.0
-    """Rotation of the tool relative to the elbow's output shaft under the elbow's torque, deg per N m: twist of the horn and bending of
-    link 2 (e: 0.5 to 2)."""
+    """Rotation of the next joint, or of the tool, relative to a servo's output shaft under that servo's torque, deg per N m, for every
+    joint but the shoulder: twist of the horn and bending of the link (e: 0.5 to 2)."""
     relaxation_s: NonNegative = 0.0006
     """Damping divided by stiffness of both springs (e: 2 to 4 % of critical damping at the arm's frequencies of 10 to 20 Hz)."""

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from pydantic import Field
-
 from companion.config.base import Model, RelativeError, Vector3
-
-LengthError = Annotated[float, Field(ge=-0.05, le=0.05)]
+from companion.sitl_config.per_joint import LengthError, LengthErrors
 
 
 class Machine(Model):
@@ -29,9 +24,9 @@ class Machine(Model):
     """True position of the shoulder minus its position in the vehicle file, body frame. (e) within 0.003."""
     shoulder_rpy_deg: Vector3 = (0.5, -0.5, 0.5)
     """True attitude of the shoulder mount in the body frame: roll, pitch and yaw (ZYX). The vehicle file assumes zero. (e) within 1."""
-    link_length_error_m: tuple[LengthError, LengthError] = (0.0006, -0.0006)
-    """True link lengths minus those in the vehicle file. (e) within 0.001."""
-    link_com_error_m: tuple[LengthError, LengthError] = (0.005, -0.005)
-    """True distances of the links' centres of mass from their joints minus those in the vehicle file. (e) within 0.01: cables and
-    screws
-    are not in the drawing."""
+    link_length_error_m: LengthErrors = (0.0006, -0.0006)
+    """True link lengths minus those in the vehicle file, from the shoulder outwards. The last value also holds for further links, and
+    surplus values are ignored. (e) within 0.001."""
+    link_com_error_m: LengthErrors = (0.005, -0.005)
+    """True distances of the links' centres of mass from their joints minus those in the vehicle file, listed like
+    `link_length_error_m`. (e) within 0.01: cables and screws are not in the drawing."""

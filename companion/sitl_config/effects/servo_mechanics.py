@@ -6,7 +6,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from companion.config.base import Model, NonNegative, Positive, RelativeError
+from companion.config.base import Model, NonNegative, Positive
+from companion.sitl_config.per_joint import RelativeErrors
 
 GEAR_MIN_DEG_PER_NM = 0.15
 """Smallest compliance of the gear; with a stiffer gear, the lightest rotor and link would oscillate too fast for the physics step of
@@ -16,7 +17,7 @@ Share = Annotated[float, Field(ge=0, lt=0.5)]
 
 
 class ServoMechanics(Model):
-    """Current loop, torque constant, friction, backlash and gear stiffness of both servos.
+    """Current loop, torque constant, friction, backlash and gear stiffness of the servos.
 
     The friction model is M4 of Duclusaud et al., "Extended Friction Models for the Physics Simulation of Servo Actuators" (ICRA 2025),
     which Rhoban/bam has identified for a Dynamixel MX-64, an MX-106 and an XL330. The XM430-W210 is not among them; its torques are
@@ -25,10 +26,10 @@ class ServoMechanics(Model):
 
     on: bool = False
     """Whether this effect acts."""
-    torque_per_amp_error: tuple[RelativeError, RelativeError] = (0.0, 0.0)
-    """Relative errors of the vehicle file's torque constant with respect to each servo's true constant, in addition to those in
-    `servos` (m: the MX-106's differs by 5 % between stall currents; e: +-10 % between servos).
-    """
+    torque_per_amp_error: RelativeErrors = (0.0, 0.0)
+    """Relative errors of the vehicle file's torque constant with respect to each servo's true constant, from the shoulder outwards, in
+    addition to those in `servos`. The last value also holds for further servos, and surplus values are ignored (m: the MX-106's differs
+    by 5 % between stall currents; e: +-10 % between servos)."""
     current_loop_s: NonNegative = 0.003
     """Time constant of the current loop; 0 for none (e: ROBOTIS discloses only that the loop runs much faster than 1 kHz)."""
     friction_nm: NonNegative = 0.015

@@ -92,9 +92,8 @@ class Downwash:
         area = config.link_drag_coefficient * config.link_width_m
         self._links = tuple(
             (body, data.xpos[body], data.xmat[body], data.xipos[body], 0.5 * length_m, area * length_m)
-            for body, length_m in zip(
-                (model.body("link1").id, model.body("link2").id), vehicle.arm.link_lengths_m, strict=True
-            )
+            for number, length_m in enumerate(vehicle.arm.link_lengths_m, start=1)
+            for body in (model.body(f"link{number}").id,)
         )
         names = {model.body(k).name: k for k in range(model.nbody)}
         payload_m2 = config.payload_drag_coefficient * math.pi * PAYLOAD_RADIUS_M**2
@@ -116,7 +115,9 @@ class Downwash:
 
     def restart_noise(self) -> None:
         """Restart the noise sequence."""
-        self._turbulence = OrnsteinUhlenbeck(3, self._config.correlation_time_s, EFFECT_PERIOD_S, self._seed, _NOISE)
+        self._turbulence = OrnsteinUhlenbeck(
+            len(self._links) + 1, self._config.correlation_time_s, EFFECT_PERIOD_S, self._seed, _NOISE
+        )
 
     def apply(self, world: World) -> None:
         """Set the wakes' forces on links, net and payload."""
@@ -126,8 +127,10 @@ class Downwash:
         axes = self._base_axes.tolist()
         down = (-axes[2], -axes[5], -axes[8])
         intensity = self._config.turbulence_intensity
-        flows = [(down[0] + intensity * x, down[1] + intensity * y, down[2] + intensity * z) for x, y, z in gusts]
-        for (body, joint, matrix, centre, half_m, area_m2), (ux, uy, uz) in zip(self._links, flows, strict=False):
+        *link_flows, flow = [
+            (down[0] + intensity * x, down[1] + intensity * y, down[2] + intensity * z) for x, y, z in gusts
+        ]
+        for (body, joint, matrix, centre, half_m, area_m2), (ux, uy, uz) in zip(self._links, link_flows, strict=True):
             ex, ey, ez = matrix[0::3].tolist()
             x, y, z = joint.tolist()
             cx, cy, cz = centre.tolist()
@@ -143,7 +146,7 @@ class Downwash:
             rx, ry, rz = x - cx, y - cy, z - cz
             torque = (ry * fz - rz * fy, rz * fx - rx * fz, rx * fy - ry * fx)
             world.loads.set(body, "downwash", (fx, fy, fz), torque)
-        ux, uy, uz = flows[2]
+        ux, uy, uz = flow
         speed = math.sqrt(ux * ux + uy * uy + uz * uz)
         for body, centre, area_m2, blur_m in self._compact:
             x, y, z = centre.tolist()

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import operator
 
 from companion.config.vehicle import Vehicle
 from companion.model.types import Vec3
 from companion.sitl_config.effects.machine import Machine
+from companion.sitl_config.per_joint import of_joints
 
 
 def as_built(vehicle: Vehicle, machine: Machine) -> Vehicle:
@@ -16,16 +18,16 @@ def as_built(vehicle: Vehicle, machine: Machine) -> Vehicle:
     airframe, arm = vehicle.airframe, vehicle.arm
     shoulder, lengths, coms = arm.shoulder_body_m, arm.link_lengths_m, arm.link_com_m
     (x, y, z), (dx, dy, dz) = shoulder, machine.shoulder_offset_m
-    (l1, l2), (dl1, dl2) = lengths, machine.link_length_error_m
-    (c1, c2), (dc1, dc2) = coms, machine.link_com_error_m
+    longer = of_joints(machine.link_length_error_m, len(lengths))
+    farther = of_joints(machine.link_com_error_m, len(coms))
     return vehicle.model_copy(
         update={
             "airframe": airframe.model_copy(update={"inertia_kg_m2": _inertia_kg_m2(airframe.inertia_kg_m2, machine)}),
             "arm": arm.model_copy(
                 update={
                     "shoulder_body_m": (x + dx, y + dy, z + dz),
-                    "link_lengths_m": (l1 + dl1, l2 + dl2),
-                    "link_com_m": (c1 + dc1, c2 + dc2),
+                    "link_lengths_m": tuple(map(operator.add, lengths, longer)),
+                    "link_com_m": tuple(map(operator.add, coms, farther)),
                 }
             ),
         }

@@ -136,9 +136,7 @@ def acts(world: World) -> bool:
     return world.servo_mechanics.on or world.compliance.on
 
 
-def transmissions_of(
-    vehicle: Vehicle, world: World, start_rad: Joints, dt_s: float
-) -> tuple[Transmission, Transmission] | None:
+def transmissions_of(vehicle: Vehicle, world: World, start_rad: Joints, dt_s: float) -> tuple[Transmission, ...] | None:
     """Return the transmission of each joint, starting at the joint angles `start_rad`; None if neither effect is on.
 
     With `compliance` alone, the servo has the plain world's constant friction and no backlash.
@@ -160,7 +158,7 @@ def transmissions_of(
             warm_up_k=0.0,
         )
     armature = vehicle.arm.joint_armature_kg_m2
-    return (
-        Transmission(servo, armature, gear_rad, mount_rad, arm.relaxation_s, start_rad[0], dt_s),
-        Transmission(servo, armature, gear_rad, link_rad, arm.relaxation_s, start_rad[1], dt_s),
+    return tuple(
+        Transmission(servo, armature, gear_rad, link_rad if joint else mount_rad, arm.relaxation_s, angle_rad, dt_s)
+        for joint, angle_rad in enumerate(start_rad)
     )
