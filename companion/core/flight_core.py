@@ -89,7 +89,7 @@ class FlightCore:
             arm is not None and t_s - arm.stamp_s <= ARM_FRESH_S,
             t_s=t_s,
             state_age_s=t_s - vehicle.attitude_stamp_s if vehicle else 0.0,
-            arm_rate_rad_s=arm.velocity_rad_s if arm else (0.0, 0.0),
+            arm_rate_rad_s=arm.velocity_rad_s if arm else None,
         )
         if verdict.refused or self._refused:
             self._report_refused(t_s, verdict.refused, events)

@@ -14,7 +14,7 @@ from companion.mission.settled import SettledEstimate
 from companion.model import flight_stage as seq
 from companion.model.flight_stage import Stage
 from companion.model.frames import euler_zyx_from_quat
-from companion.model.types import AutopilotRequest, Inputs, Outcome, PhaseKind, SafetyAction, Severity
+from companion.model.types import AutopilotRequest, Inputs, Joints, Outcome, PhaseKind, SafetyAction, Severity
 from companion.safety import notices
 from companion.safety.autopilot_landing import FLIPPED, TIPPED
 from companion.safety.mocap import unfused
@@ -136,19 +136,24 @@ def _weigh(t: Transition) -> None:
 
 def _misplaced(t: Transition) -> list[str]:
     """Return how the vehicle's pose differs from the mission's start, or an empty list if it does not."""
-    vehicle, arm, p = t.i.vehicle, t.i.arm, t.parameters
-    assert vehicle is not None and arm is not None
+    vehicle, p = t.i.vehicle, t.parameters
+    assert vehicle is not None
     yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2]
-    return check_start(p.config.mission, p.vehicle, vehicle.position_world_m, yaw_rad, arm.angle_rad)
+    return check_start(p.config.mission, p.vehicle, vehicle.position_world_m, yaw_rad, _arm_rad(t))
 
 
 def _take_off(t: Transition) -> None:
     """Plan the mission from the present position and enter OFFBOARD."""
-    vehicle, arm, p = t.i.vehicle, t.i.arm, t.parameters
-    assert vehicle is not None and arm is not None
+    vehicle, p = t.i.vehicle, t.parameters
+    assert vehicle is not None
     yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2]
-    t.change(plan=Plan.build(p.config.mission, p.vehicle, vehicle.position_world_m, yaw_rad, arm.angle_rad))
+    t.change(plan=Plan.build(p.config.mission, p.vehicle, vehicle.position_world_m, yaw_rad, _arm_rad(t)))
     t.enter(Stage.OFFBOARD)
+
+
+def _arm_rad(t: Transition) -> Joints:
+    """Return the measured joint angles, rad; empty if the vehicle has no arm."""
+    return t.i.arm.angle_rad if t.i.arm is not None else ()
 
 
 def _decline_start(t: Transition) -> None:
@@ -308,8 +313,9 @@ def missing_inputs(i: Inputs, vehicle: Vehicle) -> list[str]:
         "PX4 state": i.vehicle,
         "PX4": i.status,
         "motion capture": i.mocap,
-        "arm": i.arm,
     }
+    if vehicle.arm.joints:
+        devices["arm"] = i.arm
     if vehicle.devices.force is not None:
         devices["force sensor"] = i.force
     return [name for name, value in devices.items() if value is None]

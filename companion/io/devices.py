@@ -97,8 +97,9 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
             failures = [] if problem is None else [str(problem)]
             arm: Arm | None = None
             try:
-                async with asyncio.timeout(ARM_TIMEOUT_S):
-                    arm = await stack.enter_async_context(_arm(config, clock))
+                if (driver := _arm(config, clock)) is not None:
+                    async with asyncio.timeout(ARM_TIMEOUT_S):
+                        arm = await stack.enter_async_context(driver)
             except DeviceError as error:
                 failures.append(str(error))
             except TimeoutError:
@@ -125,7 +126,8 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
         ground = None
         if ground_address is not None:
             ground = await stack.enter_async_context(_ground(config, ground_address, autopilot))
-        arm = await stack.enter_async_context(_arm(config, clock))
+        driver = _arm(config, clock)
+        arm = await stack.enter_async_context(driver) if driver is not None else None
         yield Devices(vision=vision, autopilot=autopilot, mocap=mocap, arm=arm, force=force, ground=ground)
 
 
@@ -158,8 +160,9 @@ async def open_available(
             available.mocap = await stack.enter_async_context(_mocap(config, clock, available))
         with noted("autopilot", "PX4"):
             available.autopilot = await stack.enter_async_context(_autopilot(config, clock))
-        with noted("arm", "arm"):
-            available.arm = await stack.enter_async_context(_arm(config, clock))
+        if (driver := _arm(config, clock)) is not None:
+            with noted("arm", "arm"):
+                available.arm = await stack.enter_async_context(driver)
         yield available
 
 
@@ -214,5 +217,7 @@ def _autopilot(config: FlightConfig, clock: Clock) -> MavsdkAutopilot:
     return MavsdkAutopilot(config.vehicle.devices.autopilot, clock, forwarding=forwarding)
 
 
-def _arm(config: FlightConfig, clock: Clock) -> DynamixelArm:
-    return DynamixelArm(config.vehicle.arm_device, config.vehicle.arm, clock)
+def _arm(config: FlightConfig, clock: Clock) -> DynamixelArm | None:
+    """Return the driver of the arm, or None if the vehicle has none."""
+    vehicle = config.vehicle
+    return DynamixelArm(vehicle.arm_device, vehicle.arm, clock) if vehicle.arm.joints else None

@@ -108,7 +108,7 @@ def _paced(r: Reference, rate: float, change: float, jerk: float) -> Reference:
     """Return the reference for a plan time with rate s: s v, s^2 a + s_d v, s^3 j + 3 s s_d a + s_dd v (chain rule)."""
     squared, mixed, cubed = rate * rate, 3.0 * rate * change, rate * rate * rate
     (vx, vy, vz), (ax, ay, az) = r.velocity_world_m_s, r.acceleration_world_m_s2
-    (jx, jy, jz), (da1, da2), (dda1, dda2) = r.jerk_world_m_s3, r.arm_rate_rad_s, r.arm_acceleration_rad_s2
+    (jx, jy, jz), arm_rate = r.jerk_world_m_s3, r.arm_rate_rad_s
     return Reference(
         position_world_m=r.position_world_m,
         velocity_world_m_s=(rate * vx, rate * vy, rate * vz),
@@ -116,8 +116,10 @@ def _paced(r: Reference, rate: float, change: float, jerk: float) -> Reference:
         yaw_rad=r.yaw_rad,
         yaw_rate_rad_s=rate * r.yaw_rate_rad_s,
         arm_rad=r.arm_rad,
-        arm_rate_rad_s=(rate * da1, rate * da2),
-        arm_acceleration_rad_s2=(squared * dda1 + change * da1, squared * dda2 + change * da2),
+        arm_rate_rad_s=tuple([rate * da for da in arm_rate]),
+        arm_acceleration_rad_s2=tuple(
+            [squared * dda + change * da for dda, da in zip(r.arm_acceleration_rad_s2, arm_rate, strict=True)]
+        ),
         jerk_world_m_s3=(
             cubed * jx + mixed * ax + jerk * vx,
             cubed * jy + mixed * ay + jerk * vy,

@@ -1,6 +1,6 @@
-"""Plans jerk-limited motion of the arm with Ruckig, from rest to rest and with both joints synchronised.
+"""Plans jerk-limited motion of the arm with Ruckig, from rest to rest and with all joints synchronised.
 
-Both joints follow the same normalised profile, so the arm moves on a straight line in joint space and the more limited joint sets the
+All joints follow the same normalised profile, so the arm moves on a straight line in joint space and the most limited joint sets the
 duration.
 """
 
@@ -78,14 +78,14 @@ def plan_arm(delta_rad: Joints, limits: ArmLimits, duration_s: float = 0.0) -> A
     """Plan one move; takes a few microseconds.
 
     Args:
-        delta_rad: displacement of each joint; not both zero.
-        limits: speed limit of each joint; acceleration and jerk limits common to both.
+        delta_rad: displacement of each joint; not all zero.
+        limits: speed limit of each joint; acceleration and jerk limits common to all.
         duration_s: requested minimum duration.
 
     Raises:
         ValueError: Ruckig rejects the input. Finite angles and positive limits are always accepted.
     """
-    farthest_rad = max(map(abs, delta_rad))
+    farthest_rad = max(map(abs, delta_rad), default=0.0)
     if not farthest_rad > 0.0:
         raise ValueError("a move of the arm without displacement")
     jerk_per_s3 = limits.jerk_max_rad_s3 / farthest_rad

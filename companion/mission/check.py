@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from companion.config.mission import Mission
+from companion.config.mission import ArmMove, Mission
 from companion.config.vehicle import Vehicle
 from companion.mission.minsnap import Progress
 from companion.mission.plan import Plan
 from companion.mission.sample_check import CATCH_NEAR_M, STOP, SampleCheck, Violation
 from companion.mission.segments import Segment
 from companion.model.frames import wrap_rad
+from companion.model.listing import listed
 from companion.model.types import Joints, PhaseKind, Reference, Vec3
 from companion.safety.governor import SafeSet
 
@@ -166,13 +167,13 @@ def _start(mission: Mission, vehicle: Vehicle, position: Vec3, yaw_rad: float, a
             f"starts at a yaw of {start.yaw_deg:g} deg, but the vehicle's yaw is {math.degrees(wrap_rad(yaw_rad)):.0f} deg "
             f"(tolerance {start.yaw_tolerance_deg:g} deg); turn the vehicle or change start.yaw_deg"
         )
-    if arm_rad is not None:
+    if arm_rad:
         measured_deg = [math.degrees(angle) for angle in arm_rad]
         off_deg = max(abs(a - b) for a, b in zip(measured_deg, start.arm_deg, strict=True))
         if off_deg > start.arm_tolerance_deg:
             yield (
-                f"starts with the arm at ({start.arm_deg[0]:g}, {start.arm_deg[1]:g}) deg, but it is at ({measured_deg[0]:.0f}, "
-                f"{measured_deg[1]:.0f}) deg (tolerance {start.arm_tolerance_deg:g} deg); move it there by hand"
+                f"starts with the arm at ({listed(start.arm_deg, 'g')}) deg, but it is at ({listed(measured_deg, '.0f')}) deg "
+                f"(tolerance {start.arm_tolerance_deg:g} deg); move it there by hand"
             )
 
 
@@ -199,6 +200,13 @@ def _whole(mission: Mission, vehicle: Vehicle, plan: Plan, phase_origins: Sequen
             f"{clearance_m:g} m above the floor when the vehicle is on the ground; "
             f"set height_m to {clearance_m + TAKEOFF_RISE_MIN_M:g} or more"
         )
+    if not vehicle.arm.joints:
+        for segment in plan.segments:
+            if segment.repetition < 2 and isinstance(mission.phases[segment.index], ArmMove):
+                problems.append(
+                    f"{_place(mission, segment, phase_origins)} moves the arm, but vehicle '{vehicle.name}' has no arm; "
+                    "add arm to the vehicle file, or remove the phase from the mission"
+                )
     if mission.catch is not None:
         flown = [segment for segment in plan.segments if segment.kind is PhaseKind.FLIGHT]
         near_m, catching = min(

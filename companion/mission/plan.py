@@ -143,8 +143,8 @@ class Plan:
         """Return the third derivatives of position (world frame, m/s^3) and joint angles (rad/s^3), for checks."""
         if self._repeats is not None:
             t_s -= self._repeats.before(t_s) * self._repeats.period_s
-        (x, y, z), (first, second) = self._position.at(t_s)[3], self._arm.at(t_s)[3]
-        return (x, y, z), (first, second)
+        x, y, z = self._position.at(t_s)[3]
+        return (x, y, z), self._arm.at(t_s)[3]
 
     def segment(self, t_s: float) -> Segment:
         """Return the segment at a time: the first before 0, the last after the end."""
@@ -204,8 +204,7 @@ def landing_from(
         vehicle: provides the height of the floor and the reach of the arm.
     """
     builder = PlanBuilder(position_world_m, yaw_rad, arm_rad)
-    fold_rad = max(abs(arm_fold_rad[0] - arm_rad[0]), abs(arm_fold_rad[1] - arm_rad[1]))
-    fold_s = max(FOLD_MIN_S, REST_TO_REST_PEAK_SPEED * fold_rad / FOLD_SPEED_RAD_S)
+    fold_s = fold_time_s(arm_rad, arm_fold_rad)
     builder.fold_arm(arm_fold_rad, fold_s)
     stop_s = builder.stop(velocity_world_m_s)
     arm = vehicle.arm
@@ -218,6 +217,14 @@ def landing_from(
     builder.t_s = max(end_s, fold_s)
     builder.segments.append(Segment(name="land", kind=PhaseKind.LANDING, start_s=start_s, end_s=builder.t_s, index=-1))
     return Plan.of("landing", builder)
+
+
+def fold_time_s(arm_rad: Joints, arm_fold_rad: Joints) -> float:
+    """Return the duration of an emergency fold of the arm, s; 0 if there is no arm."""
+    if not arm_rad:
+        return 0.0
+    farthest_rad = max(abs(to - at) for to, at in zip(arm_fold_rad, arm_rad, strict=True))
+    return max(FOLD_MIN_S, REST_TO_REST_PEAK_SPEED * farthest_rad / FOLD_SPEED_RAD_S)
 
 
 def _line(builder: PlanBuilder, phase: Line, limits: VehicleLimits, arm_limits: ArmLimits) -> float:
@@ -243,11 +250,9 @@ def _vehicle_limits(mission: Mission) -> VehicleLimits:
 
 def _arm_limits(mission: Mission, vehicle: Vehicle) -> ArmLimits:
     limits = mission.limits
-    first, second = vehicle.arm.joints
     return ArmLimits(
-        speed_max_rad_s=(
-            math.radians(min(limits.arm_speed_max_deg_s, first.velocity_max_deg_s)),
-            math.radians(min(limits.arm_speed_max_deg_s, second.velocity_max_deg_s)),
+        speed_max_rad_s=tuple(
+            math.radians(min(limits.arm_speed_max_deg_s, joint.velocity_max_deg_s)) for joint in vehicle.arm.joints
         ),
         acceleration_max_rad_s2=math.radians(limits.arm_acceleration_max_deg_s2),
         jerk_max_rad_s3=math.radians(limits.arm_jerk_max_deg_s3),
@@ -260,4 +265,4 @@ def _part(progress: Progress | None, done: int, count: int) -> Progress | None:
 
 
 def _radians(angle_deg: Joints) -> Joints:
-    return (math.radians(angle_deg[0]), math.radians(angle_deg[1]))
+    return tuple(map(math.radians, angle_deg))

@@ -178,8 +178,7 @@ class PlanBuilder:
         return position, yaw, arm
 
     def _arm_delta(self, to_rad: Joints) -> Joints:
-        first_rad, second_rad = self._at[2]
-        return (to_rad[0] - first_rad, to_rad[1] - second_rad)
+        return tuple([to - at for to, at in zip(to_rad, self._at[2], strict=True)])
 
     def _go(self, track: int, to: tuple[float, ...], start_s: float, duration_s: float, profile: Profile) -> None:
         delta = tuple(b - a for a, b in zip(self._at[track], to, strict=True))

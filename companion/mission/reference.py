@@ -197,16 +197,16 @@ def reference_at(position: Track, yaw: Track, arm: Track, t_s: float) -> Referen
     """Return the reference of the three tracks at one instant."""
     (x, y, z), (vx, vy, vz), (ax, ay, az), (jx, jy, jz) = position.at(t_s)
     (psi,), (dpsi,), _, _ = yaw.at(t_s)
-    (a1, a2), (da1, da2), (dda1, dda2), _ = arm.at(t_s)
+    arm_rad, arm_rate_rad_s, arm_acceleration_rad_s2, _ = arm.at(t_s)
     return Reference(
         position_world_m=(x, y, z),
         velocity_world_m_s=(vx, vy, vz),
         acceleration_world_m_s2=(ax, ay, az),
         yaw_rad=psi,
         yaw_rate_rad_s=dpsi,
-        arm_rad=(a1, a2),
-        arm_rate_rad_s=(da1, da2),
-        arm_acceleration_rad_s2=(dda1, dda2),
+        arm_rad=arm_rad,
+        arm_rate_rad_s=arm_rate_rad_s,
+        arm_acceleration_rad_s2=arm_acceleration_rad_s2,
         jerk_world_m_s3=(jx, jy, jz),
     )
 
@@ -214,6 +214,7 @@ def reference_at(position: Track, yaw: Track, arm: Track, t_s: float) -> Referen
 def at_rest(position_world_m: Vec3, yaw_rad: float, arm_rad: Joints) -> Reference:
     """Return a constant reference."""
     zero3: Vec3 = (0.0, 0.0, 0.0)
+    still = (0.0,) * len(arm_rad)
     return Reference(
         position_world_m=position_world_m,
         velocity_world_m_s=zero3,
@@ -221,7 +222,7 @@ def at_rest(position_world_m: Vec3, yaw_rad: float, arm_rad: Joints) -> Referenc
         yaw_rad=yaw_rad,
         yaw_rate_rad_s=0.0,
         arm_rad=arm_rad,
-        arm_rate_rad_s=(0.0, 0.0),
-        arm_acceleration_rad_s2=(0.0, 0.0),
+        arm_rate_rad_s=still,
+        arm_acceleration_rad_s2=still,
         jerk_world_m_s3=zero3,
     )

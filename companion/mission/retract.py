@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Room, Tether, Vehicle
-from companion.mission.plan import FOLD_MIN_S, FOLD_SPEED_RAD_S, Plan
+from companion.mission.plan import Plan, fold_time_s
 from companion.mission.plan_builder import PlanBuilder, stopping
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED
 from companion.mission.segments import Segment
@@ -59,8 +59,7 @@ def retract_from(
     """
     safety, anchor = vehicle.safety, tether.anchor_world_m
     builder = PlanBuilder(position_world_m, yaw_rad, arm_rad)
-    fold_rad = max(abs(arm_fold_rad[0] - arm_rad[0]), abs(arm_fold_rad[1] - arm_rad[1]))
-    fold_s = max(FOLD_MIN_S, REST_TO_REST_PEAK_SPEED * fold_rad / FOLD_SPEED_RAD_S)
+    fold_s = fold_time_s(arm_rad, arm_fold_rad)
     builder.fold_arm(arm_fold_rad, fold_s)
     velocity, stop_s = stopping(inward_only(velocity_world_m_s, position_world_m, anchor))
     builder.t_s = builder.stop_within(_never_outward(velocity, stop_s, position_world_m, anchor), stop_s)

@@ -133,11 +133,14 @@ class SampleCheck:
 
     def _space(self, position: Vec3, reference: Reference, off_m: float) -> Iterator[Violation]:
         vehicle = self._vehicle
-        net_m = _world(position, reference.yaw_rad, self._manipulator.net_body_m(reference.arm_rad))
-        net_radius_m = vehicle.tip_radius_m
+        net_m, net_radius_m = position, 0.0
+        if vehicle.arm.joints:
+            net_m = _world(position, reference.yaw_rad, self._manipulator.net_body_m(reference.arm_rad))
+            net_radius_m = vehicle.tip_radius_m
         radius_m = vehicle.airframe.radius_m
         room = vehicle.room
         why = _allowance(off_m)
+        parts = "the rotors, the arm and the net" if vehicle.arm.joints else "the rotors"
         for axis, name, span in ((0, "x", room.x_m), (1, "y", room.y_m), (2, "z", room.z_m)):
             if axis == 2 and position[2] < vehicle.airframe.ground_clearance_m:
                 continue  # reported as flying into the floor
@@ -149,7 +152,7 @@ class SampleCheck:
                         limit=f"room {name} {edge}",
                         excess=excess,
                         what="leaves the room",
-                        detail=f"the rotors, the arm and the net reach {name} = {reach:.2f} m; "
+                        detail=f"{parts} reach {name} = {reach:.2f} m; "
                         f"the room is {span[0]:g} to {span[1]:g} m, reduced at each end by {why}",
                         advice="move the waypoint inwards",
                     )
@@ -239,10 +242,14 @@ class SampleCheck:
                 yield Violation(
                     limit=f"joint {number}", excess=excess, what=what, detail=detail, advice="change arm_deg"
                 )
-        net_z_m = position[2] + self._manipulator.net_body_m(reference.arm_rad)[2] - self._vehicle.tip_radius_m
-        elbow_z_m = position[2] + self._manipulator.joints_body_m(reference.arm_rad)[1][2] - LINK_RADIUS_M
+        if not arm.joints:
+            return
         tip = "net" if self._vehicle.tool is not None else "end of the arm"
-        for part, lowest_m in ((tip, net_z_m), ("elbow", elbow_z_m)):
+        parts = [(tip, self._manipulator.net_body_m(reference.arm_rad), self._vehicle.tip_radius_m)]
+        for number, joint_m in enumerate(self._manipulator.joints_body_m(reference.arm_rad)[1:], start=2):
+            parts.append(("elbow" if len(arm.joints) == 2 else f"joint {number}", joint_m, LINK_RADIUS_M))
+        for part, (_, _, z_m), radius_m in parts:
+            lowest_m = position[2] + z_m - radius_m
             if lowest_m < FLOOR_GAP_M:
                 what = f"drags the {part} over the floor"
                 detail = f"its lowest point is {lowest_m:.2f} m high (minimum {FLOOR_GAP_M:g} m)"
@@ -258,10 +265,10 @@ class SampleCheck:
         limits = self._limits
         speed = math.hypot(*reference.velocity_world_m_s)
         acceleration = math.hypot(*reference.acceleration_world_m_s2)
-        arm_speed = math.degrees(max(map(abs, reference.arm_rate_rad_s)))
-        arm_acceleration = math.degrees(max(map(abs, reference.arm_acceleration_rad_s2)))
+        arm_speed = math.degrees(max(map(abs, reference.arm_rate_rad_s), default=0.0))
+        arm_acceleration = math.degrees(max(map(abs, reference.arm_acceleration_rad_s2), default=0.0))
         jerk = math.hypot(*jerks[0])
-        arm_jerk = math.degrees(max(map(abs, jerks[1])))
+        arm_jerk = math.degrees(max(map(abs, jerks[1]), default=0.0))
         checked = (
             ("speed_max_m_s", speed, limits.speed_max_m_s, "m/s", "flies too fast"),
             ("acceleration_max_m_s2", acceleration, limits.acceleration_max_m_s2, "m/s^2", "accelerates too hard"),

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from companion.config.vehicle import Vehicle
 from companion.model.check_row import Row
+from companion.model.listing import listed
 from companion.model.observations import Observations, ServoReport
 from companion.model.types import ArmState
 from companion.preflight.checks import Check
@@ -15,7 +16,7 @@ from companion.safety.arm import error_text
 DEVICE = Check(
     "arm.device",
     "arm bus",
-    "the port opens, and both servos answer and accept their settings",
+    "the port opens, and all servos answer and accept their settings; a vehicle without `arm` only warns",
     "the flight needs the arm",
 )
 MODEL = Check(
@@ -27,7 +28,7 @@ MODEL = Check(
 FIRMWARE = Check(
     "arm.firmware",
     "servo firmware",
-    "38 or newer, the same on both servos",
+    "38 or newer, the same on all servos",
     "older firmware has no bus watchdog: the arm would keep its torque if the companion died",
 )
 MODE = Check(
@@ -75,7 +76,7 @@ ERROR = Check(
 ANGLES = Check(
     "arm.angles",
     "joint angles",
-    "within the limits of both joints",
+    "within the limits of all joints",
     "beyond a limit the links touch the airframe; or zero_count or sign is wrong",
 )
 STILL = Check("arm.still", "arm at rest", "moves less than 3 deg", "motion of the arm makes the tare wrong")
@@ -109,7 +110,11 @@ WATCHDOG_BIT = 0x80
 
 
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
-    """Return the rows of the arm."""
+    """Return the rows of the arm, or one warning if the vehicle has none."""
+    if not vehicle.arm.joints:
+        fix = "add arm and devices.arm to the vehicle file if an arm is mounted; without it, the vehicle flies as a plain multirotor"
+        yield DEVICE.doubtful("none; joints and servos are not monitored", "", fix)
+        return
     failure = o.failures.get("arm")
     if failure is not None:
         yield DEVICE.bad(failure, "", "")
@@ -160,16 +165,16 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
 
 def firmware(check: Check, versions: Sequence[int]) -> Row:
     """Return the row of the servos' firmware."""
-    read, wanted = _both(versions), f"{FIRMWARE_MIN} or newer"
+    read, wanted = _each(versions), f"{FIRMWARE_MIN} or newer"
     fix = "update with DYNAMIXEL Wizard: Recovery, newest firmware"
     if min(versions) >= FIRMWARE_MIN and len(set(versions)) > 1:
-        return check.doubtful(read, f"{wanted}, the same on both", fix)
+        return check.doubtful(read, f"{wanted}, the same on all", fix)
     return check.row(min(versions) >= FIRMWARE_MIN, read, wanted, fix)
 
 
 def supply(check: Check, volts: Sequence[float]) -> Row:
     """Return the row of the servos' supply voltage."""
-    read, wanted = _both([f"{volt:.1f} V" for volt in volts]), f"{VOLTAGE_MIN_V:g} to {VOLTAGE_MAX_V:g} V"
+    read, wanted = _each([f"{volt:.1f} V" for volt in volts]), f"{VOLTAGE_MIN_V:g} to {VOLTAGE_MAX_V:g} V"
     within = all(VOLTAGE_MIN_V <= volt <= VOLTAGE_MAX_V for volt in volts)
     return check.row(within, read, wanted, "supply the servos with 12 V from a converter; check its plugs")
 
@@ -178,8 +183,8 @@ def _current_limit(servos: Sequence[ServoReport], vehicle: Vehicle) -> Row:
     per_count_nm = vehicle.arm.torque_per_amp_nm_a * AMP_PER_COUNT
     limits = [servo.current_limit_counts for servo in servos]
     needed = [math.floor(joint.torque_max_nm / per_count_nm + 1e-9) for joint in vehicle.arm.joints]
-    read = _both([f"{limit} ({limit * per_count_nm:.2f} N m)" for limit in limits])
-    wanted = f"at least {_both(needed)}"
+    read = _each([f"{limit} ({limit * per_count_nm:.2f} N m)" for limit in limits])
+    wanted = f"at least {_each(needed)}"
     if all(limit >= need for limit, need in zip(limits, needed, strict=True)):
         return CURRENT_LIMIT.good(read, wanted)
     return CURRENT_LIMIT.bad(
@@ -196,19 +201,17 @@ def _states(states: Sequence[ArmState], vehicle: Vehicle) -> Iterator[Row]:
     else:
         row = TEMPERATURE.doubtful if hottest_c < safety.servo_max_c else TEMPERATURE.bad
         yield row(read, wanted, "let the arm cool down; check for a jammed joint or a load on the arm")
-    errors = (_or(state.hardware_error[0] for state in states), _or(state.hardware_error[1] for state in states))
+    errors = [_or(servo) for servo in zip(*(state.hardware_error for state in states), strict=True)]
     named = error_text(errors)
     if named:
         yield ERROR.bad(named, "none", "remove the cause, then cycle the servos' power")
-    elif (errors[0] | errors[1]) & WATCHDOG_BIT:
+    elif _or(errors) & WATCHDOG_BIT:
         fix = "check for a loose cable or supply, and for a computer that stalls"
         yield ERROR.doubtful("a bus watchdog tripped", "none", fix)
     else:
         yield ERROR.good("none", "none")
     yield _angles(last, vehicle)
-    moved_rad = max(
-        max(s.angle_rad[joint] for s in states) - min(s.angle_rad[joint] for s in states) for joint in (0, 1)
-    )
+    moved_rad = max(max(angles) - min(angles) for angles in zip(*(state.angle_rad for state in states), strict=True))
     read, wanted = f"moves by {math.degrees(moved_rad):.1f} deg", f"{math.degrees(STILL_RAD):.0f} deg"
     if moved_rad <= STILL_RAD:
         yield STILL.good(read, wanted)
@@ -219,7 +222,7 @@ def _states(states: Sequence[ArmState], vehicle: Vehicle) -> Iterator[Row]:
 def _angles(last: ArmState, vehicle: Vehicle) -> Row:
     degrees = [math.degrees(angle) for angle in last.angle_rad]
     limits = [joint.angle_deg for joint in vehicle.arm.joints]
-    read = f"({degrees[0]:.0f}, {degrees[1]:.0f}) deg"
+    read = f"({listed(degrees, '.0f')}) deg"
     wanted = " and ".join(f"{low:g} to {high:g} deg" for low, high in limits)
     if all(low <= angle <= high for angle, (low, high) in zip(degrees, limits, strict=True)):
         return ANGLES.good(read, wanted)
@@ -247,13 +250,13 @@ def usb_latency(check: Check, latency_ms: int | None) -> Row:
 
 
 def _equal(check: Check, values: Sequence[int], wanted: int, text: Callable[[int], str], fix: str) -> Row:
-    read = _both([text(value) for value in values])
+    read = _each([text(value) for value in values])
     good = all(value == wanted for value in values)
     return check.good(read, text(wanted)) if good else check.bad(read, text(wanted), fix)
 
 
-def _both(values: Sequence[object]) -> str:
-    """Return one value as text if both servos have it, else both values."""
+def _each(values: Sequence[object]) -> str:
+    """Return one value as text if all servos have it, else the value of each."""
     return str(values[0]) if len(set(values)) == 1 else " and ".join(map(str, values))
 
 

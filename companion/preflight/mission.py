@@ -11,6 +11,7 @@ from companion.config.loader import FlightConfig
 from companion.config.mission import Start
 from companion.config.vehicle import Room
 from companion.model.check_row import Row
+from companion.model.listing import listed
 from companion.model.observations import Observations
 from companion.model.types import Joints, Vec3
 from companion.preflight.checks import Check
@@ -55,10 +56,10 @@ def rows(o: Observations, config: FlightConfig) -> Iterator[Row]:
 
 
 def _arm(angle_rad: Joints, start: Start) -> Row:
-    first, second = (math.degrees(angle) for angle in angle_rad)
-    off_deg = max(abs(first - start.arm_deg[0]), abs(second - start.arm_deg[1]))
-    read = f"({first:.0f}, {second:.0f}) deg"
-    wanted = f"({start.arm_deg[0]:g}, {start.arm_deg[1]:g}) ± {start.arm_tolerance_deg:g} deg"
+    angle_deg = tuple(map(math.degrees, angle_rad))
+    off_deg = max(abs(angle - wanted) for angle, wanted in zip(angle_deg, start.arm_deg, strict=True))
+    read = f"({listed(angle_deg, '.0f')}) deg"
+    wanted = f"({listed(start.arm_deg, 'g')}) ± {start.arm_tolerance_deg:g} deg"
     if off_deg <= start.arm_tolerance_deg:
         return ARM.good(read, wanted)
     return ARM.bad(read, wanted, "move the arm there by hand, or change the mission's start.arm_deg")

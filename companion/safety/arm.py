@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from companion.model.listing import listed
 from companion.model.types import ArmState, ForceSample, Inputs, Joints, Vec2, Vec3
 from companion.safety.situation import HOLDS, Age, Situation, Values
 
@@ -34,7 +35,7 @@ def error_text(errors: Sequence[int]) -> str:
 
 
 class ArmTracker:
-    """Tracks the joint state of both servos."""
+    """Tracks the joint state of all servos."""
 
     def __init__(self) -> None:
         self._age = Age()
@@ -44,7 +45,7 @@ class ArmTracker:
         """Previous joint state; None if this tick has no new one."""
         self.age_s = 0.0
         self.hottest_c = -math.inf
-        """Temperature of the hotter servo; -inf without a joint state."""
+        """Temperature of the hottest servo; -inf without a joint state."""
 
     def update(self, i: Inputs, awake_s: float) -> None:
         """Update with the inputs of one tick."""
@@ -52,8 +53,7 @@ class ArmTracker:
         self.age_s = self._age.update(awake_s, arm.stamp_s if arm else None)
         self.before, self.hottest_c = None, -math.inf
         if arm is not None:
-            first_c, second_c = arm.temperature_c
-            self.hottest_c = first_c if first_c > second_c else second_c
+            self.hottest_c = max(arm.temperature_c)
             newest, self._newest = self._newest, arm
             if newest is not None and arm.stamp_s > newest.stamp_s:
                 self.before = newest
@@ -75,14 +75,20 @@ def servo_error(a: ArmTracker, _: None) -> Values | None:
     arm = a.arm
     if arm is None:
         return None
-    first, second = arm.hardware_error
-    return (error_text((first, second)),) if (first | second) & ~WATCHDOG_RESTARTED else None
+    for error in arm.hardware_error:
+        if error & ~WATCHDOG_RESTARTED:
+            return (error_text(arm.hardware_error),)
+    return None
 
 
 def arm_let_go(a: ArmTracker, _: None) -> Values | None:
     """Fires if a servo's bus watchdog has switched the torque off."""
     arm = a.arm
-    return HOLDS if arm is not None and (arm.hardware_error[0] | arm.hardware_error[1]) & WATCHDOG_RESTARTED else None
+    if arm is not None:
+        for error in arm.hardware_error:
+            if error & WATCHDOG_RESTARTED:
+                return HOLDS
+    return None
 
 
 def joint_jump(a: ArmTracker, thresholds: Vec2) -> Values | None:
@@ -92,7 +98,7 @@ def joint_jump(a: ArmTracker, thresholds: Vec2) -> Values | None:
         return None
     jump_rad, rate_max_rad_s = thresholds
     step_rad = jump_rad + rate_max_rad_s * (arm.stamp_s - before.stamp_s)
-    for index in (1, 0):
+    for index in range(len(arm.angle_rad) - 1, -1, -1):
         step = arm.angle_rad[index] - before.angle_rad[index]
         if not -step_rad < step < step_rad:
             return (index + 1, math.degrees(step))
@@ -100,12 +106,12 @@ def joint_jump(a: ArmTracker, thresholds: Vec2) -> Values | None:
 
 
 def servo_warm(a: ArmTracker, thresholds: Vec2) -> Values | None:
-    """Fires if the hotter servo's temperature has reached the first threshold but not the second."""
+    """Fires if the hottest servo's temperature has reached the first threshold but not the second."""
     return (a.hottest_c, thresholds[0]) if thresholds[0] <= a.hottest_c < thresholds[1] else None
 
 
 def servo_hot(a: ArmTracker, thresholds: Vec2) -> Values | None:
-    """Fires if the hotter servo's temperature has reached both thresholds."""
+    """Fires if the hottest servo's temperature has reached both thresholds."""
     if not (a.hottest_c >= thresholds[0] and a.hottest_c >= thresholds[1]):
         return None
     return (a.hottest_c, max(thresholds))
@@ -115,29 +121,36 @@ def servo_overload(a: ArmTracker, torque_max_nm: Joints) -> Values | None:
     """Fires if a joint is at its torque limit."""
     if a.arm is None:
         return None
-    t1, t2 = a.arm.torque_nm
-    limit1, limit2 = AT_LIMIT * torque_max_nm[0], AT_LIMIT * torque_max_nm[1]
-    return None if -limit1 < t1 < limit1 and -limit2 < t2 < limit2 else (t1, t2)
+    for torque_nm, max_nm in zip(a.arm.torque_nm, torque_max_nm, strict=True):
+        limit_nm = AT_LIMIT * max_nm
+        if not -limit_nm < torque_nm < limit_nm:
+            return (listed(a.arm.torque_nm, ".1f", " and "),)
+    return None
 
 
 def joint_rate(a: ArmTracker, rate_max_rad_s: float) -> Values | None:
     """Fires if the speed of a joint exceeds the threshold."""
     if a.arm is None:
         return None
-    w1, w2 = a.arm.velocity_rad_s
-    in_range = -rate_max_rad_s < w1 < rate_max_rad_s and -rate_max_rad_s < w2 < rate_max_rad_s
-    return None if in_range else (math.degrees(w1), math.degrees(w2), math.degrees(rate_max_rad_s))
+    for rate_rad_s in a.arm.velocity_rad_s:
+        if not -rate_max_rad_s < rate_rad_s < rate_max_rad_s:
+            rates = listed(map(math.degrees, a.arm.velocity_rad_s), ".0f", " and ")
+            return (rates, math.degrees(rate_max_rad_s))
+    return None
 
 
-def joint_beyond_limit(a: ArmTracker, thresholds: tuple[float, tuple[Vec2, Vec2]]) -> Values | None:
+def joint_beyond_limit(a: ArmTracker, thresholds: tuple[float, tuple[Vec2, ...]]) -> Values | None:
     """Fires if a joint is further beyond its limits than the first threshold; the second is each joint's lower and upper limit."""
     if a.arm is None:
         return None
-    (a1, a2), (beyond_max_rad, ((low1, high1), (low2, high2))) = a.arm.angle_rad, thresholds
-    if low1 <= a1 <= high1 and low2 <= a2 <= high2:
+    beyond_max_rad, limits_rad = thresholds
+    beyond_rad = 0.0
+    for angle_rad, (low_rad, high_rad) in zip(a.arm.angle_rad, limits_rad, strict=True):
+        if not low_rad <= angle_rad <= high_rad:
+            beyond_rad = max(beyond_rad, low_rad - angle_rad, angle_rad - high_rad)
+    if not beyond_rad > beyond_max_rad:
         return None
-    beyond_rad = max(low1 - a1, a1 - high1, low2 - a2, a2 - high2)
-    return (math.degrees(a1), math.degrees(a2), math.degrees(beyond_rad)) if beyond_rad > beyond_max_rad else None
+    return (listed(map(math.degrees, a.arm.angle_rad), ".0f"), math.degrees(beyond_rad))
 
 
 class ForceTracker:

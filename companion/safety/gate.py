@@ -45,9 +45,11 @@ class Gate:
         self._tilt_max_rad = math.radians(vehicle.airframe.tilt_max_deg) + 1e-6
         self._tilt_limit = math.sin(0.5 * self._tilt_max_rad) ** 2
         by_current_nm = safety.servo_current_max_a * vehicle.arm.torque_per_amp_nm_a
-        self._torque_max_nm = (min(joints[0].torque_max_nm, by_current_nm), min(joints[1].torque_max_nm, by_current_nm))
-        self._limits_rad = [(math.radians(joint.angle_deg[0]), math.radians(joint.angle_deg[1])) for joint in joints]
-        self._speed_max_rad_s = [math.radians(joint.velocity_max_deg_s) for joint in joints]
+        self._bounds = [
+            (min(joint.torque_max_nm, by_current_nm), *map(math.radians, (*joint.angle_deg, joint.velocity_max_deg_s)))
+            for joint in joints
+        ]
+        """Largest torque, N m, lower and upper limit, rad, and largest speed, rad/s, of each joint."""
         self._state_age_max_s = safety.command_state_age_max_s
         self._slew_max_per_s = safety.thrust_slew_max_per_s
         self._last: tuple[float, float] | None = None
@@ -62,18 +64,18 @@ class Gate:
         *,
         t_s: float = 0.0,
         state_age_s: float = 0.0,
-        arm_rate_rad_s: Joints = (0.0, 0.0),
+        arm_rate_rad_s: Joints | None = None,
     ) -> Verdict:
         """Return the commands that may be sent.
 
         Args:
             attitude: requested setpoint.
-            arm_torque_nm: requested joint torques.
+            arm_torque_nm: requested joint torques; empty or None requests none.
             arm_rad: joint angles now; None if unknown.
             arm_fresh: the joint state is fresh enough for closed-loop control.
             t_s: flight clock.
             state_age_s: age of the attitude that the setpoint was computed from.
-            arm_rate_rad_s: joint speeds now, rad/s.
+            arm_rate_rad_s: joint speeds now, rad/s; None counts as 0.
         """
         refused: list[Refusal] = []
         if attitude is not None:
@@ -83,19 +85,17 @@ class Gate:
                 attitude = None
             else:
                 attitude = self._slewed(attitude, t_s, refused)
-        if arm_torque_nm is not None:
-            first, second = arm_torque_nm
-            if not (math.isfinite(first) and math.isfinite(second)):
+        if arm_torque_nm:
+            if not math.isfinite(sum(arm_torque_nm)):
                 refused.append(Refusal("torque not finite", f"joint torque {arm_torque_nm} is not finite"))
                 arm_torque_nm = None
             elif arm_rad is None or not arm_fresh:
                 refused.append(Refusal("torque without state", "joint torque without a fresh joint state"))
                 arm_torque_nm = None
-            elif not self._is_free(first, second, arm_rad, arm_rate_rad_s):
-                arm_torque_nm = (
-                    self._limited(0, first, arm_rad[0], arm_rate_rad_s[0]),
-                    self._limited(1, second, arm_rad[1], arm_rate_rad_s[1]),
-                )
+            else:
+                rate_rad_s = arm_rate_rad_s if arm_rate_rad_s is not None else (0.0,) * len(arm_rad)
+                if not self._is_free(arm_torque_nm, arm_rad, rate_rad_s):
+                    arm_torque_nm = tuple(map(self._limited, range(len(arm_rad)), arm_torque_nm, arm_rad, rate_rad_s))
         return Verdict(attitude, arm_torque_nm, tuple(refused) if refused else ())
 
     def _attitude_fault(self, setpoint: AttitudeSetpoint, state_age_s: float) -> Refusal | None:
@@ -128,19 +128,22 @@ class Gate:
         self._last = (t_s, thrust)
         return setpoint
 
-    def _is_free(self, first_nm: float, second_nm: float, arm_rad: Joints, arm_rate_rad_s: Joints) -> bool:
+    def _is_free(self, arm_torque_nm: Joints, arm_rad: Joints, arm_rate_rad_s: Joints) -> bool:
         """Return whether torques, joint angles and speeds are within their limits, as in nearly every tick."""
-        (a1, a2), (w1, w2), (most1, most2) = arm_rad, arm_rate_rad_s, self._torque_max_nm
-        ((low1, high1), (low2, high2)), (fast1, fast2) = self._limits_rad, self._speed_max_rad_s
-        return (
-            (-most1 <= first_nm <= most1 and -most2 <= second_nm <= most2)
-            and (low1 <= a1 <= high1 and low2 <= a2 <= high2)
-            and (-fast1 <= w1 <= fast1 and -fast2 <= w2 <= fast2)
-        )
+        for torque_nm, angle_rad, rate_rad_s, (most_nm, low_rad, high_rad, fast_rad_s) in zip(
+            arm_torque_nm, arm_rad, arm_rate_rad_s, self._bounds, strict=True
+        ):
+            if not (
+                -most_nm <= torque_nm <= most_nm
+                and low_rad <= angle_rad <= high_rad
+                and -fast_rad_s <= rate_rad_s <= fast_rad_s
+            ):
+                return False
+        return True
 
     def _limited(self, index: int, torque_nm: float, angle_rad: float, rate_rad_s: float) -> float:
         """Return the torque clipped to its limit; beyond the angle or speed limit only torque that drives the joint back is kept."""
-        limit, (low, high), fast = self._torque_max_nm[index], self._limits_rad[index], self._speed_max_rad_s[index]
+        limit, low, high, fast = self._bounds[index]
         if torque_nm > limit:
             torque_nm = limit
         elif torque_nm < -limit:

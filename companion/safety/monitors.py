@@ -44,11 +44,12 @@ class Monitors:
             Subject.INPUTS: self._filter,
             Subject.MOCAP: self._mocap,
             Subject.PX4: self._px4,
-            Subject.ARM: self._arm,
             Subject.PROCESS: self._process,
             Subject.FLIGHT: self._flight,
             Subject.OPERATOR: self._process,
         }
+        if vehicle.arm.joints:
+            trackers[Subject.ARM] = self._arm
         if vehicle.devices.force is not None:
             trackers[Subject.FORCE] = self._force
         if vehicle.tether is not None:

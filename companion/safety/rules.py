@@ -236,22 +236,22 @@ RULES: tuple[Rule, ...] = (
     Rule(
         id="servo_overload", subject=Subject.ARM, what="a joint at its torque limit", predicate=arm.servo_overload,
         thresholds=("arm.joints.torque_max_nm",), hold_time="servo_overload_s", ground=_LAND, air=_LAND,
-        message="joint torques {:.1f} and {:.1f} N m are at the limit",
+        message="joint torques {} N m are at the limit",
     ),
     Rule(
         id="joint_rate", subject=Subject.ARM, what="joint speed implausibly high", predicate=arm.joint_rate,
         thresholds=("joint_rate_max_deg_s",), hold_time=0.05, ground=_LAND, air=_LAND,
-        message="joint speeds {:.0f} and {:.0f} deg/s (limit {:.0f} deg/s)",
+        message="joint speeds {} deg/s (limit {:.0f} deg/s)",
     ),
     Rule(
         id="joint_beyond_limit", subject=Subject.ARM, what="a joint beyond its limit", predicate=arm.joint_beyond_limit,
         thresholds=("joint_limit_warn_deg", "arm.joints.angle_deg"), hold_time=0.1, ground=_WARN, air=_WARN,
-        message="joints at {:.0f}, {:.0f} deg: {:.0f} deg beyond a joint limit",
+        message="joints at {} deg: {:.0f} deg beyond a joint limit",
     ),
     Rule(
         id="joint_far_beyond_limit", subject=Subject.ARM, what="a joint far beyond its limit",
         predicate=arm.joint_beyond_limit, thresholds=("joint_limit_max_deg", "arm.joints.angle_deg"), hold_time=0.3,
-        ground=_LAND, air=_LAND, message="joints at {:.0f}, {:.0f} deg: {:.0f} deg beyond a joint limit",
+        ground=_LAND, air=_LAND, message="joints at {} deg: {:.0f} deg beyond a joint limit",
     ),
 
     Rule(

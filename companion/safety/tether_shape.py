@@ -51,12 +51,13 @@ class Clearance:
         self._below = self._p[2] <= 0.0
         arm = vehicle.arm
         self._shoulder = arm.shoulder_body_m
-        self._l1, self._l2 = arm.link_lengths_m
+        self._links_m = arm.link_lengths_m
         self._net_m = vehicle.tip_radius_m
-        self._reach_m = self._l1 + self._l2 + self._net_m
+        self._reach_m = sum(arm.link_lengths_m) + self._net_m
         self._aside_m = abs(self._p[1] - self._shoulder[1]) - self._net_m
-        self.judges_arm = self._aside_m > 0.0
-        """False if the tether is attached in the arm's own plane, where it sags into the arm's sweep in every flight."""
+        self.judges_arm = bool(arm.joints) and self._aside_m > 0.0
+        """False if there is no arm, or if the tether is attached in the arm's own plane, where it sags into the arm's sweep in every
+        flight."""
         self.needs_hanging = self.judges_arm or not self._below
         """False if `least_m` does not use the hanging direction."""
 
@@ -104,8 +105,12 @@ class Clearance:
         return min(math.hypot(inner - off, pz), (-pz - max(in_s * dz, out_s * dz)) * flat)
 
     def _arm_reach_m(self, arm_rad: Joints) -> float:
-        """Return the distance of the farthest point of the arm and the net from the shoulder, m."""
-        l1, l2 = self._l1, self._l2
+        """Return the distance of the farthest point of the arm and the net from the shoulder, m; for more than two joints, that of the
+        stretched arm.
+        """
+        if len(self._links_m) != 2:
+            return self._reach_m
+        l1, l2 = self._links_m
         net_m = math.sqrt(max(0.0, l1 * l1 + l2 * l2 + 2.0 * l1 * l2 * math.cos(arm_rad[1])))
         return max(l1, net_m + self._net_m)
 

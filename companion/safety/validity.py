@@ -118,14 +118,13 @@ def _mocap_is_valid(m: MocapPose) -> bool:
 
 def _arm_is_valid(a: ArmState) -> bool:
     low, high = -OUT_OF_RANGE, OUT_OF_RANGE
-    (a1, a2), (w1, w2), (t1, t2), (c1, c2) = a.angle_rad, a.velocity_rad_s, a.torque_nm, a.temperature_c
-    return (
-        -_STAMP_MAX_S < a.stamp_s < _STAMP_MAX_S
-        and (low < a1 < high and low < a2 < high)
-        and (low < w1 < high and low < w2 < high)
-        and (low < t1 < high and low < t2 < high)
-        and (low < c1 < high and low < c2 < high)
-    )
+    if not -_STAMP_MAX_S < a.stamp_s < _STAMP_MAX_S:
+        return False
+    for values in (a.angle_rad, a.velocity_rad_s, a.torque_nm, a.temperature_c):
+        for value in values:
+            if not low < value < high:
+                return False
+    return True
 
 
 def _force_is_valid(f: ForceSample) -> bool:

@@ -63,7 +63,7 @@ class Watched:
     """Known weight given by the user; None if none was given."""
     loaded: Sequence[ForceSample] = ()
     """Samples with the weight on the net; empty if no weight was detected."""
-    loaded_arm_rad: Joints = (0.0, 0.0)
+    loaded_arm_rad: Joints = ()
     problem: str = ""
     """Why a device failed after the measurement at rest; empty if none did."""
 

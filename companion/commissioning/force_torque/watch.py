@@ -67,19 +67,25 @@ def pose_rad(text: str | None, vehicle: Vehicle) -> Joints | None:
     """Parse `--arm-pose`.
 
     Raises:
-        ConfigError: the text is not two angles within the joint limits.
+        ConfigError: the text is not one angle within the joint limits for each joint.
     """
     if text is None:
         return None
+    joints = vehicle.arm.joints
     try:
-        first, second = (float(part) for part in text.split(","))
+        angles_deg = [float(part) for part in text.split(",")]
+        if len(angles_deg) != len(joints):
+            raise ValueError
     except ValueError:
-        raise ConfigError([f"--arm-pose {text}: expected two angles in deg, such as 165,140"]) from None
-    for angle, joint, number in zip((first, second), vehicle.arm.joints, (1, 2), strict=True):
+        such_as = ",".join(f"{angle:g}" for angle in vehicle.safety.fold_arm_deg)
+        raise ConfigError(
+            [f"--arm-pose {text}: expected the angle of each joint in deg, {len(joints)} in all, such as {such_as}"]
+        ) from None
+    for number, (angle, joint) in enumerate(zip(angles_deg, joints, strict=True), 1):
         low, high = joint.angle_deg
         if not low <= angle <= high:
             raise ConfigError([f"--arm-pose {text}: joint {number} goes from {low:g} to {high:g} deg, got {angle:g}"])
-    return (math.radians(first), math.radians(second))
+    return tuple(map(math.radians, angles_deg))
 
 
 @contextlib.asynccontextmanager
@@ -109,7 +115,7 @@ async def arm_angles(
     try:
         await arm.__aenter__()
     except DeviceError as error:
-        raise DeviceError(f"{error}; or give the joint angles: --arm-pose A1,A2 in deg") from None
+        raise DeviceError(f"{error}; or give the joint angles: --arm-pose A1,A2,... in deg") from None
     try:
         yield read
     finally:
