@@ -153,12 +153,11 @@ class _Track:
         mocap = self._log.inputs[int(self._mocap[k])].mocap
         arm = self._log.inputs[int(self._arm[k])].arm
         assert mocap is not None
-        assert arm is not None
         caught = self._caught is not None and k >= self._caught
         return Pose(
             position_world_m=mocap.position_world_m,
             attitude_wxyz=mocap.attitude_wxyz,
-            arm_rad=arm.angle_rad,
+            arm_rad=arm.angle_rad if arm is not None else (),
             ball_world_m=self._ball(k),
             caught=caught,
         )
@@ -212,15 +211,17 @@ def _labels(log: FlightLog, k: int, mission_s: float, speed: float) -> list[Shap
 
 
 def _plots(log: FlightLog, mission_s: Array, ticks: slice, caught: int | None) -> tuple[list[Shape], list[Shape]]:
-    """Return the axes and the curves of position error and arm error."""
+    """Return the axes and the curves of position error and arm error, or attitude error without an arm."""
     scaled = np.array([o.phase_kind in (PhaseKind.TAKEOFF, PhaseKind.FLIGHT) for o in log.outputs])
     arm = np.degrees(_norm(log.columns.arm_rad - log.columns.arm_reference_rad))
     axes: list[Shape] = [Shape(np.array([[_SPLIT_PX, 0.0], [_SPLIT_PX, HEIGHT]]), _GRID, 1.0)]
     curves: list[Shape] = []
     t_s = mission_s[ticks]
+    attitude = np.degrees(_norm(metrics.attitude_error_rad(log)))
+    below = ("arm error [deg]", arm, LINK) if log.joint_count else ("attitude error [deg]", attitude, LINK)
     for (top, bottom), name, values, colour in (
         (_PLOTS_Y[0], "position error [cm]", 100.0 * _norm(metrics.position_error_m(log)), FRONT),
-        (_PLOTS_Y[1], "arm error [deg]", arm, LINK),
+        (_PLOTS_Y[1], *below),
     ):
         seen = values[scaled & np.isfinite(values)]
         limit = _round_up(1.1 * float(seen.max())) if len(seen) else 1.0

@@ -136,11 +136,21 @@ class FlightLog:
         """Iterate over the ticks in order."""
         return zip(self.inputs, self.outputs, self.sent, strict=True)
 
-    def column(self, value: Callable[[Inputs, Outputs, Sent], Any], width: int = 0) -> Array:
-        """Return one row per tick: a float (`width` 0) or `width` floats; NaN where `value` returns None."""
-        blank: Any = (np.nan,) * width if width else np.nan
+    @cached_property
+    def joint_count(self) -> int:
+        """Number of the arm's joints: that of the first reference or joint state, or 0 if the log has neither."""
+        for inputs, outputs, _ in self.rows():
+            if outputs.reference is not None:
+                return len(outputs.reference.arm_rad)
+            if inputs.arm is not None:
+                return len(inputs.arm.angle_rad)
+        return 0
+
+    def column(self, value: Callable[[Inputs, Outputs, Sent], Any], width: int | None = None) -> Array:
+        """Return one row per tick: a float (`width` None) or `width` floats; NaN where `value` returns None."""
+        blank: Any = np.nan if width is None else (np.nan,) * width
         values = [blank if (v := value(*row)) is None else v for row in self.rows()]
-        return np.array(values, dtype=np.float64).reshape((len(values), width) if width else (len(values),))
+        return np.array(values, dtype=np.float64).reshape((len(values),) if width is None else (len(values), width))
 
     def to_pandas(self) -> dict[str, Any]:
         """Return a pandas DataFrame for each of `/inputs`, `/outputs`, `/sent` and `/events`, indexed by `t_s` (s, flight clock).
@@ -290,8 +300,8 @@ def _columns(log: FlightLog) -> Columns:
         ),
         reference_position_world_m=log.column(lambda i, o, s: o.reference.position_world_m if o.reference else None, 3),
         attitude_desired_rad=log.column(lambda i, o, s: o.control.attitude_desired_rad if o.control else None, 3),
-        arm_rad=log.column(lambda i, o, s: i.arm.angle_rad if i.arm else None, 2),
-        arm_reference_rad=log.column(lambda i, o, s: o.reference.arm_rad if o.reference else None, 2),
+        arm_rad=log.column(lambda i, o, s: i.arm.angle_rad if i.arm else None, log.joint_count),
+        arm_reference_rad=log.column(lambda i, o, s: o.reference.arm_rad if o.reference else None, log.joint_count),
         lateness_s=log.column(lambda i, o, s: s.lateness_s),
     )
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from companion.analysis.arm_skeleton import skeleton_of
 from companion.analysis.log import Array, FlightLog
 from companion.control.sensing import CatchDetector
 from companion.model.frames import quat_rotate
@@ -18,11 +19,10 @@ from companion.model.types import PhaseKind
 Mask = npt.NDArray[np.bool_]
 SLIDING_LOWPASS_HZ = 10.0
 FINAL_WINDOW_S = 0.5
-TARGET = tuple(np.array(row) for row in ([1.0] * 3 + [0.1] * 2, [40.0] * 3 + [0.7] * 2, [144.0] * 3 + [1.225] * 2))
-"""The impedance (M_d, K_d, K_p of x, y, z and both joints) against which every law is graded, from the paper
+TARGET = ((1.0, 0.1), (40.0, 0.7), (144.0, 1.225))
+"""The impedance (M_d, K_d, K_p, each for x, y and z and for every joint) against which every law is graded, from the paper
 (tab:control_parameters).
 """
-_TARGET_ROWS = [0, 1, 2, 6, 7]
 DESIRED_FORCE_TIME_S = 0.5
 """Time constant with which the desired force F_d follows the measured force, so that a lasting load is carried rather than
 yielded to.
@@ -107,7 +107,7 @@ def attitude_error_rad(log: FlightLog) -> Array:
 
 
 def arm_error_rad(log: FlightLog) -> Array:
-    """Return joint angles minus reference, (ticks, 2)."""
+    """Return joint angles minus reference, (ticks, joints)."""
     return log.columns.arm_rad - log.columns.arm_reference_rad
 
 
@@ -122,9 +122,9 @@ def tracking_rms(log: FlightLog, mask: Mask) -> TrackingRms:
 
 
 def rms_norm(rows: Array) -> float | None:
-    """Return sqrt(mean ||row||^2) over the rows without NaN, or None if there are none."""
+    """Return sqrt(mean ||row||^2) over the rows without NaN, or None if there are none or they have no columns."""
     known = rows[np.isfinite(rows).all(axis=1)]
-    return float(np.sqrt(np.mean(np.sum(known * known, axis=1)))) if len(known) else None
+    return float(np.sqrt(np.mean(np.sum(known * known, axis=1)))) if known.size else None
 
 
 def final_e_z_m(log: FlightLog) -> float | None:
@@ -151,31 +151,35 @@ def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:
     if log.stride > 1:
         return None, None  # derivatives need every tick
     pre, post = flight_masks(log)
-    known = [o.control is not None and i.vehicle is not None and i.arm is not None for i, o, _ in log.rows()]
+    joints = log.joint_count
+    known = [
+        o.control is not None and i.vehicle is not None and (i.arm is not None or not joints) for i, o, _ in log.rows()
+    ]
     used = np.array(known, dtype=np.bool_) & (pre | post)
     t_s = log.columns.t_s[used]
     if not (used & post).any() or len(t_s) < 10 or not (np.diff(t_s) > 0).all():
         return None, None
     period_s = float(np.median(np.diff(t_s)))
-    rate = log.column(lambda i, o, s: o.control.error_rate if o.control else None, 8)[used][:, _TARGET_ROWS]
-    error = log.column(lambda i, o, s: o.control.error if o.control else None, 8)[used][:, _TARGET_ROWS]
+    rows = [0, 1, 2, *range(6, 6 + joints)]
+    rate = log.column(lambda i, o, s: o.control.error_rate if o.control else None, 6 + joints)[used][:, rows]
+    error = log.column(lambda i, o, s: o.control.error if o.control else None, 6 + joints)[used][:, rows]
     e_tau = np.hstack([np.zeros((len(t_s), 3)), _joint_torque_error_nm(log, used, period_s)])
     if not all(np.isfinite(values).all() for values in (error, rate, e_tau)):
         return None, None
-    inertia, damping, stiffness = TARGET
+    inertia, damping, stiffness = (np.array([base] * 3 + [joint] * joints) for base, joint in TARGET)
     spring = damping * rate + stiffness * error - e_tau
     slow = lowpass_zero_phase(np.hstack([rate, spring]), period_s, SLIDING_LOWPASS_HZ)
-    d_i = inertia * np.gradient(slow[:, :5], t_s, axis=0) + slow[:, 5:]
+    d_i = inertia * np.gradient(slow[:, : len(rows)], t_s, axis=0) + slow[:, len(rows) :]
     after = d_i[post[used]]
-    return rms_norm(after[:, 0:3]), rms_norm(after[:, 3:5])
+    return rms_norm(after[:, 0:3]), rms_norm(after[:, 3:])
 
 
 def _joint_torque_error_nm(log: FlightLog, used: Mask, period_s: float) -> Array:
-    """Return J'(F - F_d) for the ticks of the mask, N m, (ticks, 2); NaN if the logged configuration has no arm."""
-    arm = (log.config.get("vehicle") or {}).get("arm") or {}
-    lengths = arm.get("link_lengths_m")
-    if not isinstance(lengths, list) or len(lengths) != 2:
-        return np.full((int(used.sum()), 2), np.nan)
+    """Return J'(F - F_d) for the ticks of the mask, N m, (ticks, joints); NaN if the logged configuration does not describe the arm."""
+    joints = log.joint_count
+    skeleton = skeleton_of((log.config.get("vehicle") or {}).get("arm"))
+    if skeleton is None or len(skeleton.joint_axes) != joints:
+        return np.full((int(used.sum()), joints), np.nan)
     force = log.column(lambda i, o, s: o.control.force_ext_world_n if o.control else None, 3)[used]
     lasting, k = np.zeros(3), period_s / DESIRED_FORCE_TIME_S
     passing = np.empty_like(force)
@@ -185,13 +189,12 @@ def _joint_torque_error_nm(log: FlightLog, used: Mask, period_s: float) -> Array
     quats = log.column(lambda i, o, s: i.vehicle.attitude_wxyz if i.vehicle else None, 4)[used]
     w, x, y, z = quats.T
     body_x = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
+    body_y = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1)
     body_z = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
-    along_x, along_z = (passing * body_x).sum(axis=1), (passing * body_z).sum(axis=1)
-    first, second = log.column(lambda i, o, s: i.arm.angle_rad if i.arm else None, 2)[used].T
-    s1, c1 = lengths[0] * np.sin(first), lengths[0] * np.cos(first)
-    s2, c2 = lengths[1] * np.sin(first - second), lengths[1] * np.cos(first - second)
-    torque: Array = np.stack([-(s1 + s2) * along_x - (c1 + c2) * along_z, s2 * along_x + c2 * along_z], axis=1)
-    return torque
+    force_body = np.stack([(passing * axis).sum(axis=1) for axis in (body_x, body_y, body_z)], axis=1)
+    points, axes = skeleton.pose(log.columns.arm_rad[used])
+    torques = [(np.cross(axes[:, j], points[:, -1] - points[:, j]) * force_body).sum(axis=1) for j in range(joints)]
+    return np.stack(torques, axis=1) if torques else np.zeros((len(force_body), 0))
 
 
 def lowpass_zero_phase(rows: Array, period_s: float, cutoff_hz: float) -> Array:

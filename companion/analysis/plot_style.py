@@ -18,9 +18,9 @@ INK = "#22303c"
 SOFT = "#8b98a5"
 CATCH = "#c2255c"
 REFERENCE = "#55626e"
-SERIES = ("#1f6fb4", "#e07b22", "#2e9d6b", "#8a5cc2")
+SERIES = ("#1f6fb4", "#e07b22", "#2e9d6b", "#8a5cc2", "#b0304f", "#7a6a3a", "#3a9fb0")
 """Colours of the lines in a flight's report."""
-SERIES_DARK = ("#0b365c", "#7d3d05")
+SERIES_DARK = ("#0b365c", "#7d3d05", "#12482f", "#432a63", "#5a1527", "#3d351c", "#1a4f59")
 """Colours of a reference that is drawn over the measurement of the same quantity."""
 DASHED = (0, (4, 2))
 """Line style of a reference; the measured motion is solid."""

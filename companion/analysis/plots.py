@@ -84,7 +84,9 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
 
 
 def _tracking(log: FlightLog) -> Figure | None:
-    figure, axes, t = _stack(log, "Tracking errors and arm", (1.0, 1.0, 1.25))
+    joints = log.joint_count
+    title = "Tracking errors and arm" if joints else "Tracking errors"
+    figure, axes, t = _stack(log, title, (1.0, 1.0, *((1.25,) if joints else ())), 6.8 if joints else 4.8)
     _line(axes[0], t, _norm(metrics.position_error_m(log)), r"$\|e_p\|$", SERIES[0])
     _line(axes[0], t, log.column(lambda i, o, s: o.mocap_innovation_m or None), "motion capture against IMU", SERIES[1])
     _legend(axes[0], columns=2)
@@ -100,17 +102,19 @@ def _tracking(log: FlightLog) -> Figure | None:
         seen = values[(pre | post) & np.isfinite(values)]
         if len(seen):
             ax.set_ylim(0.0, 1.15 * max(float(seen.max()), 1e-3))
-    angles, wanted = np.degrees(log.columns.arm_rad), np.degrees(log.columns.arm_reference_rad)
-    for j in range(2):
-        _line(axes[2], t, angles[:, j], rf"$\alpha_{j + 1}$", SERIES[j])
-        _line(axes[2], t, wanted[:, j], rf"$\alpha_{j + 1}$ reference", SERIES_DARK[j], reference=True)
-    axes[2].set_ylabel("arm angle [deg]")
-    _legend(axes[2], columns=4)
+    if joints:
+        angles, wanted = np.degrees(log.columns.arm_rad), np.degrees(log.columns.arm_reference_rad)
+        for j in range(joints):
+            _line(axes[2], t, angles[:, j], rf"$\alpha_{j + 1}$", SERIES[j])
+            _line(axes[2], t, wanted[:, j], rf"$\alpha_{j + 1}$ reference", SERIES_DARK[j], reference=True)
+        axes[2].set_ylabel("arm angle [deg]")
+        _legend(axes[2], columns=4)
     return figure
 
 
 def _actuation(log: FlightLog) -> Figure | None:
-    figure, axes, t = _stack(log, "Actuation", (1.0, 1.0, 1.25))
+    joints = log.joint_count
+    figure, axes, t = _stack(log, "Actuation", (1.0, 1.0, *((1.25,) if joints else ())), 6.8 if joints else 4.8)
     thrust = log.column(lambda i, o, s: o.attitude.thrust if o.attitude else None)
     hover = log.column(lambda i, o, s: o.control.hover_thrust if o.control else None)
     _line(axes[0], t, 100 * thrust, "collective", SERIES[0])
@@ -123,9 +127,11 @@ def _actuation(log: FlightLog) -> Figure | None:
     _line(axes[1], t, np.degrees(asked), "commanded", REFERENCE, reference=True)
     axes[1].set_ylabel("tilt [deg]")
     _legend(axes[1])
-    commanded = log.column(lambda i, o, s: o.arm_torque_nm, 2)
-    sent = log.column(lambda i, o, s: s.arm_torque_sent_nm, 2)
-    for j in range(2):
+    if not joints:
+        return figure
+    commanded = log.column(lambda i, o, s: o.arm_torque_nm, joints)
+    sent = log.column(lambda i, o, s: s.arm_torque_sent_nm, joints)
+    for j in range(joints):
         # Drawn below the values sent, which are noisy and mostly the same: only a difference shall show.
         axes[2].plot(t, commanded[:, j], color=SERIES_DARK[j], lw=1.2, label=f"joint {j + 1} commanded")
         _line(axes[2], t, sent[:, j], f"joint {j + 1} sent", SERIES[j])
@@ -157,15 +163,17 @@ def _load(log: FlightLog) -> Figure | None:
     force = log.column(lambda i, o, s: o.control.load_estimate_n if o.control else None, 3)
     if not np.isfinite(force).any():
         return None
-    figure, axes, t = _stack(log, "Adaptive load", (1.0, 0.8, 0.8))
-    moments = log.column(lambda i, o, s: o.control.moment_estimate_kg_m if o.control else None, 2)
-    friction = log.column(lambda i, o, s: o.control.friction_estimate_nm if o.control else None, 2)
+    joints = log.joint_count
+    heights = (1.0, 0.8, 0.8) if joints else (1.0,)
+    figure, axes, t = _stack(log, "Adaptive load", heights, 6.8 if joints else 3.2)
+    moments = log.column(lambda i, o, s: o.control.moment_estimate_kg_m if o.control else None, joints)
+    friction = log.column(lambda i, o, s: o.control.friction_estimate_nm if o.control else None, joints)
     for j, name in enumerate("xyz"):
         _line(axes[0], t, force[:, j], f"${name}$", SERIES[j])
-    for j in range(2):
+    for j in range(joints):
         _line(axes[1], t, moments[:, j], f"link {j + 1}", SERIES[j])
         _line(axes[2], t, friction[:, j], f"joint {j + 1}", SERIES[j])
-    for ax, label in zip(axes, ("load [N]", "first moment [kg m]", "friction [N m]"), strict=True):
+    for ax, label in zip(axes, ("load [N]", "first moment [kg m]", "friction [N m]"), strict=False):
         ax.set_ylabel(label)
         _legend(ax, columns=3)
     return figure

@@ -8,10 +8,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
+from companion.analysis.arm_skeleton import NO_ARM, skeleton_of
 from companion.analysis.log import Array
 from companion.model.frames import quat_rotate
 from companion.model.hanging_line import hanging_line_m
@@ -110,13 +112,12 @@ class Scene:
         Raises:
             KeyError, TypeError: the section lacks a value.
         """
-        airframe, arm, tool = vehicle["airframe"], vehicle["arm"], vehicle["tool"]
+        airframe, tool = vehicle["airframe"], vehicle["tool"]
         rotor_arm_m = airframe.get("rotor_arm_m", 0.6 * airframe["radius_m"])  # older logs lack it in the vehicle file
         self._hub_m: float = rotor_arm_m * math.sqrt(0.5)
         self._disk_m: float = airframe["radius_m"] - rotor_arm_m
         self._foot_m: float = airframe["ground_clearance_m"]
-        self._shoulder: Array = np.array(arm["shoulder_body_m"])
-        self._links_m: tuple[float, float] = tuple(arm["link_lengths_m"])
+        self._arm = skeleton_of(vehicle["arm"]) or NO_ARM
         self._net_radius_m: float = 0.0 if tool is None else tool["net_radius_m"]
         self._tether_line: dict[str, Any] | None = vehicle["tether"]
         room = vehicle["room"]
@@ -129,7 +130,7 @@ class Scene:
 
     def net_world_m(self, pose: Pose) -> Array:
         """Return the centre of the net, world frame, m."""
-        return self._world(pose, self._arm_body_m(pose.arm_rad)[1])
+        return self._world(pose, self._arm_body_m(pose.arm_rad)[-1])
 
     def shapes(self, camera: Camera, pose: Pose) -> list[Shape]:
         """Return the shapes of one frame, the farthest first."""
@@ -153,11 +154,10 @@ class Scene:
     def _world(self, pose: Pose, body: Array) -> Array:
         return np.array(pose.position_world_m) + body @ _rotation(pose.attitude_wxyz).T
 
-    def _arm_body_m(self, arm_rad: Joints) -> tuple[Array, Array]:
-        """Return the positions of the elbow and of the centre of the net, body frame, m."""
-        a, b = arm_rad[0], arm_rad[0] - arm_rad[1]
-        elbow = self._shoulder + self._links_m[0] * np.array([math.cos(a), 0.0, -math.sin(a)])
-        return elbow, elbow + self._links_m[1] * np.array([math.cos(b), 0.0, -math.sin(b)])
+    def _arm_body_m(self, arm_rad: Joints) -> Array:
+        """Return the positions of all joints and of the centre of the net, body frame, m, shape (joints + 1, 3)."""
+        points: Array = self._arm.pose(np.array([arm_rad], dtype=np.float64))[0][0]
+        return points
 
     def _room(self, camera: Camera) -> list[Shape]:
         (x0, y0, z0), (x1, y1, z1) = self._low, self._high
@@ -217,23 +217,28 @@ class Scene:
                 )
             )
         parts.append((camera.depth_m(world((0, 0, 0))[0]), self._body(camera, pose)))
-        elbow, net = (world(point)[0] for point in self._arm_body_m(pose.arm_rad))
-        shoulder = world(self._shoulder)[0]
-        wrist = net + (elbow - net) * min(1.0, self._net_radius_m / self._links_m[1])
+        *joints, net = self._world(pose, self._arm_body_m(pose.arm_rad))
+        if not joints:
+            return parts
+        length_m = math.dist(net, joints[-1])
+        wrist = net + (joints[-1] - net) * min(1.0, self._net_radius_m / length_m)
+        links = [*pairwise(joints), (joints[-1], wrist)]
         parts.append(
             (
-                camera.depth_m(elbow),
+                camera.depth_m(joints[-1]),
                 [
-                    Shape(pixels(np.array([shoulder, elbow])), LINK, 0.03 * scale),
-                    Shape(pixels(np.array([elbow, wrist])), LINK, 0.024 * scale),
-                    *(Shape(pixels(np.array([joint])), FRAME, 0.042 * scale) for joint in (shoulder, elbow)),
+                    *(
+                        Shape(pixels(np.array(link)), LINK, (0.024 if number == len(links) else 0.03) * scale)
+                        for number, link in enumerate(links, 1)
+                    ),
+                    *(Shape(pixels(np.array([joint])), FRAME, 0.042 * scale) for joint in joints),
                     Shape(pixels(np.array([wrist])), FRAME, 0.036 * scale),
                 ],
             )
         )
         if not self._net_radius_m:
             return parts
-        along = (net - elbow) / self._links_m[1]
+        along = (net - joints[-1]) / length_m
         across = np.cross(along, y_axis)
         hoops = [
             pixels(_circle(net, u, v, self._net_radius_m))

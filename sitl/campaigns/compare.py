@@ -49,8 +49,8 @@ def series_of(log: FlightLog) -> Data:
         "t_s": _points(columns.mission_t_s[used]),
         "e_p_m": _points(np.sqrt((metrics.position_error_m(log)[used] ** 2).sum(axis=1))),
         "e_q_deg": _points(np.degrees(np.sqrt((metrics.attitude_error_rad(log)[used] ** 2).sum(axis=1)))),
-        "alpha_deg": [_points(angles[used, j]) for j in range(2)],
-        "alpha_reference_deg": [_points(wanted[used, j]) for j in range(2)],
+        "alpha_deg": [_points(angles[used, j]) for j in range(log.joint_count)],
+        "alpha_reference_deg": [_points(wanted[used, j]) for j in range(log.joint_count)],
         "catch_t_s": log.outputs[caught].mission_t_s if caught is not None else None,
     }
 

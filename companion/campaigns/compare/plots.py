@@ -36,20 +36,15 @@ from companion.campaigns.compare.grid import ABLATED, is_ablation, short_label
 from companion.campaigns.process import Message
 
 PARTS = {"pre": "before", "post": "after"}
-_PANES = (
-    ("e_p_m", None, r"$\|e_p\|$ [m]"),
-    ("e_q_deg", None, r"$\|e_q\|$ [deg]"),
-    ("alpha_deg", 0, r"$\alpha_1$ [deg]"),
-    ("alpha_deg", 1, r"$\alpha_2$ [deg]"),
-)
+_ERRORS = (("e_p_m", r"$\|e_p\|$ [m]"), ("e_q_deg", r"$\|e_q\|$ [deg]"))
 
 
 def write_pictures(messages: Sequence[Message], groups: Sequence[Group], out: Path) -> list[Picture]:
     """Draw every plot for which there is data.
 
     Args:
-        messages: results of the flights; a `series` {t_s, e_p_m, e_q_deg, alpha_deg[2], alpha_reference_deg[2], catch_t_s} is
-            drawn over time.
+        messages: results of the flights; a `series` {t_s, e_p_m, e_q_deg, alpha_deg, alpha_reference_deg, catch_t_s} is drawn
+            over time; the angles have one series per joint.
         groups: aggregated rows of the flights.
         out: folder for the PNG files.
     """
@@ -81,9 +76,12 @@ def write_pictures(messages: Sequence[Message], groups: Sequence[Group], out: Pa
 
 
 def _courses(title: str, messages: Sequence[Message], colours: dict[str, str]) -> Figure:
-    figure = new_figure(8.2)
-    axes = figure.subplots(4, 1, sharex=True, height_ratios=(1.15, 1.0, 1.0, 1.0))
-    for ax, (key, joint, label) in zip(axes, _PANES, strict=True):
+    joints = len(messages[0]["series"]["alpha_deg"])
+    panes: list[tuple[str, int | None, str]] = [(key, None, label) for key, label in _ERRORS]
+    panes += [("alpha_deg", joint, rf"$\alpha_{joint + 1}$ [deg]") for joint in range(joints)]
+    figure = new_figure(0.2 + 2.0 * len(panes))
+    axes = figure.subplots(len(panes), 1, sharex=True, height_ratios=(1.15, *(1.0 for _ in panes[1:])))
+    for ax, (key, joint, label) in zip(axes, panes, strict=True):
         dress(ax)
         ax.set_ylabel(label)
         for message in messages:
@@ -105,7 +103,7 @@ def _courses(title: str, messages: Sequence[Message], colours: dict[str, str]) -
     if caught:
         mark_catch(axes, float(np.median(caught)))
     axes[-1].set_xlabel("mission time [s]")
-    handles, names = axes[2].get_legend_handles_labels()
+    handles, names = axes[min(2, len(panes) - 1)].get_legend_handles_labels()
     figure_legend(figure, title, handles, names, columns=4)
     return figure
 

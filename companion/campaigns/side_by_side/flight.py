@@ -74,7 +74,7 @@ def course_of(log: FlightLog) -> Course:
         graded=pre | post,
         e_p_m=_norm(metrics.position_error_m(log)),
         e_q_deg=np.degrees(_norm(metrics.attitude_error_rad(log))),
-        e_alpha_deg=np.degrees(_norm(metrics.arm_error_rad(log))),
+        e_alpha_deg=np.degrees(_norm(metrics.arm_error_rad(log))) if log.joint_count else np.full(len(rho), np.nan),
         thrust_percent=100.0 * log.column(lambda i, o, s: o.attitude.thrust if o.attitude else None),
         rho=rho if np.nan_to_num(rho).any() else np.full(len(rho), np.nan),
         slack_m=metrics.slack_m(log),
