@@ -2,12 +2,12 @@
 
 ================  ==========================  =========================================================================
 ``/tf``           foxglove.FrameTransform     world -> body, 50 Hz
-``/tf_arm``       foxglove.FrameTransforms    body -> link1 -> link2 -> net, 50 Hz
+``/tf_arm``       foxglove.FrameTransforms    body -> link1 -> ... -> net, 50 Hz
 ``/pose``         foxglove.PoseInFrame        motion capture as received, 50 Hz
 ``/reference``    foxglove.PoseInFrame        reference pose, 50 Hz
 ``/scene``        foxglove.SceneUpdate        the tether, 20 Hz
 ``/scene_path``   foxglove.SceneUpdate        flown and reference path so far, every 2 s
-``/scene_static`` foxglove.SceneUpdate        room, anchor, planned path, vehicle, arm, net: once, and for a new plan or live viewer
+``/scene_static`` foxglove.SceneUpdate        room, anchor, planned path, vehicle, arm, net: once, and when the plan is known
 ================  ==========================  =========================================================================
 
 A viewer that jumps in time requests only the newest message of each topic. Data with different rates, and data sent once, therefore
@@ -94,10 +94,6 @@ class ViewerChannels:
     def plan(self, path: Any) -> None:
         """Set the planned path, [[x, y, z], ...] in the world."""
         self._planned = path_of(path)
-        self._static_due = True
-
-    def repeat_static(self) -> None:
-        """Write the static scene again with the next tick, for a viewer that has just connected; callable from any thread."""
         self._static_due = True
 
     def tick(self, stamp_ns: int, inputs: Inputs, outputs: Outputs) -> None:
@@ -200,29 +196,28 @@ class _Joints:
 
     def __init__(self, machine: Machine) -> None:
         arm = machine.arm
-        self._known = arm is not None
+        self._links: list[tuple[str, str, Vector3]] = []
+        """Parent, child and position in the parent of each link's frame."""
         if arm is None:
             return
         x, y, z = arm.shoulder_body_m
-        self._shoulder = Vector3(x=x, y=y, z=z)
-        self._elbow, self._tip = (Vector3(x=length, y=0.0, z=0.0) for length in arm.link_lengths_m)
+        parent, offset = "body", Vector3(x=x, y=y, z=z)
+        for number, length_m in enumerate(arm.link_lengths_m, start=1):
+            self._links.append((parent, f"link{number}", offset))
+            parent, offset = f"link{number}", Vector3(x=length_m, y=0.0, z=0.0)
+        self._net = (parent, "net", offset)
 
     def log(self, channel: FrameTransformsChannel, stamp: Timestamp, stamp_ns: int, angle_rad: Sequence[float]) -> None:
-        """Write all frames in one message: alpha_1 turns link 1 down about the body's y axis, alpha_2 turns link 2 the other way."""
-        half_1, half_2 = 0.5 * angle_rad[0], -0.5 * angle_rad[1]
-        if not self._known or not math.isfinite(half_1) or not math.isfinite(half_2):
+        """Write all frames in one message: alpha_1 turns link 1 down about the body's y axis; the others turn the other way."""
+        if not self._links or len(angle_rad) != len(self._links) or not math.isfinite(sum(angle_rad)):
             return
-        turn_1 = Quaternion(w=math.cos(half_1), x=0.0, y=math.sin(half_1), z=0.0)
-        turn_2 = Quaternion(w=math.cos(half_2), x=0.0, y=math.sin(half_2), z=0.0)
+        halves = [(-0.5 if number else 0.5) * angle for number, angle in enumerate(angle_rad)]
+        turns = [Quaternion(w=math.cos(half), x=0.0, y=math.sin(half), z=0.0) for half in halves]
         frames = [
             FrameTransform(
                 timestamp=stamp, parent_frame_id=parent, child_frame_id=child, translation=offset, rotation=turn
             )
-            for parent, child, offset, turn in (
-                ("body", "link1", self._shoulder, turn_1),
-                ("link1", "link2", self._elbow, turn_2),
-                ("link2", "net", self._tip, _STRAIGHT),
-            )
+            for (parent, child, offset), turn in zip([*self._links, self._net], [*turns, _STRAIGHT], strict=True)
         ]
         channel.log(FrameTransforms(transforms=frames), log_time=stamp_ns)
 

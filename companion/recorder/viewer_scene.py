@@ -1,7 +1,7 @@
 """Scene of a 3D viewer: geometry from the configuration, shapes of the vehicle and its room, the slack tether. No I/O.
 
-World ENU, body FLU, metres. The arm's frames are those of `companion.control.manipulator`: x of ``link1`` points from the shoulder
-to the elbow, and x of ``link2`` from the elbow to the net's centre; both share the body's y axis.
+World ENU, body FLU, metres. Each link of the arm has a frame, ``link1`` at the shoulder, with x along the link and y along
+the body's y axis; ``net`` is at the end of the last link.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _UPRIGHT = Quaternion(w=1.0, x=0.0, y=0.0, z=0.0)
 
 @dataclass(frozen=True, slots=True)
 class ArmShape:
-    """The 2R arm and its net."""
+    """The arm and its net."""
 
     shoulder_body_m: Vec3
     link_lengths_m: Joints
@@ -85,10 +85,10 @@ class Machine:
 def machine_of(config: Any) -> Machine:
     """Return the geometry of an effective configuration (nested dicts); missing and invalid values become None."""
     shoulder = _numbers(config, 3, "vehicle", "arm", "shoulder_body_m")
-    links = _numbers(config, 2, "vehicle", "arm", "link_lengths_m")
+    links = _numbers(config, None, "vehicle", "arm", "link_lengths_m")
     arm = None
-    if shoulder is not None and links is not None:
-        arm = ArmShape(_vec3(shoulder), (links[0], links[1]), _number(config, "vehicle", "tool", "net_radius_m"))
+    if shoulder is not None and links:
+        arm = ArmShape(_vec3(shoulder), links, _number(config, "vehicle", "tool", "net_radius_m"))
     anchor = _numbers(config, 3, "vehicle", "tether", "anchor_world_m")
     length_m = _number(config, "vehicle", "tether", "length_m")
     tether = None
@@ -137,8 +137,8 @@ def static_entities(machine: Machine, path_world_m: tuple[Vec3, ...], timestamp:
     if machine.radius_m is not None:
         add("vehicle", "body", **_airframe(machine.radius_m, machine.ground_clearance_m))
     if machine.arm is not None:
-        for frame, length_m in zip(("link1", "link2"), machine.arm.link_lengths_m, strict=True):
-            add(frame, frame, cylinders=[_rod(length_m)])
+        for number, length_m in enumerate(machine.arm.link_lengths_m, start=1):
+            add(f"link{number}", f"link{number}", cylinders=[_rod(length_m)])
         if machine.arm.net_radius_m is not None:
             add("net", "net", spheres=[_ball((0.0, 0.0, 0.0), machine.arm.net_radius_m, _NET)])
     return entities
@@ -242,9 +242,10 @@ def _number(config: Any, *path: str) -> float | None:
     return float(value) if type(value) in (int, float) and math.isfinite(value) else None
 
 
-def _numbers(config: Any, size: int, *path: str) -> tuple[float, ...] | None:
+def _numbers(config: Any, size: int | None, *path: str) -> tuple[float, ...] | None:
+    """Return the numbers of a list, or None if it is not a list of `size` finite numbers; None accepts any size."""
     values = _at(config, path)
-    if not isinstance(values, (list, tuple)) or len(values) != size:
+    if not isinstance(values, (list, tuple)) or size not in (None, len(values)):
         return None
     numbers = [_number(value) for value in values]
     return tuple(n for n in numbers if n is not None) if None not in numbers else None

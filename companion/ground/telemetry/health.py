@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from companion.config.vehicle import Vehicle
 from companion.ground.protocol.messages import DeviceHealth, HealthLevel
 from companion.model.frames import wrap_rad, yaw_from_quat
+from companion.model.listing import listed
 from companion.model.types import Inputs, Outputs, PhaseKind
 from companion.safety.arm import WATCHDOG_RESTARTED, error_text
 
@@ -80,6 +81,7 @@ class HealthEvaluator:
     def __init__(self, vehicle: Vehicle) -> None:
         self._s = vehicle.safety
         self._tether = vehicle.tether
+        self._has_arm = bool(vehicle.arm.joints)
         self._force_device = vehicle.devices.force
 
     def evaluate(self, snapshot: Snapshot) -> tuple[DeviceHealth, ...]:
@@ -142,10 +144,12 @@ class HealthEvaluator:
 
     def _arm(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
         arm, s, age_s = snapshot.inputs.arm, self._s, snapshot.ages.arm_s
+        if not self._has_arm:
+            return HealthLevel.OFF, "none on this vehicle"
         if arm is None:
             return HealthLevel.OFF, "no joint state yet"
         hottest_c = max(arm.temperature_c)
-        text = f"{_age_text(age_s)}, {arm.temperature_c[0]:.0f} / {arm.temperature_c[1]:.0f} degC"
+        text = f"{_age_text(age_s)}, {listed(arm.temperature_c, '.0f', ' / ')} degC"
         if any(error & ~WATCHDOG_RESTARTED for error in arm.hardware_error):
             return HealthLevel.BAD, error_text(arm.hardware_error)
         if hottest_c >= s.servo_max_c:

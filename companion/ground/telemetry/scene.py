@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from companion.config.loader import FlightConfig
 from companion.ground.protocol.messages import VERSION, Scene
 from companion.mission.segments import phase_name
-from companion.model.types import Joints, Vec3
+from companion.model.types import Vec3
 
 PATH_POINTS_MAX = 300
 
@@ -24,7 +24,6 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
     """
     vehicle = config.vehicle
     room, tether, safety, airframe, arm = vehicle.room, vehicle.tether, vehicle.safety, vehicle.airframe, vehicle.arm
-    first, second = arm.joints
     return Scene(
         v=VERSION,
         session=session,
@@ -39,8 +38,8 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
         shoulder_body_m=arm.shoulder_body_m,
         link_lengths_m=arm.link_lengths_m,
         net_radius_m=vehicle.tool.net_radius_m if vehicle.tool is not None else None,
-        joint_min_rad=_radians((first.angle_deg[0], second.angle_deg[0])),
-        joint_max_rad=_radians((first.angle_deg[1], second.angle_deg[1])),
+        joint_min_rad=tuple(math.radians(joint.angle_deg[0]) for joint in arm.joints),
+        joint_max_rad=tuple(math.radians(joint.angle_deg[1]) for joint in arm.joints),
         tilt_abort_rad=math.radians(safety.tilt_abort_deg),
         tracking_warn_m=safety.tracking_error_warn_m,
         tracking_abort_m=safety.tracking_error_abort_m,
@@ -57,7 +56,3 @@ def thinned(path_world_m: Sequence[Vec3]) -> tuple[Vec3, ...]:
         return tuple(path_world_m)
     last = PATH_POINTS_MAX - 1
     return tuple(path_world_m[round(k * (count - 1) / last)] for k in range(PATH_POINTS_MAX))
-
-
-def _radians(pair_deg: Joints) -> Joints:
-    return (math.radians(pair_deg[0]), math.radians(pair_deg[1]))

@@ -2,6 +2,7 @@
 
 const NAMES = [
   "page", "card", "line", "ink", "soft", "ok", "warn", "bad", "calm", "accent", "series-1", "series-2", "series-3", "series-4",
+  "series-5", "series-6", "series-7",
   "floor", "grid", "room", "machine", "link", "net", "trail", "plan", "ghost", "force",
 ];
 const listeners = [];

@@ -26,14 +26,19 @@ export function yawOnly(yaw) {
   return [Math.cos(yaw / 2), 0, 0, Math.sin(yaw / 2)];
 }
 
-/** Shoulder, elbow and net in the body: joint 1 counts from body +x downwards, joint 2 turns link 2 the other way. */
+/** All joints from the shoulder outwards, and the net, in the body: joint 1 counts from body +x downwards, the others turn their links the other way. */
 export function armBody(scene, arm) {
-  const [x, y, z] = scene.shoulder_body_m;
-  const [l1, l2] = scene.link_lengths_m;
-  const a = arm[0];
-  const b = arm[0] - arm[1];
-  const elbow = [x + l1 * Math.cos(a), y, z - l1 * Math.sin(a)];
-  return { shoulder: [x, y, z], elbow, net: [elbow[0] + l2 * Math.cos(b), y, elbow[2] - l2 * Math.sin(b)], along: [Math.cos(b), 0, -Math.sin(b)] };
+  let point = scene.shoulder_body_m;
+  let along = [1, 0, 0];
+  let angle = 0;
+  const joints = [];
+  arm.forEach((turn, index) => {
+    joints.push(point);
+    angle += index ? -turn : turn;
+    along = [Math.cos(angle), 0, -Math.sin(angle)];
+    point = add(point, scale(along, scene.link_lengths_m[index]));
+  });
+  return { joints, net: point, along };
 }
 
 /** Points of a circle about a centre, in the plane of two unit vectors. */

@@ -22,7 +22,7 @@ export function drawMachine(renderer, scene, position, attitude, { arm = null, c
     parts.push([hub, () => drawRotor(renderer, world([0, 0, 0]), hub, turn, radius * DISK, x > 0, armed)]);
   }
   parts.push([world([0, 0, -0.06]), () => drawBody(renderer, world, scene, radius)]);
-  if (arm) parts.push([world(armBody(scene, arm).elbow), () => drawArm(renderer, scene, world, turn, arm, caught)]);
+  if (arm?.length) parts.push([world(armBody(scene, arm).joints.at(-1)), () => drawArm(renderer, scene, world, turn, arm, caught)]);
   parts.map(([at, draw]) => [renderer.depth(at), draw]).sort((a, b) => b[0] - a[0]).forEach(([, draw]) => draw());
   renderer.arrow(world([0.1 * radius, 0, high]), world([1.25 * radius, 0, high]), colours.accent, 3);
 }
@@ -54,11 +54,11 @@ function drawBody(renderer, world, scene, radius) {
 }
 
 function drawArm(renderer, scene, world, turn, angles, caught) {
-  const { shoulder, elbow, net, along } = armBody(scene, angles);
-  renderer.line([world(shoulder), world(elbow)], colours.link, { width: 5 });
+  const { joints, net, along } = armBody(scene, angles);
+  if (joints.length > 1) renderer.line(joints.map(world), colours.link, { width: 5 });
   const mouth = add(net, scale(along, -(scene.net_radius_m ?? 0)));
-  renderer.line([world(elbow), world(mouth)], colours.link, { width: 4 });
-  for (const joint of [shoulder, elbow]) renderer.ball(world(joint), 0.02, colours.machine, { least: 3.5, edge: colours.card });
+  renderer.line([world(joints.at(-1)), world(mouth)], colours.link, { width: 4 });
+  for (const joint of joints) renderer.ball(world(joint), 0.02, colours.machine, { least: 3.5, edge: colours.card });
   if (!scene.net_radius_m) return;
   const across = [-along[2], 0, along[0]];
   const hoops = [[along, Y], [along, across], [across, Y]];
@@ -77,9 +77,9 @@ export function drawGhost(renderer, scene, reference, yaw, arm) {
     renderer.line(circle(hub, rotate(attitude, X), rotate(attitude, Y), scene.radius_m * DISK, 22), colours.ghost, { width: 1, dash: [2, 4] });
     renderer.line([reference, hub], colours.ghost, { width: 1, dash: [2, 4] });
   }
-  if (!arm) return;
-  const { shoulder, elbow, net } = armBody(scene, arm);
-  renderer.line([shoulder, elbow, net].map(world), colours.ghost, { width: 1.5, dash: [2, 4] });
+  if (!arm?.length) return;
+  const { joints, net } = armBody(scene, arm);
+  renderer.line([...joints, net].map(world), colours.ghost, { width: 1.5, dash: [2, 4] });
 }
 
 /** Draw the vehicle's shadow and its height above the floor. */

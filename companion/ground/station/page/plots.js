@@ -6,15 +6,26 @@ import { degrees, norm } from "./format.js";
 export const WINDOW_S = 30;
 const AHEAD_S = 10; // a replay also shows the time ahead
 
-const ANGLES = ["α₁", "α₂"];
+const JOINTS_SHOWN = 2; // before the scene of a vehicle is known
+const angle = (index) => `α${"₁₂₃₄₅₆₇"[index]}`;
 const joint = (field, index) => (record) => degrees(record[field]?.[index]);
-const joints = (scene) => [0, 1].flatMap((index) => [
-  { value: degrees(scene.joint_max_rad[index]), label: `${ANGLES[index]} limit`, level: "bad" },
-  { value: degrees(scene.joint_min_rad[index]), label: `${ANGLES[index]} limit`, level: "bad" },
+const jointLimits = (scene) => scene.joint_max_rad.flatMap((high, index) => [
+  { value: degrees(high), label: `${angle(index)} limit`, level: "bad" },
+  { value: degrees(scene.joint_min_rad[index]), label: `${angle(index)} limit`, level: "bad" },
 ]);
 
-/** All plots, from top to bottom. */
-export const PLOTS = [
+function armPlot(joints) {
+  const series = [];
+  for (let index = 0; index < joints; index += 1) {
+    const colour = `${index + 1}`;
+    series.push({ label: angle(index), unit: "", colour, value: joint("arm_rad", index) });
+    series.push({ label: "ref", unit: "", colour, dashed: true, value: joint("reference_arm_rad", index) });
+  }
+  return { title: "Arm, °", digits: 0, span: 20, series, limits: jointLimits };
+}
+
+/** All plots for an arm of this many joints, from top to bottom. */
+const plotsOf = (joints) => [
   {
     title: "Position error ‖e_p‖, m", digits: 3, floor: 0, span: 0.02,
     series: [{ label: "", unit: "", colour: "1", value: (r) => r.e_p_m }],
@@ -25,16 +36,7 @@ export const PLOTS = [
     series: [{ label: "", unit: "", colour: "1", value: (r) => r.e_q_deg }],
     limits: (scene) => [{ value: degrees(scene.tilt_abort_rad), label: "tilt abort", level: "bad" }],
   },
-  {
-    title: "Arm, °", digits: 0, span: 20,
-    series: [
-      { label: "α₁", unit: "", colour: "1", value: joint("arm_rad", 0) },
-      { label: "ref", unit: "", colour: "1", dashed: true, value: joint("reference_arm_rad", 0) },
-      { label: "α₂", unit: "", colour: "2", value: joint("arm_rad", 1) },
-      { label: "ref", unit: "", colour: "2", dashed: true, value: joint("reference_arm_rad", 1) },
-    ],
-    limits: joints,
-  },
+  ...(joints ? [armPlot(joints)] : []),
   {
     title: "Thrust", digits: 3, span: 0.08,
     series: [
@@ -81,10 +83,17 @@ export function windowOf(vehicle) {
 
 export class Plots {
   constructor(parent, changed) {
-    this.charts = PLOTS.map((spec) => new StripChart(spec));
     this._cursor = null; // position of the pointer in the window, 0 to 1
     this._parent = parent;
-    parent.append(...this.charts.map((chart) => chart.element));
+    this._changed = changed;
+    this._build(JOINTS_SHOWN);
+  }
+
+  _build(joints) {
+    const changed = this._changed;
+    this._joints = joints;
+    this.charts = plotsOf(joints).map((spec) => new StripChart(spec));
+    this._parent.replaceChildren(...this.charts.map((chart) => chart.element));
     for (const chart of this.charts) {
       chart.canvas.addEventListener("pointermove", (event) => {
         this._cursor = Math.max(0, Math.min(1, chart.timeAt(event.offsetX, 0, 1)));
@@ -100,6 +109,8 @@ export class Plots {
   }
 
   draw(vehicle) {
+    const joints = vehicle?.scene?.joint_max_rad.length ?? this._joints;
+    if (joints !== this._joints) this._build(joints);
     const span = vehicle ? windowOf(vehicle) : { from: 0, to: WINDOW_S, now: 0 };
     const shown = {
       ...span,
