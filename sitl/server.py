@@ -92,7 +92,7 @@ class Sitl:
         self.servos = servos_of(vehicle, config)
         self._on_bus = plugged_in(self.servos, config)
         stub_ports = LinkPorts(ports.autopilot_local, ports.autopilot_remote)
-        self.autopilot: AutopilotBackend = autopilot or StubBackend(config, stub_ports)
+        self.autopilot: AutopilotBackend = autopilot or StubBackend(vehicle.airframe, config, stub_ports)
         pose = (start.position_m, start.yaw_rad, start.arm_rad)
         self.plant = Plant(vehicle, config, self.autopilot, self.servos, pose, between_steps=True)
         self.autopilot.attach(self.plant.world)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import errno
 import importlib
 import os
+import re
 import shlex
+import socket
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +20,7 @@ from companion.cli.options import MISSION_HELP, MISSION_OR_DEFAULT_HELP, add_law
 from companion.cli.planning_progress import PlanningProgress
 from companion.cli.schema import schema_json
 from companion.config.document import ConfigError
+from companion.config.ground import FOXGLOVE_DEFAULT, listen_address
 from companion.config.loader import FlightConfig
 from companion.config.shipped import DEFAULT_MISSION
 from companion.install.extras import missing_extra
@@ -45,6 +49,8 @@ _WITH_MODULES = (
     *("broker", "report", "init", "plugins"),
 )
 """Commands whose parser is in `companion.cli.NAME`."""
+_ADDRESS = re.compile(r"[^/]*:\d+")
+"""A word that is the value of the `--foxglove` before it."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -97,11 +103,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _normalised(argv: list[str]) -> list[str]:
-    """Convert `--sitl` without a value to `--sitl=stub`, and `--set a=1 b=2` to one `--set` each."""
+    """Convert `--sitl` and `--foxglove` without a value to `--sitl=stub` and the default address, and `--set a=1 b=2` to one `--set`
+    each.
+    """
     out: list[str] = []
     in_set = False
-    for word in argv:
-        if word == "--sitl":
+    for word, following in zip(argv, [*argv[1:], ""], strict=False):
+        if word == "--foxglove" and not _ADDRESS.fullmatch(following):
+            out.append(f"--foxglove={FOXGLOVE_DEFAULT}")
+            in_set = False
+        elif word == "--sitl":
             out.append("--sitl=stub")
             in_set = False
         elif in_set and "=" in word and not word.startswith("-"):
@@ -142,6 +153,11 @@ def make_parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
         "--qgroundcontrol",
         metavar="ADDRESS",
         help="forward MAVLink to a ground station, e.g. udpout://192.168.1.20:14550",
+    )
+    fly.add_argument(
+        "--foxglove",
+        metavar="HOST:PORT",
+        help=f"show the flight live in Foxglove, which opens ws://HOST:PORT (without a value: {FOXGLOVE_DEFAULT})",
     )
     fly.add_argument(
         "--wait-for-start",
@@ -248,10 +264,12 @@ def _fly(arguments: argparse.Namespace) -> int:
         arguments.overrides += ["vehicle.ground.mqtt=null"] if off else [f"vehicle.ground.mqtt.url={arguments.mqtt}"]
     if arguments.qgroundcontrol is not None:
         arguments.overrides += [f"vehicle.ground.qgroundcontrol={arguments.qgroundcontrol}"]
+    if arguments.foxglove is not None:
+        arguments.overrides += [f"vehicle.ground.foxglove={arguments.foxglove}"]
     if arguments.wait_for_start:
         arguments.overrides += ["mission.start.takeoff=by_operator"]
     config = _load(arguments, hardware=arguments.sitl is None)
-    problems = [*_problems(config), *_start_impossible(config)]
+    problems = _no_server(config) or [*_problems(config), *_start_impossible(config)]
     if problems:
         for line in problems:
             print_error(line)
@@ -263,6 +281,24 @@ def _fly(arguments: argparse.Namespace) -> int:
         print_error(f"companion fly: --out {out}: {problem}")
         return EXIT_BAD_INPUT
     return run_flight(config, out, sitl=arguments.sitl, console=terminal_console(), report=not arguments.no_report)
+
+
+def _no_server(config: FlightConfig) -> list[str]:
+    """Return one line on why the Foxglove server cannot start; an empty list if it can."""
+    address = config.vehicle.ground.foxglove
+    if address is None:
+        return []
+    host, port = listen_address(address)
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as server:
+            server.setsockopt(
+                socket.SOL_SOCKET, socket.SO_REUSEADDR, 1
+            )  # as the real one: ended connections do not matter
+            server.bind((host, port))
+    except OSError as error:
+        why = "another program uses the port" if error.errno == errno.EADDRINUSE else error.strerror
+        return [f"vehicle.ground.foxglove (--foxglove) is {address}, but {why}; give another: --foxglove HOST:PORT"]
+    return []
 
 
 def _start_impossible(config: FlightConfig) -> list[str]:

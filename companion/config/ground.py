@@ -11,6 +11,8 @@ from companion.config.base import Model, refuse
 
 VEHICLE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,39}")
 _URL = re.compile(r"(?P<scheme>mqtts?)://(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+)(?::(?P<port>\d{1,5}))?/?")
+FOXGLOVE_DEFAULT = "127.0.0.1:8765"
+"""Address of the Foxglove server if `--foxglove` gives none: Foxglove's usual port, for this computer only."""
 _LOOPBACK = re.compile(r"localhost|127\.\d{1,3}\.\d{1,3}\.\d{1,3}|::1")
 
 
@@ -62,6 +64,26 @@ def _a_station(address: str) -> str:
     return address
 
 
+_LISTENER = re.compile(r"(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+):(?P<port>\d{1,5})")
+
+
+def listen_address(text: str) -> tuple[str, int]:
+    """Parse HOST:PORT, the address of a server on this computer.
+
+    Raises:
+        ValueError: the text is not HOST:PORT.
+    """
+    match = _LISTENER.fullmatch(text)
+    if match is None or not 0 < int(match["port"]) <= 65535:
+        raise ValueError(f"expected HOST:PORT of this computer, such as {FOXGLOVE_DEFAULT}, got {text!r:.60}")
+    return match["host"].strip("[]"), int(match["port"])
+
+
+def _a_listener(text: str) -> str:
+    listen_address(text)
+    return text
+
+
 class Mqtt(Model):
     """The MQTT broker for telemetry and commands."""
 
@@ -96,6 +118,9 @@ class Ground(Model):
     while PX4 is armed."""
     qgroundcontrol_console: bool = False
     """Whether SERIAL_CONTROL (PX4's console) is forwarded while PX4 is disarmed."""
+    foxglove: Annotated[str, AfterValidator(_a_listener)] | None = None
+    """HOST:PORT of this computer at which Foxglove shows the flight live; every program that reaches it may watch. If it is absent,
+    there is no server."""
 
     @model_validator(mode="after")
     def _speakable(self) -> Self:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, JsonValue, model_validator
 
+from companion.config.airframe import Airframe
 from companion.config.base import (
     JOINTS_MAX,
     Fraction,
@@ -16,7 +17,6 @@ from companion.config.base import (
     OrElse,
     PerJoint,
     Positive,
-    Positive3,
     PositivePerJoint,
     Span,
     Vector3,
@@ -27,39 +27,6 @@ from companion.config.ground import Ground
 from companion.config.mocap import NATNET
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Joints
-
-
-class Airframe(Model):
-    """The flying base."""
-
-    mass_kg: Positive
-    """Mass of the whole vehicle ready to fly, with the arm and the net, without a payload."""
-    inertia_kg_m2: Positive3 = (0.045, 0.045, 0.075)
-    """Moments of inertia of the base, without arm and tool, about the body's x, y and z axes; used by the model-based laws and the
-    simulated airframe. The default is that of the Tarot 650."""
-    rotor_arm_m: Positive = 0.325
-    """Distance of each of the four rotors from the body's z axis, in the X layout (45 deg from the body's x axis); used by the
-    simulated airframe and its CA_ROTOR parameters in PX4. The default is that of the Tarot 650."""
-    yaw_torque_per_thrust_m: Positive = 0.025
-    """Yaw torque of one rotor divided by its thrust, N m/N; used by the simulated airframe and its CA_ROTOR parameters in PX4. The
-    default is that of the Tarot 650."""
-    thrust_max_n: Positive
-    """Thrust of all rotors at full command with a charged battery."""
-    hover_thrust: Fraction | None = None
-    """Normalised thrust that carries `mass_kg` in hover. If it is absent, PX4's MPC_THR_HOVER is used."""
-    hover_thrust_adapt: bool = True
-    """Whether the hover thrust is estimated in flight from the thrust sent, the IMU and the force sensor. If false, it stays
-    constant.
-    """
-    tilt_max_deg: Annotated[float, Field(gt=0, le=45)] = 20.0
-    """Largest tilt of an attitude setpoint."""
-    ground_clearance_m: Positive
-    """Height of the body origin above the floor when the vehicle rests on its landing gear."""
-    radius_m: Positive = 0.45
-    """Horizontal radius around the body origin, including the rotor disks."""
-    payload_max_kg: NonNegative = 0.4
-    """Payload that is assumed when a mission without `catch:` is checked."""
-
 
 FOLDED, UNFOLDED = "folded", "unfolded"
 """Names of poses that the shipped missions use."""

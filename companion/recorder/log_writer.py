@@ -17,6 +17,7 @@ from foxglove.messages import Log, LogLevel
 from companion.ground.protocol.messages import EventLine
 from companion.model.codec import Record, json_schema, to_json
 from companion.model.types import Event, Inputs, Outputs, Sent
+from companion.recorder.live_viewers import LiveViewers, in_log
 from companion.recorder.log_file import LogFile
 from companion.recorder.viewer_channels import ViewerChannels, timestamp
 
@@ -38,15 +39,29 @@ class LogWriter:
         # Chunks are closed by `flush`, between ticks and not within one.
         options = MCAPWriteOptions(profile="companion", chunk_size=None, disable_seeking=True, compression_threads=0)
         self._chunk_bytes = chunk_bytes
-        self._mcap = foxglove.open_mcap(log_file, context=self._context, writer_options=options)
-        self._inputs = self._json_channel("/inputs", Inputs)
-        self._outputs = self._json_channel("/outputs", Outputs)
-        self._sent = self._json_channel("/sent", Sent)
+        self._mcap = foxglove.open_mcap(log_file, context=self._context, channel_filter=in_log, writer_options=options)
+        self._records = (
+            self._json_channel("/inputs", Inputs),
+            self._json_channel("/outputs", Outputs),
+            self._json_channel("/sent", Sent),
+        )
         self._events = self._json_channel("/events", EventLine)
         self._log = LogChannel("/log", context=self._context)
         self._viewers = ViewerChannels(self._context)
+        self._live: LiveViewers | None = None
         self._unflushed_bytes = 0
         self.viewer_error: str | None = None
+
+    def serve(self, address: tuple[str, int]) -> None:
+        """Show the flight to live viewers from the next tick on.
+
+        Args:
+            address: host and port of this computer for the Foxglove server.
+
+        Raises:
+            RuntimeError: the port is in use, or the host is not an address of this computer.
+        """
+        self._live = LiveViewers(self._context, address, self._records, self._viewers.repeat_static)
 
     @property
     def chunk_is_full(self) -> bool:
@@ -58,7 +73,7 @@ class LogWriter:
         # Encode all records first: one that cannot be encoded must not leave half a tick behind.
         texts = [to_json(record) for record in (inputs, outputs, sent)]
         stamp_ns = self._stamp_ns(inputs.t_s)
-        for channel, text in zip((self._inputs, self._outputs, self._sent), texts, strict=True):
+        for channel, text in zip(self._records, texts, strict=True):
             channel.log(text, log_time=stamp_ns)
             self._unflushed_bytes += len(text)
         # The tick is recorded: an error in its viewer messages must not count as a lost tick.
@@ -66,6 +81,8 @@ class LogWriter:
             for event in outputs.events:
                 self._event(stamp_ns, outputs.mission_t_s, event)
             self._viewers.tick(stamp_ns, inputs, outputs)
+            if self._live is not None:
+                self._live.tick(inputs.t_s, stamp_ns, texts)
         except (ValueError, TypeError, LookupError, ArithmeticError, RuntimeError) as error:
             if self.viewer_error is None:
                 self.viewer_error = f"tick {inputs.tick}: {type(error).__name__}: {error}"
@@ -97,6 +114,10 @@ class LogWriter:
     def close(self) -> None:
         """Write the summary, which completes the file."""
         self._mcap.close()
+
+    def stop_serving(self, within_s: float) -> bool:
+        """Close the server of live viewers; wait up to `within_s` for it. Return False if it is not closed by then."""
+        return self._live is None or self._live.stop(within_s)
 
     def _json_channel(self, topic: str, cls: type[Record]) -> foxglove.Channel:
         return foxglove.Channel(topic, schema=json_schema(cls), context=self._context)

@@ -1,7 +1,7 @@
 """The recorder process: reads ticks from the flight's channel and writes an MCAP log; it outlives the flight process to close the log.
 
 If the vehicle file names a broker the recorder also holds the telemetry session: telemetry out, signed commands in
-(`companion.recorder.telemetry`).
+(`companion.recorder.telemetry`). If it names an address for Foxglove, live viewers may connect (`companion.recorder.live_viewers`).
 
 Channels at full rate, JSON with JSON Schema: ``/inputs``, ``/outputs``, ``/sent``; typed channels at a lower rate, for viewers:
 `companion.recorder.viewer_channels`. Metadata records: ``companion`` (log format, epoch offset, versions), ``config`` (effective
@@ -39,6 +39,8 @@ LOG_FORMAT = "1"
 SYNC_PERIOD_S = 1.0
 TELEMETRY_END_TIMEOUT_S = 1.5
 """Timeout for sending the last telemetry messages after the log is closed."""
+VIEWERS_END_TIMEOUT_S = 0.3
+"""Timeout for sending the last messages to live viewers after the log is closed."""
 
 
 class Recorder:
@@ -149,6 +151,24 @@ def _lower_priority(config_json: str) -> None:
         keep_off(json.loads(config_json)["vehicle"]["computer"]["cpus"])
 
 
+def _serve_viewers(writer: LogWriter, config_json: str) -> None:
+    """Start the Foxglove server if the configuration has one; without it the flight goes on, with a line in the log."""
+    try:
+        address = json.loads(config_json)["vehicle"]["ground"]["foxglove"]
+    except (ValueError, LookupError, TypeError):  # a configuration without ground stations
+        return
+    if address is None:
+        return
+    from companion.config.ground import listen_address  # loads pydantic, which other flights' recorders do without
+
+    try:
+        writer.serve(listen_address(address))
+    except (ValueError, TypeError, RuntimeError) as error:
+        text = f"no live viewers at {address}: {error}"
+        writer.text(0.0, "warning", "foxglove", text)
+        print(f"recorder: {text}", file=sys.stderr, flush=True)
+
+
 def _print_json(answer: dict[str, Any]) -> None:
     """Write one JSON line for the parent process, if it still exists."""
     with contextlib.suppress(OSError):
@@ -200,6 +220,7 @@ def main(argv: list[str] | None = None) -> int:
     writer.metadata("flight", arguments.metadata)
     writer.flush()
     log_file.commit()
+    _serve_viewers(writer, config_json)
     with socket.socket(fileno=arguments.fd) as flight:
         channel = Channel(flight)
         signal.signal(signal.SIGTERM, lambda *_: channel.stop())
@@ -217,8 +238,9 @@ def main(argv: list[str] | None = None) -> int:
     log_file.close()
     _print_json({"samples": recorder.samples, "dropped": recorder.dropped, "error": recorder.error})
     code = 0 if recorder.error is None else 1
-    if telemetry is not None and not telemetry.join(TELEMETRY_END_TIMEOUT_S):
-        os._exit(code)  # a thread that waits for an unreachable broker would delay the exit by seconds
+    viewers_gone = writer.stop_serving(VIEWERS_END_TIMEOUT_S)
+    if not viewers_gone or (telemetry is not None and not telemetry.join(TELEMETRY_END_TIMEOUT_S)):
+        os._exit(code)  # a thread that waits for an unreachable broker or a dead viewer would delay the exit
     return code
 
 

@@ -7,7 +7,7 @@
 ``/reference``    foxglove.PoseInFrame        reference pose, 50 Hz
 ``/scene``        foxglove.SceneUpdate        the tether, 20 Hz
 ``/scene_path``   foxglove.SceneUpdate        flown and reference path so far, every 2 s
-``/scene_static`` foxglove.SceneUpdate        room, anchor, planned path, vehicle, arm, net: once, and when the plan is known
+``/scene_static`` foxglove.SceneUpdate        room, anchor, planned path, vehicle, arm, net: once, and for a new plan or live viewer
 ================  ==========================  =========================================================================
 
 A viewer that jumps in time requests only the newest message of each topic. Data with different rates, and data sent once, therefore
@@ -94,6 +94,10 @@ class ViewerChannels:
     def plan(self, path: Any) -> None:
         """Set the planned path, [[x, y, z], ...] in the world."""
         self._planned = path_of(path)
+        self._static_due = True
+
+    def repeat_static(self) -> None:
+        """Write the static scene again with the next tick, for a viewer that has just connected; callable from any thread."""
         self._static_due = True
 
     def tick(self, stamp_ns: int, inputs: Inputs, outputs: Outputs) -> None:

@@ -25,7 +25,6 @@ from sitl.autopilot.types import AttitudeTarget, Estimate, Fusion, ImuSample, Le
 
 Command7 = tuple[float, float, float, float, float, float, float]
 
-_STOPPED: RotorCommands = (0.0, 0.0, 0.0, 0.0)
 _COMMANDER_PERIOD_S = 0.01
 _POSITION_PERIOD_S = 0.004
 _EARTH_RADIUS_M = 6371000.0
@@ -131,7 +130,8 @@ class Px4Stub:
         self.estimate: Estimate | None = None
         self.target = AttitudeTarget((1.0, 0.0, 0.0, 0.0), 0.0)
         """Setpoint of the attitude loop (ATTITUDE_TARGET)."""
-        self.rotors: RotorCommands = _STOPPED
+        self._stopped: RotorCommands = (0.0,) * cascade.mixer.count
+        self.rotors = self._stopped
         self.vision_received = 0
         """Number of vision poses that arrived."""
         self._estimator = estimator
@@ -200,7 +200,7 @@ class Px4Stub:
         self.imu = imu
         self.t_s = t_s
         if t_s < self.booted_at_s:
-            return _STOPPED
+            return self._stopped
         self._estimator.predict(imu)
         self.estimate = estimate = self._estimator.estimate()
         queue = self._queue
@@ -212,15 +212,14 @@ class Px4Stub:
         commander = self.commander
         if not commander.armed or commander.nav_state is _TERMINATION:
             self.target = AttitudeTarget(estimate.attitude_ned_frd, 0.0)
-            self.rotors = _STOPPED
-            return _STOPPED
+            self.rotors = self._stopped
+            return self._stopped
         self._choose_target(t_s, estimate)
         if dt_s > 0.0:
             self.rotors = self._cascade.step(dt_s, estimate, self.target)
             factor = self.params.real("THR_MDL_FAC")
             if factor > 0.0:
-                a, b, c, d = (motor_signal(command, factor) for command in self.rotors)
-                self.rotors = (a, b, c, d)
+                self.rotors = tuple([motor_signal(command, factor) for command in self.rotors])
         return self.rotors
 
     def on_setpoint(self, t_s: float, target: OffboardTarget) -> None:
@@ -272,7 +271,7 @@ class Px4Stub:
         self.commander, self.navigator = Commander(self.params), Navigator(self.params)
         self.land, self._estimator = LandDetector(self.params), Estimator()
         self.estimate = self.origin = self.home_ned_m = self._offboard = self._setpoint_at_s = self._flying = None
-        self.target, self.rotors = AttitudeTarget((1.0, 0.0, 0.0, 0.0), 0.0), _STOPPED
+        self.target, self.rotors = AttitudeTarget((1.0, 0.0, 0.0, 0.0), 0.0), self._stopped
         self._queue.clear()
         self._cascade.reset()
         self._next_commander_s = self._position_at_s = -math.inf

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager
 from typing import Any, NamedTuple, Protocol
 
-from companion.model.types import Vec4
+from companion.config.airframe import Airframe
 from companion.sitl_config.effects.imu import Imu
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery, Px4Stub, gains_from_params
@@ -16,8 +16,8 @@ from sitl.autopilot.cascade import Cascade
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.mavlink import GROUND_PORTS, MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
-from sitl.autopilot.params import Params
-from sitl.autopilot.types import ImuSample, LearnedBias
+from sitl.autopilot.params import Params, mav_type
+from sitl.autopilot.types import ImuSample, LearnedBias, RotorCommands
 from sitl.faults.injector import Autopilot as FaultyAutopilot
 from sitl.world.world import World
 
@@ -68,7 +68,7 @@ class AutopilotBackend(Protocol):
     async def answered(self) -> None:
         """Wait until the autopilot has answered the sample that `sense` sent."""
 
-    def step(self, imu: ImuSample) -> Vec4:
+    def step(self, imu: ImuSample) -> RotorCommands:
         """Process one IMU sample and return normalised rotor commands (0 to 1), which are zero while disarmed."""
 
     def pump(self, t_s: float, battery: Battery) -> None:
@@ -87,18 +87,20 @@ class AutopilotBackend(Protocol):
         """Return the autopilot's kind (stub or px4) and version, for `summary.json`."""
 
 
-def stub_of(config: WorldConfig, link_delay_s: float = 0.0) -> Px4Stub:
+def stub_of(config: WorldConfig, airframe: Airframe, link_delay_s: float = 0.0) -> Px4Stub:
     """Return a stub with the parameters and gains of this world; `set_hover_thrust` sets its hover thrust.
 
     Args:
         config: configuration of the world; `setpoint_delay_s`, `thr_mdl_fac`, `px4_params` and the biases of `imu` are used.
+        airframe: airframe of the vehicle file, for the layout of the rotors.
         link_delay_s: added to the setpoint delay, for a loop without a real link.
     """
     params = Params()
+    params.set("MAV_TYPE", mav_type(airframe.rotor_layout.count))
     params.set("THR_MDL_FAC", config.thr_mdl_fac)
     for name, value in config.overridden_px4_params().items():
         params.set(name, value)
-    cascade = Cascade(gains_from_params(params))
+    cascade = Cascade(gains_from_params(params), airframe.rotor_layout)
     delay_s = config.setpoint_delay_s + link_delay_s
     return Px4Stub(params, Estimator(), cascade, setpoint_delay_s=delay_s, learned=_learned(config.imu))
 
@@ -139,10 +141,10 @@ class StubBackend:
 
     lockstep = False
 
-    def __init__(self, config: WorldConfig, ports: Ports) -> None:
+    def __init__(self, airframe: Airframe, config: WorldConfig, ports: Ports) -> None:
         self._config = config
         self._ports = ports
-        self.px4 = stub_of(config)
+        self.px4 = stub_of(config, airframe)
 
     @property
     def armed(self) -> bool:
@@ -179,7 +181,7 @@ class StubBackend:
     async def answered(self) -> None:
         """Return at once: the stub answers within `step`."""
 
-    def step(self, imu: ImuSample) -> Vec4:
+    def step(self, imu: ImuSample) -> RotorCommands:
         """Run one control period."""
         return self.px4.step(imu)
 

@@ -1,6 +1,6 @@
 """Attitude and rate cascade with mixer of the PX4 stub (mc_att_control, mc_rate_control, control allocation).
 
-Frames are PX4's: attitude FRD -> NED, rates FRD. Quad-x rotor order: front right, rear left, front left, rear right.
+Frames are PX4's: attitude FRD -> NED, rates FRD.
 """
 
 from __future__ import annotations
@@ -8,13 +8,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from companion.model.rotors import RotorLayout, standard_layout
 from companion.model.types import Quat, Vec3
+from sitl.autopilot.mixer import Mixer
 from sitl.autopilot.types import AttitudeTarget, Estimate, RotorCommands
-
-# Sign of each rotor's contribution to roll, pitch and yaw (FRD), in PX4's order.
-MIX_ROLL = (-1.0, 1.0, 1.0, -1.0)
-MIX_PITCH = (1.0, -1.0, 1.0, -1.0)
-MIX_YAW = (1.0, 1.0, -1.0, -1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +38,18 @@ def motor_signal(command: float, factor: float) -> float:
 
 
 class Cascade:
-    """PX4's multicopter attitude P loop, rate PID loop and quad-x mixer.
+    """PX4's multicopter attitude P loop, rate PID loop and mixer.
 
     Products of quaternions and sums over axes are written out for speed, because the cascade runs at 250 Hz.
+
+    Args:
+        gains: gains of the loops; None for PX4's defaults.
+        rotors: layout of the rotors; None for a quad-x.
     """
 
-    def __init__(self, gains: CascadeGains | None = None) -> None:
+    def __init__(self, gains: CascadeGains | None = None, rotors: RotorLayout | None = None) -> None:
         self._gains = gains or CascadeGains()
+        self.mixer = Mixer(rotors or standard_layout("quad_x", 1.0, 0.0))
         self.reset()
 
     def reset(self) -> None:
@@ -55,13 +57,13 @@ class Cascade:
         self._integral: Vec3 = (0.0, 0.0, 0.0)
         self._rate_previous: Vec3 | None = None
         self._d_filtered: Vec3 = (0.0, 0.0, 0.0)
-        self._unsaturated = True
+        self.mixer.unsaturated = True
 
     def step(self, dt_s: float, estimate: Estimate, target: AttitudeTarget) -> RotorCommands:
         """Run one control period and return normalised rotor commands, 0 to 1."""
         rate_sp = self._rate_setpoint(estimate.attitude_ned_frd, target)
         torque = self._rate_loop(dt_s, estimate.rates_frd_rad_s, rate_sp, target.thrust)
-        return self._mix(torque, target.thrust)
+        return self.mixer.mix(torque, target.thrust)
 
     def _rate_setpoint(self, q: Quat, target: AttitudeTarget) -> Vec3:
         """Return the rate setpoint in rad/s: quaternion P control with reduced yaw priority (Brescianini et al., as in
@@ -121,7 +123,7 @@ class Cascade:
         self._d_filtered = (dx, dy, dz)
         if thrust <= 0.1:  # on the ground the integrator would wind up against the landing gear
             self._integral = (0.0, 0.0, 0.0)
-        elif self._unsaturated:
+        elif self.mixer.unsaturated:
             most = gains.integrator_max
             (kx, ky, kz), (ix, iy, iz) = gains.rate_i, self._integral
             self._integral = (
@@ -131,24 +133,3 @@ class Cascade:
             )
         (ix, iy, iz), (kx, ky, kz), (lx, ly, lz) = self._integral, gains.rate_p, gains.rate_d
         return (kx * error_x + ix - lx * dx, ky * error_y + iy - ly * dy, kz * error_z + iz - lz * dz)
-
-    def _mix(self, torque: Vec3, thrust: float) -> RotorCommands:
-        """Mix collective thrust and torques into rotor commands; on saturation, yaw is reduced first, then the collective thrust."""
-        roll, pitch, yaw = torque
-        # MIX_ROLL and MIX_PITCH: the rotors get -across, +across, +along, -along.
-        across, along = roll - pitch, roll + pitch
-        most = max(abs(across), abs(along))
-        span = 2.0 * most
-        if span > 1.0:
-            across, along, most = across / span, along / span, most / span
-        base = max(most, min(1.0 - most, thrust)) if thrust > 0.0 else 0.0
-        room = min(base - most, 1.0 - base - most)
-        turn = max(-room, min(room, yaw)) if room > 0 else 0.0
-        self._unsaturated = span <= 1.0 and abs(base - thrust) < 0.05
-        a, b, c, d = base - across + turn, base + across + turn, base + along - turn, base - along - turn
-        return (
-            0.0 if a < 0.0 else 1.0 if a > 1.0 else a,
-            0.0 if b < 0.0 else 1.0 if b > 1.0 else b,
-            0.0 if c < 0.0 else 1.0 if c > 1.0 else c,
-            0.0 if d < 0.0 else 1.0 if d > 1.0 else d,
-        )

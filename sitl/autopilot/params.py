@@ -30,6 +30,15 @@ VEHICLE_DEFAULTS: Mapping[str, Value] = {
 }
 
 
+_MAV_TYPES = {6: 13, 8: 14}
+_MAV_TYPE_QUADROTOR = 2
+
+
+def mav_type(rotors: int) -> int:
+    """Return PX4's MAV_TYPE for a number of rotors; PX4 has no type for 5, 7 and more than 8 and flies them as a quadrotor."""
+    return _MAV_TYPES.get(rotors, _MAV_TYPE_QUADROTOR)
+
+
 class Params:
     """The autopilot's parameters; as in PX4, they are indexed in alphabetical order."""
 

@@ -295,14 +295,17 @@ def home_position(stub: Px4Stub) -> Message | None:
 
 
 def servo_output_raw(stub: Px4Stub) -> Message:
-    """Return SERVO_OUTPUT_RAW: 1000 to 2000 us per rotor, or 900 us while disarmed."""
-    pulses = [round(1000 + 1000 * command) for command in stub.rotors] if stub.armed else [900] * 4
-    return mavlink.MAVLink_servo_output_raw_message(clock_us(stub) & 0xFFFFFFFF, 0, *pulses, 0, 0, 0, 0)
+    """Return SERVO_OUTPUT_RAW: 1000 to 2000 us for each of the first eight rotors, or 900 us while disarmed."""
+    pulses = [round(1000 + 1000 * command) if stub.armed else 900 for command in stub.rotors]
+    return mavlink.MAVLink_servo_output_raw_message(clock_us(stub) & 0xFFFFFFFF, 0, *[*pulses, *[0] * 8][:8])
 
 
 def actuator_output_status(stub: Px4Stub) -> Message:
     """Return ACTUATOR_OUTPUT_STATUS with the rotor commands, 0 to 1."""
-    return mavlink.MAVLink_actuator_output_status_message(clock_us(stub), 0xF, [*stub.rotors, *[0.0] * 28])
+    count = len(stub.rotors)
+    return mavlink.MAVLink_actuator_output_status_message(
+        clock_us(stub), (1 << count) - 1, [*stub.rotors, *[0.0] * (32 - count)]
+    )
 
 
 def system_time(stub: Px4Stub) -> Message:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from companion.model.types import Quat, Vec3, Vec4
+from companion.model.types import Quat, Vec3
 
 
 class ImuSample(NamedTuple):
@@ -63,5 +63,5 @@ class AttitudeTarget(NamedTuple):
     yaw_rate_rad_s: float = 0.0
 
 
-RotorCommands = Vec4
-"""Normalised rotor commands in PX4's quad-x order: front right, rear left, front left, rear right."""
+RotorCommands = tuple[float, ...]
+"""Normalised rotor commands in PX4's order."""

@@ -33,7 +33,6 @@ from companion.model.types import (
     Outputs,
     Quat,
     Vec3,
-    Vec4,
     VehicleState,
 )
 from companion.sitl_config.faults import FaultKind
@@ -43,7 +42,7 @@ from sitl.autopilot.backend import set_hover_thrust, stub_of
 from sitl.autopilot.commander import FORCE_MAGIC, Command
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.telemetry import system_status
-from sitl.autopilot.types import AttitudeTarget, ImuSample
+from sitl.autopilot.types import AttitudeTarget, ImuSample, RotorCommands
 from sitl.fast.bus import FastBus, scales_of
 from sitl.fast.guardian import TAKE_OVER_S, FastGuardian, Landing
 from sitl.fast.link import FastLink
@@ -122,7 +121,7 @@ class _RecordedImu:
         self._px4 = px4
         self.total = DeltaVelocity()
 
-    def step(self, imu: ImuSample) -> Vec4:
+    def step(self, imu: ImuSample) -> RotorCommands:
         """Step PX4 by one IMU sample, add the sample to `total` and return the rotor commands."""
         rotors = self._px4.step(imu)
         boot_s = imu.t_s - self._px4.booted_at_s
@@ -143,7 +142,7 @@ class FastFlight:
         config = with_fault_times(config)
         vehicle, world, start = config.vehicle, config.world, config.mission.start
         self._land_at_s = land_at_s
-        self.px4 = stub_of(world, LINK_DELAY_S)
+        self.px4 = stub_of(world, vehicle.airframe, LINK_DELAY_S)
         servos = servos_of(vehicle, world)
         drives = [servo.drive for servo in servos]
         pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)

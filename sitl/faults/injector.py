@@ -17,7 +17,7 @@ import numpy as np
 
 from companion.config.vehicle import Tether
 from companion.model.frames import quat_from_euler_zyx, tilt_rad
-from companion.model.types import Quat, Vec3, Vec4
+from companion.model.types import Quat, Vec3
 from companion.sitl_config.faults import Fault, FaultKind
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.modes import NavState
@@ -212,7 +212,7 @@ class Faults:
         self.sag_v = sag.magnitude if sag is not None else 0.0
         every = (1.0 - self.sag_v / FULL_V) ** 2
         first = every * (1.0 - weak.magnitude) if weak is not None else every
-        share: Vec4 = (first, every, every, every)
+        share = (first, *[every] * (self._world.rotor_count - 1))
         self._world.rotor_share = None if min(share) == 1.0 else share
 
     def _set_gust(self, speed_m_s: float) -> None:

@@ -11,15 +11,14 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from companion.config.vehicle import Airframe
-from companion.model.types import Vec4
+from companion.config.airframe import Airframe
 from companion.sitl_config.faults import FaultKind
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.backend import Observation
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Value
-from sitl.autopilot.types import ImuSample
+from sitl.autopilot.types import ImuSample, RotorCommands
 from sitl.faults.injector import Autopilot as FaultyAutopilot
 from sitl.px4.control_link import ControlLink, Version, same
 from sitl.px4.hil_link import HilSensors, Px4Error, SimulatorLink
@@ -89,7 +88,7 @@ class RealPx4:
         self._progress = progress
         self._installation: Installation | None = find()
         self._instance = Instance.claim()
-        self._link = SimulatorLink(self._instance.simulator, HilSensors(config.seed))
+        self._link = SimulatorLink(self._instance.simulator, HilSensors(config.seed), airframe.rotor_layout.count)
         self._control = ControlLink(self._instance)
         self._relay = Relay(self._instance) if any(f.kind in _LINK_FAULTS for f in config.faults) else None
         self._process: Px4Process | None = None
@@ -256,7 +255,7 @@ class RealPx4:
         await self._process.await_end(1.0)
         return self._process.exit_summary()
 
-    def step(self, imu: ImuSample) -> Vec4:
+    def step(self, imu: ImuSample) -> RotorCommands:
         """Return the rotor commands of PX4's newest answer."""
         del imu
         return self._link.rotors

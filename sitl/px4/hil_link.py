@@ -31,7 +31,6 @@ ANSWER_DEADLINE_S = 10.0
 FIELD_EVERY, BARO_OFFSET = 5, 2
 """Every fifth sample includes the magnetometer, and every fifth, at this offset, the barometer: 50 Hz each."""
 
-_STOPPED: RotorCommands = (0.0, 0.0, 0.0, 0.0)
 _ACCEL_AND_GYRO, _MAG, _BARO = 0x07 | 0x38, 0x1C0, 0x200 | 0x800 | 0x1000
 _GROUND_ALTITUDE_M = 488.0
 _FIELD_NED_GAUSS: Vec3 = (0.21, 0.01, 0.43)
@@ -107,11 +106,13 @@ class SimulatorLink:
     Args:
         listener: listening socket to which PX4 connects, 127.0.0.1:4560 plus the instance number; closed with the link.
         sensors: builds the sensor messages.
+        rotors: number of rotors; HIL_ACTUATOR_CONTROLS carries up to 16.
     """
 
-    def __init__(self, listener: socket.socket, sensors: HilSensors) -> None:
-        self.rotors: RotorCommands = _STOPPED
-        """Rotor commands of the newest answer, 0 to 1, in PX4's quad-x order; 0 while disarmed."""
+    def __init__(self, listener: socket.socket, sensors: HilSensors, rotors: int) -> None:
+        self._stopped: RotorCommands = (0.0,) * rotors
+        self.rotors = self._stopped
+        """Rotor commands of the newest answer, 0 to 1, in PX4's order; 0 while disarmed."""
         self.armed = False
         self.answers = 0
         """Number of HIL_ACTUATOR_CONTROLS received since PX4 connected."""
@@ -237,7 +238,7 @@ class SimulatorLink:
         if self._peer is not peer:
             return
         self._peer = None
-        self.rotors, self.armed, self.answers = _STOPPED, False, 0
+        self.rotors, self.armed, self.answers = self._stopped, False, 0
         self._awaited_us = None
         self._answer.set()
         self._change.set()
@@ -251,8 +252,7 @@ class SimulatorLink:
         if self.answers == 1:
             self._change.set()
         self.armed = bool(message.mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-        a, b, c, d = (min(1.0, max(0.0, value)) for value in message.controls[0:4])
-        self.rotors = (a, b, c, d)
+        self.rotors = tuple([min(1.0, max(0.0, value)) for value in message.controls[: len(self._stopped)]])
         if self._awaited_us is not None and message.time_usec >= self._awaited_us:
             self._awaited_us = None
             self._silent_s = 0.0

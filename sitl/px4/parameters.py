@@ -7,11 +7,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from companion.config.vehicle import Airframe
+from companion.config.airframe import Airframe
 from companion.px4.required import WANTED, simulated_values
 from companion.sitl_config.world import World as WorldConfig
-from sitl.autopilot.params import PX4_DEFAULTS, VEHICLE_DEFAULTS, Value
-from sitl.world.model import ROTORS, rotor_offset_m
+from sitl.autopilot.params import PX4_DEFAULTS, VEHICLE_DEFAULTS, Value, mav_type
 
 BEFORE_BOOT: Mapping[str, Value] = {
     "SDLOG_MODE": 1,
@@ -21,7 +20,7 @@ BEFORE_BOOT: Mapping[str, Value] = {
 }
 """Parameters set before PX4 boots: one IMU, and logging from boot until disarming, at a high rate and with the estimator's inputs."""
 ROLL_PITCH_SHARE = 1.0 / math.sqrt(2.0)
-"""Fraction of a roll or pitch command that reaches each rotor of a quad-x, given by the scale of PX4's allocation matrix
+"""Root mean square of the fractions of a roll or pitch command that reach the rotors, given by the scale of PX4's allocation matrix
 (ControlAllocationPseudoInverse::updateControlAllocationMatrixScale).
 """
 
@@ -43,16 +42,17 @@ _MIXED_GAINS = (
 
 
 def rotor_geometry(airframe: Airframe) -> dict[str, Value]:
-    """Return the parameters CA_*: each rotor's position relative to the centre of mass (FRD, m) and its moment ratio.
+    """Return MAV_TYPE and the parameters CA_*: each rotor's position relative to the body origin (FRD, m) and its moment ratio.
 
     The ratio (CA_ROTORn_KM) is positive for counter-clockwise rotors.
     """
-    found: dict[str, Value] = {"CA_AIRFRAME": 0, "CA_ROTOR_COUNT": 4}
-    offset = rotor_offset_m(airframe)
-    for i, (x, y, yaw) in enumerate(ROTORS):
-        found[f"CA_ROTOR{i}_PX"] = x * offset
-        found[f"CA_ROTOR{i}_PY"] = -y * offset
-        found[f"CA_ROTOR{i}_KM"] = -yaw * airframe.yaw_torque_per_thrust_m
+    layout = airframe.rotor_layout
+    found: dict[str, Value] = {"CA_AIRFRAME": 0, "CA_ROTOR_COUNT": layout.count, "MAV_TYPE": mav_type(layout.count)}
+    for i, ((x, y, z), spin) in enumerate(zip(layout.positions_body_m, layout.spins, strict=True)):
+        found[f"CA_ROTOR{i}_PX"] = x
+        found[f"CA_ROTOR{i}_PY"] = -y
+        found[f"CA_ROTOR{i}_PZ"] = -z
+        found[f"CA_ROTOR{i}_KM"] = spin * airframe.yaw_torque_per_thrust_m
     return found
 
 

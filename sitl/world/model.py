@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
-from companion.config.vehicle import Airframe, Vehicle
+from companion.config.vehicle import Vehicle
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Joints, Vec3
+from companion.sitl_config.effects.rotors import of_rotors
 from companion.sitl_config.per_joint import of_joints
 from companion.sitl_config.world import World
 from sitl.world.effects import machine, transmission
@@ -14,15 +15,8 @@ from sitl.world.effects import machine, transmission
 PAYLOAD_RADIUS_M = 0.035
 SECOND, SECOND_CATCH = "payload2", "catch2"
 """Names of the second ball, which a fault throws after the payload, and of its constraint."""
-ROTOR_HEIGHT_M = 0.03
-"""Height of the rotors above the body origin."""
-# In PX4's quad-x order: each rotor's position (body FLU, in units of arm/sqrt 2) and the sign of its reaction torque about z (up).
-ROTORS = ((1, -1, -1), (-1, 1, -1), (1, 1, 1), (-1, -1, 1))
-
-
-def rotor_offset_m(airframe: Airframe) -> float:
-    """Return the distance in m of each rotor from the x-z and y-z planes of the body."""
-    return airframe.rotor_arm_m / math.sqrt(2.0)
+_FEET_M = ((0.18, -0.18), (-0.18, 0.18), (0.18, 0.18), (-0.18, -0.18))
+"""Positions of the feet along the body's x and y axes."""
 
 
 def base_mass_kg(vehicle: Vehicle, world: World) -> float:
@@ -93,21 +87,20 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     """Return the MuJoCo model of the true vehicle as MJCF text."""
     vehicle = machine.as_built(vehicle, world.machine)
     airframe, joints = vehicle.airframe, range(1, len(vehicle.arm.joints) + 1)
-    offset = rotor_offset_m(airframe)
+    layout = airframe.rotor_layout
     clearance = airframe.ground_clearance_m
     rotors = "\n".join(
-        f'<site name="rotor{i}" pos="{x * offset} {y * offset} {ROTOR_HEIGHT_M}"/>'
-        for i, (x, y, _) in enumerate(ROTORS)
+        f'<site name="rotor{i}" pos="{x} {y} {z}"/>' for i, (x, y, z) in enumerate(layout.positions_body_m)
     )
-    yaw_errors = world.rotors.yaw_torque_error if world.rotors.on else (0.0, 0.0, 0.0, 0.0)
+    yaw_errors = of_rotors(world.rotors.yaw_torque_error if world.rotors.on else (0.0,), layout.count)
     motors = "\n".join(
-        f'<motor name="rotor{i}" site="rotor{i}" gear="0 0 1 0 0 {s * airframe.yaw_torque_per_thrust_m * (1.0 + error)}"/>'
-        for i, ((_, _, s), error) in enumerate(zip(ROTORS, yaw_errors, strict=True))
+        f'<motor name="rotor{i}" site="rotor{i}" gear="0 0 1 0 0 {-spin * airframe.yaw_torque_per_thrust_m * (1.0 + error)}"/>'
+        for i, (spin, error) in enumerate(zip(layout.spins, yaw_errors, strict=True))
     )
     feet = "\n".join(
-        f'<geom name="foot{i}" type="sphere" size="0.02" pos="{x * 0.18} {y * 0.18} {-clearance + 0.02}" contype="1" '
+        f'<geom name="foot{i}" type="sphere" size="0.02" pos="{x} {y} {-clearance + 0.02}" contype="1" '
         f'conaffinity="2" friction="0.8 0.02 0.001" solref="0.02 1"/>'
-        for i, (x, y, _) in enumerate(ROTORS)
+        for i, (x, y) in enumerate(_FEET_M)
     )
     anchor = tendon = tension = ""
     if vehicle.tether is not None:

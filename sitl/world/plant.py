@@ -12,14 +12,14 @@ from typing import NamedTuple, Protocol
 
 from companion.config.vehicle import Joint, Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_normalize
-from companion.model.types import Joints, Quat, Vec2, Vec3, Vec4
+from companion.model.types import Joints, Quat, Vec2, Vec3
 from companion.sitl_config.distributions import with_model_error
 from companion.sitl_config.faults import Fault, FaultKind
 from companion.sitl_config.per_joint import of_joints
 from companion.sitl_config.world import Push, Servo
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery
-from sitl.autopilot.types import ImuSample
+from sitl.autopilot.types import ImuSample, RotorCommands
 from sitl.faults.injector import Faults
 from sitl.world.effects.force_sensor import ForceSensor
 from sitl.world.effects.imu import ImuErrors
@@ -39,7 +39,7 @@ _COUNTS_PER_RAD = 4096.0 / (2.0 * math.pi)
 class Px4(Protocol):
     """An autopilot that is stepped with IMU samples."""
 
-    def step(self, imu: ImuSample) -> Vec4:
+    def step(self, imu: ImuSample) -> RotorCommands:
         """Process one IMU sample and return normalised rotor commands."""
 
 
@@ -135,7 +135,8 @@ class Plant:
             for drive, joint, servo, error, gear in zip(drives, joints, servos, more, gears, strict=True)
         )
         self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
-        self._imu_errors = ImuErrors.of(config.imu, IMU_EVERY * PHYSICS_DT_S, self.world.weight_n / 4.0)
+        hover_n = self.world.weight_n / self.world.rotor_count
+        self._imu_errors = ImuErrors.of(config.imu, IMU_EVERY * PHYSICS_DT_S, hover_n, vehicle.airframe.rotor_layout)
         self._mocap_errors = MocapErrors.of(config.mocap, config.seed)
         self._seed_noise()
         self._mocap_noise_rad = math.radians(config.mocap_noise_deg)
@@ -145,7 +146,7 @@ class Plant:
         self.force_is_read = True
         """Whether the force sensor is being read; always true in the fast closed loop."""
         self._force_sensor = ForceSensor.of(config.force_sensor, config.seed)
-        self._rotors: Vec4 = (0.0, 0.0, 0.0, 0.0)
+        self._rotors: RotorCommands = (0.0,) * self.world.rotor_count
         self._tick = 0
         self._imu_sample: ImuSample | None = None
         self._mocap_queue: deque[tuple[float, MocapFrame]] = deque()

@@ -11,16 +11,16 @@ import mujoco
 
 from companion.config.vehicle import Vehicle
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import Joints, Quat, Vec2, Vec3, Vec4
+from companion.model.types import Joints, Quat, Vec2, Vec3
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.air import Air
 from sitl.world.effects.battery import BatteryPack
 from sitl.world.effects.downwash import Downwash
-from sitl.world.effects.rotors import LinearRotors, Rotors
+from sitl.world.effects.rotors import LinearRotors, Rotors, Thrusts
 from sitl.world.effects.tether_line import TetherLine
 from sitl.world.handling import Wrench
 from sitl.world.loads import EFFECT_PERIOD_S, ZERO, Loads
-from sitl.world.model import ROTOR_HEIGHT_M, mjcf
+from sitl.world.model import mjcf
 from sitl.world.payload import Payload
 
 PHYSICS_DT_S = 0.002
@@ -139,21 +139,25 @@ class World:
         self._park = [m.equality(name).id for name in (f"park{number + 1}" for number in range(len(arm_rad)))]
         self.parked = True
         """Whether a support holds the arm."""
-        self._rotor_max_n = vehicle.airframe.thrust_max_n / 4.0
-        self._rotors: Rotors | LinearRotors = Rotors.of(
-            config.rotors, vehicle.airframe.rotor_arm_m, PHYSICS_DT_S
-        ) or LinearRotors(config.rotor_lag_s, PHYSICS_DT_S)
-        self.battery = BatteryPack.of(config.battery, config.battery_start, config.battery_life_s, self.weight_n)
+        layout = vehicle.airframe.rotor_layout
+        self.rotor_count = layout.count
+        self._rotor_max_n, self._rotor_height_m = vehicle.airframe.thrust_max_n / layout.count, layout.height_m
+        self._rotors: Rotors | LinearRotors = Rotors.of(config.rotors, layout, PHYSICS_DT_S) or LinearRotors(
+            layout.count, config.rotor_lag_s, PHYSICS_DT_S
+        )
+        self.battery = BatteryPack.of(
+            config.battery, config.battery_start, config.battery_life_s, self.weight_n, layout.count
+        )
         """The battery, or None if its effect is off."""
         self._standing_m = vehicle.airframe.ground_clearance_m
         self.wind_m_s = config.wind_m_s
-        self.rotor_share: Vec4 | None = None
+        self.rotor_share: Thrusts | None = None
         """Fraction of each rotor's thrust that remains during a fault; None without a fault."""
         self.snag: tuple[Vec3, float] | None = None
         """Point where the tether is snagged and its free length from there to the vehicle; None if it is not snagged."""
         self._tether = m.tendon("tether").id if vehicle.tether is not None else None
         self._attachment = m.site("tether").id
-        self._thrust: Vec4 = (0.0, 0.0, 0.0, 0.0)
+        self._thrust: Thrusts = (0.0,) * layout.count
         self.crashed = False
         self._events: list[WorldEvent] = []
         d = self.data
@@ -214,10 +218,9 @@ class World:
             effect.restart_noise()
 
     @property
-    def rotor_thrust_n(self) -> Vec4:
-        """Thrust of each rotor in N, in PX4's quad-x order."""
-        a, b, c, d = self._ctrl[0:4].tolist()
-        return (a, b, c, d)
+    def rotor_thrust_n(self) -> Thrusts:
+        """Thrust of each rotor in N, in PX4's order."""
+        return tuple(self._ctrl[0 : self.rotor_count].tolist())
 
     @property
     def weight_n(self) -> float:
@@ -225,21 +228,24 @@ class World:
         return GRAVITY_M_S2 * float(self.model.body_subtreemass[self._base])
 
     @property
-    def thrust_n(self) -> Vec4:
-        """Thrust of each rotor in N before ground effect and faults, in PX4's quad-x order."""
+    def thrust_n(self) -> Thrusts:
+        """Thrust of each rotor in N before ground effect and faults, in PX4's order."""
         return self._thrust
 
     @property
     def hover_command(self) -> float:
         """True normalised hover thrust (0 to 1) without payload, far from the ground, at the battery's initial charge."""
         ratio = 1.0 if self.battery is None else self.battery.thrust_ratio(self.battery.hover_v)
-        return self._rotors.hover_command(self.weight_n / 4.0, self._rotor_max_n * ratio, self._config.thr_mdl_fac)
+        each_n = self.weight_n / self.rotor_count
+        return self._rotors.hover_command(each_n, self._rotor_max_n * ratio, self._config.thr_mdl_fac)
 
-    def step(self, rotor_commands: Vec4, joint_torque_nm: Joints, airborne: bool = True, *, drag: bool = True) -> None:
+    def step(
+        self, rotor_commands: Sequence[float], joint_torque_nm: Joints, airborne: bool = True, *, drag: bool = True
+    ) -> None:
         """Advance by one physics step.
 
         Args:
-            rotor_commands: motor signals, 0 to 1, in PX4's quad-x order.
+            rotor_commands: motor signals, 0 to 1, in PX4's order.
             joint_torque_nm: torque on each joint, from the motors or from their gears.
             airborne: whether a payload may be thrown.
             drag: whether aerodynamic drag and wind act.
@@ -250,11 +256,10 @@ class World:
         self._thrust = thrust = rotors.step(rotor_commands, most)
         if battery is not None:
             battery.step(PHYSICS_DT_S, thrust)
-        (a, b, c, d), near = thrust, rotors.ground_effect(self.q[2] + ROTOR_HEIGHT_M)
-        thrust = (near * a, near * b, near * c, near * d)
+        near = rotors.ground_effect(self.q[2] + self._rotor_height_m)
+        thrust = tuple([near * force for force in thrust])
         if self.rotor_share is not None:
-            a, b, c, d = (force * share for force, share in zip(thrust, self.rotor_share, strict=True))
-            thrust = (a, b, c, d)
+            thrust = tuple([force * share for force, share in zip(thrust, self.rotor_share, strict=True)])
         self._ctrl[:] = thrust + joint_torque_nm
         self.loads.set(self._base, "drag and snag", self._drag_and_snag_n(thrust, drag))
         if self.effects:
@@ -274,7 +279,7 @@ class World:
         self.payload.step(airborne)
         self._watch_crash()
 
-    def _drag_and_snag_n(self, thrust_n: Vec4, drag: bool) -> Vec3:
+    def _drag_and_snag_n(self, thrust_n: Thrusts, drag: bool) -> Vec3:
         """Return the force of the air and of a snagged tether on the base in N, world frame."""
         force_n = ZERO
         if drag:

@@ -89,6 +89,32 @@ def test_the_example_of_the_page_on_logs_runs(flight: FlightLog, capsys: pytest.
     assert re.match(r"largest height error \d\.\d{4} m\n", capsys.readouterr().out)
 
 
+def test_the_notebook_plots_error_and_force_around_the_catch(
+    flight: FlightLog, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("pandas")
+    plt = pytest.importorskip("matplotlib.pyplot")
+    notebook = json.loads((ROOT / "examples/notebook/flight.ipynb").read_text(encoding="utf-8"))
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells), "saved with its results"
+    monkeypatch.chdir(flight.path.parent)
+    plt.switch_backend("agg")
+    names: dict[str, Any] = {}
+    for cell in cells:
+        exec("".join(cell["source"]), names)
+    axes = names["figure"].axes
+    plt.close(names["figure"])
+    i = next(i for i, o in enumerate(flight.outputs) for event in o.events if event.id == "catch") + 100
+    mocap, reference, control = flight.inputs[i].mocap, flight.outputs[i].reference, flight.outputs[i].control
+    assert mocap is not None and reference is not None and control is not None
+    at_s = flight.inputs[i].t_s - names["catch_s"]
+    for k in range(3):
+        error_mm = 1e3 * (mocap.position_world_m[k] - reference.position_world_m[k])
+        for lines, expected in ((axes[0].lines, error_mm), (axes[1].lines, control.force_ext_world_n[k])):
+            assert np.interp(at_s, *lines[k].get_data()) == pytest.approx(expected, abs=1e-9)
+    assert re.match(r"largest position error \d+\.\d mm at .*\nlargest force \d+\.\d N\n", capsys.readouterr().out)
+
+
 def test_without_pandas_one_line_says_what_to_install(flight: FlightLog, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(LogError, match=r"^to_pandas: needs pandas: pip install '.*\[pandas\]'$"):

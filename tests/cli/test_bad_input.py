@@ -6,6 +6,7 @@ Through the command's entry point, in this process; a few of each sort as a user
 from __future__ import annotations
 
 import re
+import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -158,6 +159,20 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             r"mission\.yaml:\d+:\d+: .*phase 'catch' leaves the room.*x = 2\.45 m.*inwards",
         ),
     ),
+    "Foxglove without a port": (
+        (*FLY, "--foxglove=localhost"),
+        (r"^--set vehicle\.ground\.foxglove: expected HOST:PORT of this computer, such as .*got 'localhost'",),
+    ),
+    "Foxglove on another computer": (
+        (*FLY, "--foxglove", "192.0.2.1:8765"),
+        (
+            r"^vehicle\.ground\.foxglove \(--foxglove\) is 192\.0\.2\.1:8765, but .*; give another: --foxglove HOST:PORT$",
+        ),
+    ),
+    "Foxglove before the mission": (
+        ("fly", "--foxglove", "mission.yaml", "--sitl", "--preset", "papr"),
+        (r"--preset papr: .*paper, .*recommended",),
+    ),
     "empty out": (("fly", "mission.yaml", "--sitl", "--out", ""), (r"^companion fly: --out: .*folder",)),
     "out is a file": (("fly", "mission.yaml", "--sitl", "--out", "vehicle.yaml"), (r"--out vehicle\.yaml: is a file",)),
     "out is below a file": (
@@ -272,6 +287,13 @@ def test_bad_file(sandbox: Sandbox, companion: Command, case: str, command: str)
     path = sandbox.cwd / name
     path.write_text(edit(path.read_text(encoding="utf-8")), encoding="utf-8")
     assert_refused(sandbox, companion, FLY if command == "fly" else ("check", "mission.yaml", "--plan-only"), patterns)
+
+
+def test_a_foxglove_port_in_use_is_refused_before_anything_starts(sandbox: Sandbox, companion: Command) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        address = f"127.0.0.1:{other.getsockname()[1]}"
+        refusal = (rf"^vehicle\.ground\.foxglove \(--foxglove\) is {address}, but another program uses the port;",)
+        assert_refused(sandbox, companion, (*FLY, "--foxglove", address), refusal)
 
 
 def test_a_folder_that_holds_a_flight_is_not_touched(sandbox: Sandbox, companion: Command) -> None:

@@ -11,7 +11,7 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_conjugate, quat_multiply, quat_normalize, quat_rotate
 from companion.model.types import Quat, Vec3
 from sitl.autopilot.autopilot import Px4Stub, gains_from_params
-from sitl.autopilot.cascade import MIX_PITCH, MIX_ROLL, MIX_YAW, Cascade
+from sitl.autopilot.cascade import Cascade
 from sitl.autopilot.commander import Command, Result
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.mavlink import MavlinkServer
@@ -20,6 +20,7 @@ from sitl.autopilot.types import ImuSample, RotorCommands
 
 PERIOD_S = 0.004
 VISION_PERIOD_S = 0.012
+MIXER = Cascade().mixer
 
 
 class Plant:
@@ -45,9 +46,9 @@ class Plant:
             self._rotor_n[i] += blend * (command * self.rotor_max_n - self._rotor_n[i])
         force_z = -sum(self._rotor_n)
         torque = (
-            self.lever_m * sum(k * f for k, f in zip(MIX_ROLL, self._rotor_n, strict=True)),
-            self.lever_m * sum(k * f for k, f in zip(MIX_PITCH, self._rotor_n, strict=True)),
-            self.yaw_m * sum(k * f for k, f in zip(MIX_YAW, self._rotor_n, strict=True)),
+            self.lever_m * sum(k * f for k, f in zip(MIXER.roll, self._rotor_n, strict=True)),
+            self.lever_m * sum(k * f for k, f in zip(MIXER.pitch, self._rotor_n, strict=True)),
+            self.yaw_m * sum(k * f for k, f in zip(MIXER.yaw, self._rotor_n, strict=True)),
         )
         push = quat_rotate(self.attitude, (0.0, 0.0, force_z / self.mass_kg))
         drag = 0.1

@@ -85,7 +85,7 @@ async def _emitted(config: SitlConfig, end: int, usual: Emitted | None) -> Emitt
     loop = asyncio.get_running_loop()
     assert isinstance(loop, WorldLoop)
     events: list[Any] = []
-    autopilot = StubBackend(config.world, LinkPorts(0, 0))
+    autopilot = StubBackend(config.vehicle.airframe, config.world, LinkPorts(0, 0))
     start = start_of(START_M, 0.0, config.mission.start.arm_deg)
     sitl = Sitl(config.vehicle, config.world, start, Ports(), events.append, autopilot)
     steps: list[tuple[Any, ...]] = []

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
+from companion.config.airframe import Rotor
 from companion.config.vehicle import Vehicle
-from companion.model.types import Outcome, Vec3, Vec4
+from companion.model.rotors import LAYOUTS, LayoutName
+from companion.model.types import Outcome, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from companion.sitl_config.world import World as WorldConfig
+from sitl.autopilot.mixer import Mixer
 from sitl.fast.loop import FastFlight
 from sitl.world.world import World
 from tests.support import CATCH
@@ -27,11 +31,11 @@ def with_airframe(**changes: Any) -> Vehicle:
     return VEHICLE.model_copy(update={"airframe": VEHICLE.airframe.model_copy(update=changes)})
 
 
-def torque_nm(vehicle: Vehicle, thrusts_n: Vec4) -> Vec3:
+def torque_nm(vehicle: Vehicle, thrusts_n: Sequence[float], **settings: Any) -> Vec3:
     """Torque of the rotors on the base, body FLU."""
-    world = World(vehicle, WorldConfig(payload_kg=0.0), (0.0, 0.0), 0.0, (1.5, 1.5))
+    world = World(vehicle, WorldConfig(payload_kg=0.0, **settings), (0.0, 0.0), 0.0, (1.5, 1.5))
     model, data = world.model, world.data
-    data.ctrl[:4] = thrusts_n
+    data.ctrl[: len(thrusts_n)] = thrusts_n
     mujoco.mj_forward(model, data)
     x, y, z = data.qfrc_actuator[3:6].tolist()
     return (x, y, z)
@@ -47,6 +51,74 @@ def test_the_rotors_turn_it_by_their_arm_and_by_their_yaw_torque(arm_m: float, y
     yaw_nm = yaw_m * (front_left + rear_right - front_right - rear_left)
     expected = pytest.approx((roll_nm, pitch_nm, yaw_nm), abs=1e-9)
     assert torque_nm(vehicle, (front_right, rear_left, front_left, rear_right)) == expected
+
+
+PLACES = (
+    (0.3, -0.15, "ccw"),
+    (-0.2, 0.2, "ccw"),
+    (0.3, 0.15, "cw"),
+    (-0.2, -0.2, "cw"),
+    (0.0, 0.3, "cw"),
+    (0.0, -0.3, "ccw"),
+)
+SPREAD = tuple(Rotor.model_validate({"position_body_m": (x, y, 0.05), "spin": spin}) for x, y, spin in PLACES)
+
+
+@pytest.mark.parametrize("layout", [*LAYOUTS, "listed"])
+def test_the_mixer_controls_each_torque_of_the_simulated_rotors_by_itself(layout: str) -> None:
+    """Torques in FRD; thrust alone turns nothing."""
+    changes = {"rotors": SPREAD} if layout == "listed" else {"layout": layout}
+    vehicle = with_airframe(**changes)
+    mixer = Mixer(vehicle.airframe.rotor_layout)
+    for axis, column in enumerate((mixer.roll, mixer.pitch, mixer.yaw, mixer.thrust)):
+        x, y, z = torque_nm(vehicle, column)
+        found = (x, -y, -z)
+        for other in range(3):
+            if other == axis:
+                assert found[other] > 0.02
+            else:
+                assert found[other] == pytest.approx(0.0, abs=1e-9)
+    assert sum(mixer.roll) == pytest.approx(0.0, abs=1e-9)
+    assert sum(mixer.thrust) == pytest.approx(mixer.count)
+
+
+def test_saturation_shrinks_the_torques_of_any_layout_but_keeps_their_direction() -> None:
+    layout = with_airframe(rotors=SPREAD).airframe.rotor_layout
+    mixer = Mixer(layout)
+    for roll, pitch, yaw in ((0.9, -0.7, 0.8), (-2.0, 0.3, -1.0), (0.1, 0.2, 3.0)):
+        for thrust in (0.1, 0.5, 1.0):
+            commands = mixer.mix((roll, pitch, yaw), thrust)
+            assert 0.0 <= min(commands) <= max(commands) <= 1.0
+            x_nm, y_nm = (
+                sum(place[axis] * k for place, k in zip(layout.positions_body_m, commands, strict=True))
+                for axis in (1, 0)
+            )
+            assert x_nm * pitch == pytest.approx(y_nm * roll, abs=1e-6)
+            assert x_nm * roll > 0.0
+            assert yaw * sum(spin * k for spin, k in zip(layout.spins, commands, strict=True)) > -1e-6
+
+
+def test_errors_of_rotors_are_used_again_from_the_first_if_there_are_more_rotors() -> None:
+    rotors = {"on": True, "yaw_torque_error": (0.1, -0.1)}
+    one = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    for index, error in ((0, 0.1), (1, -0.1), (2, 0.1), (5, -0.1)):
+        thrusts_n = [one[i - index] for i in range(6)]
+        *_, yaw_nm = torque_nm(with_airframe(layout="hexa_x"), thrusts_n, rotors=rotors)
+        assert abs(yaw_nm) == pytest.approx(0.025 * (1.0 + error))
+
+
+@pytest.mark.parametrize("layout", ["quad_plus", "hexa_x", "octa_plus"])
+@pytest.mark.parametrize("mission", ["configs/missions/hover.yaml", "tests/short_catch.yaml"])
+def test_other_layouts_fly(layout: LayoutName, mission: str) -> None:
+    config = load_sitl(mission, overrides=(f"vehicle.airframe.layout={layout}",))
+    flight = FastFlight(config)
+    result = flight.run()
+    assert flight.plant.world.rotor_count == {"quad_plus": 4, "hexa_x": 6, "octa_plus": 8}[layout]
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert result.caught is (config.mission.catch is not None)
+    for truth, output in zip(result.truth, result.outputs, strict=True):
+        if output.reference is not None and truth.position_world_m[2] > 0.6:
+            assert math.dist(truth.position_world_m, output.reference.position_world_m) < 0.12
 
 
 def test_the_base_has_the_inertia_of_the_vehicle_file() -> None:

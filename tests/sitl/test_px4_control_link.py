@@ -109,6 +109,16 @@ def test_the_geometry_is_that_of_the_world() -> None:
     places = [(geometry[f"CA_ROTOR{i}_PX"], geometry[f"CA_ROTOR{i}_PY"]) for i in range(4)]
     assert places == [(offset, offset), (-offset, -offset), (offset, -offset), (-offset, offset)]
     assert [geometry[f"CA_ROTOR{i}_KM"] for i in range(4)] == [0.03, 0.03, -0.03, -0.03]
+    assert (geometry["CA_ROTOR_COUNT"], geometry["MAV_TYPE"], geometry["CA_ROTOR0_PZ"]) == (4, 2, -0.03)
+
+
+def test_the_geometry_of_a_hexacopter_is_that_of_px4s_airframe() -> None:
+    airframe = VEHICLE.airframe.model_copy(update={"layout": "hexa_x", "rotor_arm_m": 0.5})
+    geometry = rotor_geometry(airframe)
+    assert (geometry["CA_ROTOR_COUNT"], geometry["MAV_TYPE"]) == (6, 13)
+    assert (geometry["CA_ROTOR0_PX"], geometry["CA_ROTOR0_PY"]) == (0.0, 0.5)
+    assert (geometry["CA_ROTOR5_PX"], geometry["CA_ROTOR5_PY"]) == pytest.approx((-0.433, -0.25), abs=1e-3)
+    assert [geometry[f"CA_ROTOR{i}_KM"] for i in range(6)] == [-0.025, 0.025, -0.025, 0.025, 0.025, -0.025]
 
 
 def test_the_hover_thrust_is_wrong_by_what_the_world_says() -> None:

@@ -24,8 +24,8 @@ def sample(i: int) -> ImuSample:
     return ImuSample(i * PERIOD_S, (0.1, 0.2, 0.3), (0.0, 0.0, -9.81))
 
 
-def link() -> SimulatorLink:
-    return SimulatorLink(socket.create_server(("127.0.0.1", 0)), HilSensors(1))
+def link(rotors: int = 4) -> SimulatorLink:
+    return SimulatorLink(socket.create_server(("127.0.0.1", 0)), HilSensors(1), rotors)
 
 
 async def connected(link: SimulatorLink, answer: Answer) -> LockstepPeer:
@@ -143,6 +143,19 @@ def test_one_sample_without_an_answer_does_not_end_the_flight(monkeypatch: pytes
                     under_test.send(sample(i), 0.3, LEVEL)
                     await under_test.answered()
                 assert under_test.unanswered == 1
+
+    asyncio.run(scenario())
+
+
+def test_as_many_controls_are_read_as_there_are_rotors() -> None:
+    controls = [0.1 * number for number in range(1, 9)]
+
+    async def scenario() -> None:
+        async with link(rotors=8) as under_test:
+            assert under_test.rotors == (0.0,) * 8
+            with await connected(under_test, lambda _: [*controls, 0.9, 1.0]):
+                await boot(under_test)
+                assert under_test.rotors == pytest.approx(controls)
 
     asyncio.run(scenario())
 

@@ -80,7 +80,7 @@ def test_it_runs_in_its_folder_and_ends_when_asked(tmp_path: Path) -> None:
         installation = find({"PX4_SITL": str(installed(tmp_path / "build"))})
         assert installation is not None
         with Instance.claim() as instance:
-            async with SimulatorLink(instance.simulator, HilSensors(1)) as link:
+            async with SimulatorLink(instance.simulator, HilSensors(1), 4) as link:
                 process = Px4Process(installation, instance, tmp_path / "scratch", {"SDLOG_MODE": 1})
                 try:
                     async with asyncio.timeout(DEADLINE_S):

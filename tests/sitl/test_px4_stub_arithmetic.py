@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from companion.model import frames
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Quat, Vec3
-from sitl.autopilot.cascade import MIX_PITCH, MIX_ROLL, MIX_YAW, Cascade, CascadeGains
+from sitl.autopilot.cascade import Cascade, CascadeGains
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.types import AttitudeTarget, ImuSample
 
@@ -19,6 +19,7 @@ attitudes = st.builds(frames.quat_from_euler_zyx, angles, st.floats(-1.4, 1.4), 
 small = st.floats(-5.0, 5.0)
 vectors = st.tuples(small, small, small)
 GAINS = CascadeGains()
+MIX_ROLL, MIX_PITCH, MIX_YAW = (-1.0, 1.0, 1.0, -1.0), (1.0, -1.0, 1.0, -1.0), (1.0, 1.0, -1.0, -1.0)
 
 
 def clipped(value: float, limit: float) -> float:
@@ -63,7 +64,7 @@ def test_rate_setpoint_with_yaw_rate(q: Quat, q_d: Quat, yaw_rate_rad_s: float) 
 
 
 @given(st.tuples(*[st.floats(-1.5, 1.5)] * 3), st.floats(0.0, 1.0))
-def test_mixer(torque: Vec3, thrust: float) -> None:
+def test_mixer_of_a_quad_x(torque: Vec3, thrust: float) -> None:
     roll, pitch, yaw = torque
     lean = [a * roll + b * pitch for a, b in zip(MIX_ROLL, MIX_PITCH, strict=True)]
     span = max(lean) - min(lean)
@@ -73,7 +74,7 @@ def test_mixer(torque: Vec3, thrust: float) -> None:
     room = min(min(base + value, 1.0 - base - value) for value in lean)
     turn = clipped(yaw, room) if room > 0 else 0.0
     plain = tuple(min(1.0, max(0.0, base + value + k * turn)) for value, k in zip(lean, MIX_YAW, strict=True))
-    assert Cascade()._mix(torque, thrust) == plain
+    assert Cascade().mixer.mix(torque, thrust) == plain
 
 
 @given(st.lists(st.tuples(vectors, vectors, st.floats(0.0, 1.0)), min_size=1, max_size=8))

@@ -6,6 +6,7 @@ import math
 
 import pytest
 
+from companion.config.airframe import Airframe
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat
 from companion.model.types import IDENTITY_QUAT
@@ -15,10 +16,12 @@ from sitl.autopilot.backend import stub_of
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.types import ImuSample
 
+AIRFRAME = Airframe(mass_kg=3.0, thrust_max_n=60.0, ground_clearance_m=0.3)
+
 
 def test_the_stub_knows_the_biases_that_show_at_rest_and_no_others() -> None:
     bias = Imu(on=True, accel_bias_m_s2=(0.1, 0.2, 0.3), gyro_bias_deg_s=(1.0, 2.0, 3.0))
-    stub = stub_of(World(imu=bias))
+    stub = stub_of(World(imu=bias), AIRFRAME)
     rates = (math.radians(1.0), math.radians(-2.0), math.radians(-3.0))
     stub.step(ImuSample(1.0, rates, (0.1, -0.2, -GRAVITY_M_S2 - 0.3)))
     assert stub.imu is not None
@@ -27,14 +30,14 @@ def test_the_stub_knows_the_biases_that_show_at_rest_and_no_others() -> None:
 
 
 def test_a_bias_above_ekf2s_limit_is_learned_up_to_it() -> None:
-    stub = stub_of(World(imu=Imu(on=True, accel_bias_m_s2=(0.0, 0.0, 1.0), gyro_bias_deg_s=(0.0, 0.0, 0.0))))
+    stub = stub_of(World(imu=Imu(on=True, accel_bias_m_s2=(0.0, 0.0, 1.0), gyro_bias_deg_s=(0.0, 0.0, 0.0))), AIRFRAME)
     stub.step(ImuSample(1.0, (0.0, 0.0, 0.0), (0.0, 0.0, -GRAVITY_M_S2 - 1.0)))
     assert stub.imu is not None
     assert stub.imu.accel_frd_m_s2[2] == pytest.approx(-GRAVITY_M_S2 - 0.6)
 
 
 def test_without_errors_the_stub_takes_samples_as_they_are() -> None:
-    stub, sample = stub_of(World()), ImuSample(1.0, (0.1, 0.2, 0.3), (0.4, 0.5, -9.0))
+    stub, sample = stub_of(World(), AIRFRAME), ImuSample(1.0, (0.1, 0.2, 0.3), (0.4, 0.5, -9.0))
     stub.step(sample)
     assert stub.imu is sample
 

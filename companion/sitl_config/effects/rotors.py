@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
-from companion.config.base import Fraction, Model, NonNegative, Positive, RelativeError
+from collections.abc import Sequence
+from itertools import cycle, islice
+from typing import Annotated
 
-RotorErrors = tuple[RelativeError, RelativeError, RelativeError, RelativeError]
+from pydantic import Field
+
+from companion.config.base import Fraction, Model, NonNegative, Positive, RelativeError
+from companion.model.rotors import ROTORS_MAX
+
+RotorErrors = Annotated[tuple[RelativeError, ...], Field(min_length=1, max_length=ROTORS_MAX)]
+
+
+def of_rotors(errors: Sequence[float], count: int) -> tuple[float, ...]:
+    """Return one error per rotor; the list starts again from its beginning if the vehicle has more rotors."""
+    return tuple(islice(cycle(errors), count))
 
 
 class Rotors(Model):
@@ -26,9 +38,11 @@ class Rotors(Model):
     """Time constant of a rotor that slows down, without active braking (e: 0.06 to 0.08; p: twice `lag_up_s` in RotorS and in PX4's
     Gazebo x500)."""
     thrust_error: RotorErrors = (0.015, -0.02, 0.01, -0.005)
-    """Relative error of each rotor's thrust at a given signal, in PX4's quad-x order (e: +-0.03)."""
+    """Relative error of each rotor's thrust at a given signal, in PX4's order (e: +-0.03). The list starts again from its beginning if
+    the vehicle has more rotors."""
     yaw_torque_error: RotorErrors = (0.05, -0.03, -0.05, 0.03)
-    """Relative error of each rotor's yaw torque at a given thrust (e: +-0.1 for propellers and motor mounts)."""
+    """Relative error of each rotor's yaw torque at a given thrust (e: +-0.1 for propellers and motor mounts), listed like
+    `thrust_error`."""
     drag_s_m: NonNegative = 0.02
     """Rotor drag (H-force) divided by thrust and by the airspeed across the rotor axis (p: 0.0124 from the coefficients of PX4's
     Gazebo x500,

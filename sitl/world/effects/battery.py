@@ -8,8 +8,8 @@ proportional to the square of the voltage (ESCs without voltage compensation).
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
-from companion.model.types import Vec4
 from companion.sitl_config.effects.battery import Battery as BatteryConfig
 
 CELLS = 4
@@ -29,24 +29,25 @@ class BatteryPack:
         start: state of charge at arming, 0 to 1.
         life_s: hover time with a full battery.
         weight_n: weight of the vehicle, for the hover current.
+        rotors: number of rotors.
     """
 
-    def __init__(self, config: BatteryConfig, start: float, life_s: float, weight_n: float) -> None:
+    def __init__(self, config: BatteryConfig, start: float, life_s: float, weight_n: float, rotors: int) -> None:
         self._resistance_ohm = config.resistance_ohm
         self._power_w_n15 = config.power_w_n15
         self._electronics_w = config.electronics_w
         self._full_thrust_v = config.full_thrust_v
         self._start = start
-        hover_w = config.electronics_w + config.power_w_n15 * weight_n * math.sqrt(weight_n / 4.0)
+        hover_w = config.electronics_w + config.power_w_n15 * weight_n * math.sqrt(weight_n / rotors)
         self.hover_v = self._loaded_v(open_circuit_v(start), hover_w)
         self.capacity_as = hover_w / self._loaded_v(open_circuit_v(0.5), hover_w) * life_s
         """Charge of the full battery in A s: the hover current at half charge multiplied by `life_s`."""
         self.restart()
 
     @classmethod
-    def of(cls, config: BatteryConfig, start: float, life_s: float, weight_n: float) -> BatteryPack | None:
+    def of(cls, config: BatteryConfig, start: float, life_s: float, weight_n: float, rotors: int) -> BatteryPack | None:
         """Return the battery, or None if the effect is off."""
-        return cls(config, start, life_s, weight_n) if config.on else None
+        return cls(config, start, life_s, weight_n, rotors) if config.on else None
 
     def restart(self) -> None:
         """Reset the battery to its charge at arming."""
@@ -69,11 +70,9 @@ class BatteryPack:
         ratio = voltage_v / self._full_thrust_v
         return ratio * ratio
 
-    def step(self, dt_s: float, thrust_n: Vec4) -> None:
+    def step(self, dt_s: float, thrust_n: Iterable[float]) -> None:
         """Draw the current for these rotor thrusts during one physics step."""
-        a, b, c, d = thrust_n
-        root = math.sqrt
-        rotors_n15 = a * root(a) + b * root(b) + c * root(c) + d * root(d)
+        rotors_n15 = sum([force * math.sqrt(force) for force in thrust_n])
         power_w = self._electronics_w + self._power_w_n15 * rotors_n15
         self.voltage_v = voltage_v = self._loaded_v(open_circuit_v(self.remaining), power_w)
         self.current_a = current_a = power_w / voltage_v

@@ -2,7 +2,7 @@
 
 A wake develops and contracts according to momentum theory: z rotor radii below the disk, the velocity is the induced velocity in hover,
 sqrt(T / (2 rho A)), times 1 + z / sqrt(1 + z^2), and the area shrinks by continuity. Turbulence blurs the wake's edge but conserves its
-momentum; the momenta of the four wakes add (Reichardt's hypothesis for free turbulence). The cross-section is approximated by a square
+momentum; the momenta of all wakes add (Reichardt's hypothesis for free turbulence). The cross-section is approximated by a square
 of the same area, whose blurred profile is a product of error functions. All dynamic pressures are proportional to thrust, and the
 density of the air cancels. The flow turns aside above the floor. The component of the flow across a link's axis loads the link at its
 middle (cross-flow principle, Hoerner 1965); the whole flow loads net and payload at their centres of mass.
@@ -11,13 +11,15 @@ middle (cross-flow principle, Hoerner 1965); the whole flow loads net and payloa
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from companion.config.vehicle import Vehicle
-from companion.model.types import Vec3, Vec4
+from companion.model.rotors import RotorLayout
+from companion.model.types import Vec3
 from companion.sitl_config.effects.downwash import Downwash as DownwashConfig
 from sitl.world.loads import EFFECT_PERIOD_S
-from sitl.world.model import PAYLOAD_RADIUS_M, ROTOR_HEIGHT_M, rotor_offset_m
+from sitl.world.model import PAYLOAD_RADIUS_M
 from sitl.world.ornstein_uhlenbeck import OrnsteinUhlenbeck
 
 if TYPE_CHECKING:
@@ -28,39 +30,44 @@ _ROOT_HALF = math.sqrt(0.5)
 
 
 class Wakes:
-    """Time-averaged dynamic pressure below the four rotors.
+    """Time-averaged dynamic pressure below the rotors.
 
     Args:
-        rotor_offset_m: distance of the rotors from the x-z and y-z planes of the body.
+        layout: layout of the rotors.
         radius_m: radius of a rotor.
         spread: see section `downwash`.
     """
 
-    def __init__(self, rotor_offset_m: float, radius_m: float, spread: float) -> None:
-        self._offset_m, self._radius_m, self._spread = rotor_offset_m, radius_m, spread
+    def __init__(self, layout: RotorLayout, radius_m: float, spread: float) -> None:
+        self._radius_m, self._spread = radius_m, spread
+        rows: dict[float, list[tuple[int, float]]] = {}
+        for i, (x, y, _) in enumerate(layout.positions_body_m):
+            rows.setdefault(x, []).append((i, y))
+        self._rows = tuple((x, tuple(row)) for x, row in rows.items())
+        """Position along x and, of each rotor there, its index and its position along y."""
+        self._across_m = tuple(dict.fromkeys(y for _, y, _ in layout.positions_body_m))
 
-    def pressure_pa(self, thrust_n: Vec4, point_m: Vec3, blur_m: float = 0.0) -> float:
+    def pressure_pa(self, thrust_n: Sequence[float], point_m: Vec3, blur_m: float = 0.0) -> float:
         """Return the mean dynamic pressure at a point in Pa.
 
         Args:
-            thrust_n: thrust of each rotor, in PX4's quad-x order.
-            point_m: position relative to the centre of the four rotors, body FLU.
+            thrust_n: thrust of each rotor, in PX4's order.
+            point_m: position relative to the point on the body's z axis at the height of the rotors, body FLU.
             blur_m: size of the area over which the pressure is averaged, as a standard deviation along x and y.
         """
         x, y, z = point_m
         if z >= 0.0:
             return 0.0
-        radius_m, spread_m, offset_m = self._radius_m, self._spread * z, self._offset_m
+        radius_m, spread_m = self._radius_m, self._spread * z
         depth = -z / radius_m
         developed = 0.5 + 0.5 * depth / math.sqrt(1.0 + depth * depth)
         area_m2 = math.pi * radius_m * radius_m * 0.5 / developed
         half_m = 0.5 * math.sqrt(area_m2)
         per_m = _ROOT_HALF / math.sqrt(spread_m * spread_m + blur_m * blur_m)
-        front, back = _smeared(x - offset_m, half_m, per_m), _smeared(x + offset_m, half_m, per_m)
-        left, right = _smeared(y - offset_m, half_m, per_m), _smeared(y + offset_m, half_m, per_m)
-        front_right_n, back_left_n, front_left_n, back_right_n = thrust_n
-        inside_n = front * (front_right_n * right + front_left_n * left)
-        inside_n += back * (back_left_n * left + back_right_n * right)
+        across = {to: _smeared(y - to, half_m, per_m) for to in self._across_m}
+        inside_n = 0.0
+        for to, row in self._rows:
+            inside_n += _smeared(x - to, half_m, per_m) * sum([thrust_n[i] * across[y_i] for i, y_i in row])
         return 0.5 * developed * inside_n / area_m2
 
 
@@ -85,7 +92,8 @@ class Downwash:
     ) -> None:
         model, data = world.model, world.data
         self._config, self._seed = config, seed
-        self._wakes = Wakes(rotor_offset_m(vehicle.airframe), rotor_radius_m, config.spread)
+        layout = vehicle.airframe.rotor_layout
+        self._wakes, self._height_m = Wakes(layout, rotor_radius_m, config.spread), layout.height_m
         self._radius_m = rotor_radius_m
         base = model.body("base").id
         self._base_position, self._base_axes = data.xpos[base], data.xmat[base]
@@ -153,13 +161,15 @@ class Downwash:
             k = area_m2 * speed * self._pressure_pa(thrust_n, origin, axes, (x, y, z), blur_m)
             world.loads.set(body, "downwash", (k * ux, k * uy, k * uz))
 
-    def _pressure_pa(self, thrust_n: Vec4, origin: list[float], axes: list[float], point: Vec3, blur_m: float) -> float:
+    def _pressure_pa(
+        self, thrust_n: Sequence[float], origin: list[float], axes: list[float], point: Vec3, blur_m: float
+    ) -> float:
         """Return the mean dynamic pressure in Pa at a point in the world frame; it falls to zero over the last rotor radius above
         the floor.
         """
         px, py, pz = point
         x, y, z = px - origin[0], py - origin[1], pz - origin[2]
         a, b, c, d, e, f, g, h, i = axes
-        body: Vec3 = (a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z - ROTOR_HEIGHT_M)
+        body: Vec3 = (a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z - self._height_m)
         near = min(1.0, max(0.0, pz / self._radius_m))
         return near * near * self._wakes.pressure_pa(thrust_n, body, blur_m)

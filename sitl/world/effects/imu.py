@@ -9,19 +9,17 @@ its thrust. A rotor with two blades shakes the body along the rotor's axis at tw
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_rotate
-from companion.model.types import Vec3, Vec4
+from companion.model.rotors import RotorLayout
+from companion.model.types import Vec3
 from companion.sitl_config.effects.imu import Imu
-from sitl.world.model import ROTORS
 
 _DRIFT_EVERY = 25
 """Number of samples between two updates of the drifts."""
 _STANDS = 0.01
 """Fraction of the hover thrust below which a rotor does not vibrate."""
-_APART = (-1.0, 1.0 / 3.0, -1.0 / 3.0, 1.0)
-"""Relative speed difference of each rotor, in units of `rotor_spread`."""
 
 
 class ImuErrors:
@@ -31,9 +29,10 @@ class ImuErrors:
         config: section `imu`.
         interval_s: time from one sample to the next.
         hover_n: thrust of one rotor in hover.
+        layout: layout of the rotors.
     """
 
-    def __init__(self, config: Imu, interval_s: float, hover_n: float) -> None:
+    def __init__(self, config: Imu, interval_s: float, hover_n: float, layout: RotorLayout) -> None:
         self._interval_s, self._hover_n = interval_s, hover_n
         roll, pitch, yaw = (math.radians(angle) for angle in config.mount_rpy_deg)
         to_board = quat_conjugate(quat_from_euler_zyx(roll, pitch, yaw))
@@ -49,36 +48,38 @@ class ImuErrors:
             fresh * config.accel_drift_m_s2,
             fresh * math.radians(config.gyro_drift_deg_s),
         )
+        each = 1.0 / math.sqrt(layout.count)
         self._accel_shake, self._gyro_shake = (
-            0.5 * config.vibration_m_s2,
-            0.5 * math.radians(config.gyro_vibration_deg_s),
+            each * config.vibration_m_s2,
+            each * math.radians(config.gyro_vibration_deg_s),
         )
+        self._mean = 1.0 / layout.count
         self._rectification = config.rectification_m_s2
         self._rotors = tuple(
-            (math.tau * config.vibration_hz * (1.0 + config.rotor_spread * apart), x, y, turn)
-            for apart, (x, y, turn) in zip(_APART, ROTORS, strict=True)
+            (math.tau * config.vibration_hz * (1.0 + config.rotor_spread * apart), x, y, -spin)
+            for apart, (x, y), spin in zip(_apart(layout.count), _levers(layout), layout.spins, strict=True)
         )
-        self._phases = [0.0, 1.0, 2.0, 3.0]
+        self._phases = [float(i) for i in range(layout.count)]
         self._noise: Iterator[Vec3] | None = None
         self._tick = 0
         self._accel_drift: Vec3 = (0.0, 0.0, 0.0)
         self._gyro_drift: Vec3 = (0.0, 0.0, 0.0)
 
     @classmethod
-    def of(cls, config: Imu, interval_s: float, hover_n: float) -> ImuErrors | None:
+    def of(cls, config: Imu, interval_s: float, hover_n: float, layout: RotorLayout) -> ImuErrors | None:
         """Return the errors, or None if the effect is off."""
-        return cls(config, interval_s, hover_n) if config.on else None
+        return cls(config, interval_s, hover_n, layout) if config.on else None
 
     def drift(self, noise: Iterator[Vec3]) -> None:
         """Start the drift of the biases at zero; `noise` yields triples of standard normal numbers."""
         self._noise, self._tick = noise, 0
         self._accel_drift = self._gyro_drift = (0.0, 0.0, 0.0)
 
-    def measure(self, thrust_n: Vec4, gyro_rad_s: Vec3, accel_m_s2: Vec3) -> tuple[Vec3, Vec3]:
+    def measure(self, thrust_n: Sequence[float], gyro_rad_s: Vec3, accel_m_s2: Vec3) -> tuple[Vec3, Vec3]:
         """Return the measured angular rate (rad/s) and specific force (m/s^2) in the axes of the autopilot board.
 
         Args:
-            thrust_n: thrust of each rotor, in PX4's quad-x order.
+            thrust_n: thrust of each rotor, in PX4's order.
             gyro_rad_s: angular rate, body frame (FLU).
             accel_m_s2: specific force, body frame (FLU).
         """
@@ -119,7 +120,7 @@ class ImuErrors:
             r += gyro_shake * left
             squares += share * share
         if squares:
-            squares *= 0.25
+            squares *= self._mean
             bx, by, bz = self._rectification
             ax, ay, az = ax + bx * squares, ay + by * squares, az + bz * squares
         return (p, q, r), (ax, ay, az)
@@ -131,3 +132,16 @@ class ImuErrors:
             keep * drift[1] + step * normal[1],
             keep * drift[2] + step * normal[2],
         )
+
+
+def _apart(count: int) -> list[float]:
+    """Return the relative speed difference of each rotor in units of `rotor_spread`: evenly spaced, neighbours far apart."""
+    steps = [*range(0, count, 2), *range(1, count, 2)]
+    return [(2 * step - (count - 1)) / (count - 1) for step in steps]
+
+
+def _levers(layout: RotorLayout) -> list[tuple[float, float]]:
+    """Return the rotors' positions along x and y in units of their root mean square, so that those of a quad-x are 1 and -1."""
+    squares = sum(x * x + y * y for x, y, _ in layout.positions_body_m)
+    unit_m = math.sqrt(squares / (2.0 * layout.count))
+    return [(round(x / unit_m, 12), round(y / unit_m, 12)) for x, y, _ in layout.positions_body_m]

@@ -1,8 +1,9 @@
 """Thrust of the true rotors: static curve, differences between rotors, lag, ground effect and drag.
 
 Sources: static curve of PX4's THR_MDL_FAC (`FunctionMotors::updateValues`); drag linear in thrust and airspeed (Faessler, Franchi,
-Scaramuzza, RA-L 2018); ground effect of four rotors (Sanchez-Cuevas, Heredia, Ollero, Int. J. Aerospace Eng. 2017; the equation for
-the quadrotor, which adds the images of the other rotors and the fountain below the body to Cheeseman and Bennett 1955).
+Scaramuzza, RA-L 2018); ground effect of several rotors (Sanchez-Cuevas, Heredia, Ollero, Int. J. Aerospace Eng. 2017; the equation for
+the quadrotor, which adds the images of the other rotors and the fountain below the body to Cheeseman and Bennett 1955, with the images
+of all other rotors, averaged over the rotors).
 """
 
 from __future__ import annotations
@@ -10,10 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from companion.model.types import Vec3, Vec4
+from companion.model.rotors import RotorLayout
+from companion.model.types import Vec3
 from companion.sitl_config.effects.rotors import Rotors as RotorsConfig
+from companion.sitl_config.effects.rotors import of_rotors
 from sitl.autopilot.cascade import motor_signal
 
+Thrusts = tuple[float, ...]
+"""Thrust of each rotor in N, in PX4's order."""
 LOWEST_RADII = 0.5
 """Height in rotor radii below which the ground effect is held constant; the formula is valid only above it."""
 
@@ -27,23 +32,19 @@ class LinearRotors:
     """Rotors with thrust linear in the motor signal and a single lag, used in a world in which the effect is off.
 
     Args:
+        count: number of rotors.
         lag_s: time constant of the thrust.
         dt_s: physics step.
     """
 
-    def __init__(self, lag_s: float, dt_s: float) -> None:
+    def __init__(self, count: int, lag_s: float, dt_s: float) -> None:
         self._gain = 1.0 - math.exp(-dt_s / lag_s)
-        self._thrust: Vec4 = (0.0, 0.0, 0.0, 0.0)
+        self._thrust: Thrusts = (0.0,) * count
 
-    def step(self, signals: Vec4, full_n: float) -> Vec4:
+    def step(self, signals: Sequence[float], full_n: float) -> Thrusts:
         """Advance by one physics step, like `Rotors.step`."""
-        k, (a, b, c, d), (to_a, to_b, to_c, to_d) = self._gain, self._thrust, signals
-        self._thrust = thrust = (
-            a + k * (to_a * full_n - a),
-            b + k * (to_b * full_n - b),
-            c + k * (to_c * full_n - c),
-            d + k * (to_d * full_n - d),
-        )
+        k = self._gain
+        self._thrust = thrust = tuple([a + k * (to * full_n - a) for a, to in zip(self._thrust, signals, strict=True)])
         return thrust
 
     def hover_command(self, each_n: float, full_n: float, thr_mdl_fac: float) -> float:
@@ -60,30 +61,31 @@ class LinearRotors:
 
 
 class Rotors:
-    """The four rotors, in PX4's quad-x order; call `step` once per physics step.
+    """The rotors, in PX4's order; call `step` once per physics step.
 
     Args:
         config: section `rotors`.
-        rotor_arm_m: distance from the centre to each rotor.
+        layout: layout of the rotors.
         dt_s: physics step.
     """
 
-    def __init__(self, config: RotorsConfig, rotor_arm_m: float, dt_s: float) -> None:
+    def __init__(self, config: RotorsConfig, layout: RotorLayout, dt_s: float) -> None:
         self._factor = config.thrust_curve
         self._up = 1.0 - math.exp(-dt_s / config.lag_up_s)
         self._down = 1.0 - math.exp(-dt_s / config.lag_down_s)
-        self._gain = tuple(1.0 + error for error in config.thrust_error)
+        self._gain = tuple(1.0 + error for error in of_rotors(config.thrust_error, layout.count))
         self._drag_s_m = config.drag_s_m
-        self._radius_m, self._body_lift, self._diagonal_m = config.radius_m, config.ground_body_lift, 2.0 * rotor_arm_m
-        self._root: Vec4 = (0.0, 0.0, 0.0, 0.0)
+        self._radius_m, self._diagonal_m = config.radius_m, 2.0 * layout.arm_m
+        self._images = _images(layout, config.ground_body_lift)
+        self._root = [0.0] * layout.count
         """Square root of each rotor's thrust in N^0.5, which is proportional to the rotor's speed."""
 
     @classmethod
-    def of(cls, config: RotorsConfig, rotor_arm_m: float, dt_s: float) -> Rotors | None:
+    def of(cls, config: RotorsConfig, layout: RotorLayout, dt_s: float) -> Rotors | None:
         """Return the rotors, or None if the effect is off."""
-        return cls(config, rotor_arm_m, dt_s) if config.on else None
+        return cls(config, layout, dt_s) if config.on else None
 
-    def step(self, signals: Vec4, full_n: float) -> Vec4:
+    def step(self, signals: Sequence[float], full_n: float) -> Thrusts:
         """Advance by one physics step and return the thrust of each rotor in N, without the ground effect.
 
         Args:
@@ -92,17 +94,12 @@ class Rotors:
         """
         f, up, down = self._factor, self._up, self._down
         linear = 1.0 - f
-        (a, b, c, d), (ga, gb, gc, gd), (sa, sb, sc, sd) = self._root, self._gain, signals
-        a_to = math.sqrt(ga * full_n * sa * (f * sa + linear))
-        b_to = math.sqrt(gb * full_n * sb * (f * sb + linear))
-        c_to = math.sqrt(gc * full_n * sc * (f * sc + linear))
-        d_to = math.sqrt(gd * full_n * sd * (f * sd + linear))
-        a += (up if a_to > a else down) * (a_to - a)
-        b += (up if b_to > b else down) * (b_to - b)
-        c += (up if c_to > c else down) * (c_to - c)
-        d += (up if d_to > d else down) * (d_to - d)
-        self._root = (a, b, c, d)
-        return (a * a, b * b, c * c, d * d)
+        root = math.sqrt
+        self._root = roots = [
+            a + (up if (to := root(gain * full_n * s * (f * s + linear))) > a else down) * (to - a)
+            for a, gain, s in zip(self._root, self._gain, signals, strict=True)
+        ]
+        return tuple([a * a for a in roots])
 
     def hover_command(self, each_n: float, full_n: float, thr_mdl_fac: float) -> float:
         """Return PX4's collective thrust setpoint, 0 to 1, at which each rotor produces `each_n` far from the ground.
@@ -113,17 +110,18 @@ class Rotors:
             thr_mdl_fac: PX4's THR_MDL_FAC.
         """
         signals = (motor_signal(each_n / (gain * full_n), self._factor) for gain in self._gain)
-        return sum(curve(signal, thr_mdl_fac) for signal in signals) / 4.0
+        return sum(curve(signal, thr_mdl_fac) for signal in signals) / len(self._gain)
 
     def ground_effect(self, height_m: float) -> float:
         """Return the factor by which the ground effect multiplies the thrust of all rotors at a height above the floor."""
         radius_m, diagonal_m = self._radius_m, self._diagonal_m
         z = max(height_m, LOWEST_RADII * radius_m)
         r2, b2, z4 = radius_m * radius_m, diagonal_m * diagonal_m, 4.0 * z * z
-        beside2 = 0.5 * b2 + z4
-        across2 = b2 + z4
-        beside, across = beside2 * math.sqrt(beside2), across2 * math.sqrt(across2)
-        return 1.0 / (1.0 - r2 * (0.25 / z4 + z / beside + (0.5 + 2.0 * self._body_lift) * z / across))
+        gain = 0.25 / z4
+        for weight, square in self._images:
+            distance2 = square * b2 + z4
+            gain += weight * z / (distance2 * math.sqrt(distance2))
+        return 1.0 / (1.0 - r2 * gain)
 
     def drag_n(self, thrust_n: float, airspeed_m_s: Vec3, q: Sequence[float]) -> Vec3:
         """Return the drag of all rotors in N, world frame; it acts along the component of the relative air velocity across the rotor
@@ -140,3 +138,21 @@ class Rotors:
         ux, uy, uz = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)
         along = vx * ux + vy * uy + vz * uz
         return (k * (vx - along * ux), k * (vy - along * uy), k * (vz - along * uz))
+
+
+def _images(layout: RotorLayout, body_lift: float) -> tuple[tuple[float, float], ...]:
+    """Return the weight of the rotors' images at each distance, and the square of that distance as a fraction of the diagonal's.
+
+    Each rotor has the images of all others, with a weight of 0.5 each; the weights are means over the rotors. The fountain below the
+    body acts at the diagonal.
+    """
+    diagonal2 = (2.0 * layout.arm_m) ** 2
+    weights = {1.0: 0.0}
+    for i, (x, y, _) in enumerate(layout.positions_body_m):
+        for j, (other_x, other_y, _) in enumerate(layout.positions_body_m):
+            if i != j:
+                square = round(((x - other_x) ** 2 + (y - other_y) ** 2) / diagonal2, 12)
+                weights[square] = weights.get(square, 0.0) + 0.5
+    weights = {square: weight / layout.count for square, weight in weights.items()}
+    weights[1.0] += 2.0 * body_lift
+    return tuple((weight, square) for square, weight in sorted(weights.items()))

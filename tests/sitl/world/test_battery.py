@@ -22,13 +22,13 @@ HOVER: Vec4 = (WEIGHT_N / 4.0,) * 4
 
 
 def pack(start: float = 1.0, life_s: float = 900.0, **changes: Any) -> BatteryPack:
-    made = BatteryPack.of(BatteryConfig(on=True, **changes), start, life_s, WEIGHT_N)
+    made = BatteryPack.of(BatteryConfig(on=True, **changes), start, life_s, WEIGHT_N, 4)
     assert made is not None
     return made
 
 
 def test_battery_that_is_off_is_none() -> None:
-    assert BatteryPack.of(BatteryConfig(), 1.0, 900.0, WEIGHT_N) is None
+    assert BatteryPack.of(BatteryConfig(), 1.0, 900.0, WEIGHT_N, 4) is None
 
 
 def test_open_circuit_voltage_falls_from_full_to_empty() -> None:

@@ -10,16 +10,17 @@ import numpy as np
 import pytest
 
 from companion.config.vehicle import Vehicle
+from companion.model.rotors import standard_layout
 from companion.sitl_config.effects.downwash import Downwash as DownwashConfig
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.downwash import Downwash, Wakes
-from sitl.world.model import ROTOR_HEIGHT_M, ROTORS, rotor_offset_m
 from sitl.world.world import World
 from tests.support import CATCH
 
 VEHICLE = load_sitl(CATCH).vehicle
-OFFSET_M = rotor_offset_m(VEHICLE.airframe)
+LAYOUT = VEHICLE.airframe.rotor_layout
+OFFSET_M, _, ROTOR_HEIGHT_M = LAYOUT.positions_body_m[2]
 RADIUS_M = 0.165
 DISK_M2 = math.pi * RADIUS_M**2
 THRUST_N = 7.5
@@ -29,8 +30,8 @@ SHARP = 1e-4
 
 
 def below_rotor(depth_m: float) -> tuple[float, float, float]:
-    x, y, _ = ROTORS[0]
-    return (x * OFFSET_M, y * OFFSET_M, -depth_m)
+    x, y, _ = LAYOUT.positions_body_m[0]
+    return (x, y, -depth_m)
 
 
 def developed(depth_m: float) -> float:
@@ -39,7 +40,7 @@ def developed(depth_m: float) -> float:
 
 
 def test_the_velocity_is_the_induced_one_in_the_disk_and_twice_as_much_far_below() -> None:
-    wakes = Wakes(OFFSET_M, RADIUS_M, SHARP)
+    wakes = Wakes(LAYOUT, RADIUS_M, SHARP)
     rho = 1.2
     induced_m_s = math.sqrt(THRUST_N / (2.0 * rho * DISK_M2))
     for depth_m, velocity_m_s in ((1e-6, induced_m_s), (100 * RADIUS_M, 2.0 * induced_m_s)):
@@ -51,33 +52,42 @@ def test_the_velocity_is_the_induced_one_in_the_disk_and_twice_as_much_far_below
 @pytest.mark.parametrize("depth_m", [0.3, 1.5])
 def test_smearing_keeps_the_momentum(spread: float, depth_m: float) -> None:
     """The flow of momentum through a plane, the integral of twice the dynamic pressure, is the thrust times the development."""
-    wakes, thrust_n = Wakes(OFFSET_M, RADIUS_M, spread), (5.0, 6.0, 7.0, 8.0)
+    wakes, thrust_n = Wakes(LAYOUT, RADIUS_M, spread), (5.0, 6.0, 7.0, 8.0)
     half_m, step_m = OFFSET_M + 0.2 + 4.0 * spread * depth_m, 0.025
     places = np.arange(-half_m, half_m, step_m)
     flow_n = 2.0 * step_m**2 * sum(wakes.pressure_pa(thrust_n, (x, y, -depth_m)) for x in places for y in places)
     assert flow_n == pytest.approx(sum(thrust_n) * developed(depth_m), rel=0.01)
 
 
+def test_every_wake_of_an_octocopter_is_below_its_own_rotor() -> None:
+    layout = standard_layout("octa_x", 0.5, 0.0)
+    wakes = Wakes(layout, 0.1, SHARP)
+    for number in range(8):
+        thrust_n = [float(i == number) for i in range(8)]
+        found = [wakes.pressure_pa(thrust_n, (x, y, -0.05)) > 0.0 for x, y, _ in layout.positions_body_m]
+        assert found == [i == number for i in range(8)]
+
+
 def test_the_four_wakes_are_one_jet_where_the_spread_is_the_rotors_distance_from_the_planes() -> None:
     spread = 0.2
     depth_m = OFFSET_M / spread
-    wakes = Wakes(OFFSET_M, RADIUS_M, spread)
+    wakes = Wakes(LAYOUT, RADIUS_M, spread)
     assert wakes.pressure_pa(FOUR_N, (0.0, 0.0, -depth_m)) > wakes.pressure_pa(FOUR_N, below_rotor(depth_m))
     assert wakes.pressure_pa(FOUR_N, (0.0, 0.0, -0.4 * depth_m)) < wakes.pressure_pa(FOUR_N, below_rotor(0.4 * depth_m))
 
 
 def test_each_thrust_drives_the_wake_below_its_own_rotor() -> None:
-    wakes = Wakes(OFFSET_M, RADIUS_M, SHARP)
-    for number, (x, y, _) in enumerate(ROTORS):
+    wakes = Wakes(LAYOUT, RADIUS_M, SHARP)
+    for number, (x, y, _) in enumerate(LAYOUT.positions_body_m):
         thrust_n = (float(number == 0), float(number == 1), float(number == 2), float(number == 3))
-        for other, (x2, y2, _) in enumerate(ROTORS):
-            assert bool(wakes.pressure_pa(thrust_n, (x2 * OFFSET_M, y2 * OFFSET_M, -0.1))) == (number == other), (x, y)
+        for other, (x2, y2, _) in enumerate(LAYOUT.positions_body_m):
+            assert bool(wakes.pressure_pa(thrust_n, (x2, y2, -0.1))) == (number == other), (x, y)
 
 
 def under_rotor(arm_rad: tuple[float, float], **settings: Any) -> World:
     """A level world at 2 m whose arm is mounted below the front right rotor, with a sharp and steady wake."""
-    x, y, _ = ROTORS[0]
-    arm = VEHICLE.arm.model_copy(update={"shoulder_body_m": (x * OFFSET_M - 0.1, y * OFFSET_M, -0.07)})
+    x, y, _ = LAYOUT.positions_body_m[0]
+    arm = VEHICLE.arm.model_copy(update={"shoulder_body_m": (x - 0.1, y, -0.07)})
     return hovering(VEHICLE.model_copy(update={"arm": arm}), arm_rad, **{"spread": SHARP, **settings})
 
 
@@ -141,8 +151,8 @@ def test_the_force_sensor_reads_the_wake_on_net_and_payload() -> None:
 def test_a_payload_in_the_wake_feels_the_drag_of_a_sphere() -> None:
     world = under_rotor((0.0, 0.0))
     ball = world.model.joint("payload").qposadr[0]
-    x, y, _ = ROTORS[0]
-    world.data.qpos[ball : ball + 3] = (x * OFFSET_M, y * OFFSET_M, 2.0 + ROTOR_HEIGHT_M - 0.1)
+    x, y, _ = LAYOUT.positions_body_m[0]
+    world.data.qpos[ball : ball + 3] = (x, y, 2.0 + ROTOR_HEIGHT_M - 0.1)
     mujoco.mj_forward(world.model, world.data)
     act(world)
     drag_n = 0.47 * math.pi * 0.035**2 * THRUST_N / DISK_M2 * developed(0.1) ** 2

@@ -124,7 +124,13 @@ def test_every_reading_in_the_fast_loop_is_a_whole_number_of_counts() -> None:
 def quiet(*overrides: str) -> Plant:
     config = load_sitl(SHORT_CATCH, overrides=("world.force_noise_n=0", "world.force_bias_n=[0,0,0]", *overrides))
     drives = (ServoDrive(), ServoDrive())
-    return Plant(config.vehicle, config.world, stub_of(config.world), drives, ((0.0, 0.0), 0.0, (1.5, 1.5)))
+    return Plant(
+        config.vehicle,
+        config.world,
+        stub_of(config.world, config.vehicle.airframe),
+        drives,
+        ((0.0, 0.0), 0.0, (1.5, 1.5)),
+    )
 
 
 def test_the_scale_multiplies_what_both_loops_read() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from companion.model.rotors import standard_layout
 from companion.model.types import Vec3, Vec4
 from companion.sitl_config.effects.imu import Imu
 from companion.sitl_config.loader import load_sitl
@@ -20,6 +21,7 @@ from sitl.world.plant import Plant
 from tests.support import CATCH
 
 G = 9.81
+LAYOUT = standard_layout("quad_x", 0.325, 0.03)
 NOTHING: dict[str, Any] = {
     "accel_bias_m_s2": (0.0, 0.0, 0.0),
     "accel_drift_m_s2": 0.0,
@@ -37,13 +39,13 @@ STOPPED: Vec4 = (0.0, 0.0, 0.0, 0.0)
 
 
 def errors(interval_s: float = 0.004, **settings: Any) -> ImuErrors:
-    found = ImuErrors.of(Imu(on=True, **{**NOTHING, **settings}), interval_s, 1.0)
+    found = ImuErrors.of(Imu(on=True, **{**NOTHING, **settings}), interval_s, 1.0, LAYOUT)
     assert found is not None
     return found
 
 
 def test_off_is_nothing() -> None:
-    assert ImuErrors.of(Imu(), 0.004, 1.0) is None
+    assert ImuErrors.of(Imu(), 0.004, 1.0, LAYOUT) is None
 
 
 def test_biases_appear_in_px4s_axes() -> None:

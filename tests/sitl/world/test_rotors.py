@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from companion.model.rotors import standard_layout
 from companion.model.types import Vec4
 from companion.sitl_config.effects.rotors import Rotors as RotorsConfig
 from companion.sitl_config.loader import load_sitl
@@ -16,26 +17,26 @@ from sitl.autopilot.cascade import motor_signal
 from sitl.fast.loop import FastFlight
 from sitl.px4.parameters import parameters
 from sitl.world.effects.rotors import LOWEST_RADII, Rotors
-from sitl.world.model import ROTOR_HEIGHT_M
 from sitl.world.world import PHYSICS_DT_S, World
 from tests.support import CATCH
 
 VEHICLE = load_sitl(CATCH).vehicle
 ARM_M = VEHICLE.airframe.rotor_arm_m
+LAYOUT = VEHICLE.airframe.rotor_layout
 FULL_N = 15.0
 HALF: Vec4 = (0.5, 0.5, 0.5, 0.5)
 ALIKE = {"thrust_error": (0.0, 0.0, 0.0, 0.0), "yaw_torque_error": (0.0, 0.0, 0.0, 0.0)}
 
 
 def rotors(**changes: Any) -> Rotors:
-    made = Rotors.of(RotorsConfig(on=True, **changes), ARM_M, PHYSICS_DT_S)
+    made = Rotors.of(RotorsConfig(on=True, **changes), LAYOUT, PHYSICS_DT_S)
     assert made is not None
     return made
 
 
-def run(effect: Rotors, signals: Vec4, time_s: float) -> Vec4:
+def run(effect: Rotors, signals: Vec4, time_s: float) -> tuple[float, ...]:
     """Thrusts after this time."""
-    thrust: Vec4 = (0.0, 0.0, 0.0, 0.0)
+    thrust: tuple[float, ...] = ()
     for _ in range(round(time_s / PHYSICS_DT_S)):
         thrust = effect.step(signals, FULL_N)
     return thrust
@@ -46,7 +47,7 @@ def standing(**sections: Any) -> World:
 
 
 def test_rotors_that_are_off_are_none() -> None:
-    assert Rotors.of(RotorsConfig(), ARM_M, PHYSICS_DT_S) is None
+    assert Rotors.of(RotorsConfig(), LAYOUT, PHYSICS_DT_S) is None
 
 
 def test_settled_thrust_is_the_curve_times_each_rotors_own_gain() -> None:
@@ -69,7 +70,7 @@ def test_rotor_speed_rises_and_falls_with_its_own_time_constant() -> None:
 
 def test_ground_effect_of_rotors_far_apart_is_that_of_cheeseman_and_bennett() -> None:
     radius_m = 0.165
-    effect = Rotors(RotorsConfig(on=True, radius_m=radius_m), 1e4, PHYSICS_DT_S)
+    effect = Rotors(RotorsConfig(on=True, radius_m=radius_m), standard_layout("quad_x", 1e4, 0.0), PHYSICS_DT_S)
     for height_m in (0.1, 0.2, 0.4, 1.0):
         assert effect.ground_effect(height_m) == pytest.approx(1.0 / (1.0 - (radius_m / (4.0 * height_m)) ** 2))
 
@@ -84,6 +85,16 @@ def test_ground_effect_of_four_rotors(height_m: float) -> None:
     body = 2.0 * r**2 * z / (across**2 + 4.0 * z**2) ** 1.5 * 2.0
     found = rotors(radius_m=r, ground_body_lift=2.0).ground_effect(height_m)
     assert found == pytest.approx(1.0 / (1.0 - one - neighbours - opposite - body))
+
+
+def test_ground_effect_of_six_rotors_has_the_images_of_the_five_others() -> None:
+    r, z, arm_m = 0.165, 0.33, 0.34
+    distances_m = [arm_m, arm_m, math.sqrt(3.0) * arm_m, math.sqrt(3.0) * arm_m, 2.0 * arm_m]
+    images = sum(0.5 * r**2 * z / (distance_m**2 + 4.0 * z**2) ** 1.5 for distance_m in distances_m)
+    effect = Rotors(
+        RotorsConfig(on=True, radius_m=r, ground_body_lift=0.0), standard_layout("hexa_plus", arm_m, 0.0), PHYSICS_DT_S
+    )
+    assert effect.ground_effect(z) == pytest.approx(1.0 / (1.0 - (r / (4.0 * z)) ** 2 - images))
 
 
 def test_ground_effect_is_capped_near_the_floor_and_fades_with_height() -> None:
@@ -103,20 +114,23 @@ def test_drag_opposes_the_airspeed_across_the_rotor_axis() -> None:
 
 def test_autopilot_assumes_its_own_curve_whether_it_is_the_stub_or_px4() -> None:
     config = WorldConfig.model_validate({"rotors": {"on": True, "thr_mdl_fac": 0.25}})
-    for found in (stub_of(config).params.real("THR_MDL_FAC"), parameters(VEHICLE.airframe, config, 0.5)["THR_MDL_FAC"]):
+    for found in (
+        stub_of(config, VEHICLE.airframe).params.real("THR_MDL_FAC"),
+        parameters(VEHICLE.airframe, config, 0.5)["THR_MDL_FAC"],
+    ):
         assert found == 0.25
     for command in (0.0, 0.3, 1.0):
         signal = motor_signal(command, 0.25)
         assert 0.25 * signal**2 + 0.75 * signal == pytest.approx(command)
         assert motor_signal(command, 0.0) == command
-    assert stub_of(WorldConfig()).params.real("THR_MDL_FAC") == 0.0
+    assert stub_of(WorldConfig(), VEHICLE.airframe).params.real("THR_MDL_FAC") == 0.0
 
 
 def test_hover_command_is_the_setpoint_that_carries_the_weight() -> None:
     world = standing(rotors={"on": True, "thrust_error": (0.03, 0.03, 0.03, 0.03)})
     signal = motor_signal(world.hover_command, 0.3)
     for _ in range(200):
-        near = rotors().ground_effect(world.q[2] + ROTOR_HEIGHT_M)
+        near = rotors().ground_effect(world.q[2] + LAYOUT.height_m)
         world.step((signal,) * 4, (0.0, 0.0))
     assert sum(world.data.ctrl[0:4]) == pytest.approx(world.weight_n * near, rel=2e-3)
 
