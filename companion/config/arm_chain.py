@@ -3,45 +3,69 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
-from companion.config.vehicle import Vehicle
+from companion.config.vehicle import Arm, Vehicle
 from companion.model.arm_chain import TOOL_PART_INERTIA_KG_M2, ArmChain, ChainLink, rod_inertia_kg_m2
-from companion.model.frames import quat_from_euler_zyx
+from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 
 
 def chain_of(vehicle: Vehicle) -> ArmChain:
-    """Return the chain of the vehicle's arm and tool, payload excluded.
-
-    Every link is a rod along the x axis of its frame, at angle 0 in line with the link before. The first joint turns about +y and the
-    others about -y.
-    """
+    """Return the chain of the vehicle's arm and tool, payload excluded."""
     arm, tool = vehicle.arm, vehicle.tool
-    links: list[ChainLink] = []
-    position: Vec3 = arm.shoulder_body_m
-    for length_m, mass_kg, com_m in zip(arm.link_lengths_m, arm.link_masses_kg, arm.link_com_m, strict=True):
-        xx, yy, zz = rod_inertia_kg_m2(mass_kg, length_m)
-        links.append(
-            ChainLink(
-                position_m=position,
-                attitude_wxyz=IDENTITY_QUAT,
-                axis=(0.0, -1.0 if links else 1.0, 0.0),
-                mass_kg=mass_kg,
-                com_m=(com_m, 0.0, 0.0),
-                inertia_kg_m2=((xx, 0.0, 0.0), (0.0, yy, 0.0), (0.0, 0.0, zz)),
-                armature_kg_m2=arm.joint_armature_kg_m2,
-            )
-        )
-        position = (length_m, 0.0, 0.0)
-    if not links:
+    if not arm.joints:
         return ArmChain(())
+    sensor = _attitude(tool.sensor_rpy_deg) if tool is not None else IDENTITY_QUAT
+    tip = _attitude(arm.tip_rpy_deg) if arm.links else IDENTITY_QUAT
     return ArmChain(
-        links=tuple(links),
-        tip_m=position,
-        sensor_wxyz=_attitude(tool.sensor_rpy_deg) if tool is not None else IDENTITY_QUAT,
+        links=tuple(_bodies(arm) if arm.links else _rods(arm)),
+        tip_m=arm.tip_m if arm.links else (arm.link_lengths_m[-1], 0.0, 0.0),
+        tip_wxyz=tip,
+        sensor_wxyz=quat_multiply(tip, sensor),
         tool_mass_kg=vehicle.tool_mass_kg,
         tool_inertia_kg_m2=2.0 * TOOL_PART_INERTIA_KG_M2 if tool is not None else 0.0,
     )
+
+
+def _bodies(arm: Arm) -> Iterator[ChainLink]:
+    for link in arm.links:
+        xx, yy, zz, xy, xz, yz = link.inertia_kg_m2
+        yield ChainLink(
+            position_m=link.origin_m,
+            attitude_wxyz=_attitude(link.origin_rpy_deg),
+            axis=_unit(link.axis),
+            mass_kg=link.mass_kg,
+            com_m=link.com_m,
+            inertia_kg_m2=((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)),
+            armature_kg_m2=arm.joint_armature_kg_m2,
+        )
+
+
+def _rods(arm: Arm) -> Iterator[ChainLink]:
+    """Yield rods along x, in line with each other at angle 0. Unless an axis is given, the first joint turns about +y, and the others
+    turn about -y.
+    """
+    position: Vec3 = arm.shoulder_body_m
+    usual: Vec3 = (0.0, 1.0, 0.0)
+    rods = zip(arm.joints, arm.link_lengths_m, arm.link_masses_kg, arm.link_com_m, strict=True)
+    for joint, length_m, mass_kg, com_m in rods:
+        xx, yy, zz = rod_inertia_kg_m2(mass_kg, length_m)
+        yield ChainLink(
+            position_m=position,
+            attitude_wxyz=IDENTITY_QUAT,
+            axis=usual if joint.axis is None else _unit(joint.axis),
+            mass_kg=mass_kg,
+            com_m=(com_m, 0.0, 0.0),
+            inertia_kg_m2=((xx, 0.0, 0.0), (0.0, yy, 0.0), (0.0, 0.0, zz)),
+            armature_kg_m2=arm.joint_armature_kg_m2,
+        )
+        position, usual = (length_m, 0.0, 0.0), (0.0, -1.0, 0.0)
+
+
+def _unit(axis: Vec3) -> Vec3:
+    norm = math.hypot(*axis)
+    return (axis[0] / norm, axis[1] / norm, axis[2] / norm)
 
 
 def _attitude(rpy_deg: Vec3) -> Quat:

@@ -58,6 +58,16 @@ PositivePerJoint = Annotated[tuple[Positive, ...], Field(max_length=JOINTS_MAX)]
 Span = Annotated[Vector2, AfterValidator(_ordered)]
 
 
+def _direction(axis: Vector3) -> Vector3:
+    if not sum(value * value for value in axis) > 1e-12:
+        raise ValueError(f"expected a direction, got {list(axis)}")
+    return axis
+
+
+Axis = Annotated[Vector3, AfterValidator(_direction)]
+"""Direction of any length."""
+
+
 class OrElse:
     """Annotation that adds an alternative to a field's JSON Schema, for a value that is replaced before the field is validated."""
 

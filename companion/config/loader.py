@@ -29,6 +29,7 @@ from companion.config.explain import nearest, validate
 from companion.config.mission import ControllerChoice, Mission
 from companion.config.overrides import Override, Section, apply_overrides, parse_overrides
 from companion.config.shipped import named_file, near
+from companion.config.urdf import read_urdf
 from companion.config.vehicle import ANY_INTERFACE, NO_ARM, Vehicle
 from companion.config.yaml_strict import read_document
 
@@ -179,7 +180,28 @@ def check_document(
         _move_keys(document)
         if document.data.get("arm", NO_ARM) is None:
             document.replace(("arm",), copy.deepcopy(NO_ARM), document.origin(("arm",)))
+        _read_urdf(document)
     return _validated(model, document, lines)
+
+
+def _read_urdf(document: Document) -> None:
+    """Replace the name of a URDF file in a vehicle file by the file's links; the name stays, to be shown and logged."""
+    location: Location = ("arm", "urdf")
+    name, base, tip = (_value(document, ("arm", key)) for key in ("urdf", "urdf_base", "urdf_tip"))
+    if not isinstance(name, str) or not isinstance(base, str | None) or not isinstance(tip, str | None):
+        return  # not given, or not text: the check of the vehicle reports it
+    origin = document.origin(location)
+    if _value(document, ("arm", "links")) is not None:
+        document.problems.append(Problem(RANK_VALUE, origin, "arm.urdf: expected urdf or links, got both"))
+        return
+    folder = Path(document.source).parent if origin.line else Path()
+    try:
+        arm = read_urdf(Path(os.path.normpath(folder / name)), base, tip)
+    except ConfigError as error:
+        document.problems += [Problem(RANK_VALUE, origin, f"arm.urdf: {line}") for line in error.lines]
+        return
+    for key, value in arm.items():
+        document.replace(("arm", key), value, origin)
 
 
 def _move_keys(document: Document) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Annotated, Literal, Self
 
@@ -10,6 +11,7 @@ from pydantic import Field, JsonValue, model_validator
 from companion.config.airframe import Airframe
 from companion.config.base import (
     JOINTS_MAX,
+    Axis,
     Fraction,
     Location,
     Model,
@@ -25,6 +27,7 @@ from companion.config.base import (
 from companion.config.computer import Computer
 from companion.config.ground import Ground
 from companion.config.mocap import NATNET
+from companion.model.arm_chain import is_physical_inertia
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Joints
 
@@ -44,20 +47,65 @@ class Joint(Model):
     """Lower and upper joint limit."""
     torque_max_nm: Annotated[float, Field(gt=0, le=3.0)]
     velocity_max_deg_s: Positive = 300.0
+    axis: Axis | None = None
+    """Direction of the axis in the link's frame, for arms without `links`. If it is absent, the first joint turns about +y and the
+    others about -y.
+    """
+
+
+class Link(Model):
+    """A link in the general description of an arm. Its frame lies on its joint's axis and turns with it."""
+
+    origin_m: Vector3
+    """Position of the joint in the frame of the link before or, for the first link, in the body frame."""
+    origin_rpy_deg: Vector3 = (0.0, 0.0, 0.0)
+    """Attitude of the link's frame at joint angle 0, in the same frame: roll, pitch, yaw (ZYX)."""
+    axis: Axis
+    """Direction of the joint's axis in the link's frame, of any length; positive angles turn by the right-hand rule."""
+    mass_kg: Positive
+    com_m: Vector3
+    """Centre of mass in the link's frame."""
+    inertia_kg_m2: tuple[Positive, Positive, Positive, float, float, float]
+    """Elements xx, yy, zz, xy, xz, yz of the inertia about the centre of mass, in the axes of the link's frame."""
+
+    @model_validator(mode="after")
+    def _rigid(self) -> Self:
+        xx, yy, zz, xy, xz, yz = self.inertia_kg_m2
+        if not is_physical_inertia(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))):
+            text = "expected the inertia of a rigid body (no principal moment above the sum of the other two)"
+            refuse("link", [(("inertia_kg_m2",), text)])
+        return self
 
 
 class Arm(Model):
-    """A serial arm of up to 7 joints. Link 1 begins at the shoulder; the last link carries sensor and net."""
+    """A serial arm of up to 7 joints; the last link carries sensor and net.
 
-    shoulder_body_m: Vector3
-    link_lengths_m: PositivePerJoint
+    The links are rods along the x axes of their frames, in line with each other at angle 0 (`shoulder_body_m`, `link_lengths_m`,
+    `link_masses_kg`, `link_com_m`), or any bodies (`links`, `tip_m`), or those of a URDF file (`urdf`).
+    """
+
+    shoulder_body_m: Vector3 = (0.0, 0.0, 0.0)
+    """Position of the first joint."""
+    link_lengths_m: PositivePerJoint = ()
     """Length of each link, from its joint to the next one; of the last link, to the centre of the net or, without a tool, to the link's
     end.
     """
-    link_masses_kg: PositivePerJoint
+    link_masses_kg: PositivePerJoint = ()
     """Mass of each link with the servo of the next joint; of the last link, without sensor and net."""
-    link_com_m: PositivePerJoint
+    link_com_m: PositivePerJoint = ()
     """Distance of each link's centre of mass from its joint."""
+    links: Annotated[tuple[Link, ...], Field(max_length=JOINTS_MAX)] = ()
+    """Links of an arm of any shape, in place of the four keys above; the mass of sensor and net is that of `tool`."""
+    tip_m: Vector3 = (0.0, 0.0, 0.0)
+    """Centre of the net or, without a tool, end of the arm, in the frame of the last of `links`."""
+    tip_rpy_deg: Vector3 = (0.0, 0.0, 0.0)
+    """Attitude of the tip's frame, whose x axis points outwards, in the frame of the last of `links`: roll, pitch, yaw (ZYX)."""
+    urdf: str | None = None
+    """URDF file, relative to the vehicle file, from which `links`, `tip_m` and `tip_rpy_deg` are read (docs/arms.md)."""
+    urdf_base: str | None = None
+    """Name of the URDF's link that is the vehicle's body. If it is absent, the link that is no joint's child is used."""
+    urdf_tip: str | None = None
+    """Name of the URDF's link whose frame is the tip. If it is absent, the only link that ends the chain is used."""
     torque_per_amp_nm_a: Positive = 1.3
     joint_armature_kg_m2: NonNegative = 0.008
     """Inertia of a servo's rotor and gears, referred to the joint; used by the model-based laws and the simulated arm."""
@@ -73,9 +121,17 @@ class Arm(Model):
     def _one_value_per_joint(self) -> Self:
         problems: list[tuple[Location, str]] = []
         count = len(self.joints)
-        lists: dict[Location, Joints] = {
-            (key,): getattr(self, key) for key in ("link_lengths_m", "link_masses_kg", "link_com_m")
-        }
+        rods = ("link_lengths_m", "link_masses_kg", "link_com_m")
+        if self.links:
+            if len(self.links) != count:
+                text = f"expected {count} links, one for each of arm.joints, got {len(self.links)}"
+                problems.append((("links",), text))
+            problems += [((key,), "must be absent, because arm.links is given") for key in rods if getattr(self, key)]
+            given = [index for index, joint in enumerate(self.joints) if joint.axis is not None]
+            problems += [(("joints", index, "axis"), "must be absent; arm.links has the axes") for index in given]
+        # Without links, the loader could not read the URDF and reports that.
+        others = bool(self.links) or self.urdf is not None
+        lists: dict[Location, Joints] = {} if others else {(key,): getattr(self, key) for key in rods}
         lists |= {("poses", name): angles_deg for name, angles_deg in self.poses.items()}
         for location, values in lists.items():
             if len(values) != count:
@@ -90,6 +146,23 @@ class Arm(Model):
                     break
         refuse("arm", problems)
         return self
+
+    @property
+    def mass_kg(self) -> float:
+        """Mass of all links, without sensor and net."""
+        return sum(link.mass_kg for link in self.links) if self.links else sum(self.link_masses_kg)
+
+    @property
+    def first_joint_body_m(self) -> Vector3:
+        """Position of the first joint in the body frame."""
+        return self.links[0].origin_m if self.links else self.shoulder_body_m
+
+    @property
+    def reach_m(self) -> float:
+        """Largest possible distance of the tip from the first joint."""
+        if not self.links:
+            return sum(self.link_lengths_m)
+        return sum(math.hypot(*link.origin_m) for link in self.links[1:]) + math.hypot(*self.tip_m)
 
 
 NO_ARM: dict[str, JsonValue] = {
@@ -446,7 +519,7 @@ class Vehicle(Model):
                 else "must be null, because arm is null"
             )
             problems.append((("devices", "arm"), text))
-        carried_kg = sum(self.arm.link_masses_kg) + self.tool_mass_kg
+        carried_kg = self.arm.mass_kg + self.tool_mass_kg
         if carried_kg >= self.airframe.mass_kg:
             text = f"{self.airframe.mass_kg:g} kg is the mass of the whole vehicle, but arm and tool alone have {carried_kg:g} kg"
             problems.append((("airframe", "mass_kg"), text))

@@ -18,10 +18,10 @@ from typing import ClassVar
 from companion.config.controller import CscConfig
 from companion.config.vehicle import Vehicle
 from companion.control.common import tracking_errors
-from companion.control.dynamics import chi_rate_from_body_rate, rotation_matrix
+from companion.control.dynamics import chi_rate_from_body_rate
 from companion.control.model_based import ModelBasedLaw
 from companion.control.types import PlantState, Wrench
-from companion.model.frames import euler_zyx_from_quat, yaw_from_quat
+from companion.model.frames import euler_zyx_from_quat, rotation_matrix, yaw_from_quat
 from companion.model.types import Chi, Reference, Vec3
 
 

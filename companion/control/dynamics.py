@@ -14,7 +14,7 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from companion.model.types import Chi, Joints, Mat3, Matrix, Quat, Vec3
+from companion.model.types import Chi, Joints, Mat3, Matrix, Vec3
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,16 +65,6 @@ def chi_rate_from_body_rate(roll_pitch_yaw_rad: Vec3, rate_body_rad_s: Vec3) -> 
     s, c = math.sin(roll), math.cos(roll)
     yaw_rate = (s * y + c * z) / math.cos(pitch)
     return (x + math.sin(pitch) * yaw_rate, c * y - s * z, yaw_rate)
-
-
-def rotation_matrix(attitude_wxyz: Quat) -> Mat3:
-    """Return the body-to-world rotation matrix of a unit quaternion."""
-    w, x, y, z = attitude_wxyz
-    return (
-        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-    )
 
 
 def euler_rate_matrices(rpy: Vec3, chi_rate: Chi) -> tuple[Mat3, Mat3]:

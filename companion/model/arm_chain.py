@@ -15,7 +15,6 @@ ROD_AXIAL_KG_M2 = 1e-5
 """Inertia of a rod about its own axis: a fraction of the transverse inertia plus this constant."""
 TOOL_PART_INERTIA_KG_M2 = 1e-4
 """Inertia of the sensor and of the net about any axis, kg m^2."""
-JOINTS_MAX = 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,3 +57,20 @@ def rod_inertia_kg_m2(mass_kg: float, length_m: float) -> Vec3:
     """Return the moments of inertia of a rod along x about the x, y and z axes through its centre of mass."""
     across = mass_kg * length_m * length_m / 12.0
     return (ROD_AXIAL_SHARE * across + ROD_AXIAL_KG_M2, across, across)
+
+
+def is_physical_inertia(inertia_kg_m2: Mat3) -> bool:
+    """Return whether a symmetric matrix is the inertia of a rigid body: no principal moment is negative or exceeds the sum of the other
+    two. That holds if and only if I_trace / 2 - I, the second moment of the mass, has no negative principal minor.
+    """
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = inertia_kg_m2
+    half = 0.5 * (xx + yy + zz)
+    a, b, c, d, e, f = half - xx, half - yy, half - zz, -xy, -xz, -yz
+    slack = 1e-6 * half
+    determinant = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
+    return (
+        half > 0.0
+        and min(a, b, c) >= -slack
+        and min(a * b - d * d, a * c - e * e, b * c - f * f) >= -slack * half
+        and determinant >= -slack * half * half
+    )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from companion.model.types import Quat, Vec3
+from companion.model.types import Mat3, Quat, Vec3
 
 _SQRT_HALF = math.sqrt(0.5)
 
@@ -73,6 +73,16 @@ def body_x_z_axes_world(q: Quat) -> tuple[Vec3, Vec3]:
     return (
         (1.0 - 2.0 * (yy + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
         (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + yy)),
+    )
+
+
+def rotation_matrix(attitude_wxyz: Quat) -> Mat3:
+    """Return the body-to-world rotation matrix of a unit quaternion."""
+    w, x, y, z = attitude_wxyz
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
 
 

@@ -7,15 +7,16 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.config.arm_chain import chain_of
+from companion.config.base import JOINTS_MAX
 from companion.config.loader import load_vehicle
 from companion.control.arm_model.chain_dynamics import ChainDynamics
 from companion.control.arm_model.chain_manipulator import ChainManipulator
 from companion.control.arm_model.planar_dynamics import PlanarDynamics
 from companion.control.arm_model.planar_manipulator import PlanarManipulator, is_planar_2r
-from companion.control.dynamics import Dynamics, rotation_matrix
+from companion.control.dynamics import Dynamics
 from companion.control.manipulator import Manipulator
-from companion.model.arm_chain import JOINTS_MAX, ArmChain, ChainLink
-from companion.model.frames import quat_from_euler_zyx, quat_rotate
+from companion.model.arm_chain import ArmChain, ChainLink
+from companion.model.frames import quat_from_euler_zyx, quat_rotate, rotation_matrix
 from companion.model.types import Joints, Mat3, Quat, Vec3
 from tests.control.test_dynamics import to_twist, to_twist_rate
 from tests.pinocchio_or_skip import pin

@@ -12,10 +12,9 @@ from companion.config.controller import CscConfig
 from companion.config.loader import FlightConfig
 from companion.control.arm_model import dynamics_of
 from companion.control.csc import CscController
-from companion.control.dynamics import rotation_matrix
 from companion.control.types import PlantState, Wrench
 from companion.core.flight_core import FlightCore
-from companion.model.frames import quat_rotate
+from companion.model.frames import quat_rotate, rotation_matrix
 from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind, Reference, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import dynamics_of, manipulator_of
-from companion.control.dynamics import Dynamics, DynamicsTerms, chi_rate_from_body_rate, rotation_matrix
-from companion.model.frames import quat_from_euler_zyx
+from companion.control.dynamics import Dynamics, DynamicsTerms, chi_rate_from_body_rate
+from companion.model.frames import quat_from_euler_zyx, rotation_matrix
 from companion.model.types import Chi, Joints, Vec3
 from tests.pinocchio_or_skip import pin
 from tests.sitl.test_world_dynamics import oracle

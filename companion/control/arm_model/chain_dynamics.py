@@ -7,9 +7,9 @@ S = (a, p x a), and a rigid body is described by its mass, its first moment and 
 
 from __future__ import annotations
 
-from companion.control.arm_model.algebra import cross, dot, mat_mat, mat_vec, transpose, vec_mat
 from companion.control.arm_model.chain_kinematics import ChainKinematics, Frame
 from companion.control.dynamics import ArmTerms, Dynamics, DynamicsTerms, euler_rate_matrices
+from companion.model.algebra import cross, dot, mat_mat, mat_vec, transpose, vec_mat
 from companion.model.arm_chain import ArmChain
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Chi, Joints, Mat3, Vec3

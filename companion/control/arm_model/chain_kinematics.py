@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from companion.control.arm_model.algebra import mat_mat, mat_vec
-from companion.control.dynamics import rotation_matrix
+from companion.model.algebra import mat_mat, mat_vec
 from companion.model.arm_chain import ArmChain, ChainLink
+from companion.model.frames import rotation_matrix
 from companion.model.types import Joints, Mat3, Vec3
 
 Frame = tuple[Mat3, Vec3, Vec3]

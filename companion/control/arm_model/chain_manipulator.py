@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from companion.control.arm_model.algebra import cross, dot, mat_vec
 from companion.control.arm_model.chain_kinematics import ChainKinematics
 from companion.control.manipulator import Manipulator
+from companion.model.algebra import cross, dot, mat_vec
 from companion.model.arm_chain import ArmChain
 from companion.model.frames import quat_multiply
 from companion.model.types import IDENTITY_QUAT, Joints, Matrix, Quat, Vec3

@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from companion.control.arm_model.algebra import mat_mat, mat_vec, transpose, vec_mat
 from companion.control.dynamics import ArmTerms, Dynamics, DynamicsTerms, euler_rate_matrices
+from companion.model.algebra import mat_mat, mat_vec, transpose, vec_mat
 from companion.model.arm_chain import ROD_AXIAL_KG_M2, ROD_AXIAL_SHARE, ArmChain
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Chi, Joints, Mat3, Matrix, Vec3
