@@ -15,14 +15,24 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
 from companion import plugins
-from companion.config.base import Location, Model, NonNegative, Positive, Positive3, PositivePerJoint, refuse
+from companion.config.base import JOINTS_MAX, Location, Model, NonNegative, Positive, Positive3, refuse
 
-Positive8 = tuple[Positive, Positive, Positive, Positive, Positive, Positive, Positive, Positive]
-NonNegative8 = tuple[
-    NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative
-]
+PositiveRows = Annotated[tuple[Positive, ...], Field(min_length=7, max_length=6 + JOINTS_MAX)]
+"""One value for each of x, y, z, roll, pitch, yaw and for each joint. A vehicle with n joints uses the first 6 + n values; if there are
+fewer, the last value applies to the remaining joints too. So one file of gains serves every arm.
+"""
+NonNegativeRows = Annotated[tuple[NonNegative, ...], Field(min_length=7, max_length=6 + JOINTS_MAX)]
+PositiveJoints = Annotated[tuple[Positive, ...], Field(min_length=1, max_length=JOINTS_MAX)]
+"""One value for each joint. A vehicle with n joints uses the first n values; if there are fewer, the last value applies to the
+remaining joints too.
+"""
 NonNegative3 = tuple[NonNegative, NonNegative, NonNegative]
 Positive4 = tuple[Positive, Positive, Positive, Positive]
+
+
+def fitted(gains: tuple[float, ...], count: int) -> tuple[float, ...]:
+    """Return the gains of the first `count` rows or joints; the last gain is repeated for those beyond the list."""
+    return (*gains, *gains[-1:] * (count - len(gains)))[:count]
 
 
 class ControllerConfig(Model):
@@ -40,6 +50,9 @@ class ControllerConfig(Model):
 
 class LawConfig(ControllerConfig):
     """Settings that the companion's own laws share: for the measured force, additional compensation and limits of the commands."""
+
+    gain_lists: ClassVar[tuple[str, ...]] = ()
+    """Names of the lists of gains, one for each row or joint, which must have the same length."""
 
     force_lowpass_hz: Positive
     desired_force_time_s: Positive | None = None
@@ -66,27 +79,40 @@ class LawConfig(ControllerConfig):
     attitude_filter_rad_s: Positive = 30.0
     attitude_filter_damping: Annotated[float, Field(ge=0.5, le=2)] = 1.0
 
+    @model_validator(mode="after")
+    def _gain_lists_fit(self) -> Self:
+        lengths = {key: len(getattr(self, key)) for key in self.gain_lists}
+        for key, length in lengths.items():
+            wanted = lengths[self.gain_lists[0]]
+            if length != wanted:
+                text = f"expected {wanted} values, as many as {self.gain_lists[0]} has, got {length}"
+                refuse("controller", [((key,), text)])
+        return self
+
 
 class AdaptiveConfig(LawConfig):
     """Adaptive impedance control (paper, tab:control_parameters).
 
-    Rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. All matrices are diagonal.
+    Rows are chi = [x y z | roll pitch yaw | joints]. All matrices are diagonal, and all lists of rows have the same length, 7 to 13: 6
+    values and one or more for the joints. A vehicle with n joints uses the first 6 + n values; if there are fewer, the last value
+    applies to the remaining joints too.
     """
 
     presets = ("paper", "paper_slow_leakage", "model_free", "recommended")
+    gain_lists = ("inertia_md", "lambda_gain", "phi", "damping_kd", "stiffness_kp", "row_weights_s")
 
     law: Literal["adaptive"]
-    inertia_md: Positive8
+    inertia_md: PositiveRows
     """M_d of the paper, kg and kg m^2."""
-    lambda_gain: Positive8
+    lambda_gain: PositiveRows
     """Lambda of the paper."""
-    phi: Positive8
+    phi: PositiveRows
     """Phi of the paper, 1/s."""
-    damping_kd: Positive8
+    damping_kd: PositiveRows
     """K_d of the paper."""
-    stiffness_kp: Positive8
+    stiffness_kp: PositiveRows
     """K_p of the paper; must equal (K_d - M_d Phi) Phi (gain_cond)."""
-    row_weights_s: NonNegative8
+    row_weights_s: NonNegativeRows
     """S: weight of each row in ||s||, ||xi|| and ||chi_dd||; 0 masks a row that another loop controls."""
     h_initial: Positive4
     """Initial values H_0(0) to H_3(0)."""
@@ -146,17 +172,20 @@ class AdaptiveConfig(LawConfig):
 class CscConfig(LawConfig):
     """Complete-system compliance (after Cataldi et al., IROS 2016): one impedance for vehicle and arm, realised by the nominal model.
 
-    Rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. All matrices are diagonal.
+    Rows are chi = [x y z | roll pitch yaw | joints]. All matrices are diagonal, and all lists of rows have the same length, 7 to 13: 6
+    values and one or more for the joints. A vehicle with n joints uses the first 6 + n values; if there are fewer, the last value
+    applies to the remaining joints too.
     """
 
     presets = ("tuned_extras", "tuned")
+    gain_lists = ("inertia_md", "damping_kd", "stiffness_kp")
 
     law: Literal["csc"]
-    inertia_md: Positive8
+    inertia_md: PositiveRows
     """Desired inertia M_d, kg and kg m^2."""
-    damping_kd: Positive8
+    damping_kd: PositiveRows
     """K_d. On the attitude rows it describes the damping of PX4's attitude loop and has no effect on commands."""
-    stiffness_kp: Positive8
+    stiffness_kp: PositiveRows
     """K_p. On the attitude rows it describes the stiffness of PX4's attitude loop and has no effect on commands."""
     external_xyz: NonNegative3 = (1.0, 1.0, 1.0)
     """Fraction of the measured F_ext, per world axis, that acts on the base's impedance and is cancelled by means of the model."""
@@ -167,9 +196,14 @@ class CscConfig(LawConfig):
 
 
 class PscConfig(LawConfig):
-    """Partitioned compliance (after Wang et al., RA-L 2024): an impedance for the arm only and position control of the vehicle."""
+    """Partitioned compliance (after Wang et al., RA-L 2024): an impedance for the arm only and position control of the vehicle.
+
+    The lists of joint gains have the same length, 1 to 7. A vehicle with n joints uses the first n values; if there are fewer, the last
+    value applies to the remaining joints too.
+    """
 
     presets = ("tuned_extras", "tuned")
+    gain_lists = ("arm_inertia_md", "arm_damping_kd", "arm_stiffness_kp")
 
     law: Literal["psc"]
     position_kp_xyz: Positive3
@@ -180,10 +214,10 @@ class PscConfig(LawConfig):
     """Integral gain per world axis, 1/s^3; 0 disables the integral term."""
     integral_max_m_s2: NonNegative = 1.5
     """Largest acceleration of the integral term, per axis."""
-    arm_inertia_md: PositivePerJoint
+    arm_inertia_md: PositiveJoints
     """M_d of the joints, kg m^2."""
-    arm_damping_kd: PositivePerJoint
-    arm_stiffness_kp: PositivePerJoint
+    arm_damping_kd: PositiveJoints
+    arm_stiffness_kp: PositiveJoints
     payload_time_s: Positive
     """Time constant of the estimate of the payload's mass."""
     payload_max_kg: NonNegative = 1.0

@@ -144,7 +144,10 @@ def describe(node: _Node | None, schema: _Node) -> str:
             items = [describe(item, schema) for item in node["prefixItems"]]
             alike = len(set(items)) == 1
             return f"a list of {len(items)} {_plural(items[0]) if alike else 'values'}"
-        return f"a list of at least {node['minItems']} items" if node.get("minItems") else "a list"
+        least, most = node.get("minItems", 0), node.get("maxItems")
+        if most is not None:
+            return f"a list of {least} to {most} {_plural(describe(node.get('items'), schema))}"
+        return f"a list of at least {least} items" if least else "a list"
     if kind == "object":
         keys = node.get("properties", {})
         return f"a mapping with the keys {', '.join(keys)}" if keys else "a mapping"

@@ -531,8 +531,7 @@ class Vehicle(Model):
 
     def _poses_within_limits(self) -> Iterator[tuple[Location, str]]:
         joints, fold = self.arm.joints, self.safety.fold_arm_deg
-        given = "fold_arm_deg" in self.safety.model_fields_set
-        if len(fold) != len(joints) and (given or len(joints) > len(fold)):
+        if joints and len(fold) != len(joints):
             text = f"expected {len(joints)} angles, one for each of arm.joints, got {len(fold)}"
             yield ("safety", "fold_arm_deg"), text
             return

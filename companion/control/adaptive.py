@@ -1,36 +1,31 @@
 """Adaptive impedance control without a model of the coupling (paper, eqs. control_law and adaptive_law_full; corrected, discrete).
 
-The rows are chi = [x y z | roll pitch yaw | alpha_1 alpha_2]. PX4's attitude loop controls the attitude rows: they are masked out of
+The rows are chi = [x y z | roll pitch yaw | joints]. PX4's attitude loop controls the attitude rows: they are masked out of
 every norm and get no torque. The order of the steps is that of docs/control-law.md. The zero-order hold is exact, so H and zeta stay >=
 0 for any input.
 
-Sums over the five active rows are written out, with the row in every name (`s0` to `s2` for x y z, `s6` and `s7` for the joints),
-because this is several times as fast as loops or arrays.
+Sums over the active rows are written out for x, y and z and loop over the rows of the joints by index: for two joints this is several
+times as fast as `zip`, comprehensions or arrays.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import ClassVar
 
-from companion.config.controller import AdaptiveConfig
+from companion.config.controller import AdaptiveConfig, fitted
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import dynamics_of, manipulator_of
 from companion.control.common import Actuation, DesiredForce, ForceFilter, tracking_errors
 from companion.control.compensation import Compensation
 from companion.control.impedance import Impedance
-from companion.control.load_adaptation import LoadAdaptation, Rows
+from companion.control.load_adaptation import LoadAdaptation
 from companion.control.types import PlantState, Wrench
 from companion.control.zero_order_hold import HoldTable
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import body_x_z_axes_world
 from companion.model.types import Chi, ControlLog, Joints, Reference, Vec3, Vec4
-
-
-def active(rows: tuple[float, ...]) -> Rows:
-    """Return the five active rows out of all eight."""
-    x, y, z, _, _, _, a1, a2 = rows
-    return (x, y, z, a1, a2)
 
 
 class Adaptation:
@@ -88,21 +83,24 @@ class AccelerationFilter:
     def __init__(self, cutoff_hz: float) -> None:
         self._w = 2.0 * math.pi * cutoff_hz
         self._arm_rate_rad_s: Joints | None = None
-        self._value: Rows | None = None
+        self._value: Sequence[float] | None = None
 
-    def step(self, dt_s: float, state: PlantState) -> Rows:
-        """Return the filtered acceleration, m/s^2 and rad/s^2. The filter starts at its first sample."""
-        w6, w7 = rate = state.arm_rate_rad_s
-        w6_before, w7_before = self._arm_rate_rad_s or rate
-        self._arm_rate_rad_s = rate
+    def step(self, dt_s: float, state: PlantState) -> Sequence[float]:
+        """Return the filtered acceleration, m/s^2 and rad/s^2; rows 3 to 5 are 0. The filter starts at its first sample."""
+        rates = state.arm_rate_rad_s
+        rates_before = self._arm_rate_rad_s or rates
+        self._arm_rate_rad_s = rates
         x, y, z = state.acceleration_world_m_s2
-        a6, a7 = (w6 - w6_before) / dt_s, (w7 - w7_before) / dt_s
-        if self._value is None:
-            value: Rows = (x, y, z, a6, a7)
+        before = self._value
+        if before is None:
+            value = [x, y, z, 0.0, 0.0, 0.0, *[0.0] * len(rates)]
         else:
             k = 1.0 - math.exp(-self._w * dt_s)
-            v0, v1, v2, v6, v7 = self._value
-            value = (v0 + k * (x - v0), v1 + k * (y - v1), v2 + k * (z - v2), v6 + k * (a6 - v6), v7 + k * (a7 - v7))
+            v0, v1, v2 = before[0], before[1], before[2]
+            value = [v0 + k * (x - v0), v1 + k * (y - v1), v2 + k * (z - v2), 0.0, 0.0, 0.0]
+            for joint, rate in enumerate(rates):
+                v = before[6 + joint]
+                value.append(v + k * ((rate - rates_before[joint]) / dt_s - v))
         self._value = value
         return value
 
@@ -114,20 +112,20 @@ class AdaptiveController:
 
     def __init__(self, config: AdaptiveConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         self._manipulator = manipulator_of(vehicle)
-        self._impedance = Impedance(config)
+        joint_count = self._manipulator.joint_count
+        self._impedance = Impedance(config, joint_count)
         self._adaptation = Adaptation(config)
         self._load = LoadAdaptation(config, self._manipulator)
-        weights = active(config.row_weights_s)
-        self._weights_squared: Rows = (
-            weights[0] ** 2,
-            weights[1] ** 2,
-            weights[2] ** 2,
-            weights[3] ** 2,
-            weights[4] ** 2,
+        impedance, rows = self._impedance, 6 + joint_count
+        weights = [weight**2 for weight in fitted(config.row_weights_s, rows)]
+        gains = list(
+            zip(impedance.inertia, impedance.phi, fitted(config.lambda_gain, rows), weights, impedance.d, strict=True)
         )
-        self._inertia, self._lambda, self._phi, self._d = (
-            active(gain) for gain in (config.inertia_md, config.lambda_gain, config.phi, self._impedance.d)
-        )
+        self._base_gains = gains[:3]
+        """M_d, Phi, Lambda, S^2 and D of x, y and z."""
+        self._joint_gains = [(joint, 6 + joint, *row) for joint, row in enumerate(gains[6:])]
+        """Number of each joint and its row, then as in `_base_gains`."""
+        self._weights_squared = (weights[:3], [(row, weights[row]) for row in range(6, rows)])
         self._varpi = config.boundary_layer
         self._acceleration_cap = config.acceleration_cap
         self._acceleration = AccelerationFilter(config.acceleration_lowpass_hz)
@@ -135,7 +133,9 @@ class AdaptiveController:
         self._desired = DesiredForce(config.desired_force_time_s)
         self._actuation = Actuation(config, vehicle, hover_thrust)
         self._compliance = config.base_compliance_xyz
-        self._compensation = Compensation(config, vehicle, self._compliance, self._inertia[:2])
+        self._compensation = Compensation(
+            config, vehicle, self._compliance, (impedance.inertia[0], impedance.inertia[1])
+        )
         self._arm_dynamics = dynamics_of(vehicle) if config.arm_inertia_nominal else None
         self._gravity_nominal = config.arm_gravity_nominal
         self._up_body_m_s2: Vec3 = (0.0, 0.0, GRAVITY_M_S2)
@@ -161,14 +161,12 @@ class AdaptiveController:
         rho = adaptation.rho(regressor)
         varpi = self._varpi
         robust = rho / (varpi if varpi > norm_s else norm_s)
-        tau = self._tau(s, robust, error_rate, tau_d, reference)
-        wanted_n = self._base_force(tau, reference, force)
-        wanted_nm = self._arm_torque(tau, arm_gravity, s, e_tau, error_rate, state, reference)
+        wanted_n = self._base_force(s, robust, error_rate, reference, force)
+        wanted_nm = self._arm_torque(s, robust, error_rate, e_tau, tau_d, arm_gravity, state, reference)
         sent.step(dt_s, wanted_n, wanted_nm, body_z, reference.yaw_rad, vertical_scale)
-        (f0, f1, f2), (t6, t7) = sent.force_world_n, sent.arm_torque_nm
         self._compensation.remember(sent.force_world_n, force)
         adaptation.advance(dt_s, norm_s, regressor, clipped_before)
-        load.advance(dt_s, active(s), learn)
+        load.advance(dt_s, s, learn)
         gamma = impedance.advance(dt_s, e_tau)
         self._desired.advance(dt_s, force)
         log = ControlLog(
@@ -176,7 +174,7 @@ class AdaptiveController:
             error_rate=error_rate,
             sliding=s,
             gamma=gamma,
-            tau=(f0, f1, f2, 0.0, 0.0, 0.0, t6, t7),
+            tau=(*sent.force_world_n, 0.0, 0.0, 0.0, *sent.arm_torque_nm),
             e_tau=e_tau,
             h_hat=adaptation.h,
             zeta=adaptation.zeta,
@@ -193,112 +191,109 @@ class AdaptiveController:
             attitude_wxyz=sent.attitude_wxyz, collective_n=sent.collective_n, arm_torque_nm=sent.arm_torque_nm, log=log
         )
 
-    def _torque_error(self, arm_rad: Joints, body_x: Vec3, body_z: Vec3, force: Vec3) -> tuple[Chi, Joints, Joints]:
-        """Return e_tau = tau_ext - tau_d (8 rows), tau_d of the joints, and the joint torques that hold the arm against gravity."""
+    def _torque_error(
+        self, arm_rad: Joints, body_x: Vec3, body_z: Vec3, force: Vec3
+    ) -> tuple[Chi, Sequence[float], Joints]:
+        """Return e_tau = tau_ext - tau_d, tau_d of the joints, and the joint torques that hold the arm against gravity."""
         (xx, xy, xz), (zx, zy, zz) = body_x, body_z
         up = (GRAVITY_M_S2 * xz, GRAVITY_M_S2 * (zx * xy - zy * xx), GRAVITY_M_S2 * zz)
         self._up_body_m_s2 = up
-        ((jx6, jx7), _, (jz6, jz7)), gravity = self._manipulator.joint_terms(arm_rad, up)
+        (jx, jy, jz), gravity = self._manipulator.joint_terms(arm_rad, up)
         (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = force, self._desired.world_n, self._compliance
         f_x, f_z = xx * f0 + xy * f1 + xz * f2, zx * f0 + zy * f1 + zz * f2
         d_x, d_z = xx * d0 + xy * d1 + xz * d2, zx * d0 + zy * d1 + zz * d2
-        tau_d6, tau_d7 = jx6 * d_x + jz6 * d_z, jx7 * d_x + jz7 * d_z
-        return (
-            (
-                c0 * f0,
-                c1 * f1,
-                c2 * f2,
-                0.0,
-                0.0,
-                0.0,
-                jx6 * f_x + jz6 * f_z - tau_d6,
-                jx7 * f_x + jz7 * f_z - tau_d7,
-            ),
-            (tau_d6, tau_d7),
-            gravity,
-        )
+        e_tau, tau_d = [c0 * f0, c1 * f1, c2 * f2, 0.0, 0.0, 0.0], []
+        if any(jy):
+            yx, yy, yz = zy * xz - zz * xy, zz * xx - zx * xz, zx * xy - zy * xx
+            f_y, d_y = yx * f0 + yy * f1 + yz * f2, yx * d0 + yy * d1 + yz * d2
+            for joint, y in enumerate(jy):
+                x, z = jx[joint], jz[joint]
+                wanted = x * d_x + y * d_y + z * d_z
+                tau_d.append(wanted)
+                e_tau.append(x * f_x + y * f_y + z * f_z - wanted)
+        else:  # an arm that moves in the body's x-z plane only
+            for joint, x in enumerate(jx):
+                z = jz[joint]
+                wanted = x * d_x + z * d_z
+                tau_d.append(wanted)
+                e_tau.append(x * f_x + z * f_z - wanted)
+        return tuple(e_tau), tau_d, gravity
 
-    def _norms(self, s: Chi, error: Chi, error_rate: Chi, acceleration: Rows) -> Vec3:
+    def _norms(self, s: Chi, error: Chi, error_rate: Chi, acceleration: Sequence[float]) -> Vec3:
         """Return ||S s||, ||S [e; e']|| and ||S chi_dd||."""
-        s0, s1, s2, _, _, _, s6, s7 = s
-        e0, e1, e2, _, _, _, e6, e7 = error
-        v0, v1, v2, _, _, _, v6, v7 = error_rate
-        a0, a1, a2, a6, a7 = acceleration
-        w0, w1, w2, w6, w7 = self._weights_squared
-        return (
-            math.sqrt(w0 * s0 * s0 + w1 * s1 * s1 + w2 * s2 * s2 + w6 * s6 * s6 + w7 * s7 * s7),
-            math.sqrt(
-                w0 * (e0 * e0 + v0 * v0)
-                + w1 * (e1 * e1 + v1 * v1)
-                + w2 * (e2 * e2 + v2 * v2)
-                + w6 * (e6 * e6 + v6 * v6)
-                + w7 * (e7 * e7 + v7 * v7)
-            ),
-            math.sqrt(w0 * a0 * a0 + w1 * a1 * a1 + w2 * a2 * a2 + w6 * a6 * a6 + w7 * a7 * a7),
-        )
+        s0, s1, s2 = s[0], s[1], s[2]
+        e0, e1, e2 = error[0], error[1], error[2]
+        v0, v1, v2 = error_rate[0], error_rate[1], error_rate[2]
+        a0, a1, a2 = acceleration[0], acceleration[1], acceleration[2]
+        (w0, w1, w2), joint_weights = self._weights_squared
+        s_squared = w0 * s0 * s0 + w1 * s1 * s1 + w2 * s2 * s2
+        x_squared = w0 * (e0 * e0 + v0 * v0) + w1 * (e1 * e1 + v1 * v1) + w2 * (e2 * e2 + v2 * v2)
+        a_squared = w0 * a0 * a0 + w1 * a1 * a1 + w2 * a2 * a2
+        for row, w in joint_weights:
+            s0, e0, v0, a0 = s[row], error[row], error_rate[row], acceleration[row]
+            s_squared += w * s0 * s0
+            x_squared += w * (e0 * e0 + v0 * v0)
+            a_squared += w * a0 * a0
+        return math.sqrt(s_squared), math.sqrt(x_squared), math.sqrt(a_squared)
 
-    def _tau(self, s: Chi, robust: float, error_rate: Chi, tau_d: Joints, reference: Reference) -> Rows:
-        """Return tau (eq. tau) with - D gamma and dtau = -rho S^2 s / max(||S s||, varpi). `robust` is rho over that maximum. Row by
-        row:
+    def _base_force(self, s: Chi, robust: float, error_rate: Chi, reference: Reference, force: Vec3) -> Vec3:
+        """Return the force on the base: tau with the adaptive load and the compensation, plus the weight.
 
-        tau = M_d (chi''_d - Phi e') - (Lambda + robust S^2) s - D gamma - tau_d.
+        tau (eq. tau) has - D gamma and dtau = -rho S^2 s / max(||S s||, varpi), where `robust` is rho over that maximum. Row by row:
+
+        tau = M_d (chi''_d - Phi e') - (Lambda + robust S^2) s - D gamma - tau_d, with tau_d = 0 on the base.
         """
-        s0, s1, s2, _, _, _, s6, s7 = s
-        v0, v1, v2, _, _, _, v6, v7 = error_rate
-        g0, g1, g2, _, _, _, g6, g7 = self._impedance.gamma
+        g = self._impedance.gamma
         a0, a1, a2 = reference.acceleration_world_m_s2
-        a6, a7 = reference.arm_acceleration_rad_s2
-        m0, m1, m2, m6, m7 = self._inertia
-        p0, p1, p2, p6, p7 = self._phi
-        l0, l1, l2, l6, l7 = self._lambda
-        w0, w1, w2, w6, w7 = self._weights_squared
-        d0, d1, d2, d6, d7 = self._d
-        return (
-            m0 * (a0 - p0 * v0) - (l0 + robust * w0) * s0 - d0 * g0,
-            m1 * (a1 - p1 * v1) - (l1 + robust * w1) * s1 - d1 * g1,
-            m2 * (a2 - p2 * v2) - (l2 + robust * w2) * s2 - d2 * g2,
-            m6 * (a6 - p6 * v6) - (l6 + robust * w6) * s6 - d6 * g6 - tau_d[0],
-            m7 * (a7 - p7 * v7) - (l7 + robust * w7) * s7 - d7 * g7 - tau_d[1],
+        (m0, p0, l0, w0, d0), (m1, p1, l1, w1, d1), (m2, p2, l2, w2, d2) = self._base_gains
+        q0, q1, q2 = self._load.force_n
+        x, y, z = self._compensation.base_force_n(
+            (
+                m0 * (a0 - p0 * error_rate[0]) - (l0 + robust * w0) * s[0] - d0 * g[0] + q0,
+                m1 * (a1 - p1 * error_rate[1]) - (l1 + robust * w1) * s[1] - d1 * g[1] + q1,
+                m2 * (a2 - p2 * error_rate[2]) - (l2 + robust * w2) * s[2] - d2 * g[2] + q2,
+            ),
+            force,
+            reference,
         )
-
-    def _base_force(self, tau: Rows, reference: Reference, force: Vec3) -> Vec3:
-        """Return the force on the base: tau with the adaptive load and the compensation, plus the weight."""
-        (x, y, z, _, _), (q0, q1, q2) = tau, self._load.force_n
-        x, y, z = self._compensation.base_force_n((x + q0, y + q1, z + q2), force, reference)
         return (x, y, z + self._weight_n)
 
     def _arm_torque(
         self,
-        tau: Rows,
-        gravity: Joints,
         s: Chi,
-        e_tau: Chi,
+        robust: float,
         error_rate: Chi,
+        e_tau: Chi,
+        tau_d: Sequence[float],
+        gravity: Joints,
         state: PlantState,
         reference: Reference,
     ) -> Joints:
-        """Return the joint torques: tau and gravity, plus the configured (M_arm - M_d) alpha''* + C alpha' and friction at alpha'*.
+        """Return the joint torques: tau as in `_base_force` and gravity, plus the configured (M_arm - M_d) alpha''* + C alpha' and
+        friction at alpha'*.
 
         The star marks what the target impedance requests at this instant: alpha''* = alpha''_d - Phi e' + gamma' and alpha'* = alpha'_d
         - Phi e + gamma = alpha' - s.
         """
-        t6, t7 = tau[3], tau[4]
-        rates = state.arm_rate_rad_s
-        if self._gravity_nominal:
-            t6, t7 = t6 + gravity[0], t7 + gravity[1]
-        wanted_rate = (rates[0] - s[6], rates[1] - s[7])
+        gamma, feed, rates = self._impedance.gamma, reference.arm_acceleration_rad_s2, state.arm_rate_rad_s
+        torque, wanted_rate = [], []
+        for joint, row, m, p, lam, w, d in self._joint_gains:
+            s_row = s[row]
+            tau = m * (feed[joint] - p * error_rate[row]) - (lam + robust * w) * s_row - d * gamma[row] - tau_d[joint]
+            torque.append(tau + gravity[joint] if self._gravity_nominal else tau)
+            wanted_rate.append(rates[joint] - s_row)
         if self._load.on:
             levers = self._manipulator.gravity_levers_m_s2(state.arm_rad, self._up_body_m_s2)
-            first, second = self._load.joint_torque_nm(levers, wanted_rate)
-            t6, t7 = t6 + first, t7 + second
+            for joint, load in enumerate(self._load.joint_torque_nm(levers, wanted_rate)):
+                torque[joint] += load
         if self._arm_dynamics is not None:
-            _, _, _, m6, m7 = self._inertia
-            _, _, _, p6, p7 = self._phi
-            _, _, _, d6, d7 = self._d
-            gamma, feed = self._impedance.gamma, reference.arm_acceleration_rad_s2
-            a6 = feed[0] - p6 * error_rate[6] + (e_tau[6] - d6 * gamma[6]) / m6
-            a7 = feed[1] - p7 * error_rate[7] + (e_tau[7] - d7 * gamma[7]) / m7
-            first, second = self._arm_dynamics.arm_torque_nm(state.arm_rad, rates, (a6, a7))
-            t6 += first - m6 * a6
-            t7 += second - m7 * a7
-        return self._compensation.joint_torque_nm((t6, t7), wanted_rate)
+            wanted = tuple(
+                [
+                    feed[joint] - p * error_rate[row] + (e_tau[row] - d * gamma[row]) / m
+                    for joint, row, m, p, _, _, d in self._joint_gains
+                ]
+            )
+            inertial = self._arm_dynamics.arm_torque_nm(state.arm_rad, rates, wanted)
+            for joint, _, m, *_ in self._joint_gains:
+                torque[joint] += inertial[joint] - m * wanted[joint]
+        return self._compensation.joint_torque_nm(torque, wanted_rate)

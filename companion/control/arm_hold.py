@@ -25,4 +25,4 @@ def hold_torque_nm(
             gravity, angle_rad, rate_rad_s, target_rad, target_rate_rad_s, strict=True
         )
     ]
-    return (torque[0], torque[1])
+    return tuple(torque)

@@ -22,25 +22,22 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import wrap_rad
 from companion.model.types import IDENTITY_QUAT, Chi, ControlLog, Joints, Quat, Reference, Vec3
 
-ZERO8: Chi = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-
 
 def tracking_errors(state: PlantState, reference: Reference, yaw_rad: float) -> tuple[Chi, Chi]:
-    """Return e = chi - chi_d and e', 8 rows each. Rows 3 and 4 (roll, pitch) are 0 because their reference is the law's own output."""
+    """Return e = chi - chi_d and e'. Rows 3 and 4 (roll, pitch) are 0 because their reference is the law's own output."""
     px, py, pz = state.position_world_m
     vx, vy, vz = state.velocity_world_m_s
-    a1, a2 = state.arm_rad
-    w1, w2 = state.arm_rate_rad_s
     px_d, py_d, pz_d = reference.position_world_m
     vx_d, vy_d, vz_d = reference.velocity_world_m_s
-    a1_d, a2_d = reference.arm_rad
-    w1_d, w2_d = reference.arm_rate_rad_s
     yaw_error = wrap_rad(yaw_rad - reference.yaw_rad)
     yaw_error_rate = state.angular_rate_body_rad_s[2] - reference.yaw_rate_rad_s
-    return (
-        (px - px_d, py - py_d, pz - pz_d, 0.0, 0.0, yaw_error, a1 - a1_d, a2 - a2_d),
-        (vx - vx_d, vy - vy_d, vz - vz_d, 0.0, 0.0, yaw_error_rate, w1 - w1_d, w2 - w2_d),
-    )
+    error = [px - px_d, py - py_d, pz - pz_d, 0.0, 0.0, yaw_error]
+    error_rate = [vx - vx_d, vy - vy_d, vz - vz_d, 0.0, 0.0, yaw_error_rate]
+    angles_d, rates, rates_d = reference.arm_rad, state.arm_rate_rad_s, reference.arm_rate_rad_s
+    for joint, angle in enumerate(state.arm_rad):
+        error.append(angle - angles_d[joint])
+        error_rate.append(rates[joint] - rates_d[joint])
+    return tuple(error), tuple(error_rate)
 
 
 class ForceFilter:
@@ -103,15 +100,14 @@ class Actuation:
             lateral_max_n=config.lateral_force_max_n,
             tilt_max_tan=math.tan(math.radians(vehicle.airframe.tilt_max_deg)),
         )
-        first, second = vehicle.arm.joints
-        self._torque_max_nm = (first.torque_max_nm, second.torque_max_nm)
+        self._torque_max_nm = tuple([joint.torque_max_nm for joint in vehicle.arm.joints])
         self._tilt = TiltFilter(config.attitude_filter_rad_s, config.attitude_filter_damping)
         self.attitude_wxyz: Quat = IDENTITY_QUAT
         self.roll_pitch_yaw_rad: Vec3 = (0.0, 0.0, 0.0)
         self.collective_n = 0.0
         self.force_world_n: Vec3 = (0.0, 0.0, 0.0)
         """Force after saturation, world frame, N."""
-        self.arm_torque_nm: Joints = (0.0, 0.0)
+        self.arm_torque_nm: Joints = (0.0,) * len(self._torque_max_nm)
         self.clipped = (False, False, False)
         """Whether vertical force, lateral force and joint torque were saturated."""
         self.any_clipped = False
@@ -146,10 +142,12 @@ class Actuation:
         collective = collective_n(force, body_z_world)
         self.collective_n = collective if collective > 0.0 else 0.0
         clipped_arm = False
-        (t1, t2), (most1, most2) = torque_nm, self._torque_max_nm
-        if not (-most1 <= t1 <= most1 and -most2 <= t2 <= most2):
-            torque_nm = (max(-most1, min(most1, t1)), max(-most2, min(most2, t2)))
-            clipped_arm = True
+        for joint, most in enumerate(self._torque_max_nm):
+            if not -most <= torque_nm[joint] <= most:
+                clipped_arm = True
+        if clipped_arm:
+            limited = zip(torque_nm, self._torque_max_nm, strict=True)
+            torque_nm = tuple([max(-most, min(most, torque)) for torque, most in limited])
         self.arm_torque_nm = torque_nm
         self.clipped = (clipped_z, clipped_xy, clipped_arm)
         self.any_clipped = clipped_z or clipped_xy or clipped_arm
@@ -174,13 +172,13 @@ def wrench_of(
         hover_thrust: normalised thrust that carries the vehicle without payload.
         payload_estimate_kg: estimated mass of the payload; None if the law does not estimate it.
     """
-    (fx, fy, fz), (t1, t2) = sent.force_world_n, sent.arm_torque_nm
+    nothing: Chi = (0.0,) * len(error)
     log = ControlLog(
         error=error,
         error_rate=error_rate,
-        sliding=ZERO8,
-        gamma=ZERO8,
-        tau=(fx, fy, fz, 0.0, 0.0, 0.0, t1, t2),
+        sliding=nothing,
+        gamma=nothing,
+        tau=(*sent.force_world_n, 0.0, 0.0, 0.0, *sent.arm_torque_nm),
         e_tau=e_tau,
         h_hat=(0.0, 0.0, 0.0, 0.0),
         zeta=0.0,

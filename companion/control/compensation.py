@@ -6,6 +6,7 @@ All laws share it, so that they can be compared with the same options.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from companion.config.controller import LawConfig
 from companion.config.vehicle import Vehicle
@@ -65,15 +66,14 @@ class Compensation:
             y += my * lead_s * jerk[1]
         return (x, y, z)
 
-    def joint_torque_nm(self, torque_nm: Joints, wanted_rate_rad_s: Joints) -> Joints:
+    def joint_torque_nm(self, torque_nm: Sequence[float], wanted_rate_rad_s: Sequence[float]) -> Joints:
         """Return the torques with friction added along the wanted joint rates. Measured rates would shake a joint at rest."""
         if self._friction_nm == 0.0:
-            return torque_nm
-        (t1, t2), (r1, r2) = torque_nm, wanted_rate_rad_s
-        return (
-            t1 + self._friction_nm * math.tanh(r1 / FRICTION_RATE_RAD_S),
-            t2 + self._friction_nm * math.tanh(r2 / FRICTION_RATE_RAD_S),
-        )
+            return tuple(torque_nm)
+        with_friction = []
+        for joint, torque in enumerate(torque_nm):
+            with_friction.append(torque + self._friction_nm * math.tanh(wanted_rate_rad_s[joint] / FRICTION_RATE_RAD_S))
+        return tuple(with_friction)
 
     def remember(self, sent_n: Vec3, force: Vec3) -> None:
         """Store the force that was sent, and the part of the measured force that is accounted for, for the observer."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from companion.config.controller import CscConfig
+from companion.config.controller import CscConfig, fitted
 from companion.config.vehicle import Vehicle
 from companion.control.common import tracking_errors
 from companion.control.dynamics import chi_rate_from_body_rate
@@ -33,6 +33,10 @@ class CscController(ModelBasedLaw):
     def __init__(self, config: CscConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         super().__init__(config, vehicle, hover_thrust, config.external_xyz, config.model_mass_scale)
         self._c = config
+        rows = 6 + len(vehicle.arm.joints)
+        gains = (fitted(values, rows) for values in (config.inertia_md, config.damping_kd, config.stiffness_kp))
+        self._gains = tuple(zip(*gains, strict=True))
+        """M_d, K_d and K_p of each row."""
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
         """Run one tick of `dt_s`; see `companion.control.types.Controller`."""
@@ -45,7 +49,7 @@ class CscController(ModelBasedLaw):
             state,
             reference,
             (tau[0] - tau_ext[0], tau[1] - tau_ext[1], tau[2] - tau_ext[2]),
-            (tau[6] - tau_ext[6], tau[7] - tau_ext[7]),
+            tuple([torque - external for torque, external in zip(tau[6:], tau_ext[6:], strict=True)]),
             force,
             vertical_scale,
         )
@@ -58,21 +62,19 @@ class CscController(ModelBasedLaw):
         dx, dy, dz = (share * f for share, f in zip(self._c.desired_force_xyz, self._desired.world_n, strict=True))
         return (
             (x, y, z, 0.0, 0.0, 0.0, *ext),
-            (x - dx, y - dy, z - dz, 0.0, 0.0, 0.0, ext[0] - desired[0], ext[1] - desired[1]),
+            (x - dx, y - dy, z - dz, 0.0, 0.0, 0.0, *[t - t_d for t, t_d in zip(ext, desired, strict=True)]),
         )
 
     def _tau(self, state: PlantState, reference: Reference, error: Chi, error_rate: Chi, e_tau: Chi) -> list[float]:
-        """Return M chi''_cmd + C chi' + g, 8 rows."""
+        """Return M chi''_cmd + C chi' + g."""
         rpy = euler_zyx_from_quat(state.attitude_wxyz)
         q_rate = chi_rate_from_body_rate(rpy, state.angular_rate_body_rad_s)
         roll_d, pitch_d, _ = self._actuation.roll_pitch_yaw_rad
-        e = [*error[0:3], rpy[0] - roll_d, rpy[1] - pitch_d, *error[5:8]]
-        e_rate = [*error_rate[0:3], q_rate[0], q_rate[1], q_rate[2] - reference.yaw_rate_rad_s, *error_rate[6:8]]
+        e = [*error[0:3], rpy[0] - roll_d, rpy[1] - pitch_d, *error[5:]]
+        e_rate = [*error_rate[0:3], q_rate[0], q_rate[1], q_rate[2] - reference.yaw_rate_rad_s, *error_rate[6:]]
         feed = (*reference.acceleration_world_m_s2, 0.0, 0.0, 0.0, *reference.arm_acceleration_rad_s2)
-        c = self._c
         chi_dd = [
-            feed[i] - (c.damping_kd[i] * e_rate[i] + c.stiffness_kp[i] * e[i] - e_tau[i]) / c.inertia_md[i]
-            for i in range(8)
+            feed[i] - (k_d * e_rate[i] + k_p * e[i] - e_tau[i]) / m_d for i, (m_d, k_d, k_p) in enumerate(self._gains)
         ]
         chi_rate: Chi = (*state.velocity_world_m_s, *q_rate, *state.arm_rate_rad_s)
         terms = self._dynamics.terms(rotation_matrix(state.attitude_wxyz), rpy, state.arm_rad, chi_rate)

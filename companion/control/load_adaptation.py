@@ -13,18 +13,17 @@ arm according to K_d and K_p.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from companion.config.controller import AdaptiveConfig
 from companion.control.compensation import FRICTION_RATE_RAD_S
 from companion.control.manipulator import Manipulator
 from companion.control.zero_order_hold import HoldTable
-from companion.model.types import Joints, Matrix, Vec3
-
-Rows = tuple[float, float, float, float, float]
+from companion.model.types import Chi, Joints, Matrix, Vec3
 
 
 class LoadAdaptation:
-    """Load on the rows x, y, z (N) and on both joints (N m), integrated from zero with an exact zero-order hold.
+    """Load on the rows x, y, z (N) and on the joints (N m), integrated from zero with an exact zero-order hold.
 
     Args:
         config: rates, leakage and bounds.
@@ -46,29 +45,31 @@ class LoadAdaptation:
         self._held = HoldTable(held)
         self.force_n: Vec3 = (0.0, 0.0, 0.0)
         """Estimated additional force that the rotors must produce, world frame."""
-        self.moments_kg_m: Joints = (0.0, 0.0)
+        nothing: Joints = (0.0,) * manipulator.joint_count
+        self.moments_kg_m: Joints = nothing
         """Estimated first moments of the links about their joints, in addition to the nominal ones."""
-        self.friction_nm: Joints = (0.0, 0.0)
-        self._levers: Matrix = ((0.0, 0.0), (0.0, 0.0))
-        self._turning: Joints = (0.0, 0.0)
-        self._wanted_rate_rad_s: Joints = (0.0, 0.0)
+        self.friction_nm: Joints = nothing
+        self._levers: Matrix = (nothing,) * manipulator.joint_count
+        self._turning: Sequence[float] = nothing
+        self._wanted_rate_rad_s: Sequence[float] = nothing
 
-    def joint_torque_nm(self, levers_m_s2: Matrix, wanted_rate_rad_s: Joints) -> Joints:
+    def joint_torque_nm(self, levers_m_s2: Matrix, wanted_rate_rad_s: Sequence[float]) -> Sequence[float]:
         """Return the torque of the estimated gravity and friction.
 
         Args:
             levers_m_s2: joint torques of gravity per first moment of each link (`Manipulator.gravity_levers_m_s2`).
             wanted_rate_rad_s: joint rates that the target impedance requests.
         """
-        if not self.on:
-            return (0.0, 0.0)
-        (f1, f2), (r1, r2) = self.friction_nm, wanted_rate_rad_s
-        g1, g2 = self._manipulator.moment_torque_nm(levers_m_s2, self.moments_kg_m)
-        t1, t2 = self._turning = (math.tanh(r1 / FRICTION_RATE_RAD_S), math.tanh(r2 / FRICTION_RATE_RAD_S))
-        self._levers, self._wanted_rate_rad_s = levers_m_s2, wanted_rate_rad_s
-        return (g1 + f1 * t1, g2 + f2 * t2)
+        gravity, friction = self._manipulator.moment_torque_nm(levers_m_s2, self.moments_kg_m), self.friction_nm
+        turning, torque = [], []
+        for joint, rate in enumerate(wanted_rate_rad_s):
+            t = math.tanh(rate / FRICTION_RATE_RAD_S)
+            turning.append(t)
+            torque.append(gravity[joint] + friction[joint] * t)
+        self._turning, self._levers, self._wanted_rate_rad_s = turning, levers_m_s2, wanted_rate_rad_s
+        return torque
 
-    def advance(self, dt_s: float, s: Rows, learn: bool) -> None:
+    def advance(self, dt_s: float, s: Chi, learn: bool) -> None:
         """Integrate one step with s held. Without `learn` the estimates do not change: on the ground and in saturation.
 
         The friction of a joint changes only while the joint turns in the wanted direction. At rest static friction takes any value up
@@ -77,8 +78,6 @@ class LoadAdaptation:
         if not self.on or not learn:
             return
         decay, step = self._held[dt_s]
-        s0, s1, s2, s6, s7 = s
-        t1, t2 = self._turning
 
         def updated(value: float, rate: float, error: float, low: float, high: float) -> float:
             new = decay * value - step * rate * error
@@ -86,13 +85,16 @@ class LoadAdaptation:
             return new if low <= new <= high else low if new < low else high if new > high else value
 
         (x, y, z), (rx, ry, rz), n = self.force_n, self._rate_xyz, self._max_n
-        self.force_n = (updated(x, rx, s0, -n, n), updated(y, ry, s1, -n, n), updated(z, rz, s2, -n, n))
-        (m1, m2), rate, most = self.moments_kg_m, self._rate_moment, self._max_kg_m
-        p1, p2 = self._manipulator.projected_on_moments(self._levers, (s6, s7))
-        self.moments_kg_m = (updated(m1, rate, p1, -most, most), updated(m2, rate, p2, -most, most))
-        (f1, f2), (r1, r2), rate, most = self.friction_nm, self._wanted_rate_rad_s, self._rate_friction, self._max_nm
-        if (r1 + s6) * t1 > FRICTION_RATE_RAD_S * abs(t1):  # r + s is the measured rate
-            f1 = updated(f1, rate, s6 * t1, 0.0, most)
-        if (r2 + s7) * t2 > FRICTION_RATE_RAD_S * abs(t2):
-            f2 = updated(f2, rate, s7 * t2, 0.0, most)
-        self.friction_nm = (f1, f2)
+        self.force_n = (updated(x, rx, s[0], -n, n), updated(y, ry, s[1], -n, n), updated(z, rz, s[2], -n, n))
+        moments, frictions = [], []
+        s_joints = s[6:]
+        projected = self._manipulator.projected_on_moments(self._levers, s_joints)
+        for joint, error in enumerate(s_joints):
+            most = self._max_kg_m
+            moments.append(updated(self.moments_kg_m[joint], self._rate_moment, projected[joint], -most, most))
+            friction, turning = self.friction_nm[joint], self._turning[joint]
+            # The wanted rate + s is the measured rate.
+            if (self._wanted_rate_rad_s[joint] + error) * turning > FRICTION_RATE_RAD_S * abs(turning):
+                friction = updated(friction, self._rate_friction, error * turning, 0.0, self._max_nm)
+            frictions.append(friction)
+        self.moments_kg_m, self.friction_nm = tuple(moments), tuple(frictions)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from typing import ClassVar
 
-from companion.config.controller import PscConfig
+from companion.config.controller import PscConfig, fitted
 from companion.config.vehicle import Vehicle
 from companion.control.common import tracking_errors
 from companion.control.model_based import ModelBasedLaw
@@ -38,6 +38,9 @@ class PscController(ModelBasedLaw):
         self._estimator = PayloadEstimator(config, self._mass_kg)
         self._integral_m_s2 = [0.0, 0.0, 0.0]
         self._commanded_n = 0.0
+        lists = (config.arm_inertia_md, config.arm_damping_kd, config.arm_stiffness_kp)
+        self._arm_gains = tuple(zip(*(fitted(gains, len(vehicle.arm.joints)) for gains in lists), strict=True))
+        """M_d, K_d and K_p of each joint."""
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
         """Run one tick of `dt_s`; see `companion.control.types.Controller`."""
@@ -81,19 +84,19 @@ class PscController(ModelBasedLaw):
         self, state: PlantState, reference: Reference, error: Chi, error_rate: Chi, force: Vec3
     ) -> tuple[Joints, Joints]:
         """Return tau_ext - tau_d and the motor torques, N m."""
-        c = self._c
         ext, desired = self._joint_torques_nm(state, force)
-        e_tau: Joints = (ext[0] - desired[0], ext[1] - desired[1])
-        a1, a2 = (
-            reference.arm_acceleration_rad_s2[i]
-            - (c.arm_damping_kd[i] * error_rate[6 + i] + c.arm_stiffness_kp[i] * error[6 + i] - e_tau[i])
-            / c.arm_inertia_md[i]
-            for i in range(2)
-        )
+        e_tau = tuple([torque - wanted for torque, wanted in zip(ext, desired, strict=True)])
+        feed = reference.arm_acceleration_rad_s2
+        acceleration = [
+            feed[i] - (k_d * error_rate[6 + i] + k_p * error[6 + i] - e_tau[i]) / m_d
+            for i, (m_d, k_d, k_p) in enumerate(self._arm_gains)
+        ]
         terms = self._dynamics.arm_terms(state.arm_rad, state.arm_rate_rad_s)
         gravity = self._manipulator.gravity_torque_nm(state.arm_rad, state.attitude_wxyz)
-        (m11, m12), (m21, m22) = terms.mass
-        return e_tau, (
-            m11 * a1 + m12 * a2 + terms.coriolis[0] + gravity[0] - ext[0],
-            m21 * a1 + m22 * a2 + terms.coriolis[1] + gravity[1] - ext[1],
-        )
+        torque = []
+        for i, row in enumerate(terms.mass):
+            inertial = 0.0
+            for mass, a in zip(row, acceleration, strict=True):
+                inertial += mass * a
+            torque.append(inertial + terms.coriolis[i] + gravity[i] - ext[i])
+        return e_tau, tuple(torque)

@@ -23,28 +23,36 @@ from companion.plugins import CONTROL_LAWS, find, one_line
 HOVER_THRUST = 0.5
 """Normalised hover thrust of a trial for a vehicle file without one."""
 _ZERO: Vec3 = (0.0, 0.0, 0.0)
-AT_REST = PlantState(
-    position_world_m=(0.0, 0.0, 1.0),
-    velocity_world_m_s=_ZERO,
-    acceleration_world_m_s2=_ZERO,
-    attitude_wxyz=IDENTITY_QUAT,
-    angular_rate_body_rad_s=_ZERO,
-    arm_rad=(0.0, 0.0),
-    arm_rate_rad_s=(0.0, 0.0),
-)
-"""The vehicle at rest, 1 m above the origin."""
-HOVER = Reference(
-    position_world_m=AT_REST.position_world_m,
-    velocity_world_m_s=_ZERO,
-    acceleration_world_m_s2=_ZERO,
-    yaw_rad=0.0,
-    yaw_rate_rad_s=0.0,
-    arm_rad=(0.0, 0.0),
-    arm_rate_rad_s=(0.0, 0.0),
-    arm_acceleration_rad_s2=(0.0, 0.0),
-    jerk_world_m_s3=_ZERO,
-)
-"""The reference of a vehicle that stays as in `AT_REST`."""
+_POSITION: Vec3 = (0.0, 0.0, 1.0)
+
+
+def at_rest(arm_rad: Joints) -> PlantState:
+    """Return the state of a vehicle at rest, 1 m above the origin."""
+    return PlantState(
+        position_world_m=_POSITION,
+        velocity_world_m_s=_ZERO,
+        acceleration_world_m_s2=_ZERO,
+        attitude_wxyz=IDENTITY_QUAT,
+        angular_rate_body_rad_s=_ZERO,
+        arm_rad=arm_rad,
+        arm_rate_rad_s=(0.0,) * len(arm_rad),
+    )
+
+
+def hover(arm_rad: Joints) -> Reference:
+    """Return the reference of a vehicle that stays as in `at_rest`."""
+    still = (0.0,) * len(arm_rad)
+    return Reference(
+        position_world_m=_POSITION,
+        velocity_world_m_s=_ZERO,
+        acceleration_world_m_s2=_ZERO,
+        yaw_rad=0.0,
+        yaw_rate_rad_s=0.0,
+        arm_rad=arm_rad,
+        arm_rate_rad_s=still,
+        arm_acceleration_rad_s2=still,
+        jerk_world_m_s3=_ZERO,
+    )
 
 
 def build_law(config: ControllerConfig, vehicle: Vehicle) -> Law:
@@ -69,13 +77,11 @@ def try_law(config: ControllerConfig, vehicle: Vehicle, start_arm_rad: Joints) -
     """
     plugin = find(CONTROL_LAWS, config.law)
     law = build_law(config, vehicle)
-    reference = replace(HOVER, arm_rad=start_arm_rad)
+    resting, reference = at_rest(start_arm_rad), hover(start_arm_rad)
     fastest_s = math.inf
     for force, airborne, offset_m in product((None, (0.0, 0.0, -1.0)), (False, True), (0.0, 0.1)):
         position: Vec3 = (offset_m, 0.0, 1.0)
-        state = replace(
-            AT_REST, position_world_m=position, arm_rad=start_arm_rad, force_ext_world_n=force, airborne=airborne
-        )
+        state = replace(resting, position_world_m=position, force_ext_world_n=force, airborne=airborne)
         begin_s = time.perf_counter()
         try:
             law.hover_thrust = HOVER_THRUST

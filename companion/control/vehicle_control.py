@@ -108,18 +108,17 @@ class VehicleControl:
         now = self._arm_target_rad or (i.arm.angle_rad if i.arm is not None else None)
         if now is None:
             return Command()
-        self._arm_target_rad = (
-            now[0] + max(-step, min(step, goal[0] - now[0])),
-            now[1] + max(-step, min(step, goal[1] - now[1])),
+        self._arm_target_rad = tuple(
+            [angle + max(-step, min(step, end - angle)) for angle, end in zip(now, goal, strict=True)]
         )
         return Command(attitude=None, arm_torque_nm=self._hold(i))
 
     def _hold(self, i: Inputs) -> Joints | None:
         if i.arm is None or i.vehicle is None:
             return None
-        target = self._arm_target_rad or i.arm.angle_rad
+        target, still = self._arm_target_rad or i.arm.angle_rad, (0.0,) * len(i.arm.angle_rad)
         return hold_torque_nm(
-            self._manipulator, i.arm.angle_rad, i.arm.velocity_rad_s, target, (0.0, 0.0), i.vehicle.attitude_wxyz
+            self._manipulator, i.arm.angle_rad, i.arm.velocity_rad_s, target, still, i.vehicle.attitude_wxyz
         )
 
     def fly(self, i: Inputs, dt_s: float, reference: Reference, vertical_scale: float) -> Command:

@@ -270,14 +270,14 @@ class Event(Record, frozen=True, kw_only=True):
 
 
 class ControlLog(Record, frozen=True, kw_only=True):
-    """Quantities that the control law computed in one tick. The vectors of 8 are ordered as chi = [p; q; alpha]."""
+    """Quantities that the control law computed in one tick. Vectors of type `Chi` are ordered as chi = [p; q; alpha]."""
 
     error: Chi
     error_rate: Chi
     sliding: Chi
     gamma: Chi
     tau: Chi
-    """Generalised force after saturation: N in rows 0 to 2, N m in rows 6 and 7. Rows 3 to 5 are 0, because PX4 controls the
+    """Generalised force after saturation: N in rows 0 to 2, N m in rows 6 and above. Rows 3 to 5 are 0, because PX4 controls the
     attitude.
     """
     e_tau: Chi

@@ -15,9 +15,8 @@ from msgspec.structs import replace
 
 from companion.config.controller import PRESETS
 from companion.config.loader import FlightConfig, load_flight
-from companion.config.shipped import DEFAULT_MISSION
 from companion.config.vehicle import Vehicle
-from companion.control.trial import AT_REST, HOVER, build_law, problem_of, try_law
+from companion.control.trial import at_rest, build_law, hover, problem_of, try_law
 from companion.control.types import Law, PlantState, Wrench
 from companion.model.codec import differences, to_packet
 from companion.model.constants import GRAVITY_M_S2, TICK_PERIOD_S
@@ -39,7 +38,7 @@ def check_law(law: str, preset: str | None = None, vehicle: str | Path | None = 
     Args:
         law: name of the law.
         preset: one of the law's presets; None to check all of them in turn.
-        vehicle: vehicle file, or the name of a shipped one; None for the vehicle of the shipped catch mission.
+        vehicle: vehicle file, or the name of a shipped one; None for the vehicle of the shipped missions.
 
     Raises:
         AssertionError: a check fails; the text states the preset and what was found.
@@ -47,9 +46,8 @@ def check_law(law: str, preset: str | None = None, vehicle: str | Path | None = 
         ConfigError: a preset does not fit the law's settings.
     """
     for name in PRESETS[law] if preset is None else (preset,):
-        config = load_flight(DEFAULT_MISSION, vehicle, law, name)
-        first_deg, second_deg = config.mission.start.arm_deg
-        arm_rad = (math.radians(first_deg), math.radians(second_deg))
+        config = load_flight("hover", vehicle, law, name)
+        arm_rad = tuple([math.radians(angle_deg) for angle_deg in config.mission.start.arm_deg])
         try_law(config.controller, config.vehicle, arm_rad)
         _check_random_inputs(config, f"{law}/{name}")
         _check_hover(config, f"{law}/{name}", arm_rad)
@@ -120,11 +118,11 @@ def _held(
     """Run the law with a constant position error and return its last command. In the air, the acceleration follows from the last
     command.
     """
-    x, y, z = AT_REST.position_world_m
+    resting, reference = at_rest(arm_rad), hover(arm_rad)
+    x, y, z = resting.position_world_m
     position: Vec3 = (x + offset_m[0], y + offset_m[1], z + offset_m[2])
-    reference = replace(HOVER, arm_rad=arm_rad)
     for _ in range(round(duration_s / TICK_PERIOD_S)):
-        state = replace(AT_REST, position_world_m=position, arm_rad=arm_rad, airborne=airborne)
+        state = replace(resting, position_world_m=position, airborne=airborne)
         if airborne and wrench is not None:
             mass_kg, attitude = vehicle.airframe.mass_kg, wrench.attitude_wxyz
             fx, fy, fz = quat_rotate(attitude, (0.0, 0.0, wrench.collective_n))
@@ -146,15 +144,14 @@ def _random_ticks(vehicle: Vehicle) -> Iterator[Tick]:
     def three(most: float) -> Vec3:
         return (draw.uniform(-most, most), draw.uniform(-most, most), draw.uniform(-most, most))
 
-    def two(most: float) -> Joints:
-        return (draw.uniform(-most, most), draw.uniform(-most, most))
+    def each(most: float) -> Joints:
+        return tuple([draw.uniform(-most, most) for _ in vehicle.arm.joints])
 
     def angles() -> Joints:
-        first, second = (draw.uniform(*joint.angle_deg) for joint in vehicle.arm.joints)
-        return (math.radians(first), math.radians(second))
+        return tuple([math.radians(draw.uniform(*joint.angle_deg)) for joint in vehicle.arm.joints])
 
     for _ in range(RANDOM_TICKS):
-        roll, pitch = two(0.6)
+        roll, pitch = draw.uniform(-0.6, 0.6), draw.uniform(-0.6, 0.6)
         airborne = draw.random() < 0.8
         state = PlantState(
             position_world_m=three(2.0),
@@ -163,7 +160,7 @@ def _random_ticks(vehicle: Vehicle) -> Iterator[Tick]:
             attitude_wxyz=quat_from_euler_zyx(roll, pitch, draw.uniform(-math.pi, math.pi)),
             angular_rate_body_rad_s=three(2.0),
             arm_rad=angles(),
-            arm_rate_rad_s=two(3.0),
+            arm_rate_rad_s=each(3.0),
             force_ext_world_n=three(10.0) if draw.random() < 0.7 else None,
             airborne=airborne,
         )
@@ -174,8 +171,8 @@ def _random_ticks(vehicle: Vehicle) -> Iterator[Tick]:
             yaw_rad=draw.uniform(-math.pi, math.pi),
             yaw_rate_rad_s=draw.uniform(-1.0, 1.0),
             arm_rad=angles(),
-            arm_rate_rad_s=two(2.0),
-            arm_acceleration_rad_s2=two(5.0),
+            arm_rate_rad_s=each(2.0),
+            arm_acceleration_rad_s2=each(5.0),
             jerk_world_m_s3=three(5.0),
         )
         yield draw.uniform(0.001, 0.05), state, reference, 1.0 if airborne else draw.random()

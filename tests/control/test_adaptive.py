@@ -154,7 +154,7 @@ def test_adaptive_gains_stay_nonnegative_for_any_input(
 
 def test_gamma_is_the_exact_solution(config: FlightConfig) -> None:
     """M_d gamma' = e_tau - D gamma for a held e_tau, against a fine Euler integration."""
-    impedance = Impedance(law(config))
+    impedance = Impedance(law(config), 2)
     e_tau = [0.3, -0.2, 1.0, 0.0, 0.0, 0.0, 0.5, -0.4]
     for _ in range(20):
         impedance.advance(0.005, e_tau)

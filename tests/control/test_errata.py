@@ -202,7 +202,7 @@ def instants(config: FlightConfig, ticks: int = 400) -> list[Instant]:
         gamma_now, e_tau = gamma_before, log.e_tau
 
         def gamma_after(h: float, start: list[float] = gamma_now, held: tuple[float, ...] = e_tau) -> list[float]:
-            impedance = Impedance(law)
+            impedance = Impedance(law, 2)
             impedance.gamma = list(start)
             impedance.advance(h, held)
             return impedance.gamma
@@ -214,7 +214,7 @@ def instants(config: FlightConfig, ticks: int = 400) -> list[Instant]:
             a: Array = e_acceleration,
             after: Callable[[float], list[float]] = gamma_after,
         ) -> Array:
-            impedance = Impedance(law)
+            impedance = Impedance(law, 2)
             impedance.gamma = after(h)
             return np.array(impedance.sliding(wide(e + h * v + 0.5 * h * h * a), wide(v + h * a)))[ROWS]
 
@@ -351,7 +351,7 @@ def fly(
     duration_s: float = 8.0,
 ) -> Flown:
     """Hold a point from an initial error, tau_d = 0, ||.|| over all eight rows as the paper has it; `unknown` is force not in e_tau."""
-    impedance, adaptation = Impedance(law), Adaptation(law)
+    impedance, adaptation = Impedance(law, 2), Adaptation(law)
     m_d, lam, phi, d = np.array(law.inertia_md), np.array(law.lambda_gain), np.array(law.phi), np.array(impedance.d)
     e, rate, gamma, acceleration = start.copy(), np.zeros(8), np.full(8, gamma_start), np.zeros(8)
     rows: list[tuple[Array, Array, Array, list[float], float]] = []
@@ -397,7 +397,7 @@ def test_adaptive_1_printed_gamma_never_yields_from_zero(table: AdaptiveConfig) 
     printed = fly(table, gamma_law=gamma_printed, e_tau=PULL, start=NOTHING)
     assert not printed.gamma.any()
     corrected = fly(table, e_tau=PULL, start=NOTHING)
-    d = np.array(Impedance(table).d)
+    d = np.array(Impedance(table, 2).d)
     np.testing.assert_allclose(corrected.gamma[-1], PULL / d, atol=1e-9)
     np.testing.assert_allclose(corrected.e[-1], PULL / np.array(table.stiffness_kp), atol=1e-3)
 

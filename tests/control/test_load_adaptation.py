@@ -50,7 +50,7 @@ def test_a_constant_force_is_cancelled_and_s_returns_to_zero() -> None:
     pull_n = np.array([0.5, -0.3, -2.0])
     for _ in range(4000):
         s += DT_S / MASS_KG * (pull_n + np.array(load.force_n) - DAMPING * s)
-        load.advance(DT_S, (float(s[0]), float(s[1]), float(s[2]), 0.0, 0.0), True)
+        load.advance(DT_S, (float(s[0]), float(s[1]), float(s[2]), *[0.0] * 5), True)
     np.testing.assert_allclose(load.force_n, -pull_n, atol=1e-3)
     np.testing.assert_allclose(s, 0.0, atol=1e-3)
 
@@ -61,7 +61,7 @@ def test_leakage_leaves_the_error_that_its_balance_says() -> None:
     s = 0.0
     for _ in range(8000):
         s += DT_S / MASS_KG * (-2.0 + load.force_n[2] - DAMPING * s)
-        load.advance(DT_S, (0.0, 0.0, s, 0.0, 0.0), True)
+        load.advance(DT_S, (0.0, 0.0, s, *[0.0] * 5), True)
     assert s == pytest.approx(-2.0 / (DAMPING + 20.0 / 0.5), rel=1e-3)
 
 
@@ -79,7 +79,7 @@ def test_moments_and_friction_are_found_while_the_arm_moves() -> None:
         needed = np.array(levers) @ moments + friction * turning
         given_nm = np.array(load.joint_torque_nm(levers, rate))
         s += DT_S / 0.1 * (given_nm - needed - 1.0 * s)
-        load.advance(DT_S, (0.0, 0.0, 0.0, float(s[0]), float(s[1])), True)
+        load.advance(DT_S, (*[0.0] * 6, float(s[0]), float(s[1])), True)
     np.testing.assert_allclose(load.moments_kg_m, moments, rtol=0.05)
     np.testing.assert_allclose(load.friction_nm, friction, rtol=0.1)
     np.testing.assert_allclose(s, 0.0, atol=5e-3)
@@ -105,7 +105,7 @@ def test_static_friction_that_holds_a_joint_with_an_error_does_not_raise_the_fri
     s = held_nm
     for _ in range(400):
         load.joint_torque_nm(((0.0, 0.0), (0.0, 0.0)), (-s, -s))
-        load.advance(DT_S, (0.0, 0.0, 0.0, s, s), True)
+        load.advance(DT_S, (*[0.0] * 6, s, s), True)
     assert load.friction_nm == (0.0, 0.0)
 
 
@@ -115,7 +115,7 @@ def test_friction_of_a_joint_that_turns_slower_than_wanted_grows_by_the_integral
     s = -0.05 * math.copysign(1.0, rate_rad_s)
     for _ in range(200):
         load.joint_torque_nm(((0.0, 0.0), (0.0, 0.0)), (rate_rad_s - s, rate_rad_s - s))
-        load.advance(DT_S, (0.0, 0.0, 0.0, s, s), True)
+        load.advance(DT_S, (*[0.0] * 6, s, s), True)
     grown_nm = 0.5 * 200 * DT_S * 0.05 * math.tanh(0.45 / 0.1)
     assert load.friction_nm == pytest.approx((grown_nm, grown_nm), rel=1e-9)
 
@@ -129,7 +129,7 @@ def test_estimates_stay_inside_their_bounds_for_any_input(inputs: list[tuple[flo
     load = LoadAdaptation(config, MANIPULATOR)
     for s0, s1, s2, s6, s7, lever, rate in inputs:
         load.joint_torque_nm(((lever, -lever), (0.0, lever)), (rate, -rate))
-        load.advance(DT_S, (s0, s1, s2, s6, s7), True)
+        load.advance(DT_S, (s0, s1, s2, 0.0, 0.0, 0.0, s6, s7), True)
         assert max(map(abs, load.force_n)) <= config.load_max_n
         assert max(map(abs, load.moments_kg_m)) <= config.moment_max_kg_m
         assert 0.0 <= min(load.friction_nm) <= max(load.friction_nm) <= config.friction_max_nm
@@ -158,16 +158,16 @@ def test_adaptive_loads_and_observer_hold_while_the_ground_may_carry_a_part_of_t
 def test_nothing_is_learned_in_saturation() -> None:
     load = LoadAdaptation(law(load_rate_xyz=(5.0, 5.0, 20.0), moment_rate=1.0, friction_rate=1.0), MANIPULATOR)
     load.joint_torque_nm(((1.0, 1.0), (0.0, -1.0)), (1.0, 1.0))
-    load.advance(DT_S, (1.0, 1.0, 1.0, 1.0, 1.0), False)
+    load.advance(DT_S, (1.0,) * 8, False)
     assert (load.force_n, load.moments_kg_m, load.friction_nm) == ((0.0, 0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
 
 
 def test_a_sample_that_is_not_a_number_leaves_the_estimates() -> None:
     load = LoadAdaptation(law(load_rate_xyz=(5.0, 5.0, 20.0), moment_rate=1.0, friction_rate=1.0), MANIPULATOR)
     load.joint_torque_nm(((1.0, 1.0), (0.0, -1.0)), (1.0, 1.0))
-    load.advance(DT_S, (-1.0, -1.0, -1.0, -1.0, -1.0), True)
+    load.advance(DT_S, (-1.0,) * 8, True)
     before = (load.force_n, load.moments_kg_m, load.friction_nm)
-    load.advance(DT_S, (math.nan,) * 5, True)
+    load.advance(DT_S, (math.nan,) * 8, True)
     assert (load.force_n, load.moments_kg_m, load.friction_nm) == before
 
 

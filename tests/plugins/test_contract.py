@@ -9,6 +9,7 @@ import pytest
 from companion.config.controller import PRESETS
 from companion.testing import check_law
 from sitl.testing import check_catch
+from tests.machines import vehicle_with_joints
 from tests.plugins.installed import LAW, STEP, on_path, write_law
 from tests.support import SHORT_CATCH
 
@@ -16,6 +17,14 @@ from tests.support import SHORT_CATCH
 @pytest.mark.parametrize(("law", "preset"), [(law, preset) for law, presets in PRESETS.items() for preset in presets])
 def test_a_law_of_the_companion_keeps_the_contract(law: str, preset: str) -> None:
     check_law(law, preset)
+
+
+@pytest.mark.parametrize("joints", [0, 1, 3, 4])
+@pytest.mark.parametrize("law", PRESETS)
+def test_a_law_of_the_companion_keeps_the_contract_with_any_arm(law: str, joints: int, tmp_path: Path) -> None:
+    vehicle = tmp_path / "vehicle.yaml"
+    vehicle.write_text(vehicle_with_joints(joints).model_dump_json())
+    check_law(law, PRESETS[law][-1], vehicle)
 
 
 @pytest.mark.parametrize("law", PRESETS)

@@ -4,11 +4,11 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from companion.config.base import Positive2, Positive3
-from companion.config.controller import LawConfig
+from companion.config.base import Positive3
+from companion.config.controller import LawConfig, PositiveJoints, fitted
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
-from companion.control.common import ZERO8, Actuation, ForceFilter, tracking_errors, wrench_of
+from companion.control.common import Actuation, ForceFilter, tracking_errors, wrench_of
 from companion.control.types import PlantState, Wrench
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import body_x_z_axes_world, yaw_from_quat
@@ -19,12 +19,13 @@ class LqrConfig(LawConfig):
     """LQR with integral for the vehicle, PD with gravity compensation for the arm."""
 
     presets = ("tuned",)
+    gain_lists = ("arm_kp_nm_rad", "arm_kd_nms_rad")
     law: Literal["lqr"]
     cost_xy: Positive3
     """Cost of the integral of the horizontal error (m s), the error (m) and its rate (m/s); that of the acceleration (m/s^2) is 1."""
     cost_z: Positive3
-    arm_kp_nm_rad: Positive2
-    arm_kd_nms_rad: Positive2
+    arm_kp_nm_rad: PositiveJoints
+    arm_kd_nms_rad: PositiveJoints
 
 
 def lqr_gains(cost: Vec3) -> list[float]:
@@ -43,9 +44,11 @@ class LqrLaw:
 
     def __init__(self, config: LqrConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         self.hover_thrust = hover_thrust
-        self._config, self._mass_kg = config, vehicle.airframe.mass_kg
+        self._mass_kg = vehicle.airframe.mass_kg
         self._gains = [lqr_gains(cost) for cost in (config.cost_xy, config.cost_xy, config.cost_z)]
         self._manipulator = manipulator_of(vehicle)
+        count = self._manipulator.joint_count
+        self._arm_gains = [*zip(fitted(config.arm_kp_nm_rad, count), fitted(config.arm_kd_nms_rad, count), strict=True)]
         self._force = ForceFilter(config.force_lowpass_hz)
         self._actuation = Actuation(config, vehicle, hover_thrust)
         self._integral_m_s = [0.0, 0.0, 0.0]
@@ -65,9 +68,9 @@ class LqrLaw:
         for i, clipped in enumerate((clipped_xy, clipped_xy, clipped_z)):
             if state.airborne and not clipped:
                 self._integral_m_s[i] += dt_s * error[i]
-        return wrench_of(sent, error, rate, ZERO8, force, self.hover_thrust)
+        return wrench_of(sent, error, rate, (0.0,) * len(error), force, self.hover_thrust)
 
     def _arm(self, state: PlantState, error_rad: Joints, rate_rad_s: Joints) -> Joints:
-        c, (g1, g2) = self._config, self._manipulator.gravity_torque_nm(state.arm_rad, state.attitude_wxyz)
-        (p1, p2), (d1, d2), (e1, e2), (r1, r2) = c.arm_kp_nm_rad, c.arm_kd_nms_rad, error_rad, rate_rad_s
-        return (g1 - p1 * e1 - d1 * r1, g2 - p2 * e2 - d2 * r2)
+        gravity_nm = self._manipulator.gravity_torque_nm(state.arm_rad, state.attitude_wxyz)
+        rows = zip(gravity_nm, self._arm_gains, error_rad, rate_rad_s, strict=True)
+        return tuple([gravity - kp * error - kd * rate for gravity, (kp, kd), error, rate in rows])
