@@ -15,7 +15,7 @@ Location = tuple[str | int, ...]
 class Model(BaseModel):
     """A frozen configuration record."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 def refuse(title: str, problems: list[tuple[Location, str]]) -> None:

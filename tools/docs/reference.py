@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from companion.cli.schema import KINDS
+from companion.cli.schema import KINDS, Described
 
 Schema = dict[str, Any]
 _INTRO = {
@@ -52,7 +52,7 @@ def page(kind: str) -> str:
     Raises:
         KeyError: the kind is not one of `KINDS`.
     """
-    schema = KINDS[kind]().json_schema()
+    schema = KINDS[kind]().json_schema(schema_generator=Described)
     lines = [
         f"# The {kind} file: every key" if kind != "world" else "# The simulated world: every key",
         "",
