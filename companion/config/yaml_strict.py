@@ -6,6 +6,7 @@ follow the core schema of YAML 1.2 (section 10.3.2); duplicate keys, aliases and
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -137,17 +138,7 @@ def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
         return Origin(document.source, mark.line + 1, mark.column + 1)
 
     try:
-        loader = StrictLoader(text)
-        try:
-            node = loader.get_single_node()
-        except (
-            ValueError,
-            OverflowError,
-        ) as error:  # PyYAML converts "\\U0011FFFF" and %YAML 1.999... without a check
-            at = origin(loader.get_mark())
-            raise ConfigError([f"{at}: not YAML: an invalid escape or number ({error})"]) from None
-        finally:
-            loader.dispose()
+        node = _composed(text)
     except yaml.reader.ReaderError as error:
         before = text[: error.position]
         at = fixed or Origin(document.source, before.count("\n") + 1, error.position - (before.rfind("\n") + 1) + 1)
@@ -156,6 +147,24 @@ def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
     except yaml.MarkedYAMLError as error:
         raise ConfigError([f"{origin(error.problem_mark or error.context_mark)}: not YAML: {_syntax(error)}"]) from None
     return None if node is None else _Builder(document, origin).build(node, ())
+
+
+@functools.lru_cache(maxsize=16)
+def _composed(text: str) -> yaml.Node | None:
+    """Return the root node of the text, None if it is empty. A campaign reads the same few files for each of its cases.
+
+    Raises:
+        yaml.YAMLError: the text is not YAML.
+    """
+    loader = StrictLoader(text)
+    try:
+        return loader.get_single_node()
+    except (ValueError, OverflowError) as error:  # PyYAML converts "\\U0011FFFF" and %YAML 1.999... without a check
+        raise yaml.MarkedYAMLError(
+            problem=f"an invalid escape or number ({error})", problem_mark=loader.get_mark()
+        ) from None
+    finally:
+        loader.dispose()
 
 
 class _Builder:
