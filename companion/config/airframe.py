@@ -56,6 +56,8 @@ class Airframe(Model):
     default is that of the Tarot 650."""
     thrust_max_n: Positive
     """Thrust of all rotors at full command with a charged battery."""
+    battery_cells: Annotated[int, Field(ge=1, le=10)] = 4
+    """Number of lithium-polymer cells of the flight battery in series; used by the simulated battery and by its parameters in PX4."""
     hover_thrust: Fraction | None = None
     """Normalised thrust that carries `mass_kg` in hover. If it is absent, PX4's MPC_THR_HOVER is used."""
     hover_thrust_adapt: bool = True

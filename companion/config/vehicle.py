@@ -31,6 +31,8 @@ from companion.model.arm_chain import is_physical_inertia
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Joints
 
+_CELL_MIN_V = (2.8, 4.1)
+"""Range of the lowest permitted voltage of a lithium-polymer cell."""
 FOLDED, UNFOLDED = "folded", "unfolded"
 """Names of poses that the shipped missions use."""
 
@@ -526,6 +528,11 @@ class Vehicle(Model):
         if self.airframe.thrust_max_n <= GRAVITY_M_S2 * self.airframe.mass_kg:
             text = f"{self.airframe.thrust_max_n:g} N do not lift {self.airframe.mass_kg:g} kg"
             problems.append((("airframe", "thrust_max_n"), text))
+        cells, lowest_v = self.airframe.battery_cells, self.safety.battery_voltage_min_v
+        low_v, high_v = (cells * cell_v for cell_v in _CELL_MIN_V)
+        if lowest_v is not None and not low_v <= lowest_v <= high_v:
+            text = f"expected {low_v:.1f} to {high_v:.1f} V for the {cells} cells of airframe.battery_cells, got {lowest_v:g} V"
+            problems.append((("safety", "battery_voltage_min_v"), text))
         refuse("vehicle", problems)
         return self
 

@@ -26,7 +26,7 @@ from sitl.world.model import SECOND, SECOND_CATCH
 from sitl.world.payload import Ball
 from sitl.world.world import World
 
-FULL_V = 16.6
+CELL_FULL_V = 4.15
 OVERHEATED_C = 80.0
 OVERLOAD, OVERHEATING = 0x20, 0x04
 """Bits of register 70 (hardware error status)."""
@@ -210,7 +210,7 @@ class Faults:
     def _set_rotor_share(self) -> None:
         weak, sag = self.active.get("motor_weak"), self.active.get("battery_sag")
         self.sag_v = sag.magnitude if sag is not None else 0.0
-        every = (1.0 - self.sag_v / FULL_V) ** 2
+        every = (1.0 - self.sag_v / (CELL_FULL_V * self._world.battery_cells)) ** 2
         first = every * (1.0 - weak.magnitude) if weak is not None else every
         share = (first, *[every] * (self._world.rotor_count - 1))
         self._world.rotor_share = None if min(share) == 1.0 else share

@@ -89,7 +89,7 @@ class RealPx4:
         self._installation: Installation | None = find()
         self._instance = Instance.claim()
         self._link = SimulatorLink(self._instance.simulator, HilSensors(config.seed), airframe.rotor_layout.count)
-        self._control = ControlLink(self._instance)
+        self._control = ControlLink(self._instance, airframe.battery_cells)
         self._relay = Relay(self._instance) if any(f.kind in _LINK_FAULTS for f in config.faults) else None
         self._process: Px4Process | None = None
         self._version: Version | None = None

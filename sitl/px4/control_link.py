@@ -28,7 +28,6 @@ COMMAND_DEADLINE_S = 5.0
 HEARTBEAT_DEADLINE_S = 20.0
 MODE_PERIOD_S = 0.02
 """Period of CURRENT_MODE on this link; heartbeats arrive once per second, too rarely to show when the mode changes."""
-_CELLS = 4
 _AT_ONCE = 20
 """Number of parameters requested at a time; more would overflow PX4's receive buffer."""
 _OWN_SYSTEM, _OWN_COMPONENT = 254, mavlink.MAV_COMP_ID_SYSTEM_CONTROL
@@ -50,13 +49,18 @@ class Version:
 
 
 class ControlLink(UdpEndpoint):
-    """The world's control link to PX4; an async context manager on the socket of the instance."""
+    """The world's control link to PX4; an async context manager on the socket of the instance.
 
-    def __init__(self, instance: Instance) -> None:
+    Args:
+        instance: the PX4 with which the link communicates.
+        battery_cells: number of cells of the battery whose state is sent, 1 to 10.
+    """
+
+    def __init__(self, instance: Instance, battery_cells: int) -> None:
         super().__init__()
         self.nav_state: NavState | None = None
         """Mode in the newest HEARTBEAT or CURRENT_MODE; None if it is unknown."""
-        self._instance = instance
+        self._instance, self._cells = instance, battery_cells
         self._system = instance.number + 1
         self._encoder = mavlink.MAVLink(None, srcSystem=_OWN_SYSTEM, srcComponent=_OWN_COMPONENT)
         self._battery_encoder = mavlink.MAVLink(None, self._system, mavlink.MAV_COMP_ID_BATTERY)
@@ -217,7 +221,7 @@ class ControlLink(UdpEndpoint):
         """Send BATTERY_STATUS with PX4's system id, so that PX4 uses it in place of its power module
         (MavlinkReceiver::handle_message_battery_status).
         """
-        cells = [round(battery.voltage_v / _CELLS * 1e3)] * _CELLS + [0xFFFF] * (10 - _CELLS)
+        cells = [round(battery.voltage_v / self._cells * 1e3)] * self._cells + [0xFFFF] * (10 - self._cells)
         message = mavlink.MAVLink_battery_status_message(
             0, mavlink.MAV_BATTERY_FUNCTION_ALL, mavlink.MAV_BATTERY_TYPE_LIPO, 2500, cells, round(battery.current_a * 1e2),
             round(battery.consumed_mah), -1, round(battery.remaining * 1e2),

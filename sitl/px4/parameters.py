@@ -79,6 +79,6 @@ def parameters(airframe: Airframe, config: WorldConfig, hover_command: float) ->
         "SIM_BAT_ENABLE": int(not config.battery.on),  # with this effect the world sends the battery's state
         "SIM_BAT_DRAIN": config.battery_life_s,
         "SIM_BAT_MIN_PCT": 0.0,
-        "BAT1_N_CELLS": 4,
+        "BAT1_N_CELLS": airframe.battery_cells,
         **config.overridden_px4_params(),
     }

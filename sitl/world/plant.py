@@ -32,7 +32,7 @@ from sitl.world.world import PHYSICS_DT_S, Truth, World
 
 IMU_EVERY = 2
 """Physics steps per IMU sample: 250 Hz, the rate of PX4's rate loop."""
-BATTERY_FULL_V, BATTERY_EMPTY_V = 16.6, 14.0
+CELL_FULL_V, CELL_EMPTY_V = 4.15, 3.5
 _COUNTS_PER_RAD = 4096.0 / (2.0 * math.pi)
 
 
@@ -81,9 +81,9 @@ def _zero_rad(joint: Joint, servo: Servo) -> float:
     return joint.zero_count / _COUNTS_PER_RAD + joint.sign * math.radians(servo.zero_error_deg)
 
 
-def battery_voltage_v(remaining: float) -> float:
-    """Return the battery voltage at a state of charge of 0 to 1."""
-    return BATTERY_EMPTY_V + (BATTERY_FULL_V - BATTERY_EMPTY_V) * remaining
+def battery_voltage_v(remaining: float, cells: int) -> float:
+    """Return the voltage of a battery with this number of cells at a state of charge of 0 to 1."""
+    return cells * (CELL_EMPTY_V + (CELL_FULL_V - CELL_EMPTY_V) * remaining)
 
 
 _MOCAP, _IMU, _FORCE = range(3)
@@ -328,7 +328,7 @@ class Plant:
             return Battery(pack.voltage_v - sag_v, pack.current_a, pack.remaining, pack.drawn_as / 3.6)
         flown_s = 0.0 if self.armed_t_s is None else self.world.t_s - self.armed_t_s
         remaining = max(0.0, self._config.battery_start - flown_s / self._config.battery_life_s)
-        return Battery(voltage_v=battery_voltage_v(remaining) - sag_v, remaining=remaining)
+        return Battery(voltage_v=battery_voltage_v(remaining, self.world.battery_cells) - sag_v, remaining=remaining)
 
     def force_torque(self) -> tuple[Vec3, Vec3]:
         """Return a reading of the force-torque sensor in N and N m, in the sensor frame, with noise, bias, faults and scale error."""

@@ -140,13 +140,13 @@ class World:
         self.parked = True
         """Whether a support holds the arm."""
         layout = vehicle.airframe.rotor_layout
-        self.rotor_count = layout.count
+        self.rotor_count, self.battery_cells = layout.count, vehicle.airframe.battery_cells
         self._rotor_max_n, self._rotor_height_m = vehicle.airframe.thrust_max_n / layout.count, layout.height_m
         self._rotors: Rotors | LinearRotors = Rotors.of(config.rotors, layout, PHYSICS_DT_S) or LinearRotors(
             layout.count, config.rotor_lag_s, PHYSICS_DT_S
         )
         self.battery = BatteryPack.of(
-            config.battery, config.battery_start, config.battery_life_s, self.weight_n, layout.count
+            config.battery, config.battery_start, config.battery_life_s, self.weight_n, vehicle.airframe
         )
         """The battery, or None if its effect is off."""
         self._standing_m = vehicle.airframe.ground_clearance_m

@@ -43,7 +43,7 @@ async def connected() -> AsyncIterator[tuple[ControlLink, Rig]]:
         ):
             group.create_task(rig.fly(server, stop))
             try:
-                async with ControlLink(instance) as control:
+                async with ControlLink(instance, 4) as control:
                     yield control, rig
             finally:
                 stop.set()
@@ -81,7 +81,7 @@ def test_a_px4_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) ->
 
     async def scenario() -> None:
         with Instance.claim() as instance:
-            async with ControlLink(instance) as control:
+            async with ControlLink(instance, 4) as control:
                 with pytest.raises(Px4Error, match="expected a heartbeat on UDP"):
                     await control.await_heartbeat()
 
@@ -151,7 +151,7 @@ def test_the_battery_is_sent_as_one_of_px4s_own_system() -> None:
         with Instance.claim() as instance, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as px4:
             px4.bind(instance.control_address)
             px4.setblocking(False)
-            async with ControlLink(instance) as control, asyncio.timeout(DEADLINE_S):
+            async with ControlLink(instance, 4) as control, asyncio.timeout(DEADLINE_S):
                 control.send_battery(Battery(15.2, 21.5, 0.8, 640.0))
                 (message,) = mavlink.MAVLink(None).parse_buffer(await loop.sock_recv(px4, 512))
             assert message.get_type() == "BATTERY_STATUS"

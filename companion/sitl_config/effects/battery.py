@@ -6,7 +6,8 @@ from companion.config.base import Model, NonNegative, Positive
 
 
 class Battery(Model):
-    """True battery of four lithium-polymer cells. Its capacity is the charge that a hover of `world.battery_life_s` draws."""
+    """True battery. Its capacity is the charge that a hover of `world.battery_life_s` draws. The values are those of four cells;
+    resistance and voltage are scaled to the vehicle file's `airframe.battery_cells`."""
 
     on: bool = False
     """Whether this effect acts."""

@@ -10,15 +10,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
+from companion.config.airframe import Airframe
 from companion.sitl_config.effects.battery import Battery as BatteryConfig
 
-CELLS = 4
+_CONFIGURED_CELLS = 4
+"""Number of cells for which section `battery` gives resistance and voltage."""
 
 
-def open_circuit_v(charge: float) -> float:
-    """Return the battery's voltage without load at a state of charge (0 to 1)."""
+def open_circuit_v(charge: float, cells: int) -> float:
+    """Return the voltage of a battery with this number of cells without load at a state of charge (0 to 1)."""
     cell_v = 3.685 + charge * (0.2156 + charge * (-0.1178 + charge * 0.3201)) - 1.031 * math.exp(-35.0 * charge)
-    return CELLS * cell_v
+    return cells * cell_v
 
 
 class BatteryPack:
@@ -29,31 +31,37 @@ class BatteryPack:
         start: state of charge at arming, 0 to 1.
         life_s: hover time with a full battery.
         weight_n: weight of the vehicle, for the hover current.
-        rotors: number of rotors.
+        airframe: airframe of the vehicle file, for the numbers of rotors and cells.
     """
 
-    def __init__(self, config: BatteryConfig, start: float, life_s: float, weight_n: float, rotors: int) -> None:
-        self._resistance_ohm = config.resistance_ohm
+    def __init__(self, config: BatteryConfig, start: float, life_s: float, weight_n: float, airframe: Airframe) -> None:
+        self._cells = airframe.battery_cells
+        relative = self._cells / _CONFIGURED_CELLS
+        self._resistance_ohm = relative * config.resistance_ohm
         self._power_w_n15 = config.power_w_n15
         self._electronics_w = config.electronics_w
-        self._full_thrust_v = config.full_thrust_v
+        self._full_thrust_v = relative * config.full_thrust_v
         self._start = start
-        hover_w = config.electronics_w + config.power_w_n15 * weight_n * math.sqrt(weight_n / rotors)
-        self.hover_v = self._loaded_v(open_circuit_v(start), hover_w)
-        self.capacity_as = hover_w / self._loaded_v(open_circuit_v(0.5), hover_w) * life_s
+        hover_w = config.electronics_w + config.power_w_n15 * weight_n * math.sqrt(
+            weight_n / airframe.rotor_layout.count
+        )
+        self.hover_v = self._loaded_v(open_circuit_v(start, self._cells), hover_w)
+        self.capacity_as = hover_w / self._loaded_v(open_circuit_v(0.5, self._cells), hover_w) * life_s
         """Charge of the full battery in A s: the hover current at half charge multiplied by `life_s`."""
         self.restart()
 
     @classmethod
-    def of(cls, config: BatteryConfig, start: float, life_s: float, weight_n: float, rotors: int) -> BatteryPack | None:
+    def of(
+        cls, config: BatteryConfig, start: float, life_s: float, weight_n: float, airframe: Airframe
+    ) -> BatteryPack | None:
         """Return the battery, or None if the effect is off."""
-        return cls(config, start, life_s, weight_n, rotors) if config.on else None
+        return cls(config, start, life_s, weight_n, airframe) if config.on else None
 
     def restart(self) -> None:
         """Reset the battery to its charge at arming."""
         self.drawn_as = 0.0
         """Charge drawn since arming, A s."""
-        self.voltage_v = self._loaded_v(open_circuit_v(self._start), self._electronics_w)
+        self.voltage_v = self._loaded_v(open_circuit_v(self._start, self._cells), self._electronics_w)
         self.current_a = self._electronics_w / self.voltage_v
 
     def _loaded_v(self, open_v: float, power_w: float) -> float:
@@ -74,6 +82,6 @@ class BatteryPack:
         """Draw the current for these rotor thrusts during one physics step."""
         rotors_n15 = sum([force * math.sqrt(force) for force in thrust_n])
         power_w = self._electronics_w + self._power_w_n15 * rotors_n15
-        self.voltage_v = voltage_v = self._loaded_v(open_circuit_v(self.remaining), power_w)
+        self.voltage_v = voltage_v = self._loaded_v(open_circuit_v(self.remaining, self._cells), power_w)
         self.current_a = current_a = power_w / voltage_v
         self.drawn_as += current_a * dt_s

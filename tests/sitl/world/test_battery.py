@@ -22,17 +22,17 @@ HOVER: Vec4 = (WEIGHT_N / 4.0,) * 4
 
 
 def pack(start: float = 1.0, life_s: float = 900.0, **changes: Any) -> BatteryPack:
-    made = BatteryPack.of(BatteryConfig(on=True, **changes), start, life_s, WEIGHT_N, 4)
+    made = BatteryPack.of(BatteryConfig(on=True, **changes), start, life_s, WEIGHT_N, VEHICLE.airframe)
     assert made is not None
     return made
 
 
 def test_battery_that_is_off_is_none() -> None:
-    assert BatteryPack.of(BatteryConfig(), 1.0, 900.0, WEIGHT_N, 4) is None
+    assert BatteryPack.of(BatteryConfig(), 1.0, 900.0, WEIGHT_N, VEHICLE.airframe) is None
 
 
 def test_open_circuit_voltage_falls_from_full_to_empty() -> None:
-    volts = [open_circuit_v(0.01 * percent) for percent in range(101)]
+    volts = [open_circuit_v(0.01 * percent, 4) for percent in range(101)]
     assert volts == sorted(volts)
     assert volts[100] == pytest.approx(4.0 * 4.1029, abs=1e-3)
     assert volts[50] == pytest.approx(4.0 * 3.8034, abs=1e-3)
@@ -44,13 +44,21 @@ def test_voltage_sags_by_the_resistance_times_the_current(each_n: float) -> None
     battery = pack(resistance_ohm=0.03)
     battery.step(PHYSICS_DT_S, (each_n,) * 4)
     assert battery.voltage_v * battery.current_a == pytest.approx(15.0 + 4.0 * 3.9 * each_n**1.5)
-    assert battery.voltage_v == pytest.approx(open_circuit_v(1.0) - 0.03 * battery.current_a)
+    assert battery.voltage_v == pytest.approx(open_circuit_v(1.0, 4) - 0.03 * battery.current_a)
+
+
+def test_battery_of_six_cells_has_their_voltage_and_gives_the_vehicle_files_thrust_at_it() -> None:
+    airframe = VEHICLE.airframe.model_copy(update={"battery_cells": 6})
+    battery = BatteryPack(BatteryConfig(on=True, electronics_w=0.0), 1.0, 900.0, WEIGHT_N, airframe)
+    four = pack(electronics_w=0.0)
+    assert battery.voltage_v == pytest.approx(1.5 * four.voltage_v)
+    assert battery.thrust_ratio(battery.voltage_v) == pytest.approx(four.thrust_ratio(four.voltage_v))
 
 
 def test_more_power_than_the_battery_has_does_not_end_the_world() -> None:
     battery = pack(resistance_ohm=2.0)
     battery.step(PHYSICS_DT_S, (15.0,) * 4)
-    assert battery.voltage_v == pytest.approx(0.5 * open_circuit_v(1.0))
+    assert battery.voltage_v == pytest.approx(0.5 * open_circuit_v(1.0, 4))
 
 
 def test_charge_drawn_is_the_integral_of_the_current() -> None:
@@ -92,7 +100,7 @@ def test_thrust_goes_with_the_square_of_the_voltage() -> None:
             for _ in range(300):
                 world.step((0.5,) * 4, (0.0, 0.0))
             near = 1.0 if world._rotors is None else world._rotors.ground_effect(world.q[2] + 0.03)
-            wanted = near * VEHICLE.airframe.thrust_max_n * share * (open_circuit_v(start) / 16.0) ** 2
+            wanted = near * VEHICLE.airframe.thrust_max_n * share * (open_circuit_v(start, 4) / 16.0) ** 2
             assert sum(world.data.ctrl[0:4]) == pytest.approx(wanted, rel=2e-3)
 
 
