@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 from companion.config.vehicle import Vehicle
+from companion.model.arm_chain import TOOL_PART_INERTIA_KG_M2, ChainLink
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import Joints, Vec3
+from companion.model.frames import quat_from_euler_zyx, quat_multiply
+from companion.model.types import IDENTITY_QUAT, Joints, Quat, Vec3
 from companion.sitl_config.effects.rotors import of_rotors
-from companion.sitl_config.per_joint import of_joints
 from companion.sitl_config.world import World
 from sitl.world.effects import machine, transmission
 
@@ -22,7 +23,7 @@ _FEET_M = ((0.18, -0.18), (-0.18, 0.18), (0.18, 0.18), (-0.18, -0.18))
 def base_mass_kg(vehicle: Vehicle, world: World) -> float:
     """Return the true mass of the flying base, without arm and tool."""
     arm, tool = vehicle.arm, vehicle.tool
-    rest = sum(arm.link_masses_kg)
+    rest = arm.mass_kg
     if tool is not None:
         rest = rest + tool.sensor_mass_kg + tool.net_mass_kg
     return (vehicle.airframe.mass_kg - rest) * (1.0 + world.mass_error)
@@ -30,62 +31,76 @@ def base_mass_kg(vehicle: Vehicle, world: World) -> float:
 
 def link_masses_kg(vehicle: Vehicle, world: World) -> Joints:
     """Return the true masses of the links, without sensor and net, whose masses in the vehicle file are taken as true."""
-    masses_kg = vehicle.arm.link_masses_kg
-    errors = of_joints(world.link_mass_error, len(masses_kg))
-    return tuple(mass_kg * (1.0 + error) for mass_kg, error in zip(masses_kg, errors, strict=True))
+    return tuple(link.mass_kg for link in machine.true_chain(vehicle, world).links)
 
 
 def _xyz(values: Vec3) -> str:
     return " ".join(str(value) for value in values)
 
 
-def _rod(mass_kg: float, com_m: float, length_m: float) -> str:
-    inertia = mass_kg * length_m * length_m / 12.0
-    return f'<inertial pos="{com_m} 0 0" mass="{mass_kg}" diaginertia="{0.1 * inertia + 1e-5} {inertia} {inertia}"/>'
+def _inertial(link: ChainLink) -> str:
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = link.inertia_kg_m2
+    moments = (
+        f'diaginertia="{xx} {yy} {zz}"' if xy == xz == yz == 0.0 else f'fullinertia="{xx} {yy} {zz} {xy} {xz} {yz}"'
+    )
+    return f'<inertial pos="{_xyz(link.com_m)}" mass="{link.mass_kg}" {moments}/>'
+
+
+def _quat(attitude: Quat) -> str:
+    return "" if attitude == IDENTITY_QUAT else f'quat="{" ".join(map(str, attitude))}"'
 
 
 def _links(vehicle: Vehicle, world: World) -> str:
     """Return the bodies of the links, the sensor and the net, each inside the previous one.
 
-    Without an arm, sensor and net are massless bodies at the origin of the base, so that every model has a body with that name.
+    Without a tool, sensor and net are massless bodies at the tip, or without an arm at the origin of the base, so that every model has
+    bodies with these names.
     """
-    arm, tool = vehicle.arm, vehicle.tool
-    sensor_kg, net_kg, (roll, pitch, yaw) = 0.0, 0.0, (0.0, 0.0, 0.0)
+    chain, tool = machine.true_chain(vehicle, world), vehicle.tool
+    sensor = net = turn = ""
     if tool is not None:
-        sensor_kg, net_kg, (roll, pitch, yaw) = tool.sensor_mass_kg, tool.net_mass_kg, tool.sensor_rpy_deg
-    if arm.joints:
+        roll, pitch, yaw = tool.sensor_rpy_deg
+        turn = f'euler="{math.radians(yaw)} {math.radians(pitch)} {math.radians(roll)}"'
+        inertia = " ".join(3 * (str(TOOL_PART_INERTIA_KG_M2),))
         sensor, net = (
-            f'<inertial pos="0 0 0" mass="{max(mass_kg, 1e-4)}" diaginertia="1e-4 1e-4 1e-4"/>'
-            for mass_kg in (sensor_kg, net_kg)
+            f'<inertial pos="0 0 0" mass="{max(mass_kg, 1e-4)}" diaginertia="{inertia}"/>'
+            for mass_kg in (tool.sensor_mass_kg, tool.net_mass_kg)
         )
-    else:
-        sensor = net = ""
-    places = [_xyz(arm.shoulder_body_m), *(f"{length_m} 0 0" for length_m in arm.link_lengths_m)]
-    bodies = f"""<body name="sensor" pos="{places[-1]}">
+    bodies = f"""<body name="sensor" pos="{_xyz(chain.tip_m)}" {_quat(chain.tip_wxyz)}>
         {sensor}
-        <body name="net" euler="{math.radians(yaw)} {math.radians(pitch)} {math.radians(roll)}">
+        <body name="net" {turn}>
           {net}
           <site name="net"/>
         </body>
       </body>"""
-    friction_nm, damping_nms, armature = world.joint_friction_nm, world.joint_damping_nms, arm.joint_armature_kg_m2
+    friction_nm, damping_nms = world.joint_friction_nm, world.joint_damping_nms
     if transmission.acts(world):
-        friction_nm = damping_nms = armature = 0.0
-    rods = list(map(_rod, link_masses_kg(vehicle, world), arm.link_com_m, arm.link_lengths_m))
-    for index in reversed(range(len(arm.joints))):
-        turn = f'euler="{_xyz(machine.shoulder_ypr_rad(world.machine))}"' if index == 0 else ""
-        bodies = f"""<body name="link{index + 1}" pos="{places[index]}" {turn}>
-        <joint name="alpha{index + 1}" axis="0 {-1 if index else 1} 0" frictionloss="{friction_nm}" damping="{damping_nms}"
+        friction_nm = damping_nms = 0.0
+    for number in range(len(chain.links), 0, -1):
+        link = chain.links[number - 1]
+        armature = 0.0 if transmission.acts(world) else link.armature_kg_m2
+        bodies = f"""<body name="link{number}" pos="{_xyz(link.position_m)}" {_turn(link, number, world)}>
+        <joint name="alpha{number}" axis="{_xyz(link.axis)}" frictionloss="{friction_nm}" damping="{damping_nms}"
                armature="{armature}"/>
-        {rods[index]}
+        {_inertial(link)}
         {bodies}
       </body>"""
     return bodies
 
 
+def _turn(link: ChainLink, number: int, world: World) -> str:
+    """Return the attribute with the attitude of a link's body; that of the first link includes the turn of the arm's mount."""
+    shoulder_ypr_rad = machine.shoulder_ypr_rad(world.machine)
+    if number > 1 or shoulder_ypr_rad == (0.0, 0.0, 0.0):
+        return _quat(link.attitude_wxyz)
+    if link.attitude_wxyz == IDENTITY_QUAT:
+        return f'euler="{_xyz(shoulder_ypr_rad)}"'
+    yaw, pitch, roll = shoulder_ypr_rad
+    return _quat(quat_multiply(quat_from_euler_zyx(roll, pitch, yaw), link.attitude_wxyz))
+
+
 def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     """Return the MuJoCo model of the true vehicle as MJCF text."""
-    vehicle = machine.as_built(vehicle, world.machine)
     airframe, joints = vehicle.airframe, range(1, len(vehicle.arm.joints) + 1)
     layout = airframe.rotor_layout
     clearance = airframe.ground_clearance_m
@@ -137,7 +152,7 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     <body name="base" pos="0 0 {clearance}">
       <freejoint name="base"/>
       <inertial pos="{_xyz(machine.centre_of_mass_m(world.machine))}" mass="{base_mass_kg(vehicle, world)}"
-                diaginertia="{_xyz(airframe.inertia_kg_m2)}"/>
+                diaginertia="{_xyz(machine.inertia_kg_m2(airframe.inertia_kg_m2, world.machine))}"/>
       <site name="imu"/>
       <site name="tether" pos="{_xyz(vehicle.tether.attachment_body_m if vehicle.tether is not None else (0.0, 0.0, 0.0))}"/>
       {rotors}

@@ -14,6 +14,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from companion.config.arm_chain import chain_of
 from companion.config.vehicle import Vehicle
 from companion.model.rotors import RotorLayout
 from companion.model.types import Vec3
@@ -76,6 +77,19 @@ def _smeared(x_m: float, half_m: float, per_m: float) -> float:
     return 0.5 * (math.erf((x_m + half_m) * per_m) - math.erf((x_m - half_m) * per_m))
 
 
+def _links_of(vehicle: Vehicle) -> list[tuple[int, Vec3, float]]:
+    """Return the number of each link of more than zero length, the direction from its joint to its end in its own frame, and its length
+    in m.
+    """
+    chain, found = chain_of(vehicle), []
+    for number in range(1, len(chain.links) + 1):
+        x, y, z = chain.links[number].position_m if number < len(chain.links) else chain.tip_m
+        length_m = math.hypot(x, y, z)
+        if length_m > 0.0:
+            found.append((number, (x / length_m, y / length_m, z / length_m), length_m))
+    return found
+
+
 class Downwash:
     """The forces of the rotors' wakes.
 
@@ -98,10 +112,11 @@ class Downwash:
         base = model.body("base").id
         self._base_position, self._base_axes = data.xpos[base], data.xmat[base]
         area = config.link_drag_coefficient * config.link_width_m
+        links = _links_of(vehicle)
+        bodies = [model.body(f"link{number}").id for number, _, _ in links]
         self._links = tuple(
-            (body, data.xpos[body], data.xmat[body], data.xipos[body], 0.5 * length_m, area * length_m)
-            for number, length_m in enumerate(vehicle.arm.link_lengths_m, start=1)
-            for body in (model.body(f"link{number}").id,)
+            (body, data.xpos[body], data.xmat[body], data.xipos[body], direction, 0.5 * length_m, area * length_m)
+            for body, (_, direction, length_m) in zip(bodies, links, strict=True)
         )
         names = {model.body(k).name: k for k in range(model.nbody)}
         payload_m2 = config.payload_drag_coefficient * math.pi * PAYLOAD_RADIUS_M**2
@@ -138,8 +153,11 @@ class Downwash:
         *link_flows, flow = [
             (down[0] + intensity * x, down[1] + intensity * y, down[2] + intensity * z) for x, y, z in gusts
         ]
-        for (body, joint, matrix, centre, half_m, area_m2), (ux, uy, uz) in zip(self._links, link_flows, strict=True):
-            ex, ey, ez = matrix[0::3].tolist()
+        for (body, joint, matrix, centre, (dx, dy, dz), half_m, area_m2), (ux, uy, uz) in zip(
+            self._links, link_flows, strict=True
+        ):
+            a, b, c, d, e, f, g, h, i = matrix.tolist()
+            ex, ey, ez = a * dx + b * dy + c * dz, d * dx + e * dy + f * dz, g * dx + h * dy + i * dz
             x, y, z = joint.tolist()
             cx, cy, cz = centre.tolist()
             x, y, z = x + half_m * ex, y + half_m * ey, z + half_m * ez

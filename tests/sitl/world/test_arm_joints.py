@@ -1,0 +1,270 @@
+"""The simulated arm with any number of joints: its mechanics, its servos and their faults."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from companion.config.arm_chain import chain_of
+from companion.config.vehicle import Link, Vehicle
+from companion.control.arm_model import dynamics_of
+from companion.control.dynamics import euler_rate_matrices
+from companion.model.constants import GRAVITY_M_S2
+from companion.model.frames import quat_from_euler_zyx, quat_multiply, rotation_matrix
+from companion.model.types import Joints
+from companion.sitl_config.effects.compliance import Compliance
+from companion.sitl_config.effects.machine import Machine
+from companion.sitl_config.faults import Fault
+from companion.sitl_config.world import World as WorldConfig
+from sitl.autopilot.backend import stub_of
+from sitl.fast.bus import FastBus, scales_of
+from sitl.faults.injector import Faults
+from sitl.servo.drive import ServoDrive
+from sitl.servo.from_config import servos_of
+from sitl.world.plant import Plant
+from sitl.world.world import World
+from tests.machines import ARMS, vehicle_with_joints
+from tests.support import tool_of
+
+Array = NDArray[np.float64]
+NO_FRICTION = WorldConfig(payload_kg=0.0, joint_friction_nm=0.0, joint_damping_nms=0.0)
+
+
+def folded_rad(joints: int) -> Joints:
+    return tuple(map(math.radians, ARMS[joints][0])) if joints else ()
+
+
+def with_random_links(joints: int, rng: np.random.Generator) -> Vehicle:
+    """A vehicle whose links are any bodies with any axes."""
+
+    def link() -> Link:
+        points = rng.uniform(-0.05, 0.05, (4, 3))  # a body of four points of 50 g
+        inertia = sum(0.05 * (p @ p * np.eye(3) - np.outer(p, p)) for p in points)
+        return Link(
+            origin_m=tuple(rng.uniform(-0.2, 0.2, 3)),
+            origin_rpy_deg=tuple(rng.uniform(-80.0, 80.0, 3)),
+            axis=tuple(rng.standard_normal(3)),
+            mass_kg=0.2,
+            com_m=tuple(rng.uniform(-0.1, 0.1, 3)),
+            inertia_kg_m2=(*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]),
+        )
+
+    vehicle = vehicle_with_joints(joints)
+    arm = vehicle.arm.model_copy(
+        update={
+            "link_lengths_m": (),
+            "link_masses_kg": (),
+            "link_com_m": (),
+            "links": tuple(link() for _ in range(joints)),
+            "tip_m": tuple(rng.uniform(-0.2, 0.2, 3)),
+            "tip_rpy_deg": tuple(rng.uniform(-80.0, 80.0, 3)),
+        }
+    )
+    tool = tool_of(vehicle).model_copy(update={"sensor_rpy_deg": (10.0, 20.0, 30.0)})
+    return vehicle.model_copy(update={"arm": arm, "tool": tool})
+
+
+def free(vehicle: Vehicle, config: WorldConfig = NO_FRICTION) -> World:
+    """A world whose arm is not held."""
+    world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0,) * len(vehicle.arm.joints))
+    world.release_arm()
+    return world
+
+
+@pytest.mark.parametrize(
+    "vehicle",
+    [vehicle_with_joints(joints) for joints in (0, 1, 3, 4)]
+    + [with_random_links(joints, np.random.default_rng(joints)) for joints in (1, 2, 3, 4)],
+    ids=lambda vehicle: f"{len(vehicle.arm.joints)} {'links' if vehicle.arm.links else 'rods'}",
+)
+def test_mass_matrix_coriolis_and_gravity_are_those_of_the_laws_model(vehicle: Vehicle) -> None:
+    joints = len(vehicle.arm.joints)
+    world, model = free(vehicle), dynamics_of(vehicle)
+    m, d, size = world.model, world.data, 6 + joints
+    rng = np.random.default_rng(joints)
+    for _ in range(5):
+        roll, pitch, yaw = rpy = (*rng.uniform(-1.2, 1.2, 2).tolist(), float(rng.uniform(-3.0, 3.0)))
+        angle_rad, chi_rate = rng.uniform(-3.0, 3.0, joints).tolist(), rng.uniform(-2.0, 2.0, size)
+        attitude = quat_from_euler_zyx(roll, pitch, yaw)
+        terms = model.terms(rotation_matrix(attitude), rpy, tuple(angle_rad), tuple(chi_rate.tolist()))
+        turn, turn_rate = (np.array(matrix) for matrix in euler_rate_matrices(rpy, tuple(chi_rate.tolist())))
+        to_mujoco, rate = np.eye(size), np.zeros((size, size))
+        to_mujoco[3:6, 3:6], rate[3:6, 3:6] = turn, turn_rate
+        d.qpos[:] = (*rng.uniform(-1.0, 1.0, 3), *attitude, *angle_rad)
+        d.qvel[:] = to_mujoco @ chi_rate
+        mujoco.mj_forward(m, d)
+        mass = np.zeros((size, size))
+        mujoco.mj_fullM(m, d, mass)
+        np.testing.assert_allclose(to_mujoco.T @ mass @ to_mujoco, terms.mass, atol=1e-9)
+        bias = to_mujoco.T @ (d.qfrc_bias + mass @ rate @ chi_rate)
+        np.testing.assert_allclose(bias, np.add(terms.coriolis, terms.gravity), atol=1e-9)
+
+
+def test_the_sensor_and_the_net_are_at_the_tip_of_any_chain() -> None:
+    vehicle = with_random_links(3, np.random.default_rng(5))
+    world, chain = free(vehicle), chain_of(vehicle)
+    m, d = world.model, world.data
+    d.qpos[list(world.layout.joint_q)] = (0.5, -1.0, 2.0)
+    mujoco.mj_forward(m, d)
+    link, site = m.body("link3").id, m.site("net").id
+    last = d.xmat[link].reshape(3, 3)
+    np.testing.assert_allclose(d.site_xpos[site], d.xpos[link] + last @ chain.tip_m, atol=1e-12)
+    np.testing.assert_allclose(d.site_xmat[site].reshape(3, 3), last @ rotation_matrix(chain.sensor_wxyz), atol=1e-12)
+    hoop = last @ rotation_matrix(chain.tip_wxyz)
+    np.testing.assert_allclose(d.xmat[m.body("sensor").id].reshape(3, 3), hoop, atol=1e-12)
+
+
+def test_the_errors_of_the_machine_act_on_any_chain() -> None:
+    vehicle = with_random_links(3, np.random.default_rng(6))
+    machine = Machine(
+        on=True,
+        shoulder_offset_m=(0.003, -0.002, 0.001),
+        shoulder_rpy_deg=(1.0, -0.8, 0.6),
+        link_length_error_m=(0.001, -0.002),
+        link_com_error_m=(0.01, 0.0, -0.01),
+    )
+    config = NO_FRICTION.model_copy(update={"machine": machine, "link_mass_error": (0.1, 0.0, -0.1)})
+    nominal, built = free(vehicle).model, free(vehicle, config).model
+    arm = vehicle.arm
+    ends = [*(np.array(link.origin_m) for link in arm.links[1:]), np.array(arm.tip_m)]
+    along = [end / np.linalg.norm(end) for end in ends]
+    assert built.body("link1").pos == pytest.approx(np.add(arm.links[0].origin_m, machine.shoulder_offset_m))
+    for number, (end, way, error_m) in enumerate(zip(ends, along, (0.001, -0.002, -0.002), strict=True), start=2):
+        body = built.body(f"link{number}" if number < 4 else "sensor")
+        assert body.pos == pytest.approx(end + error_m * way)
+    for number, (link, way, error_m, mass) in enumerate(
+        zip(arm.links, along, (0.01, 0.0, -0.01), (1.1, 1.0, 0.9), strict=True), start=1
+    ):
+        body, plain = built.body(f"link{number}"), nominal.body(f"link{number}")
+        assert body.mass[0] == pytest.approx(mass * link.mass_kg)
+        assert body.inertia == pytest.approx(mass * plain.inertia)
+        assert body.ipos == pytest.approx(np.add(link.com_m, error_m * way))
+    mount = quat_from_euler_zyx(math.radians(1.0), math.radians(-0.8), math.radians(0.6))
+    own = quat_from_euler_zyx(*map(math.radians, arm.links[0].origin_rpy_deg))
+    assert built.body("link1").quat == pytest.approx(quat_multiply(mount, own))
+
+
+def test_a_level_vehicle_holds_each_joint_with_the_weight_of_the_links_beyond_it_times_their_horizontal_distance() -> (
+    None
+):
+    vehicle = vehicle_with_joints(3)
+    arm, world = vehicle.arm, free(vehicle)
+    alpha = (1.7, 0.6, -0.4)
+    world.data.qpos[list(world.layout.joint_q)] = alpha
+    mujoco.mj_forward(world.model, world.data)
+    pitch = [alpha[0], alpha[0] - alpha[1], alpha[0] - alpha[1] - alpha[2]]  # of each link, below the body's x axis
+    joint_m = np.concatenate(
+        [[0.0], np.cumsum([length * math.cos(p) for length, p in zip(arm.link_lengths_m, pitch, strict=True)])]
+    )
+    centre_m = [x + c * math.cos(p) for x, c, p in zip(joint_m, arm.link_com_m, pitch, strict=False)]
+    masses_kg, places_m = [*arm.link_masses_kg, vehicle.tool_mass_kg], [*centre_m, joint_m[3]]
+    for joint, sign in enumerate((1.0, -1.0, -1.0)):
+        beyond = zip(masses_kg[joint:], places_m[joint:], strict=True)
+        held_nm = -sign * GRAVITY_M_S2 * sum(mass * (place - joint_m[joint]) for mass, place in beyond)
+        assert world.data.qfrc_bias[6 + joint] == pytest.approx(held_nm, abs=1e-9)
+
+
+def test_without_an_arm_the_vehicle_is_one_body_that_weighs_what_the_vehicle_file_says() -> None:
+    vehicle = vehicle_with_joints(0)
+    world = free(vehicle)
+    assert world.model.nv == 6 and world.model.nu == 4
+    assert world.weight_n == pytest.approx(GRAVITY_M_S2 * vehicle.airframe.mass_kg)
+    world.hold_arm(())
+    world.step((0.0,) * 4, (), False)
+    assert world.truth().joint_angle_rad == ()
+
+
+class _Off:
+    """An autopilot whose rotors stand still."""
+
+    def step(self, _: object) -> tuple[float, float, float, float]:
+        return (0.0, 0.0, 0.0, 0.0)
+
+
+def plant_of(joints: int, **config: Any) -> tuple[Plant, FastBus, list[Any], Faults]:
+    """A plant on the floor with the folded arm, and its servo bus."""
+    vehicle = vehicle_with_joints(joints)
+    world = WorldConfig(payload_kg=0.0, **config)
+    servos = servos_of(vehicle, world)
+    drives = [servo.drive for servo in servos]
+    plant = Plant(vehicle, world, _Off(), drives, ((0.0, 0.0), 0.0, folded_rad(joints)))
+    faults = Faults(world, plant.world, stub_of(world, vehicle.airframe), drives, vehicle.tether)
+    plant.faults = faults if world.faults else None
+    return plant, FastBus(drives, scales_of(vehicle, servos), 0.1, plant.faults), drives, faults
+
+
+@pytest.mark.parametrize("joints", [1, 3, 4])
+def test_each_servo_reads_its_own_joint_and_turns_it_in_its_own_direction(joints: int) -> None:
+    plant, bus, _, _ = plant_of(joints)
+    plant.step(False)
+    state = bus.read(0.0)
+    assert state is not None
+    assert state.angle_rad == pytest.approx(folded_rad(joints), abs=0.002)
+    assert state.hardware_error == (0,) * joints and len(state.temperature_c) == joints
+    wanted_nm = tuple(0.3 + 0.2 * joint for joint in range(joints))
+    bus.write(0.0, wanted_nm)
+    plant.step(False)
+    plant.step(False)
+    assert not plant.world.parked
+    torque_nm = plant.world.data.ctrl[4:].tolist()
+    assert torque_nm == pytest.approx(wanted_nm, abs=0.002)
+
+
+def test_a_support_holds_the_arm_until_it_is_armed_and_one_servo_pushes() -> None:
+    plant, bus, _, _ = plant_of(3)
+    bus.write(0.0, (0.5, 0.0, 0.0))
+    for _ in range(3):
+        plant.step(False)
+    assert plant.world.parked
+    plant.step(True)
+    assert not plant.world.parked
+
+
+def test_a_lost_servo_lets_go_and_the_others_go_on() -> None:
+    plant, bus, drives, _ = plant_of(4, faults=(Fault(kind="servo_loss", t_s=0.1, after="start", servo=3),))
+    while plant.t_s < 0.3:
+        plant.step(False)
+        state = bus.read(plant.t_s)
+        bus.write(plant.t_s, (0.5,) * 4)
+    assert state is not None and state.read_failures > 0
+    assert [drive.watchdog_tripped for drive in drives] == [False, False, True, False]
+
+
+def test_a_hot_servo_is_reported_at_its_place() -> None:
+    plant, bus, _, _ = plant_of(3, faults=(Fault(kind="servo_hot", t_s=0.0, after="start", servo=3),))
+    plant.step(False)
+    state = bus.read(0.0)
+    assert state is not None and state.temperature_c == (35.0, 35.0, 78.0)
+
+
+def test_without_an_arm_no_joint_state_arrives() -> None:
+    plant, bus, _, _ = plant_of(0)
+    bus.write(0.0, ())
+    plant.step(False)
+    plant.step(True)
+    assert bus.read(0.0) is None
+
+
+def test_every_joint_has_a_spring_of_its_own() -> None:
+    """At rest each shaft is ahead of its link by the joint's torque times the compliance, of the mount or of the link before."""
+    vehicle, drives = vehicle_with_joints(3), [ServoDrive() for _ in range(3)]
+    flexible = Compliance(on=True, mount_deg_per_nm=1.0, link_deg_per_nm=2.0)
+    config = NO_FRICTION.model_copy(update={"compliance": flexible})
+    plant = Plant(vehicle, config, _Off(), drives, ((0.0, 0.0), 0.0, folded_rad(3)))
+    plant.step(False)
+    for drive in drives:
+        drive.torque_on, (_, _, drive.goal_position_counts) = True, drive.present()
+    plant.world.release_arm()
+    while plant.t_s < 3.0:
+        plant.step(False)
+    for joint, (drive, own, deg_per_nm) in enumerate(zip(drives, vehicle.arm.joints, (1.0, 2.0, 2.0), strict=True)):
+        held_nm = float(plant.world.data.qfrc_bias[6 + joint])
+        shaft_rad = own.sign * (drive.angle_rad - own.zero_count / 4096.0 * math.tau)
+        assert abs(held_nm) > 0.05
+        ahead_rad = shaft_rad - plant.truth.joint_angle_rad[joint]
+        assert ahead_rad == pytest.approx(math.radians(deg_per_nm) * held_nm, abs=5e-5)
