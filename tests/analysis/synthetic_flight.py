@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import (
     ArmState,
@@ -264,3 +266,33 @@ def record_flight(
         select.select([], [recorder.client], [], 60.0)
         recorder.client.record(inputs, outputs, sent)
     return recorder.finish(60.0)
+
+
+def with_joints(row: tuple[Inputs, Outputs, Sent], count: int) -> tuple[Inputs, Outputs, Sent]:
+    """Return the tick as of an arm with so many joints: surplus values are cut off, missing ones repeat the last; 0: no arm."""
+    inputs, outputs, sent = row
+
+    def joints(values: Any) -> Any:
+        return (tuple(values) + (values[-1],) * count)[:count]
+
+    def rows(values: Any) -> Any:
+        return values[:6] + joints(values[6:])
+
+    arm, reference, control = inputs.arm, outputs.reference, outputs.control
+    if arm is not None:
+        measured = ("angle_rad", "velocity_rad_s", "torque_nm", "hardware_error", "temperature_c")
+        arm = msgspec.structs.replace(arm, **{key: joints(getattr(arm, key)) for key in measured}) if count else None
+    if reference is not None:
+        planned = ("arm_rad", "arm_rate_rad_s", "arm_acceleration_rad_s2")
+        reference = msgspec.structs.replace(reference, **{key: joints(getattr(reference, key)) for key in planned})
+    if control is not None:
+        chi = ("error", "error_rate", "sliding", "gamma", "tau", "e_tau")
+        control = msgspec.structs.replace(control, **{key: rows(getattr(control, key)) for key in chi})
+    torque, written = outputs.arm_torque_nm, sent.arm_torque_sent_nm
+    return (
+        msgspec.structs.replace(inputs, arm=arm),
+        msgspec.structs.replace(
+            outputs, reference=reference, control=control, arm_torque_nm=joints(torque) if torque is not None else None
+        ),
+        msgspec.structs.replace(sent, arm_torque_sent_nm=joints(written) if written is not None and count else None),
+    )

@@ -12,7 +12,8 @@ from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, Scene, Topic, 
 from companion.ground.telemetry.scene import PATH_POINTS_MAX, scene_of
 from companion.mission.plan import Plan
 from companion.model.types import Vec3
-from tests.support import CATCH, tether_of
+from tests.machines import overrides_with_joints
+from tests.support import CATCH, HOVER, tether_of
 from tools.docs.telemetry import FOLDER, schema_file, schema_of, schema_text
 
 
@@ -36,6 +37,15 @@ def test_the_scene_of_a_vehicle_without_tether_and_net_has_no_anchor_and_no_net(
     absent = ["vehicle.tether=null", "vehicle.tool=null", "vehicle.devices.force=null"]
     scene = scene_of(load_flight(CATCH, overrides=absent), "s1")
     assert (scene.anchor_world_m, scene.tether_length_m, scene.net_radius_m) == (None, None, None)
+    assert decode(Scene, encode(scene)) == scene
+    jsonschema.Draft202012Validator(schema_of(Topic.SCENE)).validate(json.loads(encode(scene)))
+
+
+@pytest.mark.parametrize("count", [0, 1, 4])
+def test_the_scene_has_as_many_links_and_limits_as_the_arm(count: int) -> None:
+    config = load_flight(HOVER, overrides=overrides_with_joints(count))
+    scene = scene_of(config, "s1")
+    assert [len(values) for values in (scene.link_lengths_m, scene.joint_min_rad, scene.joint_max_rad)] == [count] * 3
     assert decode(Scene, encode(scene)) == scene
     jsonschema.Draft202012Validator(schema_of(Topic.SCENE)).validate(json.loads(encode(scene)))
 

@@ -12,13 +12,14 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from companion.config.loader import FlightConfig
+from companion.config.loader import FlightConfig, load_flight
 from companion.model.check_row import Level, Row
 from companion.model.observations import ForceStream, Observations, StateCounts
-from companion.model.types import VehicleState
+from companion.model.types import ArmState, VehicleState
 from companion.preflight import evaluation, frames, px4
+from tests.machines import overrides_with_joints
 from tests.preflight import records as r
-from tests.support import ROOT
+from tests.support import HOVER, ROOT
 from tools.docs.preflight import ROOMS, tables
 from tools.docs.tables import written
 
@@ -338,3 +339,42 @@ def test_the_docs_list_every_row() -> None:
     told = {check.id for checks in ROOMS.values() for check in checks}
     assert told == {check.id for check in evaluation.CHECKS}
     assert all(f"| `{name}` |" in page for name in told)
+
+
+def of_joints(state: ArmState, config: FlightConfig) -> ArmState:
+    """The state with as many joints as the vehicle has, folded."""
+    count = len(config.vehicle.arm.joints)
+    fold_rad = tuple(map(math.radians, config.vehicle.fold_arm_deg))
+    still, zeros = (0.0,) * count, (0,) * count
+    temperature_c = (state.temperature_c[0],) * count
+    return replace(
+        state,
+        angle_rad=fold_rad,
+        velocity_rad_s=still,
+        torque_nm=still,
+        hardware_error=zeros,
+        temperature_c=temperature_c,
+    )
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_every_joint_of_an_arm_is_checked(count: int) -> None:
+    config = load_flight(HOVER, overrides=overrides_with_joints(count))
+    states = tuple(of_joints(state, config) for state in r.sound().arm)
+    servos = (r.sound().servos * count)[:count]
+    seen = replace(r.sound(), arm=states, servos=servos)
+    rows = {row.id: row for row in evaluation.rows(seen, config)}
+    assert all(row.ok for row in rows.values() if row.id.startswith("arm.") or row.id == "mission.arm")
+    beyond = tuple(replace(state, angle_rad=(*state.angle_rad[:-1], 3.5)) for state in states)
+    hot = replace(servos[-1], voltage_v=5.0)
+    wrong = {row.id: row for row in evaluation.rows(replace(seen, arm=beyond, servos=(*servos[:-1], hot)), config)}
+    assert {id_ for id_, row in wrong.items() if row.ok is False and rows[id_].ok} == {
+        "arm.angles", "arm.voltage", "mission.arm"
+    }  # fmt: skip
+
+
+def test_an_absent_arm_is_one_warning() -> None:
+    config = load_flight(HOVER, overrides=overrides_with_joints(0))
+    seen = replace(r.sound(), arm=(), servos=(), arm_reads=None)
+    rows = [row for row in evaluation.rows(seen, config) if row.id.startswith("arm.") or row.id == "mission.arm"]
+    assert [(row.id, row.level) for row in rows] == [("arm.device", Level.WARN)]

@@ -20,10 +20,11 @@ from companion.control.arm_model import manipulator_of
 from companion.model.codec import Record, differences
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.hanging_line import hanging_line_m
-from companion.model.types import Inputs, MocapPose, Outputs, Quat, Sent, TetherState, Vec3
+from companion.model.types import Inputs, Joints, MocapPose, Outputs, Quat, Sent, TetherState, Vec3
 from companion.recorder.log_file import LogFile
 from companion.recorder.log_writer import LogWriter
 from companion.recorder.viewer_scene import machine_of, path_of
+from tests.machines import vehicle_with_joints
 from tests.recorder.flights import EPOCH_NS, Row, config_json, tethered
 from tests.recorder.viewers import Seen, Viewed, view
 from tests.support import tether_of
@@ -52,7 +53,7 @@ def still(ticks: int = 1) -> list[Row]:
     return [next(rows) for _ in range(ticks)]
 
 
-def moved(row: Row, position: Vec3, attitude: Quat, arm: tuple[float, float]) -> Row:
+def moved(row: Row, position: Vec3, attitude: Quat, arm: Joints) -> Row:
     """Return the same tick at another pose, in motion capture and PX4."""
     inputs, outputs, sent = row
     assert inputs.mocap is not None and inputs.arm is not None and inputs.vehicle is not None
@@ -106,6 +107,25 @@ def test_the_frames_are_where_the_arm_s_kinematics_have_them(tmp_path: Path) -> 
         along = quat_rotate(turn, (vehicle.arm.link_lengths_m[1], 0.0, 0.0))
         elbow, _ = in_world(frames, "link2")
         assert tuple(e + a for e, a in zip(elbow, along, strict=True)) == pytest.approx(position, abs=1e-12)
+
+
+@pytest.mark.parametrize("count", [0, 1, 4])
+def test_every_link_has_a_frame_and_a_shape_and_an_absent_arm_none(tmp_path: Path, count: int) -> None:
+    vehicle = vehicle_with_joints(count)
+    config = json.dumps({"vehicle": json.loads(vehicle.model_dump_json())})
+    angles = (1.2, 0.4, -0.3, 0.9)[:count]
+    row = moved(still()[0], (0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), angles)
+    viewed = written(tmp_path / "flight.mcap", [row], config=config)
+    links = [f"link{number}" for number in range(1, count + 1)]
+    (static,) = viewed.by_topic["/scene_static"]
+    assert [one["id"] for one in static.data["entities"] if one["id"].startswith("link")] == links
+    if not count:
+        assert not viewed.by_topic.get("/tf_arm")
+        return
+    frames = [viewed.by_topic["/tf"][0].data, *viewed.by_topic["/tf_arm"][0].data["transforms"]]
+    arm = manipulator_of(vehicle)
+    for frame, (x, y, z) in zip([*links, "net"], [*arm.joints_body_m(angles), arm.net_body_m(angles)], strict=True):
+        assert in_world(frames, frame)[0] == pytest.approx((x, y, z + 1.0), abs=1e-12)
 
 
 def test_each_channel_keeps_its_rate(tmp_path: Path) -> None:

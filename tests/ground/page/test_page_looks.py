@@ -12,11 +12,13 @@ import pytest
 
 from companion.config.loader import load_flight
 from companion.control.arm_model import manipulator_of
+from companion.ground.telemetry.scene import scene_of
 from companion.model.codec import to_jsonable
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from tests.ground.monitor_stub import BROKER, MonitorStub, event, flown, hello, relayed, retained
 from tests.ground.page_browser import SIZES, Page, events_of, watching
-from tests.support import CATCH
+from tests.machines import overrides_with_joints
+from tests.support import CATCH, HOVER
 
 pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
 
@@ -196,17 +198,35 @@ def test_the_camera_moves_by_mouse_wheel_and_keys(page: Page) -> None:
     assert len(set(seen)) == 7
 
 
-def test_the_arm_is_drawn_as_the_controller_knows_it(geometry: Page) -> None:
-    vehicle = load_flight(CATCH).vehicle
-    arm = manipulator_of(vehicle)
-    angles = list(itertools.product((-0.5, 0.4, 1.7, 2.9), (-0.2, 0.0, 1.0, 2.4)))
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_the_arm_is_drawn_as_the_controller_knows_it(geometry: Page, count: int) -> None:
+    config = load_flight(CATCH, overrides=overrides_with_joints(count))
+    arm = manipulator_of(config.vehicle)
+    angles = list(itertools.product((-0.5, 0.4, 2.9), repeat=count))
     script = "const { armBody } = await import('/geometry.js'); return a.map((q) => armBody(scene, q));"
     drawn = geometry.tab.evaluate(
-        f"async ([scene, a]) => {{ {script} }}", [to_jsonable(flown().scene), [list(pair) for pair in angles]]
+        f"async ([scene, a]) => {{ {script} }}", [to_jsonable(scene_of(config, "s")), [list(one) for one in angles]]
     )
-    for pair, parts in zip(angles, drawn, strict=True):
-        assert parts["elbow"] == pytest.approx(arm.joints_body_m(pair)[1], abs=1e-12)
-        assert parts["net"] == pytest.approx(arm.net_body_m(pair), abs=1e-12)
+    for one, parts in zip(angles, drawn, strict=True):
+        for joint, expected in zip(parts["joints"], arm.joints_body_m(one), strict=True):
+            assert joint == pytest.approx(expected, abs=1e-12)
+        assert parts["net"] == pytest.approx(arm.net_body_m(one), abs=1e-12)
+
+
+@pytest.mark.parametrize("count", [0, 4])
+def test_the_plot_of_the_arm_has_every_joint_and_is_absent_without_one(
+    shared: Page, stub: MonitorStub, count: int
+) -> None:
+    scene = scene_of(load_flight(HOVER, overrides=overrides_with_joints(count)), flown().scene.session)
+    arm_rad = (0.1, 0.2, 0.3, 0.4)[:count] or None
+    stream = msgspec.structs.replace(flown().at(8.5), arm_rad=arm_rad, reference_arm_rad=arm_rad)
+    shared.open_anew(stub)
+    shared.show(relayed(scene), relayed(stream))
+    shared.run(0.5)
+    assert shared.tab.locator("#plots").inner_text().count("α") == count
+    titles = shared.tab.locator(".plot h2").all_inner_texts()
+    assert [title for title in titles if title.startswith("Arm")] == ["Arm, °"] * (count > 0)
+    assert len(titles) == 6 + (count > 0)
 
 
 def test_vectors_turn_as_the_controller_turns_them(geometry: Page) -> None:

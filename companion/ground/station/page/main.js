@@ -166,7 +166,7 @@ setInterval(() => {
 }, UPDATE_MS);
 document.addEventListener("visibilitychange", refresh);
 const sizes = new ResizeObserver(refresh);
-for (const canvas of document.querySelectorAll("canvas")) sizes.observe(canvas);
+for (const element of [byId("scene"), byId("plots")]) sizes.observe(element);
 onColours(refresh);
 byId("control").addEventListener("toggle", update);
 update();
