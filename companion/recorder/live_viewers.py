@@ -48,7 +48,8 @@ class LiveViewers:
     ) -> None:
         host, port = address
         topics = {record.topic() for record in records}
-        logging.getLogger("foxglove").setLevel(logging.ERROR)  # it warns of a second channel with the same topic
+        # Any program that reaches the port could otherwise fill flight.log: each malformed message is an error there.
+        logging.getLogger("foxglove").setLevel(logging.CRITICAL)
         self._server = foxglove.start_server(
             name="companion",
             host=host,

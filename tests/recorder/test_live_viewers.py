@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import aiohttp
+import pytest
 
 from companion.model.types import Severity
 from companion.recorder.client import RecorderProcess
@@ -151,6 +152,22 @@ def test_a_viewer_sees_the_channels_of_the_log_live_and_the_static_scene_wheneve
     port = free_port()
     with recorder_for_viewers(tmp_path / "flight.mcap", port) as recorder:
         asyncio.run(flight(recorder))
+
+
+def test_what_a_viewer_sends_costs_neither_a_tick_nor_a_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    async def flight(recorder: RecorderProcess) -> None:
+        for damaged in (b"\x88" * 200, b'{"op":"subscribe","subscriptions":' + 10_000 * b"[", b"\xff"):
+            async with connected(port) as viewer:
+                await viewer.socket.send_bytes(damaged)
+                await viewer.socket.send_frame(damaged, aiohttp.WSMsgType.TEXT)
+        count = offer(recorder, itertools.islice(tethered(end_s=1.0), 20))
+        report = recorder.finish(DEADLINE_S)
+        assert (report.samples, report.dropped, report.error) == (count, 0, None)
+
+    port = free_port()
+    with recorder_for_viewers(tmp_path / "flight.mcap", port) as recorder:
+        asyncio.run(flight(recorder))
+    assert capfd.readouterr().err == ""
 
 
 def test_a_viewer_that_reads_nothing_costs_no_tick_and_does_not_delay_the_end(tmp_path: Path) -> None:
