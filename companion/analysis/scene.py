@@ -17,6 +17,7 @@ from companion.analysis.arm_skeleton import NO_ARM, skeleton_of
 from companion.analysis.log import Array
 from companion.model.frames import quat_rotate
 from companion.model.hanging_line import hanging_line_m
+from companion.model.rotors import disk_radius_m, logged_layout
 from companion.model.types import Joints, Quat, Vec2, Vec3
 
 FRAME, LEG, ROTOR, FRONT, LINK, NET, BALL, TETHER = (
@@ -110,12 +111,13 @@ class Scene:
         """Read the geometry from the `vehicle` section of an effective configuration.
 
         Raises:
-            KeyError, TypeError: the section lacks a value.
+            KeyError, TypeError, ValueError, AttributeError: the section lacks a value or has an invalid one.
         """
         airframe, tool = vehicle["airframe"], vehicle["tool"]
-        rotor_arm_m = airframe.get("rotor_arm_m", 0.6 * airframe["radius_m"])  # older logs lack it in the vehicle file
-        self._hub_m: float = rotor_arm_m * math.sqrt(0.5)
-        self._disk_m: float = airframe["radius_m"] - rotor_arm_m
+        rotors = logged_layout(airframe)
+        self._rotors_m = rotors.positions_body_m
+        self._hub_m: float = rotors.arm_m * math.sqrt(0.5)
+        self._disk_m = disk_radius_m(rotors, airframe["radius_m"])
         self._foot_m: float = airframe["ground_clearance_m"]
         self._arm = skeleton_of(vehicle["arm"]) or NO_ARM
         self._net_radius_m: float = 0.0 if tool is None else tool["net_radius_m"]
@@ -197,15 +199,16 @@ class Scene:
         scale = camera.scale(np.array(pose.position_world_m))
         parts: list[tuple[float, list[Shape]]] = []
         for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-            hub = world((x * self._hub_m, y * self._hub_m, 0.05))
             foot = world((0.55 * x * self._hub_m, 0.75 * y * self._hub_m, -self._foot_m))
-            disk = pixels(_circle(hub[0], x_axis, y_axis, self._disk_m), closed=True)
-            colour = FRONT if x > 0 else ROTOR
-            boom = pixels(np.vstack([world((0, 0, 0.02)), world((x * self._hub_m, y * self._hub_m, 0.02)), hub]))
             leg = pixels(np.vstack([world((0.3 * x * self._hub_m, 0.3 * y * self._hub_m, 0)), foot]))
             toe = pixels(np.vstack([foot, world((0.95 * x * self._hub_m, 0.75 * y * self._hub_m, -self._foot_m))]))
             heel = pixels(np.vstack([foot, world((0, 0.75 * y * self._hub_m, -self._foot_m))]))
             parts.append((camera.depth_m(foot[0]), [Shape(line, LEG, 0.012 * scale) for line in (leg, toe, heel)]))
+        for rotor_x, rotor_y, z in self._rotors_m:
+            hub = world((rotor_x, rotor_y, z + 0.02))
+            disk = pixels(_circle(hub[0], x_axis, y_axis, self._disk_m), closed=True)
+            colour = FRONT if rotor_x > 1e-9 else ROTOR
+            boom = pixels(np.vstack([world((0, 0, z - 0.01)), world((rotor_x, rotor_y, z - 0.01)), hub]))
             parts.append(
                 (
                     camera.depth_m(hub[0]),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from companion.model.types import Vec3
 
@@ -74,6 +74,25 @@ def listed_layout(positions_body_m: Sequence[Vec3], spins: Sequence[int]) -> Rot
     """Return the layout of rotors that are given one by one."""
     arm_m = sum(math.hypot(x, y) for x, y, _ in positions_body_m) / len(positions_body_m)
     return RotorLayout(tuple(positions_body_m), tuple(spins), arm_m)
+
+
+def logged_layout(airframe: Mapping[str, Any]) -> RotorLayout:
+    """Return the layout in the section `airframe` of a logged configuration; older logs have no layout, the oldest no rotor arm.
+
+    Raises:
+        KeyError, TypeError, ValueError, AttributeError: the section is not that of a vehicle file.
+    """
+    listed = airframe.get("rotors")
+    if listed:
+        places = [(float(x), float(y), float(z)) for x, y, z in (rotor["position_body_m"] for rotor in listed)]
+        return listed_layout(places, [CCW if rotor["spin"] == "ccw" else CW for rotor in listed])
+    arm_m = float(airframe.get("rotor_arm_m", 0.6 * airframe["radius_m"]))
+    return standard_layout(airframe.get("layout", "quad_x"), arm_m, float(airframe.get("rotor_height_m", 0.03)))
+
+
+def disk_radius_m(rotors: RotorLayout, radius_m: float) -> float:
+    """Return the radius of the rotor disks of a vehicle with the horizontal radius `radius_m`, for drawings."""
+    return radius_m - max(math.hypot(x, y) for x, y, _ in rotors.positions_body_m)
 
 
 def _on_circle(angle_deg: float, arm_m: float) -> tuple[float, float]:

@@ -25,6 +25,7 @@ from foxglove.messages import (
     Vector3,
 )
 
+from companion.model.rotors import RotorLayout, disk_radius_m, logged_layout
 from companion.model.types import Joints, Vec3
 
 _GREY = Color(r=0.55, g=0.60, b=0.65, a=0.8)
@@ -38,8 +39,6 @@ SLACK = Color(r=0.18, g=0.62, b=0.42, a=1.0)
 NEARLY_TAUT = Color(r=0.93, g=0.62, b=0.10, a=1.0)
 TAUT = Color(r=0.85, g=0.15, b=0.15, a=1.0)
 
-_ROTOR_PITCH = 1.0 + 1.05 * math.sqrt(2.0)
-"""Ratio of reach to disk radius for four disks in a square that nearly touch."""
 _ALONG_X = Quaternion(w=math.sqrt(0.5), x=0.0, y=math.sqrt(0.5), z=0.0)
 _UPRIGHT = Quaternion(w=1.0, x=0.0, y=0.0, z=0.0)
 
@@ -72,6 +71,7 @@ class Machine:
     tether: TetherShape | None
     radius_m: float | None
     """Horizontal reach including the rotor disks."""
+    rotors: RotorLayout | None
     ground_clearance_m: float | None
     room_min_world_m: Vec3 | None
     room_max_world_m: Vec3 | None
@@ -107,10 +107,19 @@ def machine_of(config: Any) -> Machine:
         arm=arm,
         tether=tether,
         radius_m=_number(config, "vehicle", "airframe", "radius_m"),
+        rotors=_rotors(config),
         ground_clearance_m=_number(config, "vehicle", "airframe", "ground_clearance_m"),
         room_min_world_m=_vec3([span[0] for span in known]) if whole else None,
         room_max_world_m=_vec3([span[1] for span in known]) if whole else None,
     )
+
+
+def _rotors(config: Any) -> RotorLayout | None:
+    try:
+        rotors = logged_layout(config["vehicle"]["airframe"])
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return None
+    return rotors if all(map(math.isfinite, sum(rotors.positions_body_m, ()))) else None
 
 
 def path_of(data: Any, most: int = 1000) -> tuple[Vec3, ...]:
@@ -134,8 +143,8 @@ def static_entities(machine: Machine, path_world_m: tuple[Vec3, ...], timestamp:
         add("anchor", "world", spheres=[_ball(machine.tether.anchor_world_m, 0.05, _DARK)])
     if len(path_world_m) > 1:
         add("planned path", "world", lines=[trail([point3(p) for p in path_world_m], _PLANNED)])
-    if machine.radius_m is not None:
-        add("vehicle", "body", **_airframe(machine.radius_m, machine.ground_clearance_m))
+    if machine.radius_m is not None and machine.rotors is not None:
+        add("vehicle", "body", **_airframe(machine.radius_m, machine.rotors, machine.ground_clearance_m))
     if machine.arm is not None:
         for number, length_m in enumerate(machine.arm.link_lengths_m, start=1):
             add(f"link{number}", f"link{number}", cylinders=[_rod(length_m)])
@@ -163,30 +172,30 @@ def point3(p: Vec3) -> Point3:
     return Point3(x=p[0], y=p[1], z=p[2])
 
 
-def _airframe(radius_m: float, clearance_m: float | None) -> dict[str, Any]:
-    """Return hub, booms, four rotor disks within the reach, and feet."""
-    rotor_m = radius_m / _ROTOR_PITCH
-    out = (radius_m - rotor_m) * math.sqrt(0.5)
-    corners = [(out, out), (-out, out), (-out, -out), (out, -out)]
+def _airframe(radius_m: float, rotors: RotorLayout, clearance_m: float | None) -> dict[str, Any]:
+    """Return hub, booms, rotor disks within the reach, and feet."""
+    rotor_m = max(0.0, disk_radius_m(rotors, radius_m))
+    offset_m = rotors.arm_m * math.sqrt(0.5) / 2.0
+    corners = [(x * offset_m, y * offset_m) for x, y in ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))]
     flat = Vector3(x=2.0 * rotor_m, y=2.0 * rotor_m, z=0.01)
     disks = [
         CylinderPrimitive(
-            pose=Pose(position=Vector3(x=x, y=y, z=0.03), orientation=_UPRIGHT),
+            pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=_UPRIGHT),
             size=flat,
             bottom_scale=1.0,
             top_scale=1.0,
             color=_ROTOR,
         )
-        for x, y in corners
+        for x, y, z in rotors.positions_body_m
     ]
     hub = CubePrimitive(
         pose=Pose(position=Vector3(x=0.0, y=0.0, z=0.0), orientation=_UPRIGHT),
         size=Vector3(x=0.16, y=0.12, z=0.06),
         color=_DARK,
     )
-    booms = [end for x, y in corners for end in ((0.0, 0.0, 0.02), (x, y, 0.02))]
+    booms = [end for x, y, z in rotors.positions_body_m for end in ((0.0, 0.0, z - 0.01), (x, y, z - 0.01))]
     if clearance_m is not None:
-        booms += [end for x, y in corners for end in ((x / 2, y / 2, 0.0), (x / 2, y / 2, -clearance_m))]
+        booms += [end for x, y in corners for end in ((x, y, 0.0), (x, y, -clearance_m))]
     nose = _segments([(0.08, 0.0, 0.0), (radius_m, 0.0, 0.0)], _NOSE, 4.0)
     return {"cubes": [hub], "cylinders": disks, "lines": [_segments(booms, _DARK, 3.0), nose]}
 

@@ -15,7 +15,7 @@ from PIL import Image, ImageSequence
 
 from companion.analysis.animation import FRAMES_PER_S, Movie, movie_of, player_html, write_gif
 from companion.analysis.log import FlightLog
-from companion.analysis.scene import NET, TETHER, Camera, Pose, Scene
+from companion.analysis.scene import FRONT, NET, ROTOR, TETHER, Camera, Pose, Scene
 from companion.config.loader import load_vehicle
 from companion.control.arm_model import manipulator_of
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
@@ -52,6 +52,15 @@ def movie() -> Movie:
 
 def texts(movie: Movie) -> list[list[str]]:
     return [[shape.text for shape in frame.shapes if shape.text] for frame in movie.frames]
+
+
+def test_every_rotor_of_a_hexacopter_is_drawn() -> None:
+    vehicle = json.loads(VEHICLE.model_dump_json())
+    vehicle["airframe"]["layout"] = "hexa_x"
+    camera = Camera(np.zeros(3), 0.3, 0.3, 4.0, (400.0, 300.0))
+    pose = Pose((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), (1.5, 1.5), (), False)
+    disks = [shape.colour for shape in Scene(vehicle).shapes(camera, pose) if shape.alpha == 0.45]
+    assert sorted(disks) == sorted([FRONT] * 2 + [ROTOR] * 4)
 
 
 def test_the_payload_is_thrown_and_then_caught(movie: Movie) -> None:

@@ -7,7 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from companion.model.rotors import LAYOUTS, LayoutName, SingularLayoutError, allocation, listed_layout, standard_layout
+from companion.model.rotors import (
+    LAYOUTS,
+    LayoutName,
+    SingularLayoutError,
+    allocation,
+    listed_layout,
+    logged_layout,
+    standard_layout,
+)
 
 H, C, S = math.sqrt(0.5), math.cos(math.pi / 8), math.sin(math.pi / 8)
 PX4: dict[LayoutName, list[tuple[float, float, int]]] = {
@@ -76,3 +84,13 @@ def test_rotors_that_cannot_control_the_vehicle_are_rejected(
     """In the third case, yaw torque comes only with pitch torque."""
     with pytest.raises(SingularLayoutError, match=reason):
         allocation(listed_layout([(x, y, 0.0) for x, y in places], spins))
+
+
+def test_layout_of_a_logged_configuration() -> None:
+    assert logged_layout({"radius_m": 0.5}) == standard_layout("quad_x", 0.3, 0.03)
+    hexa = {"radius_m": 0.5, "rotor_arm_m": 0.34, "layout": "hexa_x", "rotors": None, "rotor_height_m": 0.1}
+    assert logged_layout(hexa) == standard_layout("hexa_x", 0.34, 0.1)
+    listed = [
+        {"position_body_m": [x, y, 0.0], "spin": "cw" if x * y > 0 else "ccw"} for x in (0.3, -0.3) for y in (0.3, -0.3)
+    ]
+    assert logged_layout({**hexa, "rotors": listed}).spins == (-1, 1, 1, -1)

@@ -110,6 +110,8 @@ class Scene(Record, frozen=True, kw_only=True):
     attachment_body_m: Vec3 | None = None
     radius_m: float
     """Horizontal reach including the rotor disks."""
+    rotors_body_m: tuple[Vec3, ...] = ()
+    """Position of each rotor; empty in messages of version 0.1.0."""
     ground_clearance_m: float
     shoulder_body_m: Vec3
     link_lengths_m: Joints

@@ -34,6 +34,7 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
         tether_margin_m=tether.margin_m if tether is not None else None,
         attachment_body_m=tether.attachment_body_m if tether is not None else None,
         radius_m=airframe.radius_m,
+        rotors_body_m=airframe.rotor_layout.positions_body_m,
         ground_clearance_m=airframe.ground_clearance_m,
         shoulder_body_m=arm.shoulder_body_m,
         link_lengths_m=arm.link_lengths_m,

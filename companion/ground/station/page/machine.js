@@ -3,10 +3,6 @@
 import { colours } from "./colours.js";
 import { add, armBody, circle, rotate, scale, yawOnly } from "./geometry.js";
 
-// Distance of the rotor hubs as a fraction of the horizontal reach; the four disks nearly touch.
-const HUB = 0.6;
-const DISK = 1 - HUB;
-const HUBS = [[1, 1], [1, -1], [-1, 1], [-1, -1]].map(([x, y]) => [x * Math.SQRT1_2 * HUB, y * Math.SQRT1_2 * HUB]);
 const X = [1, 0, 0];
 const Y = [0, 1, 0];
 
@@ -17,14 +13,20 @@ export function drawMachine(renderer, scene, position, attitude, { arm = null, c
   const radius = scene.radius_m;
   const high = 0.05;
   const parts = [];
-  for (const [x, y] of HUBS) {
-    const hub = world([x * radius, y * radius, high]);
-    parts.push([hub, () => drawRotor(renderer, world([0, 0, 0]), hub, turn, radius * DISK, x > 0, armed)]);
+  const disk = diskRadius(scene);
+  for (const rotor of scene.rotors_body_m ?? []) {
+    const hub = world(rotor);
+    parts.push([hub, () => drawRotor(renderer, world([0, 0, 0]), hub, turn, disk, rotor[0] > 1e-9, armed)]);
   }
   parts.push([world([0, 0, -0.06]), () => drawBody(renderer, world, scene, radius)]);
   if (arm?.length) parts.push([world(armBody(scene, arm).joints.at(-1)), () => drawArm(renderer, scene, world, turn, arm, caught)]);
   parts.map(([at, draw]) => [renderer.depth(at), draw]).sort((a, b) => b[0] - a[0]).forEach(([, draw]) => draw());
   renderer.arrow(world([0.1 * radius, 0, high]), world([1.25 * radius, 0, high]), colours.accent, 3);
+}
+
+// Radius of the rotor disks, which end at the horizontal reach.
+function diskRadius(scene) {
+  return scene.radius_m - Math.max(0, ...(scene.rotors_body_m ?? []).map(([x, y]) => Math.hypot(x, y)));
 }
 
 function drawRotor(renderer, centre, hub, turn, radius, front, armed) {
@@ -72,9 +74,9 @@ function drawArm(renderer, scene, world, turn, angles, caught) {
 export function drawGhost(renderer, scene, reference, yaw, arm) {
   const attitude = yawOnly(yaw ?? 0);
   const world = (body) => add(reference, rotate(attitude, body));
-  for (const [x, y] of HUBS) {
-    const hub = world([x * scene.radius_m, y * scene.radius_m, 0.05]);
-    renderer.line(circle(hub, rotate(attitude, X), rotate(attitude, Y), scene.radius_m * DISK, 22), colours.ghost, { width: 1, dash: [2, 4] });
+  for (const rotor of scene.rotors_body_m ?? []) {
+    const hub = world(rotor);
+    renderer.line(circle(hub, rotate(attitude, X), rotate(attitude, Y), diskRadius(scene), 22), colours.ghost, { width: 1, dash: [2, 4] });
     renderer.line([reference, hub], colours.ghost, { width: 1, dash: [2, 4] });
   }
   if (!arm?.length) return;
