@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from companion.analysis.arm_skeleton import skeleton_of
+from companion.analysis.arm_skeleton import pose
 from companion.analysis.log import Array, FlightLog
 from companion.control.sensing import CatchDetector
+from companion.model.arm_skeleton import logged_skeleton
 from companion.model.frames import quat_rotate
 from companion.model.types import PhaseKind
 
@@ -177,7 +178,7 @@ def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:
 def _joint_torque_error_nm(log: FlightLog, used: Mask, period_s: float) -> Array:
     """Return J'(F - F_d) for the ticks of the mask, N m, (ticks, joints); NaN if the logged configuration does not describe the arm."""
     joints = log.joint_count
-    skeleton = skeleton_of((log.config.get("vehicle") or {}).get("arm"))
+    skeleton = logged_skeleton((log.config.get("vehicle") or {}).get("arm"))
     if skeleton is None or len(skeleton.joint_axes) != joints:
         return np.full((int(used.sum()), joints), np.nan)
     force = log.column(lambda i, o, s: o.control.force_ext_world_n if o.control else None, 3)[used]
@@ -192,7 +193,7 @@ def _joint_torque_error_nm(log: FlightLog, used: Mask, period_s: float) -> Array
     body_y = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1)
     body_z = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
     force_body = np.stack([(passing * axis).sum(axis=1) for axis in (body_x, body_y, body_z)], axis=1)
-    points, axes = skeleton.pose(log.columns.arm_rad[used])
+    points, axes = pose(skeleton, log.columns.arm_rad[used])
     torques = [(np.cross(axes[:, j], points[:, -1] - points[:, j]) * force_body).sum(axis=1) for j in range(joints)]
     return np.stack(torques, axis=1) if torques else np.zeros((len(force_body), 0))
 

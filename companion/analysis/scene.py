@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from companion.analysis.arm_skeleton import NO_ARM, skeleton_of
+from companion.analysis.arm_skeleton import pose
 from companion.analysis.log import Array
+from companion.model.arm_skeleton import NO_ARM, logged_skeleton
 from companion.model.frames import quat_rotate
 from companion.model.hanging_line import hanging_line_m
 from companion.model.rotors import disk_radius_m, logged_layout
@@ -119,7 +120,7 @@ class Scene:
         self._hub_m: float = rotors.arm_m * math.sqrt(0.5)
         self._disk_m = disk_radius_m(rotors, airframe["radius_m"])
         self._foot_m: float = airframe["ground_clearance_m"]
-        self._arm = skeleton_of(vehicle["arm"]) or NO_ARM
+        self._arm = logged_skeleton(vehicle["arm"]) or NO_ARM
         self._net_radius_m: float = 0.0 if tool is None else tool["net_radius_m"]
         self._tether_line: dict[str, Any] | None = vehicle["tether"]
         room = vehicle["room"]
@@ -158,7 +159,7 @@ class Scene:
 
     def _arm_body_m(self, arm_rad: Joints) -> Array:
         """Return the positions of all joints and of the centre of the net, body frame, m, shape (joints + 1, 3)."""
-        points: Array = self._arm.pose(np.array([arm_rad], dtype=np.float64))[0][0]
+        points: Array = pose(self._arm, np.array([arm_rad], dtype=np.float64))[0][0]
         return points
 
     def _room(self, camera: Camera) -> list[Shape]:

@@ -204,19 +204,19 @@ class _Joints:
         """Parent, child and position in the parent of each link's frame."""
         if arm is None:
             return
-        x, y, z = arm.shoulder_body_m
+        x, y, z = arm.skeleton.shoulder_body_m
         parent, offset = "body", Vector3(x=x, y=y, z=z)
-        for number, length_m in enumerate(arm.link_lengths_m, start=1):
+        for number, (x, y, z) in enumerate(arm.skeleton.links_body_m, start=1):
             self._links.append((parent, f"link{number}", offset))
-            parent, offset = f"link{number}", Vector3(x=length_m, y=0.0, z=0.0)
+            parent, offset = f"link{number}", Vector3(x=x, y=y, z=z)
+        self._axes = arm.skeleton.joint_axes
         self._net = (parent, "net", offset)
 
     def log(self, channel: FrameTransformsChannel, stamp: Timestamp, stamp_ns: int, angle_rad: Sequence[float]) -> None:
-        """Write all frames in one message: alpha_1 turns link 1 down about the body's y axis; the others turn the other way."""
+        """Write all frames in one message."""
         if not self._links or len(angle_rad) != len(self._links) or not math.isfinite(sum(angle_rad)):
             return
-        halves = [(-0.5 if number else 0.5) * angle for number, angle in enumerate(angle_rad)]
-        turns = [Quaternion(w=math.cos(half), x=0.0, y=math.sin(half), z=0.0) for half in halves]
+        turns = [_turn(axis, angle) for axis, angle in zip(self._axes, angle_rad, strict=True)]
         frames = [
             FrameTransform(
                 timestamp=stamp, parent_frame_id=parent, child_frame_id=child, translation=offset, rotation=turn
@@ -224,6 +224,11 @@ class _Joints:
             for (parent, child, offset), turn in zip([*self._links, self._net], [*turns, _STRAIGHT], strict=True)
         ]
         channel.log(FrameTransforms(transforms=frames), log_time=stamp_ns)
+
+
+def _turn(axis: Vec3, angle_rad: float) -> Quaternion:
+    s = math.sin(0.5 * angle_rad)
+    return Quaternion(w=math.cos(0.5 * angle_rad), x=s * axis[0], y=s * axis[1], z=s * axis[2])
 
 
 class _Trail:

@@ -1,7 +1,7 @@
 """Scene of a 3D viewer: geometry from the configuration, shapes of the vehicle and its room, the slack tether. No I/O.
 
-World ENU, body FLU, metres. Each link of the arm has a frame, ``link1`` at the shoulder, with x along the link and y along
-the body's y axis; ``net`` is at the end of the last link.
+World ENU, body FLU, metres. Each link of the arm has a frame at its joint, ``link1`` at the shoulder, which is parallel to the frame
+before at joint angle 0; ``net`` is at the end of the last link.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from foxglove.messages import (
     Vector3,
 )
 
+from companion.model.arm_skeleton import ArmSkeleton, logged_skeleton
 from companion.model.rotors import RotorLayout, disk_radius_m, logged_layout
-from companion.model.types import Joints, Vec3
+from companion.model.types import Vec3
 
 _GREY = Color(r=0.55, g=0.60, b=0.65, a=0.8)
 _DARK = Color(r=0.20, g=0.24, b=0.28, a=1.0)
@@ -39,7 +40,7 @@ SLACK = Color(r=0.18, g=0.62, b=0.42, a=1.0)
 NEARLY_TAUT = Color(r=0.93, g=0.62, b=0.10, a=1.0)
 TAUT = Color(r=0.85, g=0.15, b=0.15, a=1.0)
 
-_ALONG_X = Quaternion(w=math.sqrt(0.5), x=0.0, y=math.sqrt(0.5), z=0.0)
+_DOWN = Quaternion(w=0.0, x=1.0, y=0.0, z=0.0)
 _UPRIGHT = Quaternion(w=1.0, x=0.0, y=0.0, z=0.0)
 
 
@@ -47,8 +48,7 @@ _UPRIGHT = Quaternion(w=1.0, x=0.0, y=0.0, z=0.0)
 class ArmShape:
     """The arm and its net."""
 
-    shoulder_body_m: Vec3
-    link_lengths_m: Joints
+    skeleton: ArmSkeleton
     net_radius_m: float | None
 
 
@@ -84,11 +84,9 @@ class Machine:
 
 def machine_of(config: Any) -> Machine:
     """Return the geometry of an effective configuration (nested dicts); missing and invalid values become None."""
-    shoulder = _numbers(config, 3, "vehicle", "arm", "shoulder_body_m")
-    links = _numbers(config, None, "vehicle", "arm", "link_lengths_m")
-    arm = None
-    if shoulder is not None and links:
-        arm = ArmShape(_vec3(shoulder), links, _number(config, "vehicle", "tool", "net_radius_m"))
+    skeleton, arm = logged_skeleton(_at(config, ("vehicle", "arm"))), None
+    if skeleton is not None and skeleton.links_body_m:
+        arm = ArmShape(skeleton, _number(config, "vehicle", "tool", "net_radius_m"))
     anchor = _numbers(config, 3, "vehicle", "tether", "anchor_world_m")
     length_m = _number(config, "vehicle", "tether", "length_m")
     tether = None
@@ -146,8 +144,8 @@ def static_entities(machine: Machine, path_world_m: tuple[Vec3, ...], timestamp:
     if machine.radius_m is not None and machine.rotors is not None:
         add("vehicle", "body", **_airframe(machine.radius_m, machine.rotors, machine.ground_clearance_m))
     if machine.arm is not None:
-        for number, length_m in enumerate(machine.arm.link_lengths_m, start=1):
-            add(f"link{number}", f"link{number}", cylinders=[_rod(length_m)])
+        for number, link in enumerate(machine.arm.skeleton.links_body_m, start=1):
+            add(f"link{number}", f"link{number}", cylinders=[_rod(link)])
         if machine.arm.net_radius_m is not None:
             add("net", "net", spheres=[_ball((0.0, 0.0, 0.0), machine.arm.net_radius_m, _NET)])
     return entities
@@ -218,10 +216,16 @@ def _segments(ends: list[Vec3], colour: Color, thickness_px: float) -> LinePrimi
     )
 
 
-def _rod(length_m: float) -> CylinderPrimitive:
-    """Return a cylinder from the frame's origin along its x axis."""
+def _rod(end: Vec3) -> CylinderPrimitive:
+    """Return a cylinder from the frame's origin to a point of the frame."""
+    x, y, z = end
+    length_m = math.hypot(x, y, z)
+    # The rotation that turns z to the direction of the end.
+    w, qx, qy = length_m + z, -y, x
+    norm = math.hypot(w, qx, qy)
+    along = Quaternion(w=w / norm, x=qx / norm, y=qy / norm, z=0.0) if norm > 0.0 else _DOWN
     return CylinderPrimitive(
-        pose=Pose(position=Vector3(x=length_m / 2, y=0.0, z=0.0), orientation=_ALONG_X),
+        pose=Pose(position=Vector3(x=x / 2, y=y / 2, z=z / 2), orientation=along),
         size=Vector3(x=0.025, y=0.025, z=length_m),
         bottom_scale=1.0,
         top_scale=1.0,

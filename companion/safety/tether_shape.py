@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import math
 
+from companion.config.arm_chain import chain_of
 from companion.config.vehicle import Tether, Vehicle
+from companion.model.arm_skeleton import skeleton_of
 from companion.model.types import Joints, Vec2, Vec3
 
 _NEVER = 1.0
@@ -36,7 +38,8 @@ def steepest_slope(level_m: float, drop_m: float, chord_m: float, slack_m: float
 
 
 class Clearance:
-    """Models the rotors as a ring in the plane through the body's origin and the arm as a slab about its plane.
+    """Models the rotors as a ring in the plane through the body's origin, and the arm as a slab about its plane or, if it leaves that
+    plane, as a ball.
 
     Args:
         vehicle: airframe, arm and tool.
@@ -49,15 +52,18 @@ class Clearance:
         self._outer_m = max(vehicle.airframe.radius_m, self._inner_m)
         self._off_axis_m = math.hypot(self._p[0], self._p[1])
         self._below = self._p[2] <= 0.0
-        arm = vehicle.arm
+        arm = skeleton_of(chain_of(vehicle))
         self._shoulder = arm.shoulder_body_m
-        self._links_m = arm.link_lengths_m
+        self._links_m = tuple(math.hypot(*link) for link in arm.links_body_m)
         self._net_m = vehicle.tip_radius_m
-        self._reach_m = sum(arm.link_lengths_m) + self._net_m
-        self._aside_m = abs(self._p[1] - self._shoulder[1]) - self._net_m
-        self.judges_arm = bool(arm.joints) and self._aside_m > 0.0
-        """False if there is no arm, or if the tether is attached in the arm's own plane, where it sags into the arm's sweep in every
-        flight."""
+        self._reach_m = arm.reach_m + self._net_m
+        self._planar = arm.is_in_xz_plane
+        self._is_2r = self._planar and len(self._links_m) == 2 and all(z == 0.0 for _, _, z in arm.links_body_m)
+        aside_m = abs(self._p[1] - self._shoulder[1]) - self._net_m
+        self._aside_m = aside_m if self._planar else math.dist(self._p, self._shoulder) - self._reach_m
+        self.judges_arm = bool(self._links_m) and self._aside_m > 0.0
+        """False if there is no arm, or if the tether is attached in the arm's own plane or, for an arm that is not planar, within its
+        reach: there it sags into the arm's sweep in every flight."""
         self.needs_hanging = self.judges_arm or not self._below
         """False if `least_m` does not use the hanging direction."""
 
@@ -105,10 +111,10 @@ class Clearance:
         return min(math.hypot(inner - off, pz), (-pz - max(in_s * dz, out_s * dz)) * flat)
 
     def _arm_reach_m(self, arm_rad: Joints) -> float:
-        """Return the distance of the farthest point of the arm and the net from the shoulder, m; for more than two joints, that of the
-        stretched arm.
+        """Return the distance of the farthest point of the arm and the net from the shoulder, m; for other arms than two rods in
+        a plane, that of the stretched arm.
         """
-        if len(self._links_m) != 2:
+        if not self._is_2r:
             return self._reach_m
         l1, l2 = self._links_m
         net_m = math.sqrt(max(0.0, l1 * l1 + l2 * l2 + 2.0 * l1 * l2 * math.cos(arm_rad[1])))
@@ -116,12 +122,15 @@ class Clearance:
 
     def _arm_m(self, d: Vec3, reach_m: float) -> float:
         """Return the distance, in the arm's plane, of a ray from the arm: a slab |y - y_shoulder| <= net radius within `reach_m` of
-        the shoulder.
+        the shoulder, or a ball of that radius for an arm that leaves its plane.
         """
         px, py, pz = self._p
         sx, sy, sz = self._shoulder
         dx, dy, dz = d
         x, y, z = px - sx, py - sy, pz - sz
+        if not self._planar:
+            at_s = max(0.0, -(x * dx + y * dy + z * dz))
+            return math.hypot(x + at_s * dx, y + at_s * dy, z + at_s * dz) - reach_m
         if y < 0.0:
             y, dy = -y, -dy
         aside = self._aside_m

@@ -10,11 +10,9 @@ import pytest
 
 from companion.analysis import metrics
 from companion.analysis.animation import movie_of
-from companion.analysis.arm_skeleton import skeleton_of
 from companion.analysis.log import FlightLog
 from companion.analysis.plots import write_plots
 from companion.analysis.summary import summarise
-from companion.control.arm_model import manipulator_of
 from tests.analysis.synthetic_flight import CONFIG, synthetic_flight, with_joints
 from tests.machines import vehicle_with_joints
 
@@ -29,28 +27,6 @@ def flight(count: int, rate_hz: float = 20.0) -> FlightLog:
     return FlightLog(
         path=Path("flight.mcap"), inputs=inputs, outputs=outputs, sent=sent, metadata=metadata, closed=True
     )
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 4])
-def test_joints_net_and_axes_are_where_the_control_law_has_them(count: int) -> None:
-    vehicle = vehicle_with_joints(count)
-    manipulator, skeleton = manipulator_of(vehicle), skeleton_of(json.loads(vehicle.arm.model_dump_json()))
-    assert skeleton is not None
-    angles = np.random.default_rng(count).uniform(-3.0, 3.0, (5, count))
-    points, axes = skeleton.pose(angles)
-    for row, found, about in zip(angles.tolist(), points, axes, strict=True):
-        expected = (*manipulator.joints_body_m(tuple(row)), manipulator.net_body_m(tuple(row)))
-        assert found == pytest.approx(np.array(expected), abs=1e-12)
-        force = (1.0, -2.0, 3.0)
-        torque = [np.cross(axis, found[-1] - at) @ force for axis, at in zip(about, found[:-1], strict=True)]
-        assert torque == pytest.approx(manipulator.joint_torque_from_force(tuple(row), force), abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    "arm", [None, 7, {}, {"link_lengths_m": ["a", 1]}, {"shoulder_body_m": [0], "link_lengths_m": []}]
-)
-def test_a_configuration_without_a_valid_arm_has_no_skeleton(arm: object) -> None:
-    assert skeleton_of(arm) is None
 
 
 @pytest.mark.parametrize("count", [0, 1, 4])

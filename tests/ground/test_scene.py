@@ -45,7 +45,7 @@ def test_the_scene_of_a_vehicle_without_tether_and_net_has_no_anchor_and_no_net(
 def test_the_scene_has_as_many_links_and_limits_as_the_arm(count: int) -> None:
     config = load_flight(HOVER, overrides=overrides_with_joints(count))
     scene = scene_of(config, "s1")
-    assert [len(values) for values in (scene.link_lengths_m, scene.joint_min_rad, scene.joint_max_rad)] == [count] * 3
+    assert [len(values) for values in (scene.links_body_m, scene.joint_min_rad, scene.joint_max_rad)] == [count] * 3
     assert decode(Scene, encode(scene)) == scene
     jsonschema.Draft202012Validator(schema_of(Topic.SCENE)).validate(json.loads(encode(scene)))
 

@@ -366,3 +366,18 @@ def test_a_snagged_line_is_noticed_and_the_machine_lands(at_s: float, anchor: Ve
     assert not result.crashed
     assert result.outputs[-1].outcome is Outcome.ABORTED
     assert set(event_ids(result)) & {"tether_taut", "tether_snagged"}
+
+
+def test_an_arm_that_leaves_its_plane_is_a_ball_about_its_first_joint() -> None:
+    aside = "vehicle.tether.attachment_body_m=[0, 0.8, 0]"
+    yaws = vehicle(aside, "vehicle.arm.joints[0].axis=[0, 0, 1]")
+    judge = clearance(yaws)
+    assert judge.judges_arm
+    reach_m = 0.4 + yaws.tip_radius_m
+    away = judge.least_m((0.0, 1.0, 0.0), None, (2.0, 1.0))
+    assert away == pytest.approx(min(math.hypot(0.8, 0.05) - reach_m, 0.8 - yaws.airframe.radius_m))
+    # The line passes 0.05 m above the shoulder.
+    assert judge.least_m((0.0, -1.0, 0.0), None, (2.0, 1.0)) == pytest.approx(0.05 - reach_m)
+    assert not clearance(
+        vehicle("vehicle.tether.attachment_body_m=[0, 0.3, 0]", "vehicle.arm.joints[0].axis=[0, 0, 1]")
+    ).judges_arm

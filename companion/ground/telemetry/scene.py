@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from companion.config.arm_chain import chain_of
 from companion.config.loader import FlightConfig
 from companion.ground.protocol.messages import VERSION, Scene
 from companion.mission.segments import phase_name
+from companion.model.arm_skeleton import skeleton_of
 from companion.model.types import Vec3
 
 PATH_POINTS_MAX = 300
@@ -24,6 +26,7 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
     """
     vehicle = config.vehicle
     room, tether, safety, airframe, arm = vehicle.room, vehicle.tether, vehicle.safety, vehicle.airframe, vehicle.arm
+    skeleton = skeleton_of(chain_of(vehicle))
     return Scene(
         v=VERSION,
         session=session,
@@ -36,8 +39,9 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
         radius_m=airframe.radius_m,
         rotors_body_m=airframe.rotor_layout.positions_body_m,
         ground_clearance_m=airframe.ground_clearance_m,
-        shoulder_body_m=arm.shoulder_body_m,
-        link_lengths_m=arm.link_lengths_m,
+        shoulder_body_m=skeleton.shoulder_body_m,
+        links_body_m=skeleton.links_body_m,
+        joint_axes_body=skeleton.joint_axes,
         net_radius_m=vehicle.tool.net_radius_m if vehicle.tool is not None else None,
         joint_min_rad=tuple(math.radians(joint.angle_deg[0]) for joint in arm.joints),
         joint_max_rad=tuple(math.radians(joint.angle_deg[1]) for joint in arm.joints),

@@ -26,19 +26,26 @@ export function yawOnly(yaw) {
   return [Math.cos(yaw / 2), 0, 0, Math.sin(yaw / 2)];
 }
 
-/** All joints from the shoulder outwards, and the net, in the body: joint 1 counts from body +x downwards, the others turn their links the other way. */
+/** Product of two quaternions. */
+function multiply([aw, ax, ay, az], [bw, bx, by, bz]) {
+  return [
+    aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
+    aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw,
+  ];
+}
+
+/** All joints from the shoulder outwards, and the net, in the body; attitude is that of the last link, which is level at angles 0. */
 export function armBody(scene, arm) {
   let point = scene.shoulder_body_m;
-  let along = [1, 0, 0];
-  let angle = 0;
+  let attitude = LEVEL;
   const joints = [];
-  arm.forEach((turn, index) => {
+  arm.forEach((angle, index) => {
     joints.push(point);
-    angle += index ? -turn : turn;
-    along = [Math.cos(angle), 0, -Math.sin(angle)];
-    point = add(point, scale(along, scene.link_lengths_m[index]));
+    const axis = scale(scene.joint_axes_body[index], Math.sin(angle / 2));
+    attitude = multiply(attitude, [Math.cos(angle / 2), ...axis]);
+    point = add(point, rotate(attitude, scene.links_body_m[index]));
   });
-  return { joints, net: point, along };
+  return { joints, net: point, attitude };
 }
 
 /** Points of a circle about a centre, in the plane of two unit vectors. */

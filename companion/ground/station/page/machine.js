@@ -5,6 +5,7 @@ import { add, armBody, circle, rotate, scale, yawOnly } from "./geometry.js";
 
 const X = [1, 0, 0];
 const Y = [0, 1, 0];
+const Z = [0, 0, 1];
 
 /** Draw the vehicle at a pose, the farther parts first. */
 export function drawMachine(renderer, scene, position, attitude, { arm = null, caught = false, armed = false } = {}) {
@@ -56,14 +57,14 @@ function drawBody(renderer, world, scene, radius) {
 }
 
 function drawArm(renderer, scene, world, turn, angles, caught) {
-  const { joints, net, along } = armBody(scene, angles);
+  const { joints, net, attitude } = armBody(scene, angles);
+  const [along, aside, across] = [X, Y, Z].map((axis) => rotate(attitude, axis));
   if (joints.length > 1) renderer.line(joints.map(world), colours.link, { width: 5 });
   const mouth = add(net, scale(along, -(scene.net_radius_m ?? 0)));
   renderer.line([world(joints.at(-1)), world(mouth)], colours.link, { width: 4 });
   for (const joint of joints) renderer.ball(world(joint), 0.02, colours.machine, { least: 3.5, edge: colours.card });
   if (!scene.net_radius_m) return;
-  const across = [-along[2], 0, along[0]];
-  const hoops = [[along, Y], [along, across], [across, Y]];
+  const hoops = [[along, aside], [along, across], [across, aside]];
   for (const [u, v] of hoops) {
     renderer.line(circle(world(net), turn(u), turn(v), scene.net_radius_m, 20), colours.net, { width: 1.3, alpha: 0.9 });
   }
