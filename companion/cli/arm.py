@@ -31,12 +31,12 @@ def add_parser(commands: Any) -> None:
         "are then written and read back. Exit 0: all servos are set up; 3: not all are.",
     )  # fmt: skip
     setup.add_argument(
-        "--joint", type=_joint, metavar="N", help="joint to which the only connected servo belongs, 1 or 2"
+        "--joint", type=_joint, metavar="N", help="joint to which the only connected servo belongs, from 1"
     )
     add_tool(
         parts, "zero", _TOOLS, yes=False,
         help="find zeros and directions: hold the arm by hand in three poses",
-        description="Torque is off. Hold the arm by hand in three poses, to find zero_count and sign of both joints "
+        description="Torque is off. Hold the arm by hand in three poses, to find zero_count and sign of every joint "
         "and whether the servos are interchanged. A pose is accepted when it is held still for 2 s, or "
         "on Enter.",
     )  # fmt: skip
@@ -46,17 +46,17 @@ def add_parser(commands: Any) -> None:
         description="Move one joint at a time, at up to 20 deg/s, within the joint limits. It stops as soon as you release "
         "the key or it meets an obstacle. Afterwards the arm is limp: hold it.",
     )  # fmt: skip
-    jog.add_argument("--joint", type=_joint, metavar="N", help="with --to: joint to move, 1 or 2")
+    jog.add_argument("--joint", type=_joint, metavar="N", help="with --to: joint to move, from 1")
     jog.add_argument("--to", type=float, metavar="DEG", help="move to this angle instead of using keys")
     add_tool(
         parts, "friction", _TOOLS,
-        help="measure torque constant and friction of both joints",
+        help="measure torque constant and friction of every joint",
         description="Sweep each joint slowly in both directions about the hanging pose, and fit its torque constant and "
         "its dry and viscous friction, with gravity as the reference torque. The arm must hang freely.",
     )  # fmt: skip
 
 
 def _joint(text: str) -> int:
-    if text not in ("1", "2"):
-        raise argparse.ArgumentTypeError(f"expected 1 (shoulder) or 2 (elbow), got '{text}'")
+    if text not in list("1234567"):
+        raise argparse.ArgumentTypeError(f"expected 1 (shoulder), 2 (elbow) or a later joint up to 7, got '{text}'")
     return int(text) - 1

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, JsonValue, model_validator
+from pydantic import BeforeValidator, Field, JsonValue, model_validator
 
 from companion.config.airframe import Airframe
 from companion.config.base import (
@@ -29,6 +29,7 @@ from companion.config.ground import Ground
 from companion.config.mocap import NATNET
 from companion.model.arm_chain import is_physical_inertia
 from companion.model.constants import GRAVITY_M_S2
+from companion.model.servos import SERVOS, WITHOUT_CURRENT_CONTROL, ServoKind, ServoName
 from companion.model.types import Joints
 
 _CELL_MIN_V = (2.8, 4.1)
@@ -37,9 +38,17 @@ FOLDED, UNFOLDED = "folded", "unfolded"
 """Names of poses that the shipped missions use."""
 
 
+def _with_current_control(name: object) -> object:
+    if isinstance(name, str) and name in WITHOUT_CURRENT_CONTROL:
+        raise ValueError(f"the {name} has no current control (operating mode 0), so that it cannot follow a torque")
+    return name
+
+
 class Joint(Model):
     """One servo and its joint, with angles as defined in the paper."""
 
+    servo: Annotated[ServoName, BeforeValidator(_with_current_control)] = "XM430-W210"
+    """Model of the Dynamixel servo; the driver refuses a servo of another model."""
     servo_id: Annotated[int, Field(ge=0, le=252)]
     sign: Literal[-1, 1]
     """1 if the servo's counts increase with the joint angle, -1 if they decrease."""
@@ -47,12 +56,34 @@ class Joint(Model):
     """Present Position (register 132) at joint angle 0."""
     angle_deg: Span
     """Lower and upper joint limit."""
-    torque_max_nm: Annotated[float, Field(gt=0, le=3.0)]
+    torque_max_nm: Positive
+    """Largest commanded torque, at most the stall torque of the servo."""
     velocity_max_deg_s: Positive = 300.0
+    """Largest planned speed, at most the speed of the servo without load."""
+    torque_per_amp_nm_a: Positive | None = None
+    """Torque constant of this servo; null for the value of the arm."""
     axis: Axis | None = None
     """Direction of the axis in the link's frame, for arms without `links`. If it is absent, the first joint turns about +y and the
     others about -y.
     """
+
+    @property
+    def kind(self) -> ServoKind:
+        """Return the data of the servo's model."""
+        return SERVOS[self.servo]
+
+    @model_validator(mode="after")
+    def _servo_suffices(self) -> Self:
+        kind, problems = self.kind, list[tuple[Location, str]]()
+        if self.torque_max_nm > kind.stall_torque_nm:
+            text = f"the {kind.name} stalls at {kind.stall_torque_nm:g} N m, got {self.torque_max_nm:g} N m"
+            problems.append((("torque_max_nm",), text))
+        speed_deg_s = 6.0 * kind.speed_max_rpm
+        if self.velocity_max_deg_s > speed_deg_s:
+            text = f"the {kind.name} turns at most at {speed_deg_s:g} deg/s, got {self.velocity_max_deg_s:g} deg/s"
+            problems.append((("velocity_max_deg_s",), text))
+        refuse("joint", problems)
+        return self
 
 
 class Link(Model):
@@ -108,7 +139,9 @@ class Arm(Model):
     """Name of the URDF's link that is the vehicle's body. If it is absent, the link that is no joint's child is used."""
     urdf_tip: str | None = None
     """Name of the URDF's link whose frame is the tip. If it is absent, the only link that ends the chain is used."""
-    torque_per_amp_nm_a: Positive = 1.3
+    torque_per_amp_nm_a: Positive | None = None
+    """Torque constant of the servos, if all of them are of one model. null: stall torque divided by stall current of each model
+    (docs/hardware.md)."""
     joint_armature_kg_m2: NonNegative = 0.008
     """Inertia of a servo's rotor and gears, referred to the joint; used by the model-based laws and the simulated arm."""
     joint_friction_nm: NonNegative = 0.04
@@ -118,6 +151,14 @@ class Arm(Model):
     """Joint angles, in degrees, that missions refer to by name. Always defined are `folded` (safety.fold_arm_deg) and, for two joints,
     `unfolded` (100, 60 unless given here).
     """
+
+    @property
+    def torque_constants_nm_a(self) -> tuple[float, ...]:
+        """Return the torque constant of each joint's servo, N m/A: that of the joint, of the arm, or of the servo's model."""
+        return tuple(
+            joint.torque_per_amp_nm_a or self.torque_per_amp_nm_a or joint.kind.torque_per_amp_nm_a
+            for joint in self.joints
+        )
 
     @model_validator(mode="after")
     def _one_value_per_joint(self) -> Self:
@@ -146,6 +187,10 @@ class Arm(Model):
                     text = f"joint {earlier + 1} has the servo id {joint.servo_id} too; give each servo its own id"
                     problems.append((("joints", index, "servo_id"), text))
                     break
+        names = list(dict.fromkeys(joint.servo for joint in self.joints if joint.torque_per_amp_nm_a is None))
+        if self.torque_per_amp_nm_a is not None and len(names) > 1:
+            text = f"one torque constant cannot hold for {' and '.join(names)}; set arm.joints[].torque_per_amp_nm_a instead"
+            problems.append((("torque_per_amp_nm_a",), text))
         refuse("arm", problems)
         return self
 
@@ -381,18 +426,19 @@ class Safety(Model):
     """Largest number of consecutive bus cycles without an answer."""
     servo_warn_c: Positive = 65.0
     servo_max_c: Positive = 75.0
-    """Temperature above which the vehicle lands; the servos shut down at 80 degC."""
+    """Temperature above which the vehicle lands; it must be below the temperature at which a servo shuts down (80 degC; 70 degC for the
+    330 models)."""
     servo_overload_s: Positive = 1.0
     """Longest time for which a joint may be at its torque limit."""
     joint_jump_deg: Positive = 15.0
     """Largest change of a joint angle between two reads in excess of the change at the joint's largest speed."""
     joint_rate_max_deg_s: Positive = 700.0
-    """Largest plausible joint rate; no servo of this type reaches it, even when driven by an external force."""
+    """Largest plausible joint rate; no XM430-W210 reaches it, even when driven by an external force."""
     joint_limit_warn_deg: Positive = 3.0
     joint_limit_max_deg: Positive = 10.0
     """Largest angle by which a joint may exceed its limits; beyond it, the vehicle lands."""
-    servo_current_max_a: Positive = 2.3
-    """Largest commanded current; the default is the stall current."""
+    servo_current_max_a: Positive | None = None
+    """Largest commanded current of each servo; null for the stall current of its model."""
     force_timeout_s: Positive = 0.25
     """Max age of a force sample; beyond it, the controller continues without the force and a warning is raised."""
     force_stuck_s: Positive = 0.25
@@ -503,6 +549,13 @@ class Vehicle(Model):
                 text = f"the centre of mass is beyond the end of the link: at {com_m:g} m on a link of {length_m:g} m"
                 problems.append((("arm", "link_com_m", index), text))
         problems += self._poses_within_limits()
+        coolest = min((joint.kind for joint in self.arm.joints), key=lambda kind: kind.temperature_max_c, default=None)
+        if coolest is not None and self.safety.servo_max_c >= coolest.temperature_max_c:
+            text = (
+                f"expected less than {coolest.temperature_max_c:g} degC, at which the {coolest.name} switches its torque off, got "
+                f"{self.safety.servo_max_c:g} degC"
+            )
+            problems.append((("safety", "servo_max_c"), text))
         for axis, own in enumerate(self.airframe.inertia_kg_m2):
             others = sum(self.airframe.inertia_kg_m2) - own
             if own > others * (1.0 + 1e-9):

@@ -31,11 +31,11 @@ class EstimatorReport(Record, frozen=True, kw_only=True):
 
 
 class ServoReport(Record, frozen=True, kw_only=True):
-    """Identity and settings of one servo, from registers of the XM430 control table."""
+    """Identity and settings of one servo, from registers of its control table."""
 
     servo_id: int
     model: int
-    """Model number (register 0); 1030 is the XM430-W210."""
+    """Model number (register 0), as in `companion.model.servos`."""
     firmware: int
     """Firmware version (register 6)."""
     operating_mode: int

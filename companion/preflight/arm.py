@@ -9,6 +9,7 @@ from companion.config.vehicle import Vehicle
 from companion.model.check_row import Row
 from companion.model.listing import listed
 from companion.model.observations import Observations, ServoReport
+from companion.model.servos import WATCHDOG_ERROR, ServoKind, model_text
 from companion.model.types import ArmState
 from companion.preflight.checks import Check
 from companion.safety.arm import error_text
@@ -22,14 +23,14 @@ DEVICE = Check(
 MODEL = Check(
     "arm.model",
     "servos",
-    "XM430-W210 (model 1030)",
+    "the models of `arm.joints[].servo` (register 0)",
     "other models have a different torque constant and different registers",
 )
 FIRMWARE = Check(
     "arm.firmware",
     "servo firmware",
-    "38 or newer, the same on all servos",
-    "older firmware has no bus watchdog: the arm would keep its torque if the companion died",
+    "38 or newer (53 for the 330 models), the same on all servos of one model",
+    "older firmware has no bus watchdog, or other register addresses",
 )
 MODE = Check(
     "arm.mode",
@@ -58,14 +59,14 @@ CURRENT_LIMIT = Check(
 VOLTAGE = Check(
     "arm.voltage",
     "servo supply",
-    "10.0 to 14.8 V",
+    "the range of each servo's model, such as 10.0 to 14.8 V for the XM430",
     "outside this range the servos report an input voltage error and switch their torque off",
 )
 TEMPERATURE = Check(
     "arm.temperature",
     "servo temperature",
     "below `safety.servo_warn_c`; refused at `safety.servo_max_c` or above",
-    "at 80 degC a servo switches its torque off",
+    "at 80 degC (70 degC for the 330 models) a servo switches its torque off",
 )
 ERROR = Check(
     "arm.error",
@@ -97,16 +98,11 @@ CHECKS = (
     DEVICE, MODEL, FIRMWARE, MODE, RETURN_DELAY, WATCHDOG, CURRENT_LIMIT, VOLTAGE, TEMPERATURE, ERROR, ANGLES, STILL, READS, USB,
 )  # fmt: skip
 
-MODEL_XM430_W210 = 1030
-FIRMWARE_MIN = 38
 MODE_CURRENT = 0
 MODES = {0: "current", 1: "velocity", 3: "position", 4: "extended position", 5: "current-based position", 16: "PWM"}
-AMP_PER_COUNT = 2.69e-3
-VOLTAGE_MIN_V, VOLTAGE_MAX_V = 10.0, 14.8
 STILL_RAD = math.radians(3.0)
 MISSED_GOOD, MISSED_MAX = 0.001, 0.1
 LATENCY_GOOD_MS = 1
-WATCHDOG_BIT = 0x80
 
 
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
@@ -131,13 +127,14 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
 
 
 def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
-    models = [servo.model for servo in servos]
-    read = ", ".join(f"id {servo.servo_id}: {_model(servo.model)}" for servo in servos)
-    if all(model == MODEL_XM430_W210 for model in models):
-        yield MODEL.good(read, "XM430-W210")
-    else:
-        yield MODEL.bad(read, "XM430-W210", "install the configured servo, or correct arm.joints[].servo_id")
-    yield firmware(FIRMWARE, [servo.firmware for servo in servos])
+    kinds = [joint.kind for joint in vehicle.arm.joints]
+    read = ", ".join(f"id {servo.servo_id}: {model_text(servo.model)}" for servo in servos)
+    wanted = _each([kind.name for kind in kinds])
+    fix = "install the configured servo, or correct arm.joints[].servo_id or arm.joints[].servo"
+    yield MODEL.row(
+        all(servo.model == kind.number for servo, kind in zip(servos, kinds, strict=True)), read, wanted, fix
+    )
+    yield firmware(FIRMWARE, [(kind, servo.firmware) for servo, kind in zip(servos, kinds, strict=True)])
     modes = [servo.operating_mode for servo in servos]
     yield _equal(
         MODE,
@@ -160,30 +157,42 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
         WATCHDOG, watchdogs_ms, wanted_ms, "{} ms".format, "cycle the servos' power; check for a loose supply cable"
     )
     yield _current_limit(servos, vehicle)
-    yield supply(VOLTAGE, [servo.voltage_v for servo in servos])
+    yield supply(VOLTAGE, [(kind, servo.voltage_v) for servo, kind in zip(servos, kinds, strict=True)])
 
 
-def firmware(check: Check, versions: Sequence[int]) -> Row:
-    """Return the row of the servos' firmware."""
-    read, wanted = _each(versions), f"{FIRMWARE_MIN} or newer"
+def firmware(check: Check, versions: Sequence[tuple[ServoKind, int]]) -> Row:
+    """Return the row of the servos' firmware, given the model and the version of each."""
+    read = _each([version for _, version in versions])
+    wanted = _each([f"{kind.firmware_min} or newer" for kind, _ in versions])
     fix = "update with DYNAMIXEL Wizard: Recovery, newest firmware"
-    if min(versions) >= FIRMWARE_MIN and len(set(versions)) > 1:
-        return check.doubtful(read, f"{wanted}, the same on all", fix)
-    return check.row(min(versions) >= FIRMWARE_MIN, read, wanted, fix)
+    new_enough = all(version >= kind.firmware_min for kind, version in versions)
+    if new_enough and len(set(versions)) > len({kind for kind, _ in versions}):
+        return check.doubtful(read, f"{wanted}, the same on all servos of one model", fix)
+    return check.row(new_enough, read, wanted, fix)
 
 
-def supply(check: Check, volts: Sequence[float]) -> Row:
-    """Return the row of the servos' supply voltage."""
-    read, wanted = _each([f"{volt:.1f} V" for volt in volts]), f"{VOLTAGE_MIN_V:g} to {VOLTAGE_MAX_V:g} V"
-    within = all(VOLTAGE_MIN_V <= volt <= VOLTAGE_MAX_V for volt in volts)
-    return check.row(within, read, wanted, "supply the servos with 12 V from a converter; check its plugs")
+def supply(check: Check, volts: Sequence[tuple[ServoKind, float]]) -> Row:
+    """Return the row of the servos' supply voltage, given the model and the voltage of each."""
+    read = _each([f"{volt:.1f} V" for _, volt in volts])
+    ranges_v = [kind.voltage_v for kind, _ in volts]
+    wanted = _each([f"{low_v:g} to {high_v:g} V" for low_v, high_v in ranges_v])
+    within = all(low_v <= volt <= high_v for (low_v, high_v), (_, volt) in zip(ranges_v, volts, strict=True))
+    return check.row(
+        within,
+        read,
+        wanted,
+        "supply each servo with its voltage, 12 V for the XM430, from a converter; check its plugs",
+    )
 
 
 def _current_limit(servos: Sequence[ServoReport], vehicle: Vehicle) -> Row:
-    per_count_nm = vehicle.arm.torque_per_amp_nm_a * AMP_PER_COUNT
+    arm = vehicle.arm
+    per_count_nm = [
+        nm_a * joint.kind.current_unit_a for nm_a, joint in zip(arm.torque_constants_nm_a, arm.joints, strict=True)
+    ]
     limits = [servo.current_limit_counts for servo in servos]
-    needed = [math.floor(joint.torque_max_nm / per_count_nm + 1e-9) for joint in vehicle.arm.joints]
-    read = _each([f"{limit} ({limit * per_count_nm:.2f} N m)" for limit in limits])
+    needed = [math.floor(joint.torque_max_nm / nm + 1e-9) for joint, nm in zip(arm.joints, per_count_nm, strict=True)]
+    read = _each([f"{limit} ({limit * nm:.2f} N m)" for limit, nm in zip(limits, per_count_nm, strict=True)])
     wanted = f"at least {_each(needed)}"
     if all(limit >= need for limit, need in zip(limits, needed, strict=True)):
         return CURRENT_LIMIT.good(read, wanted)
@@ -205,7 +214,7 @@ def _states(states: Sequence[ArmState], vehicle: Vehicle) -> Iterator[Row]:
     named = error_text(errors)
     if named:
         yield ERROR.bad(named, "none", "remove the cause, then cycle the servos' power")
-    elif _or(errors) & WATCHDOG_BIT:
+    elif _or(errors) & WATCHDOG_ERROR:
         fix = "check for a loose cable or supply, and for a computer that stalls"
         yield ERROR.doubtful("a bus watchdog tripped", "none", fix)
     else:
@@ -262,10 +271,6 @@ def _each(values: Sequence[object]) -> str:
 
 def _mode(mode: int) -> str:
     return f"{mode} ({MODES.get(mode, 'unknown')})"
-
-
-def _model(model: int) -> str:
-    return "XM430-W210" if model == MODEL_XM430_W210 else f"model {model}"
 
 
 def _or(errors: Iterable[int]) -> int:

@@ -9,13 +9,10 @@ import math
 from collections.abc import Sequence
 
 from companion.model.listing import listed
+from companion.model.servos import WATCHDOG_ERROR, hardware_error_text
 from companion.model.types import ArmState, ForceSample, Inputs, Joints, Vec2, Vec3
 from companion.safety.situation import HOLDS, Age, Situation, Values
 
-WATCHDOG_RESTARTED = 0x80
-"""Bit of `ArmState.hardware_error` that the companion sets: the bus watchdog had switched the torque off."""
-ERROR_NAMES = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
-"""Bits of register 70, Hardware Error Status, of the XM430."""
 AT_LIMIT = 0.97
 """Fraction of the torque limit at which a joint counts as being at its limit."""
 DRIFT_TIME_S = 1.0
@@ -24,14 +21,9 @@ _NO_FORCE: Vec3 = (0.0, 0.0, 0.0)
 
 
 def error_text(errors: Sequence[int]) -> str:
-    """Return the hardware errors of the servos by name: "servo 2: overload, overheating"."""
-    parts = []
-    for index, error in enumerate(errors):
-        bits = [bit for bit in range(7) if error >> bit & 1]
-        if bits:
-            names = ", ".join(ERROR_NAMES.get(bit, f"bit {bit}") for bit in bits)
-            parts.append(f"servo {index + 1}: {names}")
-    return "; ".join(parts)
+    """Return the hardware errors of all servos by name: "servo 2: overheating, overload"."""
+    own = [error & ~WATCHDOG_ERROR for error in errors]
+    return "; ".join(f"servo {number}: {hardware_error_text(error)}" for number, error in enumerate(own, 1) if error)
 
 
 class ArmTracker:
@@ -76,7 +68,7 @@ def servo_error(a: ArmTracker, _: None) -> Values | None:
     if arm is None:
         return None
     for error in arm.hardware_error:
-        if error & ~WATCHDOG_RESTARTED:
+        if error & ~WATCHDOG_ERROR:
             return (error_text(arm.hardware_error),)
     return None
 
@@ -86,7 +78,7 @@ def arm_let_go(a: ArmTracker, _: None) -> Values | None:
     arm = a.arm
     if arm is not None:
         for error in arm.hardware_error:
-            if error & WATCHDOG_RESTARTED:
+            if error & WATCHDOG_ERROR:
                 return HOLDS
     return None
 

@@ -44,10 +44,12 @@ class Gate:
         safety, joints = vehicle.safety, vehicle.arm.joints
         self._tilt_max_rad = math.radians(vehicle.airframe.tilt_max_deg) + 1e-6
         self._tilt_limit = math.sin(0.5 * self._tilt_max_rad) ** 2
-        by_current_nm = safety.servo_current_max_a * vehicle.arm.torque_per_amp_nm_a
         self._bounds = [
-            (min(joint.torque_max_nm, by_current_nm), *map(math.radians, (*joint.angle_deg, joint.velocity_max_deg_s)))
-            for joint in joints
+            (
+                min(joint.torque_max_nm, (safety.servo_current_max_a or joint.kind.stall_current_a) * nm_a),
+                *map(math.radians, (*joint.angle_deg, joint.velocity_max_deg_s)),
+            )
+            for joint, nm_a in zip(joints, vehicle.arm.torque_constants_nm_a, strict=True)
         ]
         """Largest torque, N m, lower and upper limit, rad, and largest speed, rad/s, of each joint."""
         self._state_age_max_s = safety.command_state_age_max_s

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field
 from companion.config.base import JOINTS_MAX, Fraction, Model, NonNegative, Positive, RelativeError, Vector2, Vector3
 from companion.config.explain import nearest
 from companion.config.vehicle import NatNetVersion, ServoBaud
+from companion.model.servos import ServoName
 from companion.px4.defaults import PX4_DEFAULTS
 from companion.sitl_config.effects.air import Air
 from companion.sitl_config.effects.battery import Battery
@@ -72,12 +73,16 @@ class Servo(Model):
     """Servo id (register 7); null for the id in the vehicle file. The answers of two servos with the same id collide."""
     baud: Literal[9600, ServoBaud] | None = None
     """Baud rate (register 8); null for the baud rate in the vehicle file."""
-    firmware: Annotated[int, Field(ge=0, le=255)] = 48
+    model: ServoName | None = None
+    """Model of the servo; null for the model in the vehicle file."""
+    firmware: Annotated[int, Field(ge=0, le=255)] | None = None
+    """Firmware version (register 6); null for that of the model as delivered."""
     return_delay_us: Annotated[int, Field(ge=0, le=508, multiple_of=2)] = 500
     operating_mode: Literal[0, 3, 5] = 3
     drive_mode: Annotated[int, Field(ge=0, le=5)] = 0
     shadow_id: Annotated[int, Field(ge=0, le=255)] = 255
-    current_limit_counts: Annotated[int, Field(ge=0, le=1193)] = 1193
+    current_limit_counts: Annotated[int, Field(ge=0, le=2352)] | None = None
+    """Current limit (register 38); null for the factory setting of the model."""
     position_limit_counts: tuple[Annotated[int, Field(ge=0, le=4095)], Annotated[int, Field(ge=0, le=4095)]] = (0, 4095)
     connected: bool = True
     """Whether the servo is plugged in."""

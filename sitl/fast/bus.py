@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from companion.config.vehicle import Joint, Vehicle
-from companion.io.dynamixel.registers import WATCHDOG_ERROR, JointScale, joint_scale
+from companion.io.dynamixel.registers import JointScale, joint_scale
+from companion.model.servos import WATCHDOG_ERROR
 from companion.model.types import ArmState, Joints
 from sitl.faults.injector import COOL_C, Faults
 from sitl.servo import registers as reg
@@ -28,17 +29,17 @@ def scales_of(vehicle: Vehicle, servos: Sequence[ServoModel]) -> tuple[JointScal
         servos: all servos that are connected to the bus.
 
     Returns:
-        None unless exactly one servo answers at each joint's id and baud rate in the vehicle file and its current limit suffices
-        for `torque_max_nm`.
+        None unless exactly one servo of the right model answers at each joint's id and baud rate in the vehicle file and its current
+        limit suffices for `torque_max_nm`.
     """
     line, arm = ServoLine(servos), vehicle.arm
     scales: list[JointScale] = []
-    for joint in arm.joints:
+    for joint, nm_a in zip(arm.joints, arm.torque_constants_nm_a, strict=True):
         limit_counts = _current_limit_counts(line, joint, vehicle.arm_device.baud)
         if limit_counts is None:
             return None
         try:
-            scales.append(joint_scale(joint, arm.torque_per_amp_nm_a, limit_counts))
+            scales.append(joint_scale(joint, nm_a, limit_counts))
         except ValueError:  # the current limit is too low
             return None
     return tuple(scales)
@@ -47,7 +48,7 @@ def scales_of(vehicle: Vehicle, servos: Sequence[ServoModel]) -> tuple[JointScal
 def _current_limit_counts(line: ServoLine, joint: Joint, baud_bps: int) -> int | None:
     own = [servo for servo in line.servos if servo.servo_id == joint.servo_id]
     answer = line.feed(packet(joint.servo_id, _READ_LIMIT), baud_bps)
-    if len(own) != 1:
+    if len(own) != 1 or own[0].model != joint.kind.number:
         return None
     data = own[0].read(_LIMIT.address, _LIMIT.size)
     return _LIMIT.decode(data) if answer == status(joint.servo_id, 0, data) else None

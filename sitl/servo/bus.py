@@ -1,4 +1,4 @@
-"""A half-duplex bus of emulated XM430 servos: `ServoLine` implements the protocol without I/O; `ServoBus` connects it to a pty.
+"""A half-duplex bus of emulated Dynamixel servos: `ServoLine` implements the protocol without I/O; `ServoBus` connects it to a pty.
 
 Source: ROBOTIS e-manual, "DYNAMIXEL Protocol 2.0".
 """

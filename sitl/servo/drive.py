@@ -1,4 +1,4 @@
-"""Motor and encoder of one XM430, on world time, without I/O or control table.
+"""Motor and encoder of one servo, on world time, without I/O or control table.
 
 `sitl.servo.model.ServoModel` adds the control table for the bus; the fast closed loop uses the drive directly.
 """
@@ -11,6 +11,7 @@ from collections import deque
 COUNTS_PER_TURN = 4096
 RAD_PER_COUNT = 2.0 * math.pi / COUNTS_PER_TURN
 AMP_PER_COUNT = 2.69e-3
+"""Unit of current of the XM430-W210, the default of `ServoDrive.amp_per_count`."""
 RAD_S_PER_COUNT = 0.229 * 2.0 * math.pi / 60.0
 
 MODE_CURRENT, MODE_POSITION, MODE_CURRENT_POSITION = 0, 3, 5
@@ -30,6 +31,8 @@ class ServoDrive:
     """
 
     def __init__(self, shaft_angle_rad: float = 0.0) -> None:
+        self.amp_per_count = AMP_PER_COUNT
+        """Unit of current of the servo's model."""
         self.torque_on = False
         """Whether torque is enabled (register 64)."""
         self.mode = MODE_POSITION
@@ -103,9 +106,9 @@ class ServoDrive:
         if self.current_loop_s > 0.0:
             self._current -= math.expm1(-since_s / self.current_loop_s) * (counts - self._current)
             self._current_counts = round(self._current)
-            return self._current * AMP_PER_COUNT * self.direction
+            return self._current * self.amp_per_count * self.direction
         self._current_counts = counts
-        return counts * AMP_PER_COUNT * self.direction
+        return counts * self.amp_per_count * self.direction
 
     def set_goal_current(self, counts: int, *, at_once: bool = False) -> None:
         """Set the goal current (register 102), in the servo's own direction; it takes effect `goal_delay_s` later.
@@ -173,4 +176,4 @@ class ServoDrive:
         error_rad = goal_rad - self.direction * self.angle_rad
         damping_a = _AMP_PER_RAD_S * self.direction * self.velocity_rad_s
         current_a = self.position_gain * _AMP_PER_RAD * error_rad - damping_a
-        return max(-limit, min(limit, round(current_a / AMP_PER_COUNT)))
+        return max(-limit, min(limit, round(current_a / self.amp_per_count)))

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from companion.config.vehicle import ArmDevice, Joint, Vehicle
 from companion.sitl_config.world import Servo, World
 from sitl.servo import registers as reg
+from sitl.servo.kinds import KINDS
 from sitl.servo.model import ServoModel
 
 
@@ -24,17 +25,26 @@ def plugged_in(servos: Sequence[ServoModel], config: World) -> list[ServoModel]:
     return [servo for index, servo in enumerate(servos) if config.servo(index).connected]
 
 
+def torque_constants_nm_a(vehicle: Vehicle) -> tuple[float, ...]:
+    """Return the torque constant of each joint's servo in N m/A: that of the vehicle file, or of the servo's model."""
+    arm = vehicle.arm
+    return tuple(
+        joint.torque_per_amp_nm_a or arm.torque_per_amp_nm_a or KINDS[joint.servo].nm_per_amp for joint in arm.joints
+    )
+
+
 def servo_of(joint: Joint, device: ArmDevice, settings: Servo) -> ServoModel:
     """Return the servo of a joint.
 
     Args:
-        joint: joint of the vehicle file; gives the servo's id unless `settings` does.
+        joint: joint of the vehicle file; gives the servo's model, and its id unless `settings` does.
         device: arm device of the vehicle file; gives the baud rate unless `settings` does.
         settings: actual settings of the simulated servo.
     """
     servo = ServoModel(
         joint.servo_id if settings.id is None else settings.id,
         baud_bps=device.baud if settings.baud is None else settings.baud,
+        kind=joint.servo if settings.model is None else settings.model,
         firmware=settings.firmware,
     )
     low, high = settings.position_limit_counts
@@ -43,9 +53,10 @@ def servo_of(joint: Joint, device: ArmDevice, settings: Servo) -> ServoModel:
         (reg.DRIVE_MODE, settings.drive_mode),
         (reg.OPERATING_MODE, settings.operating_mode),
         (reg.SECONDARY_ID, settings.shadow_id),
-        (reg.CURRENT_LIMIT, settings.current_limit_counts),
         (reg.MIN_POSITION_LIMIT, low),
         (reg.MAX_POSITION_LIMIT, high),
     ):
         servo.write(register.address, register.encode(value))
+    if settings.current_limit_counts is not None:
+        servo.write(reg.CURRENT_LIMIT.address, reg.CURRENT_LIMIT.encode(settings.current_limit_counts))
     return servo

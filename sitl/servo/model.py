@@ -1,4 +1,4 @@
-"""An emulated XM430-W210-T without I/O: a control table for the bus and a motor for the world.
+"""An emulated Dynamixel servo without I/O: a control table for the bus and a motor for the world.
 
 The motor is a `ServoDrive`. Writes are copied to it, and its present values are copied into the table before each read. The watchdog
 runs on the world time of `update`.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 
+from companion.model.servos import ServoName
 from sitl.servo import registers as reg
 from sitl.servo.drive import (
     AMP_PER_COUNT,
@@ -18,6 +19,7 @@ from sitl.servo.drive import (
     RAD_S_PER_COUNT,
     ServoDrive,
 )
+from sitl.servo.kinds import KINDS
 from sitl.servo.protocol import ALERT, StatusError
 from sitl.servo.registers import Register
 
@@ -49,8 +51,9 @@ class ServoModel:
     Args:
         servo_id: servo id (register 7).
         baud_bps: baud rate (register 8); the servo receives only packets sent at this rate.
-        firmware: firmware version (register 6).
-        model: model number (register 0).
+        kind: name of the model.
+        firmware: firmware version (register 6); None for that of the model as delivered.
+        model: model number (register 0); None for that of the model.
         shaft_angle_rad: shaft angle before the first `update`.
 
     Raises:
@@ -62,22 +65,35 @@ class ServoModel:
         servo_id: int,
         *,
         baud_bps: int = 3_000_000,
-        firmware: int = 48,
-        model: int = reg.MODEL,
+        kind: ServoName = "XM430-W210",
+        firmware: int | None = None,
+        model: int | None = None,
         shaft_angle_rad: float = 0.0,
     ) -> None:
         if baud_bps not in reg.BAUDS:
-            raise ValueError(f"an XM430 does not support the baud rate {baud_bps}; supported: {reg.BAUDS}")
+            raise ValueError(f"the servo does not support the baud rate {baud_bps}; supported: {reg.BAUDS}")
         if not reg.ID.low <= servo_id <= reg.ID.high:
             raise ValueError(f"servo id {servo_id} is not in 0..252")
         self._memory = bytearray(reg.TABLE_SIZE)
         for register in reg.REGISTERS:
             self._set(register, register.initial)
-        self._set(reg.MODEL_NUMBER, model)
+        own = self._kind = KINDS[kind]
+        low_v, high_v, supply_v = own.volts
+        for register, value in (
+            (reg.MODEL_NUMBER, own.number if model is None else model),
+            (reg.FIRMWARE, own.firmware if firmware is None else firmware),
+            (reg.CURRENT_LIMIT, own.current_counts),
+            (reg.TEMPERATURE_LIMIT, own.temperature_c),
+            (reg.MIN_VOLTAGE_LIMIT, round(10.0 * low_v)),
+            (reg.MAX_VOLTAGE_LIMIT, round(10.0 * high_v)),
+            (reg.PRESENT_VOLTAGE, round(10.0 * supply_v)),
+            (reg.SHUTDOWN, own.shutdown),
+        ):
+            self._set(register, value)
         self._set(reg.ID, servo_id)
         self._set(reg.BAUD, reg.BAUDS.index(baud_bps))
-        self._set(reg.FIRMWARE, firmware)
         self.drive = ServoDrive(shaft_angle_rad)
+        self.drive.amp_per_count = own.amp_per_count
         self.lights = 0
         """Number of times that the LED has been switched on."""
         self._shutdown = False
@@ -306,7 +322,10 @@ class ServoModel:
             raise ServoRefusal(StatusError.ACCESS)
         if memory[98] == WATCHDOG_TRIPPED and (register in reg.GOALS or (register is reg.BUS_WATCHDOG and value != 0)):
             raise ServoRefusal(StatusError.DATA_RANGE)
-        if not register.low <= value <= register.high:
+        in_range = register.low <= value <= register.high
+        if register in (reg.CURRENT_LIMIT, reg.GOAL_CURRENT):
+            in_range = abs(value) <= self._kind.current_counts
+        if not in_range:
             raise ServoRefusal(StatusError.DATA_RANGE)
         if register is reg.OPERATING_MODE and value not in MODES:
             raise ServoRefusal(StatusError.DATA_RANGE)

@@ -1,4 +1,4 @@
-"""Control table of the XM430-W210-T as data.
+"""Control table of the XM430-W210 as data; other models differ in the values of `sitl.servo.kinds`.
 
 Source: ROBOTIS e-manual, XM430-W210, "Control Table of EEPROM Area" and "Control Table of RAM Area".
 """
@@ -69,8 +69,8 @@ FIRMWARE = _read_only(6, 1, "firmware version")
 HOMING_OFFSET = _read_write(20, 4, "homing offset", 0, -1_044_479, 1_044_479)
 MOVING_THRESHOLD = _read_write(24, 4, "moving threshold", 10, 0, 1023)
 TEMPERATURE_LIMIT = _read_write(31, 1, "temperature limit", 80, 0, 100)
-MAX_VOLTAGE_LIMIT = _read_write(32, 2, "max voltage limit", 160, 95, 160)
-MIN_VOLTAGE_LIMIT = _read_write(34, 2, "min voltage limit", 95, 95, 160)
+MAX_VOLTAGE_LIMIT = _read_write(32, 2, "max voltage limit", 160, 31, 300)
+MIN_VOLTAGE_LIMIT = _read_write(34, 2, "min voltage limit", 95, 31, 300)
 PWM_LIMIT = _read_write(36, 2, "pwm limit", 885, 0, 885)
 CURRENT_LIMIT = _read_write(38, 2, "current limit", 1193, 0, 1193)
 VELOCITY_LIMIT = _read_write(44, 4, "velocity limit", 330, 0, 1023)

@@ -21,6 +21,7 @@ from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.types import ImuSample, RotorCommands
 from sitl.faults.injector import Faults
+from sitl.servo.from_config import torque_constants_nm_a
 from sitl.world.effects.force_sensor import ForceSensor
 from sitl.world.effects.imu import ImuErrors
 from sitl.world.effects.mocap import MocapErrors
@@ -129,10 +130,12 @@ class Plant:
                 drive,
                 -joint.sign if servo.reversed else joint.sign,
                 _zero_rad(joint, servo),
-                vehicle.arm.torque_per_amp_nm_a / (1.0 + servo.torque_per_amp_error) / (1.0 + error),
+                nm_a / (1.0 + servo.torque_per_amp_error) / (1.0 + error),
                 gear,
             )
-            for drive, joint, servo, error, gear in zip(drives, joints, servos, more, gears, strict=True)
+            for drive, joint, servo, nm_a, error, gear in zip(
+                drives, joints, servos, torque_constants_nm_a(vehicle), more, gears, strict=True
+            )
         )
         self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
         hover_n = self.world.weight_n / self.world.rotor_count

@@ -37,7 +37,7 @@ HAND = "world.arm_hand=true"
 FILES = "3000000"
 """The shipped vehicle file's baud rate: to look at it alone takes a second."""
 SHIPPED = ROOT / "configs/vehicles/tarot650_2r.yaml"
-PATIENT = ("vehicle.arm_device.watchdog_ms=1500", "vehicle.safety.arm_timeout_s=2.0", "vehicle.ground.mqtt=null")
+PATIENT = ("vehicle.devices.arm.watchdog_ms=1500", "vehicle.safety.arm_timeout_s=2.0", "vehicle.ground.mqtt=null")
 """A shared machine is held up as a whole now and then, by more than the vehicle file allows."""
 
 OF_THE_COMPUTER = {"arm.reads"}
@@ -54,7 +54,7 @@ class Rig:
 
     def overrides(self, *more: str) -> list[str]:
         """Of every tool."""
-        return [f"vehicle.arm_device.port={self.port}", *PATIENT, *more]
+        return [f"vehicle.devices.arm.port={self.port}", *PATIENT, *more]
 
     def options(self, *overrides: str) -> list[str]:
         """The same on a command line, and the vehicle file."""

@@ -154,6 +154,7 @@ def test_doubled_friction_and_a_weaker_motor_are_measured(tmp_path: Path) -> Non
         "vehicle.arm.joints[0].angle_deg=[77,103]",
         "vehicle.arm.joints[1].angle_deg=[-10,28]",
         "vehicle.safety.fold_arm_deg=[100,0]",
+        "vehicle.arm.poses={}",
     )
     with rig(tmp_path, *knobs, HAND) as one:
         ended = one.run("friction", "--yes", "--write", *(word for limits in narrow for word in ("--set", limits)))
@@ -174,7 +175,7 @@ def test_an_adapter_with_the_factory_latency_timer_is_found(tmp_path: Path) -> N
             timer = tmp_path / os.path.basename(bus.path) / "device/latency_timer"
             timer.parent.mkdir(parents=True, exist_ok=True)
             timer.write_text(latency, encoding="utf-8")
-            vehicle = load_vehicle(SHIPPED, [f"vehicle.arm_device.port={bus.path}"])
+            vehicle = load_vehicle(SHIPPED, [f"vehicle.devices.arm.port={bus.path}"])
             found = await asyncio.to_thread(scan, vehicle.arm_device, sysfs=tmp_path, only=int(FILES))
             return {row.id: row.fix for row in judge(found, vehicle).rows if not row.ok and row.read.endswith(" ms")}
 
@@ -188,7 +189,7 @@ def test_a_port_that_is_not_there_is_one_line(tmp_path: Path, tool: str, capsys:
     words = ["--joint", "1", "--to", "90"] if tool == "jog" else []
     yes = ["--yes"] if tool in ("setup", "jog", "friction") else []
     code = main(
-        ["arm", tool, *words, *yes, "--vehicle", str(SHIPPED), "--set", f"vehicle.arm_device.port={tmp_path}/none"]
+        ["arm", tool, *words, *yes, "--vehicle", str(SHIPPED), "--set", f"vehicle.devices.arm.port={tmp_path}/none"]
     )
     err = capsys.readouterr().err.splitlines()
     assert code == EXIT_REFUSED and len(err) == 1 and f"{tmp_path}/none: no such port" in err[0]

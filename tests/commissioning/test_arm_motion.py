@@ -221,7 +221,7 @@ def test_what_a_terminal_sends_is_taken_apart() -> None:
 
 
 def test_to_an_angle_and_no_further(vehicle: Vehicle) -> None:
-    bench, leader = Bench(vehicle), Sweeper([Leg(1, 50.0, SPEED_MAX_DEG_S)], 1.0)
+    bench, leader = Bench(vehicle), Sweeper([Leg(1, 50.0, SPEED_MAX_DEG_S)], (1.0, 1.0))
     leader.begin(bench.state())
     bench.until(lambda m: leader.update(bench.motion, m, bench.state()))
     assert bench.degrees == pytest.approx((90.0, 50.0), abs=1.0)
@@ -229,7 +229,7 @@ def test_to_an_angle_and_no_further(vehicle: Vehicle) -> None:
 
 def test_the_sweeps_keep_samples_of_both_ways_at_both_speeds_and_end_hanging(vehicle: Vehicle) -> None:
     bench = Bench(vehicle, (165.0, 140.0))
-    sweeper = Sweeper(legs_of(vehicle.arm), vehicle.arm.torque_per_amp_nm_a)
+    sweeper = Sweeper(legs_of(vehicle), vehicle.arm.torque_constants_nm_a)
 
     assert bench.until(lambda moved: sweeper.update(bench.motion, moved, bench.state())).stop == ""
     assert bench.degrees == pytest.approx((90.0, 0.0), abs=1.0)
@@ -246,4 +246,4 @@ def test_joint_limits_without_room_to_sweep_are_one_line() -> None:
         SHIPPED, ["vehicle.arm.joints[0].angle_deg=[80, 100]", "vehicle.safety.fold_arm_deg=[90, 140]"]
     )
     with pytest.raises(ConfigError, match=r"arm.joints\[0\].angle_deg"):
-        legs_of(narrow.arm)
+        legs_of(narrow)

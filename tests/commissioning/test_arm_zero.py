@@ -15,7 +15,8 @@ from companion.commissioning.arm.zero import HELD_S, ZeroGuide, ZeroView
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Arm
-from companion.io.dynamixel.registers import COUNTS_PER_TURN, RAD_PER_COUNT
+from companion.io.dynamixel.registers import RAD_PER_COUNT
+from companion.model.servos import COUNTS_PER_TURN
 from companion.model.types import Joints
 from tests.commissioning.arm_rig import SHIPPED
 
@@ -25,8 +26,9 @@ FOLDED: Joints = (165.0, 140.0)
 
 @cache
 def arm_with(limits: tuple[Joints, Joints] = ((60.0, 175.0), (-10.0, 150.0))) -> Arm:
-    return load_vehicle(SHIPPED, [f"vehicle.arm.joints[{i}].angle_deg={list(limits[i])}" for i in (0, 1)]
-                        + [f"vehicle.safety.fold_arm_deg={[sum(limit) / 2 for limit in limits]}"]).arm  # fmt: skip
+    angles = [f"vehicle.arm.joints[{i}].angle_deg={list(limits[i])}" for i in (0, 1)]
+    folded = f"vehicle.safety.fold_arm_deg={[sum(limit) / 2 for limit in limits]}"
+    return load_vehicle(SHIPPED, [*angles, folded, "vehicle.arm.poses={}"]).arm
 
 
 class Bench:
@@ -119,7 +121,7 @@ def test_both_joints_at_once_are_reported_and_put_right() -> None:
     bench.move(bench.guide.steps[0].pose_deg)
     assert bench.hold().number == 2
     view = bench.move((130.0, 90.0))
-    assert "both joints have moved" in view.notice and bench.hold().number == 2
+    assert "two joints have moved" in view.notice and bench.hold().number == 2
     bench.move((90.0, 90.0))
     assert bench.hold().number == 3
 
@@ -137,7 +139,7 @@ def test_the_same_joint_twice_is_reported() -> None:
     for pose in ((90.0, 0.0), (90.0, 90.0), (90.0, 45.0)):
         bench.move(pose)
         view = bench.hold()
-    assert view.result is None and "turned in both steps" in view.failed
+    assert view.result is None and "turned in two steps" in view.failed
 
 
 def test_poses_that_disagree_are_reported() -> None:

@@ -21,15 +21,14 @@ from companion.config.vehicle import Arm as ArmConfig
 from companion.config.vehicle import ArmDevice, Joint
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.arm import DynamixelArm
-from companion.io.dynamixel.registers import (
-    WATCHDOG_ERROR,
-)
 from companion.io.protocols import Arm as ArmEdge
 from companion.io.protocols import DeviceError
 from companion.model.observations import ServoReport
+from companion.model.servos import WATCHDOG_ERROR, ServoName
 from companion.model.types import ArmState
 from companion.runtime.clock import flight_clock
 from sitl.servo.bus import ServoBus
+from sitl.servo.kinds import KINDS
 from sitl.servo.model import ServoModel
 
 pytestmark = pytest.mark.waits
@@ -45,14 +44,15 @@ LONG_S = 30.0
 """No test measures time: this only ends a run that hangs."""
 
 
-def arm_config(*joints: Joint) -> ArmConfig:
+def arm_config(*joints: Joint, torque_per_amp_nm_a: float | None = KT) -> ArmConfig:
+    joints = joints or JOINTS
     return ArmConfig(
         shoulder_body_m=(0.0, 0.0, -0.05),
-        link_lengths_m=(0.2, 0.2),
-        link_masses_kg=(0.15, 0.05),
-        link_com_m=(0.1, 0.1),
-        torque_per_amp_nm_a=KT,
-        joints=(joints[0], joints[1]) if joints else JOINTS,
+        link_lengths_m=(0.2,) * len(joints),
+        link_masses_kg=(0.05,) * len(joints),
+        link_com_m=(0.1,) * len(joints),
+        torque_per_amp_nm_a=torque_per_amp_nm_a,
+        joints=joints,
     )
 
 
@@ -439,7 +439,47 @@ def test_wrong_baud_rate_says_that_nobody_answers() -> None:
 def test_wrong_model_is_refused() -> None:
     servos = [ServoModel(11, model=1020), ServoModel(12)]
     text = refused(servos)
-    assert "servo 11 (joint 1): has model number 1020, expected 1030 (XM430-W210)" in text
+    assert "servo 11 (joint 1): is XM430-W350 (model 1020); the vehicle file says XM430-W210" in text
+
+
+def test_old_firmware_of_a_330_is_refused_because_its_addresses_differ() -> None:
+    joint = Joint(servo="XL330-M288", servo_id=1, sign=1, zero_count=0, angle_deg=(-90, 90), torque_max_nm=0.4)
+    servos = [ServoModel(1, kind="XL330-M288", firmware=52)]
+    text = refused(servos, arm_config(joint, torque_per_amp_nm_a=None))
+    assert "servo 1 (joint 1): has firmware 52; the XL330-M288 needs 53 or newer" in text
+
+
+def test_three_models_on_one_bus_are_each_driven_in_their_own_units() -> None:
+    limits_nm: dict[ServoName, float] = {"XM540-W270": 6.0, "XL330-M288": 0.3, "XM430-W210": 1.2}
+    torques_nm = (6.0, -0.3, 1.2)
+    common: dict[str, Any] = {"sign": 1, "zero_count": 2048, "angle_deg": (-90, 90), "velocity_max_deg_s": 150.0}
+    joints = [
+        Joint(servo=name, servo_id=20 + index, torque_max_nm=limit_nm, **common)
+        for index, (name, limit_nm) in enumerate(limits_nm.items())
+    ]
+    config = arm_config(*joints, torque_per_amp_nm_a=None)
+
+    async def main() -> None:
+        servos = [
+            ServoModel(joint.servo_id, kind=joint.servo, shaft_angle_rad=shaft_rad(joint, 0.5)) for joint in joints
+        ]
+        async with (
+            ServoBus(servos) as bus,
+            DynamixelArm(device_on(bus.path, watchdog_ms=2000), config, flight_clock()) as arm,
+        ):
+            assert [report.model for report in arm.servos] == [1120, 1200, 1030]
+            sent_nm = arm.write_torque(torques_nm)
+            assert sent_nm == pytest.approx(torques_nm, rel=0.005)
+            await until(lambda: all(register(servo, 102, 2) for servo in servos))
+            for joint, servo, torque_nm in zip(joints, servos, torques_nm, strict=True):
+                current_a = servo.update(0.1, shaft_rad(joint, 0.5), 0.0)
+                assert current_a * KINDS[joint.servo].nm_per_amp == pytest.approx(torque_nm, rel=0.01)
+            state = await state_when(arm, lambda s: all(s.torque_nm))
+            assert state.torque_nm == pytest.approx(sent_nm, rel=1e-9)
+            assert state.angle_rad == pytest.approx((0.5, 0.5, 0.5), abs=0.002)
+
+    asyncio.run(asyncio.wait_for(main(), LONG_S))
+    assert_nothing_left()
 
 
 def test_hardware_error_at_start_is_named_and_not_rebooted() -> None:

@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 from companion.config.vehicle import Joint
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.registers import (
-    WATCHDOG_ERROR,
-    hardware_error_text,
     joint_scale,
     turn_offset_counts,
     usb_latency_ms,
 )
+from companion.model.servos import WATCHDOG_ERROR, hardware_error_text
 
 KT = 1.3
 NM_PER_COUNT = KT * 2.69e-3

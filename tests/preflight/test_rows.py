@@ -150,7 +150,7 @@ CASES = {
     ),
     "paused": Case("mocap.clock", "does not advance", "paused", {"mocap": r.mocap(frame_number=5)}, WARN),
     "no arm": Case("arm.device", "expected it", "", failure("arm")),
-    "another servo": Case("arm.model", "id 2: model 1020", "servo_id", {"servos": r.servos(model=1020)}),
+    "another servo": Case("arm.model", "id 2: XM430-W350 (model 1020)", "servo_id", {"servos": r.servos(model=1020)}),
     "old firmware": Case("arm.firmware", "48 and 37", "Wizard", {"servos": r.servos(firmware=37)}),
     "two firmwares": Case("arm.firmware", "48 and 45", "Wizard", {"servos": r.servos(firmware=45)}, WARN),
     "another mode": Case("arm.mode", "3 (position)", "another program", {"servos": r.servos(operating_mode=3)}),

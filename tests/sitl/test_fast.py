@@ -8,7 +8,7 @@ from functools import cache
 
 import pytest
 
-from companion.io.dynamixel.registers import WATCHDOG_ERROR
+from companion.model.servos import WATCHDOG_ERROR
 from companion.model.types import Outcome
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult

@@ -49,6 +49,8 @@ VALUES: dict[str, Any] = {
     "hand_taps": 2,
     "servos.id": 9,
     "servos.baud": 57600,
+    "servos.model": "XM430-W350",
+    "servos.firmware": 37,
     "servos.current_limit_counts": 600,
     "catch_at_m[1]": 1.0,
     "faults.phase": "takeoff",

@@ -109,5 +109,4 @@ def _show(bars: Bars, limits_deg: Sequence[Joints], state: ArmState, moved: Move
 
 
 def _driven(stop: str, motion: Motion, state: ArmState) -> Driven:
-    (a, b), (one, other) = state.angle_rad, motion.load_max_nm
-    return Driven(stop, (math.degrees(a), math.degrees(b)), (one, other))
+    return Driven(stop, tuple(map(math.degrees, state.angle_rad)), tuple(motion.load_max_nm))

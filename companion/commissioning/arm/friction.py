@@ -1,4 +1,4 @@
-"""Torque constant, dry and viscous friction of both joints, from slow sweeps against gravity. Pure functions.
+"""Torque constant, dry and viscous friction of every joint, from slow sweeps against gravity. Pure functions.
 
 At constant speed a joint's motor carries gravity and friction alone: `K i = G(alpha) + c sign(rate) + b rate`, with G from the
 vehicle file's masses. Divided by K this is linear in 1/K, c/K and b/K. A fourth unknown is the angle by which the machine is not
@@ -20,6 +20,7 @@ from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
+from companion.model.servos import ServoKind
 from companion.model.types import IDENTITY_QUAT, Joints
 
 BIN_S: Final = 0.25
@@ -36,8 +37,8 @@ FRICTION_SAME_NM: Final = 0.008
 """Smaller differences from the vehicle file's values are ignored."""
 JOINTS_SAME: Final = 0.06
 """Largest relative difference between the torque constants of two servos of the same model."""
-PLAUSIBLE_NM_A: Final = (0.7, 2.2)
-"""Plausible torque constants of an XM430-W210; its stall torque over its stall current is 1.3."""
+PLAUSIBLE: Final = (0.54, 1.69)
+"""Plausible torque constants, relative to the servo's stall torque over its stall current."""
 _SURE: Final = 3.0
 """Number of standard errors at which a difference is certain."""
 
@@ -73,45 +74,63 @@ class JointFit:
 
 @dataclass(frozen=True, slots=True)
 class FrictionFit:
-    """Torque constant and friction of both joints, and the values for the vehicle file."""
+    """Torque constant and friction of every joint, and the values for the vehicle file."""
 
-    joints: tuple[JointFit | None, JointFit | None]
+    joints: tuple[JointFit | None, ...]
     """Fit of each joint; None with too few samples."""
-    torque_per_amp_nm_a: Estimate | None
-    """Mean of both joints; None if the data do not determine it."""
+    torque_constants_nm_a: tuple[Estimate | None, ...]
+    """Torque constant of each joint's servo, the mean of all servos of its model; None if the data do not determine it."""
     joint_friction_nm: Estimate | None
+    """Mean of all joints; None if the data do not determine it."""
     notes: tuple[str, ...]
     """Remarks, one line each."""
+
+    @property
+    def torque_per_amp_nm_a(self) -> Estimate | None:
+        """Torque constant of all servos; None if the data do not determine it or it differs from model to model."""
+        return self.torque_constants_nm_a[0] if len(set(self.torque_constants_nm_a)) == 1 else None
 
     def changes(self, vehicle: Vehicle) -> dict[Location, Data]:
         """Return the values to change in the vehicle file; empty if the data do not contradict it."""
         wanted: dict[Location, Data] = {}
-        for name, found, same in (
-            ("torque_per_amp_nm_a", self.torque_per_amp_nm_a, CONSTANT_SAME * vehicle.arm.torque_per_amp_nm_a),
-            ("joint_friction_nm", self.joint_friction_nm, FRICTION_SAME_NM),
+        arm = vehicle.arm
+        together = len({joint.servo for joint in arm.joints}) == 1 and not any(
+            joint.torque_per_amp_nm_a for joint in arm.joints
+        )
+        for index, (found, has_nm_a) in enumerate(
+            zip(self.torque_constants_nm_a, arm.torque_constants_nm_a, strict=True)
         ):
-            has = getattr(vehicle.arm, name)
-            if found is not None and abs(found.value - has) > max(same, _SURE * found.standard_error):
-                wanted[("arm", name)] = max(0.0, round(found.value, 3))
+            if found is not None and _differs(found, has_nm_a, CONSTANT_SAME * has_nm_a):
+                at: Location = ("arm",) if together else ("arm", "joints", index)
+                wanted[(*at, "torque_per_amp_nm_a")] = round(found.value, 3)
+        friction = self.joint_friction_nm
+        if friction is not None and _differs(friction, arm.joint_friction_nm, FRICTION_SAME_NM):
+            wanted["arm", "joint_friction_nm"] = max(0.0, round(friction.value, 3))
         return wanted
 
 
+def _differs(found: Estimate, has: float, same: float) -> bool:
+    return abs(found.value - has) > max(same, _SURE * found.standard_error)
+
+
 def fit(samples: Sequence[Sample], vehicle: Vehicle) -> FrictionFit:
-    """Fit both joints.
+    """Fit all joints.
 
     Args:
-        samples: sweeps of both joints in both directions, at two speeds or more.
-        vehicle: masses, lengths, and the torque constant and friction to compare with.
+        samples: sweeps of all joints in both directions, at two speeds or more.
+        vehicle: masses, lengths, and the torque constants and friction to compare with.
     """
-    fits = tuple(fit_joint([one for one in samples if one.joint == joint], vehicle, joint) for joint in (0, 1))
-    constants, frictions, notes = [], [], []
+    count = len(vehicle.arm.joints)
+    fits = tuple(fit_joint([one for one in samples if one.joint == joint], vehicle, joint) for joint in range(count))
+    known: list[Estimate | None] = [None] * count
+    frictions, notes = [], []
     for number, one in enumerate(fits, 1):
         if one is None:
             notes.append(f"joint {number}: too few samples at constant speed; nothing can be determined")
             continue
         k, c, off = one.torque_per_amp_nm_a, one.dry_nm, one.off_deg
         if k.standard_error <= CONSTANT_ERROR_MAX * abs(k.value):
-            constants.append(k)
+            known[number - 1] = k
         else:
             notes.append(
                 f"joint {number}: the data do not determine the torque constant ({k.text(2)} N m/A): gravity changes by "
@@ -124,23 +143,33 @@ def fit(samples: Sequence[Sample], vehicle: Vehicle) -> FrictionFit:
         if abs(off.value) > LEVEL_DEG + _SURE * off.standard_error:
             turned = f"gravity acts as if the arm were turned by {off.value:+.1f} deg"
             notes.append(f"joint {number}: {turned}: check that the machine is level and the zero is correct")
-    constant = _together(constants)
-    low, high = PLAUSIBLE_NM_A
+    kinds = [joint.kind for joint in vehicle.arm.joints]
+    constants = {
+        kind: _constant(kind, [k for k, its in zip(known, kinds, strict=True) if its is kind], notes) for kind in kinds
+    }
+    return FrictionFit(fits, tuple(constants[kind] for kind in kinds), _together(frictions), tuple(notes))
+
+
+def _constant(kind: ServoKind, found: Sequence[Estimate | None], notes: list[str]) -> Estimate | None:
+    """Return the torque constant of one model from those of its servos, and note what contradicts it."""
+    known = [one for one in found if one is not None]
+    constant = _together(known)
+    low, high = (share * kind.torque_per_amp_nm_a for share in PLAUSIBLE)
     if constant is not None and not low <= constant.value <= high:
         notes.append(
-            f"{constant.value:.2f} N m/A is implausible for an XM430-W210 ({low} to {high}): check the masses and centres of mass of "
-            "the vehicle file first; nothing is proposed"
+            f"{constant.value:.2f} N m/A is implausible for an {kind.name} ({low:.2g} to {high:.2g}): check the masses and centres of "
+            "mass of the vehicle file first; nothing is proposed"
         )
         constant = None
-    if len(constants) == 2:
-        a, b = constants
-        apart = abs(a.value - b.value)
+    if len(known) > 1:
+        a, b = min(known, key=lambda one: one.value), max(known, key=lambda one: one.value)
+        apart = b.value - a.value
         if apart > JOINTS_SAME * a.value and apart > _SURE * math.hypot(a.standard_error, b.standard_error):
             notes.append(
-                f"the joints' torque constants differ, {a.value:.3f} and {b.value:.3f} N m/A: servos of one model should agree; check "
-                "the masses, lengths and centres of mass of the vehicle file"
+                f"the joints' torque constants differ, {' and '.join(f'{one.value:.3f}' for one in known)} N m/A: servos of one model "
+                "should agree; check the masses, lengths and centres of mass of the vehicle file"
             )
-    return FrictionFit((fits[0], fits[1]), constant, _together(frictions), tuple(notes))
+    return constant
 
 
 def fit_joint(samples: Sequence[Sample], vehicle: Vehicle, joint: int) -> JointFit | None:
@@ -151,7 +180,9 @@ def fit_joint(samples: Sequence[Sample], vehicle: Vehicle, joint: int) -> JointF
     # Repeated, because the weights and that of the prior depend on the scatter of the currents.
     scatter, theta, covariance, weights = 0.01, np.zeros(4), np.eye(4), np.ones(len(currents))
     for _ in range(8):
-        prior = np.array([[0.0, 0.0, 0.0, scatter / math.radians(LEVEL_DEG) * vehicle.arm.torque_per_amp_nm_a]])
+        prior = np.array(
+            [[0.0, 0.0, 0.0, scatter / math.radians(LEVEL_DEG) * vehicle.arm.torque_constants_nm_a[joint]]]
+        )
         root = np.sqrt(weights)
         design, wanted = np.vstack([rows * root[:, None], prior]), np.append(currents * root, 0.0)
         inverse = np.linalg.pinv(design.T @ design)
@@ -179,7 +210,7 @@ def _binned(samples: Sequence[Sample], vehicle: Vehicle, joint: int) -> tuple[_A
     began: dict[int, float] = {}
     for one in samples:
         since = one.t_s - began.setdefault(one.leg, one.t_s)
-        turned: Joints = (one.angle_rad[0] + small, one.angle_rad[1])
+        turned: Joints = (one.angle_rad[0] + small, *one.angle_rad[1:])
         gravity = manipulator.gravity_torque_nm(one.angle_rad, IDENTITY_QUAT)[joint]
         slope = (manipulator.gravity_torque_nm(turned, IDENTITY_QUAT)[joint] - gravity) / small
         row = (gravity, float(one.direction), one.velocity_rad_s, slope, one.current_a)

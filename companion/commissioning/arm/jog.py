@@ -19,7 +19,6 @@ IDLE_S: Final = 60.0
 FORWARD_KEYS: Final = frozenset({"\x1b[C", "\x1b[A", "+", "="})
 BACKWARD_KEYS: Final = frozenset({"\x1b[D", "\x1b[B", "-"})
 END_KEYS: Final = frozenset({"q", "Q", "\x1b", "\x04"})
-JOINT_KEYS: Final = {"1": 0, "2": 1}
 
 
 def keys_in(data: str) -> list[str]:
@@ -28,7 +27,7 @@ def keys_in(data: str) -> list[str]:
 
 
 class ByKeys:
-    """Leader that moves the selected joint while an arrow key (or + or -) is pressed; 1 and 2 select the joint.
+    """Leader that moves the selected joint while an arrow key (or + or -) is pressed; the digits select the joint.
 
     Args:
         pressed: returns the terminal's input since the last call.
@@ -53,8 +52,8 @@ class ByKeys:
             self._ends_s = state.stamp_s + IDLE_S
             if key in END_KEYS:
                 return True
-            if key in JOINT_KEYS:
-                self._joint = JOINT_KEYS[key]
+            if key in "1234567"[: len(state.angle_rad)]:
+                self._joint = int(key) - 1
                 self._halt(motion)
             elif key in FORWARD_KEYS or key in BACKWARD_KEYS:
                 self._go(motion, 1.0 if key in FORWARD_KEYS else -1.0, state)
@@ -70,8 +69,9 @@ class ByKeys:
 
     def _go(self, motion: Motion, way: float, state: ArmState) -> None:
         goal_rad = motion.reference_rad[self._joint] + way * math.radians(STEP_DEG)
-        there = (goal_rad, state.angle_rad[1]) if self._joint == 0 else (state.angle_rad[0], goal_rad)
-        self._refusal = motion.refusal((there,))
+        there = list(state.angle_rad)
+        there[self._joint] = goal_rad
+        self._refusal = motion.refusal((tuple(there),))
         if self._refusal:
             self._halt(motion)
             return

@@ -13,7 +13,7 @@ from typing import Final
 from companion.config.vehicle import Arm, Vehicle
 from companion.control.arm_hold import hold_torque_nm
 from companion.control.arm_model import manipulator_of
-from companion.io.dynamixel.registers import WATCHDOG_ERROR, hardware_error_text
+from companion.model.servos import WATCHDOG_ERROR, hardware_error_text
 from companion.model.types import IDENTITY_QUAT, ArmState, Joints
 
 SPEED_MAX_DEG_S: Final = 20.0
@@ -37,8 +37,8 @@ _LEAD_RAD: Final = math.radians(5.0)
 
 def gentle(arm: Arm, share: float = TORQUE_SHARE) -> Arm:
     """Return the arm's configuration with this fraction of the torque limits, to which the driver clips every command."""
-    first, second = (joint.model_copy(update={"torque_max_nm": share * joint.torque_max_nm}) for joint in arm.joints)
-    return arm.model_copy(update={"joints": (first, second)})
+    joints = tuple(joint.model_copy(update={"torque_max_nm": share * joint.torque_max_nm}) for joint in arm.joints)
+    return arm.model_copy(update={"joints": joints})
 
 
 def limits_deg(arm: Arm, joint: int) -> tuple[float, float]:
@@ -63,7 +63,7 @@ class Moved:
 
 
 class Motion:
-    """Controls both joints, of which one moves at a time.
+    """Controls all joints, of which one moves at a time.
 
     Args:
         vehicle: arm, tool and limits.
@@ -76,45 +76,46 @@ class Motion:
         self._manipulator = manipulator_of(vehicle)
         self._limit_nm = tuple(TORQUE_SHARE * joint.torque_max_nm for joint in vehicle.arm.joints)
         self._reference = list(state.angle_rad)
-        self._rate = [0.0, 0.0]
+        self._count = len(vehicle.arm.joints)
+        self._rate = [0.0] * self._count
         self._goal = list(state.angle_rad)
-        self._integral = [0.0, 0.0]
+        self._integral = [0.0] * self._count
         self._loaded_s = 0.0
         self._speed_rad_s = math.radians(SPEED_MAX_DEG_S)
-        self.load_max_nm = [0.0, 0.0]
+        self.load_max_nm = [0.0] * self._count
         """Largest torque beyond gravity so far."""
 
     @property
     def reference_rad(self) -> Joints:
-        """The reference of both joints."""
-        return (self._reference[0], self._reference[1])
+        """The reference of each joint."""
+        return tuple(self._reference)
 
     def go(self, joint: int, goal_rad: float, speed_rad_s: float) -> None:
-        """Start moving a joint; the other one stays at its reference.
+        """Start moving a joint; the others stay at their references.
 
         Args:
-            joint: 0 or 1.
+            joint: index of the joint.
             goal_rad: goal, clipped to the joint limits minus the margin; a joint beyond them may only return.
             speed_rad_s: speed, limited to `SPEED_MAX_DEG_S`.
         """
         low, high = (math.radians(limit) for limit in limits_deg(self._arm, joint))
         here = self._reference[joint]
+        self._goal = list(self._reference)
         self._goal[joint] = max(min(low, here), min(max(high, here), goal_rad))
-        self._goal[1 - joint] = self._reference[1 - joint]
         self._speed_rad_s = min(speed_rad_s, math.radians(SPEED_MAX_DEG_S))
 
     def halt(self) -> None:
-        """Stop both joints at their references."""
+        """Stop all joints at their references."""
         self._goal = list(self._reference)
-        self._rate = [0.0, 0.0]
+        self._rate = [0.0] * self._count
 
     def refusal(self, poses_rad: Sequence[Joints]) -> str:
         """Return why the arm must not move to these poses (rad); empty if it may."""
         for pose in poses_rad:
             gravity = self._manipulator.gravity_torque_nm(pose, IDENTITY_QUAT)
-            for joint in (0, 1):
+            for joint in range(self._count):
                 if abs(gravity[joint]) > 0.9 * self._limit_nm[joint]:
-                    where = f"({math.degrees(pose[0]):.0f}, {math.degrees(pose[1]):.0f}) deg"
+                    where = f"({', '.join(f'{math.degrees(angle):.0f}' for angle in pose)}) deg"
                     return (
                         f"at {where} joint {joint + 1} carries {abs(gravity[joint]):.2f} N m, more than 90 % of the "
                         f"{self._limit_nm[joint]:.2f} N m allowed here; choose a pose closer to hanging"
@@ -129,28 +130,29 @@ class Motion:
             dt_s: time since the last step; a late step moves the reference by at most 20 ms.
         """
         dt_s = min(dt_s, 0.02)
-        for joint in (0, 1):
+        for joint in range(self._count):
             self._lead(joint, state.angle_rad[joint], dt_s)
         reference = self.reference_rad
-        rate = (self._rate[0], self._rate[1])
+        rate = tuple(self._rate)
         gravity = self._manipulator.gravity_torque_nm(state.angle_rad, IDENTITY_QUAT)
         held = hold_torque_nm(self._manipulator, state.angle_rad, state.velocity_rad_s, reference, rate, IDENTITY_QUAT)
         torque = [
-            self._torque_nm(joint, held[joint], reference[joint] - state.angle_rad[joint], dt_s) for joint in (0, 1)
+            self._torque_nm(joint, held[joint], reference[joint] - state.angle_rad[joint], dt_s)
+            for joint in range(self._count)
         ]
-        load = (torque[0] - gravity[0], torque[1] - gravity[1])
+        load = tuple(a - b for a, b in zip(torque, gravity, strict=True))
         self.load_max_nm = [max(most, abs(now)) for most, now in zip(self.load_max_nm, load, strict=True)]
         self._loaded_s = self._loaded_s + dt_s if max(map(abs, load)) > LOAD_NM else 0.0
         stop = self._stop(state, load)
         if stop:
-            torque = [0.0, 0.0]
+            torque = [0.0] * self._count
         reached = all(
             self._goal[joint] == reference[joint]
             and abs(reference[joint] - state.angle_rad[joint]) <= math.radians(REACHED_DEG)
-            for joint in (0, 1)
+            for joint in range(self._count)
         )
         return Moved(
-            torque_nm=(torque[0], torque[1]),
+            torque_nm=tuple(torque),
             reference_rad=reference,
             reference_rate_rad_s=rate,
             load_nm=load,
@@ -183,7 +185,7 @@ class Motion:
 
     def _stop(self, state: ArmState, load: Joints) -> str:
         safety = self._vehicle.safety
-        for joint in (0, 1):
+        for joint in range(self._count):
             name = f"joint {joint + 1}"
             error = state.hardware_error[joint]
             if error & WATCHDOG_ERROR:
@@ -202,7 +204,7 @@ class Motion:
             if not low <= angle_deg <= high:
                 return f"{name} is at {angle_deg:.0f} deg, beyond its limits, {low:g} to {high:g} deg; move it back by hand"
         if self._loaded_s > LOAD_S:
-            joint = 0 if abs(load[0]) > abs(load[1]) else 1
+            joint = max(range(self._count), key=lambda index: abs(load[index]))
             return (
                 f"joint {joint + 1}: {load[joint]:+.2f} N m beyond gravity; check for an obstacle, and check the masses "
                 "and the torque constant in the vehicle file"

@@ -7,6 +7,7 @@ it points along `alpha_1 - alpha_2`. Only level and plumb directions can be held
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from companion.config.document import ConfigError
@@ -31,26 +32,28 @@ class Step:
     name: str
     instruction: str
     joint: int | None
-    """Joint that moves, 0 or 1; None if both may."""
+    """Index of the joint that moves; None if all may."""
     by_deg: float
     """Angle by which the joint moves."""
     exact: bool
     """Whether the step ends in a direction that can be held exactly; if not, only the direction of the motion is used."""
     pose_deg: Joints
-    """Both joints at the end; approximate if not exact."""
+    """All joints at the end; approximate if not exact."""
 
     @property
     def hand_rad(self) -> Joints:
-        """Return the angles of both joints at the end of the step."""
-        return (math.radians(self.pose_deg[0]), math.radians(self.pose_deg[1]))
+        """Return the angles of all joints at the end of the step."""
+        return tuple(map(math.radians, self.pose_deg))
 
 
-def steps_of(arm: Arm) -> tuple[Step, Step, Step]:
-    """Return the three steps for an arm, within its limits: straight, elbow alone, shoulder alone.
+def steps_of(arm: Arm) -> tuple[Step, ...]:
+    """Return the steps for an arm, within its limits: straight, then each joint alone, from the last one to the shoulder.
 
     Raises:
         ConfigError: the joint limits allow no straight pose, or leave a joint too small a range.
     """
+    if len(arm.joints) != 2:
+        return _steps_by_angle(arm)
     first, second = arm.joints
     straight = next((pose for pose in _STRAIGHT_DEG if _within(first, pose[0]) and _within(second, pose[1])), None)
     if straight is None:
@@ -90,6 +93,44 @@ def steps_of(arm: Arm) -> tuple[Step, Step, Step]:
             pose_deg=(swung, bent),
         ),
     )
+
+
+def _steps_by_angle(arm: Arm) -> tuple[Step, ...]:
+    """Return the steps for an arm other than the planar one of two joints: only the vehicle file defines its directions."""
+    pose = [max(low, min(high, 0.0)) for low, high in (joint.angle_deg for joint in arm.joints)]
+    steps = [
+        Step(
+            name="start",
+            instruction=f"hold the arm with its joints at {_angles(pose)} deg, as the vehicle file defines them",
+            joint=None,
+            by_deg=0.0,
+            exact=True,
+            pose_deg=tuple(pose),
+        )
+    ]
+    for index in reversed(range(len(arm.joints))):
+        by_deg, exact = _turn(arm.joints[index], pose[index], index)
+        pose[index] += by_deg
+        how = (
+            f"by {by_deg:+.0f} deg"
+            if exact
+            else f"in its {'positive' if by_deg > 0.0 else 'negative'} direction by about {abs(by_deg):.0f} deg"
+        )
+        steps.append(
+            Step(
+                name=f"joint {index + 1}",
+                instruction=f"turn joint {index + 1} alone {how}, as the vehicle file defines its direction",
+                joint=index,
+                by_deg=by_deg,
+                exact=exact,
+                pose_deg=tuple(pose),
+            )
+        )
+    return tuple(steps)
+
+
+def _angles(angles_deg: Sequence[float]) -> str:
+    return f"({', '.join(f'{angle:.0f}' for angle in angles_deg)})"
 
 
 def _within(joint: Joint, angle_deg: float) -> bool:

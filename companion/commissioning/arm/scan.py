@@ -9,7 +9,16 @@ from typing import Any, Final
 
 from companion.commissioning.arm import bus
 from companion.commissioning.arm.bus import ServoTalk
-from companion.commissioning.arm.servo import SETTINGS, Assignment, FoundServo, Scan, assign, settings
+from companion.commissioning.arm.servo import (
+    SETTINGS,
+    Assignment,
+    FoundServo,
+    Scan,
+    assign,
+    expected_models,
+    is_strange,
+    settings,
+)
 from companion.commissioning.tool import Session
 from companion.config.base import Location
 from companion.config.document import Data
@@ -17,6 +26,7 @@ from companion.config.vehicle import Arm, ArmDevice, Vehicle
 from companion.io.dynamixel import registers as dxl
 from companion.io.protocols import DeviceError
 from companion.model.check_row import Row
+from companion.model.servos import hardware_error_text, kind_of, model_text
 from companion.preflight import arm as preflight
 from companion.preflight.checks import Check
 
@@ -89,16 +99,16 @@ def scan(
             tried.append(baud)
             found = [_read(talk, *answer) for answer in answers.servos]
             servos += found
-            unreadable = any(one.model == dxl.MODEL_NUMBER_XM430_W210 and not one.registers for one in found)
+            unreadable = any(kind_of(one.model) is not None and not one.registers for one in found)
             if answers.garbled or unreadable:
                 garbled.append(baud)
     return Scan(tuple(tried), tuple(servos), tuple(garbled), dxl.usb_latency_ms(device.port, sysfs))
 
 
 def _read(talk: ServoTalk, servo_id: int, model: int, firmware: int) -> FoundServo:
-    """Read the registers of a servo that answered a ping; read none if it is a different model or no longer answers."""
+    """Read the registers of a servo that answered a ping; read none if its model is not supported or it no longer answers."""
     registers: dict[str, int] = {}
-    if model == dxl.MODEL_NUMBER_XM430_W210:
+    if kind_of(model) is not None:
         try:
             registers = {register.name: talk.read(servo_id, register) for register in SETTINGS}
         except DeviceError:
@@ -111,7 +121,7 @@ def judge(found: Scan, vehicle: Vehicle) -> Judgement:
     arm, device = vehicle.arm, vehicle.arm_device
     who = assign(found.servos, arm)
     present = [(index, servo) for index, servo in enumerate(who.joints) if servo is not None]
-    rows = [_collision(found), _ids(found, who, arm), *_models(found), *_bauds(found, device)]
+    rows = [_collision(found, arm), _ids(found, who, arm), *_models(found, arm), *_bauds(found, device)]
     if present:
         rows += _states([servo for _, servo in present], vehicle)
     for index, servo in present:
@@ -130,15 +140,18 @@ def _changes(who: Assignment, device: ArmDevice) -> dict[Location, Data]:
     return changes
 
 
-def _one_at_a_time() -> str:
-    return f"connect only the servo of joint 1: {_SETUP} --joint 1; then only that of joint 2: {_SETUP} --joint 2"
+def one_at_a_time(arm: Arm) -> str:
+    """Return how to set up servos that cannot be told apart."""
+    count = len(arm.joints)
+    more = f"; then only that of joint 2: {_SETUP} --joint 2" if count == 2 else f"; then likewise up to joint {count}"
+    return f"connect only the servo of joint 1: {_SETUP} --joint 1{more if count > 1 else ''}"
 
 
-def _collision(found: Scan) -> Row:
+def _collision(found: Scan, arm: Arm) -> Row:
     if not found.garbled_at:
         return COLLISION.good("every answer is readable", "readable answers")
     where = " and ".join(map(str, found.garbled_at))
-    fix = f"two servos may share one id: {_one_at_a_time()}; otherwise check for a bad cable or ground"
+    fix = f"two servos may share one id: {one_at_a_time(arm)}; otherwise check for a bad cable or ground"
     return COLLISION.bad(f"unreadable answers at {where} baud", "readable answers", fix)
 
 
@@ -154,8 +167,8 @@ def _ids(found: Scan, who: Assignment, arm: Arm) -> Row:
         return IDS.bad(read, wanted, fix)
     if not missing:
         return IDS.good(read, wanted)
-    if found.garbled_at or (len(missing) == 2 and len(who.others) > 1):
-        return IDS.bad(read, wanted, _one_at_a_time())
+    if found.garbled_at or (len(missing) > 1 and len(who.others) > 1):
+        return IDS.bad(read, wanted, one_at_a_time(arm))
     ids = " and ".join(str(arm.joints[index].servo_id) for index in missing)
     if one_rate:
         fix = f"servo {ids} does not answer at {one_rate}: companion arm scan without --baud tries all rates"
@@ -164,19 +177,20 @@ def _ids(found: Scan, who: Assignment, arm: Arm) -> Row:
     return IDS.bad(read, wanted, fix)
 
 
-def _models(found: Scan) -> Iterator[Row]:
-    strange = [servo for servo in found.servos if not servo.is_xm430]
+def _models(found: Scan, arm: Arm) -> Iterator[Row]:
+    strange = [servo for servo in found.servos if is_strange(servo, arm)]
     for servo in strange:
-        read, fix = (
-            f"id {servo.servo_id}: model {servo.model}",
-            "install an XM430-W210, or remove this servo from the bus",
-        )
-        if servo.model == dxl.MODEL_NUMBER_XM430_W210:
+        read = f"id {servo.servo_id}: {model_text(servo.model)}"
+        wanted = " or ".join(expected_models(servo, arm))
+        fix = f"install an {wanted}, correct arm.joints[].servo, or remove this servo from the bus"
+        kind = kind_of(servo.model)
+        if kind is not None and kind.name in expected_models(servo, arm):
             read = f"id {servo.servo_id}: answers a ping, but not all reads"
             fix = "another program may be using the bus: close it; otherwise cycle the servo's power"
-        yield MODEL.bad(read, "XM430-W210", fix)
+        yield MODEL.bad(read, wanted, fix)
     if found.servos and not strange:
-        yield MODEL.good("XM430-W210", "XM430-W210")
+        names = ", ".join(dict.fromkeys(servo.kind.name for servo in found.servos))
+        yield MODEL.good(names, ", ".join(dict.fromkeys(joint.servo for joint in arm.joints)))
 
 
 def _bauds(found: Scan, device: ArmDevice) -> Iterator[Row]:
@@ -199,10 +213,10 @@ def _states(servos: Sequence[FoundServo], vehicle: Vehicle) -> list[Row]:
     temperatures_c = [servo.value(dxl.PRESENT_TEMPERATURE) for servo in servos]
     warn_c = vehicle.safety.servo_warn_c
     return [
-        preflight.firmware(FIRMWARE, [servo.firmware for servo in servos]),
+        preflight.firmware(FIRMWARE, [(servo.kind, servo.firmware) for servo in servos]),
         ERROR.row(
             not any(errors),
-            _each(servos, [dxl.hardware_error_text(error) for error in errors]),
+            _each(servos, [hardware_error_text(error) for error in errors]),
             "none",
             "remove the cause, then cycle the servos' power",
         ),
@@ -212,7 +226,9 @@ def _states(servos: Sequence[FoundServo], vehicle: Vehicle) -> list[Row]:
             "not tripped",
             f"{_SETUP} clears it; it tripped because the companion died or a cable was pulled while torque was on",
         ),
-        preflight.supply(VOLTAGE, [servo.value(dxl.PRESENT_VOLTAGE) * dxl.VOLTAGE_UNIT_V for servo in servos]),
+        preflight.supply(
+            VOLTAGE, [(servo.kind, servo.value(dxl.PRESENT_VOLTAGE) * dxl.VOLTAGE_UNIT_V) for servo in servos]
+        ),
         TEMPERATURE.row(
             max(temperatures_c) < warn_c,
             _each(servos, [f"{temperature_c} degC" for temperature_c in temperatures_c]),
@@ -224,7 +240,7 @@ def _states(servos: Sequence[FoundServo], vehicle: Vehicle) -> list[Row]:
 
 def _settings(index: int, servo: FoundServo, arm: Arm, device: ArmDevice) -> Iterator[Row]:
     """Return one row per setting of a joint's servo; id and baud rate have rows of their own."""
-    for setting in settings(servo, arm.joints[index], arm, device):
+    for setting in settings(servo, index, arm, device):
         if setting.register not in (bus.ID, bus.BAUD):
             name = setting.register.name
             key = f"arm.scan.joint{index + 1}.{name.replace(' ', '_').lower()}"
@@ -250,7 +266,13 @@ def table(found: Scan, judged: Judgement) -> list[str]:
     layout = "{:>4}  {:>8}  {:<10}  {:>8}  {:>5}  {:>8}  {:>11}  {:>6}"
     lines = [layout.format("id", "baud", "model", "firmware", "joint", "position", "temperature", "supply")]
     for servo, about in zip(found.servos, _found(found, judged), strict=True):
-        cells = [servo.servo_id, servo.baud, "XM430-W210" if servo.is_xm430 else servo.model, servo.firmware]
+        kind = kind_of(servo.model)
+        cells: list[object] = [
+            servo.servo_id,
+            servo.baud,
+            kind.name if kind is not None else servo.model,
+            servo.firmware,
+        ]
         cells += [about["joint"] or "-", about.get("position_counts", "-")]
         cells += [f"{about['temperature_c']} degC", f"{about['voltage_v']} V"] if servo.registers else ["-", "-"]
         lines.append(layout.format(*cells))

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from companion.commissioning.arm import bus
+from companion.config.document import ConfigError
 from companion.config.vehicle import Arm, ArmDevice, Joint
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.registers import Register
+from companion.model.servos import COUNTS_PER_TURN, ServoKind, kind_of
 from companion.preflight.arm import MODES
 
 SETTINGS: Final = (
@@ -20,7 +22,6 @@ SETTINGS: Final = (
     dxl.PRESENT_TEMPERATURE,
 )  # fmt: skip
 """Registers that are read from every servo."""
-CURRENT_LIMIT_MAX: Final = 1193
 CURRENT_RESERVE: Final = 1.1
 SHUTDOWN_BITS: Final = 0b00110100
 """Overheating, electrical shock, overload: factory value of register 63."""
@@ -37,7 +38,7 @@ class FoundServo:
     model: int
     firmware: int
     registers: dict[str, int]
-    """Register values by name; empty if the servo only answers pings."""
+    """Register values by name; empty if the servo only answers pings, or its model is not supported."""
 
     def value(self, register: Register) -> int:
         """Return a register's value.
@@ -48,9 +49,20 @@ class FoundServo:
         return self.registers[register.name]
 
     @property
-    def is_xm430(self) -> bool:
-        """Whether it is an XM430-W210 and its registers were read."""
-        return self.model == dxl.MODEL_NUMBER_XM430_W210 and bool(self.registers)
+    def kind(self) -> ServoKind:
+        """Return the data of the servo's model.
+
+        Raises:
+            ValueError: the model is not supported.
+        """
+        kind = kind_of(self.model)
+        if kind is None:
+            raise ValueError(f"model {self.model} is not supported")
+        return kind
+
+    def fits(self, joint: Joint) -> bool:
+        """Return whether the servo is of the joint's model and its registers were read."""
+        return self.model == joint.kind.number and bool(self.registers)
 
     def as_json(self) -> dict[str, Any]:
         """Return the servo's part of the JSON document, with names and units instead of register values."""
@@ -105,19 +117,21 @@ class Setting(NamedTuple):
         return self.found == self.wanted
 
 
-def settings(servo: FoundServo, joint: Joint, arm: Arm, device: ArmDevice) -> list[Setting]:
+def settings(servo: FoundServo, index: int, arm: Arm, device: ArmDevice) -> list[Setting]:
     """Return every setting that the companion needs, in the order of writing: id and baud rate come last because they change the
     address.
 
     Args:
         servo: found servo with its registers.
-        joint: joint of this servo.
-        arm: provides the torque constant.
+        index: index of the servo's joint.
+        arm: provides the joints and their torque constants.
         device: provides the bus's baud rate.
     """
-    needed = math.floor(joint.torque_max_nm / (arm.torque_per_amp_nm_a * dxl.AMP_PER_COUNT) + 1e-9)
+    joint = arm.joints[index]
+    kind = joint.kind
+    needed = math.floor(joint.torque_max_nm / (arm.torque_constants_nm_a[index] * kind.current_unit_a) + 1e-9)
     limit = servo.value(dxl.CURRENT_LIMIT)
-    wanted_limit = limit if limit >= needed else min(CURRENT_LIMIT_MAX, math.ceil(CURRENT_RESERVE * needed))
+    wanted_limit = limit if limit >= needed else min(kind.current_limit_max_counts, math.ceil(CURRENT_RESERVE * needed))
     delay = dxl.RETURN_DELAY_UNIT_US
     rows: list[tuple[Register, int, Callable[[int], str], str]] = [
         (dxl.RETURN_DELAY, 0, lambda v: f"{v * delay} us", "the factory setting of 500 us per servo takes a fifth of a control tick"),
@@ -128,7 +142,7 @@ def settings(servo: FoundServo, joint: Joint, arm: Arm, device: ArmDevice) -> li
         (dxl.CURRENT_LIMIT, wanted_limit, str, f"torque_max_nm {joint.torque_max_nm:g} needs {needed}"),
         (bus.PWM_LIMIT, 885, str, "a lower limit gives less torque at speed"),
         (bus.MIN_POSITION_LIMIT, 0, str, "the companion itself enforces the joint limits"),
-        (bus.MAX_POSITION_LIMIT, dxl.COUNTS_PER_TURN - 1, str, "the companion itself enforces the joint limits"),
+        (bus.MAX_POSITION_LIMIT, COUNTS_PER_TURN - 1, str, "the companion itself enforces the joint limits"),
         (bus.STARTUP, 0, str, "no torque at power-on"),
         (bus.SHUTDOWN, SHUTDOWN_BITS, lambda v: f"0x{v:02x}", "overheating, shock and overload switch the torque off"),
         (bus.ID, joint.servo_id, str, "the vehicle file's servo_id"),
@@ -144,7 +158,7 @@ def settings(servo: FoundServo, joint: Joint, arm: Arm, device: ArmDevice) -> li
 class Assignment:
     """Assignment of servos to joints."""
 
-    joints: tuple[FoundServo | None, FoundServo | None]
+    joints: tuple[FoundServo | None, ...]
     """Servo of each joint, by id; a single remaining servo is assigned to the joint without one."""
     renamed: int | None
     """Joint whose servo id differs from the vehicle file."""
@@ -153,19 +167,45 @@ class Assignment:
 
 
 def assign(servos: Sequence[FoundServo], arm: Arm) -> Assignment:
-    """Assign servos by id. If one joint's servo is missing and one XM430 remains, assign it to this joint."""
+    """Assign servos of the right model by id. If one joint is left and one servo of its model, assign that servo to this joint."""
     by_joint: list[FoundServo | None] = []
     for joint in arm.joints:
-        having = [servo for servo in servos if servo.servo_id == joint.servo_id and servo.is_xm430]
+        having = [servo for servo in servos if servo.servo_id == joint.servo_id and servo.fits(joint)]
         by_joint.append(having[0] if len(having) == 1 else None)
     left = [servo for servo in servos if servo not in by_joint]
-    candidates = [servo for servo in left if servo.is_xm430]
     renamed = None
-    if by_joint.count(None) == 1 and len(candidates) == 1:
-        renamed = by_joint.index(None)
-        by_joint[renamed] = candidates[0]
-        left.remove(candidates[0])
-    return Assignment((by_joint[0], by_joint[1]), renamed, tuple(left))
+    if by_joint.count(None) == 1:
+        missing = by_joint.index(None)
+        candidates = [servo for servo in left if servo.fits(arm.joints[missing])]
+        if len(candidates) == 1:
+            renamed = missing
+            by_joint[missing] = candidates[0]
+            left.remove(candidates[0])
+    return Assignment(tuple(by_joint), renamed, tuple(left))
+
+
+def joint_in(arm: Arm, index: int | None) -> int | None:
+    """Return the index of `--joint`, or None if it is absent.
+
+    Raises:
+        ConfigError: the arm has no such joint.
+    """
+    count = len(arm.joints)
+    if index is not None and index >= count:
+        raise ConfigError([f"--joint {index + 1}: expected 1 to {count}, the arm's joints from the shoulder outwards"])
+    return index
+
+
+def expected_models(servo: FoundServo, arm: Arm) -> Sequence[str]:
+    """Return the models that the vehicle file permits for this servo: that of the joint with its id, or those of all joints."""
+    own = [joint.servo for joint in arm.joints if joint.servo_id == servo.servo_id]
+    return own or sorted({joint.servo for joint in arm.joints})
+
+
+def is_strange(servo: FoundServo, arm: Arm) -> bool:
+    """Return whether the servo is of a model that the vehicle file does not permit, or its registers could not be read."""
+    kind = kind_of(servo.model)
+    return kind is None or kind.name not in expected_models(servo, arm) or not servo.registers
 
 
 def baud_text(value: int) -> str:

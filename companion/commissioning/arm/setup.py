@@ -15,12 +15,23 @@ from rich.text import Text
 
 from companion.commissioning.arm import bus
 from companion.commissioning.arm.bus import ServoTalk
-from companion.commissioning.arm.scan import scan, scan_for
-from companion.commissioning.arm.servo import FoundServo, Scan, Setting, assign, baud_text, settings
+from companion.commissioning.arm.scan import one_at_a_time, scan, scan_for
+from companion.commissioning.arm.servo import (
+    FoundServo,
+    Scan,
+    Setting,
+    assign,
+    baud_text,
+    expected_models,
+    is_strange,
+    joint_in,
+    settings,
+)
 from companion.commissioning.tool import Cancelled, Report, Session
 from companion.config.vehicle import Arm, ArmDevice, Vehicle
 from companion.io.dynamixel import registers as dxl
 from companion.io.protocols import DeviceError
+from companion.model.servos import model_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,19 +93,24 @@ def plan(found: Scan, arm: Arm, device: ArmDevice, joint: int | None = None) -> 
         found: a scan of all baud rates.
         arm: joints of the vehicle file.
         device: baud rate of the vehicle file.
-        joint: 0 or 1 if the one connected servo belongs to this joint regardless of its id; None to assign by id.
+        joint: index of the joint to which the one connected servo belongs regardless of its id; None to assign by id.
     """
-    alone = "connect only the servo of joint 1: companion arm setup --joint 1; then only that of joint 2: companion arm setup --joint 2"
+    alone = one_at_a_time(arm)
     if joint is not None:
         alone = f"connect only the servo of joint {joint + 1} and run companion arm setup --joint {joint + 1} again"
     if found.garbled_at:
         where = " and ".join(map(str, found.garbled_at))
         text = f"unreadable answers at {where} baud, probably from two servos with the same id; {alone}"
         return SetupPlan(refusal=text, one_at_a_time=True)
-    strange = [servo for servo in found.servos if not servo.is_xm430]
+    strange = [
+        servo
+        for servo in found.servos
+        if (is_strange(servo, arm) if joint is None else not servo.fits(arm.joints[joint]))
+    ]
     if strange:
         servo = strange[0]
-        text = f"servo {servo.servo_id} at {servo.baud} baud: expected a readable XM430-W210, found model {servo.model}"
+        models = " or ".join(expected_models(servo, arm)) if joint is None else arm.joints[joint].servo
+        text = f"servo {servo.servo_id} at {servo.baud} baud: expected a readable {models}, found {model_text(servo.model)}"
         return SetupPlan(refusal=f"{text}; remove it from the bus, or cycle its power")
     if not found.servos:
         return SetupPlan(
@@ -113,7 +129,7 @@ def plan(found: Scan, arm: Arm, device: ArmDevice, joint: int | None = None) -> 
             return SetupPlan(refusal=text, one_at_a_time=True)
         joints = list(enumerate(who.joints))
     return SetupPlan(
-        tuple(ServoPlan(i, one, tuple(settings(one, arm.joints[i], arm, device))) for i, one in joints if one),
+        tuple(ServoPlan(i, one, tuple(settings(one, i, arm, device))) for i, one in joints if one),
         absent=tuple(i for i, one in joints if one is None),
     )
 
@@ -183,21 +199,18 @@ def set_up(session: Session) -> Done:
         DeviceError: a servo no longer answers; scan again.
         Cancelled: the user declined to write.
     """
-    joint, arguments = session.arguments.joint, session.arguments
+    joint, arguments = joint_in(session.vehicle.arm, session.arguments.joint), session.arguments
     session.say("setup: torque stays off; the changes are shown before they are written", "bold")
     wanted = _plan(session, joint)
     at_terminal = sys.stdin is not None and sys.stdin.isatty() and not arguments.yes and not arguments.json
     if not (wanted.one_at_a_time and joint is None and at_terminal):
         return _set_up(session, wanted)
     session.say(wanted.refusal, "yellow")
-    for joint, which in (
-        (0, "only the servo of joint 1 (shoulder)"),
-        (1, "only the servo of joint 2 (elbow)"),
-        (None, "both"),
-    ):
+    alone = [(index, f"only the servo of joint {index + 1}") for index in range(len(session.vehicle.arm.joints))]
+    for joint, which in (*alone, (None, "all servos")):
         session.say(f"connect {which}, then press Enter", "bold")
         if not sys.stdin.readline():
-            raise Cancelled("ended before both servos were set up")
+            raise Cancelled("ended before all servos were set up")
         done = _set_up(session, _plan(session, joint))
         if not done.right:
             break
@@ -237,14 +250,14 @@ def _set_up(session: Session, wanted: SetupPlan) -> Done:
 def _left(vehicle: Vehicle, wanted: SetupPlan) -> list[str]:
     """Scan again and return the settings that differ, one line each."""
     arm, device = vehicle.arm, vehicle.arm_device
-    servos = {servo.servo_id: servo for servo in scan(device, only=device.baud).servos if servo.is_xm430}
+    servos = {servo.servo_id: servo for servo in scan(device, only=device.baud).servos if servo.registers}
     lines: list[str] = []
     for one in wanted.servos:
         servo_id = arm.joints[one.joint].servo_id
         if servo_id not in servos:
             lines.append(f"servo {servo_id}: no longer answers at {device.baud} baud; find it with companion arm scan")
             continue
-        for setting in settings(servos[servo_id], arm.joints[one.joint], arm, device):
+        for setting in settings(servos[servo_id], one.joint, arm, device):
             if not setting.right:
                 text = f"reads {setting.shown(setting.found)} afterwards, expected {setting.shown(setting.wanted)}"
                 lines.append(f"servo {servo_id}: {setting.register} {text}; run companion arm setup again")

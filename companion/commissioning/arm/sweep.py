@@ -9,18 +9,23 @@ from typing import Final
 
 from companion.commissioning.arm.motion import Motion, Moved, limits_deg
 from companion.config.document import ConfigError
-from companion.config.vehicle import Arm
-from companion.model.types import ArmState, Joints
+from companion.config.vehicle import Vehicle
+from companion.control.arm_model import manipulator_of
+from companion.model.types import IDENTITY_QUAT, ArmState, Joints
 
 HANGING_DEG: Final = (90.0, 0.0)
+"""Hanging pose of the planar arm of two joints; the search for that of another arm begins at 90 and zeros."""
 SPEEDS_DEG_S: Final = (9.0, 18.0)
 REACH_DEG: Final = ((-30.0, 30.0), (-5.0, 70.0))
-"""Sweep of each joint about the hanging pose, within its limits."""
+"""Sweep of the first joint and of every other one about the hanging pose, within its limits."""
 REACH_MIN_DEG: Final = 20.0
 SETTLED_S: Final = 0.4
 """Time at constant speed before a sample counts."""
 HELD_UP_S: Final = 0.1
 """Gap between two samples after which the joint has to settle again."""
+_SEARCHES: Final = 100
+_WEIGHTLESS_NM: Final = 1e-9
+_FOUND_RAD: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,19 +53,41 @@ class Sample:
     """Motor current, positive in the direction of the joint angle."""
 
 
-def legs_of(arm: Arm) -> tuple[Leg, ...]:
+def hanging_deg(vehicle: Vehicle) -> Joints:
+    """Return the pose in which the arm hangs freely, deg, within the joint limits minus a margin.
+
+    Along one joint the potential energy is a sine, whose minimum follows from the gravity torque here and 90 deg further. This is
+    repeated joint by joint until the torques are small.
+    """
+    manipulator, count = manipulator_of(vehicle), len(vehicle.arm.joints)
+    limits = [tuple(map(math.radians, limits_deg(vehicle.arm, joint))) for joint in range(count)]
+    pose = [max(low, min(high, math.pi / 2.0 if joint == 0 else 0.0)) for joint, (low, high) in enumerate(limits)]
+    for _ in range(_SEARCHES):
+        moved_rad = 0.0
+        for joint, (low, high) in enumerate(limits):
+            here, further = list(pose), list(pose)
+            further[joint] += math.pi / 2.0
+            p = manipulator.gravity_torque_nm(tuple(here), IDENTITY_QUAT)[joint]
+            q = manipulator.gravity_torque_nm(tuple(further), IDENTITY_QUAT)[joint]
+            if math.hypot(p, q) > _WEIGHTLESS_NM and abs(p) > _WEIGHTLESS_NM:
+                pose[joint] = max(low, min(high, pose[joint] + math.atan2(-p, q)))
+                moved_rad = max(moved_rad, abs(pose[joint] - here[joint]))
+        if moved_rad < _FOUND_RAD:
+            break
+    return tuple(map(math.degrees, pose))
+
+
+def legs_of(vehicle: Vehicle) -> tuple[Leg, ...]:
     """Return the sweeps: to the hanging pose, each joint back and forth at each speed, then to the hanging pose, to go limp.
 
     Raises:
         ConfigError: the joint limits leave too small a range.
     """
-    limits = [limits_deg(arm, joint) for joint in (0, 1)]
-    home = [max(low, min(high, deg)) for (low, high), deg in zip(limits, HANGING_DEG, strict=True)]
-    fast = SPEEDS_DEG_S[-1]
-    legs = [Leg(0, home[0], fast), Leg(1, home[1], fast)]
-    for joint in (0, 1):
-        (low, high), (down, up) = limits[joint], REACH_DEG[joint]
-        begin, end = max(low, home[joint] + down), min(high, home[joint] + up)
+    home, fast = hanging_deg(vehicle), SPEEDS_DEG_S[-1]
+    legs = [Leg(joint, angle_deg, fast) for joint, angle_deg in enumerate(home)]
+    for joint, angle_deg in enumerate(home):
+        (low, high), (down, up) = limits_deg(vehicle.arm, joint), REACH_DEG[min(joint, 1)]
+        begin, end = max(low, angle_deg + down), min(high, angle_deg + up)
         if end - begin < REACH_MIN_DEG:
             room = f"about the hanging pose and within its limits joint {joint + 1} can turn {max(0.0, end - begin):.0f} deg"
             why = f"at least {REACH_MIN_DEG:g} deg are needed to separate gravity from friction"
@@ -68,7 +95,7 @@ def legs_of(arm: Arm) -> tuple[Leg, ...]:
         legs.append(Leg(joint, begin, fast))
         for speed in SPEEDS_DEG_S:
             legs += [Leg(joint, end, speed, True), Leg(joint, begin, speed, True)]
-        legs.append(Leg(joint, home[joint], fast))
+        legs.append(Leg(joint, angle_deg, fast))
     return tuple(legs)
 
 
@@ -87,12 +114,12 @@ class Sweeper:
 
     Args:
         legs: legs in order.
-        torque_per_amp_nm_a: the constant by which the arm's driver converts currents to torques.
+        torque_constants_nm_a: the constant of each joint by which the arm's driver converts currents to torques.
     """
 
-    def __init__(self, legs: Sequence[Leg], torque_per_amp_nm_a: float) -> None:
+    def __init__(self, legs: Sequence[Leg], torque_constants_nm_a: Sequence[float]) -> None:
         self.legs = legs
-        self._nm_a = torque_per_amp_nm_a
+        self._nm_a = torque_constants_nm_a
         self.samples: list[Sample] = []
         self._leg = -1
         self._steady_since_s: float | None = None
@@ -103,7 +130,7 @@ class Sweeper:
         at, poses = list(state.angle_rad), [state.angle_rad]
         for leg in self.legs:
             at[leg.joint] = math.radians(leg.goal_deg)
-            poses.append((at[0], at[1]))
+            poses.append(tuple(at))
         return poses
 
     def update(self, motion: Motion, moved: Moved | None, state: ArmState) -> bool:
@@ -147,6 +174,6 @@ class Sweeper:
                 t_s=state.stamp_s,
                 angle_rad=state.angle_rad,
                 velocity_rad_s=state.velocity_rad_s[leg.joint],
-                current_a=state.torque_nm[leg.joint] / self._nm_a,
+                current_a=state.torque_nm[leg.joint] / self._nm_a[leg.joint],
             )
         )

@@ -11,10 +11,10 @@ from companion.commissioning.arm import scan as arm_scan
 from companion.commissioning.arm import setup as arm_setup
 from companion.commissioning.arm.bus import BAUDS
 from companion.commissioning.arm.drive import Driven, Leader, drive
-from companion.commissioning.arm.friction import fit
+from companion.commissioning.arm.friction import Estimate, fit
 from companion.commissioning.arm.jog import ByKeys
 from companion.commissioning.arm.motion import LOAD_NM, SPEED_MAX_DEG_S, TORQUE_SHARE, limits_deg
-from companion.commissioning.arm.servo import Scan
+from companion.commissioning.arm.servo import Scan, joint_in
 from companion.commissioning.arm.sweep import Leg, Sample, Sweeper, duration_s, legs_of
 from companion.commissioning.arm.zero import ZeroGuide, ZeroResult
 from companion.commissioning.arm.zero_session import hold
@@ -23,8 +23,6 @@ from companion.config.document import ConfigError
 from companion.config.vehicle import Vehicle
 from companion.model.check_row import Level
 from companion.runtime.terminal import Bars, pressed, raw_keys
-
-_NAMES = ("joint 1", "joint 2")
 
 
 def _stand_text(vehicle: Vehicle) -> str:
@@ -56,7 +54,7 @@ def _judge_scan(found: Scan, vehicle: Vehicle) -> Report:
         judged.changes,
         advice=[] if wrong else ["the servos match the vehicle file"],
         ok=wrong <= settled,
-        brief={f"arm.scan.joint{n}": f"joint {n}: settings" for n in (1, 2)},
+        brief={f"arm.scan.joint{n}": f"joint {n}: settings" for n in range(1, len(vehicle.arm.joints) + 1)},
     )
 
 
@@ -104,49 +102,50 @@ async def _drive(session: Session, leader: Leader, what: str) -> Driven:
         raise ConfigError([f"companion arm {part}: there is no terminal to ask whether the arm may move; add --yes"])
     if not answer:
         raise Cancelled("the arm was not moved")
-    with Bars(session.console, _NAMES) as bars:
+    with Bars(session.console, [f"joint {number}" for number in range(1, len(session.vehicle.arm.joints) + 1)]) as bars:
         return await drive(session.vehicle, leader, bars)
 
 
 async def _jog(session: Session) -> Driven:
     arguments, arm = session.arguments, session.vehicle.arm
-    joint, goal_deg = arguments.joint, arguments.to
+    joint, goal_deg = joint_in(arm, arguments.joint), arguments.to
     if (goal_deg is None) != (joint is None):
         raise ConfigError(
             ["companion arm jog: --joint N and --to DEG belong together; without both, keys move the arm"]
         )
-    if goal_deg is not None:
+    if goal_deg is not None and joint is not None:
         low, high = limits_deg(arm, joint)
         if not low <= goal_deg <= high:
             expected = f"expected {low:g} to {high:g} deg, joint {joint + 1}'s limits minus a margin"
             raise ConfigError([f"companion arm jog: --to {goal_deg:g}: {expected}"])
-        leader = Sweeper([Leg(joint, goal_deg, SPEED_MAX_DEG_S)], arm.torque_per_amp_nm_a)
+        leader = Sweeper([Leg(joint, goal_deg, SPEED_MAX_DEG_S)], arm.torque_constants_nm_a)
         return await _drive(session, leader, f"joint {joint + 1} moves to {goal_deg:g} deg")
     if sys.stdin is None or not sys.stdin.isatty():
         raise ConfigError(
             ["companion arm jog: no terminal to read keys from; --joint N --to DEG --yes moves without keys"]
         )
-    keys = "1, 2: select the joint; arrows or + and -: move it while held; any other key: stop; q: end"
+    joints = f"1 to {len(arm.joints)}" if len(arm.joints) > 2 else "1, 2"
+    keys = f"{joints}: select the joint; arrows or + and -: move it while held; any other key: stop; q: end"
     with raw_keys() as descriptor:
         return await _drive(session, ByKeys(lambda: pressed(descriptor)), f"keys move the arm; {keys}")
 
 
 def _judge_jog(driven: Driven, vehicle: Vehicle) -> Report:
-    first, second = driven.angle_deg
+    angles = ", ".join(f"{angle:.1f}" for angle in driven.angle_deg)
     load_nm = max(driven.load_max_nm)
     text = [f"stopped: {driven.stop}"] if driven.stop else []
-    text.append(f"the arm is limp, at ({first:.1f}, {second:.1f}) deg; at most {load_nm:.2f} N m beyond gravity")
-    data = {"stopped": driven.stop, "angle_deg": [first, second], "load_max_nm": list(driven.load_max_nm)}
+    text.append(f"the arm is limp, at ({angles}) deg; at most {load_nm:.2f} N m beyond gravity")
+    data = {"stopped": driven.stop, "angle_deg": list(driven.angle_deg), "load_max_nm": list(driven.load_max_nm)}
     return Report((), data, text, ok=not driven.stop)
 
 
 async def _sweep(session: Session) -> tuple[Driven, Sequence[Sample]]:
     vehicle = session.vehicle
-    legs = legs_of(vehicle.arm)
-    leader = Sweeper(legs, vehicle.arm.torque_per_amp_nm_a)
+    legs = legs_of(vehicle)
+    leader = Sweeper(legs, vehicle.arm.torque_constants_nm_a)
     seconds = duration_s(legs, vehicle.safety.fold_arm_deg)
     driven = await _drive(
-        session, leader, f"both joints sweep slowly for about {seconds:.0f} s, about the hanging pose"
+        session, leader, f"each joint sweeps slowly, about the hanging pose, for about {seconds:.0f} s in all"
     )
     return driven, leader.samples
 
@@ -154,7 +153,7 @@ async def _sweep(session: Session) -> tuple[Driven, Sequence[Sample]]:
 def _judge_sweep(swept: tuple[Driven, Sequence[Sample]], vehicle: Vehicle) -> Report:
     driven, samples = swept
     if driven.stop:
-        data: Mapping[str, Any] = {"stopped": driven.stop, "joints": [None, None], "notes": []}
+        data: Mapping[str, Any] = {"stopped": driven.stop, "joints": [None for _ in vehicle.arm.joints], "notes": []}
         return Report((), data, [f"stopped: {driven.stop}"], ok=False)
     found = fit(samples, vehicle)
     text = []
@@ -167,13 +166,22 @@ def _judge_sweep(swept: tuple[Driven, Sequence[Sample]], vehicle: Vehicle) -> Re
                 f"  viscous friction  {one.viscous_nms.text(4)} N m s/rad",
                 f"  turned by         {one.off_deg.text(2)} deg",
             ]
-    for name, unit in (("torque_per_amp_nm_a", "N m/A"), ("joint_friction_nm", "N m")):
-        estimate = getattr(found, name)
-        value = "not determined" if estimate is None else f"{estimate.text(3)} {unit}"
-        text.append(f"{name}: {value}; the vehicle file has {getattr(vehicle.arm, name):g}")
-    known = found.torque_per_amp_nm_a is not None and found.joint_friction_nm is not None
+    constants = set(zip(found.torque_constants_nm_a, vehicle.arm.torque_constants_nm_a, strict=True))
+    for index, (constant, has_nm_a) in enumerate(
+        zip(found.torque_constants_nm_a, vehicle.arm.torque_constants_nm_a, strict=True)
+    ):
+        if len(constants) > 1 or index == 0:
+            name = f"arm.joints[{index}].torque_per_amp_nm_a" if len(constants) > 1 else "torque_per_amp_nm_a"
+            text.append(f"{name}: {_value(constant, 'N m/A')}; the vehicle file has {has_nm_a:g}")
+    has = vehicle.arm.joint_friction_nm
+    text.append(f"joint_friction_nm: {_value(found.joint_friction_nm, 'N m')}; the vehicle file has {has:g}")
+    known = None not in found.torque_constants_nm_a and found.joint_friction_nm is not None
     data = {"stopped": "", **asdict(found)}
     return Report((), data, [*text, *found.notes], found.changes(vehicle), ok=known)
+
+
+def _value(estimate: Estimate | None, unit: str) -> str:
+    return "not determined" if estimate is None else f"{estimate.text(3)} {unit}"
 
 
 TOOLS: Final[Mapping[str, Tool[Any]]] = {

@@ -1,4 +1,4 @@
-"""Finds zeros, directions and swapped plugs of the arm's servos from three hand-held poses. No I/O."""
+"""Finds zeros, directions and swapped plugs of the arm's servos from hand-held poses. No I/O."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from companion.commissioning.arm.poses import SWING_MIN_DEG, Step, steps_of
 from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.vehicle import Arm
-from companion.io.dynamixel.registers import COUNTS_PER_TURN
+from companion.model.servos import COUNTS_PER_TURN
 
 HELD_S: Final = 2.0
 """Time at rest after which a pose is accepted."""
@@ -23,14 +23,14 @@ BEGUN_DEG: Final = 5.0
 NEAR_SHARE: Final = 0.35
 """Largest accepted error of an exact turn, as a fraction of the turn."""
 ALONE_SHARE: Final = 0.35
-"""Largest accepted motion of the other joint, as a fraction of the turn."""
+"""Largest accepted motion of another joint, as a fraction of the turn."""
 HAND_DEG: Final = 2.0
 """Accuracy of a link held level or plumb; a zero in the vehicle file is kept if its error is smaller."""
 DISAGREE_DEG: Final = 8.0
 """Largest difference between the zeros of two poses; a larger one means that a pose was not held, or that the arm slips on a servo."""
 _DEG_PER_COUNT: Final = 360.0 / COUNTS_PER_TURN
 
-Counts = tuple[int, int]
+Counts = tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +47,11 @@ class ZeroJoint:
 
 @dataclass(frozen=True, slots=True)
 class ZeroResult:
-    """Servos, directions and zeros of both joints, shoulder first."""
+    """Servos, directions and zeros of all joints, shoulder first."""
 
-    joints: tuple[ZeroJoint, ZeroJoint]
+    joints: tuple[ZeroJoint, ...]
     swapped: bool
-    """Whether the vehicle file assigns each servo to the other joint."""
+    """Whether the vehicle file assigns a servo to another joint."""
 
     def changes(self, arm: Arm) -> dict[Location, Data]:
         """Return the values to change in the vehicle file; empty if it is correct within `HAND_DEG`."""
@@ -79,7 +79,7 @@ class ZeroView:
     step: Step | None
     """The step under way; None at the end."""
     number: int
-    moved_deg: tuple[float, float]
+    moved_deg: tuple[float, ...]
     """Motion since the step began, as each servo counts, in the order of the vehicle file's servos."""
     held: float
     """Fraction of `HELD_S` for which the arm has been held, 0 to 1."""
@@ -120,7 +120,7 @@ class ZeroGuide:
         step = self.steps[index]
         if self._began is None:
             self._began = counts
-        moved = (_moved_deg(self._began, counts, 0), _moved_deg(self._began, counts, 1))
+        moved = tuple((now - began) * _DEG_PER_COUNT for began, now in zip(self._began, counts, strict=True))
         self._begun = self._begun or max(map(abs, moved)) > BEGUN_DEG
         window = self._window
         window.append((t_s, counts))
@@ -136,54 +136,57 @@ class ZeroGuide:
         self._began, self._begun = self._held[-1], False
         window.clear()
         if len(self._held) < len(self.steps):
-            return ZeroView(step=self.steps[index + 1], number=index + 2, moved_deg=(0.0, 0.0), held=0.0, notice="")
+            return ZeroView(
+                step=self.steps[index + 1], number=index + 2, moved_deg=(0.0,) * len(counts), held=0.0, notice=""
+            )
         return self._conclude(moved)
 
     def _still_s(self, t_s: float) -> float:
-        """Return how long both joints have been at rest, s."""
+        """Return how long all joints have been at rest, s."""
         newest = self._window[-1][1]
         low, high = list(newest), list(newest)
         since_s = t_s
         for at_s, counts in reversed(self._window):
-            for servo in (0, 1):
-                low[servo], high[servo] = min(low[servo], counts[servo]), max(high[servo], counts[servo])
-            if max(high[0] - low[0], high[1] - low[1]) * _DEG_PER_COUNT > STILL_DEG:
+            low, high = list(map(min, low, counts)), list(map(max, high, counts))
+            if max(most - least for least, most in zip(low, high, strict=True)) * _DEG_PER_COUNT > STILL_DEG:
                 break
             since_s = at_s
         return t_s - since_s
 
-    def _notice(self, step: Step, moved: tuple[float, float]) -> str:
+    def _notice(self, step: Step, moved: tuple[float, ...]) -> str:
         if step.joint is None or not self._begun:
             return ""
-        most, least = max(map(abs, moved)), min(map(abs, moved))
-        if least > ALONE_SHARE * max(most, SWING_MIN_DEG):
-            return "both joints have moved; turn only the requested one and move the other one back"
+        *others, most = sorted(map(abs, moved))
+        if others and others[-1] > ALONE_SHARE * max(most, SWING_MIN_DEG):
+            return "two joints have moved; turn only the requested one and move the other one back"
         if step.exact and abs(most - abs(step.by_deg)) > NEAR_SHARE * abs(step.by_deg):
             return f"requested {abs(step.by_deg):.0f} deg, but the joint has turned by {most:.0f} deg"
         if most < SWING_MIN_DEG:
             return f"turn the joint further, by at least {SWING_MIN_DEG:.0f} deg; it has turned by {most:.0f} deg"
         return ""
 
-    def _conclude(self, moved: tuple[float, float]) -> ZeroView:
-        first, second, third = self._held
-        elbow, shoulder = _mover(first, second), _mover(second, third)
+    def _conclude(self, moved: tuple[float, ...]) -> ZeroView:
         view = ZeroView(step=None, number=len(self.steps), moved_deg=moved, held=1.0, notice="")
-        if elbow == shoulder:
-            servo_id = self._arm.joints[elbow].servo_id
-            text = f"servo {servo_id} turned in both steps, and the other one did not: turn the elbow first, then the shoulder"
+        # The step with index 1 turns the last joint, the last step the shoulder.
+        movers = [_mover(before, after) for before, after in zip(self._held, self._held[1:], strict=False)][::-1]
+        twice = next((servo for servo in movers if movers.count(servo) > 1), None)
+        if twice is not None:
+            servo_id = self._arm.joints[twice].servo_id
+            text = f"servo {servo_id} turned in two steps, and another one in none: turn the joints one after the other, as requested"
             return _failed(view, text)
-        counts = (tuple(held[shoulder] for held in self._held), tuple(held[elbow] for held in self._held))
-        joints = tuple(self._joint(joint, (shoulder, elbow)[joint], counts[joint]) for joint in (0, 1))
+        joints = tuple(
+            self._joint(joint, servo, [held[servo] for held in self._held]) for joint, servo in enumerate(movers)
+        )
         for joint, found in enumerate(joints):
             if found.spread_deg is not None and found.spread_deg > DISAGREE_DEG:
                 text = f"joint {joint + 1}: the poses disagree by {found.spread_deg:.1f} deg"
                 return _failed(view, f"{text}; hold the arm more precisely, and check for a slipping horn")
-        result = ZeroResult((joints[0], joints[1]), elbow == 0)
+        result = ZeroResult(joints, movers != list(range(len(movers))))
         return ZeroView(step=None, number=view.number, moved_deg=moved, held=1.0, notice="", result=result)
 
     def _joint(self, joint: int, servo: int, counts: Sequence[int]) -> ZeroJoint:
-        # The elbow turns in the second step, the shoulder in the third, in which the elbow is only roughly held.
-        at = 1 if joint == 1 else 2
+        # In the steps after its own, a joint is only roughly held.
+        at = len(self.steps) - 1 - joint
         turns = self.steps[at]
         sign = 1 if (counts[at] - counts[at - 1]) * turns.by_deg > 0.0 else -1
         last = at + turns.exact
@@ -203,13 +206,9 @@ def _failed(view: ZeroView, text: str) -> ZeroView:
     )
 
 
-def _moved_deg(began: Counts, counts: Counts, servo: int) -> float:
-    return (counts[servo] - began[servo]) * _DEG_PER_COUNT
-
-
 def _mover(before: Counts, after: Counts) -> int:
-    return 0 if abs(after[0] - before[0]) > abs(after[1] - before[1]) else 1
+    return max(reversed(range(len(before))), key=lambda servo: abs(after[servo] - before[servo]))
 
 
 def _mean(counts: Sequence[Counts]) -> Counts:
-    return (round(math.fsum(a for a, _ in counts) / len(counts)), round(math.fsum(b for _, b in counts) / len(counts)))
+    return tuple(round(math.fsum(own) / len(own)) for own in zip(*counts, strict=True))

@@ -57,7 +57,7 @@ def _ready(talk: ServoTalk, servo_id: int) -> None:
 def _steps(talk: ServoTalk, ids: Sequence[int], guide: ZeroGuide, bars: Bars, keys: int | None) -> ZeroResult:
     number, deadline_s = 0, 0.0
     while True:
-        counts = (talk.read(ids[0], dxl.PRESENT_POSITION), talk.read(ids[1], dxl.PRESENT_POSITION))
+        counts = tuple(talk.read(servo_id, dxl.PRESENT_POSITION) for servo_id in ids)
         now_s = time.monotonic()
         typed = pressed(keys)
         view = guide.update(now_s, counts, accept="\n" in typed or "\r" in typed)
@@ -74,9 +74,8 @@ def _steps(talk: ServoTalk, ids: Sequence[int], guide: ZeroGuide, bars: Bars, ke
         if now_s > deadline_s:
             text = f"step {number} ({view.step.name}): not held within {STEP_TIMEOUT_S:.0f} s: {_why(view)}"
             raise DeviceError(f"arm zero: {text}; run it again")
-        first, second = view.moved_deg
-        shares = [abs(first) / _FULL_DEG, abs(second) / _FULL_DEG, view.held]
-        bars.show(shares, [f"{first:+7.1f} deg", f"{second:+7.1f} deg", view.notice])
+        shares = [*(abs(moved) / _FULL_DEG for moved in view.moved_deg), view.held]
+        bars.show(shares, [*(f"{moved:+7.1f} deg" for moved in view.moved_deg), view.notice])
         time.sleep(PERIOD_S)
 
 

@@ -13,8 +13,9 @@ from companion.config.vehicle import Vehicle
 from companion.ground.protocol.messages import DeviceHealth, HealthLevel
 from companion.model.frames import wrap_rad, yaw_from_quat
 from companion.model.listing import listed
+from companion.model.servos import WATCHDOG_ERROR
 from companion.model.types import Inputs, Outputs, PhaseKind
-from companion.safety.arm import WATCHDOG_RESTARTED, error_text
+from companion.safety.arm import error_text
 
 DEVICE_NAMES = (
     "PX4", "estimate", "motion capture", "arm", "force sensor", "loop", "recorder", "guardian", "battery", "tether",
@@ -150,7 +151,7 @@ class HealthEvaluator:
             return HealthLevel.OFF, "no joint state yet"
         hottest_c = max(arm.temperature_c)
         text = f"{_age_text(age_s)}, {listed(arm.temperature_c, '.0f', ' / ')} degC"
-        if any(error & ~WATCHDOG_RESTARTED for error in arm.hardware_error):
+        if any(error & ~WATCHDOG_ERROR for error in arm.hardware_error):
             return HealthLevel.BAD, error_text(arm.hardware_error)
         if hottest_c >= s.servo_max_c:
             return HealthLevel.BAD, text

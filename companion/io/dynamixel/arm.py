@@ -17,10 +17,11 @@ from typing import Self, TypeVar
 from msgspec.structs import replace
 
 from companion.config.vehicle import Arm, ArmDevice
-from companion.io.dynamixel.bus import SETUP_ATTEMPTS, ArmBus, Pair
-from companion.io.dynamixel.registers import WATCHDOG_ERROR, WATCHDOG_TRIPPED, Block, JointScale
+from companion.io.dynamixel.bus import SETUP_ATTEMPTS, ArmBus, Counts
+from companion.io.dynamixel.registers import WATCHDOG_TRIPPED, Block, JointScale
 from companion.io.protocols import DeviceError
 from companion.model.observations import ServoReport
+from companion.model.servos import WATCHDOG_ERROR
 from companion.model.types import ArmState, Joints
 from companion.runtime.clock import Clock
 
@@ -50,7 +51,7 @@ class _Read:
 
 
 class DynamixelArm:
-    """Two XM430-W210-T in current mode behind the `Arm` protocol.
+    """The arm's Dynamixel servos in current mode behind the `Arm` protocol.
 
     Without read requests the thread reads by itself, often enough that the servos' bus watchdogs do not trip. A torque that is not
     renewed within `device.watchdog_ms` is set to 0. The watchdogs themselves cover the case that the whole process stops. A tripped one
@@ -59,7 +60,7 @@ class DynamixelArm:
 
     Args:
         device: port, baud rate, watchdog.
-        arm: joints and torque constant.
+        arm: joints and torque constants.
         clock: the flight clock, source of all stamps.
     """
 
@@ -69,13 +70,13 @@ class DynamixelArm:
         self._clock = clock
         self._jobs: queue.SimpleQueue[object] = queue.SimpleQueue()
         """Queue of `_Read` objects and of the markers above."""
-        self._goals: deque[Pair] = deque(maxlen=1)
+        self._goals: deque[Counts] = deque(maxlen=1)
         self._goal_handed_s = 0.0
         self._state: ArmState | None = None
         self._failures = 0
         self._written_s: float | None = None
         self._problem = ""
-        self._scales: tuple[JointScale, JointScale] | None = None
+        self._scales: tuple[JointScale, ...] | None = None
         self._servos: tuple[ServoReport, ...] = ()
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -120,7 +121,7 @@ class DynamixelArm:
 
     @property
     def servos(self) -> tuple[ServoReport, ...]:
-        """Return the state of both servos at the time when the driver was opened."""
+        """Return the state of all servos at the time when the driver was opened."""
         return self._servos
 
     @property
@@ -178,12 +179,12 @@ class DynamixelArm:
             ValueError: a torque is not finite.
         """
         assert self._scales is not None, "the arm is not open"
-        first, second = self._scales
-        counts = (first.current_counts(torque_nm[0]), second.current_counts(torque_nm[1]))
+        scales = self._scales
+        counts = tuple([scale.current_counts(nm) for scale, nm in zip(scales, torque_nm, strict=True)])
         self._goal_handed_s = time.monotonic()
         self._goals.append(counts)
         self._jobs.put(_WRITE)
-        return (first.torque_nm(counts[0]), second.torque_nm(counts[1]))
+        return tuple([scale.torque_nm(count) for scale, count in zip(scales, counts, strict=True)])
 
     async def _shut_down(self) -> None:
         self._stop.set()
@@ -229,7 +230,8 @@ class DynamixelArm:
 
     def _serve(self, bus: ArmBus) -> None:
         watchdog_s = self._device.watchdog_ms * 1e-3
-        sent: Pair = (0, 0)
+        limp: Counts = (0,) * len(self._arm.joints)
+        sent = limp
         later: _Read | None = None
         while True:
             wait_s = watchdog_s / _KEEPALIVES_PER_WATCHDOG
@@ -262,14 +264,14 @@ class DynamixelArm:
                 if reading.waiter is not None:
                     self._post(functools.partial(_resolve, reading.waiter, None))
             if tripped:
-                sent = (0, 0)
+                sent = limp
                 self._try(bus.restart_watchdogs)
             elif self._goal_handed_s > 0.0 and time.monotonic() - self._goal_handed_s > watchdog_s:
                 # Repeated, because a sync write has no reply and our reads keep the servos' watchdogs from tripping.
-                sent = (0, 0)
-                self._try(lambda: bus.write_currents((0, 0)))
+                sent = limp
+                self._try(lambda: bus.write_currents(limp))
 
-    def _write_newest(self, bus: ArmBus, sent: Pair) -> Pair:
+    def _write_newest(self, bus: ArmBus, sent: Counts) -> Counts:
         try:
             goal = self._goals.pop()
         except IndexError:
@@ -282,32 +284,32 @@ class DynamixelArm:
         """Read and publish the state. Return whether a bus watchdog had tripped."""
         asked_s = self._clock()
         try:
-            pair = bus.read()
+            blocks = bus.read()
         except Exception as error:  # as in `_try`
             self._problem = _describe(error)
-            pair = None
-        if pair is None:
+            blocks = None
+        if blocks is None:
             self._failures += 1
             if self._state is not None:
                 self._state = replace(self._state, read_failures=self._failures)
             return False
         self._failures = 0
-        self._state = state = self._to_state(pair, asked_s)
+        self._state = state = self._to_state(blocks, asked_s)
         off_s = state.stamp_s - asked_s - self._read_s
         self._read_s += _SMOOTHING * off_s
         self._read_deviation_s += _SMOOTHING * (abs(off_s) - self._read_deviation_s)
-        return WATCHDOG_TRIPPED in (pair[0].bus_watchdog, pair[1].bus_watchdog)
+        return any(block.bus_watchdog == WATCHDOG_TRIPPED for block in blocks)
 
-    def _to_state(self, blocks: tuple[Block, Block], asked_s: float) -> ArmState:
+    def _to_state(self, blocks: tuple[Block, ...], asked_s: float) -> ArmState:
         assert self._scales is not None
-        (a, b), (first, second) = blocks, self._scales
+        servos = list(zip(self._scales, blocks, strict=True))
         return ArmState(
             stamp_s=self._clock(),
-            angle_rad=(first.angle_rad(a.position_count), second.angle_rad(b.position_count)),
-            velocity_rad_s=(first.velocity_rad_s(a.velocity_count), second.velocity_rad_s(b.velocity_count)),
-            torque_nm=(first.torque_nm(a.current_count), second.torque_nm(b.current_count)),
-            hardware_error=(_errors(a), _errors(b)),
-            temperature_c=(float(a.temperature_c), float(b.temperature_c)),
+            angle_rad=tuple([scale.angle_rad(block.position_count) for scale, block in servos]),
+            velocity_rad_s=tuple([scale.velocity_rad_s(block.velocity_count) for scale, block in servos]),
+            torque_nm=tuple([scale.torque_nm(block.current_count) for scale, block in servos]),
+            hardware_error=tuple([_errors(block) for block in blocks]),
+            temperature_c=tuple([float(block.temperature_c) for block in blocks]),
             read_failures=0,
             written_s=self._written_s,
             asked_s=asked_s,

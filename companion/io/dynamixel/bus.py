@@ -1,4 +1,4 @@
-"""Blocking communication with the arm's two servos: check and set up, one read and one write per cycle, release.
+"""Blocking communication with the arm's servos: check and set up, one read and one write per cycle, release.
 
 Everything here runs in the one thread that owns the bus. The dynamixel-sdk implements the protocol.
 """
@@ -16,6 +16,7 @@ from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.registers import Block, JointScale, Register
 from companion.io.protocols import DeviceError
 from companion.model.observations import ServoReport
+from companion.model.servos import COUNTS_PER_TURN, hardware_error_text, model_text
 
 _FLIGHT_REPLY_TIMEOUT_MS = 8.0
 """Reply timeout in flight, the longest delay caused by an absent servo."""
@@ -26,22 +27,24 @@ SETUP_ATTEMPTS = 5
 """Number of attempts at each read or write during set-up: interference corrupts single packets, and a busy computer delays an answer.
 """
 
-Pair = tuple[int, int]
+Counts = tuple[int, ...]
+"""One value in register units for each servo, from the shoulder outwards."""
 
 
 class ArmBus:
-    """Two servos on one port. Not thread-safe.
+    """The arm's servos on one port, which may be of several models. Not thread-safe.
 
     Args:
         device: port, baud rate, watchdog.
-        arm: joints and torque constant.
+        arm: joints and torque constants.
         aborted: called between the steps of `open`; True aborts it.
     """
 
     def __init__(self, device: ArmDevice, arm: Arm, aborted: Callable[[], bool] = lambda: False) -> None:
         self._device = device
         self._joints = arm.joints
-        self._torque_per_amp_nm_a = arm.torque_per_amp_nm_a
+        self._torque_constants_nm_a = arm.torque_constants_nm_a
+        self._limp = (0,) * len(arm.joints)
         self._aborted = aborted
         self._ids = [joint.servo_id for joint in arm.joints]
         self._protocol = PacketHandler(2.0)
@@ -50,10 +53,10 @@ class ArmBus:
         self._watchdog = device.watchdog_ms // dxl.WATCHDOG_UNIT_MS
         self._touched = False
         self.reports: tuple[ServoReport, ...] = ()
-        """Identity and settings of both servos, read back at the end of `open`."""
+        """Identity and settings of all servos, read back at the end of `open`."""
 
-    def open(self, timeout_s: float) -> tuple[JointScale, JointScale]:
-        """Open the port, check both servos, set them up and switch torque on with goal current 0.
+    def open(self, timeout_s: float) -> tuple[JointScale, ...]:
+        """Open the port, check all servos, set them up and switch torque on with goal current 0.
 
         Raises:
             DeviceError: a servo or the port does not meet the requirements; the text is one line.
@@ -63,8 +66,10 @@ class ArmBus:
         for joint in self._joints:
             self._check_identity(joint)
         self._touched = True
-        scales = tuple(self._set_up(joint) for joint in self._joints)
-        blocks = next((pair for pair in (self.read() for _ in range(SETUP_ATTEMPTS)) if pair is not None), None)
+        scales = tuple(
+            self._set_up(joint, nm_a) for joint, nm_a in zip(self._joints, self._torque_constants_nm_a, strict=True)
+        )
+        blocks = next((found for found in (self.read() for _ in range(SETUP_ATTEMPTS)) if found is not None), None)
         if blocks is None:
             raise self._error(
                 "servos", self._ids, "answered individually but not to a sync read; check for a loose cable"
@@ -80,10 +85,10 @@ class ArmBus:
             self._write(joint, dxl.TORQUE_ENABLE, 1)
         self._port.reply_timeout_ms = _FLIGHT_REPLY_TIMEOUT_MS
         self._port.late_reply_ms = 0.0
-        return scales[0], scales[1]
+        return scales
 
-    def read(self) -> tuple[Block, Block] | None:
-        """Perform one sync read. Return None unless both servos answered in time and still have the settings of `open`.
+    def read(self) -> tuple[Block, ...] | None:
+        """Perform one sync read. Return None unless every servo answered in time and still have the settings of `open`.
 
         Raises:
             OSError: the port is gone.
@@ -103,9 +108,9 @@ class ArmBus:
                     None  # restarted by itself (a loose supply): its indirect addresses are lost, the block is invalid
                 )
             blocks.append(block)
-        return blocks[0], blocks[1]
+        return tuple(blocks)
 
-    def write_currents(self, counts: Pair) -> None:
+    def write_currents(self, counts: Counts) -> None:
         """Perform one sync write of the goal currents, which has no reply.
 
         Raises:
@@ -127,7 +132,7 @@ class ArmBus:
         """
         for servo_id in self._ids:
             self._try_write(servo_id, dxl.BUS_WATCHDOG, 0)
-        self.write_currents((0, 0))
+        self.write_currents(self._limp)
         for servo_id in self._ids:
             self._try_write(servo_id, dxl.BUS_WATCHDOG, self._watchdog)
 
@@ -137,7 +142,7 @@ class ArmBus:
         self._port.late_reply_ms = 0.0
         try:
             if self._touched and self._port.is_open:
-                self.write_currents((0, 0))
+                self.write_currents(self._limp)
                 for register in (dxl.TORQUE_ENABLE, dxl.BUS_WATCHDOG):
                     for servo_id in self._ids:
                         self._try_write(servo_id, register, 0)
@@ -182,31 +187,35 @@ class ArmBus:
                 joint.servo_id,
                 f"does not answer at {self._device.baud} baud; {others}; check its power, cable, id and baud rate",
             )
-        if model != dxl.MODEL_NUMBER_XM430_W210:
+        if model != joint.kind.number:
+            raise self._error("servo", joint.servo_id, f"is {model_text(model)}; the vehicle file says {joint.servo}")
+        # A servo set to answer pings only would look dead; the answer to this write does not matter.
+        self._try_write(joint.servo_id, dxl.STATUS_RETURN_LEVEL, 2)
+        firmware = self._read(joint, dxl.FIRMWARE)
+        if firmware < joint.kind.firmware_min:
             raise self._error(
                 "servo",
                 joint.servo_id,
-                f"has model number {model}, expected {dxl.MODEL_NUMBER_XM430_W210} (XM430-W210)",
+                f"has firmware {firmware}; the {joint.servo} needs {joint.kind.firmware_min} or newer; update it with DYNAMIXEL "
+                "Wizard",
             )
-        # A servo set to answer pings only would look dead; the answer to this write does not matter.
-        self._try_write(joint.servo_id, dxl.STATUS_RETURN_LEVEL, 2)
         errors = self._read(joint, dxl.HARDWARE_ERROR)
         if errors:
             raise self._error(
                 "servo",
                 joint.servo_id,
-                f"reports a hardware error: {dxl.hardware_error_text(errors)} ({dxl.HARDWARE_ERROR} = {errors}); "
+                f"reports a hardware error: {hardware_error_text(errors)} ({dxl.HARDWARE_ERROR} = {errors}); "
                 "remove the cause, then reboot it or cycle its power",
             )
 
-    def _set_up(self, joint: Joint) -> JointScale:
+    def _set_up(self, joint: Joint, torque_per_amp_nm_a: float) -> JointScale:
         self._write(joint, dxl.TORQUE_ENABLE, 0)
         self._write(joint, dxl.BUS_WATCHDOG, 0)
         for register, value in ((dxl.RETURN_DELAY, 0), (dxl.OPERATING_MODE, dxl.MODE_CURRENT)):
             if self._read(joint, register) != value:  # EEPROM wears
                 self._write(joint, register, value)
         try:
-            scale = dxl.joint_scale(joint, self._torque_per_amp_nm_a, self._read(joint, dxl.CURRENT_LIMIT))
+            scale = dxl.joint_scale(joint, torque_per_amp_nm_a, self._read(joint, dxl.CURRENT_LIMIT))
         except ValueError as error:
             raise self._error("servo", joint.servo_id, str(error)) from error
         pointers = [byte for address in dxl.BLOCK_ADDRESSES for byte in (address & 0xFF, address >> 8)]
@@ -218,7 +227,7 @@ class ArmBus:
     def _within_limits(self, joint: Joint, scale: JointScale, block: Block) -> JointScale:
         zero_count = joint.zero_count + dxl.turn_offset_counts(joint, block.position_count)
         scale = JointScale(scale.sign, zero_count, scale.torque_nm_per_count, scale.current_max_counts)
-        angle_deg = scale.angle_rad(block.position_count) * 360.0 / (dxl.COUNTS_PER_TURN * dxl.RAD_PER_COUNT)
+        angle_deg = scale.angle_rad(block.position_count) * 360.0 / (COUNTS_PER_TURN * dxl.RAD_PER_COUNT)
         low_deg, high_deg = joint.angle_deg
         if not low_deg <= angle_deg <= high_deg:
             raise self._error(

@@ -1,6 +1,7 @@
-"""XM430-W210-T: control table, units, and the SDK's serial port adapted to a control loop. The SDK implements the protocol.
+"""The servos' control table and units, and the SDK's serial port adapted to a control loop. The SDK implements the protocol.
 
-Source: ROBOTIS e-manual, XM430-W210 control table. The supported baud rates are those of `companion.config.vehicle.ServoBaud`.
+Source: ROBOTIS e-manual, XM430-W210 control table; every model of `companion.model.servos` has these registers at these addresses.
+The supported baud rates are those of `companion.config.vehicle.ServoBaud`.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from serial.tools import list_ports
 
 from companion.config.vehicle import Joint
 from companion.io.protocols import DeviceError
+from companion.model.servos import COUNTS_PER_TURN, RPM_PER_COUNT
 
-MODEL_NUMBER_XM430_W210 = 1030
 MODE_CURRENT = 0
 WATCHDOG_UNIT_MS = 20
 RETURN_DELAY_UNIT_US = 2
@@ -27,10 +28,8 @@ VOLTAGE_UNIT_V = 0.1
 WATCHDOG_TRIPPED = 0xFF
 """Value of register 98 after the bus watchdog has tripped."""
 
-COUNTS_PER_TURN = 4096
 RAD_PER_COUNT = 2.0 * math.pi / COUNTS_PER_TURN
-RAD_S_PER_COUNT = 0.229 * 2.0 * math.pi / 60.0
-AMP_PER_COUNT = 2.69e-3
+RAD_S_PER_COUNT = RPM_PER_COUNT * 2.0 * math.pi / 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +75,6 @@ _NOISE_PATIENCE = 20.0
 _NOISE_BYTES = 4096
 """More bytes than the replies to any one instruction: 252 servos answer a broadcast ping with 14 bytes each."""
 
-HARDWARE_ERROR_NAMES = {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
-WATCHDOG_ERROR = 0x80
-"""Bit that the companion sets in `ArmState.hardware_error` after the bus watchdog has tripped; register 70 does not use it."""
-
 
 @dataclass(frozen=True, slots=True)
 class Block:
@@ -96,14 +91,6 @@ class Block:
     def from_bytes(data: bytes) -> Block:
         """Decode `BLOCK_SIZE` bytes of indirect data."""
         return Block(*_BLOCK.unpack(data))
-
-
-def hardware_error_text(error: int) -> str:
-    """Return the names of the bits of register 70 (and of `WATCHDOG_ERROR`)."""
-    names = [HARDWARE_ERROR_NAMES.get(bit, f"bit {bit}") for bit in range(7) if error >> bit & 1]
-    if error & WATCHDOG_ERROR:
-        names.append("bus watchdog")
-    return ", ".join(names) if names else "none"
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,12 +128,17 @@ class JointScale:
 
 
 def joint_scale(joint: Joint, torque_per_amp_nm_a: float, current_limit_counts: int) -> JointScale:
-    """Return the scale of a joint whose servo has the given current limit (register 38).
+    """Return the scale of a joint.
+
+    Args:
+        joint: limits, zero, direction and model of its servo.
+        torque_per_amp_nm_a: torque constant of its servo, N m/A.
+        current_limit_counts: current limit of its servo (register 38).
 
     Raises:
         ValueError: the current limit is below what `torque_max_nm` needs.
     """
-    torque_nm_per_count = torque_per_amp_nm_a * AMP_PER_COUNT
+    torque_nm_per_count = torque_per_amp_nm_a * joint.kind.current_unit_a
     wanted = math.floor(joint.torque_max_nm / torque_nm_per_count + 1e-9)
     if wanted > current_limit_counts:
         raise ValueError(
