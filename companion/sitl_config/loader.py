@@ -14,6 +14,7 @@ from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import read_document
 from companion.control.trial import try_law
 from companion.sitl_config.distributions import Laboratory, check_world, take_ranges
+from companion.sitl_config.effects.rotors import repeat_for_rotors
 from companion.sitl_config.faults import absent_part
 from companion.sitl_config.per_joint import repeat_for_joints
 from companion.sitl_config.world import World
@@ -69,7 +70,9 @@ def load_sitl(
     except ConfigError as error:
         lines += error.lines
     try:
-        simulated = load_world(overrides, world, len(flight.vehicle.arm.joints) if flight is not None else 0)
+        vehicle = flight.vehicle if flight is not None else None
+        joints, rotors = (len(vehicle.arm.joints), vehicle.airframe.rotor_layout.count) if vehicle else (0, 0)
+        simulated = load_world(overrides, world, joints, rotors)
     except ConfigError as error:
         lines += [line for line in error.lines if line not in lines]
     if flight is None or simulated is None:
@@ -97,13 +100,16 @@ def _faults_of_absent_parts(world: World, vehicle: Vehicle) -> Iterator[str]:
             yield f"world.faults[{number}].servo: vehicle '{vehicle.name}' has {servos} servos, got servo {fault.servo}"
 
 
-def load_world(overrides: Sequence[str] = (), world: str = DEFAULT_WORLD, joints: int = 0) -> tuple[World, Laboratory]:
+def load_world(
+    overrides: Sequence[str] = (), world: str = DEFAULT_WORLD, joints: int = 0, rotors: int = 0
+) -> tuple[World, Laboratory]:
     """Return a simulated world, drawn from its seed, and the laboratory from which it was drawn.
 
     Args:
         overrides: `--set` options; options of other sections are ignored. They override ranges before the draw.
         world: name of a built-in world, or path of a file.
         joints: number of joints of the arm. A list with one value for each joint that is shorter is extended by its last value.
+        rotors: number of rotors. A list with one value for each rotor that is shorter starts again from its beginning.
 
     Raises:
         ConfigError: the world has problems; the exception has one message per problem.
@@ -111,6 +117,7 @@ def load_world(overrides: Sequence[str] = (), world: str = DEFAULT_WORLD, joints
     document = read_document(named_file("worlds", world, "--world"))
     apply_overrides(document, "world", parse_overrides(overrides))
     repeat_for_joints(document, joints)
+    repeat_for_rotors(document, rotors)
     ranges = take_ranges(document)
     return check_world(document, ranges, _seed_of(document.data)), Laboratory(name=world, ranges=ranges)
 

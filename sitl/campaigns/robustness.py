@@ -39,7 +39,6 @@ END_MARGIN_M = 0.08
 """Smallest distance of a catch point from the ends of the line, which a vehicle displaced by wind might not reach."""
 HAND_HEIGHT_M = 0.1
 """Smallest height above the floor at which the payload is released."""
-ROTORS_ABOVE_BODY_M = 0.03
 FELT_S = 0.05
 """Time after the catch within which the force sensor must have sent a sample taken after the catch."""
 _STEP_S = 0.01
@@ -61,7 +60,7 @@ def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
         CampaignError: the mission has no such pass.
     """
     plan = Plan.build(mission, vehicle)
-    manipulator = manipulator_of(vehicle)
+    manipulator, rotors_m = manipulator_of(vehicle), vehicle.airframe.rotor_layout.height_m
     times = [n * _STEP_S for n in range(int(plan.duration_s / _STEP_S))]
     forwards = [t_s for t_s in times if plan.reference(t_s).velocity_world_m_s[0] > 0.0]
     begun_s = next((t_s for t_s in forwards if plan.segment(t_s).kind is PhaseKind.FLIGHT), math.inf)
@@ -83,7 +82,7 @@ def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
         net_z_m = later.position_world_m[2] - net_below_m
         rise_m = 0.5 * GRAVITY_M_S2 * THROW_LEAD_S**2
         slowest = max(0.0, (rise_m + HAND_HEIGHT_M - net_z_m) / THROW_LEAD_S)
-        fastest = math.sqrt(2.0 * GRAVITY_M_S2 * max(0.0, net_below_m + ROTORS_ABOVE_BODY_M))
+        fastest = math.sqrt(2.0 * GRAVITY_M_S2 * max(0.0, net_below_m + rotors_m))
         fastest = max(slowest, min(DESCENT_MAX_M_S, fastest))
         found.append(Throw((x_m, later.position_world_m[1]), (slowest, fastest)))
     if not found:

@@ -239,3 +239,13 @@ def test_both_loops_fly_the_machine_with_the_model_error() -> None:
     true_kg = base_mass_kg(config.vehicle, errs) + sum(links_kg) + tool.sensor_mass_kg + tool.net_mass_kg
     assert true == pytest.approx(GRAVITY_M_S2 * true_kg, rel=1e-6)
     assert true != pytest.approx(believed, rel=0.05)
+
+
+def test_each_rotor_of_an_octocopter_is_drawn_and_those_of_a_quadrotor_stay_as_they_were() -> None:
+    plain, _ = load_world(["world.seed=3"], "lab")
+    four, _ = load_world(["world.seed=3"], "lab", rotors=4)
+    eight, _ = load_world(["world.seed=3"], "lab", rotors=8)
+    assert four == plain
+    assert eight.rotors.thrust_error[:4] == four.rotors.thrust_error
+    assert len(set(eight.rotors.thrust_error)) == len(set(eight.rotors.yaw_torque_error)) == 8
+    assert eight.model_copy(update={"rotors": four.rotors}) == four

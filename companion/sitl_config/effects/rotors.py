@@ -9,9 +9,22 @@ from typing import Annotated
 from pydantic import Field
 
 from companion.config.base import Fraction, Model, NonNegative, Positive, RelativeError
+from companion.config.document import Document
 from companion.model.rotors import ROTORS_MAX
 
 RotorErrors = Annotated[tuple[RelativeError, ...], Field(min_length=1, max_length=ROTORS_MAX)]
+
+
+def repeat_for_rotors(document: Document, count: int) -> None:
+    """Extend the lists of the rotors' errors in a world's document to `count` rotors by starting them again from their beginning.
+
+    A repeated distribution is then drawn separately for each rotor.
+    """
+    rotors = document.data.get("rotors")
+    for key in ("thrust_error", "yaw_torque_error"):
+        errors = rotors.get(key) if isinstance(rotors, dict) else None
+        if isinstance(errors, list) and errors:
+            errors.extend(islice(cycle(errors.copy()), len(errors), max(count, len(errors))))
 
 
 def of_rotors(errors: Sequence[float], count: int) -> tuple[float, ...]:
