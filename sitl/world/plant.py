@@ -124,7 +124,8 @@ class Plant:
         servos = [config.servo(joint) for joint in range(len(joints))]
         mechanics = config.servo_mechanics
         more = of_joints(mechanics.torque_per_amp_error if mechanics.on else (0.0,), len(joints))
-        gears = transmissions_of(vehicle, config, arm_rad, PHYSICS_DT_S) or (None,) * len(joints)
+        transmissions = transmissions_of(vehicle, config, arm_rad, PHYSICS_DT_S)
+        gears = transmissions or (None,) * len(joints)
         self._servos = tuple(
             _JointServo(
                 drive,
@@ -138,6 +139,8 @@ class Plant:
             )
         )
         self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
+        if transmissions:
+            self.world.add_joint_inertia(transmissions)
         hover_n = self.world.weight_n / self.world.rotor_count
         self._imu_errors = ImuErrors.of(config.imu, IMU_EVERY * PHYSICS_DT_S, hover_n, vehicle.airframe.rotor_layout)
         self._mocap_errors = MocapErrors.of(config.mocap, config.seed)

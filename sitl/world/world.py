@@ -18,6 +18,7 @@ from sitl.world.effects.battery import BatteryPack
 from sitl.world.effects.downwash import Downwash
 from sitl.world.effects.rotors import LinearRotors, Rotors, Thrusts
 from sitl.world.effects.tether_line import TetherLine
+from sitl.world.effects.transmission import Transmission, added_inertia_kg_m2
 from sitl.world.handling import Wrench
 from sitl.world.loads import EFFECT_PERIOD_S, ZERO, Loads
 from sitl.world.model import mjcf
@@ -291,6 +292,13 @@ class World:
             (x, y, z), (px, py, pz) = force_n, self._snag_pull_n(*self.snag)
             force_n = (x + px, y + py, z + pz)
         return force_n
+
+    def add_joint_inertia(self, transmissions: Sequence[Transmission]) -> None:
+        """Add the inertia to the links that their transmissions need (`added_inertia_kg_m2`)."""
+        joint_v = list(self.layout.joint_v)
+        added_kg_m2 = added_inertia_kg_m2(self.model, list(self.layout.joint_q), joint_v, transmissions)
+        if added_kg_m2 > 0.0:
+            self.model.dof_armature[joint_v] += added_kg_m2
 
     def release_arm(self) -> None:
         """Release the arm from its support."""

@@ -16,6 +16,10 @@ where L = |motor torque - external torque|, and the external torque is the torqu
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
 
 from companion.config.vehicle import Vehicle
 from companion.model.types import Joints
@@ -27,6 +31,12 @@ ARMATURE_MIN_KG_M2 = 4e-3
 gear.
 """
 _WARM_UP_STEPS = 500
+STIFF_MAX, STIFF_TARGET = 4.3, 2.0
+"""Largest stiffness of the transmissions relative to the physics step, and the stiffness to which `added_inertia_kg_m2` reduces it.
+A linear oscillator is stable below 4. The shipped arm reaches 4.2 with `servo_mechanics` alone; its friction keeps it at rest.
+"""
+_POSES = 16
+_ADDED_MAX_KG_M2 = 0.1
 
 
 class Transmission:
@@ -69,6 +79,13 @@ class Transmission:
         self._stretch_rad = self._stretch_rad_s = 0.0
         self._step = 0
         self._torque_share = self._friction_share = 1.0
+
+    def stiffness(self) -> tuple[float, float]:
+        """Return the stiffness relative to the physics step, kg m^2 (below 4 times the inertia, an oscillator is stable), and the
+        rotor's inertia, kg m^2.
+        """
+        dt_s = self._dt_s
+        return dt_s * (self._stiffness_nm * dt_s + 2.0 * self._damping_nms), self._armature_kg_m2
 
     def encoder(self, link_rad: float, link_rad_s: float) -> tuple[float, float]:
         """Update with the link's angle and velocity, and return the angle and velocity of the servo's output shaft."""
@@ -162,3 +179,41 @@ def transmissions_of(vehicle: Vehicle, world: World, start_rad: Joints, dt_s: fl
         Transmission(servo, armature, gear_rad, link_rad if joint else mount_rad, arm.relaxation_s, angle_rad, dt_s)
         for joint, angle_rad in enumerate(start_rad)
     )
+
+
+def added_inertia_kg_m2(
+    model: mujoco.MjModel, joint_q: Sequence[int], joint_v: Sequence[int], transmissions: Sequence[Transmission]
+) -> float:
+    """Return the inertia to add to every link about its joint, so that the physics step can represent the links on their springs; 0 if
+    the links are heavy enough, as those of the shipped arm are.
+
+    Args:
+        model: the vehicle; the masses of its first 6 + n degrees of freedom are used.
+        joint_q: indices of the joint angles in qpos.
+        joint_v: indices of the joint rates in qvel.
+        transmissions: transmission of each joint.
+    """
+    data, poses = mujoco.MjData(model), np.random.default_rng(0)
+    stiffness, rotor = np.array([each.stiffness() for each in transmissions]).T
+    scale, count = np.sqrt(np.outer(stiffness, stiffness)), 6 + len(joint_v)
+    masses, mass = [], np.zeros((model.nv, model.nv))
+    for pose in range(_POSES):
+        data.qpos[joint_q] = poses.uniform(-math.pi, math.pi, len(joint_q)) if pose else 0.0
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_crb(model, data)
+        mujoco.mj_fullM(model, data, mass)
+        masses.append(mass[:count, :count].copy())
+
+    def stiffest(added_kg_m2: float) -> float:
+        added = np.zeros(count)
+        added[joint_v] = added_kg_m2
+        inverse = np.linalg.inv(np.array(masses) + np.diag(added))[:, joint_v][:, :, joint_v]
+        return float(np.linalg.eigvalsh((inverse + np.diag(1.0 / rotor)) * scale).max())
+
+    if stiffest(0.0) <= STIFF_MAX:
+        return 0.0
+    added_kg_m2 = 1e-5
+    while stiffest(added_kg_m2) > STIFF_TARGET and added_kg_m2 < _ADDED_MAX_KG_M2:
+        added_kg_m2 *= 1.25
+    return added_kg_m2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -11,25 +12,29 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.config.arm_chain import chain_of
+from companion.config.loader import load_vehicle
 from companion.config.vehicle import Link, Vehicle
 from companion.control.arm_model import dynamics_of
 from companion.control.dynamics import euler_rate_matrices
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, rotation_matrix
-from companion.model.types import Joints
+from companion.model.types import Joints, Outcome, Severity
 from companion.sitl_config.effects.compliance import Compliance
 from companion.sitl_config.effects.machine import Machine
+from companion.sitl_config.effects.servo_mechanics import ServoMechanics
 from companion.sitl_config.faults import Fault
+from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.backend import stub_of
 from sitl.fast.bus import FastBus, scales_of
+from sitl.fast.loop import FastFlight
 from sitl.faults.injector import Faults
 from sitl.servo.drive import ServoDrive
 from sitl.servo.from_config import servos_of
 from sitl.world.plant import Plant
 from sitl.world.world import World
-from tests.machines import ARMS, vehicle_with_joints
-from tests.support import tool_of
+from tests.machines import ARMS, overrides_with_joints, vehicle_with_joints
+from tests.support import HOVER, SHORT_CATCH, tool_of
 
 Array = NDArray[np.float64]
 NO_FRICTION = WorldConfig(payload_kg=0.0, joint_friction_nm=0.0, joint_damping_nms=0.0)
@@ -268,3 +273,45 @@ def test_every_joint_has_a_spring_of_its_own() -> None:
         assert abs(held_nm) > 0.05
         ahead_rad = shaft_rad - plant.truth.joint_angle_rad[joint]
         assert ahead_rad == pytest.approx(math.radians(deg_per_nm) * held_nm, abs=5e-5)
+
+
+def test_links_too_light_for_their_springs_get_the_inertia_that_the_physics_step_needs() -> None:
+    shipped, geared = (
+        load_vehicle("tarot650_2r"),
+        NO_FRICTION.model_copy(update={"servo_mechanics": ServoMechanics(on=True)}),
+    )
+    two = Plant(shipped, geared, _Off(), [ServoDrive(), ServoDrive()], ((0.0, 0.0), 0.0, folded_rad(2)))
+    assert not two.world.model.dof_armature.any()
+
+    sprung, drives = (
+        NO_FRICTION.model_copy(update={"compliance": Compliance(on=True)}),
+        [ServoDrive() for _ in range(4)],
+    )
+    four = Plant(vehicle_with_joints(4), sprung, _Off(), drives, ((0.0, 0.0), 0.0, folded_rad(4)))
+    added_kg_m2 = four.world.model.dof_armature[6:10]
+    assert 0.0 < added_kg_m2.min() == added_kg_m2.max() < 0.001
+    four.step(False)
+    for drive in drives:
+        drive.torque_on, (_, _, drive.goal_position_counts) = True, drive.present()
+    four.world.release_arm()
+    while four.t_s < 2.0:
+        four.step(False)
+    assert max(map(abs, four.truth.joint_velocity_rad_s)) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("joints", "mission", "changes"),
+    [
+        (0, HOVER, []),
+        (1, SHORT_CATCH, []),
+        (3, SHORT_CATCH, ["vehicle.arm.joints[1].axis=[0, -1, 0.3]", "vehicle.arm.joints[2].axis=[1, 0, 0]"]),
+        (4, SHORT_CATCH, []),
+    ],
+)
+def test_a_vehicle_with_any_number_of_joints_and_any_axes_flies(joints: int, mission: Path, changes: list[str]) -> None:
+    config = load_sitl(mission, overrides=[*overrides_with_joints(joints), *changes])
+    result = FastFlight(config).run()
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    warnings = {event.id for output in result.outputs for event in output.events if event.severity is not Severity.INFO}
+    assert warnings == set()
+    assert {None if i.arm is None else len(i.arm.angle_rad) for i in result.inputs} == {joints or None}
