@@ -18,7 +18,7 @@ from companion.config.controller import AdaptiveConfig, fitted
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import dynamics_of, manipulator_of
 from companion.control.common import Actuation, DesiredForce, ForceFilter, tracking_errors
-from companion.control.compensation import Compensation
+from companion.control.compensation import FRICTION_RATE_RAD_S, Compensation
 from companion.control.impedance import Impedance
 from companion.control.load_adaptation import LoadAdaptation
 from companion.control.types import PlantState, Wrench
@@ -75,36 +75,6 @@ class Adaptation:
             self.h = (h0, h1, h2, h3)
 
 
-class AccelerationFilter:
-    """Low-pass filter of the acceleration chi'' of the active rows, exact for a held input. The acceleration of the base is
-    measured, that of the joints differentiated numerically.
-    """
-
-    def __init__(self, cutoff_hz: float) -> None:
-        self._w = 2.0 * math.pi * cutoff_hz
-        self._arm_rate_rad_s: Joints | None = None
-        self._value: Sequence[float] | None = None
-
-    def step(self, dt_s: float, state: PlantState) -> Sequence[float]:
-        """Return the filtered acceleration, m/s^2 and rad/s^2; rows 3 to 5 are 0. The filter starts at its first sample."""
-        rates = state.arm_rate_rad_s
-        rates_before = self._arm_rate_rad_s or rates
-        self._arm_rate_rad_s = rates
-        x, y, z = state.acceleration_world_m_s2
-        before = self._value
-        if before is None:
-            value = [x, y, z, 0.0, 0.0, 0.0, *[0.0] * len(rates)]
-        else:
-            k = 1.0 - math.exp(-self._w * dt_s)
-            v0, v1, v2 = before[0], before[1], before[2]
-            value = [v0 + k * (x - v0), v1 + k * (y - v1), v2 + k * (z - v2), 0.0, 0.0, 0.0]
-            for joint, rate in enumerate(rates):
-                v = before[6 + joint]
-                value.append(v + k * ((rate - rates_before[joint]) / dt_s - v))
-        self._value = value
-        return value
-
-
 class AdaptiveController:
     """The adaptive impedance control law for vehicle and arm."""
 
@@ -125,10 +95,15 @@ class AdaptiveController:
         """M_d, Phi, Lambda, S^2 and D of x, y and z."""
         self._joint_gains = [(joint, 6 + joint, *row) for joint, row in enumerate(gains[6:])]
         """Number of each joint and its row, then as in `_base_gains`."""
-        self._weights_squared = (weights[:3], [(row, weights[row]) for row in range(6, rows)])
+        self._base_phi, self._base_weights = (*impedance.phi[:3], impedance.phi[5]), weights[:3]
+        self._joint_weights = [(joint, row, phi, weight) for joint, row, _, phi, _, weight, _ in self._joint_gains]
+        """Number of each joint, its row, Phi and S^2."""
         self._varpi = config.boundary_layer
         self._acceleration_cap = config.acceleration_cap
-        self._acceleration = AccelerationFilter(config.acceleration_lowpass_hz)
+        self._acceleration_cutoff_rad_s = 2.0 * math.pi * config.acceleration_lowpass_hz
+        self._acceleration: Sequence[float] | None = None
+        """Filtered acceleration of x, y, z and the joints."""
+        self._arm_rate_rad_s: Joints = ()
         self._force = ForceFilter(config.force_lowpass_hz)
         self._desired = DesiredForce(config.desired_force_time_s)
         self._actuation = Actuation(config, vehicle, hover_thrust)
@@ -138,7 +113,6 @@ class AdaptiveController:
         )
         self._arm_dynamics = dynamics_of(vehicle) if config.arm_inertia_nominal else None
         self._gravity_nominal = config.arm_gravity_nominal
-        self._up_body_m_s2: Vec3 = (0.0, 0.0, GRAVITY_M_S2)
         self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
         self.hover_thrust = hover_thrust
         """Normalised hover thrust, for the log. The hover-thrust estimator sets it before every step."""
@@ -147,22 +121,19 @@ class AdaptiveController:
         """Run one tick of `dt_s`; see `companion.control.types.Controller`."""
         adaptation, impedance, sent, load = self._adaptation, self._impedance, self._actuation, self._load
         clipped_before = sent.any_clipped
-        acceleration = self._acceleration.step(dt_s, state)
         force = self._force.step(dt_s, state.force_ext_world_n)
         learn = state.airborne and not clipped_before
         self._compensation.observe(dt_s, state, learn)
         body_x, body_z = body_x_z_axes_world(state.attitude_wxyz)
         error, error_rate = tracking_errors(state, reference, math.atan2(body_x[1], body_x[0]))
-        e_tau, tau_d, arm_gravity = self._torque_error(state.arm_rad, body_x, body_z, force)
-        s = impedance.sliding(error, error_rate)
-        norm_s, x, norm_a = self._norms(s, error, error_rate, acceleration)
+        s, norm_s, x, norm_a = self._sliding(dt_s, state, error, error_rate)
         cap = self._acceleration_cap
         regressor: Vec4 = (1.0, x, x * x, cap if norm_a > cap else norm_a)
         rho = adaptation.rho(regressor)
         varpi = self._varpi
         robust = rho / (varpi if varpi > norm_s else norm_s)
         wanted_n = self._base_force(s, robust, error_rate, reference, force)
-        wanted_nm = self._arm_torque(s, robust, error_rate, e_tau, tau_d, arm_gravity, state, reference)
+        wanted_nm, e_tau = self._joints(s, robust, error_rate, body_x, body_z, force, state, reference)
         sent.step(dt_s, wanted_n, wanted_nm, body_z, reference.yaw_rad, vertical_scale)
         self._compensation.remember(sent.force_world_n, force)
         adaptation.advance(dt_s, norm_s, regressor, clipped_before)
@@ -191,50 +162,42 @@ class AdaptiveController:
             attitude_wxyz=sent.attitude_wxyz, collective_n=sent.collective_n, arm_torque_nm=sent.arm_torque_nm, log=log
         )
 
-    def _torque_error(
-        self, arm_rad: Joints, body_x: Vec3, body_z: Vec3, force: Vec3
-    ) -> tuple[Chi, Sequence[float], Joints]:
-        """Return e_tau = tau_ext - tau_d, tau_d of the joints, and the joint torques that hold the arm against gravity."""
-        (xx, xy, xz), (zx, zy, zz) = body_x, body_z
-        up = (GRAVITY_M_S2 * xz, GRAVITY_M_S2 * (zx * xy - zy * xx), GRAVITY_M_S2 * zz)
-        self._up_body_m_s2 = up
-        (jx, jy, jz), gravity = self._manipulator.joint_terms(arm_rad, up)
-        (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = force, self._desired.world_n, self._compliance
-        f_x, f_z = xx * f0 + xy * f1 + xz * f2, zx * f0 + zy * f1 + zz * f2
-        d_x, d_z = xx * d0 + xy * d1 + xz * d2, zx * d0 + zy * d1 + zz * d2
-        e_tau, tau_d = [c0 * f0, c1 * f1, c2 * f2, 0.0, 0.0, 0.0], []
-        if any(jy):
-            yx, yy, yz = zy * xz - zz * xy, zz * xx - zx * xz, zx * xy - zy * xx
-            f_y, d_y = yx * f0 + yy * f1 + yz * f2, yx * d0 + yy * d1 + yz * d2
-            for joint, y in enumerate(jy):
-                x, z = jx[joint], jz[joint]
-                wanted = x * d_x + y * d_y + z * d_z
-                tau_d.append(wanted)
-                e_tau.append(x * f_x + y * f_y + z * f_z - wanted)
-        else:  # an arm that moves in the body's x-z plane only
-            for joint, x in enumerate(jx):
-                z = jz[joint]
-                wanted = x * d_x + z * d_z
-                tau_d.append(wanted)
-                e_tau.append(x * f_x + z * f_z - wanted)
-        return tuple(e_tau), tau_d, gravity
+    def _sliding(self, dt_s: float, state: PlantState, error: Chi, error_rate: Chi) -> tuple[Chi, float, float, float]:
+        """Return s = e' + Phi e - gamma (eq. s_general), ||S s||, ||S [e; e']|| and ||S chi_dd||.
 
-    def _norms(self, s: Chi, error: Chi, error_rate: Chi, acceleration: Sequence[float]) -> Vec3:
-        """Return ||S s||, ||S [e; e']|| and ||S chi_dd||."""
-        s0, s1, s2 = s[0], s[1], s[2]
-        e0, e1, e2 = error[0], error[1], error[2]
-        v0, v1, v2 = error_rate[0], error_rate[1], error_rate[2]
-        a0, a1, a2 = acceleration[0], acceleration[1], acceleration[2]
-        (w0, w1, w2), joint_weights = self._weights_squared
+        chi_dd is low-pass filtered, exactly for a held input; the filter starts at its first sample. The acceleration of the base is
+        measured, that of the joints differentiated numerically.
+        """
+        k = 1.0 - math.exp(-self._acceleration_cutoff_rad_s * dt_s)
+        x, y, z = state.acceleration_world_m_s2
+        rates, before = state.arm_rate_rad_s, self._acceleration
+        if before is None:
+            before, self._arm_rate_rad_s = (x, y, z, *(0.0,) * len(rates)), rates
+        rates_before, self._arm_rate_rad_s = self._arm_rate_rad_s, rates
+        a0, a1, a2 = before[0], before[1], before[2]
+        a0, a1, a2 = a0 + k * (x - a0), a1 + k * (y - a1), a2 + k * (z - a2)
+        e0, e1, e2, e5 = error[0], error[1], error[2], error[5]
+        v0, v1, v2, v5 = error_rate[0], error_rate[1], error_rate[2], error_rate[5]
+        p0, p1, p2, p5 = self._base_phi
+        gamma = self._impedance.gamma
+        s0, s1, s2 = v0 + p0 * e0 - gamma[0], v1 + p1 * e1 - gamma[1], v2 + p2 * e2 - gamma[2]
+        s = [s0, s1, s2, 0.0, 0.0, v5 + p5 * e5]  # of roll, pitch and yaw, gamma is 0, and e too but for yaw
+        w0, w1, w2 = self._base_weights
         s_squared = w0 * s0 * s0 + w1 * s1 * s1 + w2 * s2 * s2
         x_squared = w0 * (e0 * e0 + v0 * v0) + w1 * (e1 * e1 + v1 * v1) + w2 * (e2 * e2 + v2 * v2)
         a_squared = w0 * a0 * a0 + w1 * a1 * a1 + w2 * a2 * a2
-        for row, w in joint_weights:
-            s0, e0, v0, a0 = s[row], error[row], error_rate[row], acceleration[row]
+        acceleration = [a0, a1, a2]
+        for joint, row, p0, w in self._joint_weights:
+            e0, v0, a0 = error[row], error_rate[row], before[3 + joint]
+            s0 = v0 + p0 * e0 - gamma[row]
+            s.append(s0)
+            a0 += k * ((rates[joint] - rates_before[joint]) / dt_s - a0)
+            acceleration.append(a0)
             s_squared += w * s0 * s0
             x_squared += w * (e0 * e0 + v0 * v0)
             a_squared += w * a0 * a0
-        return math.sqrt(s_squared), math.sqrt(x_squared), math.sqrt(a_squared)
+        self._acceleration = acceleration
+        return tuple(s), math.sqrt(s_squared), math.sqrt(x_squared), math.sqrt(a_squared)
 
     def _base_force(self, s: Chi, robust: float, error_rate: Chi, reference: Reference, force: Vec3) -> Vec3:
         """Return the force on the base: tau with the adaptive load and the compensation, plus the weight.
@@ -258,42 +221,66 @@ class AdaptiveController:
         )
         return (x, y, z + self._weight_n)
 
-    def _arm_torque(
+    def _joints(
         self,
         s: Chi,
         robust: float,
         error_rate: Chi,
-        e_tau: Chi,
-        tau_d: Sequence[float],
-        gravity: Joints,
+        body_x: Vec3,
+        body_z: Vec3,
+        force: Vec3,
         state: PlantState,
         reference: Reference,
-    ) -> Joints:
-        """Return the joint torques: tau as in `_base_force` and gravity, plus the configured (M_arm - M_d) alpha''* + C alpha' and
-        friction at alpha'*.
+    ) -> tuple[Joints, Chi]:
+        """Return the joint torques, and e_tau = tau_ext - tau_d of all rows.
 
-        The star marks what the target impedance requests at this instant: alpha''* = alpha''_d - Phi e' + gamma' and alpha'* = alpha'_d
-        - Phi e + gamma = alpha' - s.
+        The torques are tau as in `_base_force` and gravity, plus the configured adaptive load, (M_arm - M_d) alpha''* + C alpha', and
+        friction at alpha'*. The star marks what the target impedance requests at this instant: alpha''* = alpha''_d - Phi e' + gamma'
+        and alpha'* = alpha'_d - Phi e + gamma = alpha' - s.
         """
+        (xx, xy, xz), (zx, zy, zz) = body_x, body_z
+        yz, arm_rad = zx * xy - zy * xx, state.arm_rad
+        up = (GRAVITY_M_S2 * xz, GRAVITY_M_S2 * yz, GRAVITY_M_S2 * zz)
+        (jx, jy, jz), gravity = self._manipulator.joint_terms(arm_rad, up)
+        (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = force, self._desired.world_n, self._compliance
+        f_x, f_z = xx * f0 + xy * f1 + xz * f2, zx * f0 + zy * f1 + zz * f2
+        d_x, d_z = xx * d0 + xy * d1 + xz * d2, zx * d0 + zy * d1 + zz * d2
+        f_y = d_y = 0.0
+        if any(jy):
+            yx, yy = zy * xz - zz * xy, zz * xx - zx * xz
+            f_y, d_y = yx * f0 + yy * f1 + yz * f2, yx * d0 + yy * d1 + yz * d2
         gamma, feed, rates = self._impedance.gamma, reference.arm_acceleration_rad_s2, state.arm_rate_rad_s
-        torque, wanted_rate = [], []
-        for joint, row, m, p, lam, w, d in self._joint_gains:
-            s_row = s[row]
-            tau = m * (feed[joint] - p * error_rate[row]) - (lam + robust * w) * s_row - d * gamma[row] - tau_d[joint]
-            torque.append(tau + gravity[joint] if self._gravity_nominal else tau)
-            wanted_rate.append(rates[joint] - s_row)
-        if self._load.on:
-            levers = self._manipulator.gravity_levers_m_s2(state.arm_rad, self._up_body_m_s2)
-            for joint, load in enumerate(self._load.joint_torque_nm(levers, wanted_rate)):
-                torque[joint] += load
-        if self._arm_dynamics is not None:
-            wanted = tuple(
-                [
-                    feed[joint] - p * error_rate[row] + (e_tau[row] - d * gamma[row]) / m
-                    for joint, row, m, p, _, _, d in self._joint_gains
-                ]
+        load, gravity_nominal = self._load, self._gravity_nominal
+        dynamics, fed_nm = self._arm_dynamics, self._compensation.friction_nm
+        if load.on:
+            load_gravity, friction = (
+                load.gravity_torque_nm(self._manipulator.gravity_levers_m_s2(arm_rad, up)),
+                load.friction_nm,
             )
-            inertial = self._arm_dynamics.arm_torque_nm(state.arm_rad, rates, wanted)
+        e_tau, torque, wanted_rate, turning = [c0 * f0, c1 * f1, c2 * f2, 0.0, 0.0, 0.0], [], [], []
+        for joint, row, m, p, lam, w, d in self._joint_gains:
+            x, y, z, s_row = jx[joint], jy[joint], jz[joint], s[row]
+            tau_d = x * d_x + y * d_y + z * d_z
+            e_tau.append(x * f_x + y * f_y + z * f_z - tau_d)
+            t = m * (feed[joint] - p * error_rate[row]) - (lam + robust * w) * s_row - d * gamma[row] - tau_d
+            if gravity_nominal:
+                t += gravity[joint]
+            rate = rates[joint] - s_row
+            direction = math.tanh(rate / FRICTION_RATE_RAD_S)
+            if load.on:
+                t += load_gravity[joint] + friction[joint] * direction
+            if dynamics is None and fed_nm:
+                t += fed_nm * direction
+            torque.append(t)
+            wanted_rate.append(rate)
+            turning.append(direction)
+        load.set_motion(wanted_rate, turning)
+        if dynamics is not None:
+            wanted = []
+            for joint, row, m, p, _, _, d in self._joint_gains:
+                wanted.append(feed[joint] - p * error_rate[row] + (e_tau[row] - d * gamma[row]) / m)
+            inertial = dynamics.arm_torque_nm(arm_rad, rates, tuple(wanted))
             for joint, _, m, *_ in self._joint_gains:
                 torque[joint] += inertial[joint] - m * wanted[joint]
-        return self._compensation.joint_torque_nm(torque, wanted_rate)
+                torque[joint] += fed_nm * turning[joint]
+        return tuple(torque), tuple(e_tau)

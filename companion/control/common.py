@@ -100,7 +100,8 @@ class Actuation:
             lateral_max_n=config.lateral_force_max_n,
             tilt_max_tan=math.tan(math.radians(vehicle.airframe.tilt_max_deg)),
         )
-        self._torque_max_nm = tuple([joint.torque_max_nm for joint in vehicle.arm.joints])
+        self._torque_max_nm = [(number, joint.torque_max_nm) for number, joint in enumerate(vehicle.arm.joints)]
+        """Number and torque limit of each joint."""
         self._tilt = TiltFilter(config.attitude_filter_rad_s, config.attitude_filter_damping)
         self.attitude_wxyz: Quat = IDENTITY_QUAT
         self.roll_pitch_yaw_rad: Vec3 = (0.0, 0.0, 0.0)
@@ -142,12 +143,11 @@ class Actuation:
         collective = collective_n(force, body_z_world)
         self.collective_n = collective if collective > 0.0 else 0.0
         clipped_arm = False
-        for joint, most in enumerate(self._torque_max_nm):
+        for joint, most in self._torque_max_nm:
             if not -most <= torque_nm[joint] <= most:
                 clipped_arm = True
         if clipped_arm:
-            limited = zip(torque_nm, self._torque_max_nm, strict=True)
-            torque_nm = tuple([max(-most, min(most, torque)) for torque, most in limited])
+            torque_nm = tuple([max(-most, min(most, torque_nm[joint])) for joint, most in self._torque_max_nm])
         self.arm_torque_nm = torque_nm
         self.clipped = (clipped_z, clipped_xy, clipped_arm)
         self.any_clipped = clipped_z or clipped_xy or clipped_arm

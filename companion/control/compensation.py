@@ -6,7 +6,6 @@ All laws share it, so that they can be compared with the same options.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 from companion.config.controller import LawConfig
 from companion.config.vehicle import Vehicle
@@ -47,7 +46,8 @@ class Compensation:
         self._accounted: Vec3 = (x, y, z)
         self._known_n: Vec3 = (0.0, 0.0, 0.0)
         """Known force on the base in the last tick: rotors, weight, and the part of the measured force that is accounted for."""
-        self._friction_nm = config.arm_friction_share * vehicle.arm.joint_friction_nm
+        self.friction_nm = config.arm_friction_share * vehicle.arm.joint_friction_nm
+        """Friction of each joint that is fed forward."""
 
     def observe(self, dt_s: float, state: PlantState, learn: bool) -> None:
         """Run the disturbance observer for one tick; without `learn` its estimate does not change."""
@@ -66,13 +66,13 @@ class Compensation:
             y += my * lead_s * jerk[1]
         return (x, y, z)
 
-    def joint_torque_nm(self, torque_nm: Sequence[float], wanted_rate_rad_s: Sequence[float]) -> Joints:
+    def joint_torque_nm(self, torque_nm: Joints, wanted_rate_rad_s: Joints) -> Joints:
         """Return the torques with friction added along the wanted joint rates. Measured rates would shake a joint at rest."""
-        if self._friction_nm == 0.0:
-            return tuple(torque_nm)
+        if self.friction_nm == 0.0:
+            return torque_nm
         with_friction = []
         for joint, torque in enumerate(torque_nm):
-            with_friction.append(torque + self._friction_nm * math.tanh(wanted_rate_rad_s[joint] / FRICTION_RATE_RAD_S))
+            with_friction.append(torque + self.friction_nm * math.tanh(wanted_rate_rad_s[joint] / FRICTION_RATE_RAD_S))
         return tuple(with_friction)
 
     def remember(self, sent_n: Vec3, force: Vec3) -> None:

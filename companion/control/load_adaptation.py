@@ -45,29 +45,27 @@ class LoadAdaptation:
         self._held = HoldTable(held)
         self.force_n: Vec3 = (0.0, 0.0, 0.0)
         """Estimated additional force that the rotors must produce, world frame."""
+        self._joints = tuple(range(manipulator.joint_count))
         nothing: Joints = (0.0,) * manipulator.joint_count
         self.moments_kg_m: Joints = nothing
         """Estimated first moments of the links about their joints, in addition to the nominal ones."""
         self.friction_nm: Joints = nothing
         self._levers: Matrix = (nothing,) * manipulator.joint_count
-        self._turning: Sequence[float] = nothing
+        self._direction: Sequence[float] = nothing
         self._wanted_rate_rad_s: Sequence[float] = nothing
 
-    def joint_torque_nm(self, levers_m_s2: Matrix, wanted_rate_rad_s: Sequence[float]) -> Sequence[float]:
-        """Return the torque of the estimated gravity and friction.
+    def gravity_torque_nm(self, levers_m_s2: Matrix) -> Joints:
+        """Return the joint torques that hold the estimated moments against gravity.
 
         Args:
             levers_m_s2: joint torques of gravity per first moment of each link (`Manipulator.gravity_levers_m_s2`).
-            wanted_rate_rad_s: joint rates that the target impedance requests.
         """
-        gravity, friction = self._manipulator.moment_torque_nm(levers_m_s2, self.moments_kg_m), self.friction_nm
-        turning, torque = [], []
-        for joint, rate in enumerate(wanted_rate_rad_s):
-            t = math.tanh(rate / FRICTION_RATE_RAD_S)
-            turning.append(t)
-            torque.append(gravity[joint] + friction[joint] * t)
-        self._turning, self._levers, self._wanted_rate_rad_s = turning, levers_m_s2, wanted_rate_rad_s
-        return torque
+        self._levers = levers_m_s2
+        return self._manipulator.moment_torque_nm(levers_m_s2, self.moments_kg_m)
+
+    def set_motion(self, wanted_rate_rad_s: Sequence[float], direction: Sequence[float]) -> None:
+        """Set the joint rates that the target impedance requests, and their directions, tanh(rate / FRICTION_RATE_RAD_S)."""
+        self._wanted_rate_rad_s, self._direction = wanted_rate_rad_s, direction
 
     def advance(self, dt_s: float, s: Chi, learn: bool) -> None:
         """Integrate one step with s held. Without `learn` the estimates do not change: on the ground and in saturation.
@@ -78,23 +76,44 @@ class LoadAdaptation:
         if not self.on or not learn:
             return
         decay, step = self._held[dt_s]
-
-        def updated(value: float, rate: float, error: float, low: float, high: float) -> float:
-            new = decay * value - step * rate * error
-            # NaN fails every comparison and leaves the value unchanged: an estimate could never recover from NaN.
-            return new if low <= new <= high else low if new < low else high if new > high else value
-
-        (x, y, z), (rx, ry, rz), n = self.force_n, self._rate_xyz, self._max_n
-        self.force_n = (updated(x, rx, s[0], -n, n), updated(y, ry, s[1], -n, n), updated(z, rz, s[2], -n, n))
+        (x, y, z), (rx, ry, rz), most = self.force_n, self._rate_xyz, self._max_n
+        x_new = decay * x - step * rx * s[0]
+        y_new = decay * y - step * ry * s[1]
+        z_new = decay * z - step * rz * s[2]
+        if not (-most <= x_new <= most and -most <= y_new <= most and -most <= z_new <= most):
+            x_new, y_new, z_new = (
+                _projected(x_new, x, -most, most),
+                _projected(y_new, y, -most, most),
+                _projected(z_new, z, -most, most),
+            )
+        self.force_n = (x_new, y_new, z_new)
+        rates, directions, s_joints = self._wanted_rate_rad_s, self._direction, s[6:]
+        by_moments = self._manipulator.projected_on_moments(self._levers, s_joints)
         moments, frictions = [], []
-        s_joints = s[6:]
-        projected = self._manipulator.projected_on_moments(self._levers, s_joints)
-        for joint, error in enumerate(s_joints):
-            most = self._max_kg_m
-            moments.append(updated(self.moments_kg_m[joint], self._rate_moment, projected[joint], -most, most))
-            friction, turning = self.friction_nm[joint], self._turning[joint]
+        rate_moment, most, rate_friction, most_nm = (
+            step * self._rate_moment,
+            self._max_kg_m,
+            step * self._rate_friction,
+            self._max_nm,
+        )
+        old_moments, old_frictions = self.moments_kg_m, self.friction_nm
+        for joint in self._joints:
+            moment, friction, error, direction = (
+                old_moments[joint],
+                old_frictions[joint],
+                s_joints[joint],
+                directions[joint],
+            )
+            new = decay * moment - rate_moment * by_moments[joint]
+            moments.append(new if -most <= new <= most else _projected(new, moment, -most, most))
             # The wanted rate + s is the measured rate.
-            if (self._wanted_rate_rad_s[joint] + error) * turning > FRICTION_RATE_RAD_S * abs(turning):
-                friction = updated(friction, self._rate_friction, error * turning, 0.0, self._max_nm)
+            if (rates[joint] + error) * direction > FRICTION_RATE_RAD_S * abs(direction):
+                new = decay * friction - rate_friction * (error * direction)
+                friction = new if 0.0 <= new <= most_nm else _projected(new, friction, 0.0, most_nm)
             frictions.append(friction)
         self.moments_kg_m, self.friction_nm = tuple(moments), tuple(frictions)
+
+
+def _projected(new: float, before: float, low: float, high: float) -> float:
+    """Return the new value within its bounds, or the value before if the new one is NaN, from which an estimate could never recover."""
+    return low if new < low else high if new > high else new if low <= new else before

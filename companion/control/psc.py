@@ -39,8 +39,9 @@ class PscController(ModelBasedLaw):
         self._integral_m_s2 = [0.0, 0.0, 0.0]
         self._commanded_n = 0.0
         lists = (config.arm_inertia_md, config.arm_damping_kd, config.arm_stiffness_kp)
-        self._arm_gains = tuple(zip(*(fitted(gains, len(vehicle.arm.joints)) for gains in lists), strict=True))
-        """M_d, K_d and K_p of each joint."""
+        joints = len(vehicle.arm.joints)
+        self._arm_gains = list(zip(range(joints), *(fitted(gains, joints) for gains in lists), strict=True))
+        """Number, M_d, K_d and K_p of each joint."""
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
         """Run one tick of `dt_s`; see `companion.control.types.Controller`."""
@@ -85,18 +86,17 @@ class PscController(ModelBasedLaw):
     ) -> tuple[Joints, Joints]:
         """Return tau_ext - tau_d and the motor torques, N m."""
         ext, desired = self._joint_torques_nm(state, force)
-        e_tau = tuple([torque - wanted for torque, wanted in zip(ext, desired, strict=True)])
         feed = reference.arm_acceleration_rad_s2
-        acceleration = [
-            feed[i] - (k_d * error_rate[6 + i] + k_p * error[6 + i] - e_tau[i]) / m_d
-            for i, (m_d, k_d, k_p) in enumerate(self._arm_gains)
-        ]
+        e_tau, acceleration = [], []
+        for joint, m_d, k_d, k_p in self._arm_gains:
+            e_tau.append(t := ext[joint] - desired[joint])
+            acceleration.append(feed[joint] - (k_d * error_rate[6 + joint] + k_p * error[6 + joint] - t) / m_d)
         terms = self._dynamics.arm_terms(state.arm_rad, state.arm_rate_rad_s)
         gravity = self._manipulator.gravity_torque_nm(state.arm_rad, state.attitude_wxyz)
         torque = []
-        for i, row in enumerate(terms.mass):
+        for joint, row in enumerate(terms.mass):
             inertial = 0.0
-            for mass, a in zip(row, acceleration, strict=True):
-                inertial += mass * a
-            torque.append(inertial + terms.coriolis[i] + gravity[i] - ext[i])
-        return e_tau, tuple(torque)
+            for other, a in enumerate(acceleration):
+                inertial += row[other] * a
+            torque.append(inertial + terms.coriolis[joint] + gravity[joint] - ext[joint])
+        return tuple(e_tau), tuple(torque)

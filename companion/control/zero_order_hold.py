@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeVar
 
 _MOST = 64
 """Largest number of stored step lengths: a simulation has a few, a real clock a new one in every tick."""
 
 
-class HoldTable(dict[float, tuple[float, ...]]):
+Held = TypeVar("Held")
+
+
+class HoldTable(dict[float, Held]):
     """Values that depend on the step length only, stored by its exact value.
 
     Args:
         compute: returns the values for a step length in seconds.
     """
 
-    def __init__(self, compute: Callable[[float], tuple[float, ...]]) -> None:
+    def __init__(self, compute: Callable[[float], Held]) -> None:
         super().__init__()
         self._compute = compute
 
-    def __missing__(self, dt_s: float) -> tuple[float, ...]:
+    def __missing__(self, dt_s: float) -> Held:
         """Compute and store the values of a new step length."""
         if len(self) >= _MOST:
             self.clear()
-        numbers = self[dt_s] = self._compute(dt_s)
-        return numbers
+        held = self[dt_s] = self._compute(dt_s)
+        return held

@@ -184,7 +184,7 @@ def instants(config: FlightConfig, ticks: int = 400) -> list[Instant]:
     # The same law with the options beyond the paper off: what they add to tau is the difference, and belongs to E.
     plain = AdaptiveController(law.model_copy(update=OPTIONS_OFF), config.vehicle, HOVER)
     machine = Machine(config=config)
-    m_d, weight = (np.array(gain)[ROWS] for gain in (law.inertia_md, law.row_weights_s))
+    m_d, phi, weight = (np.array(gain)[ROWS] for gain in (law.inertia_md, law.phi, law.row_weights_s))
     share = np.array([*law.base_compliance_xyz, 1.0, 1.0])
     fed = np.array([*law.force_feedforward_xyz, 0.0, 0.0])
     wanted_acceleration = np.array([*TARGET.acceleration_world_m_s2, *TARGET.arm_acceleration_rad_s2])
@@ -214,9 +214,7 @@ def instants(config: FlightConfig, ticks: int = 400) -> list[Instant]:
             a: Array = e_acceleration,
             after: Callable[[float], list[float]] = gamma_after,
         ) -> Array:
-            impedance = Impedance(law, 2)
-            impedance.gamma = after(h)
-            return np.array(impedance.sliding(wide(e + h * v + 0.5 * h * h * a), wide(v + h * a)))[ROWS]
+            return np.array(v + h * a + phi * (e + h * v + 0.5 * h * h * a) - np.array(after(h))[ROWS])
 
         s = np.array(log.sliding)[ROWS]
         norm = max(float(np.linalg.norm(weight * s)), law.boundary_layer)
@@ -358,7 +356,7 @@ def fly(
     lost_s = None
     for tick in range(round(duration_s / DT_S)):
         impedance.gamma = list(gamma.tolist())
-        s = np.array(impedance.sliding(e.tolist(), rate.tolist()))
+        s = rate + phi * e - gamma
         norm, x = float(np.linalg.norm(s)), float(np.linalg.norm([e, rate]))
         regressor = (1.0, x, x * x, min(float(np.linalg.norm(acceleration)), law.acceleration_cap))
         dtau = robust(adaptation.rho(regressor), s, max(norm, law.boundary_layer))

@@ -17,7 +17,7 @@ from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.arm_model import manipulator_of
 from companion.control.load_adaptation import LoadAdaptation
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import IDENTITY_QUAT, ControlLog, Joints, Reference
+from companion.model.types import IDENTITY_QUAT, ControlLog, Joints, Matrix, Reference
 from tests.control.states import POSE, ZERO, at
 from tests.support import tool_of
 
@@ -42,6 +42,14 @@ REFERENCE = Reference(
 def law(**changes: Any) -> AdaptiveConfig:
     assert isinstance(CONFIG.controller, AdaptiveConfig)
     return AdaptiveConfig.model_validate(CONFIG.controller.model_dump() | changes)
+
+
+def torque_nm(load: LoadAdaptation, levers_m_s2: Matrix, wanted_rate_rad_s: Joints) -> Joints:
+    """The joint torques of the estimated gravity and friction, at a wanted motion that the load is told."""
+    direction = tuple(math.tanh(rate / 0.1) for rate in wanted_rate_rad_s)
+    load.set_motion(wanted_rate_rad_s, direction)
+    gravity = load.gravity_torque_nm(levers_m_s2)
+    return tuple(g + f * d for g, f, d in zip(gravity, load.friction_nm, direction, strict=True))
 
 
 def test_a_constant_force_is_cancelled_and_s_returns_to_zero() -> None:
@@ -77,7 +85,7 @@ def test_moments_and_friction_are_found_while_the_arm_moves() -> None:
         levers = MANIPULATOR.gravity_levers_m_s2(angle, (0.0, 0.0, GRAVITY_M_S2))
         turning = np.tanh(np.array(rate) / 0.1)
         needed = np.array(levers) @ moments + friction * turning
-        given_nm = np.array(load.joint_torque_nm(levers, rate))
+        given_nm = np.array(torque_nm(load, levers, rate))
         s += DT_S / 0.1 * (given_nm - needed - 1.0 * s)
         load.advance(DT_S, (*[0.0] * 6, float(s[0]), float(s[1])), True)
     np.testing.assert_allclose(load.moments_kg_m, moments, rtol=0.05)
@@ -104,7 +112,7 @@ def test_static_friction_that_holds_a_joint_with_an_error_does_not_raise_the_fri
     load = LoadAdaptation(law(friction_rate=0.5), MANIPULATOR)
     s = held_nm
     for _ in range(400):
-        load.joint_torque_nm(((0.0, 0.0), (0.0, 0.0)), (-s, -s))
+        torque_nm(load, ((0.0, 0.0), (0.0, 0.0)), (-s, -s))
         load.advance(DT_S, (*[0.0] * 6, s, s), True)
     assert load.friction_nm == (0.0, 0.0)
 
@@ -114,7 +122,7 @@ def test_friction_of_a_joint_that_turns_slower_than_wanted_grows_by_the_integral
     load = LoadAdaptation(law(friction_rate=0.5), MANIPULATOR)
     s = -0.05 * math.copysign(1.0, rate_rad_s)
     for _ in range(200):
-        load.joint_torque_nm(((0.0, 0.0), (0.0, 0.0)), (rate_rad_s - s, rate_rad_s - s))
+        torque_nm(load, ((0.0, 0.0), (0.0, 0.0)), (rate_rad_s - s, rate_rad_s - s))
         load.advance(DT_S, (*[0.0] * 6, s, s), True)
     grown_nm = 0.5 * 200 * DT_S * 0.05 * math.tanh(0.45 / 0.1)
     assert load.friction_nm == pytest.approx((grown_nm, grown_nm), rel=1e-9)
@@ -128,7 +136,7 @@ def test_estimates_stay_inside_their_bounds_for_any_input(inputs: list[tuple[flo
     config = law(load_rate_xyz=(5.0, 5.0, 20.0), moment_rate=1.0, friction_rate=1.0)
     load = LoadAdaptation(config, MANIPULATOR)
     for s0, s1, s2, s6, s7, lever, rate in inputs:
-        load.joint_torque_nm(((lever, -lever), (0.0, lever)), (rate, -rate))
+        torque_nm(load, ((lever, -lever), (0.0, lever)), (rate, -rate))
         load.advance(DT_S, (s0, s1, s2, 0.0, 0.0, 0.0, s6, s7), True)
         assert max(map(abs, load.force_n)) <= config.load_max_n
         assert max(map(abs, load.moments_kg_m)) <= config.moment_max_kg_m
@@ -157,14 +165,14 @@ def test_adaptive_loads_and_observer_hold_while_the_ground_may_carry_a_part_of_t
 
 def test_nothing_is_learned_in_saturation() -> None:
     load = LoadAdaptation(law(load_rate_xyz=(5.0, 5.0, 20.0), moment_rate=1.0, friction_rate=1.0), MANIPULATOR)
-    load.joint_torque_nm(((1.0, 1.0), (0.0, -1.0)), (1.0, 1.0))
+    torque_nm(load, ((1.0, 1.0), (0.0, -1.0)), (1.0, 1.0))
     load.advance(DT_S, (1.0,) * 8, False)
     assert (load.force_n, load.moments_kg_m, load.friction_nm) == ((0.0, 0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
 
 
 def test_a_sample_that_is_not_a_number_leaves_the_estimates() -> None:
     load = LoadAdaptation(law(load_rate_xyz=(5.0, 5.0, 20.0), moment_rate=1.0, friction_rate=1.0), MANIPULATOR)
-    load.joint_torque_nm(((1.0, 1.0), (0.0, -1.0)), (1.0, 1.0))
+    torque_nm(load, ((1.0, 1.0), (0.0, -1.0)), (1.0, 1.0))
     load.advance(DT_S, (-1.0,) * 8, True)
     before = (load.force_n, load.moments_kg_m, load.friction_nm)
     load.advance(DT_S, (math.nan,) * 8, True)
