@@ -224,7 +224,7 @@ class Scene:
         *joints, net = self._world(pose, self._arm_body_m(pose.arm_rad))
         if not joints:
             return parts
-        length_m = math.dist(net, joints[-1])
+        length_m = max(math.dist(net, joints[-1]), 1e-6)
         wrist = net + (joints[-1] - net) * min(1.0, self._net_radius_m / length_m)
         links = [*pairwise(joints), (joints[-1], wrist)]
         parts.append(

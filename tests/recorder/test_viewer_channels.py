@@ -15,7 +15,7 @@ from mcap.writer import Writer
 from msgspec.structs import fields, replace
 
 from companion.analysis.log import FlightLog
-from companion.config.loader import load_flight
+from companion.config.loader import load_flight, load_vehicle
 from companion.control.arm_model import manipulator_of
 from companion.model.codec import Record, differences
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
@@ -24,7 +24,7 @@ from companion.model.types import Inputs, Joints, MocapPose, Outputs, Quat, Sent
 from companion.recorder.log_file import LogFile
 from companion.recorder.log_writer import LogWriter
 from companion.recorder.viewer_scene import machine_of, path_of
-from tests.machines import vehicle_with_joints
+from tests.machines import overrides_with_joints
 from tests.recorder.flights import EPOCH_NS, Row, config_json, tethered
 from tests.recorder.viewers import Seen, Viewed, view
 from tests.support import tether_of
@@ -109,9 +109,11 @@ def test_the_frames_are_where_the_arm_s_kinematics_have_them(tmp_path: Path) -> 
         assert tuple(e + a for e, a in zip(elbow, along, strict=True)) == pytest.approx(position, abs=1e-12)
 
 
-@pytest.mark.parametrize("count", [0, 1, 4])
-def test_every_link_has_a_frame_and_a_shape_and_an_absent_arm_none(tmp_path: Path, count: int) -> None:
-    vehicle = vehicle_with_joints(count)
+@pytest.mark.parametrize(("count", "change"), [(0, []), (1, []), (4, ["vehicle.arm.joints[0].axis=[0, 0, 1]"])])
+def test_every_link_has_a_frame_and_a_shape_and_an_absent_arm_none(
+    tmp_path: Path, count: int, change: list[str]
+) -> None:
+    vehicle = load_vehicle("tarot650_2r", [*overrides_with_joints(count), *change])
     config = json.dumps({"vehicle": json.loads(vehicle.model_dump_json())})
     angles = (1.2, 0.4, -0.3, 0.9)[:count]
     row = moved(still()[0], (0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), angles)

@@ -8,12 +8,13 @@ import random
 import msgspec
 import pytest
 
+from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.model.types import ArmState, Inputs
 from companion.safety.gate import Gate
 from companion.safety.tether_shape import Clearance
-from tests.machines import vehicle_with_joints
+from tests.machines import overrides_with_joints, vehicle_with_joints
 from tests.safety.healthy import flying, healthy, standing, watched
 from tests.support import tether_of
 
@@ -105,6 +106,18 @@ def test_no_point_of_the_arm_is_nearer_to_the_line_than_the_clearance_says(count
         shoulder, *others = (*manipulator.joints_body_m(angles), manipulator.net_body_m(angles))
         reach_m = max(math.dist(shoulder, point) for point in others)
         assert clearance.least_m((0.0, -1.0, 0.0), None, angles) <= 1.0 - reach_m + 1e-9
+
+
+def test_an_arm_that_leaves_the_plane_is_a_ball_about_its_shoulder() -> None:
+    yaw = ["vehicle.arm.joints[0].axis=[0, 0, 1]"]
+    vehicle = load_vehicle("tarot650_2r", [*overrides_with_joints(2), *yaw])
+    shoulder, reach_m = vehicle.arm.shoulder_body_m, vehicle.arm.reach_m + vehicle.tip_radius_m
+    away = (0.0, reach_m + 0.2, shoulder[2])
+    outside = Clearance(vehicle, tether_of(vehicle).model_copy(update={"attachment_body_m": away}))
+    assert outside.judges_arm
+    assert outside.least_m((0.0, -1.0, 0.0), None, (1.0, 0.5)) == pytest.approx(-reach_m)
+    inside = tether_of(vehicle).model_copy(update={"attachment_body_m": (0.0, 0.9 * reach_m, shoulder[2])})
+    assert not Clearance(vehicle, inside).judges_arm
 
 
 def test_without_an_arm_the_tether_is_judged_by_the_rotors_alone() -> None:

@@ -114,6 +114,8 @@ class Scene(Record, frozen=True, kw_only=True):
     """Position of each rotor; empty in messages of version 0.1.0."""
     ground_clearance_m: float
     shoulder_body_m: Vec3
+    link_lengths_m: Joints
+    """Distance from each joint to the next one, and from the last joint to the net."""
     links_body_m: tuple[Vec3, ...]
     """Vector from each joint to the next one, and from the last joint to the net, in the body frame at joint angles 0."""
     joint_axes_body: tuple[Vec3, ...]

@@ -40,6 +40,7 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
         rotors_body_m=airframe.rotor_layout.positions_body_m,
         ground_clearance_m=airframe.ground_clearance_m,
         shoulder_body_m=skeleton.shoulder_body_m,
+        link_lengths_m=tuple(math.hypot(*link) for link in skeleton.links_body_m),
         links_body_m=skeleton.links_body_m,
         joint_axes_body=skeleton.joint_axes,
         net_radius_m=vehicle.tool.net_radius_m if vehicle.tool is not None else None,

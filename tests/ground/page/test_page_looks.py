@@ -198,9 +198,9 @@ def test_the_camera_moves_by_mouse_wheel_and_keys(page: Page) -> None:
     assert len(set(seen)) == 7
 
 
-@pytest.mark.parametrize("count", [1, 2, 4])
-def test_the_arm_is_drawn_as_the_controller_knows_it(geometry: Page, count: int) -> None:
-    config = load_flight(CATCH, overrides=overrides_with_joints(count))
+@pytest.mark.parametrize(("count", "change"), [(1, []), (2, []), (4, ["vehicle.arm.joints[0].axis=[0, 0, 1]"])])
+def test_the_arm_is_drawn_as_the_controller_knows_it(geometry: Page, count: int, change: list[str]) -> None:
+    config = load_flight(CATCH, overrides=[*overrides_with_joints(count), *change])
     arm = manipulator_of(config.vehicle)
     angles = list(itertools.product((-0.5, 0.4, 2.9), repeat=count))
     script = "const { armBody } = await import('/geometry.js'); return a.map((q) => armBody(scene, q));"
