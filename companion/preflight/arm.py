@@ -23,7 +23,7 @@ DEVICE = Check(
 MODEL = Check(
     "arm.model",
     "servos",
-    "the models of `arm.joints[].servo` (register 0)",
+    "the models of `arm.joints[].servo` (register 0); a 330 warns, because it measures the current of its supply",
     "other models have a different torque constant and different registers",
 )
 FIRMWARE = Check(
@@ -130,10 +130,14 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
     kinds = [joint.kind for joint in vehicle.arm.joints]
     read = ", ".join(f"id {servo.servo_id}: {model_text(servo.model)}" for servo in servos)
     wanted = _each([kind.name for kind in kinds])
-    fix = "install the configured servo, or correct arm.joints[].servo_id or arm.joints[].servo"
-    yield MODEL.row(
-        all(servo.model == kind.number for servo, kind in zip(servos, kinds, strict=True)), read, wanted, fix
-    )
+    if any(servo.model != kind.number for servo, kind in zip(servos, kinds, strict=True)):
+        fix = "install the configured servo, or correct arm.joints[].servo_id or arm.joints[].servo"
+        yield MODEL.bad(read, wanted, fix)
+    elif any(kind.supply_current for kind in kinds):
+        fix = "a 330 measures the current of its supply, so that its torque is inexact: measure it with companion arm friction"
+        yield MODEL.doubtful(read, wanted, fix)
+    else:
+        yield MODEL.good(read, wanted)
     yield firmware(FIRMWARE, [(kind, servo.firmware) for servo, kind in zip(servos, kinds, strict=True)])
     modes = [servo.operating_mode for servo in servos]
     yield _equal(

@@ -141,6 +141,16 @@ def test_a_constant_of_no_such_servo_is_not_proposed(vehicle: Vehicle) -> None:
     assert any("implausible for an XM430-W210" in note for note in found.notes)
 
 
+def test_each_model_of_servo_has_a_constant_of_its_own() -> None:
+    names = [f"vehicle.arm.joints[0].{key}" for key in ("servo=XM540-W270", "velocity_max_deg_s=180")]
+    mixed = load_vehicle(SHIPPED, [*names, "vehicle.arm.torque_per_amp_nm_a=null"])
+    found = fit(swept(mixed, k=(2.2, 1.3)), mixed)
+    first, second = found.torque_constants_nm_a
+    assert first is not None and second is not None and found.torque_per_amp_nm_a is None
+    assert (first.value, second.value) == (pytest.approx(2.2, rel=0.03), pytest.approx(1.3, rel=0.03))
+    assert found.changes(mixed).keys() == {("arm", "joints", 0, "torque_per_amp_nm_a")} and found.notes == ()
+
+
 def test_a_machine_that_is_not_level_is_reported(vehicle: Vehicle) -> None:
     found = fit(swept(vehicle, off_deg=6.0, noise_a=0.003), vehicle)
     assert any("gravity acts as if the arm were turned" in note for note in found.notes)

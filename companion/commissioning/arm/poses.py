@@ -97,7 +97,13 @@ def steps_of(arm: Arm) -> tuple[Step, ...]:
 
 def _steps_by_angle(arm: Arm) -> tuple[Step, ...]:
     """Return the steps for an arm other than the planar one of two joints: only the vehicle file defines its directions."""
-    pose = [max(low, min(high, 0.0)) for low, high in (joint.angle_deg for joint in arm.joints)]
+    others = [0.0] * (len(arm.joints) - 1)
+    within = [
+        angles for angles in ([first, *others] for first, _ in _STRAIGHT_DEG) if all(map(_within, arm.joints, angles))
+    ]
+    pose = (
+        within[0] if within else [max(low, min(high, 0.0)) for low, high in (joint.angle_deg for joint in arm.joints)]
+    )
     steps = [
         Step(
             name="start",
