@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from pathlib import Path
 
 import pytest
 
@@ -14,6 +15,7 @@ from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind, Quat, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
+from tests.support import CATCH, SHORT_CATCH
 
 MASS_KG = 3.0
 START, TRUE = 0.5, 0.45
@@ -113,13 +115,13 @@ def test_it_is_bounded(thrust: float, bound: float) -> None:
 # -- whole flights in the fast loop ----------------------------------------------------------------------------------------------
 
 
-def flown(error: float, adapt: bool = True, faults: str = "[]") -> FastResult:
-    result = FastFlight(configured(error, adapt, faults)).run()
+def flown(error: float, adapt: bool = True, faults: str = "[]", mission: Path = CATCH) -> FastResult:
+    result = FastFlight(configured(error, adapt, faults, mission)).run()
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     return result
 
 
-def configured(error: float, adapt: bool, faults: str = "[]") -> SitlConfig:
+def configured(error: float, adapt: bool, faults: str = "[]", mission: Path = CATCH) -> SitlConfig:
     """Without the law's own adaptive force, which would make good for a wrong hover thrust by itself."""
     overrides = (
         "controller.load_rate_xyz=[0, 0, 0]",
@@ -127,7 +129,7 @@ def configured(error: float, adapt: bool, faults: str = "[]") -> SitlConfig:
         f"vehicle.airframe.hover_thrust_adapt={str(adapt).lower()}",
         f"world.faults={faults}",
     )
-    return load_sitl("configs/missions/catch.yaml", preset="recommended", overrides=overrides)
+    return load_sitl(mission, preset="recommended", overrides=overrides)
 
 
 @cache
@@ -155,14 +157,14 @@ def test_a_wrong_parameter_is_flown_out(error: float) -> None:
 
 
 def test_switched_off_it_stays_at_the_parameter() -> None:
-    result = flown(0.1, adapt=False)
+    result = flown(0.1, adapt=False, mission=SHORT_CATCH)
     assert {o.control.hover_thrust for o in result.outputs if o.control} == {true_hover_thrust() * 1.1}
-    assert max(abs(e) for e in height_errors_m(result, 4.0)) > 0.04
+    assert max(abs(e) for e in height_errors_m(result, 3.0)) > 0.04
 
 
 def test_a_catch_without_force_sensor_does_not_move_it() -> None:
     """The sensor dies after the catch: what hangs there can no longer be told from a weak motor."""
-    result = flown(0.0, faults="[{kind: force_loss, t_s: 9.0}]")
+    result = flown(0.0, faults="[{kind: force_loss, t_s: 4.7}]", mission=SHORT_CATCH)
     lost_s = next(e.t_s for o in result.outputs for e in o.events if e.id == "force_lost")
     later = {o.control.hover_thrust for o in result.outputs if o.control and o.t_s > lost_s + 0.1}
     assert len(later) == 1

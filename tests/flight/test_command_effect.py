@@ -92,8 +92,8 @@ def commanded(
 
 @cache
 def ordinary() -> Commanded:
-    """A flight without a command."""
-    return commanded()
+    """A low flight without a command."""
+    return commanded(sets=LOW)
 
 
 def off_its_way(since_s: float, until_s: float, x_m: float = 0.65) -> Change:
@@ -192,7 +192,7 @@ def test_too_low_to_hold_and_in_the_missions_own_landing() -> None:
     flown = commanded((3.9, HOLD), until_s=4.5)
     assert flown.effects == [(True, "too low to hold: landing")]
     begin_s = times_of(ordinary())["land"]
-    flown = commanded((begin_s + 0.5, HOLD), (begin_s + 1.0, RESUME))
+    flown = commanded((begin_s + 0.2, HOLD), (begin_s + 0.4, RESUME), sets=LOW)
     assert flown.effects == [(False, "hold rejected: the vehicle is landing"), (True, "the landing continues")]
     assert flown.outcome is Outcome.COMPLETED
 

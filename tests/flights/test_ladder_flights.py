@@ -134,8 +134,14 @@ TAUT = (
 """Taut on the last centimetres of the way up; the predicted stop, which would hold it before, is let by."""
 
 
+@cache
+def retracted() -> tuple[FastFlight, FastResult]:
+    flight = FastFlight(configured(*TAUT))
+    return flight, flight.run()
+
+
 def test_taut_it_goes_back_along_the_tether_and_lands() -> None:
-    result = flown(lambda i: i, *TAUT)
+    _, result = retracted()
     ids = event_ids(result)
     assert ids == ["takeoff", "tether_taut", "retract_done", "touchdown"]
     assert result.outputs[-1].outcome is Outcome.ABORTED
@@ -281,8 +287,7 @@ def test_no_command_answers_a_state_that_is_older_than_it_may_be(part: str) -> N
 
 def test_the_same_inputs_give_the_same_outputs_bit_for_bit_also_through_a_retract() -> None:
     """Through a hold: tests/flight/test_command_effect.py."""
-    flight = FastFlight(configured(*TAUT))
-    result = flight.run()
+    flight, result = retracted()
     core = FlightCore(flight.config)
     for i, o in zip(result.inputs, result.outputs, strict=True):
         assert differences(o, core.step(i)) is None

@@ -12,10 +12,13 @@ from companion.model.servos import WATCHDOG_ERROR
 from companion.model.types import Outcome
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
+from tests.support import LOW_HOVER
+
+LOW = tuple(f"{key}={value}" for key, value in LOW_HOVER.items())
 
 
 def configured(*overrides: str) -> SitlConfig:
-    return load_sitl("configs/missions/hover.yaml", overrides=("world.payload_kg=0", *overrides))
+    return load_sitl("configs/missions/hover.yaml", overrides=("world.payload_kg=0", *LOW, *overrides))
 
 
 @cache
@@ -78,10 +81,10 @@ def test_the_arm_delay_delays_the_currents_and_nothing_else() -> None:
 
 def test_a_silent_servo_lets_go_and_that_is_reported_when_it_answers_again() -> None:
     """As over the wire: the watchdog trips, and the driver restarts it and reports it in one state."""
-    result = flown("world.faults=[{kind: servo_loss, t_s: 4.0, duration_s: 0.12}]")
+    result = flown("world.faults=[{kind: servo_loss, t_s: 3.5, duration_s: 0.12}]")
     armed_s = next(i.t_s for i in result.inputs if i.status is not None and i.status.armed)
     told = [i.t_s - armed_s for i in result.inputs if i.arm is not None and i.arm.hardware_error != (0, 0)]
-    assert told == [pytest.approx(4.12, abs=0.011)] * len(told)
+    assert told == [pytest.approx(3.62, abs=0.011)] * len(told)
     assert len({i.arm.stamp_s for i in result.inputs if i.arm is not None and any(i.arm.hardware_error)}) == 1
     errors = {i.arm.hardware_error for i in result.inputs if i.arm is not None}
     assert errors == {(0, 0), (WATCHDOG_ERROR, 0)}

@@ -10,7 +10,7 @@ from companion.config.vehicle import Safety
 from companion.model.types import Outcome
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
-from tests.support import CATCH
+from tests.support import SHORT_CATCH
 
 LIMIT_M = Safety().mocap_inertial_m
 ONLY_VIBRATION = {
@@ -27,7 +27,7 @@ ONLY_VIBRATION = {
 
 def flown(amplitude_m_s2: float, hz: float, *faults: str) -> tuple[SitlConfig, FastFlight, FastResult]:
     config = load_sitl(
-        CATCH,
+        SHORT_CATCH,
         overrides=[
             "world.imu=" + json.dumps({**ONLY_VIBRATION, "vibration_m_s2": amplitude_m_s2, "vibration_hz": hz}),
             f"world.faults=[{', '.join(faults)}]",
@@ -39,13 +39,13 @@ def flown(amplitude_m_s2: float, hz: float, *faults: str) -> tuple[SitlConfig, F
 
 @pytest.mark.parametrize(("amplitude_m_s2", "hz"), [(10.0, 100.2), (10.0, 149.7)])
 def test_vibration_is_neither_drag_nor_snag(amplitude_m_s2: float, hz: float) -> None:
-    """A whole catch flight stays below a third of the limit. At 100 and 150 Hz samples of 200 Hz alias to nearly 0 Hz in
+    """A whole flight with a catch stays below a third of the limit. At 100 and 150 Hz samples of 200 Hz alias to nearly 0 Hz in
     hover, at 200 Hz those along the rotor axes do."""
     _, _, result = flown(amplitude_m_s2, hz)
     judged = [outputs.mocap_innovation_m for outputs in result.outputs if outputs.mocap_innovation_m]
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     assert "tether_snagged" not in {event.id for outputs in result.outputs for event in outputs.events}
-    assert len(judged) > 3000
+    assert len(judged) > 900
     assert max(judged) < LIMIT_M / 3.0
 
 

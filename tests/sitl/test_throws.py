@@ -28,6 +28,8 @@ TO_AND_FRO = (
     f"world.keep_s={KEEP_S}",
 )
 """The short catch, flown there and back: it may be repeated."""
+FIRST_MISSED = "world.faults=[{kind: payload_missed, t_s: 0, duration_s: 6, size: 0.5}]"
+"""The first of its throws goes beside the net."""
 
 
 def configured(*overrides: str, mission: str = "catch") -> SitlConfig:
@@ -102,8 +104,7 @@ def test_one_throw_is_one_throw_however_often_it_passes() -> None:
 
 def test_after_a_miss_the_next_pass_is_thrown_at() -> None:
     """The first throw goes beside the net; `missed` and `caught_t_s` are about that one."""
-    missed = "world.faults=[{kind: payload_missed, t_s: 0, duration_s: 12, size: 0.5}]"
-    result, world = flown(configured("mission.repeat=2", "world.throws=2", missed))
+    result, world = repeated("mission.repeat=2", "world.throws=2", FIRST_MISSED)
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     assert (world.payload.throws, world.payload.catches, world.payload.missed, world.payload.caught_t_s) == (
         2,

@@ -23,7 +23,8 @@ from sitl.world.effects.net import SETTLED_S, Bag
 from sitl.world.model import PAYLOAD_RADIUS_M, SECOND, SECOND_CATCH
 from sitl.world.payload import Ball
 from sitl.world.world import PHYSICS_DT_S, World
-from tests.support import tool_of
+from tests.sitl.test_throws import FIRST_MISSED, TO_AND_FRO
+from tests.support import SHORT_CATCH, tool_of
 
 Array = NDArray[np.float64]
 HOOP_M = 0.09
@@ -312,9 +313,15 @@ def test_two_payloads_lie_in_the_bag(vehicle: Vehicle) -> None:
 
 
 def test_a_flight_whose_payload_missed_flies_on_and_catches_the_next_one() -> None:
-    missed = "world.faults=[{kind: payload_missed, t_s: 0, duration_s: 12, size: 0.5}]"
-    overrides = ("mission.repeat=2", "world.throws=2", "world.net.on=true", missed)
-    flight = FastFlight(load_sitl("configs/missions/catch.yaml", overrides=overrides))
+    overrides = (
+        *TO_AND_FRO,
+        "world.catch_at_m=[0.2, 0]",
+        "mission.repeat=2",
+        "world.throws=2",
+        "world.net.on=true",
+        FIRST_MISSED,
+    )
+    flight = FastFlight(load_sitl(SHORT_CATCH, overrides=overrides))
     result, world = flight.run(), flight.plant.world
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     assert (world.payload.throws, world.payload.catches, world.payload.missed, world.payload.caught_t_s) == (
