@@ -1,7 +1,7 @@
 """`python -m tests.stages [STAGE ...]`: run the stages of `make test`, all of them, and sum them up.
 
-A stage that fails does not stop the others. Tests that compute run beside those that wait and fly, with the lowest priority. The last
-line counts tests; each check (format, lint, imports, types) counts as one.
+A stage that fails does not stop the others. Tests that compute, and the check of types, run beside tests that wait and fly, with the
+lowest priority. The last line counts tests; each check (format, lint, imports, types) counts as one.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ STAGES = (
         tests=True,
         beside=True,
     ),
-    Stage("types", (str(_BIN / "mypy"),), tests=False),
+    Stage("types", (str(_BIN / "mypy"),), tests=False, beside=True),
     Stage("waiting", (*_PYTEST, "--dist", "loadgroup", "-m", "waits", *_files_of("waits")), tests=True),
     Stage("flights", (*_PYTEST, "--dist", "loadgroup", "-m", "flight and not alone", *_files_of("flight")), tests=True),
     Stage("alone", (*_PYTEST, "-m", "alone", *_files_of("alone")), tests=True),
