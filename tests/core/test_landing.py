@@ -25,7 +25,7 @@ from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.fast.loop import FastFlight, FastResult
 from tests.safety.healthy import put
-from tests.support import CATCH, SHORT_CATCH
+from tests.support import HOVER, SHORT_CATCH
 
 replace = msgspec.structs.replace
 Change = Callable[[Inputs], Inputs]
@@ -46,7 +46,7 @@ class Spoiled(FastFlight):
     def _pose(self, frame: object) -> MocapPose:
         """The error comes in slowly, as a shifting volume would bring it; PX4 is reported the same."""
         pose = super()._pose(frame)  # type: ignore[arg-type]
-        share = min(1.0, max(0.0, (pose.stamp_s - 11.0) / 8.0))
+        share = min(1.0, max(0.0, (pose.stamp_s - 4.0) / 8.0))
         x, y, z = pose.position_world_m
         return replace(pose, position_world_m=(x, y, z + self._lift_m * share))
 
@@ -71,7 +71,7 @@ class Deaf:
 
 def flown(change: Change = lambda i: i, lift_m: float = 0.0, *, deaf: bool = False) -> tuple[FastFlight, FastResult]:
     # The error of the height takes 8 s to come.
-    flight = Spoiled(configured(CATCH if lift_m else SHORT_CATCH), change, lift_m)
+    flight = Spoiled(configured(HOVER if lift_m else SHORT_CATCH), change, lift_m)
     if deaf:
         flight.px4.land = Deaf(flight.px4)  # type: ignore[assignment]
     return flight, flight.run()
