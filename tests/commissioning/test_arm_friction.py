@@ -147,7 +147,7 @@ def test_each_model_of_servo_has_a_constant_of_its_own() -> None:
     found = fit(swept(mixed, k=(2.2, 1.3)), mixed)
     first, second = found.torque_constants_nm_a
     assert first is not None and second is not None and found.torque_per_amp_nm_a is None
-    assert (first.value, second.value) == (pytest.approx(2.2, rel=0.03), pytest.approx(1.3, rel=0.03))
+    assert (first.value, second.value) == pytest.approx((2.2, 1.3), rel=0.03)
     assert found.changes(mixed).keys() == {("arm", "joints", 0, "torque_per_amp_nm_a")} and found.notes == ()
 
 
