@@ -1,0 +1,21 @@
+"""A vehicle whose arm is a URDF file flies: yaw joint, three pitch joints, servos of two models."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from companion.sitl_config.loader import load_sitl
+from sitl.fast.loop import FastFlight
+
+CATCH_S = 10.5
+
+
+def test_an_arm_of_four_joints_from_a_urdf_catches_the_payload() -> None:
+    config = load_sitl("catch", vehicle_path="tarot650_4r", world="ideal", overrides=["world.payload_kg=0.2"])
+    outputs = FastFlight(config).run(limit_s=CATCH_S).outputs
+    assert "catch" in {event.id for output in outputs for event in output.events}
+    controls = [output.control for output in outputs if output.control is not None]
+    assert np.max(np.abs([control.error[:3] for control in controls[-200:]])) < 0.25
+    assert np.max(np.abs([control.error[6:] for control in controls])) < math.radians(20.0)
