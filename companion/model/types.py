@@ -191,7 +191,8 @@ class MocapPose(Record, frozen=True, kw_only=True):
 
 
 class ArmState(Record, frozen=True, kw_only=True):
-    """Joint state in the paper's angles: alpha_1 is measured from body +x downwards, alpha_2 turns link 2 in the opposite direction."""
+    """Joint state in the paper's angles: from the shoulder outwards. In the 2R arm, alpha_1 is measured from body
+    +x downwards, and alpha_2 turns link 2 in the opposite direction."""
 
     stamp_s: float
     """Flight clock at the end of the joint read."""
@@ -299,7 +300,7 @@ class ControlLog(Record, frozen=True, kw_only=True):
     """Adapted first moments of links 1 and 2 about their joints, in addition to the nominal moments; None if the law does not adapt
     them."""
     friction_estimate_nm: Joints | None = None
-    """Adapted friction of both joints; None if the law does not adapt it."""
+    """Adapted friction of each joint; None if the law does not adapt it."""
 
 
 class TetherState(Record, frozen=True, kw_only=True):

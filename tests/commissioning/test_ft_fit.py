@@ -10,12 +10,12 @@ import pytest
 from companion.commissioning.force_torque import fit as ft_fit
 from companion.commissioning.force_torque.fit import WeightFit
 from companion.config.loader import load_vehicle
-from companion.control.arm_model import manipulator_of
 from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.types import ForceSample, Joints, Quat, Vec3
 from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
 from companion.sitl_config.world import World
 from sitl.world.handling import HungWeight
+from tests.machines import overrides_with_joints
 from tests.support import ROOT
 
 VEHICLE = load_vehicle(ROOT / "configs/vehicles/tarot650_2r.yaml")
@@ -39,17 +39,24 @@ def fitted(
     off_n: Vec3 = (0.0, 0.0, 0.0),
 ) -> WeightFit:
     """Fit the readings of a sensor that has a bias and is mounted as `truth`; the vehicle file says `sensor_rpy_deg`."""
-    x, y, z = quat_rotate(quat_conjugate(truth), ft_fit.down_in_link2(arm_rad))
+    x, y, z = quat_rotate(quat_conjugate(truth), ft_fit.down_at_tip(VEHICLE, arm_rad))
     n = scale * 9.81 * WEIGHT_KG
     loaded_n = (1.0 + n * x + off_n[0], -2.0 + n * y + off_n[1], 30.0 + n * z + off_n[2])
-    return ft_fit.fit_weight((1.0, -2.0, 30.0), loaded_n, arm_rad, WEIGHT_KG, sensor_rpy_deg)
+    return ft_fit.fit_weight(
+        (1.0, -2.0, 30.0), loaded_n, ft_fit.down_at_tip(VEHICLE, arm_rad), WEIGHT_KG, sensor_rpy_deg
+    )
 
 
-def test_down_in_link_2_is_what_the_arm_says() -> None:
-    arm = manipulator_of(VEHICLE)
-    for arm_rad in (FOLDED, HANGING, (1.3, -0.1)):
-        body = quat_rotate(arm.sensor_attitude_body(arm_rad), ft_fit.down_in_link2(arm_rad))
-        assert body == pytest.approx((0.0, 0.0, -1.0), abs=1e-12)
+@pytest.mark.parametrize("rpy_deg", [[0, 0, 0], [90, 0, -30]])
+@pytest.mark.parametrize("arm_rad", [(1.9,), (1.3, -0.1), (1.3, -0.1, 0.4, 0.9)])
+def test_down_at_the_tip_is_along_the_last_link_as_far_as_that_points_down(
+    arm_rad: Joints, rpy_deg: list[float]
+) -> None:
+    """The elevation of the last link is the joint angles' sum, of which all but the first turn up."""
+    overrides = [*overrides_with_joints(len(arm_rad)), f"vehicle.tool.sensor_rpy_deg={rpy_deg}"]
+    below_rad = arm_rad[0] - sum(arm_rad[1:])
+    down = ft_fit.down_at_tip(load_vehicle("tarot650_2r", overrides), arm_rad)
+    assert down == pytest.approx((math.sin(below_rad), 0.0, -math.cos(below_rad)), abs=1e-12)
 
 
 @pytest.mark.parametrize("mounted_deg", [(0.0, 0.0, 0.0), (180.0, 0.0, 45.0)])

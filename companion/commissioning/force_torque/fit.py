@@ -1,6 +1,6 @@
 """Mounting and scale of the force sensor from a known weight on the net, and its drift at rest. Pure functions.
 
-Frames: link 2 (x outwards along the link, y along the joint axis) and the sensor, which is rotated relative to it by
+Frames: the last link's tip (x outwards; for a planar arm, y along the joint axes) and the sensor, which is rotated relative to it by
 `tool.sensor_rpy_deg`. A reading is the force of the surroundings on the tool side of the sensor.
 """
 
@@ -15,6 +15,7 @@ from typing import Any, Final
 from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.vehicle import Vehicle
+from companion.control.arm_model import manipulator_of
 from companion.model.check_row import Row
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
@@ -61,26 +62,32 @@ class WeightFit:
     """Value of `tool.sensor_rpy_deg` with that rotation."""
 
 
-def down_in_link2(arm_rad: Joints) -> Vec3:
-    """Return gravity's direction in link 2's frame for a level vehicle."""
-    half = 0.5 * (arm_rad[0] - arm_rad[1])
-    return quat_rotate((math.cos(half), 0.0, -math.sin(half), 0.0), (0.0, 0.0, -1.0))
+def down_at_tip(vehicle: Vehicle, arm_rad: Joints) -> Vec3:
+    """Return gravity's direction in the frame of the arm's tip for a level vehicle."""
+    rpy_deg = vehicle.tool.sensor_rpy_deg if vehicle.tool is not None else (0.0, 0.0, 0.0)
+    sensor = quat_rotate(quat_conjugate(manipulator_of(vehicle).sensor_attitude_body(arm_rad)), (0.0, 0.0, -1.0))
+    return quat_rotate(_mounting(rpy_deg), sensor)
 
 
-def fit_weight(empty_n: Vec3, loaded_n: Vec3, arm_rad: Joints, weight_kg: float, sensor_rpy_deg: Vec3) -> WeightFit:
+def _mounting(sensor_rpy_deg: Vec3) -> Quat:
+    roll, pitch, yaw = map(math.radians, sensor_rpy_deg)
+    return quat_from_euler_zyx(roll, pitch, yaw)
+
+
+def fit_weight(empty_n: Vec3, loaded_n: Vec3, down_tip: Vec3, weight_kg: float, sensor_rpy_deg: Vec3) -> WeightFit:
     """Return the sensor's scale and mounting. The mounting is the one of the 24 rotations by multiples of 90 deg that best fits the
     direction of the weight; the configured mounting is kept if it is within 1 deg of the best.
 
     Args:
         empty_n: mean reading with the net empty, sensor frame.
         loaded_n: mean reading with the weight on the net, sensor frame.
-        arm_rad: joint angles.
+        down_tip: gravity's direction in the frame of the arm's tip.
         weight_kg: mass of the weight.
         sensor_rpy_deg: the vehicle file's mounting.
     """
-    mounted: Quat = quat_from_euler_zyx(*(math.radians(angle) for angle in sensor_rpy_deg))
+    mounted = _mounting(sensor_rpy_deg)
     measured = (loaded_n[0] - empty_n[0], loaded_n[1] - empty_n[1], loaded_n[2] - empty_n[2])
-    expected = quat_rotate(quat_conjugate(mounted), down_in_link2(arm_rad))
+    expected = quat_rotate(quat_conjugate(mounted), down_tip)
     off_deg = {turn: math.degrees(angle_rad(turn.vector(expected), measured)) for turn in ROTATIONS}
     best = min(ROTATIONS, key=off_deg.__getitem__)
     if off_deg[IDENTITY] <= off_deg[best] + 1.0:
@@ -109,7 +116,7 @@ def rows(fit: WeightFit) -> Iterator[Row]:
     read = f"{fit.off_deg:.0f} deg from the direction according to tool.sensor_rpy_deg"
     fix = (
         "hang the weight freely from the net's centre; check the arm's angles (companion arm zero); level the vehicle; raise "
-        "link 2 to about 30 deg below level, and repeat"
+        "the last link to about 30 deg below level, and repeat"
     )
     if changes(fit):
         rpy = ", ".join(f"{angle:g}" for angle in fit.rpy_deg)
@@ -118,7 +125,9 @@ def rows(fit: WeightFit) -> Iterator[Row]:
         )
     yield DIRECTION.row(fit.off_deg <= DIRECTION_MAX_DEG, read, f"within {DIRECTION_MAX_DEG:g} deg", fix)
     read = f"{len(fit.others) or 'no'} other rotations by multiples of 90 deg fit the weight as well"
-    yield POSE.row(not fit.others, read, "none", "repeat with link 2 about 20 to 35 deg below level, not straight down")
+    yield POSE.row(
+        not fit.others, read, "none", "repeat with the last link about 20 to 35 deg below level, not straight down"
+    )
 
 
 def changes(fit: WeightFit) -> dict[Location, Data]:

@@ -128,7 +128,7 @@ def judge(seen: Watched, vehicle: Vehicle) -> Report:
     fit = ft_fit.fit_weight(
         mean_force_n(seen.empty),
         mean_force_n(seen.loaded),
-        seen.loaded_arm_rad,
+        ft_fit.down_at_tip(vehicle, seen.loaded_arm_rad),
         seen.weight_kg,
         tool_of(vehicle).sensor_rpy_deg,
     )
