@@ -87,6 +87,8 @@ def _problems(error: ValidationError, schema: _Node, document: Document) -> list
                 or_null = ", or null if there is none" if {"type": "null"} in options else ""
                 missing.append((at, describe(node, schema) + or_null))
                 continue
+        if detail["type"] == "too_short" and any(known[: len(at)] == at for known in reported):
+            continue  # Pydantic counts the valid items only
         if at not in reported:
             reported.add(at)
             problems.append(_value_problem(detail, at, node, schema, document))
@@ -145,8 +147,9 @@ def describe(node: _Node | None, schema: _Node) -> str:
             alike = len(set(items)) == 1
             return f"a list of {len(items)} {_plural(items[0]) if alike else 'values'}"
         least, most = node.get("minItems", 0), node.get("maxItems")
-        if most is not None:
-            return f"a list of {least} to {most} {_plural(describe(node.get('items'), schema))}"
+        each = _plural(describe(node.get("items"), schema))
+        if most is not None and each.startswith("numbers"):
+            return f"a list of {least} to {most} {each}"
         return f"a list of at least {least} items" if least else "a list"
     if kind == "object":
         keys = node.get("properties", {})
