@@ -39,12 +39,15 @@ _GAINS = (
 _MIXED_GAINS = (
     "MC_ROLLRATE_P", "MC_ROLLRATE_I", "MC_ROLLRATE_D", "MC_PITCHRATE_P", "MC_PITCHRATE_I", "MC_PITCHRATE_D",
 )  # fmt: skip
+_MOTOR_1 = 101
+"""PX4's output function of the first motor."""
 
 
 def rotor_geometry(airframe: Airframe) -> dict[str, Value]:
-    """Return MAV_TYPE and the parameters CA_*: each rotor's position relative to the body origin (FRD, m) and its moment ratio.
+    """Return MAV_TYPE, the parameters CA_*, and the outputs of the rotors.
 
-    The ratio (CA_ROTORn_KM) is positive for counter-clockwise rotors.
+    Positions are relative to the body origin (FRD, m). The moment ratio (CA_ROTORn_KM) is positive for counter-clockwise rotors.
+    PX4's simulator sends the outputs PWM_MAIN in HIL_ACTUATOR_CONTROLS.
     """
     layout = airframe.rotor_layout
     found: dict[str, Value] = {"CA_AIRFRAME": 0, "CA_ROTOR_COUNT": layout.count, "MAV_TYPE": mav_type(layout.count)}
@@ -53,6 +56,7 @@ def rotor_geometry(airframe: Airframe) -> dict[str, Value]:
         found[f"CA_ROTOR{i}_PY"] = -y
         found[f"CA_ROTOR{i}_PZ"] = -z
         found[f"CA_ROTOR{i}_KM"] = spin * airframe.yaw_torque_per_thrust_m
+        found[f"PWM_MAIN_FUNC{i + 1}"] = _MOTOR_1 + i
     return found
 
 

@@ -118,6 +118,7 @@ def test_the_geometry_of_a_hexacopter_is_that_of_px4s_airframe() -> None:
     assert (geometry["CA_ROTOR_COUNT"], geometry["MAV_TYPE"]) == (6, 13)
     assert (geometry["CA_ROTOR0_PX"], geometry["CA_ROTOR0_PY"]) == (0.0, 0.5)
     assert (geometry["CA_ROTOR5_PX"], geometry["CA_ROTOR5_PY"]) == pytest.approx((-0.433, -0.25), abs=1e-3)
+    assert [geometry[f"PWM_MAIN_FUNC{i + 1}"] for i in range(6)] == [101, 102, 103, 104, 105, 106]
     assert [geometry[f"CA_ROTOR{i}_KM"] for i in range(6)] == [-0.025, 0.025, -0.025, 0.025, 0.025, -0.025]
 
 
