@@ -17,7 +17,7 @@ from typing import ClassVar
 from companion.config.controller import AdaptiveConfig, fitted
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import dynamics_of, manipulator_of
-from companion.control.common import Actuation, DesiredForce, ForceFilter, tracking_errors
+from companion.control.common import Actuation, DesiredForce, ForceFilter, base_errors
 from companion.control.compensation import FRICTION_RATE_RAD_S, Compensation
 from companion.control.impedance import Impedance
 from companion.control.load_adaptation import LoadAdaptation
@@ -125,8 +125,8 @@ class AdaptiveController:
         learn = state.airborne and not clipped_before
         self._compensation.observe(dt_s, state, learn)
         body_x, body_z = body_x_z_axes_world(state.attitude_wxyz)
-        error, error_rate = tracking_errors(state, reference, math.atan2(body_x[1], body_x[0]))
-        s, norm_s, x, norm_a = self._sliding(dt_s, state, error, error_rate)
+        yaw_rad = math.atan2(body_x[1], body_x[0])
+        error, error_rate, s, norm_s, x, norm_a = self._sliding(dt_s, state, reference, yaw_rad)
         cap = self._acceleration_cap
         regressor: Vec4 = (1.0, x, x * x, cap if norm_a > cap else norm_a)
         rho = adaptation.rho(regressor)
@@ -162,8 +162,10 @@ class AdaptiveController:
             attitude_wxyz=sent.attitude_wxyz, collective_n=sent.collective_n, arm_torque_nm=sent.arm_torque_nm, log=log
         )
 
-    def _sliding(self, dt_s: float, state: PlantState, error: Chi, error_rate: Chi) -> tuple[Chi, float, float, float]:
-        """Return s = e' + Phi e - gamma (eq. s_general), ||S s||, ||S [e; e']|| and ||S chi_dd||.
+    def _sliding(
+        self, dt_s: float, state: PlantState, reference: Reference, yaw_rad: float
+    ) -> tuple[Chi, Chi, Chi, float, float, float]:
+        """Return e and e' as `tracking_errors`, s = e' + Phi e - gamma (eq. s_general), ||S s||, ||S [e; e']|| and ||S chi_dd||.
 
         chi_dd is low-pass filtered, exactly for a held input; the filter starts at its first sample. The acceleration of the base is
         measured, that of the joints differentiated numerically.
@@ -176,6 +178,8 @@ class AdaptiveController:
         rates_before, self._arm_rate_rad_s = self._arm_rate_rad_s, rates
         a0, a1, a2 = before[0], before[1], before[2]
         a0, a1, a2 = a0 + k * (x - a0), a1 + k * (y - a1), a2 + k * (z - a2)
+        error, error_rate = base_errors(state, reference, yaw_rad)
+        angles, angles_d, rates_d = state.arm_rad, reference.arm_rad, reference.arm_rate_rad_s
         e0, e1, e2, e5 = error[0], error[1], error[2], error[5]
         v0, v1, v2, v5 = error_rate[0], error_rate[1], error_rate[2], error_rate[5]
         p0, p1, p2, p5 = self._base_phi
@@ -188,16 +192,20 @@ class AdaptiveController:
         a_squared = w0 * a0 * a0 + w1 * a1 * a1 + w2 * a2 * a2
         acceleration = [a0, a1, a2]
         for joint, row, p0, w in self._joint_weights:
-            e0, v0, a0 = error[row], error_rate[row], before[3 + joint]
+            rate = rates[joint]
+            e0, v0, a0 = angles[joint] - angles_d[joint], rate - rates_d[joint], before[3 + joint]
+            error.append(e0)
+            error_rate.append(v0)
             s0 = v0 + p0 * e0 - gamma[row]
             s.append(s0)
-            a0 += k * ((rates[joint] - rates_before[joint]) / dt_s - a0)
+            a0 += k * ((rate - rates_before[joint]) / dt_s - a0)
             acceleration.append(a0)
             s_squared += w * s0 * s0
             x_squared += w * (e0 * e0 + v0 * v0)
             a_squared += w * a0 * a0
         self._acceleration = acceleration
-        return tuple(s), math.sqrt(s_squared), math.sqrt(x_squared), math.sqrt(a_squared)
+        norms = (math.sqrt(s_squared), math.sqrt(x_squared), math.sqrt(a_squared))
+        return tuple(error), tuple(error_rate), tuple(s), *norms
 
     def _base_force(self, s: Chi, robust: float, error_rate: Chi, reference: Reference, force: Vec3) -> Vec3:
         """Return the force on the base: tau with the adaptive load and the compensation, plus the weight.
@@ -241,7 +249,7 @@ class AdaptiveController:
         (xx, xy, xz), (zx, zy, zz) = body_x, body_z
         yz, arm_rad = zx * xy - zy * xx, state.arm_rad
         up = (GRAVITY_M_S2 * xz, GRAVITY_M_S2 * yz, GRAVITY_M_S2 * zz)
-        (jx, jy, jz), gravity = self._manipulator.joint_terms(arm_rad, up)
+        (jx, jy, jz), gravity, levers = self._manipulator.joint_terms_and_levers(arm_rad, up)
         (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = force, self._desired.world_n, self._compliance
         f_x, f_z = xx * f0 + xy * f1 + xz * f2, zx * f0 + zy * f1 + zz * f2
         d_x, d_z = xx * d0 + xy * d1 + xz * d2, zx * d0 + zy * d1 + zz * d2
@@ -250,13 +258,10 @@ class AdaptiveController:
             yx, yy = zy * xz - zz * xy, zz * xx - zx * xz
             f_y, d_y = yx * f0 + yy * f1 + yz * f2, yx * d0 + yy * d1 + yz * d2
         gamma, feed, rates = self._impedance.gamma, reference.arm_acceleration_rad_s2, state.arm_rate_rad_s
-        load, gravity_nominal = self._load, self._gravity_nominal
+        load, loaded, gravity_nominal = self._load, self._load.on, self._gravity_nominal
         dynamics, fed_nm = self._arm_dynamics, self._compensation.friction_nm
-        if load.on:
-            load_gravity, friction = (
-                load.gravity_torque_nm(self._manipulator.gravity_levers_m_s2(arm_rad, up)),
-                load.friction_nm,
-            )
+        if loaded:
+            load_gravity, friction = load.gravity_torque_nm(levers), load.friction_nm
         e_tau, torque, wanted_rate, turning = [c0 * f0, c1 * f1, c2 * f2, 0.0, 0.0, 0.0], [], [], []
         for joint, row, m, p, lam, w, d in self._joint_gains:
             x, y, z, s_row = jx[joint], jy[joint], jz[joint], s[row]
@@ -267,14 +272,14 @@ class AdaptiveController:
                 t += gravity[joint]
             rate = rates[joint] - s_row
             direction = math.tanh(rate / FRICTION_RATE_RAD_S)
-            if load.on:
+            if loaded:
                 t += load_gravity[joint] + friction[joint] * direction
             if dynamics is None and fed_nm:
                 t += fed_nm * direction
             torque.append(t)
             wanted_rate.append(rate)
             turning.append(direction)
-        load.set_motion(wanted_rate, turning)
+        load.wanted_rate_rad_s, load.direction = wanted_rate, turning
         if dynamics is not None:
             wanted = []
             for joint, row, m, p, _, _, d in self._joint_gains:

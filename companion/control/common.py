@@ -25,19 +25,26 @@ from companion.model.types import IDENTITY_QUAT, Chi, ControlLog, Joints, Quat, 
 
 def tracking_errors(state: PlantState, reference: Reference, yaw_rad: float) -> tuple[Chi, Chi]:
     """Return e = chi - chi_d and e'. Rows 3 and 4 (roll, pitch) are 0 because their reference is the law's own output."""
+    error, error_rate = base_errors(state, reference, yaw_rad)
+    angles_d, rates, rates_d = reference.arm_rad, state.arm_rate_rad_s, reference.arm_rate_rad_s
+    for joint, angle in enumerate(state.arm_rad):
+        error.append(angle - angles_d[joint])
+        error_rate.append(rates[joint] - rates_d[joint])
+    return tuple(error), tuple(error_rate)
+
+
+def base_errors(state: PlantState, reference: Reference, yaw_rad: float) -> tuple[list[float], list[float]]:
+    """Return the rows of the base of `tracking_errors`."""
     px, py, pz = state.position_world_m
     vx, vy, vz = state.velocity_world_m_s
     px_d, py_d, pz_d = reference.position_world_m
     vx_d, vy_d, vz_d = reference.velocity_world_m_s
     yaw_error = wrap_rad(yaw_rad - reference.yaw_rad)
     yaw_error_rate = state.angular_rate_body_rad_s[2] - reference.yaw_rate_rad_s
-    error = [px - px_d, py - py_d, pz - pz_d, 0.0, 0.0, yaw_error]
-    error_rate = [vx - vx_d, vy - vy_d, vz - vz_d, 0.0, 0.0, yaw_error_rate]
-    angles_d, rates, rates_d = reference.arm_rad, state.arm_rate_rad_s, reference.arm_rate_rad_s
-    for joint, angle in enumerate(state.arm_rad):
-        error.append(angle - angles_d[joint])
-        error_rate.append(rates[joint] - rates_d[joint])
-    return tuple(error), tuple(error_rate)
+    return (
+        [px - px_d, py - py_d, pz - pz_d, 0.0, 0.0, yaw_error],
+        [vx - vx_d, vy - vy_d, vz - vz_d, 0.0, 0.0, yaw_error_rate],
+    )
 
 
 class ForceFilter:

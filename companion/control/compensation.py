@@ -51,7 +51,8 @@ class Compensation:
 
     def observe(self, dt_s: float, state: PlantState, learn: bool) -> None:
         """Run the disturbance observer for one tick; without `learn` its estimate does not change."""
-        self._observer.step(dt_s, self._known_n, state.acceleration_world_m_s2, learn)
+        if self._observer.on:
+            self._observer.step(dt_s, self._known_n, state.acceleration_world_m_s2, learn)
 
     def base_force_n(self, wanted_n: Vec3, force: Vec3, reference: Reference) -> Vec3:
         """Return the desired force with the measured force, the estimated disturbance and the lead compensated, world frame."""
@@ -77,5 +78,7 @@ class Compensation:
 
     def remember(self, sent_n: Vec3, force: Vec3) -> None:
         """Store the force that was sent, and the part of the measured force that is accounted for, for the observer."""
+        if not self._observer.on:
+            return
         (x, y, z), (f0, f1, f2), (c0, c1, c2) = sent_n, force, self._accounted
         self._known_n = (x + c0 * f0, y + c1 * f1, z + c2 * f2 - self._weight_n)

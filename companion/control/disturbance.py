@@ -25,7 +25,8 @@ class DisturbanceObserver:
     def __init__(self, mass_kg: float, time_xyz_s: Vec3, lag_s: float, max_n: float) -> None:
         self._mass_kg = mass_kg
         self._times_s = time_xyz_s
-        self._on = any(time_s > 0.0 for time_s in time_xyz_s)
+        self.on = any(time_s > 0.0 for time_s in time_xyz_s)
+        """Whether an axis has a time constant. Without one the estimate stays 0."""
         self._lag_s = lag_s
         self._max_n = max_n
         self._lagged: Vec3 | None = None
@@ -41,7 +42,7 @@ class DisturbanceObserver:
             acceleration_world_m_s2: measured acceleration.
             learn: if False, the estimate does not change (on the ground, or while the actuators are saturated).
         """
-        if not self._on:
+        if not self.on:
             return self.force_n
         (lx, ly, lz), (kx, ky, kz) = self._lagged or known_n, known_n
         k = 1.0 - math.exp(-dt_s / self._lag_s) if self._lag_s > 0 else 1.0

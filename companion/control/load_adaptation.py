@@ -51,8 +51,10 @@ class LoadAdaptation:
         """Estimated first moments of the links about their joints, in addition to the nominal ones."""
         self.friction_nm: Joints = nothing
         self._levers: Matrix = (nothing,) * manipulator.joint_count
-        self._direction: Sequence[float] = nothing
-        self._wanted_rate_rad_s: Sequence[float] = nothing
+        self.wanted_rate_rad_s: Sequence[float] = nothing
+        """Joint rates that the target impedance requests in this tick; set before `advance`."""
+        self.direction: Sequence[float] = nothing
+        """Directions of these rates, tanh(rate / FRICTION_RATE_RAD_S); set before `advance`."""
 
     def gravity_torque_nm(self, levers_m_s2: Matrix) -> Joints:
         """Return the joint torques that hold the estimated moments against gravity.
@@ -62,10 +64,6 @@ class LoadAdaptation:
         """
         self._levers = levers_m_s2
         return self._manipulator.moment_torque_nm(levers_m_s2, self.moments_kg_m)
-
-    def set_motion(self, wanted_rate_rad_s: Sequence[float], direction: Sequence[float]) -> None:
-        """Set the joint rates that the target impedance requests, and their directions, tanh(rate / FRICTION_RATE_RAD_S)."""
-        self._wanted_rate_rad_s, self._direction = wanted_rate_rad_s, direction
 
     def advance(self, dt_s: float, s: Chi, learn: bool) -> None:
         """Integrate one step with s held. Without `learn` the estimates do not change: on the ground and in saturation.
@@ -87,7 +85,7 @@ class LoadAdaptation:
                 _projected(z_new, z, -most, most),
             )
         self.force_n = (x_new, y_new, z_new)
-        rates, directions, s_joints = self._wanted_rate_rad_s, self._direction, s[6:]
+        rates, directions, s_joints = self.wanted_rate_rad_s, self.direction, s[6:]
         by_moments = self._manipulator.projected_on_moments(self._levers, s_joints)
         moments, frictions = [], []
         rate_moment, most, rate_friction, most_nm = (

@@ -47,6 +47,10 @@ class Manipulator(ABC):
         which points from the link's joint to the next one, against gravity. Arguments as for `joint_terms`.
         """
 
+    def joint_terms_and_levers(self, angle_rad: Joints, up_body_m_s2: Vec3) -> tuple[Matrix, Joints, Matrix]:
+        """Return the results of `joint_terms` and of `gravity_levers_m_s2`, in one call."""
+        return (*self.joint_terms(angle_rad, up_body_m_s2), self.gravity_levers_m_s2(angle_rad, up_body_m_s2))
+
     @abstractmethod
     def moment_torque_nm(self, levers_m_s2: Matrix, moment_kg_m: Joints) -> Joints:
         """Return the joint torques that hold one first moment per link against gravity: levers times moments."""

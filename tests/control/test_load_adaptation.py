@@ -47,7 +47,7 @@ def law(**changes: Any) -> AdaptiveConfig:
 def torque_nm(load: LoadAdaptation, levers_m_s2: Matrix, wanted_rate_rad_s: Joints) -> Joints:
     """The joint torques of the estimated gravity and friction, at a wanted motion that the load is told."""
     direction = tuple(math.tanh(rate / 0.1) for rate in wanted_rate_rad_s)
-    load.set_motion(wanted_rate_rad_s, direction)
+    load.wanted_rate_rad_s, load.direction = wanted_rate_rad_s, direction
     gravity = load.gravity_torque_nm(levers_m_s2)
     return tuple(g + f * d for g, f, d in zip(gravity, load.friction_nm, direction, strict=True))
 

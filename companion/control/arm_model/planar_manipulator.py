@@ -82,16 +82,25 @@ class PlanarManipulator(Manipulator):
 
     def joint_terms(self, angle_rad: Joints, up_body_m_s2: Vec3) -> tuple[Matrix, Joints]:
         """See `Manipulator`."""
+        jacobian, gravity, _ = self.joint_terms_and_levers(angle_rad, up_body_m_s2)
+        return jacobian, gravity
+
+    def joint_terms_and_levers(self, angle_rad: Joints, up_body_m_s2: Vec3) -> tuple[Matrix, Joints, Matrix]:
+        """See `Manipulator`."""
         a1, a2 = angle_rad
         up_x, _, up_z = up_body_m_s2
         b = a1 - a2
         s1, c1, s2, c2 = math.sin(a1), math.cos(a1), math.sin(b), math.cos(b)
-        about_1 = self._moment_1 * (-s1 * up_x - c1 * up_z)
-        about_2 = self._moment_2 * (-s2 * up_x - c2 * up_z)
+        first, second = -s1 * up_x - c1 * up_z, -s2 * up_x - c2 * up_z
+        about_1, about_2 = self._moment_1 * first, self._moment_2 * second
         l1, l2 = self._l1, self._l2
         s2 *= l2
         c2 *= l2
-        return ((-l1 * s1 - s2, s2), _ROW_Y, (-l1 * c1 - c2, c2)), (about_1 + about_2, -about_2)
+        return (
+            ((-l1 * s1 - s2, s2), _ROW_Y, (-l1 * c1 - c2, c2)),
+            (about_1 + about_2, -about_2),
+            ((first, second), (0.0, -second)),
+        )
 
     def gravity_levers_m_s2(self, angle_rad: Joints, up_body_m_s2: Vec3) -> Matrix:
         """See `Manipulator`."""
