@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from companion.commissioning.arm.friction import FrictionFit, JointFit, fit
-from companion.commissioning.arm.sweep import HANGING_DEG, REACH_DEG, SPEEDS_DEG_S, Sample
+from companion.commissioning.arm.sweep import REACH_DEG, SPEEDS_DEG_S, Sample
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
@@ -18,6 +18,7 @@ from companion.model.types import IDENTITY_QUAT, Joints
 from tests.commissioning.arm_rig import SHIPPED
 
 RATE_HZ = 200.0
+HANGING_DEG = (90.0, 0.0)
 
 
 @pytest.fixture(scope="module")

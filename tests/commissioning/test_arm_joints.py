@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-import yaml
 from msgspec.structs import replace
 
 from companion.commissioning.arm.motion import Motion
@@ -90,18 +88,8 @@ def test_an_arm_hangs_where_gravity_turns_no_joint(count: int) -> None:
     assert manipulator_of(vehicle).gravity_torque_nm(pose_rad, IDENTITY_QUAT) == pytest.approx((0.0,) * count, abs=1e-6)
 
 
-def test_the_hanging_pose_of_an_arm_from_a_urdf_is_one_where_gravity_turns_no_joint(tmp_path: Path) -> None:
-    joints = [
-        {"servo": servo, "servo_id": number, "sign": 1, "zero_count": 2048, "angle_deg": [-170.0, 170.0]}
-        | {"torque_max_nm": 2.5, "velocity_max_deg_s": 180.0}
-        for number, servo in enumerate(("XM540-W270", "XM540-W270", "XM430-W210", "XM430-W210"), 1)
-    ]
-    data = yaml.safe_load(SHIPPED.read_text(encoding="utf-8"))
-    data["arm"] = {"urdf": str(SHIPPED.parent / "arm_4r.urdf"), "joints": joints}
-    data["safety"] = {"fold_arm_deg": [0.0] * 4}
-    (tmp_path / "vehicle.yaml").write_text(json.dumps(data), encoding="utf-8")
-    vehicle = load_vehicle(tmp_path / "vehicle.yaml")
-    assert vehicle.arm.torque_constants_nm_a == pytest.approx((10.6 / 4.4, 10.6 / 4.4, 3.0 / 2.3, 3.0 / 2.3))
+def test_an_arm_from_a_urdf_hangs_where_gravity_turns_no_joint() -> None:
+    vehicle = load_vehicle("tarot650_4r")
     pose_rad = tuple(map(math.radians, hanging_deg(vehicle)))
     assert manipulator_of(vehicle).gravity_torque_nm(pose_rad, IDENTITY_QUAT) == pytest.approx((0.0,) * 4, abs=1e-5)
 

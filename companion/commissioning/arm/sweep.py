@@ -13,8 +13,6 @@ from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.model.types import IDENTITY_QUAT, ArmState, Joints
 
-HANGING_DEG: Final = (90.0, 0.0)
-"""Hanging pose of the planar arm of two joints; the search for that of another arm begins at 90 and zeros."""
 SPEEDS_DEG_S: Final = (9.0, 18.0)
 REACH_DEG: Final = ((-30.0, 30.0), (-5.0, 70.0))
 """Sweep of the first joint and of every other one about the hanging pose, within its limits."""
@@ -57,11 +55,11 @@ def hanging_deg(vehicle: Vehicle) -> Joints:
     """Return the pose in which the arm hangs freely, deg, within the joint limits minus a margin.
 
     Along one joint the potential energy is a sine, whose minimum follows from the gravity torque here and 90 deg further. This is
-    repeated joint by joint until the torques are small.
+    repeated joint by joint until no joint moves. A joint without weight, such as one with a vertical axis, stays at 0.
     """
     manipulator, count = manipulator_of(vehicle), len(vehicle.arm.joints)
     limits = [tuple(map(math.radians, limits_deg(vehicle.arm, joint))) for joint in range(count)]
-    pose = [max(low, min(high, math.pi / 2.0 if joint == 0 else 0.0)) for joint, (low, high) in enumerate(limits)]
+    pose = [max(low, min(high, 0.0)) for low, high in limits]
     for _ in range(_SEARCHES):
         moved_rad = 0.0
         for joint, (low, high) in enumerate(limits):
@@ -69,12 +67,12 @@ def hanging_deg(vehicle: Vehicle) -> Joints:
             further[joint] += math.pi / 2.0
             p = manipulator.gravity_torque_nm(tuple(here), IDENTITY_QUAT)[joint]
             q = manipulator.gravity_torque_nm(tuple(further), IDENTITY_QUAT)[joint]
-            if math.hypot(p, q) > _WEIGHTLESS_NM and abs(p) > _WEIGHTLESS_NM:
+            if math.hypot(p, q) > _WEIGHTLESS_NM:
                 pose[joint] = max(low, min(high, pose[joint] + math.atan2(-p, q)))
                 moved_rad = max(moved_rad, abs(pose[joint] - here[joint]))
         if moved_rad < _FOUND_RAD:
             break
-    return tuple(map(math.degrees, pose))
+    return tuple(round(math.degrees(angle), 6) + 0.0 for angle in pose)
 
 
 def legs_of(vehicle: Vehicle) -> tuple[Leg, ...]:
