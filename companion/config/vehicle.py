@@ -227,7 +227,7 @@ LINK_RADIUS_M = 0.03
 
 
 class Tool(Model):
-    """Force-torque sensor and net at the end of link 2."""
+    """Force-torque sensor and net at the tip of the arm."""
 
     sensor_mass_kg: NonNegative
     """Mass of the sensor and the mount on the arm's side, which the sensor does not measure."""
@@ -235,9 +235,7 @@ class Tool(Model):
     """Mass of all parts on the tool side of the sensor; their weight is subtracted from the readings."""
     net_radius_m: Positive
     sensor_rpy_deg: Vector3 = (0.0, 0.0, 0.0)
-    """Attitude of the sensor frame in the frame of link 2 (x outwards along the link, y along the joint axis): roll, pitch, yaw
-    (ZYX).
-    """
+    """Attitude of the sensor frame in the tip's frame (x outwards; for rods, the frame of the last link): roll, pitch, yaw (ZYX)."""
 
 
 class Tether(Model):
