@@ -38,6 +38,14 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> FlightLog:
     return FlightLog.read(path)
 
 
+@pytest.fixture(scope="module")
+def brief(tmp_path_factory: pytest.TempPathFactory) -> FlightLog:
+    """The beginning of `flight`, into the take-off."""
+    path = tmp_path_factory.mktemp("brief") / "flight.mcap"
+    record_flight(path, end_s=2.0)
+    return FlightLog.read(path)
+
+
 @cache
 def flown() -> list[Row]:
     """The ticks of `flight`."""
@@ -475,9 +483,7 @@ def rewritten(source: Path, target: Path, message: Callable[[str, dict[str, Any]
     return target
 
 
-def test_a_log_from_before_a_field_that_may_be_none_opens_but_is_not_replayed(
-    flight: FlightLog, tmp_path: Path
-) -> None:
+def test_a_log_from_before_a_field_that_may_be_none_opens_but_is_not_replayed(brief: FlightLog, tmp_path: Path) -> None:
     """`None` is left out of a log, so the ticks of such a log are those of today; what the core makes of them is not."""
 
     def same(topic: str, data: dict[str, Any]) -> None:
@@ -485,8 +491,8 @@ def test_a_log_from_before_a_field_that_may_be_none_opens_but_is_not_replayed(
         if topic == "/outputs":
             data["bent_by"] = data.pop("limited_by")
 
-    log = FlightLog.read(rewritten(flight.path, tmp_path / "older.mcap", same, "0" * 16))
-    assert log.outputs == flight.outputs
+    log = FlightLog.read(rewritten(brief.path, tmp_path / "older.mcap", same, "0" * 16))
+    assert log.outputs == brief.outputs
     with pytest.raises(
         LogError,
         match=r"^[^\n]*the fields of its records differ from those of this version[^\n]*replay it with that version$",
@@ -498,7 +504,7 @@ def test_a_log_from_before_a_field_that_may_be_none_opens_but_is_not_replayed(
     ("field", "reason"), [("zeta", "missing required field `zeta`"), ("news", "unknown field `news`")]
 )
 def test_a_log_with_records_of_another_shape_is_refused_in_one_line(
-    flight: FlightLog, tmp_path: Path, field: str, reason: str
+    brief: FlightLog, tmp_path: Path, field: str, reason: str
 ) -> None:
     def change(topic: str, data: dict[str, Any]) -> None:
         if "control" in data:
@@ -506,7 +512,7 @@ def test_a_log_with_records_of_another_shape_is_refused_in_one_line(
             if field == "news":
                 data["control"]["news"] = 1.0
 
-    path = rewritten(flight.path, tmp_path / "other.mcap", change, "0" * 16)
+    path = rewritten(brief.path, tmp_path / "other.mcap", change, "0" * 16)
     with pytest.raises(LogError) as refusal:
         FlightLog.read(path)
     assert str(refusal.value).startswith(f"{path}: its records' fields differ from this version's (Outputs: ")
