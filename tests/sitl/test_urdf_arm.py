@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from companion.mission.check import check_mission
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 
@@ -14,6 +15,7 @@ CATCH_S = 10.5
 
 def test_an_arm_of_four_joints_from_a_urdf_catches_the_payload() -> None:
     config = load_sitl("catch", vehicle_path="tarot650_4r", world="ideal", overrides=["world.payload_kg=0.2"])
+    assert check_mission(config.mission, config.vehicle) == []
     outputs = FastFlight(config).run(limit_s=CATCH_S).outputs
     assert "catch" in {event.id for output in outputs for event in output.events}
     controls = [output.control for output in outputs if output.control is not None]
