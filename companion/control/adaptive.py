@@ -4,8 +4,8 @@ The rows are chi = [x y z | roll pitch yaw | joints]. PX4's attitude loop contro
 every norm and get no torque. The order of the steps is that of docs/control-law.md. The zero-order hold is exact, so H and zeta stay >=
 0 for any input.
 
-Sums over the active rows are written out for x, y and z and loop over the rows of the joints by index: for two joints this is several
-times as fast as `zip`, comprehensions or arrays.
+Sums over the active rows are written out for x, y and z and loop over the rows of the joints by index: for two joints such a loop is
+twice as fast as one with `zip` or a comprehension.
 """
 
 from __future__ import annotations
@@ -180,8 +180,8 @@ class AdaptiveController:
         a0, a1, a2 = a0 + k * (x - a0), a1 + k * (y - a1), a2 + k * (z - a2)
         error, error_rate = base_errors(state, reference, yaw_rad)
         angles, angles_d, rates_d = state.arm_rad, reference.arm_rad, reference.arm_rate_rad_s
-        e0, e1, e2, e5 = error[0], error[1], error[2], error[5]
-        v0, v1, v2, v5 = error_rate[0], error_rate[1], error_rate[2], error_rate[5]
+        e0, e1, e2, _, _, e5 = error
+        v0, v1, v2, _, _, v5 = error_rate
         p0, p1, p2, p5 = self._base_phi
         gamma = self._impedance.gamma
         s0, s1, s2 = v0 + p0 * e0 - gamma[0], v1 + p1 * e1 - gamma[1], v2 + p2 * e2 - gamma[2]
@@ -264,7 +264,8 @@ class AdaptiveController:
             load_gravity, friction = load.gravity_torque_nm(levers), load.friction_nm
         e_tau, torque, wanted_rate, turning = [c0 * f0, c1 * f1, c2 * f2, 0.0, 0.0, 0.0], [], [], []
         for joint, row, m, p, lam, w, d in self._joint_gains:
-            x, y, z, s_row = jx[joint], jy[joint], jz[joint], s[row]
+            x, y, z = jx[joint], jy[joint], jz[joint]
+            s_row = s[row]
             tau_d = x * d_x + y * d_y + z * d_z
             e_tau.append(x * f_x + y * f_y + z * f_z - tau_d)
             t = m * (feed[joint] - p * error_rate[row]) - (lam + robust * w) * s_row - d * gamma[row] - tau_d

@@ -96,12 +96,8 @@ class LoadAdaptation:
         )
         old_moments, old_frictions = self.moments_kg_m, self.friction_nm
         for joint in self._joints:
-            moment, friction, error, direction = (
-                old_moments[joint],
-                old_frictions[joint],
-                s_joints[joint],
-                directions[joint],
-            )
+            moment, friction = old_moments[joint], old_frictions[joint]
+            error, direction = s_joints[joint], directions[joint]
             new = decay * moment - rate_moment * by_moments[joint]
             moments.append(new if -most <= new <= most else _projected(new, moment, -most, most))
             # The wanted rate + s is the measured rate.

@@ -149,8 +149,8 @@ class VehicleControl:
         self._watch_disturbance(dt_s, state, vertical_scale)
         self._law.hover_thrust = hover = self._hover.value
         wrench = self._controller.step(dt_s, state, reference, vertical_scale)
-        ex, ey, ez, *_ = wrench.log.error
-        self.tracking_error_m = math.hypot(ex, ey, ez)
+        error = wrench.log.error
+        self.tracking_error_m = math.hypot(error[0], error[1], error[2])
         thrust = wrench.collective_n * hover / self._weight_n
         if not math.isfinite(
             thrust + self.tracking_error_m
