@@ -228,6 +228,15 @@ def test_addresses_of_the_simulated_world_are_distinguished_from_settings_but_no
     assert (keys(real), real.addresses) == ({"vehicle.devices.arm.port"}, ())
 
 
+@pytest.mark.parametrize(("server", "payload_known"), [("127.0.0.1", True), ("192.168.1.10", False)])
+def test_without_an_arm_a_flight_is_simulated_if_motion_capture_is_on_this_computer(
+    server: str, payload_known: bool
+) -> None:
+    config = configured(vehicle__devices={"arm": None, "mocap": {"server": server}}, world__payload_kg=0.2)
+    comparison = compare([made(n, config=config, payload_kg=None) for n in "AB"])
+    assert (comparison.cautions == ()) == payload_known
+
+
 def test_the_world_of_a_flight_on_the_vehicle_says_nothing() -> None:
     flights = [
         made(n, config=configured(vehicle__devices={"arm": {"port": "/dev/ttyUSB0"}}, world__seed=k), payload_kg=None)

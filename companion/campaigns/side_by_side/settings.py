@@ -45,9 +45,14 @@ class Setting:
 
 
 def simulated(config: dict[str, Any]) -> bool:
-    """Return whether the flight was simulated: if so, its arm is on a pseudo-terminal."""
+    """Return whether the flight was simulated: if so, its arm is on a pseudo-terminal or, without an arm, motion capture is on this
+    computer.
+    """
     devices = _part(_part(config, "vehicle"), "devices")
-    return str(_part(devices, "arm").get("port", "")).startswith("/dev/pts/")
+    port = _part(devices, "arm").get("port")
+    if port is None:
+        return _part(devices, "mocap").get("server") == "127.0.0.1"
+    return str(port).startswith("/dev/pts/")
 
 
 def payload_kg(flight: Flight) -> float | None:
