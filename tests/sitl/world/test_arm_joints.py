@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from sitl.autopilot.backend import stub_of
 from sitl.fast.bus import FastBus, scales_of
 from sitl.fast.loop import FastFlight
 from sitl.faults.injector import Faults
+from sitl.server import Ports, Sitl, start_of
 from sitl.servo.drive import ServoDrive
 from sitl.servo.from_config import servos_of
 from sitl.world.plant import Plant
@@ -315,3 +317,17 @@ def test_a_vehicle_with_any_number_of_joints_and_any_axes_flies(joints: int, mis
     warnings = {event.id for output in result.outputs for event in output.events if event.severity is not Severity.INFO}
     assert warnings == set()
     assert {None if i.arm is None else len(i.arm.angle_rad) for i in result.inputs} == {joints or None}
+
+
+def test_without_an_arm_the_server_opens_no_servo_bus_and_no_force_sensor() -> None:
+    config = WorldConfig(payload_kg=0.0, arm_hand=True, faults=(Fault(kind="gust", t_s=0.0, after="start"),))
+    server = Sitl(vehicle_with_joints(0), config, start_of((0.0, 0.0), 0.0, ()), Ports(), lambda _: None)
+
+    async def served() -> set[str]:
+        async with server.wires() as devices:
+            for _ in range(5):
+                server._step()
+            return set(devices)
+
+    assert asyncio.run(served()) == {"autopilot", "mocap"}
+    assert server.plant.t_s == pytest.approx(0.01)
