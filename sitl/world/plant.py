@@ -65,6 +65,9 @@ class _JointServo(NamedTuple):
     torque_per_amp_nm_a: float
     gear: Transmission | None
     """Gear and mount between the servo and its link; None if they are rigid."""
+    q: int
+    v: int
+    """Indices of the joint in qpos and qvel."""
 
 
 class MocapFrame(NamedTuple):
@@ -121,6 +124,7 @@ class Plant:
         self._px4 = px4
         for drive in drives:
             drive.goal_delay_s = config.arm_delay_s
+        self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
         servos = [config.servo(joint) for joint in range(len(joints))]
         mechanics = config.servo_mechanics
         more = of_joints(mechanics.torque_per_amp_error if mechanics.on else (0.0,), len(joints))
@@ -133,12 +137,21 @@ class Plant:
                 _zero_rad(joint, servo),
                 nm_a / (1.0 + servo.torque_per_amp_error) / (1.0 + error),
                 gear,
+                at_q,
+                at_v,
             )
-            for drive, joint, servo, nm_a, error, gear in zip(
-                drives, joints, servos, torque_constants_nm_a(vehicle), more, gears, strict=True
+            for drive, joint, servo, nm_a, error, gear, at_q, at_v in zip(
+                drives,
+                joints,
+                servos,
+                torque_constants_nm_a(vehicle),
+                more,
+                gears,
+                self.world.layout.joint_q,
+                self.world.layout.joint_v,
+                strict=True,
             )
         )
-        self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
         if transmissions:
             self.world.add_joint_inertia(transmissions)
         hover_n = self.world.weight_n / self.world.rotor_count
@@ -214,21 +227,17 @@ class Plant:
                 world.battery.restart()
         if self.faults is not None:
             self.faults.step(t_s, self.armed_t_s)
-        q, v, layout = world.q, world.v, world.layout
-        torques_nm = []
-        for (drive, sign, zero_rad, k_nm_a, gear), at_q, at_v in zip(
-            self._servos, layout.joint_q, layout.joint_v, strict=True
-        ):
+        q, v = world.q, world.v
+        torques_nm, pushing = [], 0
+        for drive, sign, zero_rad, k_nm_a, gear, at_q, at_v in self._servos:
             angle_rad, rate_rad_s = q[at_q], v[at_v]
             if gear is not None:
                 angle_rad, rate_rad_s = gear.encoder(angle_rad, rate_rad_s)
-            torques_nm.append(sign * drive.update(t_s, zero_rad + sign * angle_rad, sign * rate_rad_s) * k_nm_a)
-        if world.parked and (all(torques_nm) or (armed and any(torques_nm))):
+            torque_nm = sign * drive.update(t_s, zero_rad + sign * angle_rad, sign * rate_rad_s) * k_nm_a
+            pushing += torque_nm != 0.0
+            torques_nm.append(torque_nm if gear is None else gear.step(torque_nm))
+        if world.parked and (pushing == len(torques_nm) or (armed and pushing)):
             world.release_arm()
-        torques_nm = [
-            torque_nm if servo.gear is None else servo.gear.step(torque_nm)
-            for servo, torque_nm in zip(self._servos, torques_nm, strict=True)
-        ]
         if self._tick % IMU_EVERY == 0:
             self._rotors = self._px4.step(self._imu_sample or self._imu())
             self._imu_sample = None
