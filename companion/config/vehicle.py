@@ -579,6 +579,11 @@ class Vehicle(Model):
         if self.airframe.thrust_max_n <= GRAVITY_M_S2 * self.airframe.mass_kg:
             text = f"{self.airframe.thrust_max_n:g} N do not lift {self.airframe.mass_kg:g} kg"
             problems.append((("airframe", "thrust_max_n"), text))
+        nearest_m = min(math.hypot(x, y) for x, y, _ in self.airframe.rotor_layout.positions_body_m)
+        if self.tether is not None and nearest_m <= self.tether.rotor_inner_radius_m:
+            text = f"expected less than {nearest_m:g} m, the distance of the nearest rotor from the body's z axis"
+            text += f", got {self.tether.rotor_inner_radius_m:g} m"
+            problems.append((("tether", "rotor_inner_radius_m"), text))
         cells, lowest_v = self.airframe.battery_cells, self.safety.battery_voltage_min_v
         low_v, high_v = (cells * cell_v for cell_v in _CELL_MIN_V)
         if lowest_v is not None and not low_v <= lowest_v <= high_v:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -19,9 +20,8 @@ from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.mixer import Mixer
 from sitl.fast.loop import FastFlight
 from sitl.world.world import World
-from tests.support import CATCH
+from tests.support import HOVER, SHORT_CATCH
 
-HOVER = CATCH.parent / "hover.yaml"
 VEHICLE = load_sitl(HOVER).vehicle
 SMALL = {"rotor_arm_m": 0.22, "inertia_kg_m2": (0.022, 0.022, 0.04), "yaw_torque_per_thrust_m": 0.016}
 FULL_N = VEHICLE.airframe.thrust_max_n / 4.0
@@ -107,15 +107,20 @@ def test_errors_of_rotors_are_used_again_from_the_first_if_there_are_more_rotors
         assert abs(yaw_nm) == pytest.approx(0.025 * (1.0 + error))
 
 
+WEAK = "world.faults=[{kind: motor_weak, t_s: 1.0, size: 0.2}]"
+
+
 @pytest.mark.parametrize("layout", ["quad_plus", "hexa_x", "octa_plus"])
-@pytest.mark.parametrize("mission", ["configs/missions/hover.yaml", "tests/short_catch.yaml"])
-def test_other_layouts_fly(layout: LayoutName, mission: str) -> None:
-    config = load_sitl(mission, overrides=(f"vehicle.airframe.layout={layout}",))
-    flight = FastFlight(config)
-    result = flight.run()
-    assert flight.plant.world.rotor_count == {"quad_plus": 4, "hexa_x": 6, "octa_plus": 8}[layout]
+@pytest.mark.parametrize("mission", [HOVER, SHORT_CATCH])
+def test_other_layouts_hover_with_a_weak_rotor_and_catch(layout: LayoutName, mission: Path) -> None:
+    overrides = [f"vehicle.airframe.layout={layout}", *([WEAK] if mission == HOVER else [])]
+    flight = FastFlight(load_sitl(mission, overrides=overrides))
+    result, world = flight.run(), flight.plant.world
+    assert world.rotor_count == {"quad_plus": 4, "hexa_x": 6, "octa_plus": 8}[layout]
+    if mission == HOVER:
+        assert world.rotor_share == (0.8, *[1.0] * (world.rotor_count - 1))
+    assert result.caught is (mission == SHORT_CATCH)
     assert result.outputs[-1].outcome is Outcome.COMPLETED
-    assert result.caught is (config.mission.catch is not None)
     for truth, output in zip(result.truth, result.outputs, strict=True):
         if output.reference is not None and truth.position_world_m[2] > 0.6:
             assert math.dist(truth.position_world_m, output.reference.position_world_m) < 0.12
