@@ -11,7 +11,8 @@ ARMS: dict[int, tuple[tuple[float, ...], tuple[float, ...]]] = {
     3: ((165.0, 140.0, 0.0), (100.0, 60.0, -20.0)),
     4: ((165.0, 140.0, 0.0, 20.0), (100.0, 60.0, -20.0, 10.0)),
 }
-"""Folded and unfolded pose by number of joints, deg. Each arm is 0.4 m long; every joint after the first turns the other way."""
+"""Folded and unfolded pose by number of joints, deg. Each arm is 0.4 m long, or 0.28 m with one joint; every joint after the first
+turns the other way."""
 _MASS_KG = (0.15, 0.08)
 
 
@@ -21,7 +22,7 @@ def overrides_with_joints(count: int) -> list[str]:
         absent = ("arm", "tool", "devices.arm", "devices.force")
         return [f"vehicle.{key}=null" for key in absent]
     folded, unfolded = (list(pose) for pose in ARMS[count])
-    length_m = 0.4 / count
+    length_m = 0.4 / count if count > 1 else 0.28
     masses_kg = [_MASS_KG[0] * 2.0 / count if index + 1 < count else _MASS_KG[1] for index in range(count)]
     joints = [
         f"{{servo_id: {index + 1}, sign: {1 if index % 2 == 0 else -1}, zero_count: {1024 if index % 2 == 0 else 3072}, "
