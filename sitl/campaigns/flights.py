@@ -103,10 +103,10 @@ def row_of(
 
 
 def torque_activity_nm(log: FlightLog, mask: metrics.Mask) -> float | None:
-    """Return the RMS of the change in commanded joint torque (norm over both joints, N m) from one tick to the next, over the ticks
+    """Return the RMS of the change in commanded joint torque (norm over all joints, N m) from one tick to the next, over the ticks
     that `mask` selects.
     """
-    torque = log.column(lambda i, o, s: o.arm_torque_nm, 2)
+    torque = log.column(lambda i, o, s: o.arm_torque_nm, log.joint_count)
     return metrics.rms_norm(np.diff(torque, axis=0)[mask[1:] & mask[:-1]])
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 from companion.analysis import metrics
@@ -30,6 +31,7 @@ from sitl.campaigns import compare, faults, flights, robustness
 from sitl.campaigns.flights import Flown
 from sitl.campaigns.runner import Fly
 from sitl.fast.loop import FastFlight, FastResult
+from tests.machines import overrides_with_joints
 from tests.support import DEADLINE_S, SHORT_CATCH, Sandbox, position_error_m, run_here, sandbox_in, wait_until
 
 CONFIG = load_sitl(SHORT_CATCH, preset="recommended", overrides=("world.payload_kg=0.7", "world.seed=9"))
@@ -148,6 +150,18 @@ def test_what_was_not_flown_to_its_end_is_not_graded(seen: Seen) -> None:
         for name in ("final_e_z_m", "peak_e_p_m", "torque_activity_nm"):
             assert row[name] is None
         assert set(row["impedance_error"].values()) == {None}
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_the_torque_activity_counts_every_joint(count: int) -> None:
+    config = load_sitl(SHORT_CATCH, overrides=(*overrides_with_joints(count), "world.payload_kg=0"))
+    result = FastFlight(config).run(2.0)
+    log = flights.log_of(config.flight, result, None)
+    known = [o.arm_torque_nm for o in result.outputs if o.arm_torque_nm is not None]
+    changes = [math.dist(after, before) for before, after in itertools.pairwise(known)]
+    expected = math.sqrt(sum(change**2 for change in changes) / len(changes)) if count else None
+    activity = flights.torque_activity_nm(log, np.ones(len(result.outputs), np.bool_))
+    assert activity == (pytest.approx(expected) if count else None)
 
 
 @pytest.mark.parametrize(
