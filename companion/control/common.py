@@ -154,7 +154,8 @@ class Actuation:
             if not -most <= torque_nm[joint] <= most:
                 clipped_arm = True
         if clipped_arm:
-            torque_nm = tuple([max(-most, min(most, torque_nm[joint])) for joint, most in self._torque_max_nm])
+            # In this order NaN stays NaN, which the gate refuses.
+            torque_nm = tuple([min(max(torque_nm[joint], -most), most) for joint, most in self._torque_max_nm])
         self.arm_torque_nm = torque_nm
         self.clipped = (clipped_z, clipped_xy, clipped_arm)
         self.any_clipped = clipped_z or clipped_xy or clipped_arm

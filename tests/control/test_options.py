@@ -12,6 +12,7 @@ from companion.config.controller import AdaptiveConfig
 from companion.config.loader import FlightConfig, load_flight
 from companion.control.adaptive import AdaptiveController
 from companion.control.arm_model import dynamics_of
+from companion.control.common import Actuation
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.types import PlantState
 from companion.model.types import IDENTITY_QUAT, Joints, Reference, Vec3
@@ -191,3 +192,13 @@ def test_a_force_that_the_base_gives_way_to_is_not_observed_away(config: FlightC
         found.append(controller._compensation._observer.force_n[0])
     without, with_rows = found
     assert without - with_rows > 1.0
+
+
+@pytest.mark.parametrize(("torque_nm", "sent_nm"), [(9.0, 2.5), (-9.0, -2.5), (math.nan, math.nan)])
+def test_a_torque_that_is_not_a_number_does_not_become_the_largest_one(
+    config: FlightConfig, torque_nm: float, sent_nm: float
+) -> None:
+    assert isinstance(config.controller, AdaptiveConfig)
+    actuation = Actuation(config.controller, config.vehicle, 0.49)
+    actuation.step(0.005, (0.0, 0.0, 29.4), (0.1, torque_nm), (0.0, 0.0, 1.0), 0.0, 1.0)
+    assert actuation.arm_torque_nm == pytest.approx((0.1, sent_nm), nan_ok=True)
