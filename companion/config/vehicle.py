@@ -518,6 +518,14 @@ class Vehicle(Model):
         return self.safety.fold_arm_deg[: len(self.arm.joints)]
 
     @property
+    def joint_torque_limits_nm(self) -> Joints:
+        """Largest torque that is commanded to each joint, N m: `torque_max_nm`, or what the largest current of its servo gives."""
+        return tuple(
+            min(joint.torque_max_nm, (self.safety.servo_current_max_a or joint.kind.stall_current_a) * nm_a)
+            for joint, nm_a in zip(self.arm.joints, self.arm.torque_constants_nm_a, strict=True)
+        )
+
+    @property
     def arm_device(self) -> ArmDevice:
         """Bus of the arm's servos; may be read only if there is an arm."""
         assert self.devices.arm is not None, "the vehicle has no arm"

@@ -45,11 +45,8 @@ class Gate:
         self._tilt_max_rad = math.radians(vehicle.airframe.tilt_max_deg) + 1e-6
         self._tilt_limit = math.sin(0.5 * self._tilt_max_rad) ** 2
         self._bounds = [
-            (
-                min(joint.torque_max_nm, (safety.servo_current_max_a or joint.kind.stall_current_a) * nm_a),
-                *map(math.radians, (*joint.angle_deg, joint.velocity_max_deg_s)),
-            )
-            for joint, nm_a in zip(joints, vehicle.arm.torque_constants_nm_a, strict=True)
+            (torque_max_nm, *map(math.radians, (*joint.angle_deg, joint.velocity_max_deg_s)))
+            for joint, torque_max_nm in zip(joints, vehicle.joint_torque_limits_nm, strict=True)
         ]
         """Largest torque, N m, lower and upper limit, rad, and largest speed, rad/s, of each joint."""
         self._state_age_max_s = safety.command_state_age_max_s
@@ -87,7 +84,11 @@ class Gate:
                 attitude = None
             else:
                 attitude = self._slewed(attitude, t_s, refused)
-        if arm_torque_nm:
+        if arm_torque_nm is not None and len(arm_torque_nm) != len(self._bounds):
+            text = f"{len(arm_torque_nm)} joint torques for {len(self._bounds)} joints"
+            refused.append(Refusal("number of torques", text))
+            arm_torque_nm = None
+        elif arm_torque_nm:
             if not math.isfinite(sum(arm_torque_nm)):
                 refused.append(Refusal("torque not finite", f"joint torque {arm_torque_nm} is not finite"))
                 arm_torque_nm = None

@@ -91,6 +91,8 @@ def thresholds_of(rule: Rule, vehicle: Vehicle) -> Any:
 
 
 def _value(vehicle: Vehicle, key: str) -> Any:
+    if key == "arm.joints.torque_max_nm":
+        return vehicle.joint_torque_limits_nm  # a joint whose current is limited never reaches its torque_max_nm
     if key.startswith("arm.joints."):
         name = key.rpartition(".")[2]
         return tuple(_in_rad(name, getattr(joint, name)) for joint in vehicle.arm.joints)

@@ -58,7 +58,9 @@ class Clearance:
         self._net_m = vehicle.tip_radius_m
         self._reach_m = arm.reach_m + self._net_m
         self._planar = arm.is_in_xz_plane
-        self._is_2r = self._planar and len(self._links_m) == 2 and all(z == 0.0 for _, _, z in arm.links_body_m)
+        self._is_2r = (
+            self._planar and len(self._links_m) == 2 and all(x > 0.0 and z == 0.0 for x, _, z in arm.links_body_m)
+        )
         aside_m = abs(self._p[1] - self._shoulder[1]) - self._net_m
         self._aside_m = aside_m if self._planar else math.dist(self._p, self._shoulder) - self._reach_m
         self.judges_arm = bool(self._links_m) and self._aside_m > 0.0

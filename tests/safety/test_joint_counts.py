@@ -90,6 +90,21 @@ def test_the_gate_limits_every_joint(count: int) -> None:
         assert torque == tuple(0.0 if k == joint else 1.0 for k in range(count))
 
 
+@pytest.mark.parametrize("torque", [(), (9.0,), (0.1,), (0.1, 0.1, 0.1), (9.0, 0.1, 0.1)])
+def test_another_number_of_torques_than_joints_does_not_leave(torque: tuple[float, ...]) -> None:
+    vehicle = vehicle_with_joints(2)
+    verdict = Gate(vehicle).check(None, torque, in_the_middle(vehicle), True, arm_rate_rad_s=(0.0, 0.0))
+    assert verdict.arm_torque_nm is None
+    assert [refusal.text for refusal in verdict.refused] == [f"{len(torque)} joint torques for 2 joints"]
+
+
+def test_a_joint_whose_current_is_limited_is_overloaded_at_the_torque_of_that_current() -> None:
+    vehicle = load_vehicle("tarot650_2r", ["vehicle.safety.servo_current_max_a=1.0"])  # 1.3 N m/A
+    for torque_nm, overloaded in ((1.25, False), (1.29, True)):
+        events = watched(vehicle, ticks(vehicle, torque_nm=torque_nm), flying())
+        assert ("servo_overload" in {event.id for event in events}) is overloaded
+
+
 def test_without_an_arm_no_torque_is_no_refusal() -> None:
     assert Gate(vehicle_with_joints(0)).check(None, (), None, False).refused == ()
 
@@ -106,6 +121,20 @@ def test_no_point_of_the_arm_is_nearer_to_the_line_than_the_clearance_says(count
         shoulder, *others = (*manipulator.joints_body_m(angles), manipulator.net_body_m(angles))
         reach_m = max(math.dist(shoulder, point) for point in others)
         assert clearance.least_m((0.0, -1.0, 0.0), None, angles) <= 1.0 - reach_m + 1e-9
+
+
+def test_the_reach_of_links_that_lie_on_each_other_at_angle_0_is_not_underestimated() -> None:
+    """Link 2 points back to the shoulder at angle 0, so that the arm is stretched at 180 deg."""
+    inertia = "mass_kg: 0.1, com_m: [0, 0, 0], inertia_kg_m2: [1.0e-4, 1.0e-4, 1.0e-4, 0, 0, 0]"
+    links = (
+        f"[{{origin_m: [0, 0, 0], axis: [0, 1, 0], {inertia}}}, {{origin_m: [0.2, 0, 0], axis: [0, 1, 0], {inertia}}}]"
+    )
+    rods = [f"vehicle.arm.{key}=[]" for key in ("link_lengths_m", "link_masses_kg", "link_com_m")]
+    vehicle = load_vehicle("tarot650_2r", [*rods, f"vehicle.arm.links={links}", "vehicle.arm.tip_m=[-0.2, 0, 0]"])
+    clearance = Clearance(vehicle, tether_of(vehicle).model_copy(update={"attachment_body_m": (1.0, 0.6, 0.0)}))
+    net_m = manipulator_of(vehicle).net_body_m((0.0, math.pi))
+    assert math.dist((0.0, 0.0, 0.0), net_m) == pytest.approx(0.4)
+    assert clearance.least_m((0.0, -1.0, 0.0), None, (0.0, math.pi)) <= 1.0 - 0.4 - vehicle.tip_radius_m + 1e-9
 
 
 def test_an_arm_that_leaves_the_plane_is_a_ball_about_its_shoulder() -> None:
