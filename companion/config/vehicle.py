@@ -562,6 +562,13 @@ class Vehicle(Model):
                 f"{self.safety.servo_max_c:g} degC"
             )
             problems.append((("safety", "servo_max_c"), text))
+        fastest_deg_s = max((joint.velocity_max_deg_s for joint in self.arm.joints), default=0.0)
+        if fastest_deg_s >= self.safety.joint_rate_max_deg_s:
+            text = (
+                f"expected more than {fastest_deg_s:g} deg/s, the largest planned speed of a joint (arm.joints[].velocity_max_deg_s), "
+                f"because the vehicle lands above this rate, got {self.safety.joint_rate_max_deg_s:g} deg/s"
+            )
+            problems.append((("safety", "joint_rate_max_deg_s"), text))
         for axis, own in enumerate(self.airframe.inertia_kg_m2):
             others = sum(self.airframe.inertia_kg_m2) - own
             if own > others * (1.0 + 1e-9):

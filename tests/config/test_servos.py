@@ -18,6 +18,10 @@ NO_CONSTANT = "vehicle.arm.torque_per_amp_nm_a=null"
     [
         (("vehicle.arm.joints[0].torque_max_nm=3.1",), "the XM430-W210 stalls at 3 N m, got 3.1 N m"),
         (("vehicle.arm.joints[1].velocity_max_deg_s=571",), "the XM430-W210 turns at most at 570 deg/s, got 571 deg/s"),
+        (
+            ("vehicle.safety.joint_rate_max_deg_s=300",),
+            "expected more than 300 deg/s, the largest planned speed of a joint",
+        ),
         (XM540[:1], "the XM540-W270 turns at most at 222 deg/s, got 300 deg/s"),
         (XM540, "one torque constant cannot hold for XM540-W270 and XM430-W210"),
         (("vehicle.arm.joints[0].servo=XL430-W250",), "the XL430-W250 has no current control (operating mode 0)"),
