@@ -16,7 +16,7 @@ from companion.config.vehicle import LINK_RADIUS_M, Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx
-from companion.model.types import Joints, PhaseKind, Quat, Reference, Vec3
+from companion.model.types import IDENTITY_QUAT, Joints, PhaseKind, Quat, Reference, Vec3
 from companion.safety.governor import BODY_TOP_M, SafeSet
 from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
@@ -30,6 +30,8 @@ CATCH_NEAR_M = 0.05
 """Largest horizontal distance from the expected place at which the catch can happen, m."""
 CATCH_S = 2.0
 THRUST_SHARE_MAX = 0.9
+HOLDING_SHARE_MAX = 0.9
+"""Largest fraction of a joint's torque that may hold the arm's own weight; the rest is for motion and a payload."""
 """Upper bound on `limits.thrust_share_max`; the rest is reserved for attitude control."""
 STOP = "stop "
 """Prefix of a limit's name if the planned position respects the limit, but the position where the vehicle would come to rest does not.
@@ -60,6 +62,7 @@ class SampleCheck:
         self._limits = mission.limits
         self._catch = mission.catch
         self._vehicle = vehicle
+        self._torque_limits_nm = vehicle.joint_torque_limits_nm
         self._manipulator = manipulator_of(vehicle)
         self._safe = SafeSet(vehicle)
         self._stop_model = StopModel(vehicle.safety)
@@ -133,10 +136,12 @@ class SampleCheck:
 
     def _space(self, position: Vec3, reference: Reference, off_m: float) -> Iterator[Violation]:
         vehicle = self._vehicle
-        net_m, net_radius_m = position, 0.0
+        points = [(position, 0.0)]
         if vehicle.arm.joints:
-            net_m = _world(position, reference.yaw_rad, self._manipulator.net_body_m(reference.arm_rad))
-            net_radius_m = vehicle.tip_radius_m
+            arm_rad, yaw_rad = reference.arm_rad, reference.yaw_rad
+            points = [(_world(position, yaw_rad, self._manipulator.net_body_m(arm_rad)), vehicle.tip_radius_m)]
+            for joint_m in self._manipulator.joints_body_m(arm_rad):
+                points.append((_world(position, yaw_rad, joint_m), LINK_RADIUS_M))
         radius_m = vehicle.airframe.radius_m
         room = vehicle.room
         why = _allowance(off_m)
@@ -144,8 +149,11 @@ class SampleCheck:
         for axis, name, span in ((0, "x", room.x_m), (1, "y", room.y_m), (2, "z", room.z_m)):
             if axis == 2 and position[2] < vehicle.airframe.ground_clearance_m:
                 continue  # reported as flying into the floor
-            low = min(position[axis] - radius_m, net_m[axis] - net_radius_m) if axis < 2 else position[2] + off_m
-            high = max(position[axis] + (radius_m if axis < 2 else BODY_TOP_M), net_m[axis] + net_radius_m)
+            low = position[2] + off_m
+            if axis < 2:
+                low = min(position[axis] - radius_m, *(point[axis] - around_m for point, around_m in points))
+            body = position[axis] + (radius_m if axis < 2 else BODY_TOP_M)
+            high = max(body, *(point[axis] + around_m for point, around_m in points))
             for edge, excess, reach in (("low", span[0] - low + off_m, low), ("high", high + off_m - span[1], high)):
                 if excess > TOLERANCE:
                     yield Violation(
@@ -244,6 +252,17 @@ class SampleCheck:
                 )
         if not arm.joints:
             return
+        gravity_nm = self._manipulator.gravity_torque_nm(reference.arm_rad, IDENTITY_QUAT)
+        for number, (torque_nm, limit_nm) in enumerate(zip(gravity_nm, self._torque_limits_nm, strict=True), start=1):
+            if abs(torque_nm) > HOLDING_SHARE_MAX * limit_nm:
+                yield Violation(
+                    limit=f"torque {number}",
+                    excess=abs(torque_nm) - HOLDING_SHARE_MAX * limit_nm,
+                    what=f"overloads joint {number}",
+                    detail=f"the arm's own weight needs {abs(torque_nm):.2f} N m of the {limit_nm:.2f} N m that the joint has "
+                    f"(at most {HOLDING_SHARE_MAX:.0%})",
+                    advice="choose a pose closer to hanging, a lighter arm or a stronger servo, or raise torque_max_nm",
+                )
         tip = "net" if self._vehicle.tool is not None else "end of the arm"
         parts = [(tip, self._manipulator.net_body_m(reference.arm_rad), self._vehicle.tip_radius_m)]
         for number, joint_m in enumerate(self._manipulator.joints_body_m(reference.arm_rad)[1:], start=2):
