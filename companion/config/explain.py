@@ -161,8 +161,9 @@ def describe(node: _Node | None, schema: _Node) -> str:
 
 def nearest(word: str, known: list[str]) -> str | None:
     """Return the known word most similar to `word`, or None if none is similar."""
-    close = difflib.get_close_matches(word.lower(), known, n=1, cutoff=0.6)
-    return close[0] if close else None
+    by_lower = {name.lower(): name for name in known}
+    close = difflib.get_close_matches(word.lower(), by_lower, n=1, cutoff=0.6)
+    return by_lower[close[0]] if close else None
 
 
 def _bounds(node: _Node) -> str:
@@ -217,6 +218,8 @@ def _hint(value: Data, node: _Node | None) -> str:
             return " (put it in quotes)"
         return _did_you_mean(value, [str(option) for option in options]) if isinstance(value, str) else ""
     if isinstance(value, str) and wanted.get("type") in ("number", "integer"):
+        if re.fullmatch(r"\s*[-+]?[0-9]+,[0-9]+\s*", value):
+            return f" (write {value.strip().replace(',', '.')})"
         number = re.match(r"\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([^\s0-9]*)", value)
         if number and number[2]:
             return f" (write {number[1]}; the key's name contains the unit)"

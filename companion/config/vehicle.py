@@ -166,12 +166,15 @@ class Arm(Model):
         count = len(self.joints)
         rods = ("link_lengths_m", "link_masses_kg", "link_com_m")
         if self.links:
+            source, parts = ("links", "links") if self.urdf is None else ("urdf", "moving joints")
             if len(self.links) != count:
-                text = f"expected {count} links, one for each of arm.joints, got {len(self.links)}"
-                problems.append((("links",), text))
-            problems += [((key,), "must be absent, because arm.links is given") for key in rods if getattr(self, key)]
+                text = f"expected {count} {parts}, one for each of arm.joints, got {len(self.links)}"
+                problems.append(((source,), text))
+            problems += [
+                ((key,), f"must be absent, because arm.{source} is given") for key in rods if getattr(self, key)
+            ]
             given = [index for index, joint in enumerate(self.joints) if joint.axis is not None]
-            problems += [(("joints", index, "axis"), "must be absent; arm.links has the axes") for index in given]
+            problems += [(("joints", index, "axis"), f"must be absent; arm.{source} has the axes") for index in given]
         # Without links, the loader could not read the URDF and reports that.
         others = bool(self.links) or self.urdf is not None
         lists: dict[Location, Joints] = {} if others else {(key,): getattr(self, key) for key in rods}
@@ -559,7 +562,7 @@ class Vehicle(Model):
         if coolest is not None and self.safety.servo_max_c >= coolest.temperature_max_c:
             text = (
                 f"expected less than {coolest.temperature_max_c:g} degC, at which the {coolest.name} switches its torque off, got "
-                f"{self.safety.servo_max_c:g} degC"
+                f"{self.safety.servo_max_c:g} degC{self._default_note('servo_max_c')}"
             )
             problems.append((("safety", "servo_max_c"), text))
         fastest_deg_s = max((joint.velocity_max_deg_s for joint in self.arm.joints), default=0.0)
@@ -602,15 +605,23 @@ class Vehicle(Model):
         cells, lowest_v = self.airframe.battery_cells, self.safety.battery_voltage_min_v
         low_v, high_v = (cells * cell_v for cell_v in _CELL_MIN_V)
         if lowest_v is not None and not low_v <= lowest_v <= high_v:
-            text = f"expected {low_v:.1f} to {high_v:.1f} V for the {cells} cells of airframe.battery_cells, got {lowest_v:g} V"
+            text = (
+                f"expected {low_v:.1f} to {high_v:.1f} V for the {cells} cells of airframe.battery_cells, got {lowest_v:g} V"
+                + self._default_note("battery_voltage_min_v")
+            )
             problems.append((("safety", "battery_voltage_min_v"), text))
         refuse("vehicle", problems)
         return self
 
+    def _default_note(self, key: str) -> str:
+        """Return a note for a message if the key of `safety` is not in the file, so that its default is used."""
+        return "" if key in self.safety.model_fields_set else " (the default, because the file does not give it)"
+
     def _poses_within_limits(self) -> Iterator[tuple[Location, str]]:
         joints, fold = self.arm.joints, self.safety.fold_arm_deg
         if joints and len(fold) != len(joints):
-            text = f"expected {len(joints)} angles, one for each of arm.joints, got {len(fold)}"
+            angles = "1 angle" if len(joints) == 1 else f"{len(joints)} angles"
+            text = f"expected {angles}, one for each of arm.joints, got {len(fold)}{self._default_note('fold_arm_deg')}"
             yield ("safety", "fold_arm_deg"), text
             return
         poses: list[tuple[Location, Joints]] = [(("safety", "fold_arm_deg"), self.fold_arm_deg)]

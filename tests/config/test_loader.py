@@ -16,6 +16,7 @@ from companion.config.controller import LAWS, AdaptiveConfig
 from companion.config.document import ConfigError
 from companion.config.loader import PRESETS, FlightConfig, load_vehicle, logged_flight
 from companion.sitl_config.loader import SitlConfig, load_sitl, load_world
+from tests.machines import overrides_with_joints
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(__file__).parent / "data"
@@ -63,6 +64,7 @@ BAD_MISSION = [
         "speed_max_km_h: 0.8",
         [f"{CATCH}:18:3: limits.speed_max_km_h: unknown key; write speed_max_m_s, in m/s (not in km/h)"],
     ),
+    ("arm_deg: [100.0, 60.0]", "arm_deg: stretched", [f'{CATCH}:39:14: phases[2].arm_deg: expected joint angles or a pose of the vehicle (folded, unfolded), got "stretched"; define it in arm.poses of the vehicle file']),
     ("height_m: 1.0", "hieght_m: 1.0", [f"{CATCH}:30:5: phases[0].hieght_m: unknown key; did you mean height_m?"]),
     (
         "height_m: 1.0",
@@ -189,6 +191,10 @@ BAD_VEHICLE = [
     ("x_m: [-2.2, 2.2]", "x_m: [2.2, -2.2]", ["room.x_m: expected the first number to be below the second, got [2.2, -2.2]"]),
     ("link_com_m: [0.16, 0.08]", "link_com_m: [0.26, 0.08]", ["the centre of mass is beyond the end of the link: at 0.26 m on a link of 0.2 m"]),
     ("fold_arm_deg: [165.0, 140.0]", "fold_arm_deg: [165.0, 151.0]", ["fold_arm_deg[1]: 151 deg is outside the joint limits, -10 to 150 deg"]),
+    ("fold_arm_deg: [165.0, 140.0]", "fold_arm_deg: [165.0]", ["fold_arm_deg: expected 2 angles, one for each of arm.joints, got 1"]),
+    ("mass_kg: 3.0 ", "battery_cells: 6\n  mass_kg: 3.0 ", ["battery_voltage_min_v: expected 16.8 to 24.6 V for the 6 cells of airframe.battery_cells, got 13.2 V (the default, because the file does not give it)"]),
+    ("mass_kg: 3.0 ", "mass_kg: 3,0 ", ['mass_kg: expected a number > 0, got "3,0" (write 3.0)']),
+    ("servo_id: 1", "servo_id: 1\n      servo: XL330", ['expected one of 14 names ("XM430-W210", "XM430-W350", "XM540-W150", ...), got "XL330" (did you mean XL330-M288?)']),
     ("mass_kg: 3.0 ", "mass_kg: 0.4 ", ["mass_kg: 0.4 kg is the mass of the whole vehicle, but arm and tool alone have 0.45 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 20.0", ["thrust_max_n: 20 N do not lift 3 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 60.0\n  inertia_kg_m2: [0.02, 0.02, 0.05]", ["inertia_kg_m2[2]: expected at most 0.04 kg m^2 (no moment of a rigid body exceeds the sum of the other two), got 0.05"]),
@@ -196,6 +202,13 @@ BAD_VEHICLE = [
     ("safety:", "computer:\n  cpus: [2, 3, 2]\nsafety:", ["computer.cpus: expected each core once, got 2 twice in [2, 3, 2]"]),
     ("safety:", "computer:\n  cpus: [-1]\nsafety:", ["computer.cpus[0]: expected a whole number from 0 to 1023, got -1"]),
 ]  # fmt: skip
+
+
+def test_a_pose_is_refused_without_an_arm() -> None:
+    (line,) = lines_of(lambda: load_sitl(ROOT / CATCH, overrides=overrides_with_joints(0)))
+    assert line.endswith(
+        'expected joint angles or a pose of the vehicle (folded), got "unfolded"; the vehicle has no arm'
+    )
 
 
 @pytest.mark.parametrize(("old", "new", "expected"), BAD_VEHICLE, ids=[new for _, new, _ in BAD_VEHICLE])

@@ -237,7 +237,7 @@ def test_the_vehicle_file_names_the_line_of_the_urdf_key(tmp_path: Path) -> None
     with pytest.raises(ConfigError, match=r"arm\.urdf: .*missing\.urdf: not readable: No such file"):
         load_vehicle(vehicle_file(tmp_path, {"urdf": "missing.urdf", "joints": JOINTS}))
     (tmp_path / "arm.urdf").write_text(TEXT, encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"expected 3 links, one for each of arm\.joints, got 4"):
+    with pytest.raises(ConfigError, match=r"arm\.urdf: expected 3 moving joints, one for each of arm\.joints, got 4"):
         load_vehicle(vehicle_file(tmp_path, {"urdf": "arm.urdf", "joints": JOINTS[:3]}))
 
 
