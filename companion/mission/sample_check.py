@@ -270,14 +270,14 @@ class SampleCheck:
         for part, (_, _, z_m), radius_m in parts:
             lowest_m = position[2] + z_m - radius_m
             if lowest_m < FLOOR_GAP_M:
-                what = f"drags the {part} over the floor"
+                what = f"drags {part if part.startswith('joint') else f'the {part}'} over the floor"
                 detail = f"its lowest point is {lowest_m:.2f} m high (minimum {FLOOR_GAP_M:g} m)"
                 yield Violation(
                     limit=f"floor {part}",
                     excess=FLOOR_GAP_M - lowest_m,
                     what=what,
                     detail=detail,
-                    advice="fly higher or fold the arm first",
+                    advice="fly higher or choose another pose of the arm",
                 )
 
     def _motion(self, reference: Reference, jerks: tuple[Vec3, Joints]) -> Iterator[Violation]:

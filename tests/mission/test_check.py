@@ -103,7 +103,7 @@ REFUSED = [
     (["mission.phases[2].to_m=[1, -1.5, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.00, -1.50, 1.00) m: the rotors, the arm and the net reach y = -1.95 m; the room is -1.8 to 1.8 m, reduced at each end by 0.1 m for tracking; move the waypoint inwards"),
     (["mission.phases[2].to_m=[1, 0, 2.1]"], "the rotors, the arm and the net reach z = 2.23 m; the room is 0 to 2.2 m, reduced at each end by 0.2 m for the catch"),
     (["mission.phases[2].to_m=[1, 0, 0.2]"], "phase 'catch' flies into the floor at t = 9.5 s, (1.00, 0.00, 0.20) m: the body's origin at 0.20 m (minimum 0.30 m); raise the waypoint"),
-    (["mission.phases[2].to_m=[1, 0, 0.4]"], "phase 'catch' drags the net over the floor at t = 9.5 s, (1.00, 0.00, 0.40) m: its lowest point is -0.07 m high (minimum 0.01 m); fly higher or fold the arm first"),
+    (["mission.phases[2].to_m=[1, 0, 0.4]"], "phase 'catch' drags the net over the floor at t = 9.5 s, (1.00, 0.00, 0.40) m: its lowest point is -0.07 m high (minimum 0.01 m); fly higher or choose another pose of the arm"),
     (["mission.phases[4].arm_deg=[100, 60]"], "phase 'land' drags the net over the floor"),
     (["mission.phases[4].arm_deg=[50, 140]"], "phase 'return' drives joint 1 beyond its limit at t = 17.0 s, (-1.00, 0.00, 1.00) m: 50.0 deg (limits 60 and 175 deg); change arm_deg (also in 'above the start', 'land')"),
     (["mission.phases[2].arm_deg=[100, -20]"], "phase 'catch' drives joint 2 beyond its limit"),
