@@ -20,6 +20,7 @@ PX4_DEFAULTS: Mapping[str, float | int] = {
     "BAT_LOW_THR": 0.15,
     "CAL_ACC0_ID": 1310988,
     "CAL_GYRO0_ID": 1310988,
+    "CA_ROTOR_COUNT": 4,
     "CBRK_FLIGHTTERM": 121212,
     "CBRK_IO_SAFETY": 22027,
     "CBRK_SUPPLY_CHK": 0,

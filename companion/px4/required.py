@@ -16,6 +16,7 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.flight_stage import SPOOL_S
 
 HOVER = "MPC_THR_HOVER"
+ROTOR_COUNT = "CA_ROTOR_COUNT"
 RADIO = "COM_RC_IN_MODE"
 NO_RADIO = 4
 _HOVER_OFF_MAX = 0.35
@@ -96,6 +97,11 @@ def _hover(vehicle: Vehicle) -> tuple[float, float]:
     airframe = vehicle.airframe
     expected = airframe.hover_thrust or airframe.mass_kg * GRAVITY_M_S2 / airframe.thrust_max_n
     return expected * (1.0 - _HOVER_OFF_MAX), expected * (1.0 + _HOVER_OFF_MAX)
+
+
+def _rotors(vehicle: Vehicle) -> tuple[float, float]:
+    count = float(vehicle.airframe.rotor_layout.count)
+    return count, count
 
 
 def _below_ceiling(vehicle: Vehicle) -> tuple[float, float]:
@@ -296,6 +302,15 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted("COM_THROW_EN", 0, "if 1, an armed vehicle that is picked up and moved fast would start its motors"),
     ),
     "Arming, take-off and landing": (
+        Wanted(
+            ROTOR_COUNT,
+            None,
+            "with another number, PX4 or the vehicle file describes another airframe, and thrust and torques would be wrong",
+            limits=_rotors,
+            limits_text="number of rotors of `airframe`",
+            fix="select the machine's airframe in QGroundControl, or correct airframe.layout or airframe.rotors",
+            file=False,
+        ),
         Wanted(
             HOVER,
             None,

@@ -97,6 +97,7 @@ def stub_of(config: WorldConfig, airframe: Airframe, link_delay_s: float = 0.0) 
     """
     params = Params()
     params.set("MAV_TYPE", mav_type(airframe.rotor_layout.count))
+    params.set("CA_ROTOR_COUNT", airframe.rotor_layout.count)
     params.set("BAT1_N_CELLS", airframe.battery_cells)
     params.set("THR_MDL_FAC", config.thr_mdl_fac)
     for name, value in config.overridden_px4_params().items():

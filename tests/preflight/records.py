@@ -31,7 +31,11 @@ from tests.support import CATCH
 
 START_S, SPAN_S = 2.0, 5.0
 ARM_RAD: Joints = (math.radians(165.0), math.radians(140.0))
-PARAMS = {**{one.name: one.value for one in required.WANTED if one.value is not None}, required.HOVER: 0.49}
+PARAMS = {
+    **{one.name: one.value for one in required.WANTED if one.value is not None},
+    required.HOVER: 0.49,
+    required.ROTOR_COUNT: 4,
+}
 FLAGS = 447
 """As PX4 1.16 says it of a machine that stands and fuses motion capture, with a global origin."""
 

@@ -14,10 +14,11 @@ from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.check_row import Level, Row
 from companion.preflight.px4 import firmware_row, rows
 from companion.px4.defaults import PX4_DEFAULTS
-from companion.px4.required import HOVER, WANTED, file_values, names, simulated_values
+from companion.px4.required import HOVER, ROTOR_COUNT, WANTED, file_values, names, simulated_values
 from companion.runtime.clock import flight_clock
 from companion.sitl_config.loader import load_world
 from companion.sitl_config.world import World
+from sitl.autopilot.backend import stub_of
 from tests.io.px4_peer import free_udp_port
 from tests.io.stub_rig import standing_stub
 
@@ -42,6 +43,7 @@ SPOILED = [
     ("RTL_RETURN_ALT", 30.0, True, "set RTL_RETURN_ALT to 1.5"),
     ("COM_RC_IN_MODE", 7, True, "no_radio.params"),
     ("MPC_THR_HOVER", 0.2, True, "companion hover fit"),
+    ("CA_ROTOR_COUNT", 6, True, "select the machine's airframe in QGroundControl"),
     ("BAT_CRIT_THR", 0.25, False, "set BAT_CRIT_THR to 0.1"),
 ]
 
@@ -51,7 +53,7 @@ def vehicle(*overrides: str) -> Vehicle:
 
 
 def good() -> dict[str, float | int]:
-    return {**simulated_values(), HOVER: 0.49}
+    return {**simulated_values(), HOVER: 0.49, ROTOR_COUNT: 4}
 
 
 def wrong(params: dict[str, float | int], machine: Vehicle | None = None) -> list[Row]:
@@ -197,3 +199,11 @@ def test_wrong_parameters_come_in_px4s_types() -> None:
     world = World(px4_params={"EKF2_EV_CTRL": 3.0, "COM_OF_LOSS_T": 1.0})
     assert world.overridden_px4_params() == {"EKF2_EV_CTRL": 3, "COM_OF_LOSS_T": 1.0}
     assert [type(value) for value in world.overridden_px4_params().values()] == [int, float]
+
+
+def test_the_number_of_rotors_is_that_of_the_vehicle_file() -> None:
+    hexacopter = load_vehicle("hexa_2r", [UDP])
+    titles = {row.title for row in wrong({**good(), HOVER: 0.4}, hexacopter)}
+    assert ROTOR_COUNT in titles
+    assert ROTOR_COUNT not in {row.title for row in wrong({**good(), HOVER: 0.4, ROTOR_COUNT: 6}, hexacopter)}
+    assert stub_of(load_world()[0], hexacopter.airframe).params[ROTOR_COUNT] == 6
