@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import math
 import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -22,6 +23,8 @@ from rich.text import Text
 
 from companion.cli.campaign import wide_console
 from companion.config.loader import FlightConfig
+from companion.config.vehicle import Vehicle
+from companion.control.arm_model import manipulator_of
 from companion.io.devices import open_available
 from companion.io.protocols import DeviceError
 from companion.launcher.launcher import replace_device_settings
@@ -108,7 +111,23 @@ def _plan_only(arguments: argparse.Namespace, config: FlightConfig, found: list[
     if found:
         return EXIT_BAD_INPUT
     print(f"{arguments.mission}: mission {config.mission.name!r} can be flown by {config.vehicle.name}")
+    for line in _poses(config.vehicle):
+        print(f"  {line}")
     return EXIT_OK
+
+
+def _poses(vehicle: Vehicle) -> Iterator[str]:
+    """Return a line for each pose of the arm with the position of its tip, so that an axis or an angle in a wrong unit is noticed."""
+    if not vehicle.arm.joints:
+        return
+    arm = manipulator_of(vehicle)
+    tip = "net" if vehicle.tool is not None else "end of the arm"
+    for name, angles_deg in vehicle.poses_deg.items():
+        # Adding 0 turns -0.0 into 0.0.
+        x_m, y_m, z_m = (round(m, 2) + 0.0 for m in arm.net_body_m(tuple(map(math.radians, angles_deg))))
+        angles = ", ".join(f"{angle:g}" for angle in angles_deg)
+        at = f"{x_m:+.2f} m forward, {y_m:+.2f} m left and {z_m:+.2f} m up from the body origin"
+        yield f"pose {name}, {angles} deg: the {tip} is {at}"
 
 
 def _rows(task: Task, plan: tuple[str, ...], scratch: Path, people: Console) -> list[Row]:

@@ -306,3 +306,10 @@ def test_the_good_files_that_the_bad_ones_are_made_of_pass(sandbox: Sandbox) -> 
     ended = sandbox.run("check", "mission.yaml", "--plan-only", "--set", "world.payload_kg=0.1", "world.seed=2")
     assert (ended.code, ended.err) == (EXIT_OK, "")
     assert "can be flown" in ended.out
+
+
+def test_the_plan_check_shows_where_each_pose_puts_the_net(capsys: pytest.CaptureFixture[str]) -> None:
+    straight = ("vehicle.arm.poses={unfolded: [90, 0]}", "vehicle.arm.link_lengths_m=[0.2, 0.22]")
+    assert main(["check", "hover", "--plan-only", "--set", *straight]) == EXIT_OK
+    line = "pose unfolded, 90, 0 deg: the net is +0.00 m forward, +0.00 m left and -0.47 m up from the body origin"
+    assert line in capsys.readouterr().out
