@@ -133,6 +133,15 @@ def test_something_in_the_way_stops_it_gently(vehicle: Vehicle) -> None:
     assert bench.degrees[1] < 41.0
 
 
+def test_a_small_servo_that_cannot_press_as_hard_stops_at_its_torque_limit() -> None:
+    bench = Bench(load_vehicle(SHIPPED, ["vehicle.arm.joints[1].torque_max_nm=0.75"]))
+    obstacle_rad = math.radians(40.0)
+    bench.disturbance = lambda angle: (0.0, -200.0 * max(0.0, angle[1] - obstacle_rad))
+    bench.motion.go(1, math.radians(80.0), math.radians(20.0))
+    moved = bench.until(lambda m: m.reached)
+    assert moved.stop.startswith("joint 2: +0.") and "obstacle" in moved.stop and moved.torque_nm == (0.0, 0.0)
+
+
 @pytest.mark.parametrize("joint", [0, 1])
 def test_a_wrong_sign_ends_before_it_goes_far(vehicle: Vehicle, joint: int) -> None:
     bench = Bench(vehicle, (90.0, 40.0))

@@ -21,7 +21,8 @@ ACCELERATION_DEG_S2: Final = 60.0
 TORQUE_SHARE: Final = 0.6
 """Torque limit of each servo as a fraction of `torque_max_nm`."""
 LOAD_NM: Final = 0.5
-"""Torque beyond gravity that indicates an obstacle if it lasts for `LOAD_S`."""
+"""Torque beyond gravity that indicates an obstacle if it lasts for `LOAD_S`; so does a joint at its torque limit, which is lower for
+a small servo."""
 LOAD_S: Final = 0.15
 LIMIT_MARGIN_DEG: Final = 3.0
 RUNAWAY_DEG_S: Final = 90.0
@@ -142,8 +143,12 @@ class Motion:
         ]
         load = tuple(a - b for a, b in zip(torque, gravity, strict=True))
         self.load_max_nm = [max(most, abs(now)) for most, now in zip(self.load_max_nm, load, strict=True)]
-        self._loaded_s = self._loaded_s + dt_s if max(map(abs, load)) > LOAD_NM else 0.0
-        stop = self._stop(state, load)
+        pressing = [
+            abs(beyond_nm) > LOAD_NM or abs(torque_nm) >= most_nm
+            for beyond_nm, torque_nm, most_nm in zip(load, torque, self._limit_nm, strict=True)
+        ]
+        self._loaded_s = self._loaded_s + dt_s if any(pressing) else 0.0
+        stop = self._stop(state, load, pressing)
         if stop:
             torque = [0.0] * self._count
         reached = all(
@@ -183,7 +188,7 @@ class Motion:
         self._integral[joint] = max(-_INTEGRAL_MAX_NM, min(_INTEGRAL_MAX_NM, grown))
         return max(-most, min(most, held_nm + self._integral[joint]))
 
-    def _stop(self, state: ArmState, load: Joints) -> str:
+    def _stop(self, state: ArmState, load: Joints, pressing: Sequence[bool]) -> str:
         safety = self._vehicle.safety
         for joint in range(self._count):
             name = f"joint {joint + 1}"
@@ -204,7 +209,7 @@ class Motion:
             if not low <= angle_deg <= high:
                 return f"{name} is at {angle_deg:.0f} deg, beyond its limits, {low:g} to {high:g} deg; move it back by hand"
         if self._loaded_s > LOAD_S:
-            joint = max(range(self._count), key=lambda index: abs(load[index]))
+            joint = max(range(self._count), key=lambda index: (pressing[index], abs(load[index])))
             return (
                 f"joint {joint + 1}: {load[joint]:+.2f} N m beyond gravity; check for an obstacle, and check the masses "
                 "and the torque constant in the vehicle file"

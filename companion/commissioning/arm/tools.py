@@ -95,7 +95,9 @@ async def _drive(session: Session, leader: Leader, what: str) -> Driven:
     session.say(f"{part}: {what}", "bold")
     session.say(f"  propellers off; {_stand_text(session.vehicle)}")
     bounds = f"at most {SPEED_MAX_DEG_S:g} deg/s and {100 * TORQUE_SHARE:.0f} % of the torque"
-    session.say(f"  {bounds}; the arm stops at {LOAD_NM:g} N m beyond gravity, and immediately on Ctrl-C")
+    session.say(
+        f"  {bounds}; the arm stops at {LOAD_NM:g} N m beyond gravity, at its torque limit, and immediately on Ctrl-C"
+    )
     session.say("  at the end the arm always goes limp: keep hands and objects out of the space below it")
     answer = session.ask("may the arm move now?")
     if answer is None:
