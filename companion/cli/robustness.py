@@ -93,4 +93,5 @@ def _campaign(arguments: argparse.Namespace) -> Robustness:
         cases=cases,
         cases_file=arguments.cases,
         keep=arguments.keep,
+        vehicle=arguments.vehicle,
     )

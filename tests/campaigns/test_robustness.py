@@ -94,11 +94,13 @@ def test_a_mistake_in_a_file_of_cases_is_reported_with_its_place(tmp_path: Path,
 
 def test_the_printed_command_flies_the_same_world() -> None:
     drawn = {**WORLD, "machine": {"on": True, "inertia_error": [0.1, 0.0, 0.0]}}
-    line = fly_command(str(CATCH), "adaptive", "recommended", "ideal", drawn, ["controller.rho_max=5.0"])
+    line = fly_command(str(CATCH), "adaptive", "recommended", "ideal", drawn, ["controller.rho_max=5.0"], "hexa_2r")
     words = shlex.split(line)
     assert words[:4] == ["companion", "fly", str(CATCH), "--sitl"]
     assert words[words.index("--world") + 1] == "ideal"
-    config = load_sitl(CATCH, None, "adaptive", "recommended", words[words.index("--set") + 1 :])
+    vehicle = words[words.index("--vehicle") + 1]
+    config = load_sitl(CATCH, vehicle, "adaptive", "recommended", words[words.index("--set") + 1 :])
+    assert config.vehicle.name == "hexa-2r"
     (case,) = as_cases([row(0, 0.04, machine=drawn["machine"])])
     assert config.world == case.world
 

@@ -34,6 +34,8 @@ class Robustness(Campaign):
     cases_file: str | None = None
     keep: str | None = None
     """File to which the worst flights, or the flown cases, are written."""
+    vehicle: str | None = None
+    """Vehicle file; None for the mission's."""
 
     @property
     def law(self) -> tuple[str, str]:
@@ -118,7 +120,8 @@ class Robustness(Campaign):
                 console.print(text, style="yellow" if row["outcome"] in SAFE else "red", highlight=False, markup=False)
         hardest = worst(rows)[0]["world"]
         keys = hardest if self.cases else {key: hardest[key] for key in DRAWN}
-        line = fly_command(self.mission, law, preset, self.configs[0].laboratory.name, keys, self.overrides)
+        world = self.configs[0].laboratory.name
+        line = fly_command(self.mission, law, preset, world, keys, self.overrides, self.vehicle)
         console.print(
             f"to fly the worst world with companion fly:\n{line}", highlight=False, markup=False, soft_wrap=True
         )

@@ -113,7 +113,13 @@ def write_cases(cases: Cases, path: Path, remark: str) -> None:
 
 
 def fly_command(
-    mission: str, controller: str, preset: str, name: str, world: Mapping[str, Any], sets: Sequence[str] = ()
+    mission: str,
+    controller: str,
+    preset: str,
+    name: str,
+    world: Mapping[str, Any],
+    sets: Sequence[str] = (),
+    vehicle: str | None = None,
 ) -> str:
     """Return the `companion fly --sitl` command that flies the same world.
 
@@ -124,8 +130,11 @@ def fly_command(
         name: name of a built-in world, or a world file.
         world: keys of the world to set.
         sets: further overrides.
+        vehicle: vehicle file; None for the mission's.
     """
-    words = ["companion", "fly", mission, "--sitl", "--controller", controller, "--preset", preset, "--world", name]
+    words = ["companion", "fly", mission, "--sitl"]
+    words += [] if vehicle is None else ["--vehicle", vehicle]
+    words += ["--controller", controller, "--preset", preset, "--world", name]
     words += ["--set", *sets]
     for key, value in world.items():
         text = flow_text(value)
