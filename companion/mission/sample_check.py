@@ -16,12 +16,15 @@ from companion.config.vehicle import LINK_RADIUS_M, Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx
+from companion.model.rotors import disk_radius_m
 from companion.model.types import IDENTITY_QUAT, Joints, PhaseKind, Quat, Reference, Vec3
 from companion.safety.governor import BODY_TOP_M, SafeSet
 from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
 
 FLOOR_GAP_M = 0.01
+ROTOR_GAP_M = 0.02
+"""Smallest distance of the arm and the net below a rotor's disk."""
 TRACKING_M = 0.10
 """Largest expected distance from the plan, m; measured over random missions in a wind of 3 m/s."""
 CATCH_M = 0.20
@@ -62,6 +65,9 @@ class SampleCheck:
         self._limits = mission.limits
         self._catch = mission.catch
         self._vehicle = vehicle
+        rotors = vehicle.airframe.rotor_layout
+        self._rotors_body_m = rotors.positions_body_m
+        self._disk_m = disk_radius_m(rotors, vehicle.airframe.radius_m)
         self._torque_limits_nm = vehicle.joint_torque_limits_nm
         self._manipulator = manipulator_of(vehicle)
         self._safe = SafeSet(vehicle)
@@ -267,7 +273,17 @@ class SampleCheck:
         parts = [(tip, self._manipulator.net_body_m(reference.arm_rad), self._vehicle.tip_radius_m)]
         for number, joint_m in enumerate(self._manipulator.joints_body_m(reference.arm_rad)[1:], start=2):
             parts.append(("elbow" if len(arm.joints) == 2 else f"joint {number}", joint_m, LINK_RADIUS_M))
-        for part, (_, _, z_m), radius_m in parts:
+        for part, (x_m, y_m, z_m), radius_m in parts:
+            for number, (rotor_x_m, rotor_y_m, rotor_z_m) in enumerate(self._rotors_body_m, start=1):
+                above_m = z_m + radius_m - (rotor_z_m - ROTOR_GAP_M)
+                if above_m > 0.0 and math.hypot(x_m - rotor_x_m, y_m - rotor_y_m) < self._disk_m + radius_m:
+                    yield Violation(
+                        limit=f"rotor {part}",
+                        excess=above_m,
+                        what=f"brings the {part} into a rotor",
+                        detail=f"at ({x_m:.2f}, {y_m:.2f}, {z_m:.2f}) m in the body frame, it is at rotor {number}",
+                        advice="change arm_deg, or the joint limits arm.joints[].angle_deg",
+                    )
             lowest_m = position[2] + z_m - radius_m
             if lowest_m < FLOOR_GAP_M:
                 what = f"drags {part if part.startswith('joint') else f'the {part}'} over the floor"

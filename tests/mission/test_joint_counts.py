@@ -75,3 +75,12 @@ def test_an_arm_away_from_its_start_is_told_with_every_joint(count: int) -> None
     (problem,) = check_start(config.mission, config.vehicle, at, math.radians(start.yaw_deg), off)
     wanted = ", ".join(f"{angle:g}" for angle in start.arm_deg)
     assert f"starts with the arm at ({wanted}) deg" in problem
+
+
+@pytest.mark.parametrize(("yaw_deg", "hits"), [(45.0, True), (0.0, False)])
+def test_an_arm_that_swings_into_a_rotor_is_refused(yaw_deg: float, hits: bool) -> None:
+    """The forearm points up in front of the body, between the front rotors at a yaw of 0 and into the left one at 45 deg."""
+    move = f"mission.phases[1]={{type: arm, name: swing, arm_deg: [{yaw_deg}, 20, 90, 0]}}"
+    config = load_flight("hover", vehicle_path="tarot650_4r", overrides=[move])
+    found = check_mission(config.mission, config.vehicle)
+    assert any("brings the net into a rotor" in problem and "at rotor 3" in problem for problem in found) is hits
