@@ -69,7 +69,7 @@ STAGES = (
     Stage("imports", (str(_BIN / "lint-imports"), "--no-cache"), tests=False),
     Stage(
         "computing",
-        (*_PYTEST, "-n", "3", "--dist", "worksteal", "-m", "not flight and not waits"),
+        (*_PYTEST, "-n", "3", "--dist", "worksteal", "-o", "timeout=600", "-m", "not flight and not waits"),
         tests=True,
         beside=True,
     ),
