@@ -1,8 +1,8 @@
 """`python -m tests.at_a_time waits|flights`: how many tests of a kind run at a time, one fewer where other programs take a core.
 
-A flight takes about half a core, a waiting test a quarter. The bytes of a pty are carried by a thread of the kernel that waits for a
-core like any other program, so neither fills two cores. Where the flight, the guardian and the simulated world get real-time priority,
-they go on in time whatever else two cores have to do. Without it their limits are met by fewer.
+A flight takes about half a core, a waiting test a third. The bytes of a pty are carried by a thread of the kernel that waits for a core
+like any other program, so neither fills two cores. Where the flight, the guardian and the simulated world get real-time priority, they
+go on in time whatever else two cores have to do. Without it their limits are met by fewer.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 from companion.runtime.realtime import FLIGHT_PRIORITY
 
-AT_A_TIME = {"waits": (2, 4), "flights": (1, 3)}
+AT_A_TIME = {"waits": (2, 3), "flights": (1, 3)}
 """Without and with real-time priority, on two cores or more."""
 BUSY_CORES = "COMPANION_TESTS_BUSY_CORES"
 """Environment variable: how many cores other programs used before the first stage."""
