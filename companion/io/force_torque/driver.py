@@ -26,6 +26,8 @@ _LOG = logging.getLogger(__name__)
 
 _REPEAT_S: Final = 0.4
 _FIRST_SAMPLES: Final = 5
+SILENT_S: Final = 1.0
+"""Time without a sample after which a sensor that is being read for the tare counts as silent, s."""
 _READ_BYTES: Final = 4096
 _MODEL: Final = "RFT60"
 
@@ -74,16 +76,18 @@ class RobotousForceTorque:
         """Return the samples of the next `duration_s` (counted at the configured rate), for the caller to average.
 
         Raises:
-            DeviceError: the samples did not arrive within twice the time plus one second.
+            DeviceError: no sample arrived for `SILENT_S`.
         """
         count = max(1, math.ceil(duration_s * self._device.rate_hz))
-        deadline_s = 2.0 * duration_s + 1.0
-        samples = await self._collect(count, deadline_s)
-        if len(samples) < count:
-            raise DeviceError(
-                f"{self._where}: {len(samples)} of {count} samples received within {deadline_s:g} s while taring; "
-                f"{self._lost or 'the sensor fell silent'}"
-            )
+        samples: list[ForceSample] = []
+        while len(samples) < count:
+            more = await self._collect(count - len(samples), SILENT_S)
+            samples += more
+            if not more:
+                raise DeviceError(
+                    f"{self._where}: {len(samples)} of {count} samples received, none in the last {SILENT_S:g} s, while taring; "
+                    f"{self._lost or 'the sensor fell silent'}"
+                )
         return samples
 
     async def __aenter__(self) -> Self:
