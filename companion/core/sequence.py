@@ -153,7 +153,10 @@ def _take_off(t: Transition) -> None:
 
 def _arm_rad(t: Transition) -> Joints:
     """Return the measured joint angles, rad; empty if the vehicle has no arm."""
-    return t.i.arm.angle_rad if t.i.arm is not None else ()
+    if not t.parameters.vehicle.arm.joints:
+        return ()
+    assert t.i.arm is not None
+    return t.i.arm.angle_rad
 
 
 def _decline_start(t: Transition) -> None:

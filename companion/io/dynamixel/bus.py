@@ -88,7 +88,7 @@ class ArmBus:
         return scales
 
     def read(self) -> tuple[Block, ...] | None:
-        """Perform one sync read. Return None unless every servo answered in time and still have the settings of `open`.
+        """Perform one sync read. Return None unless every servo answered in time and still has the settings of `open`.
 
         Raises:
             OSError: the port is gone.
