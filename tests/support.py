@@ -24,7 +24,9 @@ from types import TracebackType
 from typing import Any, Self
 
 from companion.cli.main import main
-from companion.config.vehicle import Tether, Tool, Vehicle
+from companion.config.arm import Tool
+from companion.config.tether import Tether
+from companion.config.vehicle import Vehicle
 from companion.model.types import Inputs, Outputs
 from companion.sitl_config.loader import load_sitl
 

@@ -153,7 +153,7 @@ def bare_mavsdk(frames: int) -> tuple[Latency, Latency]:
 
 def autopilot_edge(frames: int) -> tuple[Latency, Latency]:
     """Receive, then call MavsdkAutopilot.send_attitude, which converts, checks and sends through MavlinkDirect."""
-    from companion.config.vehicle import AutopilotDevice
+    from companion.config.devices import AutopilotDevice
     from companion.io.px4.driver import MavsdkAutopilot
     from companion.model.types import IDENTITY_QUAT, AttitudeSetpoint
     from companion.runtime.clock import flight_clock

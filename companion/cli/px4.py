@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
+from companion.config.devices import AutopilotDevice
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
 from companion.config.shipped import DEFAULT_VEHICLE
-from companion.config.vehicle import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4.transfer import Comparison, Difference, WriteResult, compare, write
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from companion.config.vehicle import Arm, Vehicle
+from companion.config.arm import Arm
+from companion.config.vehicle import Vehicle
 from companion.model.arm_chain import TOOL_PART_INERTIA_KG_M2, ArmChain, ChainLink, rod_inertia_kg_m2
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.types import IDENTITY_QUAT, Quat, Vec3

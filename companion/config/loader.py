@@ -12,9 +12,11 @@ from typing import TypeVar
 from pydantic import ValidationError
 
 from companion.config import mocap
+from companion.config.arm import NO_ARM
 from companion.config.base import Location, Model
 from companion.config.controller import LAWS, AnyControllerConfig, ControllerConfig, preset_file
 from companion.config.controller import PRESETS as PRESETS
+from companion.config.devices import ANY_INTERFACE
 from companion.config.document import (
     RANK_MISSING,
     RANK_VALUE,
@@ -30,7 +32,7 @@ from companion.config.mission import ControllerChoice, Mission
 from companion.config.overrides import Override, Section, apply_overrides, parse_overrides
 from companion.config.shipped import named_file, near
 from companion.config.urdf import read_urdf
-from companion.config.vehicle import ANY_INTERFACE, NO_ARM, Vehicle
+from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import read_document
 
 M = TypeVar("M", bound=Model)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from companion.config.vehicle import Tool
+from companion.config.arm import Tool
 from companion.control.manipulator import Manipulator
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_conjugate, quat_multiply, quat_rotate

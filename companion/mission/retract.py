@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from companion.config.vehicle import Room, Tether, Vehicle
+from companion.config.tether import Room, Tether
+from companion.config.vehicle import Vehicle
 from companion.mission.plan import Plan, fold_time_s
 from companion.mission.plan_builder import PlanBuilder, stopping
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED

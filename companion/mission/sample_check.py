@@ -11,8 +11,9 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from companion.config.arm import LINK_RADIUS_M
 from companion.config.mission import Mission
-from companion.config.vehicle import LINK_RADIUS_M, Vehicle
+from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx

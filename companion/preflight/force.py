@@ -6,7 +6,8 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 
-from companion.config.vehicle import ForceDevice, Vehicle
+from companion.config.devices import ForceDevice
+from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.control.sensing import ForceSensing
 from companion.model.check_row import Row

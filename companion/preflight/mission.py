@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from companion.config.loader import FlightConfig
 from companion.config.mission import Start
-from companion.config.vehicle import Room
+from companion.config.tether import Room
 from companion.model.check_row import Row
 from companion.model.listing import listed
 from companion.model.observations import Observations

@@ -2,7 +2,7 @@
 
 A pose is trusted if it is near the one that PX4's velocity and rates predict. A pose that is not trusted counts as not received and
 is not passed on to PX4: an estimator that has fused another body's pose is useless for a landing. Thresholds are keys of `safety:`
-in the vehicle file (`companion.config.vehicle.Safety`). The rows of these rules, with their thresholds, actions and the texts for
+in the vehicle file (`companion.config.safety.Safety`). The rows of these rules, with their thresholds, actions and the texts for
 the operator, are in `companion.safety.rules`.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from companion.config.vehicle import Safety
+from companion.config.safety import Safety
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_rotate, wrap_rad
 from companion.model.types import Inputs, MocapPose, Quat, Vec2, VehicleState

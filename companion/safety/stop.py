@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from companion.config.vehicle import Safety
+from companion.config.safety import Safety
 
 LAND_AHEAD_S = 0.6
 """PX4 sets the stop point of LAND this far ahead, in addition to the braking distance. Confirmed by measurement: docs/px4.md."""

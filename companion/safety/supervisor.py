@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from companion.config.vehicle import Safety
+from companion.config.safety import Safety
 from companion.model.types import Event, SafetyAction
 from companion.safety.notices import HOLD_EXPIRED, RETRACT_EXPIRED
 from companion.safety.rules import OPERATOR_RESUME

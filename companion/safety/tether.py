@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 
-from companion.config.vehicle import Tether, Vehicle
+from companion.config.tether import Tether
+from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_rotate
 from companion.model.types import Joints, Quat, TetherState, Vec3
 from companion.safety.stop import StopModel

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from companion.config.vehicle import Tether
+from companion.config.tether import Tether
 from companion.model.types import Vec3
 
 HORIZONTAL_N = 0.7

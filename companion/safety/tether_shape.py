@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 
 from companion.config.arm_chain import chain_of
-from companion.config.vehicle import Tether, Vehicle
+from companion.config.tether import Tether
+from companion.config.vehicle import Vehicle
 from companion.model.arm_skeleton import skeleton_of
 from companion.model.types import Joints, Vec2, Vec3
 

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from companion.config.base import JOINTS_MAX, Fraction, Model, NonNegative, Positive, RelativeError, Vector2, Vector3
+from companion.config.devices import NatNetVersion, ServoBaud
 from companion.config.explain import nearest
-from companion.config.vehicle import NatNetVersion, ServoBaud
 from companion.model.servos import ServoName
 from companion.px4.defaults import PX4_DEFAULTS
 from companion.sitl_config.effects.air import Air

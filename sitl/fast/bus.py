@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from companion.config.vehicle import Joint, Vehicle
+from companion.config.arm import Joint
+from companion.config.vehicle import Vehicle
 from companion.io.dynamixel.registers import JointScale, joint_scale
 from companion.model.servos import WATCHDOG_ERROR
 from companion.model.types import ArmState, Joints

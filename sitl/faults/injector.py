@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from companion.config.vehicle import Tether
+from companion.config.tether import Tether
 from companion.model.frames import quat_from_euler_zyx, tilt_rad
 from companion.model.types import Quat, Vec3
 from companion.sitl_config.faults import Fault, FaultKind

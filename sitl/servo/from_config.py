@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from companion.config.vehicle import ArmDevice, Joint, Vehicle
+from companion.config.arm import Joint
+from companion.config.devices import ArmDevice
+from companion.config.vehicle import Vehicle
 from companion.sitl_config.world import Servo, World
 from sitl.servo import registers as reg
 from sitl.servo.kinds import KINDS

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import get_args
 
-from companion.config.vehicle import ServoBaud
+from companion.config.devices import ServoBaud
 
 MODEL = 1030
 BAUDS: tuple[int, ...] = (9600, *get_args(ServoBaud), 4_500_000)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from companion.commissioning.arm.poses import steps_of
-from companion.config.vehicle import Arm
+from companion.config.arm import Arm
 from companion.model.types import Joints
 
 MOVE_S: Final = 2.0

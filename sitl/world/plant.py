@@ -10,7 +10,8 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
-from companion.config.vehicle import Joint, Vehicle
+from companion.config.arm import Joint
+from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_normalize
 from companion.model.types import Joints, Quat, Vec2, Vec3
 from companion.sitl_config.distributions import with_model_error

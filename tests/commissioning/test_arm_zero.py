@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from companion.commissioning.arm.poses import steps_of
 from companion.commissioning.arm.zero import HELD_S, ZeroGuide, ZeroView
+from companion.config.arm import Arm
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
-from companion.config.vehicle import Arm
 from companion.io.dynamixel.registers import RAD_PER_COUNT
 from companion.model.servos import COUNTS_PER_TURN
 from companion.model.types import Joints

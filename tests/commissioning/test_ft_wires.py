@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from companion.commissioning.force_torque.watch import FtSensor
+from companion.config.devices import ForceDevice
 from companion.config.loader import load_vehicle
-from companion.config.vehicle import ForceDevice
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.runtime.clock import flight_clock
 from sitl.force_torque import ForceTorqueServer

@@ -16,7 +16,7 @@ from companion.cli.main import _normalised, make_parser
 from companion.config.base import Model
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import PRESETS, load_flight
-from companion.config.vehicle import Safety
+from companion.config.safety import Safety
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_CODES
 from companion.model.types import SafetyAction
 from companion.safety import notices

@@ -12,7 +12,8 @@ from collections.abc import Callable
 from random import Random
 from typing import ClassVar, Self
 
-from companion.config.vehicle import Arm, ArmDevice, Joint
+from companion.config.arm import Arm, Joint
+from companion.config.devices import ArmDevice
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.dynamixel.bus import ArmBus

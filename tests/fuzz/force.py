@@ -9,7 +9,7 @@ import time
 from random import Random
 from typing import ClassVar, Self
 
-from companion.config.vehicle import ForceDevice
+from companion.config.devices import ForceDevice
 from companion.io.force_torque import rft
 from companion.io.force_torque.driver import RobotousForceTorque
 from companion.io.force_torque.rft import RATE_CODES, Command, Wrench

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Self
 from pymavlink.dialects.v20 import common as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
-from companion.config.vehicle import AutopilotDevice
+from companion.config.devices import AutopilotDevice
 from companion.guardian.link import Link, UdpWire
 from companion.guardian.px4 import Px4State
 from companion.io.px4 import messages

@@ -10,7 +10,7 @@ import struct
 from random import Random
 from typing import ClassVar, Self
 
-from companion.config.vehicle import MocapDevice
+from companion.config.devices import MocapDevice
 from companion.io.mocap import natnet
 from companion.io.mocap.driver import NatNetMocap
 from companion.io.mocap.natnet import Message

@@ -15,7 +15,7 @@ from contextlib import closing, contextmanager
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.config.vehicle import AutopilotDevice
+from companion.config.devices import AutopilotDevice
 from companion.guardian.link import Link, SerialWire, TcpWire, UdpWire, Wire, address_problem, open_wire
 from companion.io.px4.claim import LinkClaim
 from companion.io.px4.driver import MavsdkAutopilot

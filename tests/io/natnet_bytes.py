@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from typing import get_args
 
-from companion.config.vehicle import NatNetVersion
+from companion.config.devices import NatNetVersion
 from companion.io.mocap.natnet import Message, Version, encode_message
 
 LATER = "4.9"

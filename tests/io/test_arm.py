@@ -17,8 +17,9 @@ from typing import Any
 import pytest
 import serial
 
-from companion.config.vehicle import Arm as ArmConfig
-from companion.config.vehicle import ArmDevice, Joint
+from companion.config.arm import Arm as ArmConfig
+from companion.config.arm import Joint
+from companion.config.devices import ArmDevice
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.protocols import Arm as ArmEdge

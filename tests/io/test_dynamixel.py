@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.config.vehicle import Joint
+from companion.config.arm import Joint
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.registers import (
     joint_scale,

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.config.vehicle import ForceDevice
+from companion.config.devices import ForceDevice
 from companion.io.force_torque import rft
 from companion.io.force_torque.driver import RobotousForceTorque
 from companion.io.force_torque.rft import Command, PacketScanner, Wrench

@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from companion.config.vehicle import ArmDevice
+from companion.config.devices import ArmDevice
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.bus import ArmBus
 from sitl.servo.bus import ServoLine

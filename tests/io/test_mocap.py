@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import pytest
 
-from companion.config.vehicle import MocapDevice
+from companion.config.devices import MocapDevice
 from companion.io.mocap import natnet
 from companion.io.mocap.driver import NatNetMocap
 from companion.io.mocap.natnet import Message

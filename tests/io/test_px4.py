@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.config.vehicle import AutopilotDevice
+from companion.config.devices import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4 import params as autopilot_params
 from companion.io.px4.driver import MavsdkAutopilot

@@ -16,7 +16,7 @@ import pytest
 import serial
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.config.vehicle import AutopilotDevice
+from companion.config.devices import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4.claim import LinkClaim
 from companion.io.px4.driver import MavsdkAutopilot

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 import pytest
 
-from companion.config.vehicle import AutopilotDevice
+from companion.config.devices import AutopilotDevice
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import AttitudeSetpoint, FlightMode, Vec3

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from companion.config.vehicle import AutopilotDevice
+from companion.config.devices import AutopilotDevice
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import (

@@ -18,9 +18,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.config.devices import AutopilotDevice
 from companion.config.document import ConfigError
 from companion.config.loader import load_flight
-from companion.config.vehicle import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.io.qgroundcontrol.channel import pack, unpack

@@ -18,10 +18,10 @@ import pytest
 from pydantic import JsonValue
 
 from companion.cli.main import main
+from companion.config.devices import MocapDevice
 from companion.config.document import ConfigError
 from companion.config.loader import load_flight, load_vehicle, logged_flight
 from companion.config.mocap import system_class
-from companion.config.vehicle import MocapDevice
 from companion.guardian import process
 from companion.guardian.mocap import MocapProblem, open_client
 from companion.io.mocap.plugin_driver import PluginMocap, open_mocap

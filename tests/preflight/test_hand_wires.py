@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from companion.config.vehicle import MocapDevice
+from companion.config.devices import MocapDevice
 from companion.io.devices import AvailableDevices, VisionFilter, open_available
 from companion.io.mocap.driver import NatNetMocap
 from companion.model.check_row import Row

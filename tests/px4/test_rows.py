@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from companion.config.devices import AutopilotDevice
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
-from companion.config.vehicle import AutopilotDevice, Vehicle
+from companion.config.vehicle import Vehicle
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.check_row import Level, Row
 from companion.preflight.px4 import firmware_row, rows

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.config.vehicle import Safety
+from companion.config.safety import Safety
 from companion.safety.stop import LAND_AHEAD_S, LAND_DECELERATION_M_S2, StopModel
 
 SPEEDS_M_S = st.floats(0.0, 3.0)

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from companion.config.vehicle import Safety
+from companion.config.safety import Safety
 from companion.model.types import Outcome
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult

@@ -10,7 +10,9 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from companion.config.vehicle import ForceDevice, Safety, Tether
+from companion.config.devices import ForceDevice
+from companion.config.safety import Safety
+from companion.config.tether import Tether
 from companion.model.types import Event, SafetyAction, Severity
 from companion.safety.notices import HOLD_EXPIRED, NO_ROOM_TO_STAY, NOTICES, RETRACT_DONE, RETRACT_EXPIRED
 from companion.safety.rule import Repeat, Rule, Subject

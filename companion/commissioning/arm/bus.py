@@ -13,7 +13,7 @@ from typing import Final, Self, get_args
 
 from dynamixel_sdk import COMM_SUCCESS, PacketHandler
 
-from companion.config.vehicle import ServoBaud
+from companion.config.devices import ServoBaud
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.registers import Register
 from companion.io.protocols import DeviceError

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from companion.config.vehicle import Arm, Vehicle
+from companion.config.arm import Arm
+from companion.config.vehicle import Vehicle
 from companion.control.arm_hold import hold_torque_nm
 from companion.control.arm_model import manipulator_of
 from companion.model.servos import WATCHDOG_ERROR, hardware_error_text

@@ -10,8 +10,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from companion.config.arm import Arm, Joint
 from companion.config.document import ConfigError
-from companion.config.vehicle import Arm, Joint
 from companion.model.types import Joints
 
 SWING_DEG, SWING_MIN_DEG = 45.0, 25.0

@@ -20,9 +20,11 @@ from companion.commissioning.arm.servo import (
     settings,
 )
 from companion.commissioning.tool import Session
+from companion.config.arm import Arm
 from companion.config.base import Location
+from companion.config.devices import ArmDevice
 from companion.config.document import Data
-from companion.config.vehicle import Arm, ArmDevice, Vehicle
+from companion.config.vehicle import Vehicle
 from companion.io.dynamixel import registers as dxl
 from companion.io.protocols import DeviceError
 from companion.model.check_row import Row

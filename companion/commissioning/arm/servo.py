@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from companion.commissioning.arm import bus
+from companion.config.arm import Arm, Joint
+from companion.config.devices import ArmDevice
 from companion.config.document import ConfigError
-from companion.config.vehicle import Arm, ArmDevice, Joint
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.registers import Register
 from companion.model.servos import COUNTS_PER_TURN, ServoKind, kind_of

@@ -28,7 +28,9 @@ from companion.commissioning.arm.servo import (
     settings,
 )
 from companion.commissioning.tool import Cancelled, Report, Session
-from companion.config.vehicle import Arm, ArmDevice, Vehicle
+from companion.config.arm import Arm
+from companion.config.devices import ArmDevice
+from companion.config.vehicle import Vehicle
 from companion.io.dynamixel import registers as dxl
 from companion.io.protocols import DeviceError
 from companion.model.servos import model_text

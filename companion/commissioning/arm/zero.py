@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from companion.commissioning.arm.poses import SWING_MIN_DEG, Step, steps_of
+from companion.config.arm import Arm
 from companion.config.base import Location
 from companion.config.document import Data
-from companion.config.vehicle import Arm
 from companion.model.servos import COUNTS_PER_TURN
 
 HELD_S: Final = 2.0

@@ -10,8 +10,10 @@ import math
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Final
 
+from companion.config.arm import Tool
+from companion.config.devices import ForceDevice
 from companion.config.document import ConfigError
-from companion.config.vehicle import ForceDevice, Tool, Vehicle
+from companion.config.vehicle import Vehicle
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.force_torque.driver import RobotousForceTorque
 from companion.io.force_torque.rft import Command

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Final, Self
 
-from companion.config.vehicle import AutopilotDevice
+from companion.config.devices import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.frames import flu_from_frd

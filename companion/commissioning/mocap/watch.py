@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from companion.commissioning.mocap.judge import FrameSeen, Route
-from companion.config.vehicle import MocapDevice
+from companion.config.devices import MocapDevice
 from companion.io.mocap import natnet
 from companion.io.mocap.driver import NatNetMocap
 from companion.io.mocap.frames import Frame

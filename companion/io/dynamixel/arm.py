@@ -16,7 +16,8 @@ from typing import Self, TypeVar
 
 from msgspec.structs import replace
 
-from companion.config.vehicle import Arm, ArmDevice
+from companion.config.arm import Arm
+from companion.config.devices import ArmDevice
 from companion.io.dynamixel.bus import SETUP_ATTEMPTS, ArmBus, Counts
 from companion.io.dynamixel.registers import WATCHDOG_TRIPPED, Block, JointScale
 from companion.io.protocols import DeviceError

@@ -11,7 +11,8 @@ from collections.abc import Callable
 
 from dynamixel_sdk import COMM_SUCCESS, PacketHandler
 
-from companion.config.vehicle import Arm, ArmDevice, Joint
+from companion.config.arm import Arm, Joint
+from companion.config.devices import ArmDevice
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.registers import Block, JointScale, Register
 from companion.io.protocols import DeviceError

@@ -1,7 +1,7 @@
 """The servos' control table and units, and the SDK's serial port adapted to a control loop. The SDK implements the protocol.
 
 Source: ROBOTIS e-manual, XM430-W210 control table; every model of `companion.model.servos` has these registers at these addresses.
-The supported baud rates are those of `companion.config.vehicle.ServoBaud`.
+The supported baud rates are those of `companion.config.devices.ServoBaud`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import serial
 from dynamixel_sdk import PortHandler
 from serial.tools import list_ports
 
-from companion.config.vehicle import Joint
+from companion.config.arm import Joint
 from companion.io.protocols import DeviceError
 from companion.model.servos import COUNTS_PER_TURN, RPM_PER_COUNT
 

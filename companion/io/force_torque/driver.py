@@ -14,7 +14,7 @@ from typing import Final, Self
 import serial
 from serial.tools import list_ports
 
-from companion.config.vehicle import ForceDevice
+from companion.config.devices import ForceDevice
 from companion.io.force_torque import rft
 from companion.io.force_torque.rft import Command, PacketScanner
 from companion.io.protocols import DeviceError

@@ -11,7 +11,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Final, Self
 
-from companion.config.vehicle import MocapDevice
+from companion.config.devices import MocapDevice
 from companion.io.arrival import arrived_s
 from companion.io.mocap import natnet, sockets
 from companion.io.mocap.client import CONNECT_PERIOD_S, SUPPORTED_VERSIONS, NatNetClient

@@ -10,8 +10,8 @@ from dataclasses import fields
 from types import TracebackType
 from typing import Final, Self, TypeVar
 
+from companion.config.devices import MocapDevice
 from companion.config.mocap import NATNET, system_class
-from companion.config.vehicle import MocapDevice
 from companion.io.mocap.driver import NatNetMocap
 from companion.io.mocap.system import MocapSettings, PoseClient, valid_poses
 from companion.io.protocols import DeviceError, Mocap

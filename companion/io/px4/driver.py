@@ -21,7 +21,7 @@ from mavsdk.plugins.mocap.mocap import AngleBody, Covariance, Mocap, PositionBod
 from mavsdk.plugins.param.param import Param
 from mavsdk.plugins.telemetry.telemetry import Telemetry
 
-from companion.config.vehicle import AutopilotDevice
+from companion.config.devices import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4 import messages
 from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls

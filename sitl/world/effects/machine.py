@@ -7,8 +7,9 @@ import operator
 from collections.abc import Sequence
 from typing import Any
 
+from companion.config.arm import Arm, Link
 from companion.config.arm_chain import chain_of
-from companion.config.vehicle import Arm, Link, Vehicle
+from companion.config.vehicle import Vehicle
 from companion.model.arm_chain import ArmChain
 from companion.model.types import Joints, Vec3
 from companion.sitl_config.effects.machine import Machine

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
-from companion.config.vehicle import Tether
+from companion.config.tether import Tether
 from companion.model.constants import GRAVITY_M_S2
 from companion.sitl_config.effects.tether_line import TetherLine as TetherLineConfig
 

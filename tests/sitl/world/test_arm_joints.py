@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from companion.config.arm import Link
 from companion.config.arm_chain import chain_of
 from companion.config.loader import load_vehicle
-from companion.config.vehicle import Link, Vehicle
+from companion.config.vehicle import Vehicle
 from companion.control.arm_model import dynamics_of
 from companion.control.dynamics import euler_rate_matrices
 from companion.model.constants import GRAVITY_M_S2

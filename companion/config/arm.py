@@ -1,0 +1,231 @@
+"""The arm and the tool of the vehicle file."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal, Self
+
+from pydantic import BeforeValidator, Field, JsonValue, model_validator
+
+from companion.config.base import (
+    JOINTS_MAX,
+    Axis,
+    Location,
+    Model,
+    NonNegative,
+    PerJoint,
+    Positive,
+    PositivePerJoint,
+    Span,
+    Vector3,
+    refuse,
+)
+from companion.model.arm_chain import is_physical_inertia
+from companion.model.servos import SERVOS, WITHOUT_CURRENT_CONTROL, ServoKind, ServoName
+from companion.model.types import Joints
+
+FOLDED, UNFOLDED = "folded", "unfolded"
+"""Names of poses that the shipped missions use."""
+
+
+def _with_current_control(name: object) -> object:
+    if isinstance(name, str) and name in WITHOUT_CURRENT_CONTROL:
+        raise ValueError(f"the {name} has no current control (operating mode 0), so that it cannot follow a torque")
+    return name
+
+
+class Joint(Model):
+    """One servo and its joint, with angles as defined in the paper."""
+
+    servo: Annotated[ServoName, BeforeValidator(_with_current_control)] = "XM430-W210"
+    """Model of the Dynamixel servo; the driver refuses a servo of another model."""
+    servo_id: Annotated[int, Field(ge=0, le=252)]
+    sign: Literal[-1, 1]
+    """1 if the servo's counts increase with the joint angle, -1 if they decrease."""
+    zero_count: Annotated[int, Field(ge=-1048575, le=1048575)]
+    """Present Position (register 132) at joint angle 0."""
+    angle_deg: Span
+    """Lower and upper joint limit."""
+    torque_max_nm: Positive
+    """Largest commanded torque, at most the stall torque of the servo."""
+    velocity_max_deg_s: Positive = 300.0
+    """Largest planned speed, at most the speed of the servo without load."""
+    torque_per_amp_nm_a: Positive | None = None
+    """Torque constant of this servo; null for the value of the arm."""
+    axis: Axis | None = None
+    """Direction of the axis in the link's frame, for arms without `links`. If it is absent, the first joint turns about +y and the
+    others about -y.
+    """
+
+    @property
+    def kind(self) -> ServoKind:
+        """Return the data of the servo's model."""
+        return SERVOS[self.servo]
+
+    @model_validator(mode="after")
+    def _servo_suffices(self) -> Self:
+        kind, problems = self.kind, list[tuple[Location, str]]()
+        if self.torque_max_nm > kind.stall_torque_nm:
+            text = f"the {kind.name} stalls at {kind.stall_torque_nm:g} N m, got {self.torque_max_nm:g} N m"
+            problems.append((("torque_max_nm",), text))
+        speed_deg_s = 6.0 * kind.speed_max_rpm
+        if self.velocity_max_deg_s > speed_deg_s:
+            text = f"the {kind.name} turns at most at {speed_deg_s:g} deg/s, got {self.velocity_max_deg_s:g} deg/s"
+            problems.append((("velocity_max_deg_s",), text))
+        refuse("joint", problems)
+        return self
+
+
+class Link(Model):
+    """A link in the general description of an arm. Its frame lies on its joint's axis and turns with it."""
+
+    origin_m: Vector3
+    """Position of the joint in the frame of the link before or, for the first link, in the body frame."""
+    origin_rpy_deg: Vector3 = (0.0, 0.0, 0.0)
+    """Attitude of the link's frame at joint angle 0, in the same frame: roll, pitch, yaw (ZYX)."""
+    axis: Axis
+    """Direction of the joint's axis in the link's frame, of any length; positive angles turn by the right-hand rule."""
+    mass_kg: Positive
+    com_m: Vector3
+    """Centre of mass in the link's frame."""
+    inertia_kg_m2: tuple[Positive, Positive, Positive, float, float, float]
+    """Elements xx, yy, zz, xy, xz, yz of the inertia about the centre of mass, in the axes of the link's frame."""
+
+    @model_validator(mode="after")
+    def _rigid(self) -> Self:
+        xx, yy, zz, xy, xz, yz = self.inertia_kg_m2
+        if not is_physical_inertia(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))):
+            text = "expected the inertia of a rigid body (no principal moment above the sum of the other two)"
+            refuse("link", [(("inertia_kg_m2",), text)])
+        return self
+
+
+class Arm(Model):
+    """A serial arm of up to 7 joints; the last link carries sensor and net.
+
+    The links are rods along the x axes of their frames, in line with each other at angle 0 (`shoulder_body_m`, `link_lengths_m`,
+    `link_masses_kg`, `link_com_m`), or any bodies (`links`, `tip_m`), or those of a URDF file (`urdf`).
+    """
+
+    shoulder_body_m: Vector3 = (0.0, 0.0, 0.0)
+    """Position of the first joint."""
+    link_lengths_m: PositivePerJoint = ()
+    """Length of each link, from its joint to the next one; of the last link, to the centre of the net or, without a tool, to the link's
+    end.
+    """
+    link_masses_kg: PositivePerJoint = ()
+    """Mass of each link with the servo of the next joint; of the last link, without sensor and net."""
+    link_com_m: PositivePerJoint = ()
+    """Distance of each link's centre of mass from its joint."""
+    links: Annotated[tuple[Link, ...], Field(max_length=JOINTS_MAX)] = ()
+    """Links of an arm of any shape, in place of the four keys above; the mass of sensor and net is that of `tool`."""
+    tip_m: Vector3 = (0.0, 0.0, 0.0)
+    """Centre of the net or, without a tool, end of the arm, in the frame of the last of `links`."""
+    tip_rpy_deg: Vector3 = (0.0, 0.0, 0.0)
+    """Attitude of the tip's frame, whose x axis points outwards, in the frame of the last of `links`: roll, pitch, yaw (ZYX)."""
+    urdf: str | None = None
+    """URDF file, relative to the vehicle file, from which `links`, `tip_m` and `tip_rpy_deg` are read (docs/arms.md)."""
+    urdf_base: str | None = None
+    """Name of the URDF's link that is the vehicle's body. If it is absent, the link that is no joint's child is used."""
+    urdf_tip: str | None = None
+    """Name of the URDF's link whose frame is the tip. If it is absent, the only link that ends the chain is used."""
+    torque_per_amp_nm_a: Positive | None = None
+    """Torque constant of the servos, if all of them are of one model. null: stall torque divided by stall current of each model
+    (docs/hardware.md)."""
+    joint_armature_kg_m2: NonNegative = 0.008
+    """Inertia of a servo's rotor and gears, referred to the joint; used by the model-based laws and the simulated arm."""
+    joint_friction_nm: NonNegative = 0.04
+    """Dry friction of one joint, for laws with friction feedforward."""
+    joints: Annotated[tuple[Joint, ...], Field(max_length=JOINTS_MAX)]
+    poses: dict[str, PerJoint] = Field(default={})
+    """Joint angles, in degrees, that missions refer to by name. Always defined are `folded` (safety.fold_arm_deg) and, for two joints,
+    `unfolded` (100, 60 unless given here).
+    """
+
+    @property
+    def torque_constants_nm_a(self) -> tuple[float, ...]:
+        """Return the torque constant of each joint's servo, N m/A: that of the joint, of the arm, or of the servo's model."""
+        return tuple(
+            joint.torque_per_amp_nm_a or self.torque_per_amp_nm_a or joint.kind.torque_per_amp_nm_a
+            for joint in self.joints
+        )
+
+    @model_validator(mode="after")
+    def _one_value_per_joint(self) -> Self:
+        problems: list[tuple[Location, str]] = []
+        count = len(self.joints)
+        rods = ("link_lengths_m", "link_masses_kg", "link_com_m")
+        if self.links:
+            source, parts = ("links", "links") if self.urdf is None else ("urdf", "moving joints")
+            if len(self.links) != count:
+                text = f"expected {count} {parts}, one for each of arm.joints, got {len(self.links)}"
+                problems.append(((source,), text))
+            problems += [
+                ((key,), f"must be absent, because arm.{source} is given") for key in rods if getattr(self, key)
+            ]
+            given = [index for index, joint in enumerate(self.joints) if joint.axis is not None]
+            problems += [(("joints", index, "axis"), f"must be absent; arm.{source} has the axes") for index in given]
+        # Without links, the loader could not read the URDF and reports that.
+        others = bool(self.links) or self.urdf is not None
+        lists: dict[Location, Joints] = {} if others else {(key,): getattr(self, key) for key in rods}
+        lists |= {("poses", name): angles_deg for name, angles_deg in self.poses.items()}
+        for location, values in lists.items():
+            if len(values) != count:
+                problems.append((location, f"expected {count} values, one for each of arm.joints, got {len(values)}"))
+        if FOLDED in self.poses:
+            problems.append((("poses", FOLDED), "is defined by safety.fold_arm_deg; give this pose another name"))
+        for index, joint in enumerate(self.joints):
+            for earlier in range(index):
+                if self.joints[earlier].servo_id == joint.servo_id:
+                    text = f"joint {earlier + 1} has the servo id {joint.servo_id} too; give each servo its own id"
+                    problems.append((("joints", index, "servo_id"), text))
+                    break
+        names = list(dict.fromkeys(joint.servo for joint in self.joints if joint.torque_per_amp_nm_a is None))
+        if self.torque_per_amp_nm_a is not None and len(names) > 1:
+            text = f"one torque constant cannot hold for {' and '.join(names)}; set arm.joints[].torque_per_amp_nm_a instead"
+            problems.append((("torque_per_amp_nm_a",), text))
+        refuse("arm", problems)
+        return self
+
+    @property
+    def mass_kg(self) -> float:
+        """Mass of all links, without sensor and net."""
+        return sum(link.mass_kg for link in self.links) if self.links else sum(self.link_masses_kg)
+
+    @property
+    def first_joint_body_m(self) -> Vector3:
+        """Position of the first joint in the body frame."""
+        return self.links[0].origin_m if self.links else self.shoulder_body_m
+
+    @property
+    def reach_m(self) -> float:
+        """Largest possible distance of the tip from the first joint."""
+        if not self.links:
+            return sum(self.link_lengths_m)
+        return sum(math.hypot(*link.origin_m) for link in self.links[1:]) + math.hypot(*self.tip_m)
+
+
+NO_ARM: dict[str, JsonValue] = {
+    "shoulder_body_m": [0.0, 0.0, 0.0],
+    "link_lengths_m": [],
+    "link_masses_kg": [],
+    "link_com_m": [],
+    "joints": [],
+}
+"""What `arm: null` in a file stands for; the loader replaces it."""
+
+
+LINK_RADIUS_M = 0.03
+"""Half the thickness of servos and links."""
+
+
+class Tool(Model):
+    """Force-torque sensor and net at the tip of the arm."""
+
+    sensor_mass_kg: NonNegative
+    """Mass of the sensor and the mount on the arm's side, which the sensor does not measure."""
+    net_mass_kg: NonNegative
+    """Mass of all parts on the tool side of the sensor; their weight is subtracted from the readings."""
+    net_radius_m: Positive
+    sensor_rpy_deg: Vector3 = (0.0, 0.0, 0.0)
+    """Attitude of the sensor frame in the tip's frame (x outwards; for rods, the frame of the last link): roll, pitch, yaw (ZYX)."""

@@ -1,0 +1,99 @@
+"""The devices of the vehicle file: addresses and settings."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, JsonValue, model_validator
+
+from companion.config.base import Model, Positive, refuse
+from companion.config.mocap import NATNET
+
+
+class AutopilotDevice(Model):
+    """PX4 over MAVLink."""
+
+    address: str
+    """MAVSDK connection, such as udpin://0.0.0.0:14540 or serial:///dev/ttyAMA0:921600."""
+    discovery_timeout_s: Positive = 10.0
+    setpoint_path: Literal["direct", "offboard"] = "direct"
+    """How SET_ATTITUDE_TARGET is sent: direct (MAVSDK's MavlinkDirect, which sends only when the flight loop does) or offboard
+    (MAVSDK's
+    Offboard plugin, whose thread repeats the last setpoint at 20 Hz, even while the flight loop hangs)."""
+
+
+ANY_INTERFACE = "0.0.0.0"
+
+
+NatNetVersion = Literal["3.0", "3.1", "4.0", "4.1", "4.2", "4.3", "4.4"]
+"""Versions of the NatNet bitstream that the NatNet SDK describes: those of Motive 2.0, 2.1, 3.0, 3.1, 3.2, 3.3 and 3.4."""
+
+
+class MocapDevice(Model):
+    """Motion capture: OptiTrack Motive over NatNet, or a system that a plug-in provides (docs/mocap-systems.md)."""
+
+    type: str = NATNET
+    """natnet, or the name of an installed motion-capture system (`companion plugins` lists them). With `--sitl`, natnet is used."""
+    server: str
+    """Address of the computer that runs Motive or the other system."""
+    interface: str = ANY_INTERFACE
+    """This computer's address on the camera network. Without `--sitl`, `fly` and `check` refuse 0.0.0.0 (all networks)."""
+    transport: Literal["multicast", "unicast"] = "multicast"
+    multicast_group: str = "239.255.42.99"
+    command_port: Annotated[int, Field(gt=0, le=65535)] = 1510
+    data_port: Annotated[int, Field(gt=0, le=65535)] = 1511
+    natnet_version: NatNetVersion | None = None
+    """Version that the server must use. If it is absent, all these versions and later ones are accepted."""
+    rigid_body_id: Annotated[int, Field(ge=0)]
+    up_axis: Literal["y", "z"] = "z"
+    """Up axis in Motive's streaming settings."""
+    rate_hz: Positive = 200.0
+    """Expected frame rate."""
+    options: dict[str, JsonValue] = Field(default={})
+    """Settings of the system that a plug-in provides; must be empty for natnet."""
+
+
+ServoBaud = Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000]
+"""Baud rates of the arm's servos, in the order of the values of register 8. The tools and the simulated servos also support rates that
+are too slow or too fast for a flight."""
+
+
+class ArmDevice(Model):
+    """The Dynamixel bus, connected by a U2D2 adapter."""
+
+    port: str
+    baud: ServoBaud = 3000000
+    watchdog_ms: Annotated[int, Field(ge=20, le=2540)] = 100
+    """Timeout of the bus watchdog (register 98), a multiple of 20 ms; after this time without an instruction, the servos release
+    torque.
+    """
+
+    @model_validator(mode="after")
+    def _watchdog_steps(self) -> Self:
+        if self.watchdog_ms % 20:
+            refuse(
+                "arm device",
+                [(("watchdog_ms",), f"must be a multiple of 20 ms (the register's unit), got {self.watchdog_ms} ms")],
+            )
+        return self
+
+
+class ForceDevice(Model):
+    """The Robotous RFT60-HA01 on its serial port."""
+
+    port: str
+    baud: Literal[115200] = 115200
+    rate_hz: Literal[200, 333] = 200
+    force_max_n: Positive = 200.0
+
+
+class Devices(Model):
+    """Addresses and settings of the devices."""
+
+    autopilot: AutopilotDevice
+    mocap: MocapDevice
+    arm: ArmDevice | None = None
+    """Bus of the arm's servos; absent if and only if the vehicle has no arm."""
+    force: ForceDevice | None
+    """Force-torque sensor; null states that there is none: the control law then runs without a measured force, and no catch is detected
+    (docs/parts.md)."""
