@@ -80,11 +80,13 @@ def _campaign(arguments: argparse.Namespace) -> Robustness:
     # The file's preset belongs to the file's control law.
     preset = arguments.preset or (kept.preset if kept is not None and arguments.controller is None else None)
     law = arguments.controller or (kept.controller if kept is not None else None)
+    vehicle = arguments.vehicle or (kept.vehicle if kept is not None else None)
+    arguments.overrides = [*(kept.overrides if kept is not None else ()), *arguments.overrides]
     # A case contains its whole world.
     world = arguments.world or ("robustness" if kept is None else "ideal")
     numbers = range(arguments.first, arguments.first + arguments.draws)
     return Robustness(
-        configs=[checked(mission, arguments.vehicle, law, preset, arguments.overrides, world=world)],
+        configs=[checked(mission, vehicle, law, preset, arguments.overrides, world=world)],
         flights=[{"variant": 0, "name": case.name, "number": None, "world": case.knobs()} for case in cases]
         or [{"variant": 0, "name": f"draw {n}", "number": n, "world": None} for n in numbers],
         **common(arguments),
@@ -93,5 +95,5 @@ def _campaign(arguments: argparse.Namespace) -> Robustness:
         cases=cases,
         cases_file=arguments.cases,
         keep=arguments.keep,
-        vehicle=arguments.vehicle,
+        vehicle=vehicle,
     )

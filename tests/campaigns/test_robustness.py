@@ -68,9 +68,17 @@ def test_cases_come_back_from_their_file_as_they_were(tmp_path: Path) -> None:
         cases.named(["nobody"])
 
 
-def test_a_file_of_cases_takes_any_name_of_a_mission(tmp_path: Path) -> None:
+def test_a_file_of_cases_takes_any_name_of_a_mission_and_of_a_vehicle(tmp_path: Path) -> None:
     mission = "my flights: #1/on the \x85 line.yaml"
-    cases = Cases(mission=mission, controller="adaptive", preset="paper", cases=as_cases([row(0, 0.04)]))
+    overrides = ("controller.rho_max=5.0", "vehicle.safety.room.x_m=[-3, 3]")
+    cases = Cases(
+        mission=mission,
+        controller="adaptive",
+        preset="paper",
+        vehicle="my: vehicle.yaml",
+        overrides=overrides,
+        cases=as_cases([row(0, 0.04)]),
+    )
     write_cases(cases, tmp_path / "cases.yaml", "")
     assert read_cases(tmp_path / "cases.yaml") == cases
 

@@ -24,6 +24,7 @@ import pytest
 
 from companion.analysis import metrics
 from companion.campaigns.process import CampaignProcess
+from companion.campaigns.robustness.cases import read_cases
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
 from companion.model.types import Outcome, PhaseKind
 from companion.sitl_config.loader import SitlConfig, load_sitl
@@ -296,10 +297,13 @@ def test_ctrl_c_ends_the_workers_and_shows_what_is_there(place: Sandbox) -> None
 def test_a_draw_is_flown_again_as_a_case(place: Sandbox, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(place.cwd)
     options = ("--jobs", "1", "--json")
-    ended = run_here("robustness", SHORT_CATCH, "--draws", "1", *options, "--out", "draws")
+    machine = ("--vehicle", "hexa_2r", "--set", "vehicle.safety.arm_timeout_s=0.4", "--model-error", "0.1")
+    ended = run_here("robustness", SHORT_CATCH, *machine, "--draws", "1", *options, "--out", "draws")
     assert ended.code == EXIT_OK, ended.err
     (draw,) = json.loads(ended.out)["rows"]
     assert draw["outcome"] == "completed" and draw["e_p_m"] is not None
+    kept = read_cases(Path("draws/worst.yaml"))
+    assert (kept.vehicle, kept.overrides) == ("hexa_2r", ("vehicle.safety.arm_timeout_s=0.4",))
     again = run_here("robustness", "--cases", "draws/worst.yaml", *options, "--out", "cases")
     assert again.code == EXIT_OK, again.err
     (case,) = json.loads(again.out)["rows"]

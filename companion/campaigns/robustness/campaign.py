@@ -157,7 +157,14 @@ class Robustness(Campaign):
         if not self.cases:
             first, last = self.flights[0]["number"], self.flights[-1]["number"]
             remark += f"\nThese are the worst of draws {first} to {last}, seed {self.seed}."
-        cases = Cases(mission=self.mission, controller=law, preset=preset, cases=as_cases(rows))
+        cases = Cases(
+            mission=self.mission,
+            controller=law,
+            preset=preset,
+            vehicle=self.vehicle,
+            overrides=tuple(override for override in self.overrides if not world_key(override)),
+            cases=as_cases(rows),
+        )
         write_cases(cases, path, remark)
 
 

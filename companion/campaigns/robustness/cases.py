@@ -63,6 +63,10 @@ class Cases(Model):
     mission: str
     controller: str
     preset: str
+    vehicle: str | None = None
+    """Vehicle file; None for the mission's."""
+    overrides: tuple[str, ...] = ()
+    """Settings of `--set` outside the world, which each case contains whole."""
     cases: tuple[Case, ...]
 
     def named(self, names: Sequence[str]) -> tuple[Case, ...]:
@@ -104,7 +108,8 @@ def write_cases(cases: Cases, path: Path, remark: str) -> None:
         remark: comment lines at the head of the file.
     """
     lines = [f"# {line}".rstrip() for line in remark.splitlines()]
-    lines += [*(f"{key}: {flow_text(getattr(cases, key))}" for key in ("mission", "controller", "preset")), "cases:"]
+    keys = cases.model_dump(mode="json", exclude={"cases"}, exclude_defaults=True)
+    lines += [*(f"{key}: {flow_text(value)}" for key, value in keys.items()), "cases:"]
     for case in cases.cases:
         lines += ["", f"  - name: {flow_text(case.name)}", "    world:"]
         lines += [f"      {key}: {flow_text(value)}" for key, value in case.knobs().items()]
