@@ -12,6 +12,7 @@ from typing import Any
 import foxglove.layouts
 import pytest
 
+from companion.config.base import JOINTS_MAX
 from tests.recorder.viewers import Viewed, at_path, split_path
 
 FOXGLOVE = Path("configs/foxglove/companion.json")
@@ -23,6 +24,13 @@ PANELS: dict[str, Any] = {
     "StateTransitions": foxglove.layouts.StateTransitionsConfig,
 }
 """By panel type in saved layouts: its configuration class in the SDK."""
+JOINT_PATHS = {
+    "/inputs.arm.angle_rad": 0,
+    "/outputs.reference.arm_rad": 0,
+    "/outputs.control.tau": 6,
+    "/sent.arm_torque_sent_nm": 0,
+}
+"""Message paths with one value per joint, and the index of joint 1."""
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +64,11 @@ def foxglove_paths(layout: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def resolve(viewed: Viewed, kind: str, path: str) -> None:
+    """Find the path in the flight. Its arm has two joints: paths of joints 3 to 7 are looked up as joint 2."""
+    for base, first in JOINT_PATHS.items():
+        joint = path.removeprefix(f"{base}[")
+        if joint != path and first + 2 <= int(joint.removesuffix("]")) < first + JOINTS_MAX:
+            path = f"{base}[{first + 1}]"
     topic, steps = split_path(path)
     values = [at_path(message.data, steps) for message in viewed.by_topic[topic]]
     found = [value for value in values if value is not None]
@@ -67,6 +80,8 @@ def resolve(viewed: Viewed, kind: str, path: str) -> None:
 def test_every_path_of_the_foxglove_layout_is_in_a_flight(layout: dict[str, Any], viewed: Viewed) -> None:
     paths = list(foxglove_paths(layout))
     assert len(paths) > 30
+    wanted = {f"{base}[{first + n}]" for base, first in JOINT_PATHS.items() for n in range(JOINTS_MAX)}
+    assert wanted <= {path for _, path in paths}, "every joint is plotted"
     for kind, path in paths:
         resolve(viewed, kind, path)
     for panel in panels(layout, "RosOut"):
