@@ -227,11 +227,13 @@ def _place_arm(document: Document, vehicle: Vehicle | None) -> None:
         if isinstance(given, str):
             poses_deg = vehicle.poses_deg if vehicle is not None else {given: ()}
             if given not in poses_deg:
-                text = f'{key_path(place)}: expected joint angles or a pose of the vehicle ({", ".join(poses_deg)}), got "{given}"'
+                text = f"{key_path(place)}: "
                 if vehicle is not None and vehicle.arm.joints:
-                    text += "; define it in arm.poses of the vehicle file"
+                    text += f'expected joint angles or a pose of the vehicle ({", ".join(poses_deg)}), got "{given}"; '
+                    text += "define it in arm.poses of the vehicle file"
                 else:
-                    text += "; the vehicle has no arm"
+                    text += f'the mission moves the arm to "{given}", but the vehicle has no arm; choose a mission without arm '
+                    text += "motion, such as hover, or a vehicle with an arm"
                 document.problems.append(Problem(RANK_VALUE, document.origin(place), text))
             document.replace(place, list(poses_deg.get(given, ())), document.origin(place))
         elif isinstance(given, list) and vehicle is not None and len(given) != len(vehicle.arm.joints):

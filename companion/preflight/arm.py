@@ -23,7 +23,7 @@ DEVICE = Check(
 MODEL = Check(
     "arm.model",
     "servos",
-    "the models of `arm.joints[].servo` (register 0); a 330 warns, because it measures the current of its supply",
+    "the models of `arm.joints[].servo` (register 0); an XC330 or XL330 warns, because its current is that of its supply",
     "other models have a different torque constant and different registers",
 )
 FIRMWARE = Check(
@@ -134,7 +134,8 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
         fix = "install the configured servo, or correct arm.joints[].servo_id or arm.joints[].servo"
         yield MODEL.bad(read, wanted, fix)
     elif any(kind.supply_current for kind in kinds):
-        fix = "a 330 measures the current of its supply, so that its torque is inexact: measure it with companion arm friction"
+        named = ", ".join(dict.fromkeys(kind.name for kind in kinds if kind.supply_current))
+        fix = f"{named}: its current is that of the supply, so that the torque is inexact; measure it with companion arm friction"
         yield MODEL.doubtful(read, wanted, fix)
     else:
         yield MODEL.good(read, wanted)

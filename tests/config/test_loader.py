@@ -207,7 +207,8 @@ BAD_VEHICLE = [
 def test_a_pose_is_refused_without_an_arm() -> None:
     (line,) = lines_of(lambda: load_sitl(ROOT / CATCH, overrides=overrides_with_joints(0)))
     assert line.endswith(
-        'expected joint angles or a pose of the vehicle (folded), got "unfolded"; the vehicle has no arm'
+        'phases[2].arm_deg: the mission moves the arm to "unfolded", but the vehicle has no arm; choose a mission without arm motion, '
+        "such as hover, or a vehicle with an arm"
     )
 
 
