@@ -15,6 +15,7 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from typing import Any
 
+from companion.config.device_plugins import RFT60
 from companion.config.mocap import NATNET
 from companion.config.vehicle import Vehicle
 from companion.model.types import IDENTITY_QUAT, Joints, Vec2
@@ -174,6 +175,13 @@ class Sitl:
                 addresses["arm"] = {"port": self.bus.path}
             if self.force is not None:
                 addresses["force"] = {"port": self.force.port}
+                if device.force is not None and device.force.type != RFT60:
+                    addresses["force"] |= {"type": RFT60, "options": {}, "rate_hz": self.force.rate_hz}
+            for name in ("mocap", "force"):
+                if "type" in addresses.get(name, ()):
+                    ours, theirs = addresses[name]["type"], getattr(device, name).type
+                    text = f"devices.{name}.type: the simulated world has a {ours}, which is used in place of {theirs}"
+                    self._on_message({"type": "progress", "text": text})
             yield addresses
 
     def flight_environment(self) -> dict[str, str]:

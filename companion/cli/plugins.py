@@ -8,11 +8,16 @@ from typing import Any
 
 from companion.config.base import Model
 from companion.config.controller import LAWS
+from companion.config.device_plugins import OptionsOf
 from companion.config.mocap import SYSTEMS
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
-from companion.plugins import CONTROL_LAWS, KINDS, MOCAP_SYSTEMS, PluginError, installed
+from companion.plugins import CONTROL_LAWS, FORCE_SENSORS, KINDS, MOCAP_SYSTEMS, PluginError, installed
 
-_SETTINGS: dict[str, Mapping[str, type[Model]]] = {CONTROL_LAWS: LAWS, MOCAP_SYSTEMS: SYSTEMS}
+_SETTINGS: dict[str, Mapping[str, type[Model]]] = {
+    CONTROL_LAWS: LAWS,
+    MOCAP_SYSTEMS: SYSTEMS,
+    FORCE_SENSORS: OptionsOf(FORCE_SENSORS),
+}
 """Settings class of each plug-in, by group and name."""
 
 
@@ -20,7 +25,7 @@ def add_parser(commands: Any) -> None:
     """Add `plugins` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "plugins",
-        help="list the installed control laws and motion-capture systems, and the packages that provide them",
+        help="list the installed control laws, motion-capture systems and force sensors, and the packages that provide them",
         description="List the installed plug-ins: name, kind, distribution, version, description. Exit code 2: one cannot be used.",
     )
     parser.set_defaults(run=run)

@@ -6,7 +6,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, JsonValue, model_validator
 
-from companion.config.base import Model, Positive, refuse
+from companion.config.base import Location, Model, Positive, refuse
+from companion.config.device_plugins import RFT60
 from companion.config.mocap import NATNET
 
 
@@ -78,13 +79,33 @@ class ArmDevice(Model):
         return self
 
 
-class ForceDevice(Model):
-    """The Robotous RFT60-HA01 on its serial port."""
+class Rft60Options(Model):
+    """Robotous RFT60-HA01 on a serial port; its settings are keys of devices.force."""
 
-    port: str
+
+class ForceDevice(Model):
+    """The force-torque sensor: the Robotous RFT60-HA01 on a serial port, or one that a plug-in provides (docs/own-devices.md)."""
+
+    type: str = RFT60
+    """rft60, or the name of an installed force sensor (`companion plugins` lists them). With `--sitl`, rft60 is used."""
+    port: str | None = None
+    """Serial port; required for rft60."""
     baud: Literal[115200] = 115200
-    rate_hz: Literal[200, 333] = 200
+    rate_hz: Annotated[int, Field(gt=0, le=10000)] = 200
+    """Expected rate of the samples; of rft60, 200 or 333 Hz."""
     force_max_n: Positive = 200.0
+    options: dict[str, JsonValue] = Field(default={})
+    """Settings of the sensor that a plug-in provides; must be empty for rft60."""
+
+    @model_validator(mode="after")
+    def _suits_the_type(self) -> Self:
+        problems: list[tuple[Location, str]] = []
+        if self.type == RFT60 and self.port is None:
+            problems.append((("port",), "missing; the serial port of the sensor"))
+        if self.type == RFT60 and self.rate_hz not in (200, 333):
+            problems.append((("rate_hz",), f"expected one of 200, 333, got {self.rate_hz}"))
+        refuse("force device", problems)
+        return self
 
 
 class Devices(Model):

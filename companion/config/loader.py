@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from pydantic import ValidationError
 
-from companion.config import mocap
+from companion.config import device_plugins, mocap
 from companion.config.arm import NO_ARM
 from companion.config.base import Location, Model
 from companion.config.controller import LAWS, AnyControllerConfig, ControllerConfig, preset_file
@@ -34,6 +34,7 @@ from companion.config.shipped import named_file, near
 from companion.config.urdf import read_urdf
 from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import read_document
+from companion.plugins import FORCE_SENSORS
 
 M = TypeVar("M", bound=Model)
 
@@ -88,7 +89,7 @@ def load_flight(
         overrides: `--set` options, `section.key[index].key=value`, applied before anything is checked. Options of the section
             `world` are ignored, because they belong to the simulated world (`companion.sitl_config`).
         hardware: whether the vehicle file's device addresses are used instead of those of SITL. If so, `devices.mocap.interface`
-            must name one network and `devices.mocap.type` an installed system.
+            must name one network, and the types of the devices must be installed.
 
     Raises:
         ConfigError: the files have problems; the exception has one message per problem.
@@ -104,7 +105,11 @@ def load_flight(
     if vehicle_file is not None:
         vehicle = check_document(Vehicle, vehicle_file, "vehicle", parsed, of_vehicle)
         if hardware and vehicle is not None:
-            of_vehicle += _open_to_every_network(vehicle, vehicle_file) + _unusable_mocap(vehicle, vehicle_file)
+            of_vehicle += (
+                _open_to_every_network(vehicle, vehicle_file)
+                + _unusable_mocap(vehicle, vehicle_file)
+                + _unusable_devices(vehicle, vehicle_file)
+            )
     _place_arm(mission_file, vehicle)
     mission = _validated(Mission, mission_file, lines)
     lines += of_vehicle
@@ -149,7 +154,7 @@ def load_vehicle(path: str | Path, overrides: Sequence[str] = ()) -> Vehicle:
     document = read_document(named_file("vehicles", path, "--vehicle"))
     vehicle = check_document(Vehicle, document, "vehicle", parse_overrides(overrides), lines)
     if vehicle is not None:
-        lines += _unusable_mocap(vehicle, document)
+        lines += _unusable_mocap(vehicle, document) + _unusable_devices(vehicle, document)
     if vehicle is None or lines:
         raise ConfigError(lines)
     return vehicle
@@ -258,6 +263,16 @@ def _unusable_mocap(vehicle: Vehicle, document: Document) -> list[str]:
     """Return messages if the motion-capture system is not installed or its options are invalid. Logs are read without this check."""
     device = vehicle.devices.mocap
     found = [(("devices", "mocap", *at), text) for at, text in mocap.problems(device.type, device.options)]
+    return problem_lines([Problem(RANK_VALUE, document.origin(at), f"{key_path(at)}: {text}") for at, text in found])
+
+
+def _unusable_devices(vehicle: Vehicle, document: Document) -> list[str]:
+    """Return messages if the force sensor is not installed or its options are invalid. Logs are read without this check."""
+    found: list[tuple[Location, str]] = []
+    force = vehicle.devices.force
+    if force is not None:
+        problems = device_plugins.problems(FORCE_SENSORS, force.type, force.options)
+        found += [(("devices", "force", *at), text) for at, text in problems]
     return problem_lines([Problem(RANK_VALUE, document.origin(at), f"{key_path(at)}: {text}") for at, text in found])
 
 

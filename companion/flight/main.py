@@ -19,7 +19,9 @@ import traceback
 from pathlib import Path
 
 from companion import plugins
+from companion.config.device_plugins import BUILT_IN
 from companion.config.loader import FlightConfig
+from companion.config.vehicle import Vehicle
 from companion.core.flight_core import FlightCore
 from companion.flight.command_effect import effect_of
 from companion.flight.command_queue import Operator, StartCancelled
@@ -264,6 +266,14 @@ class Flight:
         }
 
 
+def _device_plugins(vehicle: Vehicle) -> dict[str, str]:
+    """Return name, distribution and version of each device that a plug-in provides, for the log."""
+    devices = vehicle.devices
+    named = [(plugins.MOCAP_SYSTEMS, devices.mocap.type), (plugins.FORCE_SENSORS, devices.force and devices.force.type)]
+    found = [str(plugins.find(group, name)) for group, name in named if name and name not in BUILT_IN]
+    return {"device_plugins": "; ".join(found)} if found else {}
+
+
 async def fly(
     config: FlightConfig,
     out: Path,
@@ -315,6 +325,7 @@ async def fly(
                     "law_version": law.version,
                     "preset": config.controller.preset,
                     "simulated": str(sitl).lower(),
+                    **_device_plugins(config.vehicle),
                 },
                 simulated=sitl,
             )

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from companion.config.loader import FlightConfig
 from companion.io.dynamixel.arm import DynamixelArm
-from companion.io.force_torque.driver import RobotousForceTorque
+from companion.io.force_torque.plugin_driver import open_force
 from companion.io.mocap.plugin_driver import open_mocap
 from companion.io.protocols import Arm, Autopilot, DeviceError, ForceTorque, GroundLink, Mocap
 from companion.io.px4.driver import MavsdkAutopilot
@@ -175,10 +175,10 @@ async def _is_armed(autopilot: Autopilot) -> bool:
     return is_armed(autopilot.status())
 
 
-def _force(config: FlightConfig, clock: Clock) -> RobotousForceTorque | None:
+def _force(config: FlightConfig, clock: Clock) -> ForceTorque | None:
     """Return the driver of the force sensor, or None if the vehicle has none."""
     device = config.vehicle.devices.force
-    return RobotousForceTorque(device, clock) if device is not None else None
+    return open_force(device, clock) if device is not None else None
 
 
 def _mocap(config: FlightConfig, clock: Clock, available: AvailableDevices) -> Mocap:

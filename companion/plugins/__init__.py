@@ -18,7 +18,12 @@ from companion import DISTRIBUTION, __version__
 
 CONTROL_LAWS = "companion.control_laws"
 MOCAP_SYSTEMS = "companion.mocap_systems"
-KINDS = {CONTROL_LAWS: "control law", MOCAP_SYSTEMS: "motion-capture system"}
+FORCE_SENSORS = "companion.force_sensors"
+KINDS = {
+    CONTROL_LAWS: "control law",
+    MOCAP_SYSTEMS: "motion-capture system",
+    FORCE_SENSORS: "force sensor",
+}
 """Kind of part, in words, that each group of entry points announces."""
 _SOURCE_TREE = Path(__file__).parents[2]
 

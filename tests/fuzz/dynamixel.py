@@ -116,7 +116,7 @@ class DynamixelTarget(Target):
     def __enter__(self) -> Self:
         self._arm, self._bus = self._new()
         self._line.answer = _servos().feed
-        failure = self._arm._open(self._bus)
+        failure = self._arm._open()
         if failure is not None:
             raise failure
         return self
@@ -174,7 +174,7 @@ class DynamixelTarget(Target):
         arm, line = self._arm, self._line
         failures = arm._failures
         line.limit_s = line.now_s + _READ_LIMIT_S
-        tripped = arm._read_once(self._bus)
+        tripped = arm._read_once()
         state = arm.latest()
         if state is None or not all(map(math.isfinite, (*state.angle_rad, *state.velocity_rad_s, *state.torque_nm))):
             raise Wrong(f"a joint state that is not finite: {state}")
@@ -216,7 +216,7 @@ class DynamixelTarget(Target):
     def _open_another(self) -> None:
         arm, bus = self._new()
         self._line.limit_s = self._line.now_s + _OPEN_LIMIT_S
-        failure = arm._open(bus)
+        failure = arm._open()
         if failure is not None:
             one_line(str(failure), "the refusal of the bus")
             if "Error: " in str(failure):
@@ -230,10 +230,10 @@ class DynamixelTarget(Target):
 
     def _new(self) -> tuple[DynamixelArm, ArmBus]:
         device = ArmDevice(port="memory", watchdog_ms=_WATCHDOG_MS)
-        bus = ArmBus(device, arm_config())
-        bus._port = MemoryPort(self._line)
+        arm = DynamixelArm(device, arm_config(), lambda: self._line.now_s)
+        arm._bus._port = MemoryPort(self._line)
         self._line.reset_input_buffer()
-        return DynamixelArm(device, arm_config(), lambda: self._line.now_s), bus
+        return arm, arm._bus
 
 
 class DynamixelWireTarget(Target):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from companion import plugins
 from companion.config.controller import law_class
+from companion.config.device_plugins import device_class
 from companion.config.explain import schema_of
 from companion.config.mocap import system_class
 from companion.config.shipped import FILES
@@ -43,6 +44,7 @@ def on_path(site: Path) -> Iterator[None]:
 
 def _forget() -> None:
     plugins.installed.cache_clear()
+    device_class.cache_clear()
     law_class.cache_clear()
     schema_of.cache_clear()
     system_class.cache_clear()

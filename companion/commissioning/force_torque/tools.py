@@ -17,10 +17,13 @@ from companion.commissioning.force_torque.watch import (
     arm_angles,
     force_device,
     pose_rad,
+    sensor_of,
     tool_of,
     until_loaded,
 )
 from companion.commissioning.tool import SENSORS, Cancelled, Report, Session, Tool
+from companion.config.device_plugins import RFT60
+from companion.config.document import ConfigError
 from companion.config.vehicle import Vehicle
 from companion.io.dynamixel.registers import usb_latency_ms
 from companion.io.protocols import DeviceError
@@ -73,8 +76,8 @@ async def watch(session: Session) -> Watched:
     vehicle, weight_kg = session.vehicle, session.arguments.weight
     clock, device = flight_clock(), force_device(vehicle)
     given_rad = pose_rad(session.arguments.arm_pose, vehicle)
-    async with FtSensor(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
-        session.say(f"force sensor: {device.port}; {_EMPTY} for {WATCH_S:g} s")
+    async with sensor_of(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
+        session.say(f"force sensor: {device.port or device.type}; {_EMPTY} for {WATCH_S:g} s")
         empty = await sensor.tare_samples(WATCH_S)
         health = sensor.counts()
         product = f"{sensor.product_name}, firmware {sensor.firmware}" if sensor.firmware else sensor.product_name
@@ -173,24 +176,28 @@ class Tared:
 async def watch_drift(session: Session) -> Tared:
     """Measure with an empty net; set or clear the sensor's own zero on request."""
     arguments, vehicle = session.arguments, session.vehicle
-    given_rad = pose_rad(arguments.arm_pose, vehicle)
+    given_rad, device = pose_rad(arguments.arm_pose, vehicle), force_device(vehicle)
+    if (arguments.sensor or arguments.clear) and device.type != RFT60:
+        option = "--sensor" if arguments.sensor else "--clear"
+        text = f"{option}: only the {RFT60} has a zero of its own to set; devices.force.type is {device.type}"
+        raise ConfigError([f"companion ft tare: {text}"])
     for wanted, question in (
         (arguments.sensor, "set the sensor's own zero to the current reading?"),
         (arguments.clear, "clear the sensor's own zero?"),
     ):
         if wanted and not session.confirm(question):
             raise Cancelled("nothing was written to the sensor")
-    clock, device = flight_clock(), force_device(vehicle)
-    async with FtSensor(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
-        if arguments.clear:
+    clock = flight_clock()
+    async with sensor_of(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
+        if arguments.clear and isinstance(sensor, FtSensor):
             await sensor.set_bias(False)
-        session.say(f"force sensor: {device.port}; {_EMPTY} for {arguments.seconds:g} s")
+        session.say(f"force sensor: {device.port or device.type}; {_EMPTY} for {arguments.seconds:g} s")
         first = await sensor.tare_samples(TARE_S)
         samples = list(first)
         while samples[-1].stamp_s - samples[0].stamp_s < arguments.seconds:
             samples += await sensor.tare_samples(TARE_S)
         seen = Tared(samples, first, await angles_rad())
-        if not arguments.sensor:
+        if not (arguments.sensor and isinstance(sensor, FtSensor)):
             return seen
         await sensor.set_bias(True)
         return replace(seen, zeroed=await sensor.tare_samples(TARE_S))

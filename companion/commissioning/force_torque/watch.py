@@ -11,12 +11,15 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Final
 
 from companion.config.arm import Tool
+from companion.config.device_plugins import RFT60
 from companion.config.devices import ForceDevice
 from companion.config.document import ConfigError
 from companion.config.vehicle import Vehicle
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.force_torque.driver import RobotousForceTorque
+from companion.io.force_torque.plugin_driver import PluginForceTorque
 from companion.io.force_torque.rft import Command
+from companion.io.force_torque.samples import SampleStream
 from companion.io.protocols import DeviceError
 from companion.model.types import Joints, Vec3
 from companion.preflight.force import mean_force_n
@@ -46,6 +49,11 @@ class FtSensor(RobotousForceTorque):
         """
         self._send(Command.SET_BIAS, int(on))
         await self.tare_samples(_ON_THEIR_WAY_S)
+
+
+def sensor_of(device: ForceDevice, clock: Clock) -> FtSensor | PluginForceTorque:
+    """Return the driver of the force sensor, with SET_BIAS if it is the built-in one."""
+    return (FtSensor if device.type == RFT60 else PluginForceTorque)(device, clock)
 
 
 def force_device(vehicle: Vehicle) -> ForceDevice:
@@ -124,7 +132,9 @@ async def arm_angles(
         await arm.__aexit__(None, None, None)
 
 
-async def until_loaded(sensor: FtSensor, empty_n: Vec3, weight_n: float, timeout_s: float = WEIGHT_TIMEOUT_S) -> bool:
+async def until_loaded(
+    sensor: SampleStream, empty_n: Vec3, weight_n: float, timeout_s: float = WEIGHT_TIMEOUT_S
+) -> bool:
     """Wait until a weight hangs steadily on the net. Return False at the timeout.
 
     Raises:

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import functools
 import queue
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Self
 
 from msgspec.structs import replace
 
 from companion.config.arm import Arm
 from companion.config.devices import ArmDevice
+from companion.io.device_thread import DeviceThread, resolve
 from companion.io.dynamixel.bus import SETUP_ATTEMPTS, ArmBus, Counts
 from companion.io.dynamixel.registers import WATCHDOG_TRIPPED, Block, JointScale
 from companion.io.protocols import DeviceError
@@ -27,13 +26,10 @@ from companion.model.types import ArmState, Joints
 from companion.runtime.clock import Clock
 
 _OPEN_TIMEOUT_S = 8.0
-_CLOSE_TIMEOUT_S = 2.0
 _KEEPALIVES_PER_WATCHDOG = 3.0
 _FIRST_READ_S = 0.002
 _SMOOTHING, _DEVIATIONS = 0.05, 2.0
 """Smoothing of the estimated read duration, as in TCP's round-trip estimate (RFC 6298) but slower."""
-
-_T = TypeVar("_T")
 
 _WRITE = object()
 _STOP = object()
@@ -79,42 +75,26 @@ class DynamixelArm:
         self._problem = ""
         self._scales: tuple[JointScale, ...] | None = None
         self._servos: tuple[ServoReport, ...] = ()
-        self._thread: threading.Thread | None = None
+        self._thread = DeviceThread(
+            "arm-bus", self._open, self._serve, lambda: self._bus.close(), lambda: self._jobs.put(_STOP)
+        )
+        self._bus = ArmBus(device, arm, self._thread.stopping.is_set)
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._finished: asyncio.Future[None] | None = None
         self._reading: _Read | None = None
         self._read_s, self._read_deviation_s = _FIRST_READ_S, 0.0
-        self._stop = threading.Event()
 
     # --- event loop --------------------------------------------------------------------------------------------------
 
     async def __aenter__(self) -> Self:
-        if self._thread is not None:
-            raise RuntimeError("the arm can be opened only once")
         self._loop = asyncio.get_running_loop()
-        opened: asyncio.Future[DeviceError | None] = self._loop.create_future()
-        self._finished = self._loop.create_future()
-        self._thread = threading.Thread(target=self._run, args=(opened,), name="arm-bus", daemon=True)
-        self._thread.start()
-        try:
-            await asyncio.wait((opened,), timeout=_OPEN_TIMEOUT_S + 1.0)
-        except BaseException:
-            await self._shut_down()
-            raise
-        failure = (
-            opened.result()
-            if opened.done()
-            else DeviceError(f"arm bus {self._device.port}: the port did not open within {_OPEN_TIMEOUT_S:g} s")
-        )
-        if failure is not None:
-            await self._shut_down()
-            raise failure
+        too_late = f"arm bus {self._device.port}: the port did not open within {_OPEN_TIMEOUT_S:g} s"
+        await self._thread.start(_OPEN_TIMEOUT_S + 1.0, too_late)
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        await self._shut_down()
+        await self._thread.stop()
 
     def latest(self) -> ArmState | None:
         """Return the newest joint state."""
@@ -187,36 +167,14 @@ class DynamixelArm:
         self._jobs.put(_WRITE)
         return tuple([scale.torque_nm(count) for scale, count in zip(scales, counts, strict=True)])
 
-    async def _shut_down(self) -> None:
-        self._stop.set()
-        self._jobs.put(_STOP)
-        if self._thread is None or self._finished is None:
-            return
-        await asyncio.wait((self._finished,), timeout=_CLOSE_TIMEOUT_S)
-        if self._finished.done():
-            self._thread.join(_CLOSE_TIMEOUT_S)  # it only has to end
-
     # --- bus thread --------------------------------------------------------------------------------------------------
 
-    def _run(self, opened: asyncio.Future[DeviceError | None]) -> None:
-        bus = ArmBus(self._device, self._arm, self._stop.is_set)
+    def _open(self) -> DeviceError | None:
         try:
-            failure = self._open(bus)
-            self._post(functools.partial(_resolve, opened, failure))
-            if failure is None:
-                self._serve(bus)
-        finally:
-            bus.close()
-            finished = self._finished
-            assert finished is not None
-            self._post(functools.partial(_resolve, finished, None))
-
-    def _open(self, bus: ArmBus) -> DeviceError | None:
-        try:
-            self._scales = bus.open(_OPEN_TIMEOUT_S)
-            self._servos = bus.reports
+            self._scales = self._bus.open(_OPEN_TIMEOUT_S)
+            self._servos = self._bus.reports
             for _ in range(SETUP_ATTEMPTS):
-                self._read_once(bus)
+                self._read_once()
                 if self._state is not None:
                     break
         except DeviceError as error:
@@ -229,7 +187,7 @@ class DynamixelArm:
             )
         return None
 
-    def _serve(self, bus: ArmBus) -> None:
+    def _serve(self) -> None:
         watchdog_s = self._device.watchdog_ms * 1e-3
         limp: Counts = (0,) * len(self._arm.joints)
         sent = limp
@@ -245,7 +203,7 @@ class DynamixelArm:
             if job is _STOP:
                 return
             if job is _WRITE:
-                sent = self._write_newest(bus, sent)
+                sent = self._write_newest(sent)
                 continue
             if isinstance(job, _Read):
                 later = job
@@ -259,33 +217,33 @@ class DynamixelArm:
             if reading is not None:
                 later = None
                 reading.begun = True
-            tripped = self._read_once(bus)
+            tripped = self._read_once()
             if reading is not None:
                 reading.done = True
                 if reading.waiter is not None:
-                    self._post(functools.partial(_resolve, reading.waiter, None))
+                    self._thread.post(functools.partial(resolve, reading.waiter, None))
             if tripped:
                 sent = limp
-                self._try(bus.restart_watchdogs)
+                self._try(self._bus.restart_watchdogs)
             elif self._goal_handed_s > 0.0 and time.monotonic() - self._goal_handed_s > watchdog_s:
                 # Repeated, because a sync write has no reply and our reads keep the servos' watchdogs from tripping.
                 sent = limp
-                self._try(lambda: bus.write_currents(limp))
+                self._try(lambda: self._bus.write_currents(limp))
 
-    def _write_newest(self, bus: ArmBus, sent: Counts) -> Counts:
+    def _write_newest(self, sent: Counts) -> Counts:
         try:
             goal = self._goals.pop()
         except IndexError:
             return sent  # an earlier pass has already taken the newest
-        self._try(lambda: bus.write_currents(goal))
+        self._try(lambda: self._bus.write_currents(goal))
         self._written_s = self._clock()
         return goal
 
-    def _read_once(self, bus: ArmBus) -> bool:
+    def _read_once(self) -> bool:
         """Read and publish the state. Return whether a bus watchdog had tripped."""
         asked_s = self._clock()
         try:
-            blocks = bus.read()
+            blocks = self._bus.read()
         except Exception as error:  # as in `_try`
             self._problem = _describe(error)
             blocks = None
@@ -323,11 +281,6 @@ class DynamixelArm:
         except Exception as error:
             self._problem = _describe(error)
 
-    def _post(self, callback: Callable[[], None]) -> None:
-        assert self._loop is not None
-        with contextlib.suppress(RuntimeError):  # the loop is closed: no caller waits
-            self._loop.call_soon_threadsafe(callback)
-
 
 def _errors(block: Block) -> int:
     return block.hardware_error | (WATCHDOG_ERROR if block.bus_watchdog == WATCHDOG_TRIPPED else 0)
@@ -335,8 +288,3 @@ def _errors(block: Block) -> int:
 
 def _describe(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
-
-
-def _resolve(future: asyncio.Future[_T], result: _T) -> None:
-    if not future.done():
-        future.set_result(result)

@@ -280,8 +280,10 @@ def _open_failure(port: str, error: Exception) -> str:
     return f"is not a usable serial port: {error}"
 
 
-def usb_latency_ms(port: str, sysfs: Path = Path("/sys/class/tty")) -> int | None:
-    """Return the latency timer of the FTDI chip behind a port, ms, or None if the port has none (a pty, a native UART)."""
+def usb_latency_ms(port: str | None, sysfs: Path = Path("/sys/class/tty")) -> int | None:
+    """Return the latency timer of the FTDI chip behind a port, ms, or None without a port or a timer (a pty, a native UART)."""
+    if port is None:
+        return None
     try:
         return int((sysfs / Path(port).resolve().name / "device" / "latency_timer").read_text())
     except (OSError, ValueError):

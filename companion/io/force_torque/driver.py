@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
-import math
 import os
 from contextlib import suppress
 from types import TracebackType
@@ -14,9 +13,10 @@ from typing import Final, Self
 import serial
 from serial.tools import list_ports
 
-from companion.config.devices import ForceDevice
+from companion.config.devices import ForceDevice, Rft60Options
 from companion.io.force_torque import rft
 from companion.io.force_torque.rft import Command, PacketScanner
+from companion.io.force_torque.samples import SampleStream
 from companion.io.protocols import DeviceError
 from companion.model.observations import ForceCounts
 from companion.model.types import ForceSample
@@ -26,17 +26,15 @@ _LOG = logging.getLogger(__name__)
 
 _REPEAT_S: Final = 0.4
 _FIRST_SAMPLES: Final = 5
-SILENT_S: Final = 1.0
-"""Time without a sample after which a sensor that is being read for the tare counts as silent, s."""
 _READ_BYTES: Final = 4096
 _MODEL: Final = "RFT60"
 
 
-class RobotousForceTorque:
+class RobotousForceTorque(SampleStream):
     """RFT60-HA01 in continuous-output mode; implements `companion.io.protocols.ForceTorque`.
 
-    The port is read from the event loop: 200 packets/s of 19 bytes need no thread. Samples are raw, in the sensor frame; the user
-    of a sample removes the bias. When the sensor falls silent or the port vanishes, `latest()` becomes stale and nothing is raised.
+    The port is read from the event loop: 200 packets/s of 19 bytes need no thread. When the sensor falls silent or the port vanishes,
+    `latest()` becomes stale and nothing is raised.
 
     Args:
         device: port, rate and the force above which a sample counts as overloaded.
@@ -44,24 +42,17 @@ class RobotousForceTorque:
         answer_timeout_s: timeout for each reply of the sensor, and for the first samples.
     """
 
+    options = Rft60Options
+
     def __init__(self, device: ForceDevice, clock: Clock, *, answer_timeout_s: float = 2.0) -> None:
+        super().__init__(f"force sensor {device.port}", device.rate_hz)
         self._device = device
         self._clock = clock
         self._answer_timeout_s = answer_timeout_s
         self._serial: serial.Serial | None = None
         self._scanner = PacketScanner(rft.RESPONSE_BYTES)
         self._answers: dict[int, asyncio.Future[bytes]] = {}
-        self._collectors: list[_Collector] = []
-        self._latest: ForceSample | None = None
-        self._samples = 0
         self._received_bytes = 0
-        self._lost: str | None = None
-        self.product_name = ""
-        self.firmware = ""
-
-    def latest(self) -> ForceSample | None:
-        """Return the newest raw sample; never blocks."""
-        return self._latest
 
     def counts(self) -> ForceCounts:
         """Return the counters, for logs and preflight."""
@@ -71,24 +62,6 @@ class RobotousForceTorque:
             bad_sums=self._scanner.bad_sums,
             lost=self._lost,
         )
-
-    async def tare_samples(self, duration_s: float) -> list[ForceSample]:
-        """Return the samples of the next `duration_s` (counted at the configured rate), for the caller to average.
-
-        Raises:
-            DeviceError: no sample arrived for `SILENT_S`.
-        """
-        count = max(1, math.ceil(duration_s * self._device.rate_hz))
-        samples: list[ForceSample] = []
-        while len(samples) < count:
-            more = await self._collect(count - len(samples), SILENT_S)
-            samples += more
-            if not more:
-                raise DeviceError(
-                    f"{self._where}: {len(samples)} of {count} samples received, none in the last {SILENT_S:g} s, while taring; "
-                    f"{self._lost or 'the sensor fell silent'}"
-                )
-        return samples
 
     async def __aenter__(self) -> Self:
         """Open the port, identify the sensor, set its rate, start continuous output, wait for the first samples.
@@ -122,10 +95,6 @@ class RobotousForceTorque:
         self._shut()
 
     # -- opening ---------------------------------------------------------------------------------------------------------------
-
-    @property
-    def _where(self) -> str:
-        return f"force sensor {self._device.port}"
 
     def _open(self) -> serial.Serial:
         try:
@@ -252,22 +221,7 @@ class RobotousForceTorque:
         )
         self._latest = sample
         self._samples += 1
-        for collector in self._collectors:
-            collector.add(sample)
-
-    async def _collect(self, count: int, deadline_s: float) -> list[ForceSample]:
-        """Return the next `count` samples, or fewer at the deadline or when the port is lost."""
-        collector = _Collector(count)
-        self._collectors.append(collector)
-        if self._lost is not None:
-            collector.full.set()
-        try:
-            with suppress(TimeoutError):
-                async with asyncio.timeout(deadline_s):
-                    await collector.full.wait()
-        finally:
-            self._collectors.remove(collector)
-        return collector.samples
+        self._hand_on(sample)
 
     def _lose(self, reason: str) -> None:
         """Stop reading a lost port (a dead descriptor is always readable) and wake the waiting callers."""
@@ -276,8 +230,7 @@ class RobotousForceTorque:
         self._lost = f"the port was lost ({reason})"
         asyncio.get_running_loop().remove_reader(self._serial.fileno())
         _LOG.error("%s: %s", self._where, self._lost)
-        for collector in self._collectors:
-            collector.full.set()
+        self._wake()
 
     def _shut(self) -> None:
         opened = self._serial
@@ -288,18 +241,3 @@ class RobotousForceTorque:
         self._serial = None
         with suppress(OSError):
             opened.close()
-
-
-class _Collector:
-    """Collects a given number of samples."""
-
-    def __init__(self, count: int) -> None:
-        self._count = count
-        self.samples: list[ForceSample] = []
-        self.full = asyncio.Event()
-
-    def add(self, sample: ForceSample) -> None:
-        if len(self.samples) < self._count:
-            self.samples.append(sample)
-        if len(self.samples) == self._count:
-            self.full.set()

@@ -1,0 +1,68 @@
+"""Force sensors and arms: `devices.force.type` and `devices.arm.type` name a built-in one or a plug-in (`companion.plugins`)."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from pydantic import ValidationError
+
+from companion import plugins
+from companion.config.base import Location, Model
+
+RFT60 = "rft60"
+DYNAMIXEL = "dynamixel"
+BUILT_IN = ("natnet", RFT60, DYNAMIXEL)
+"""Types that the companion provides; they are announced as those of plug-ins are."""
+
+
+@functools.cache
+def device_class(group: str, name: str) -> Any:
+    """Return the class of an installed device.
+
+    Args:
+        group: group of entry points, such as `companion.plugins.FORCE_SENSORS`.
+        name: type of the device.
+
+    Raises:
+        PluginError: the device is not installed, cannot be imported or has no model for its options.
+    """
+    plugin = plugins.find(group, name)
+    found = plugin.load()
+    options = getattr(found, "options", None)
+    if not (isinstance(options, type) and issubclass(options, Model)):
+        raise plugin.error("its attribute 'options' is not a subclass of companion.config.base.Model")
+    return found
+
+
+def problems(group: str, name: str, options: Mapping[str, Any]) -> list[tuple[Location, str]]:
+    """Return the problems of `type` and `options` of a device, each with the key to which it belongs."""
+    if name in BUILT_IN and not options:
+        return []  # nothing to check: the search for plug-ins takes some hundredths of a second
+    try:
+        device_class(group, name).options.model_validate(dict(options))
+    except plugins.PluginError as error:
+        return [(("type",), str(error))]
+    except ValidationError as error:
+        return [(("options", *detail["loc"]), detail["msg"]) for detail in error.errors(include_url=False)]
+    return []
+
+
+class OptionsOf(Mapping[str, type[Model]]):
+    """Model of the options of each installed device of a group. Access raises PluginError if the device cannot be used."""
+
+    def __init__(self, group: str) -> None:
+        self._group = group
+
+    def __getitem__(self, name: str) -> type[Model]:
+        if name not in plugins.installed(self._group):
+            raise KeyError(name)
+        options: type[Model] = device_class(self._group, name).options
+        return options
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(plugins.installed(self._group))
+
+    def __len__(self) -> int:
+        return len(plugins.installed(self._group))
