@@ -17,6 +17,7 @@ from companion.model.rotors import (
     RotorLayout,
     SingularLayoutError,
     allocation,
+    disk_radius_m,
     listed_layout,
     standard_layout,
 )
@@ -68,8 +69,12 @@ class Airframe(Model):
     """Largest tilt of an attitude setpoint."""
     ground_clearance_m: Positive
     """Height of the body origin above the floor when the vehicle rests on its landing gear."""
-    radius_m: Positive = 0.45
-    """Horizontal radius around the body origin, including the rotor disks."""
+    rotor_radius_m: Positive | None = None
+    """Radius of a rotor: half the diameter of the propeller (13 inches: 0.165). The arm must keep clear of the rotors. If it is absent,
+    the distance from the outermost rotor to `radius_m` is used."""
+    radius_m: Positive = 0.49
+    """Horizontal radius around the body origin, including the rotor disks. The default is that of the Tarot 650 with
+    13-inch propellers."""
     payload_max_kg: NonNegative = 0.4
     """Payload that is assumed when a mission without `catch:` is checked."""
 
@@ -80,6 +85,11 @@ class Airframe(Model):
             return standard_layout(self.layout, self.rotor_arm_m, self.rotor_height_m)
         spins = [CCW if rotor.spin == "ccw" else CW for rotor in self.rotors]
         return listed_layout([rotor.position_body_m for rotor in self.rotors], spins)
+
+    @property
+    def disk_radius_m(self) -> float:
+        """Radius of a rotor."""
+        return self.rotor_radius_m or disk_radius_m(self.rotor_layout, self.radius_m)
 
     @model_validator(mode="after")
     def _rotors_fly(self) -> Self:
@@ -94,6 +104,13 @@ class Airframe(Model):
             key: Location = ("rotor_arm_m",) if self.rotors is None else ("rotors", far, "position_body_m")
             text = f"expected less than radius_m, {self.radius_m:g} m, from the body's z axis, got {reach_m[far]:g} m"
             refuse("airframe", [(key, text)])
+        blades_m = reach_m[far] + (self.rotor_radius_m or 0.0)
+        if blades_m > self.radius_m + 1e-9:
+            text = (
+                f"expected at least {blades_m:g} m, the distance of a rotor from the body's z axis plus rotor_radius_m"
+            )
+            text += f", got {self.radius_m:g} m"
+            refuse("airframe", [(("radius_m",), text)])
         try:
             shares = [row[3] for row in allocation(rotors)]
         except SingularLayoutError as error:

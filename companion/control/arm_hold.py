@@ -26,3 +26,12 @@ def hold_torque_nm(
         )
     ]
     return tuple(torque)
+
+
+def towards(angle_rad: Joints, goal_rad: Joints, step_rad: float) -> Joints:
+    """Return the next joint angles on the straight line in joint space to the goal: no joint moves farther than the step."""
+    farthest_rad = max((abs(goal - angle) for angle, goal in zip(angle_rad, goal_rad, strict=True)), default=0.0)
+    if farthest_rad <= step_rad:
+        return goal_rad
+    share = step_rad / farthest_rad
+    return tuple([angle + share * (goal - angle) for angle, goal in zip(angle_rad, goal_rad, strict=True)])

@@ -6,7 +6,7 @@ import math
 
 from companion.config.controller import law_class
 from companion.config.loader import FlightConfig
-from companion.control.arm_hold import hold_torque_nm
+from companion.control.arm_hold import hold_torque_nm, towards
 from companion.control.arm_model import manipulator_of
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.hover_thrust import HoverThrust, off_the_ground
@@ -102,15 +102,14 @@ class VehicleControl:
         return Command(self.level(i), self._hold(i))
 
     def fold(self, i: Inputs, dt_s: float) -> Command:
-        """Return the command that moves the arm to its folded pose at a limited rate, without an attitude setpoint."""
-        goal, step = self.fold_rad, FOLD_RATE_RAD_S * dt_s
+        """Return the command that moves the arm to its folded pose at a limited rate, without an attitude setpoint. The way is straight
+        in joint space, as the mission check assumes (`companion.mission.arm_clearance`).
+        """
         # The arm was not held before: start from the present angle.
         now = self._arm_target_rad or (i.arm.angle_rad if i.arm is not None else None)
         if now is None:
             return Command()
-        self._arm_target_rad = tuple(
-            [angle + max(-step, min(step, end - angle)) for angle, end in zip(now, goal, strict=True)]
-        )
+        self._arm_target_rad = towards(now, self.fold_rad, FOLD_RATE_RAD_S * dt_s)
         return Command(attitude=None, arm_torque_nm=self._hold(i))
 
     def _hold(self, i: Inputs) -> Joints | None:

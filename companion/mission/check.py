@@ -13,8 +13,9 @@ from companion.config.mission import ArmMove, Mission
 from companion.config.vehicle import Vehicle
 from companion.mission.minsnap import Progress
 from companion.mission.plan import Plan
-from companion.mission.sample_check import CATCH_NEAR_M, STOP, SampleCheck, Violation
+from companion.mission.sample_check import CATCH_NEAR_M, STOP, SampleCheck
 from companion.mission.segments import Segment
+from companion.mission.violation import Violation
 from companion.model.frames import wrap_rad
 from companion.model.listing import listed
 from companion.model.types import Joints, PhaseKind, Reference, Vec3

@@ -9,23 +9,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from companion.config.arm import LINK_RADIUS_M
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
+from companion.mission.arm_check import ArmCheck
+from companion.mission.violation import TOLERANCE, Violation
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx
-from companion.model.rotors import disk_radius_m
-from companion.model.types import IDENTITY_QUAT, Joints, PhaseKind, Quat, Reference, Vec3
+from companion.model.types import Joints, PhaseKind, Quat, Reference, Vec3
 from companion.safety.governor import BODY_TOP_M, SafeSet
 from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
 
-FLOOR_GAP_M = 0.01
-ROTOR_GAP_M = 0.02
-"""Smallest distance of the arm and the net below a rotor's disk."""
 TRACKING_M = 0.10
 """Largest expected distance from the plan, m; measured over random missions in a wind of 3 m/s."""
 CATCH_M = 0.20
@@ -34,25 +31,10 @@ CATCH_NEAR_M = 0.05
 """Largest horizontal distance from the expected place at which the catch can happen, m."""
 CATCH_S = 2.0
 THRUST_SHARE_MAX = 0.9
-HOLDING_SHARE_MAX = 0.9
-"""Largest fraction of a joint's torque that may hold the arm's own weight; the rest is for motion and a payload."""
 """Upper bound on `limits.thrust_share_max`; the rest is reserved for attitude control."""
 STOP = "stop "
 """Prefix of a limit's name if the planned position respects the limit, but the position where the vehicle would come to rest does not.
 """
-TOLERANCE = 1e-6
-"""Relative tolerance, so that a mission may use its limits fully."""
-
-
-@dataclass(frozen=True, slots=True)
-class Violation:
-    """A limit that one sample exceeds. `excess` orders violations of the same limit."""
-
-    limit: str
-    excess: float
-    what: str
-    detail: str
-    advice: str
 
 
 class SampleCheck:
@@ -66,10 +48,7 @@ class SampleCheck:
         self._limits = mission.limits
         self._catch = mission.catch
         self._vehicle = vehicle
-        rotors = vehicle.airframe.rotor_layout
-        self._rotors_body_m = rotors.positions_body_m
-        self._disk_m = disk_radius_m(rotors, vehicle.airframe.radius_m)
-        self._torque_limits_nm = vehicle.joint_torque_limits_nm
+        self._arm = ArmCheck(vehicle)
         self._manipulator = manipulator_of(vehicle)
         self._safe = SafeSet(vehicle)
         self._stop_model = StopModel(vehicle.safety)
@@ -130,7 +109,7 @@ class SampleCheck:
         yield from self._space(position, reference, off_m)
         yield from self._stop(position, reference, kind, off_m)
         yield from self._line(t_s, position, reference)
-        yield from self._arm(position, reference)
+        yield from self._arm.violations(position, reference)
         yield from self._motion(reference, jerks)
         yield from self._thrust(reference)
 
@@ -244,58 +223,6 @@ class SampleCheck:
                 detail=detail,
                 advice=advice,
             )
-
-    def _arm(self, position: Vec3, reference: Reference) -> Iterator[Violation]:
-        arm = self._vehicle.arm
-        for number, (angle_rad, joint) in enumerate(zip(reference.arm_rad, arm.joints, strict=True), start=1):
-            angle_deg = math.degrees(angle_rad)
-            low_deg, high_deg = joint.angle_deg
-            excess = max(low_deg - angle_deg, angle_deg - high_deg)
-            if excess > TOLERANCE:
-                what = f"drives joint {number} beyond its limit"
-                detail = f"{angle_deg:.1f} deg (limits {low_deg:g} and {high_deg:g} deg)"
-                yield Violation(
-                    limit=f"joint {number}", excess=excess, what=what, detail=detail, advice="change arm_deg"
-                )
-        if not arm.joints:
-            return
-        gravity_nm = self._manipulator.gravity_torque_nm(reference.arm_rad, IDENTITY_QUAT)
-        for number, (torque_nm, limit_nm) in enumerate(zip(gravity_nm, self._torque_limits_nm, strict=True), start=1):
-            if abs(torque_nm) > HOLDING_SHARE_MAX * limit_nm:
-                yield Violation(
-                    limit=f"torque {number}",
-                    excess=abs(torque_nm) - HOLDING_SHARE_MAX * limit_nm,
-                    what=f"overloads joint {number}",
-                    detail=f"the arm's own weight needs {abs(torque_nm):.2f} N m of the {limit_nm:.2f} N m that the joint has "
-                    f"(at most {HOLDING_SHARE_MAX:.0%})",
-                    advice="choose a pose closer to hanging, a lighter arm or a stronger servo, or raise torque_max_nm",
-                )
-        tip = "net" if self._vehicle.tool is not None else "end of the arm"
-        parts = [(tip, self._manipulator.net_body_m(reference.arm_rad), self._vehicle.tip_radius_m)]
-        for number, joint_m in enumerate(self._manipulator.joints_body_m(reference.arm_rad)[1:], start=2):
-            parts.append(("elbow" if len(arm.joints) == 2 else f"joint {number}", joint_m, LINK_RADIUS_M))
-        for part, (x_m, y_m, z_m), radius_m in parts:
-            for number, (rotor_x_m, rotor_y_m, rotor_z_m) in enumerate(self._rotors_body_m, start=1):
-                above_m = z_m + radius_m - (rotor_z_m - ROTOR_GAP_M)
-                if above_m > 0.0 and math.hypot(x_m - rotor_x_m, y_m - rotor_y_m) < self._disk_m + radius_m:
-                    yield Violation(
-                        limit=f"rotor {part}",
-                        excess=above_m,
-                        what=f"brings the {part} into a rotor",
-                        detail=f"at ({x_m:.2f}, {y_m:.2f}, {z_m:.2f}) m in the body frame, it is at rotor {number}",
-                        advice="change arm_deg, or the joint limits arm.joints[].angle_deg",
-                    )
-            lowest_m = position[2] + z_m - radius_m
-            if lowest_m < FLOOR_GAP_M:
-                what = f"drags {part if part.startswith('joint') else f'the {part}'} over the floor"
-                detail = f"its lowest point is {lowest_m:.2f} m high (minimum {FLOOR_GAP_M:g} m)"
-                yield Violation(
-                    limit=f"floor {part}",
-                    excess=FLOOR_GAP_M - lowest_m,
-                    what=what,
-                    detail=detail,
-                    advice="fly higher or choose another pose of the arm",
-                )
 
     def _motion(self, reference: Reference, jerks: tuple[Vec3, Joints]) -> Iterator[Violation]:
         limits = self._limits

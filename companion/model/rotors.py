@@ -91,7 +91,7 @@ def logged_layout(airframe: Mapping[str, Any]) -> RotorLayout:
 
 
 def disk_radius_m(rotors: RotorLayout, radius_m: float) -> float:
-    """Return the radius of the rotor disks of a vehicle with the horizontal radius `radius_m`, for drawings."""
+    """Return the radius of the rotor disks of a vehicle whose outermost blade reaches `radius_m` from the body's z axis."""
     return radius_m - max(math.hypot(x, y) for x, y, _ in rotors.positions_body_m)
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from companion.config.loader import FlightConfig
+from companion.config.vehicle import Vehicle
 from companion.model.check_row import Row, refusals
 from companion.model.observations import Observations, Waiting
 from companion.preflight import arm, estimator, force, frames, machine, mission, mocap, px4, tether
 from companion.preflight.checks import Check
-from companion.px4 import required
+from companion.px4 import required, rotors
 
 CHECKS: tuple[Check, ...] = (
+    *px4.CHECKS,
     *estimator.CHECKS,
     *mocap.CHECKS,
     *frames.CHECKS,
@@ -58,6 +60,6 @@ def unsettled(o: Observations, config: FlightConfig) -> Waiting | None:
     return Waiting(", ".join(settling), SETTLE_S if len(settling) == len(refusing) else BEGIN_S)
 
 
-def param_names() -> tuple[str, ...]:
+def param_names(vehicle: Vehicle) -> tuple[str, ...]:
     """Return the PX4 parameters that the rows need."""
-    return required.names()
+    return (*required.names(), *rotors.names(vehicle.airframe.rotor_layout.count))

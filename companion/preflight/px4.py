@@ -7,11 +7,20 @@ from collections.abc import Iterator, Mapping
 
 from companion.config.vehicle import Vehicle
 from companion.model.check_row import Level, Row
-from companion.px4.required import WANTED, Value, Wanted
+from companion.preflight.checks import Check
+from companion.px4.required import ROTOR_COUNT, WANTED, Value, Wanted
+from companion.px4.rotors import differences
 
 KNOWN_GOOD = ((1, 16), (1, 18))
 """Versions with which missions have been flown, in simulation."""
 OLDEST = (1, 15)
+ROTORS = Check(
+    "px4.rotors",
+    "rotors in PX4",
+    "`CA_ROTORi_PX`, `CA_ROTORi_PY` and the sign of `CA_ROTORi_KM` place every rotor and its spin direction as in the vehicle file",
+    "with another order of rotors or another spin direction, the vehicle flips or spins at take-off",
+)
+CHECKS = (ROTORS,)
 FIRMWARE_ID, UNREAD_ID = "px4.firmware", "px4.params"
 PARAM_ID = "px4.param."
 """Prefix of the id of a parameter's row; the parameter's name follows it."""
@@ -45,7 +54,7 @@ def rows(firmware: str | None, params: Mapping[str, Value], vehicle: Vehicle) ->
                 )
             )
         return found
-    return [*found, *_param_rows(params, vehicle)]
+    return [*found, *_param_rows(params, vehicle), *_rotor_rows(params, vehicle)]
 
 
 def firmware_row(firmware: str) -> Row:
@@ -115,6 +124,23 @@ def _param_rows(params: Mapping[str, Value], vehicle: Vehicle) -> Iterator[Row]:
             fix="" if ok else fix_of(wanted),
             level=wanted.level,
         )
+
+
+def _rotor_rows(params: Mapping[str, Value], vehicle: Vehicle) -> Iterator[Row]:
+    layout = vehicle.airframe.rotor_layout
+    if params.get(ROTOR_COUNT, layout.count) != layout.count:
+        return  # the row of the parameter refuses
+    wanted = "as in the vehicle file: airframe.layout or airframe.rotors"
+    found = differences(params, layout)
+    if found is None:
+        yield ROTORS.doubtful(
+            "PX4 lacks CA_ROTORi_PX, _PY or _KM", wanted, "check motor order and spin directions by hand"
+        )
+    elif found:
+        fix = "select the machine's airframe in QGroundControl, or correct airframe.layout or airframe.rotors"
+        yield ROTORS.bad("; ".join(found), wanted, fix)
+    else:
+        yield ROTORS.good(f"{layout.count} rotors in the same places, with the same spin directions", wanted)
 
 
 def fix_of(wanted: Wanted) -> str:

@@ -51,7 +51,7 @@ async def preflight(
         config,
         clock,
         out=out,
-        param_names=evaluation.param_names(),
+        param_names=evaluation.param_names(config.vehicle),
         unsettled=lambda o: evaluation.unsettled(o, config),
         progress=progress,
         known=known,

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from companion.model.rotors import ROTORS_MAX
+
 PX4_DEFAULTS: Mapping[str, float | int] = {
     "BAT1_CAPACITY": -1.0,
     "BAT1_N_CELLS": 4,
@@ -21,6 +23,11 @@ PX4_DEFAULTS: Mapping[str, float | int] = {
     "CAL_ACC0_ID": 1310988,
     "CAL_GYRO0_ID": 1310988,
     "CA_ROTOR_COUNT": 4,
+    **{
+        f"CA_ROTOR{index}_{key}": value
+        for index in range(ROTORS_MAX)
+        for key, value in (("PX", 0.0), ("PY", 0.0), ("PZ", 0.0), ("KM", 0.05))
+    },
     "CBRK_FLIGHTTERM": 121212,
     "CBRK_IO_SAFETY": 22027,
     "CBRK_SUPPLY_CHK": 0,

@@ -9,6 +9,7 @@ from contextlib import AbstractAsyncContextManager
 from typing import Any, NamedTuple, Protocol
 
 from companion.config.airframe import Airframe
+from companion.px4.rotors import geometry_of
 from companion.sitl_config.effects.imu import Imu
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery, Px4Stub, gains_from_params
@@ -98,6 +99,8 @@ def stub_of(config: WorldConfig, airframe: Airframe, link_delay_s: float = 0.0) 
     params = Params()
     params.set("MAV_TYPE", mav_type(airframe.rotor_layout.count))
     params.set("CA_ROTOR_COUNT", airframe.rotor_layout.count)
+    for name, value in geometry_of(airframe).items():
+        params.set(name, value)
     params.set("BAT1_N_CELLS", airframe.battery_cells)
     params.set("THR_MDL_FAC", config.thr_mdl_fac)
     for name, value in config.overridden_px4_params().items():

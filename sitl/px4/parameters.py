@@ -9,6 +9,7 @@ from collections.abc import Mapping
 
 from companion.config.airframe import Airframe
 from companion.px4.required import WANTED, simulated_values
+from companion.px4.rotors import geometry_of
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.params import PX4_DEFAULTS, VEHICLE_DEFAULTS, Value, mav_type
 
@@ -46,18 +47,12 @@ _MOTOR_1 = 101
 def rotor_geometry(airframe: Airframe) -> dict[str, Value]:
     """Return MAV_TYPE, the parameters CA_*, and the outputs of the rotors.
 
-    Positions are relative to the body origin (FRD, m). The moment ratio (CA_ROTORn_KM) is positive for counter-clockwise rotors.
     PX4's simulator sends the outputs PWM_MAIN in HIL_ACTUATOR_CONTROLS.
     """
     layout = airframe.rotor_layout
-    found: dict[str, Value] = {"CA_AIRFRAME": 0, "CA_ROTOR_COUNT": layout.count, "MAV_TYPE": mav_type(layout.count)}
-    for i, ((x, y, z), spin) in enumerate(zip(layout.positions_body_m, layout.spins, strict=True)):
-        found[f"CA_ROTOR{i}_PX"] = x
-        found[f"CA_ROTOR{i}_PY"] = -y
-        found[f"CA_ROTOR{i}_PZ"] = -z
-        found[f"CA_ROTOR{i}_KM"] = spin * airframe.yaw_torque_per_thrust_m
-        found[f"PWM_MAIN_FUNC{i + 1}"] = _MOTOR_1 + i
-    return found
+    outputs = {f"PWM_MAIN_FUNC{i + 1}": _MOTOR_1 + i for i in range(layout.count)}
+    kind = {"CA_AIRFRAME": 0, "CA_ROTOR_COUNT": layout.count, "MAV_TYPE": mav_type(layout.count)}
+    return {**kind, **geometry_of(airframe), **outputs}
 
 
 def parameters(airframe: Airframe, config: WorldConfig, hover_command: float) -> dict[str, Value]:

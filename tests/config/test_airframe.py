@@ -45,7 +45,7 @@ def test_listed_rotors_replace_the_layout() -> None:
             [*SQUARE[:3], (-300.0, -200.0)],
             "lrrl",
             ("rotors", 3, "position_body_m"),
-            "expected less than radius_m, 0.45 m",
+            "expected less than radius_m, 0.49 m",
         ),
         ([*FRONT, (-0.02, 0.2), (-0.02, -0.2)], "lrrl", ("rotors", 0), "not balanced .* has 12% of the mean thrust"),
     ],
@@ -64,7 +64,7 @@ def test_rotors_that_cannot_fly_are_refused(
     ("override", "text"),
     [
         ("vehicle.airframe.layout=hexa", "airframe.layout.*hexa_x"),
-        ("vehicle.airframe.rotor_arm_m=325.0", r"airframe.rotor_arm_m.*expected less than radius_m, 0.45 m"),
+        ("vehicle.airframe.rotor_arm_m=325.0", r"airframe.rotor_arm_m.*expected less than radius_m, 0.49 m"),
         ("vehicle.airframe.battery_cells=6", "safety.battery_voltage_min_v.*expected 16.8 to 24.6 V for the 6 cells"),
         ("vehicle.tether.rotor_inner_radius_m=0.4", "tether.rotor_inner_radius_m.*expected less than 0.325 m"),
         ("vehicle.airframe.rotors=[]", "airframe.rotors.*expected 4 to 12 rotors"),

@@ -37,7 +37,7 @@ def problems(*overrides: str, **measured: Any) -> list[str]:
 @pytest.mark.parametrize(("duration_s", "accepted"), [(5.03, False), (6.0, True)])
 def test_a_line_to_the_wall_is_as_fast_as_the_landing_of_px4_can_stop_it(duration_s: float, accepted: bool) -> None:
     """1.13 m/s in between, rotors 0.15 m from the wall at its end: PX4's LAND overran the wall there by 0.02 m. 0.1 m more are left now."""
-    line = f"mission.phases[1]={{type: line, to_m: [1.5, 0, 1.0], duration_s: {duration_s}}}"
+    line = f"mission.phases[1]={{type: line, to_m: [1.46, 0, 1.0], duration_s: {duration_s}}}"
     config = load("mission.limits.speed_max_m_s=1.2", "mission.limits.acceleration_max_m_s2=1.2", line, mission="hover")
     found = check_mission(config.mission, config.vehicle)
     assert found == [] if accepted else ["could not stop within the room" in problem for problem in found] == [True]
@@ -99,8 +99,8 @@ def test_committed_missions_are_flyable(mission: str) -> None:
 
 REFUSED = [
     (["mission.phases[2].to_m=[1, 0, 1.9]", "vehicle.tether.length_m=2.5"], "phase 'catch' leaves the tether sphere at t = 8.6 s, (0.97, 0.00, 1.89) m: 2.44 m from the anchor (limit 2.05 m: length minus margin and 0.2 m for the catch); shorten the line or move the anchor (also in 'stabilise', 'return')"),
-    (["mission.phases[2].to_m=[1.9, 0, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.90, 0.00, 1.00) m: the rotors, the arm and the net reach x = 2.35 m; the room is -2.2 to 2.2 m, reduced at each end by 0.1 m for tracking; move the waypoint inwards (also in 'stabilise', 'return')"),
-    (["mission.phases[2].to_m=[1, -1.5, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.00, -1.50, 1.00) m: the rotors, the arm and the net reach y = -1.95 m; the room is -1.8 to 1.8 m, reduced at each end by 0.1 m for tracking; move the waypoint inwards"),
+    (["mission.phases[2].to_m=[1.9, 0, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.90, 0.00, 1.00) m: the rotors, the arm and the net reach x = 2.39 m; the room is -2.2 to 2.2 m, reduced at each end by 0.1 m for tracking; move the waypoint inwards (also in 'stabilise', 'return')"),
+    (["mission.phases[2].to_m=[1, -1.5, 1]"], "phase 'catch' leaves the room at t = 9.5 s, (1.00, -1.50, 1.00) m: the rotors, the arm and the net reach y = -1.99 m; the room is -1.8 to 1.8 m, reduced at each end by 0.1 m for tracking; move the waypoint inwards"),
     (["mission.phases[2].to_m=[1, 0, 2.1]"], "the rotors, the arm and the net reach z = 2.23 m; the room is 0 to 2.2 m, reduced at each end by 0.2 m for the catch"),
     (["mission.phases[2].to_m=[1, 0, 0.2]"], "phase 'catch' flies into the floor at t = 9.5 s, (1.00, 0.00, 0.20) m: the body's origin at 0.20 m (minimum 0.30 m); raise the waypoint"),
     (["mission.phases[2].to_m=[1, 0, 0.4]"], "phase 'catch' drags the net over the floor at t = 9.5 s, (1.00, 0.00, 0.40) m: its lowest point is -0.07 m high (minimum 0.01 m); fly higher or choose another pose of the arm"),
@@ -123,12 +123,12 @@ REFUSED = [
     (["mission.catch.payload_max_kg=2"], "phase 'take-off' needs too much thrust at t = 0.8 s"),
     (["mission.phases[2].duration_s=2.2", "mission.phases[2].arm_duration_s=2", "vehicle.airframe.tilt_max_deg=10"], "phase 'catch' tilts too far"),
     (["mission.phases[0].height_m=0.4"], "phase 'take-off' ends at 0.4 m, but the body's origin is 0.3 m above the floor when the vehicle is on the ground; set height_m to 0.5 or more"),
-    (["mission.catch.expected_at_m=[1, 0]", "vehicle.room.x_m=[-1.6, 1.6]"], "phase 'catch' leaves the room at t = 9.5 s, (1.00, 0.00, 1.00) m: the rotors, the arm and the net reach x = 1.45 m; the room is -1.6 to 1.6 m, reduced at each end by 0.2 m for the catch"),
-    (["vehicle.safety.stop_deceleration_m_s2=0.3", "vehicle.room.x_m=[-1.7, 1.7]", "vehicle.safety.react_time_s=0.3"], "phase 'catch' could not stop within the room at t = 7.1 s, (0.41, 0.00, 1.00) m: at 0.65 m/s the vehicle needs 0.96 m to stop, 0.31 m too far with 0.2 m for the catch; fly more slowly towards the edge or turn back earlier"),
+    (["mission.catch.expected_at_m=[1, 0]", "vehicle.room.x_m=[-1.64, 1.64]"], "phase 'catch' leaves the room at t = 9.5 s, (1.00, 0.00, 1.00) m: the rotors, the arm and the net reach x = 1.49 m; the room is -1.64 to 1.64 m, reduced at each end by 0.2 m for the catch"),
+    (["vehicle.safety.stop_deceleration_m_s2=0.3", "vehicle.room.x_m=[-1.74, 1.74]", "vehicle.safety.react_time_s=0.3"], "phase 'catch' could not stop within the room at t = 7.1 s, (0.41, 0.00, 1.00) m: at 0.65 m/s the vehicle needs 0.96 m to stop, 0.31 m too far with 0.2 m for the catch; fly more slowly towards the edge or turn back earlier"),
     (["vehicle.safety.stop_deceleration_m_s2=0.2", "vehicle.tether.length_m=2.4"], "could not stop within the tether sphere"),
     (["mission.phases[1]={type: line, to_m: [-1, 0, 0.32], duration_s: 2}", "mission.phases[2]={type: line, to_m: [1, 0, 1]}"], "could not stop within the height above the floor"),
     (["mission.phases[2]={type: path, through_m: [[1, -1.2, 1.2], [0, -2.2, 1.2], [-1, -1.2, 1.2], [0, -0.2, 1.2], [1, -1.2, 1.2], [0, -2.2, 1.2], [-1, -1.2, 1.2], [-1, 0, 1]]}", "vehicle.room.y_m=[-3, 2]"], "winds up the tether at t = "),
-    (["vehicle.tether.anchor_world_m=[0, -1.2, 0.95]"], "phase 'take-off' brings the tether too close to the rotors or the arm at t = 0.0 s, (-1.00, 0.00, 0.30) m: -0.173 m between the line and the rotors or the arm (tether.clearance_min_m is 0.01; the anchor is seen -23 deg below the horizon); fly higher"),
+    (["vehicle.tether.anchor_world_m=[0, -1.2, 0.95]"], "phase 'take-off' brings the tether too close to the rotors or the arm at t = 0.0 s, (-1.00, 0.00, 0.30) m: -0.188 m between the line and the rotors or the arm (tether.clearance_min_m is 0.01; the anchor is seen -23 deg below the horizon); fly higher"),
     (["mission.catch=null", "vehicle.airframe.thrust_max_n=42"], "needs too much thrust at t = 0.8 s, (-1.00, 0.00, 0.37) m: 35.6 N with 0.4 kg of payload and the tether's weight (limit 33.6 N: 0.8 of 42 N); allow more time or carry less"),
     (["mission.limits.thrust_share_max=1", "vehicle.airframe.thrust_max_n=36"], "34.6 N with 0.3 kg of payload and the tether's weight (limit 32.4 N: 0.9 of 36 N)"),
     (["vehicle.tether.load_rating_n=50"], "vehicle 'tarot650-2r': tether.load_rating_n is 50 N, but the rotors pull with 60 N (airframe.thrust_max_n); the tether must hold them: use a stronger one"),
@@ -246,7 +246,7 @@ def test_a_yawed_vehicle_reaches_elsewhere_with_its_net() -> None:
 
 
 def test_on_the_way_back_over_the_place_of_the_catch_nothing_is_caught() -> None:
-    found = problems("vehicle.room.x_m=[-1.66, 1.76]")
+    found = problems("vehicle.room.x_m=[-1.70, 1.80]")
     assert found == [], "0.1 m for tracking is left behind the start, 0.2 m for the catch before the far end"
 
 

@@ -27,6 +27,7 @@ from companion.model.types import (
     VehicleState,
 )
 from companion.px4 import required
+from companion.px4.rotors import geometry_of
 from tests.support import CATCH
 
 START_S, SPAN_S = 2.0, 5.0
@@ -35,6 +36,7 @@ PARAMS = {
     **{one.name: one.value for one in required.WANTED if one.value is not None},
     required.HOVER: 0.49,
     required.ROTOR_COUNT: 4,
+    **geometry_of(load_flight(CATCH).vehicle.airframe),
 }
 FLAGS = 447
 """As PX4 1.16 says it of a machine that stands and fuses motion capture, with a global origin."""

@@ -122,6 +122,10 @@ CASES = {
         also=("px4.param.MPC_THR_HOVER",),
     ),
     "a parameter": Case("px4.param.EKF2_EV_CTRL", "0", "set EKF2_EV_CTRL to 11", {"params": {**r.PARAMS, "EKF2_EV_CTRL": 0}}),
+    "another motor map": Case(
+        "px4.rotors", "CA_ROTOR0 is 45 deg to the left", "select the machine's airframe",
+        {"params": {**r.PARAMS, "CA_ROTOR0_PY": -0.23, "CA_ROTOR2_PY": 0.23}},
+    ),
     "old firmware of PX4": Case("px4.firmware", "PX4 1.13.3", "flash", {"firmware": "PX4 1.13.3 release (git 0)"}),
     "hover thrust of the vehicle file": Case(
         "px4.hover_thrust", "airframe.hover_thrust", "airframe.hover_thrust", {}, vehicle={"airframe.hover_thrust": 0.2}

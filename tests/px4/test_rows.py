@@ -13,9 +13,11 @@ from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.check_row import Level, Row
+from companion.preflight.evaluation import param_names
 from companion.preflight.px4 import firmware_row, rows
 from companion.px4.defaults import PX4_DEFAULTS
-from companion.px4.required import HOVER, ROTOR_COUNT, WANTED, file_values, names, simulated_values
+from companion.px4.required import HOVER, ROTOR_COUNT, WANTED, file_values, simulated_values
+from companion.px4.rotors import geometry_of
 from companion.runtime.clock import flight_clock
 from companion.sitl_config.loader import load_world
 from companion.sitl_config.world import World
@@ -54,7 +56,7 @@ def vehicle(*overrides: str) -> Vehicle:
 
 
 def good() -> dict[str, float | int]:
-    return {**simulated_values(), HOVER: 0.49, ROTOR_COUNT: 4}
+    return {**simulated_values(), HOVER: 0.49, ROTOR_COUNT: 4, **geometry_of(vehicle().airframe)}
 
 
 def wrong(params: dict[str, float | int], machine: Vehicle | None = None) -> list[Row]:
@@ -64,7 +66,8 @@ def wrong(params: dict[str, float | int], machine: Vehicle | None = None) -> lis
 def test_what_this_project_sets_is_fine() -> None:
     found = rows(FIRMWARE, good(), vehicle())
     assert wrong(good()) == []
-    assert [row.id for row in found[1:]] == [f"px4.param.{wanted.name}" for wanted in WANTED if not wanted.hardware]
+    params = [f"px4.param.{wanted.name}" for wanted in WANTED if not wanted.hardware]
+    assert [row.id for row in found[1:]] == [*params, "px4.rotors"]
     assert all(row.why and row.wanted for row in found)
 
 
@@ -167,19 +170,21 @@ def test_types_and_names_are_those_of_px4() -> None:
 
 
 def test_a_wrong_parameter_over_real_mavlink_gives_its_row() -> None:
-    wrong = {"EKF2_EV_CTRL": 3.0, "COM_OBL_RC_ACT": 6.0, "COM_OF_LOSS_T": 5.0}
+    wrong = {"EKF2_EV_CTRL": 3.0, "COM_OBL_RC_ACT": 6.0, "COM_OF_LOSS_T": 5.0, "CA_ROTOR1_KM": -0.025}
+    geometry = geometry_of(vehicle().airframe)
     world, _ = load_world([f"world.px4_params={wrong}".replace("'", "")])
 
     async def read() -> list[Row]:
         port = free_udp_port()
         device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
         async with (
-            standing_stub(port, {HOVER: 0.49, **world.overridden_px4_params()}),
+            standing_stub(port, {HOVER: 0.49, **geometry, **world.overridden_px4_params()}),
             MavsdkAutopilot(device, flight_clock()) as autopilot,
         ):
-            return rows(await autopilot.firmware(), await autopilot.read_params(names()), vehicle())
+            return rows(await autopilot.firmware(), await autopilot.read_params(param_names(vehicle())), vehicle())
 
-    assert {row.title for row in asyncio.run(read()) if not row.ok} == set(wrong)
+    found = {row.title for row in asyncio.run(read()) if not row.ok}
+    assert found == {"EKF2_EV_CTRL", "COM_OBL_RC_ACT", "COM_OF_LOSS_T", "rotors in PX4"}
 
 
 @pytest.mark.parametrize(
@@ -204,7 +209,48 @@ def test_wrong_parameters_come_in_px4s_types() -> None:
 
 def test_the_number_of_rotors_is_that_of_the_vehicle_file() -> None:
     hexacopter = load_vehicle("hexa_2r", [UDP])
+    geometry = geometry_of(hexacopter.airframe)
     titles = {row.title for row in wrong({**good(), HOVER: 0.4}, hexacopter)}
     assert ROTOR_COUNT in titles
-    assert ROTOR_COUNT not in {row.title for row in wrong({**good(), HOVER: 0.4, ROTOR_COUNT: 6}, hexacopter)}
-    assert stub_of(load_world()[0], hexacopter.airframe).params[ROTOR_COUNT] == 6
+    assert wrong({**good(), HOVER: 0.4, ROTOR_COUNT: 6, **geometry}, hexacopter) == []
+    served = stub_of(load_world()[0], hexacopter.airframe).params
+    assert served[ROTOR_COUNT] == 6
+    assert {name: served[name] for name in geometry} == pytest.approx(geometry)
+
+
+PX4_QUAD_X = {
+    f"CA_ROTOR{i}_{key}": value
+    for i, row in enumerate(((0.15, 0.15, 0.05), (-0.15, -0.15, 0.05), (0.15, -0.15, -0.05), (-0.15, 0.15, -0.05)))
+    for key, value in zip(("PX", "PY", "KM"), row, strict=True)
+}
+"""Generic quadrotor of PX4 (airframe 4001), whose rotor arm is not that of this vehicle."""
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({}, None),
+        ({"CA_ROTOR0_PX": 0.20}, None),
+        (
+            {"CA_ROTOR0_PY": -0.15, "CA_ROTOR2_PY": 0.15},
+            "CA_ROTOR0 is 45 deg to the left, ccw (vehicle file: 45 deg to the right, ccw); "
+            "CA_ROTOR2 is 45 deg to the right, cw (vehicle file: 45 deg to the left, cw)",
+        ),
+        (
+            {"CA_ROTOR3_KM": 0.05},
+            "CA_ROTOR3 is 135 deg to the right, ccw (vehicle file: 135 deg to the right, cw)",
+        ),
+        ({"CA_ROTOR3_KM": 0.0}, "CA_ROTOR3 is 135 deg to the right, without yaw torque"),
+        (dict.fromkeys((f"CA_ROTOR{i}_P{axis}" for i in range(4) for axis in "XY"), 0.0), "CA_ROTOR0 is at the centre"),
+    ],
+)
+def test_another_motor_map_in_px4_is_refused(changed: dict[str, float], said: str | None) -> None:
+    found = wrong({**good(), **PX4_QUAD_X, **changed})
+    assert [row.id for row in found if row.refuses] == ([] if said is None else ["px4.rotors"])
+    if said is not None:
+        assert said in found[0].read and "select the machine's airframe" in found[0].fix
+
+
+def test_a_px4_without_the_rotors_parameters_only_warns() -> None:
+    (row,) = wrong({name: value for name, value in good().items() if name != "CA_ROTOR2_PY"})
+    assert (row.id, row.refuses) == ("px4.rotors", False)

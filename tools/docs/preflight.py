@@ -7,12 +7,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from companion.preflight import arm, estimator, force, frames, machine, mission, mocap, tether
+from companion.preflight import arm, estimator, force, frames, machine, mission, mocap, px4, tether
 from companion.preflight.checks import Check
 from tools.docs.tables import write_page
 
 ROOMS: dict[str, Sequence[Check]] = {
-    "px4": estimator.CHECKS,
+    "px4": (*px4.CHECKS, *estimator.CHECKS),
     "mocap": mocap.CHECKS,
     "frames": frames.CHECKS,
     "arm": arm.CHECKS,
