@@ -113,10 +113,15 @@ def measure(name: str, out: Path, quick: bool) -> dict[str, Any]:
     words = ["--part", name, "--out", str(out), *(["--quick"] if quick else [])]
     begun_s = time.monotonic()
     with (folder / "stderr.txt").open("wb") as stderr:
+        pressed: list[int] = []
+        before = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))  # while the part starts
         process = subprocess.Popen(
             [sys.executable, "-m", "benchmarks", *words], cwd=ROOT, stderr=stderr, start_new_session=True
         )
         try:
+            signal.signal(signal.SIGINT, before)
+            if pressed:
+                raise KeyboardInterrupt
             code = process.wait(DEADLINE_S[name])
         except subprocess.TimeoutExpired:
             code = None
