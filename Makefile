@@ -7,7 +7,7 @@ MINUTES ?= 10
 # Without bytecode each of some hundred processes would compile the project anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install lock fly compile test lint explore debian bench docs clean
+.PHONY: install lock audit fly compile test lint explore debian bench docs clean
 
 install: $(STAMP)
 
@@ -27,6 +27,11 @@ lock:
 	  echo 'setuptools>=77' | build/lock/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate --no-header \
 	    --no-emit-index-url --constraints constraints.txt $$extras pyproject.toml - --output-file requirements/$$what.txt || exit 1; \
 	done
+
+# Whether a locked version has a known vulnerability. Fails as well if the package index has no answer for a package.
+audit:
+	@test -x build/audit/bin/pip-audit || { $(PYTHON) -m venv build/audit && build/audit/bin/python -m pip install --quiet pip-audit==2.10.1; }
+	@for what in flight all; do build/audit/bin/pip-audit --strict --disable-pip --require-hashes --progress-spinner off --requirement requirements/$$what.txt || exit 1; done
 
 fly: install
 	@$(BIN)/companion fly configs/missions/catch.yaml --sitl
