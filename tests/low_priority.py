@@ -1,7 +1,9 @@
 """`python -m tests.low_priority COMMAND ...`: run a command that takes what the other processes leave of the processors.
 
 To be started in a session of its own. Linux shares the processors among sessions first (sched_autogroup) and among the processes of a
-session second: a niceness alone counts in its session only.
+session second: a niceness alone counts in its session only. So a foreign program gets a whole core before a session of the lowest
+priority gets anything, even if its niceness is 19. Where that is so (`EQUAL`), the command's session has the priority of any other, and
+each worker of pytest (`-p tests.low_priority`) a session of its own.
 """
 
 from __future__ import annotations
@@ -11,10 +13,22 @@ import os
 import sys
 from pathlib import Path
 
+import pytest
+
 LOWEST = 19
+EQUAL = "COMPANION_TESTS_EQUAL_SESSIONS"
+"""Environment variable: set if a foreign program takes a core, and what has to be in time has real-time priority."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Give a worker its own session, if sessions are equal."""
+    if EQUAL in os.environ and hasattr(config, "workerinput"):
+        os.setsid()
+
 
 if __name__ == "__main__":
     os.nice(LOWEST)
-    with contextlib.suppress(OSError):  # a kernel without groups of sessions, where niceness counts everywhere
-        Path("/proc/self/autogroup").write_text(str(LOWEST), encoding="ascii")
+    if EQUAL not in os.environ:
+        with contextlib.suppress(OSError):  # a kernel without groups of sessions, where niceness counts everywhere
+            Path("/proc/self/autogroup").write_text(str(LOWEST), encoding="ascii")
     os.execvp(sys.argv[1], sys.argv[1:])

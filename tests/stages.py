@@ -1,7 +1,7 @@
 """`python -m tests.stages [STAGE ...]`: run the stages of `make test`, all of them, and sum them up.
 
 A stage that fails does not stop the others. Tests that compute, and the check of types, run beside tests that wait and fly, with the
-lowest priority. The last line counts tests; each check (format, lint, imports, types) counts as one.
+lowest priority (`tests.low_priority`). The last line counts tests; each check (format, lint, imports, types) counts as one.
 """
 
 from __future__ import annotations
@@ -20,13 +20,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.at_a_time import AT_A_TIME, BUSY_CORES, busy_cores
+from tests.at_a_time import AT_A_TIME, at_a_time, core_is_taken, real_time
+from tests.low_priority import EQUAL
 from tests.marked import TESTS, files_of
 
 _BIN = Path(sys.executable).parent
 _PYTEST = (sys.executable, "-m", "pytest")
-_TOGETHER = {"waiting": "waits", "flights": "flights"}
-"""Stages whose number of simultaneous tests depends on the computer, with their names in `tests.at_a_time`."""
 _INTERRUPTED = 130
 _LINE_MAX = 120
 _TALLY, _OUTPUT = "tally.json", "output"
@@ -69,7 +68,10 @@ STAGES = (
     Stage("imports", (str(_BIN / "lint-imports"), "--no-cache"), tests=False),
     Stage(
         "computing",
-        (*_PYTEST, "-n", "3", "--dist", "worksteal", "-o", "timeout=600", "-m", "not flight and not waits"),
+        (
+            *(*_PYTEST, "-p", "tests.low_priority", "-n", "3", "--dist", "worksteal", "-o", "timeout=600"),
+            *("-m", "not flight and not waits"),
+        ),
         tests=True,
         beside=True,
     ),
@@ -107,7 +109,8 @@ def start(stage: Stage, folder: Path, *, beside: bool = False) -> Running:
     own.mkdir()
     command = stage.command
     if stage.tests:
-        command += (*_at_a_time(stage), "-p", "tests.tally", "--tally", str(own / _TALLY), "--durations=10")
+        together = ("-n", str(at_a_time(stage.name))) if stage.name in AT_A_TIME else ()
+        command += (*together, "-p", "tests.tally", "--tally", str(own / _TALLY), "--durations=10")
     begun_s = time.monotonic()
     if not beside:
         return Running(stage, subprocess.Popen(command), begun_s, own)
@@ -151,15 +154,6 @@ def _wait(process: subprocess.Popen[bytes]) -> int:
     except KeyboardInterrupt:
         process.wait()
         raise
-
-
-def _at_a_time(stage: Stage) -> tuple[str, ...]:
-    kind = _TOGETHER.get(stage.name)
-    if kind is None:
-        return ()
-    assert kind in AT_A_TIME
-    asked = (sys.executable, "-m", "tests.at_a_time", kind)
-    return ("-n", subprocess.run(asked, check=True, stdout=subprocess.PIPE, encoding="ascii").stdout.strip())
 
 
 def summary(results: Sequence[Result]) -> str:
@@ -224,7 +218,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     unknown = [name for name in wanted if name not in names]
     if unknown:
         parser.error(f"no stage {unknown[0]!r}; there are {', '.join(names)}")
-    os.environ.setdefault(BUSY_CORES, f"{busy_cores():.1f}")
+    if real_time() and core_is_taken():
+        os.environ[EQUAL] = "1"
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored if a shell started us in the background
     return run_all([stage for stage in STAGES if stage.name in wanted])
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.low_priority import EQUAL
 from tests.stages import Stage, run_all
 from tests.support import DEADLINE_S, ROOT, wait_until
 
@@ -104,6 +105,19 @@ def test_tests_of_a_group_share_one_worker(tmp_path: Path) -> None:
     path.write_text(GROUP, encoding="utf-8")
     subprocess.run((*pytest_of(path), "-n", "2", "--dist", "loadgroup"), cwd=tmp_path, check=True)
     assert len(set((tmp_path / "workers").read_text(encoding="utf-8").splitlines())) == 1
+
+
+@pytest.mark.parametrize("equal", [False, True])
+def test_workers_have_sessions_of_their_own_where_these_share_the_processors(tmp_path: Path, *, equal: bool) -> None:
+    path = tmp_path / "test_session.py"
+    path.write_text("import os\ndef test_session():\n    open('session', 'w').write(f'{os.getsid(0)} {os.getpid()}')\n")
+    own = {key: value for key, value in os.environ.items() if key != EQUAL}
+    environment = {**own, "PYTHONPATH": str(ROOT), **({EQUAL: "1"} if equal else {})}
+    command = (*pytest_of(path), "-p", "tests.low_priority", "-n", "1")
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, start_new_session=True) as process:
+        assert process.wait() == 0
+    session, worker = (tmp_path / "session").read_text(encoding="utf-8").split()
+    assert int(session) == (int(worker) if equal else process.pid)
 
 
 @pytest.mark.parametrize("beside", [False, True])
