@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from companion.config.shipped import DEFAULT_MISSION
+from companion.mission.check import check_mission
 from companion.model.types import Outcome
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import fly_to_end
@@ -19,11 +20,14 @@ def check_catch(law: str, preset: str | None = None, mission: str | Path = DEFAU
         mission: mission file with a catch, or the name of a shipped one.
 
     Raises:
-        AssertionError: the payload was not caught, or the mission was not completed.
+        AssertionError: the mission cannot be flown, the payload was not caught, or the mission was not completed.
         ConfigError: a configuration file is invalid.
         PluginError: the law cannot be used.
     """
-    flown = fly_to_end(load_sitl(mission, controller_law=law, preset=preset))
+    config = load_sitl(mission, controller_law=law, preset=preset)
+    problems = check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases)
+    assert not problems, f"companion fly refuses this mission: {'; '.join(problems)}"
+    flown = fly_to_end(config)
     assert flown.error is None, f"{law}: the law raises in flight: {flown.error}"
     outputs = flown.result.outputs
     events = [event for output in outputs for event in output.events]

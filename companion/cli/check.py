@@ -22,6 +22,7 @@ from rich.table import Table
 from rich.text import Text
 
 from companion.cli.campaign import wide_console
+from companion.config.left_out import figures_left_out
 from companion.config.loader import FlightConfig
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
@@ -113,6 +114,8 @@ def _plan_only(arguments: argparse.Namespace, config: FlightConfig, found: list[
     print(f"{arguments.mission}: mission {config.mission.name!r} can be flown by {config.vehicle.name}")
     for line in _poses(config.vehicle):
         print(f"  {line}")
+    if left_out := figures_left_out(config.vehicle):
+        print(f"  left out of the vehicle file, so that the values of the Tarot 650 are used: {'; '.join(left_out)}")
     return EXIT_OK
 
 
@@ -149,6 +152,7 @@ def _rows(task: Task, plan: tuple[str, ...], scratch: Path, people: Console) -> 
             start_s=0.0,
             duration_s=0.0,
             plan=plan,
+            left_out=tuple(figures_left_out(task.config.vehicle)),
             mission_s=None if plan else Plan.build(config.mission, config.vehicle).duration_s,
             recorder=_recorder(config, scratch),
         )

@@ -190,6 +190,7 @@ class FlightCore:
         before = {refusal.kind for refusal in self._refused}
         events += [event_of(notices.GATE, t_s, refusal.text) for refusal in refused if refusal.kind not in before]
         self._refused = refused
+        self._situation.torque_refused = next((refusal.text for refusal in refused if refusal.limp), None)
 
     # -- command ---------------------------------------------------------------------------------------------------
 

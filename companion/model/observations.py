@@ -175,6 +175,8 @@ class Observations(Record, frozen=True, kw_only=True):
     mission_s: float | None = None
     plan: tuple[str, ...] | None = None
     """Reasons why the mission cannot be flown, one line each; None if the mission was already checked."""
+    left_out: tuple[str, ...] | None = None
+    """Figures that the vehicle file leaves out; None if that is unknown, because the configuration does not come from its files."""
     recorder: str | None = None
     """Reason why no log can be opened; empty if a log can be opened, None if this was not tried."""
     failures: Mapping[str, str] = msgspec.field(default_factory=dict)

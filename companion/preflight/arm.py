@@ -6,7 +6,9 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from companion.config.vehicle import Vehicle
+from companion.io.dynamixel.registers import cycle_bytes, cycle_s
 from companion.model.check_row import Row
+from companion.model.constants import TICK_PERIOD_S
 from companion.model.listing import listed
 from companion.model.observations import Observations, ServoReport
 from companion.model.servos import WATCHDOG_ERROR, ServoKind, model_text
@@ -80,6 +82,12 @@ ANGLES = Check(
     "within the limits of all joints",
     "beyond a limit the links touch the airframe; or zero_count or sign is wrong",
 )
+BUS_TIME = Check(
+    "arm.bus_time",
+    "time of a bus cycle",
+    "at most 4 ms of the control tick of 5 ms, from `devices.arm.baud`, the number of servos and their return delay",
+    "the bus cannot read and write the joints in every control tick: torques would come late and irregularly",
+)
 STILL = Check("arm.still", "arm at rest", "moves less than 3 deg", "motion of the arm makes the tare wrong")
 READS = Check(
     "arm.reads",
@@ -95,7 +103,8 @@ USB = Check(
     warns=True,
 )
 CHECKS = (
-    DEVICE, MODEL, FIRMWARE, MODE, RETURN_DELAY, WATCHDOG, CURRENT_LIMIT, VOLTAGE, TEMPERATURE, ERROR, ANGLES, STILL, READS, USB,
+    DEVICE, BUS_TIME, MODEL, FIRMWARE, MODE, RETURN_DELAY, WATCHDOG, CURRENT_LIMIT, VOLTAGE, TEMPERATURE, ERROR, ANGLES, STILL,
+    READS, USB,
 )  # fmt: skip
 
 MODE_CURRENT = 0
@@ -103,6 +112,10 @@ MODES = {0: "current", 1: "velocity", 3: "position", 4: "extended position", 5: 
 STILL_RAD = math.radians(3.0)
 MISSED_GOOD, MISSED_MAX = 0.001, 0.1
 LATENCY_GOOD_MS = 1
+CYCLE_MAX_S = 0.8 * TICK_PERIOD_S
+"""Longest bus cycle; the rest of the tick is for the USB adapter, whose latency timer is 1 ms."""
+BAUD_ENOUGH = 1_000_000
+"""Baud rate at which seven servos take 2.2 ms."""
 
 
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
@@ -116,6 +129,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         yield DEVICE.bad(failure, "", "")
         return
     yield DEVICE.good(f"{vehicle.arm_device.port} at {vehicle.arm_device.baud} baud")
+    yield _bus_time(vehicle, o.servos)
     if o.servos:
         yield from _settings(o.servos, vehicle)
     if o.arm:
@@ -163,6 +177,16 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
     )
     yield _current_limit(servos, vehicle)
     yield supply(VOLTAGE, [(kind, servo.voltage_v) for servo, kind in zip(servos, kinds, strict=True)])
+
+
+def _bus_time(vehicle: Vehicle, servos: Sequence[ServoReport]) -> Row:
+    count, baud = len(vehicle.arm.joints), vehicle.arm_device.baud
+    takes_s = cycle_s(count, baud) + 1e-6 * sum(servo.return_delay_us for servo in servos)
+    read = f"{takes_s * 1e3:.2g} ms ({count} servos, {cycle_bytes(count)} bytes at {baud} baud)"
+    wanted = f"at most {CYCLE_MAX_S * 1e3:g} ms"
+    return BUS_TIME.row(
+        takes_s <= CYCLE_MAX_S, read, wanted, f"set the servos and devices.arm.baud to {BAUD_ENOUGH} baud or more"
+    )
 
 
 def firmware(check: Check, versions: Sequence[tuple[ServoKind, int]]) -> Row:

@@ -34,12 +34,27 @@ ROOM = Check(
     "body origin and rotors inside `room`",
     "no sensor detects the real walls; only the limits in `room` keep the rotors away from them",
 )
-CHECKS = (PLAN, ARM, ROOM)
+VEHICLE = Check(
+    "mission.vehicle",
+    "figures of the vehicle file",
+    "inertia, rotors, radii, yaw torque, armature of the joints and poses are in the vehicle file (`companion check` only)",
+    "a key that is left out has the value of the Tarot 650, which is wrong for another machine",
+    warns=True,
+)
+CHECKS = (VEHICLE, PLAN, ARM, ROOM)
 
 
 def rows(o: Observations, config: FlightConfig) -> Iterator[Row]:
     """Return the rows on plan, arm and position."""
     mission, vehicle = config.mission, config.vehicle
+    if o.left_out:
+        yield VEHICLE.bad(
+            f"left out: {'; '.join(o.left_out)}",
+            "all given",
+            "add them to the vehicle file, as they are on the machine",
+        )
+    elif o.left_out is not None:
+        yield VEHICLE.good("all given", "all given")
     if o.plan is not None:
         if o.plan:
             yield PLAN.bad(

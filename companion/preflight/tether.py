@@ -7,11 +7,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from companion.config.tether import Tether
 from companion.config.vehicle import Vehicle
 from companion.model.check_row import Row
 from companion.model.frames import quat_rotate
 from companion.model.observations import Observations
 from companion.preflight.checks import Check
+from companion.safety.tether_shape import Clearance
 
 LINE = Check(
     "tether.line",
@@ -31,7 +33,14 @@ SLACK = Check(
     "`tether.margin_m` or more at the vehicle's position",
     "a taut tether tips the vehicle over at take-off",
 )
-CHECKS = (LINE, STRENGTH, SLACK)
+ARM = Check(
+    "tether.arm",
+    "tether and arm",
+    "the tether is tied outside the space that the arm sweeps; otherwise its clearance from the arm is not judged",
+    "a slack line that hangs through the arm's sweep can catch arm or net, and neither mission check nor `tether_near` sees it",
+    warns=True,
+)
+CHECKS = (LINE, STRENGTH, SLACK, ARM)
 
 
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
@@ -52,6 +61,8 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         yield STRENGTH.good(read, wanted)
     else:
         yield STRENGTH.bad(read, wanted, "use a stronger tether, and correct tether.load_rating_n")
+    if vehicle.arm.joints:
+        yield _arm(vehicle, tether)
     pose = next((pose for pose in reversed(o.mocap) if pose.tracking_valid), None)
     if pose is None:
         return
@@ -64,3 +75,18 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     else:
         fix = "move the vehicle nearer to the anchor, or correct tether.length_m and tether.anchor_world_m"
         yield SLACK.bad(read, wanted, fix)
+
+
+def _arm(vehicle: Vehicle, tether: Tether) -> Row:
+    clearance = Clearance(vehicle, tether)
+    if clearance.judges_arm:
+        return ARM.good("the clearance of the tether from the arm is judged", "")
+    read = "the clearance of the tether from the arm is not judged: the tether is tied within the arm's sweep"
+    if not clearance.arm_is_planar:
+        return ARM.bad(read, "", "watch the line in flight; keep the arm folded where the line hangs below the vehicle")
+    shoulder_y_m = vehicle.arm.first_joint_body_m[1]
+    fix = (
+        f"tie it more than {vehicle.tip_radius_m:g} m beside the arm's plane (y = {shoulder_y_m:g} m), on the anchor's side, and "
+        "correct tether.attachment_body_m; otherwise watch the line in flight"
+    )
+    return ARM.bad(read, "", fix)

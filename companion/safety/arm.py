@@ -38,9 +38,12 @@ class ArmTracker:
         self.age_s = 0.0
         self.hottest_c = -math.inf
         """Temperature of the hottest servo; -inf without a joint state."""
+        self.torque_refused: str | None = None
+        """Why the law's joint torques were not sent in the last tick; None if they were."""
 
-    def update(self, i: Inputs, awake_s: float) -> None:
+    def update(self, i: Inputs, awake_s: float, torque_refused: str | None = None) -> None:
         """Update with the inputs of one tick."""
+        self.torque_refused = torque_refused
         arm = self.arm = i.arm
         self.age_s = self._age.update(awake_s, arm.stamp_s if arm else None)
         self.before, self.hottest_c = None, -math.inf
@@ -60,6 +63,11 @@ def arm_read_failures(a: ArmTracker, failures_max: int) -> Values | None:
     """Fires if consecutive bus cycles without an answer have reached the limit."""
     arm = a.arm
     return (arm.read_failures,) if arm is not None and arm.read_failures >= failures_max else None
+
+
+def torque_refused(a: ArmTracker, _: None) -> Values | None:
+    """Fires if the law's joint torques were not sent."""
+    return (a.torque_refused,) if a.torque_refused is not None else None
 
 
 def servo_error(a: ArmTracker, _: None) -> Values | None:

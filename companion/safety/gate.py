@@ -27,6 +27,8 @@ class Refusal:
     kind: str
     """Kind of the reason, independent of the numbers in the text."""
     text: str
+    limp: bool = False
+    """Whether the law's joint torques are unusable, so that none are sent; a stale joint state is not the law's fault."""
 
 
 class Verdict(Record, frozen=True):
@@ -86,11 +88,12 @@ class Gate:
                 attitude = self._slewed(attitude, t_s, refused)
         if arm_torque_nm is not None and len(arm_torque_nm) != len(self._bounds):
             text = f"{len(arm_torque_nm)} joint torques for {len(self._bounds)} joints"
-            refused.append(Refusal("number of torques", text))
+            refused.append(Refusal("number of torques", text, limp=True))
             arm_torque_nm = None
         elif arm_torque_nm:
             if not math.isfinite(sum(arm_torque_nm)):
-                refused.append(Refusal("torque not finite", f"joint torque {arm_torque_nm} is not finite"))
+                text = f"joint torque {arm_torque_nm} is not finite"
+                refused.append(Refusal("torque not finite", text, limp=True))
                 arm_torque_nm = None
             elif arm_rad is None or not arm_fresh:
                 refused.append(Refusal("torque without state", "joint torque without a fresh joint state"))

@@ -94,7 +94,7 @@ class Monitors:
             moving = i.vehicle is not None and _moves(i.vehicle)
             self._mocap.update(i, situation, awake_s, moving)
             self._px4.update(i, situation, awake_s, moving)
-            self._arm.update(i, awake_s)
+            self._arm.update(i, awake_s, situation.torque_refused)
             self._force.update(i, situation, awake_s, gap_s, moving)
             if not self._mocap.trusted:
                 i = msgspec.structs.replace(i, mocap=None)

@@ -210,6 +210,12 @@ RULES: tuple[Rule, ...] = (
         message="{} bus cycles without an answer",
     ),
     Rule(
+        id="torque_refused", subject=Subject.ARM,
+        what="the control law's joint torques are not finite or not one per joint, so that none are sent and the arm is limp",
+        predicate=arm.torque_refused, hold_time=0.1, ground=_LAND, air=_PX4_LANDS,
+        message="the arm is limp, because the control law's torques are unusable: {}",
+    ),
+    Rule(
         id="servo_error", subject=Subject.ARM, what="a servo reports a hardware error (register 70)",
         predicate=arm.servo_error, ground=_LAND, air=_LAND, message="hardware error (register 70) of {}",
     ),

@@ -30,6 +30,8 @@ class Situation:
     tether: TetherState | None = None
     found_armed: str | None = None
     """Event text if PX4 was armed without a request from the companion; `airborne` then shows whether the vehicle is flying."""
+    torque_refused: str | None = None
+    """Why the gate sent none of the law's joint torques in the last tick; None if they were sent."""
     waiting: bool = False
     """Inputs are still missing on the ground: only rules with `while_waiting` are evaluated."""
 

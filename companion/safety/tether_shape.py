@@ -58,12 +58,13 @@ class Clearance:
         self._links_m = tuple(math.hypot(*link) for link in arm.links_body_m)
         self._net_m = vehicle.tip_radius_m
         self._reach_m = arm.reach_m + self._net_m
-        self._planar = arm.is_in_xz_plane
+        self.arm_is_planar = arm.is_in_xz_plane
+        """Whether the arm moves in a plane parallel to the body's x-z plane."""
         self._is_2r = (
-            self._planar and len(self._links_m) == 2 and all(x > 0.0 and z == 0.0 for x, _, z in arm.links_body_m)
+            self.arm_is_planar and len(self._links_m) == 2 and all(x > 0.0 and z == 0.0 for x, _, z in arm.links_body_m)
         )
         aside_m = abs(self._p[1] - self._shoulder[1]) - self._net_m
-        self._aside_m = aside_m if self._planar else math.dist(self._p, self._shoulder) - self._reach_m
+        self._aside_m = aside_m if self.arm_is_planar else math.dist(self._p, self._shoulder) - self._reach_m
         self.judges_arm = bool(self._links_m) and self._aside_m > 0.0
         """False if there is no arm, or if the tether is attached in the arm's own plane or, for an arm that is not planar, within its
         reach: there it sags into the arm's sweep in every flight."""
@@ -131,7 +132,7 @@ class Clearance:
         sx, sy, sz = self._shoulder
         dx, dy, dz = d
         x, y, z = px - sx, py - sy, pz - sz
-        if not self._planar:
+        if not self.arm_is_planar:
             at_s = max(0.0, -(x * dx + y * dy + z * dz))
             return math.hypot(x + at_s * dx, y + at_s * dy, z + at_s * dz) - reach_m
         if y < 0.0:

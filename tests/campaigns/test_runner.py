@@ -255,3 +255,13 @@ def test_a_mission_that_cannot_be_flown_so_is_refused_by_the_campaign(
     assert ended.code == EXIT_BAD_INPUT
     assert len(ended.err_lines) == 1 and why in ended.err
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("campaign", ["compare", "robustness", "faults"])
+def test_a_campaign_refuses_a_mission_that_a_flight_refuses(tmp_path: Path, campaign: str) -> None:
+    ended = run_here(
+        campaign, *(() if campaign == "compare" else (str(CATCH),)), "--set", "mission.phases[2].to_m=[1.9, 0, 1]"
+    )
+    assert ended.code == EXIT_BAD_INPUT
+    assert any("phase 'catch' leaves the room" in line for line in ended.err_lines)
+    assert not any(tmp_path.iterdir())

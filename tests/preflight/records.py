@@ -44,7 +44,7 @@ FLAGS = 447
 
 @cache
 def config() -> FlightConfig:
-    return load_flight(CATCH)
+    return load_flight(CATCH, overrides=["vehicle.tether.attachment_body_m=[0, -0.1, 0]"])
 
 
 def wave(index: int, size: float) -> float:
@@ -206,5 +206,6 @@ def sound() -> Observations:
         arm_reads=(700, 0),
         mission_s=21.0,
         plan=(),
+        left_out=(),
         recorder="",
     )

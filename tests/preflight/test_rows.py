@@ -126,6 +126,16 @@ CASES = {
         "px4.rotors", "CA_ROTOR0 is 45 deg to the left", "select the machine's airframe",
         {"params": {**r.PARAMS, "CA_ROTOR0_PY": -0.23, "CA_ROTOR2_PY": 0.23}},
     ),
+    "tether through the arm": Case(
+        "tether.arm", "is not judged", "more than 0.09 m beside the arm's plane", {}, WARN,
+        vehicle={"tether.attachment_body_m": (0.0, 0.0, 0.0)},
+    ),
+    "figures of another machine": Case(
+        "mission.vehicle", "airframe.radius_m = 0.49", "add them", {"left_out": ("airframe.radius_m = 0.49",)}, WARN
+    ),
+    "slow bus": Case(
+        "arm.bus_time", "7.3 ms (2 servos, 84 bytes at 115200 baud)", "1000000 baud", {}, vehicle={"devices.arm.baud": 115200}
+    ),
     "old firmware of PX4": Case("px4.firmware", "PX4 1.13.3", "flash", {"firmware": "PX4 1.13.3 release (git 0)"}),
     "hover thrust of the vehicle file": Case(
         "px4.hover_thrust", "airframe.hover_thrust", "airframe.hover_thrust", {}, vehicle={"airframe.hover_thrust": 0.2}
@@ -197,7 +207,7 @@ CASES = {
         "tether.line", "slack, tension, winding and clearance of a tether are not monitored", "add tether", {}, WARN,
         vehicle={"tether": None},
     ),
-    "short tether": Case("tether.slack", "0.11 m", "nearer", {}, vehicle={"tether.length_m": 1.7}),
+    "short tether": Case("tether.slack", "0.18 m", "nearer", {}, vehicle={"tether.length_m": 1.7}),
     "mission that cannot be flown": Case("mission.plan", "leaves the room", "correct the mission", {"plan": ("leaves the room",)}),
     "arm elsewhere": Case("mission.arm", "(150, 140)", "by hand", {"arm": r.arm(angle_rad=(math.radians(150), r.ARM_RAD[1]))}),
     "near the wall": Case("mission.room", "(-1.00,", "further in", {}, vehicle={"room.x_m": (-1.3, 2.2)}),

@@ -176,6 +176,7 @@ FAULTS: dict[str, Fault] = {
     "battery_voltage": Fault(put("status", battery_voltage_v=13.0)),
     "arm_lost": Fault(stopped("arm")),
     "arm_read_failures": Fault(put("arm", read_failures=5)),
+    "torque_refused": Fault(situation=lambda: flying(torque_refused="joint torque (nan, 0.0) is not finite")),
     "servo_error": Fault(put("arm", hardware_error=(0, 32))),
     "arm_let_go": Fault(put("arm", hardware_error=(0x80, 0))),
     "servo_warm": Fault(put("arm", temperature_c=(35.0, 68.0))),
@@ -259,6 +260,7 @@ def test_on_the_ground_only_what_matters_there_is_reported(rule: Rule) -> None:
     situation = standing(
         offboard_expected=rule.id in ("pilot_took_over", "offboard_left"),
         found_armed=FOUND if rule.id == "reattached" else None,
+        torque_refused="joint torque (nan, 0.0) is not finite" if rule.id == "torque_refused" else None,
     )
     events = watched(VEHICLE, stream(rule.id), situation)
     expected = {rule.id, *fault.also} - IN_THE_AIR

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import gc
+import math
 from collections.abc import Iterator
 from functools import cache
 
 import pytest
+from msgspec.structs import replace
 
+from companion.control.vehicle_control import Command
 from companion.model.servos import WATCHDOG_ERROR
-from companion.model.types import Outcome
+from companion.model.types import Inputs, Outcome, PhaseKind, Reference, SafetyAction
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from tests.support import LOW_HOVER
@@ -91,3 +94,28 @@ def test_a_silent_servo_lets_go_and_that_is_reported_when_it_answers_again() -> 
     back = next(i for i in result.inputs if i.arm is not None and any(i.arm.hardware_error))
     assert back.arm is not None and back.arm.torque_nm[0] == 0.0
     assert any(event.id == "arm_let_go" for o in result.outputs for event in o.events)
+
+
+def test_a_law_whose_torques_stay_unusable_is_landed_by_px4_with_the_arm_folded() -> None:
+    """From 1 s after take-off on the law's joint torques are not finite, and the arm is limp; a single such tick does no harm."""
+    flight = FastFlight(configured())
+    control, ticks, nan = flight.core._control, 0, float("nan")
+    fly = control.fly
+
+    def spoiled(i: Inputs, dt_s: float, reference: Reference, vertical_scale: float) -> Command:
+        nonlocal ticks
+        command, ticks = fly(i, dt_s, reference, vertical_scale), ticks + (vertical_scale >= 1.0)
+        return replace(command, arm_torque_nm=(nan, 0.1)) if ticks in (100, 110) or ticks > 200 else command
+
+    control.fly = spoiled  # type: ignore[method-assign]
+    result = flight.run()
+    events = [(o.t_s, event) for o in result.outputs for event in o.events]
+    assert [event.id for _, event in events].count("torque_refused") == 1
+    at_s, event = next(found for found in events if found[1].id == "torque_refused")
+    refused_s = [o.t_s for o in result.outputs if o.arm_torque_nm is None and o.phase_kind is not PhaseKind.GROUND]
+    assert event.action is SafetyAction.AUTOPILOT_LAND and "joint torque (nan, 0.1) is not finite" in event.text
+    assert at_s - refused_s[2] == pytest.approx(0.1, abs=0.02), "the two single ticks did not count"
+    assert not result.crashed and not result.armed and result.outputs[-1].outcome is Outcome.ABORTED
+    fold_deg = flight.config.vehicle.fold_arm_deg
+    assert result.inputs[-1].arm is not None
+    assert [math.degrees(angle) for angle in result.inputs[-1].arm.angle_rad] == pytest.approx(fold_deg, abs=5.0)

@@ -69,6 +69,20 @@ BLOCK = (PRESENT_POSITION, HARDWARE_ERROR, PRESENT_VELOCITY, PRESENT_TEMPERATURE
 BLOCK_SIZE = sum(register.size for register in BLOCK)
 BLOCK_ADDRESSES = tuple(register.address + i for register in BLOCK for i in range(register.size))
 _BLOCK = struct.Struct("<iBiBhB")
+_INSTRUCTION_BYTES, _STATUS_BYTES, _GOAL_BYTES = 14, 11, 3
+"""Bytes of a sync read or sync write without its servos, of a status packet without its data, and per servo in the sync write."""
+
+
+def cycle_bytes(servos: int) -> int:
+    """Return the bytes on the bus in one cycle: the sync read with one id per servo, its answers, and the sync write."""
+    per_servo = 1 + _STATUS_BYTES + BLOCK_SIZE + _GOAL_BYTES
+    return 2 * _INSTRUCTION_BYTES + servos * per_servo
+
+
+def cycle_s(servos: int, baud: int) -> float:
+    """Return the time that one cycle occupies the bus, with ten bits per byte; return delays and the USB adapter come on top."""
+    return 10.0 * cycle_bytes(servos) / baud
+
 
 _POLL_MS = 1.0
 _NOISE_PATIENCE = 20.0
