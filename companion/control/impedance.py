@@ -28,20 +28,21 @@ class Impedance:
         self.d = tuple([kd - md * phi for kd, md, phi in zip(damping_kd, self.inertia, self.phi, strict=True)])
         rates = [d / md for d, md in zip(self.d, self.inertia, strict=True)]
 
-        def held(dt_s: float) -> tuple[tuple[int, float, float], ...]:
+        def held(dt_s: float) -> tuple[tuple[tuple[int, float, float], ...], tuple[tuple[int, float, float], ...]]:
             decays = [math.exp(-rate * dt_s) for rate in rates]
-            return tuple(
-                [(row, decay, (1.0 - decay) / d) for row, (decay, d) in enumerate(zip(decays, self.d, strict=True))]
-            )
+            held = [(row, decay, (1.0 - decay) / d) for row, (decay, d) in enumerate(zip(decays, self.d, strict=True))]
+            return tuple(held[:3]), tuple(held[6:])
 
         self._held = HoldTable(held)
-        """Number of each row, e^{-M_d^-1 D T} and (1 - e^{-M_d^-1 D T}) / D."""
+        """Number of each row, e^{-M_d^-1 D T} and (1 - e^{-M_d^-1 D T}) / D; first of x, y and z, then of the joints."""
         self.gamma: Sequence[float] = (0.0,) * rows
 
     def advance(self, dt_s: float, e_tau: Sequence[float]) -> Chi:
-        """Integrate gamma over one step with e_tau held (eq. adaptive_1, corrected; exact)."""
-        gamma_before, grown = self.gamma, []
-        for row, decay, growth in self._held[dt_s]:
-            grown.append(decay * gamma_before[row] + growth * e_tau[row])
+        """Integrate gamma over one step with e_tau held (eq. adaptive_1, corrected; exact). The attitude rows stay 0."""
+        g = self.gamma
+        ((_, k0, r0), (_, k1, r1), (_, k2, r2)), joints = self._held[dt_s]
+        grown = [k0 * g[0] + r0 * e_tau[0], k1 * g[1] + r1 * e_tau[1], k2 * g[2] + r2 * e_tau[2], 0.0, 0.0, 0.0]
+        for row, decay, growth in joints:
+            grown.append(decay * g[row] + growth * e_tau[row])
         self.gamma = gamma = tuple(grown)
         return gamma

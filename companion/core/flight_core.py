@@ -77,7 +77,7 @@ class FlightCore:
         self._carry_out(request, i)
         reference, command = self._command(dt_s, i)
         self._log = command.log
-        phase, kind = state.phase(t_s)
+        phase, kind, progress = state.phase(t_s)
         events = list(request.events)
         if command.log is not None and kind is PhaseKind.FLIGHT:
             self._watch_for_catch(t_s, command.log, events)
@@ -100,7 +100,7 @@ class FlightCore:
             mission_t_s=t_s - start_s if start_s is not None else 0.0,
             phase=phase,
             phase_kind=kind,
-            progress=state.progress(t_s),
+            progress=progress,
             reference=reference,
             attitude=verdict.attitude,
             arm_torque_nm=verdict.arm_torque_nm,
@@ -197,24 +197,29 @@ class FlightCore:
     def _command(self, dt_s: float, i: Inputs) -> tuple[Reference | None, Command]:
         self._limited_by = ()
         state, stage = self._state, self._state.stage
-        if stage in (Stage.WAIT, Stage.READY, Stage.DONE):
-            return None, Command()
-        if stage is Stage.STAND_DOWN and state.armed_by_others:
-            return None, msgspec.structs.replace(self._control.wait(i), attitude=None)
-        if stage is Stage.AUTOPILOT_LAND:
-            folding = self._control.fold(i, dt_s)
-            return None, msgspec.structs.replace(
-                folding, attitude=self._control.level(i)
-            ) if state.zero_thrust else folding
         course = state.course
         if course is None or not (stage is _PLAN or stage is _SPOOL or stage is _TOUCHDOWN):
-            return None, self._control.wait(i)
+            return None, self._without_reference(stage, dt_s, i)
         reference = course.plan.reference(0.0) if stage is _SPOOL else course.reference(i.t_s)
         if stage is _PLAN:
             governed = self._governor.constrain(dt_s, reference, self._situation.tether)
             reference, self._limited_by = governed.reference, governed.limited_by
         self._reference = reference
         return reference, self._control.fly(i, dt_s, reference, state.vertical_scale(i.t_s))
+
+    def _without_reference(self, stage: Stage, dt_s: float, i: Inputs) -> Command:
+        if stage in (Stage.WAIT, Stage.READY, Stage.DONE):
+            return Command()
+        if stage is Stage.STAND_DOWN and self._state.armed_by_others:
+            return msgspec.structs.replace(self._control.wait(i), attitude=None)
+        if stage is Stage.AUTOPILOT_LAND:
+            folding = self._control.fold(i, dt_s)
+            return (
+                msgspec.structs.replace(folding, attitude=self._control.level(i))
+                if self._state.zero_thrust
+                else folding
+            )
+        return self._control.wait(i)
 
     def _watch_for_catch(self, t_s: float, log: ControlLog, events: list[Event]) -> None:
         caught_s, start_s = self._control.catch_s(t_s, log), self._state.mission_start_s

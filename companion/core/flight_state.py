@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from enum import Enum
 
 from companion.mission.active_plan import Course
@@ -27,8 +26,7 @@ class Tare(Enum):
     FINISH = "finish"
 
 
-@dataclass(frozen=True, slots=True)
-class Waiting:
+class Waiting(Record, frozen=True):
     """State while the vehicle waits on the ground for the inputs, the estimate, the tare and, if the mission requires it, a start
     command.
     """
@@ -41,11 +39,10 @@ class Waiting:
     unready: str = "the inputs have not been checked yet"
     looked_s: float = 0.0
     """Time of the last check of the estimate and the position."""
-    settled: SettledEstimate = field(default_factory=SettledEstimate)
+    settled: SettledEstimate = SettledEstimate()
 
 
-@dataclass(frozen=True, slots=True)
-class FlightState:
+class FlightState(Record, frozen=True):
     """Everything that `companion.core.state_machine` keeps from tick to tick."""
 
     touchdown: Touchdown
@@ -54,7 +51,7 @@ class FlightState:
     stage: Stage = Stage.WAIT
     entered_s: float | None = None
     """Flight clock when the stage was entered; None before the first tick."""
-    supervisor: SupervisorState = field(default_factory=SupervisorState)
+    supervisor: SupervisorState = SupervisorState()
     outcome: Outcome | None = None
     plan: Plan | None = None
     """Plan of the mission from the measured start."""
@@ -81,22 +78,20 @@ class FlightState:
         """Return the outcome once the flight has ended; None before."""
         return self.outcome if self.stage is Stage.DONE else None
 
-    def phase(self, t_s: float) -> tuple[str, PhaseKind]:
-        """Return the phase's name for the operator and its kind for programs."""
-        stage = self.stage
-        if stage is Stage.PLAN and self.course is not None:
-            segment = self.course.segment(t_s)
-            return (f"abort: {segment.name}" if self.aborting else segment.name), segment.kind
+    def phase(self, t_s: float) -> tuple[str, PhaseKind, float]:
+        """Return the phase's name for the operator, its kind for programs, and the completed fraction of the plan, 0 to 1."""
+        stage, course = self.stage, self.course
+        begun = self.mission_start_s is not None and course is not None
+        if stage is Stage.PLAN and course is not None:
+            plan_s = course.pace(t_s)[0]
+            segment = course.plan.segment(plan_s)
+            name = f"abort: {segment.name}" if self.aborting else segment.name
+            return name, segment.kind, course.plan.progress(plan_s) if begun else 0.0
+        progress = 1.0 if begun else 0.0
         if stage in (Stage.TOUCHDOWN, Stage.AUTOPILOT_LAND):
-            return (seq.PILOT_FLIES if self.pilot_flies else stage.value), PhaseKind.LANDING
+            return (seq.PILOT_FLIES if self.pilot_flies else stage.value), PhaseKind.LANDING, progress
         done = stage in (Stage.DISARM, Stage.DONE, Stage.STAND_DOWN)
-        return stage.value, PhaseKind.DONE if done else PhaseKind.GROUND
-
-    def progress(self, t_s: float) -> float:
-        """Return the completed fraction of the plan, 0 to 1."""
-        if self.mission_start_s is None or self.course is None:
-            return 0.0
-        return self.course.progress(t_s) if self.stage is Stage.PLAN else 1.0
+        return stage.value, PhaseKind.DONE if done else PhaseKind.GROUND, progress
 
     def vertical_scale(self, t_s: float) -> float:
         """Return the fraction of the vertical force that the controller may command while the rotors spool up or down on the ground."""

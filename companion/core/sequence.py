@@ -224,7 +224,8 @@ def _spool(t: Transition, elapsed_s: float) -> AutopilotRequest:
 def _fly(t: Transition, _: float) -> AutopilotRequest:
     i, course, vehicle = t.i, t.state.course, t.i.vehicle
     assert course is not None
-    if vehicle is not None and course.segment(i.t_s).kind is PhaseKind.LANDING:
+    plan_s = course.pace(i.t_s)[0]
+    if vehicle is not None and course.plan.segment(plan_s).kind is PhaseKind.LANDING:
         reference_m = course.reference(i.t_s).position_world_m[2]
         touchdown = t.state.touchdown.update(
             i.t_s, vehicle, i.mocap, reference_m, t.o.thrust_share, seq.on_ground(i.status)
@@ -235,7 +236,7 @@ def _fly(t: Transition, _: float) -> AutopilotRequest:
             t.finish(Outcome.COMPLETED)
             t.enter(Stage.TOUCHDOWN)
             return _NONE
-    if course.left_s(i.t_s) < -NO_TOUCHDOWN_S:
+    if course.plan.duration_s - plan_s < -NO_TOUCHDOWN_S:
         t.report(notices.NO_TOUCHDOWN, f"no touchdown detected {NO_TOUCHDOWN_S:g} s after the plan's end; PX4 lands")
         t.finish(Outcome.ABORTED)
         t.enter(Stage.AUTOPILOT_LAND)

@@ -99,10 +99,6 @@ class Course:
         """Return the plan time that is left; negative after the plan's end."""
         return self.plan.duration_s - self.pace(t_s)[0]
 
-    def progress(self, t_s: float) -> float:
-        """Return the completed fraction of the plan's duration, 0 to 1."""
-        return self.plan.progress(self.pace(t_s)[0])
-
 
 def _paced(r: Reference, rate: float, change: float, jerk: float) -> Reference:
     """Return the reference for a plan time with rate s: s v, s^2 a + s_d v, s^3 j + 3 s s_d a + s_dd v (chain rule)."""

@@ -44,6 +44,9 @@ class Stage(Enum):
     STAND_DOWN = "stand down"
     DONE = "done"
 
+    # An enum's own hash is a Python function; sets and tables of stages are looked up in every tick.
+    __hash__ = object.__hash__
+
 
 BEFORE_LIFT = frozenset({Stage.WAIT, Stage.READY, Stage.OFFBOARD, Stage.ARM})
 BEFORE_ARMING = frozenset({Stage.WAIT, Stage.READY, Stage.OFFBOARD})

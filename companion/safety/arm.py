@@ -75,16 +75,17 @@ def servo_error(a: ArmTracker, _: None) -> Values | None:
     arm = a.arm
     if arm is None:
         return None
-    for error in arm.hardware_error:
-        if error & ~WATCHDOG_ERROR:
-            return (error_text(arm.hardware_error),)
+    if any(arm.hardware_error):
+        for error in arm.hardware_error:
+            if error & ~WATCHDOG_ERROR:
+                return (error_text(arm.hardware_error),)
     return None
 
 
 def arm_let_go(a: ArmTracker, _: None) -> Values | None:
     """Fires if a servo's bus watchdog has switched the torque off."""
     arm = a.arm
-    if arm is not None:
+    if arm is not None and any(arm.hardware_error):
         for error in arm.hardware_error:
             if error & WATCHDOG_ERROR:
                 return HOLDS
@@ -121,10 +122,11 @@ def servo_overload(a: ArmTracker, torque_max_nm: Joints) -> Values | None:
     """Fires if a joint is at its torque limit."""
     if a.arm is None:
         return None
-    for torque_nm, max_nm in zip(a.arm.torque_nm, torque_max_nm, strict=True):
+    torques_nm = a.arm.torque_nm
+    for joint, max_nm in enumerate(torque_max_nm):
         limit_nm = AT_LIMIT * max_nm
-        if not -limit_nm < torque_nm < limit_nm:
-            return (listed(a.arm.torque_nm, ".1f", " and "),)
+        if not -limit_nm < torques_nm[joint] < limit_nm:
+            return (listed(torques_nm, ".1f", " and "),)
     return None
 
 
@@ -144,13 +146,14 @@ def joint_beyond_limit(a: ArmTracker, thresholds: tuple[float, tuple[Vec2, ...]]
     if a.arm is None:
         return None
     beyond_max_rad, limits_rad = thresholds
-    beyond_rad = 0.0
-    for angle_rad, (low_rad, high_rad) in zip(a.arm.angle_rad, limits_rad, strict=True):
+    angles_rad, beyond_rad = a.arm.angle_rad, 0.0
+    for joint, (low_rad, high_rad) in enumerate(limits_rad):
+        angle_rad = angles_rad[joint]
         if not low_rad <= angle_rad <= high_rad:
             beyond_rad = max(beyond_rad, low_rad - angle_rad, angle_rad - high_rad)
     if not beyond_rad > beyond_max_rad:
         return None
-    return (listed(map(math.degrees, a.arm.angle_rad), ".0f"), math.degrees(beyond_rad))
+    return (listed(map(math.degrees, angles_rad), ".0f"), math.degrees(beyond_rad))
 
 
 class ForceTracker:

@@ -30,8 +30,14 @@ class FlightTracker:
         # For a quaternion, x^2 + y^2 = sin^2(tilt / 2): most ticks need no angle.
         self._upright_max = math.sin(0.5 * min(tilt_max_rad, FLIPPED_TILT_RAD)) ** 2
         self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
-        self._radius_m = vehicle.airframe.radius_m
-        self._room = vehicle.room
+        room, tolerance_m = vehicle.room, vehicle.safety.geofence_tolerance_m
+        (x_low, x_high), (y_low, y_high), inset_m = room.x_m, room.y_m, vehicle.airframe.radius_m - tolerance_m
+        self._fence_m = (
+            (x_low + inset_m, x_high - inset_m),
+            (y_low + inset_m, y_high - inset_m),
+            room.z_m[1] - BODY_TOP_M + tolerance_m,
+        )
+        """Range of x and y, and largest z, of a vehicle whose rotors are in the room, with the tolerance."""
         self._stop = StopModel(vehicle.safety)
         self._inputs: Inputs | None = None
         self.vehicle: VehicleState | None = None
@@ -75,15 +81,10 @@ class FlightTracker:
         vx, vy, vz = vehicle.velocity_world_m_s
         return self._stop.time_s(math.sqrt(vx * vx + vy * vy + vz * vz))
 
-    def rotors_in_room(self, x: float, y: float, z: float, tolerance_m: float) -> bool:
-        """Return whether the rotors of a vehicle at this position, in m, are in the room."""
-        room, inset_m = self._room, self._radius_m - tolerance_m
-        (x_low, x_high), (y_low, y_high) = room.x_m, room.y_m
-        return (
-            x_low + inset_m <= x <= x_high - inset_m
-            and y_low + inset_m <= y <= y_high - inset_m
-            and z <= room.z_m[1] - BODY_TOP_M + tolerance_m
-        )
+    def rotors_in_room(self, x: float, y: float, z: float) -> bool:
+        """Return whether the rotors of a vehicle at this position, in m, are in the room or beyond it by less than the tolerance."""
+        (x_low, x_high), (y_low, y_high), z_high = self._fence_m
+        return x_low <= x <= x_high and y_low <= y <= y_high and z <= z_high
 
 
 def tilt(f: FlightTracker, tilt_max_rad: float) -> Values | None:
@@ -117,21 +118,21 @@ def sinks_too_fast(f: FlightTracker, sink_max_m_s: float) -> Values | None:
     return (-up_m_s, sink_max_m_s) if up_m_s < -sink_max_m_s else None
 
 
-def geofence_left(f: FlightTracker, tolerance_m: float) -> Values | None:
+def geofence_left(f: FlightTracker, _: None) -> Values | None:
     """Fires if the rotors are outside the room by more than the tolerance."""
     if f.vehicle is None:
         return None
     x, y, z = f.vehicle.position_world_m
-    return None if f.rotors_in_room(x, y, z, tolerance_m) else (x, y, z)
+    return None if f.rotors_in_room(x, y, z) else (x, y, z)
 
 
-def geofence_near(f: FlightTracker, tolerance_m: float) -> Values | None:
+def geofence_near(f: FlightTracker, _: None) -> Values | None:
     """Fires if at the predicted stop after a fault the rotors would be outside the room by more than the tolerance."""
     if f.vehicle is None:
         return None
     (x, y, z), (vx, vy, vz), stop_s = f.vehicle.position_world_m, f.vehicle.velocity_world_m_s, f.stop_s(f.vehicle)
     x, y, z = x + vx * stop_s, y + vy * stop_s, z + vz * stop_s
-    return None if f.rotors_in_room(x, y, z, tolerance_m) else (x, y, z)
+    return None if f.rotors_in_room(x, y, z) else (x, y, z)
 
 
 def tracking_error(f: FlightTracker, thresholds: tuple[float, float]) -> Values | None:

@@ -47,10 +47,16 @@ class Gate:
         self._tilt_max_rad = math.radians(vehicle.airframe.tilt_max_deg) + 1e-6
         self._tilt_limit = math.sin(0.5 * self._tilt_max_rad) ** 2
         self._bounds = [
-            (torque_max_nm, *map(math.radians, (*joint.angle_deg, joint.velocity_max_deg_s)))
-            for joint, torque_max_nm in zip(joints, vehicle.joint_torque_limits_nm, strict=True)
+            (
+                number,
+                torque_max_nm,
+                math.radians(joint.angle_deg[0]),
+                math.radians(joint.angle_deg[1]),
+                math.radians(joint.velocity_max_deg_s),
+            )
+            for number, (joint, torque_max_nm) in enumerate(zip(joints, vehicle.joint_torque_limits_nm, strict=True))
         ]
-        """Largest torque, N m, lower and upper limit, rad, and largest speed, rad/s, of each joint."""
+        """Number, largest torque, N m, lower and upper limit, rad, and largest speed, rad/s, of each joint."""
         self._state_age_max_s = safety.command_state_age_max_s
         self._slew_max_per_s = safety.thrust_slew_max_per_s
         self._last: tuple[float, float] | None = None
@@ -136,20 +142,18 @@ class Gate:
 
     def _is_free(self, arm_torque_nm: Joints, arm_rad: Joints, arm_rate_rad_s: Joints) -> bool:
         """Return whether torques, joint angles and speeds are within their limits, as in nearly every tick."""
-        for torque_nm, angle_rad, rate_rad_s, (most_nm, low_rad, high_rad, fast_rad_s) in zip(
-            arm_torque_nm, arm_rad, arm_rate_rad_s, self._bounds, strict=True
-        ):
+        for joint, most_nm, low_rad, high_rad, fast_rad_s in self._bounds:
             if not (
-                -most_nm <= torque_nm <= most_nm
-                and low_rad <= angle_rad <= high_rad
-                and -fast_rad_s <= rate_rad_s <= fast_rad_s
+                -most_nm <= arm_torque_nm[joint] <= most_nm
+                and low_rad <= arm_rad[joint] <= high_rad
+                and -fast_rad_s <= arm_rate_rad_s[joint] <= fast_rad_s
             ):
                 return False
         return True
 
     def _limited(self, index: int, torque_nm: float, angle_rad: float, rate_rad_s: float) -> float:
         """Return the torque clipped to its limit; beyond the angle or speed limit only torque that drives the joint back is kept."""
-        limit, low, high, fast = self._bounds[index]
+        _, limit, low, high, fast = self._bounds[index]
         if torque_nm > limit:
             torque_nm = limit
         elif torque_nm < -limit:

@@ -60,7 +60,7 @@ class SafeSet:
         ValueError: the set is empty; the message is one line with the cause.
     """
 
-    __slots__ = ("anchor_m", "high_m", "low_m", "radius_m")
+    __slots__ = ("_least_m", "_most_m", "anchor_m", "high_m", "low_m", "radius_m")
 
     def __init__(self, vehicle: Vehicle) -> None:
         tether, room, reach_m = vehicle.tether, vehicle.room, vehicle.airframe.radius_m
@@ -78,6 +78,12 @@ class SafeSet:
                     f"vehicle '{vehicle.name}': room.{name}_m is {span[0]:g} to {span[1]:g} m, too "
                     f"small for the vehicle; measure the room, or airframe.radius_m ({reach_m:g} m)"
                 )
+        (x, y, z), (x_high, y_high, _) = self.low_m, self.high_m
+        self._least_m, self._most_m = (
+            (x - _TOLERANCE, y - _TOLERANCE, z - _TOLERANCE),
+            (x_high + _TOLERANCE, y_high + _TOLERANCE),
+        )
+        """Walls and floor of the box with the tolerance."""
         into = math.dist(self.anchor_m, _clamped(self.anchor_m, self.low_m, self.high_m))
         if tether is not None and into > self.radius_m:
             raise ValueError(
@@ -92,12 +98,12 @@ class SafeSet:
 
     def holds_within(self, p: Vec3, radius_m: float, top_m: float) -> bool:
         """Return whether the point is within this distance of the anchor and inside the box with this ceiling."""
-        low, high, (ax, ay, az) = self.low_m, self.high_m, self.anchor_m
+        (x_low, y_low, z_low), (x_high, y_high), (ax, ay, az) = self._least_m, self._most_m, self.anchor_m
         x, y, z = p
         return (
-            low[0] - _TOLERANCE <= x <= high[0] + _TOLERANCE
-            and low[1] - _TOLERANCE <= y <= high[1] + _TOLERANCE
-            and low[2] - _TOLERANCE <= z <= top_m + _TOLERANCE
+            x_low <= x <= x_high
+            and y_low <= y <= y_high
+            and z_low <= z <= top_m + _TOLERANCE
             and (x - ax) * (x - ax) + (y - ay) * (y - ay) + (z - az) * (z - az)
             <= (radius_m + _TOLERANCE) * (radius_m + _TOLERANCE)
         )

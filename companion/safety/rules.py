@@ -328,13 +328,13 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         id="geofence_left", subject=Subject.FLIGHT, what="the rotors are outside the room",
-        predicate=flight.geofence_left, thresholds=("geofence_tolerance_m",), hold_time=0.05, ground=None, air=_LAND,
+        predicate=flight.geofence_left, tracked_by=("geofence_tolerance_m",), hold_time=0.05, ground=None, air=_LAND,
         message="the rotors are outside the room at ({:.2f}, {:.2f}, {:.2f}) m",
     ),
     Rule(
         id="geofence_near", subject=Subject.FLIGHT, what="the vehicle would stop with its rotors outside the room",
-        predicate=flight.geofence_near, thresholds=("geofence_tolerance_m",),
-        tracked_by=("react_time_s", "stop_deceleration_m_s2"), hold_time=0.05, ground=None, air=_HOLD,
+        predicate=flight.geofence_near, tracked_by=("geofence_tolerance_m", "react_time_s", "stop_deceleration_m_s2"),
+        hold_time=0.05, ground=None, air=_HOLD,
         message="the vehicle would stop at ({:.2f}, {:.2f}, {:.2f}) m with its rotors outside the room",
     ),
     Rule(

@@ -52,6 +52,11 @@ class Clearance:
         self._inner_m = tether.rotor_inner_radius_m
         self._outer_m = max(vehicle.airframe.radius_m, self._inner_m)
         self._off_axis_m = math.hypot(self._p[0], self._p[1])
+        self._off_m2 = self._p[0] * self._p[0] + self._p[1] * self._p[1]
+        self._past_inner_m2 = self._off_m2 - self._inner_m * self._inner_m
+        self._past_outer_m2 = self._off_m2 - self._outer_m * self._outer_m
+        """Squared distance of the attachment from the ring's axis, minus the squared radii of the ring."""
+        self._to_edge_m = math.hypot(self._inner_m - self._off_axis_m, self._p[2])
         self._below = self._p[2] <= 0.0
         arm = skeleton_of(chain_of(vehicle))
         self._shoulder = arm.shoulder_body_m
@@ -96,23 +101,23 @@ class Clearance:
             pz, dz = -pz, -dz
         flat_2 = dx * dx + dy * dy
         inner, outer, off = self._inner_m, self._outer_m, self._off_axis_m
-        b, c = px * dx + py * dy, px * px + py * py
+        b, past_outer = px * dx + py * dy, self._past_outer_m2
         if off > outer:
             if b >= 0.0 or flat_2 <= 0.0:
                 return off - outer  # leads away from the disk
-            passes_2 = c - b * b / flat_2
+            passes_2 = self._off_m2 - b * b / flat_2
             if passes_2 >= outer * outer:
                 return math.sqrt(passes_2) - outer
-        out_s = (math.sqrt(max(0.0, b * b - flat_2 * (c - outer * outer))) - b) / flat_2 if flat_2 > 1e-12 else _NEVER
+        out_s = (math.sqrt(max(0.0, b * b - flat_2 * past_outer)) - b) / flat_2 if flat_2 > 1e-12 else _NEVER
         if off >= inner:
-            at_s = 0.0 if off <= outer else (-b - math.sqrt(b * b - flat_2 * (c - outer * outer))) / flat_2
+            at_s = 0.0 if off <= outer else (-b - math.sqrt(b * b - flat_2 * past_outer)) / flat_2
             return -pz - max(at_s * dz, out_s * dz)
         # Through the middle, where there are no blades: the distance depends on how steeply it passes the ring's inner edge.
         flat = math.sqrt(flat_2)
         if flat < 1e-6:
-            return math.hypot(inner - off, pz) if dz > 0.0 else inner - off
-        in_s = (math.sqrt(b * b - flat_2 * (c - inner * inner)) - b) / flat_2
-        return min(math.hypot(inner - off, pz), (-pz - max(in_s * dz, out_s * dz)) * flat)
+            return self._to_edge_m if dz > 0.0 else inner - off
+        in_s = (math.sqrt(b * b - flat_2 * self._past_inner_m2) - b) / flat_2
+        return min(self._to_edge_m, (-pz - max(in_s * dz, out_s * dz)) * flat)
 
     def _arm_reach_m(self, arm_rad: Joints) -> float:
         """Return the distance of the farthest point of the arm and the net from the shoulder, m; for other arms than two rods in

@@ -120,10 +120,9 @@ def _arm_is_valid(a: ArmState) -> bool:
     low, high = -OUT_OF_RANGE, OUT_OF_RANGE
     if not -_STAMP_MAX_S < a.stamp_s < _STAMP_MAX_S:
         return False
-    for values in (a.angle_rad, a.velocity_rad_s, a.torque_nm, a.temperature_c):
-        for value in values:
-            if not low < value < high:
-                return False
+    for value in a.angle_rad + a.velocity_rad_s + a.torque_nm + a.temperature_c:  # noqa: SIM110 `all` takes three times as long
+        if not low < value < high:
+            return False
     return True
 
 
