@@ -9,8 +9,10 @@ each worker of pytest (`-p tests.low_priority`) a session of its own.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -24,6 +26,18 @@ def pytest_configure(config: pytest.Config) -> None:
     """Give a worker its own session, if sessions are equal."""
     if EQUAL in os.environ and hasattr(config, "workerinput"):
         os.setsid()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection(session: pytest.Session) -> Iterator[None]:
+    """Let one worker collect at a time: the first writes the bytecode of what it imports (15 s of a core in a new clone), the others
+    read it.
+    """
+    if not hasattr(session.config, "workerinput"):
+        return (yield)
+    with open(__file__, "rb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return (yield)
 
 
 if __name__ == "__main__":
