@@ -129,8 +129,8 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         yield DEVICE.bad(failure, "", "")
         return
     yield DEVICE.good(f"{vehicle.arm_device.port} at {vehicle.arm_device.baud} baud")
-    yield _bus_time(vehicle, o.servos)
     if o.servos:
+        yield _bus_time(vehicle, o.servos)
         yield from _settings(o.servos, vehicle)
     if o.arm:
         yield from _states(o.arm, vehicle)
