@@ -38,8 +38,9 @@ class Adaptation:
         nu = config.nu
 
         def held(dt_s: float) -> tuple[float, ...]:
-            decays = [math.exp(-leakage * dt_s) for leakage in nu]
-            return (*decays, *((1.0 - decay) / leakage for decay, leakage in zip(decays, nu, strict=True)))
+            (n0, n1, n2, n3), exp = nu, math.exp
+            k0, k1, k2, k3 = exp(-n0 * dt_s), exp(-n1 * dt_s), exp(-n2 * dt_s), exp(-n3 * dt_s)
+            return (k0, k1, k2, k3, (1.0 - k0) / n0, (1.0 - k1) / n1, (1.0 - k2) / n2, (1.0 - k3) / n3)
 
         self._held = HoldTable(held)
         """e^{-nu T} for H_0 to H_3, then (1 - e^{-nu T}) / nu."""

@@ -26,12 +26,14 @@ class Impedance:
         self.inertia, self.phi = fitted(config.inertia_md, rows), fitted(config.phi, rows)
         damping_kd = fitted(config.damping_kd, rows)
         self.d = tuple([kd - md * phi for kd, md, phi in zip(damping_kd, self.inertia, self.phi, strict=True)])
-        rates = [d / md for d, md in zip(self.d, self.inertia, strict=True)]
+        rows_of = [(row, self.d[row] / self.inertia[row], self.d[row]) for row in (0, 1, 2, *range(6, rows))]
 
         def held(dt_s: float) -> tuple[tuple[tuple[int, float, float], ...], tuple[tuple[int, float, float], ...]]:
-            decays = [math.exp(-rate * dt_s) for rate in rates]
-            held = [(row, decay, (1.0 - decay) / d) for row, (decay, d) in enumerate(zip(decays, self.d, strict=True))]
-            return tuple(held[:3]), tuple(held[6:])
+            held = []
+            for row, rate, d in rows_of:
+                decay = math.exp(-rate * dt_s)
+                held.append((row, decay, (1.0 - decay) / d))
+            return tuple(held[:3]), tuple(held[3:])
 
         self._held = HoldTable(held)
         """Number of each row, e^{-M_d^-1 D T} and (1 - e^{-M_d^-1 D T}) / D; first of x, y and z, then of the joints."""
