@@ -94,17 +94,15 @@ class Flight:
         """Run ticks until the flight ends; return its outcome."""
         ticker = Ticker(self._period_s, self._clock, self._mocap_rate_hz)
         self._devices.vision.on_frame = ticker.frame
-        arm = self._devices.arm
         tick = 0
         before: Outputs | None = None
         if self._devices.ground is not None:
             self._tell_forwarding(self._clock(), self._devices.ground.line)
+        self._begin_read(ticker.due_s)
         while True:
-            if arm is not None:
-                arm.begin_read(ticker.due_s - min(JOINT_LEAD_MAX_S, arm.read_takes_s + JOINT_MARGIN_S))
             now = await ticker.next()
             turn = self._operator.next()
-            inputs, outputs, sent = await self._tick(tick, now.start_s, now.lateness_s, turn.command)
+            inputs, outputs, sent = await self._tick(tick, now.start_s, now.lateness_s, turn.command, ticker.due_s)
             if turn.asked is not None:
                 self._answer(turn.asked, turn.refused, before, outputs)
             before = outputs
@@ -120,8 +118,14 @@ class Flight:
                 return Outcome.ABORTED
             tick += 1
 
+    def _begin_read(self, due_s: float) -> None:
+        """Schedule the read of the joint state for the tick that is due at `due_s`."""
+        arm = self._devices.arm
+        if arm is not None:
+            arm.begin_read(due_s - min(JOINT_LEAD_MAX_S, arm.read_takes_s + JOINT_MARGIN_S))
+
     async def _tick(
-        self, tick: int, start_s: float, lateness_s: float, command: OperatorCommand
+        self, tick: int, start_s: float, lateness_s: float, command: OperatorCommand, next_due_s: float
     ) -> tuple[Inputs, Outputs, Sent]:
         devices = self._devices
         arm_state = await devices.arm.read(JOINT_READ_TIMEOUT_S) if devices.arm is not None else None
@@ -147,6 +151,7 @@ class Flight:
         torque_sent: Joints | None = None
         if outputs.arm_torque_nm is not None and devices.arm is not None:
             torque_sent = devices.arm.write_torque(outputs.arm_torque_nm)
+        self._begin_read(next_due_s)  # right after the write, so that the bus thread wakes once for both
         current_s = self._clock()
         if outputs.request is not AutopilotRequest.NONE:
             devices.autopilot.request(outputs.request)

@@ -98,6 +98,10 @@ class MemoryPort(dxl.ServoPort):
         self.tx_time_per_byte = 10_000.0 / cflag_baud
         return True
 
+    def _receive(self) -> bytes:
+        data: bytes = self.ser.read(dxl.NOISE_BYTES)
+        return data
+
     def getCurrentTime(self) -> float:
         now_ms: float = self.ser.now_s * 1e3
         return now_ms

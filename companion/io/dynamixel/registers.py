@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import errno
 import math
+import os
+import select
 import struct
 import time
 from dataclasses import dataclass
@@ -86,7 +88,7 @@ def cycle_s(servos: int, baud: int) -> float:
 
 _POLL_MS = 1.0
 _NOISE_PATIENCE = 20.0
-_NOISE_BYTES = 4096
+NOISE_BYTES = 4096
 """More bytes than the replies to any one instruction: 252 servos answer a broadcast ping with 14 bytes each."""
 
 
@@ -186,6 +188,8 @@ class ServoPort(PortHandler):  # type: ignore[misc]
     """
 
     is_open: bool
+    _arrived = b""
+    """Bytes that were read from the port and not yet asked for by the SDK, which reads the head of a packet before the rest."""
     _waited_ms = 0.0
     _taken_bytes = 0
     _reply_missing = False
@@ -253,8 +257,9 @@ class ServoPort(PortHandler):  # type: ignore[misc]
             self._reply_missing = False
             end_ms = self.getCurrentTime() + self.late_reply_ms
             while self.getCurrentTime() < end_ms:
-                self.ser.read(_NOISE_BYTES)
+                self.ser.read(NOISE_BYTES)
         self.ser.reset_input_buffer()
+        self._arrived = b""
 
     def readPort(self, length: int) -> bytes:
         """Return up to `length` bytes, after at most 1 ms.
@@ -262,19 +267,34 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         Raises:
             OSError: the port is gone.
         """
-        if self._taken_bytes > _NOISE_BYTES:
+        if self._taken_bytes > NOISE_BYTES:
             return b""  # the SDK checks the time only when it lacks bytes: endless noise would keep it reading for ever
-        data: bytes = self.ser.read(length)
-        if data:
-            self._taken_bytes += len(data)
-        else:
-            self._waited_ms += _POLL_MS
+        if not self._arrived:
+            self._arrived = self._receive()
+            if not self._arrived:
+                self._waited_ms += _POLL_MS
+        data, self._arrived = self._arrived[:length], self._arrived[length:]
+        self._taken_bytes += len(data)
+        return data
+
+    def _receive(self) -> bytes:
+        """Return all bytes that have arrived, after a wait of at most 1 ms; empty if none have. pyserial's `read` takes only the bytes
+        asked for, so that each packet would cost two waits and two reads.
+        """
+        if not select.select((self.ser.fd,), (), (), _POLL_MS * 1e-3)[0]:
+            return b""
+        try:
+            data = os.read(self.ser.fd, NOISE_BYTES)
+        except BlockingIOError:
+            return b""
+        if not data:
+            raise OSError(f"{self.port_name}: disconnected, or another program reads from it")
         return data
 
     def isPacketTimeout(self) -> bool:
         """Return whether the reply has timed out."""
         elapsed_ms = self.getTimeSinceStart()
-        noise = elapsed_ms > _NOISE_PATIENCE * self.packet_timeout or self._taken_bytes > _NOISE_BYTES
+        noise = elapsed_ms > _NOISE_PATIENCE * self.packet_timeout or self._taken_bytes > NOISE_BYTES
         silence = elapsed_ms > self.packet_timeout and self._waited_ms > 0.5 * self.packet_timeout
         self._reply_missing = noise or silence
         return self._reply_missing
