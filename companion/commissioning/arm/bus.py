@@ -37,7 +37,6 @@ SHUTDOWN = Register(63, 1, "shutdown")
 LED = Register(65, 1, "LED")
 
 PING_BYTES: Final = 14
-_WRITE_TIMEOUT_S = 1.0
 _REPLY_TIMEOUT_MS: Final = 100.0
 """Timeout for an answer: an FTDI adapter with its factory latency timer delays it by 16 ms, a busy computer by more."""
 _ERROR_NUMBER: Final = 0x7F
@@ -98,7 +97,6 @@ class ServoTalk:
         self._port.baudrate = baud
         if not self._port.openPort():
             raise DeviceError(f"arm bus {self._name}: this computer's serial ports do not support baud rate {baud}")
-        self._port.ser.write_timeout = _WRITE_TIMEOUT_S  # the flight's timeout is one control tick
         # Discard bytes received at the old rate.
         with contextlib.suppress(OSError):
             self._port.ser.reset_input_buffer()

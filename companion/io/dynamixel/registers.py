@@ -208,14 +208,10 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         if self.is_open:
             self.closePort()
         try:
-            # A write that cannot proceed means that no device is present; it must not block the bus thread for ever.
-            # Not shorter: pyserial checks the time even after a successful write, and the process may have been held up
-            # during it.
             self.ser = serial.Serial(
                 self.port_name,
                 cflag_baud,
                 timeout=_POLL_MS * 1e-3,
-                write_timeout=0.1,
                 exclusive=True,
                 bytesize=serial.EIGHTBITS,
             )
@@ -290,6 +286,15 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         if not data:
             raise OSError(f"{self.port_name}: disconnected, or another program reads from it")
         return data
+
+    def writePort(self, packet: list[int]) -> int:
+        """Pass a packet to the port's output buffer, which has room for many, and return the number of bytes taken. pyserial's `write`
+        waits once more after each packet.
+
+        Raises:
+            OSError: the port is gone, or its buffer is full because the adapter has stopped sending.
+        """
+        return os.write(self.ser.fd, bytes(packet))
 
     def isPacketTimeout(self) -> bool:
         """Return whether the reply has timed out."""
