@@ -15,7 +15,7 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from typing import Any
 
-from companion.config.device_plugins import RFT60
+from companion.config.device_plugins import DYNAMIXEL, RFT60
 from companion.config.mocap import NATNET
 from companion.config.vehicle import Vehicle
 from companion.model.types import IDENTITY_QUAT, Joints, Vec2
@@ -173,11 +173,13 @@ class Sitl:
             }
             if self.bus is not None:
                 addresses["arm"] = {"port": self.bus.path}
+                if device.arm is not None and device.arm.type != DYNAMIXEL:
+                    addresses["arm"] |= {"type": DYNAMIXEL, "options": {}}
             if self.force is not None:
                 addresses["force"] = {"port": self.force.port}
                 if device.force is not None and device.force.type != RFT60:
                     addresses["force"] |= {"type": RFT60, "options": {}, "rate_hz": self.force.rate_hz}
-            for name in ("mocap", "force"):
+            for name in ("mocap", "arm", "force"):
                 if "type" in addresses.get(name, ()):
                     ours, theirs = addresses[name]["type"], getattr(device, name).type
                     text = f"devices.{name}.type: the simulated world has a {ours}, which is used in place of {theirs}"

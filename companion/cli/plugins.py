@@ -11,12 +11,13 @@ from companion.config.controller import LAWS
 from companion.config.device_plugins import OptionsOf
 from companion.config.mocap import SYSTEMS
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
-from companion.plugins import CONTROL_LAWS, FORCE_SENSORS, KINDS, MOCAP_SYSTEMS, PluginError, installed
+from companion.plugins import ARMS, CONTROL_LAWS, FORCE_SENSORS, KINDS, MOCAP_SYSTEMS, PluginError, installed
 
 _SETTINGS: dict[str, Mapping[str, type[Model]]] = {
     CONTROL_LAWS: LAWS,
     MOCAP_SYSTEMS: SYSTEMS,
     FORCE_SENSORS: OptionsOf(FORCE_SENSORS),
+    ARMS: OptionsOf(ARMS),
 }
 """Settings class of each plug-in, by group and name."""
 
@@ -25,7 +26,7 @@ def add_parser(commands: Any) -> None:
     """Add `plugins` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "plugins",
-        help="list the installed control laws, motion-capture systems and force sensors, and the packages that provide them",
+        help="list the installed control laws, motion-capture systems, force sensors and arms, and the packages that provide them",
         description="List the installed plug-ins: name, kind, distribution, version, description. Exit code 2: one cannot be used.",
     )
     parser.set_defaults(run=run)

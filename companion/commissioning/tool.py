@@ -18,6 +18,7 @@ from rich.text import Text
 
 from companion.commissioning.patch import Patch, propose
 from companion.config.base import Location
+from companion.config.device_plugins import DYNAMIXEL
 from companion.config.document import ConfigError, Data
 from companion.config.loader import load_vehicle
 from companion.config.shipped import DEFAULT_VEHICLE, named_file, names
@@ -137,6 +138,8 @@ class Tool(Generic[_T]):
     """Check whose row reports a device that cannot be opened or stops answering; None to report it as one line on standard error."""
     no_data: Mapping[str, Any] = field(default_factory=dict)
     """`Report.data` when a device fails."""
+    servos_only: bool = False
+    """Whether the tool reads or writes registers of Dynamixel servos."""
 
 
 def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
@@ -147,6 +150,11 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
         KeyboardInterrupt: Ctrl-C was pressed.
     """
     session = Session(arguments, tool.family)
+    bus = session.vehicle.devices.arm
+    if tool.servos_only and bus is not None and bus.type != DYNAMIXEL:
+        raise ConfigError(
+            [f"companion {tool.name}: works with {DYNAMIXEL} servos only; devices.arm.type is {bus.type}"]
+        )
     try:
         collected = tool.collect(session)
         if isinstance(collected, Coroutine):

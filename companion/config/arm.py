@@ -21,7 +21,7 @@ from companion.config.base import (
     refuse,
 )
 from companion.model.arm_chain import is_physical_inertia
-from companion.model.servos import SERVOS, WITHOUT_CURRENT_CONTROL, ServoKind, ServoName
+from companion.model.servos import SERVOS, WITHOUT_CURRENT_CONTROL, ServoKind, ServoName, simulated_kind
 from companion.model.types import Joints
 
 FOLDED, UNFOLDED = "folded", "unfolded"
@@ -35,15 +35,17 @@ def _with_current_control(name: object) -> object:
 
 
 class Joint(Model):
-    """One servo and its joint, with angles as defined in the paper."""
+    """One servo or motor and its joint, with angles as defined in the paper."""
 
-    servo: Annotated[ServoName, BeforeValidator(_with_current_control)] = "XM430-W210"
-    """Model of the Dynamixel servo; the driver refuses a servo of another model."""
+    servo: Annotated[ServoName | None, BeforeValidator(_with_current_control)] = "XM430-W210"
+    """Model of the Dynamixel servo; the driver refuses a servo of another model. null for a motor that a plug-in drives
+    (docs/own-devices.md)."""
     servo_id: Annotated[int, Field(ge=0, le=252)]
+    """Id of the servo, or of the motor, on its bus."""
     sign: Literal[-1, 1]
     """1 if the servo's counts increase with the joint angle, -1 if they decrease."""
     zero_count: Annotated[int, Field(ge=-1048575, le=1048575)]
-    """Present Position (register 132) at joint angle 0."""
+    """Present Position (register 132) at joint angle 0; of a motor that a plug-in drives, its angle in 1/4096 of a turn."""
     angle_deg: Span
     """Lower and upper joint limit."""
     torque_max_nm: Positive
@@ -59,12 +61,21 @@ class Joint(Model):
 
     @property
     def kind(self) -> ServoKind:
-        """Return the data of the servo's model."""
+        """Return the data of the servo's model, or of the servo that the simulated world has in place of another motor."""
+        if self.servo is None:
+            return simulated_kind(self.torque_max_nm, self.velocity_max_deg_s / 6.0)
         return SERVOS[self.servo]
 
     @model_validator(mode="after")
     def _servo_suffices(self) -> Self:
         kind, problems = self.kind, list[tuple[Location, str]]()
+        if self.servo is None:
+            if "velocity_max_deg_s" not in self.model_fields_set:
+                problems.append((("velocity_max_deg_s",), "missing; required if servo is null"))
+            if self.torque_per_amp_nm_a is not None:
+                problems.append((("torque_per_amp_nm_a",), "must be absent, because servo is null"))
+            refuse("joint", problems)
+            return self
         if self.torque_max_nm > kind.stall_torque_nm:
             text = f"the {kind.name} stalls at {kind.stall_torque_nm:g} N m, got {self.torque_max_nm:g} N m"
             problems.append((("torque_max_nm",), text))
@@ -180,7 +191,11 @@ class Arm(Model):
                     text = f"joint {earlier + 1} has the servo id {joint.servo_id} too; give each servo its own id"
                     problems.append((("joints", index, "servo_id"), text))
                     break
-        names = list(dict.fromkeys(joint.servo for joint in self.joints if joint.torque_per_amp_nm_a is None))
+        names = list(
+            dict.fromkeys(joint.servo or "other motors" for joint in self.joints if joint.torque_per_amp_nm_a is None)
+        )
+        if self.torque_per_amp_nm_a is not None and any(joint.servo is None for joint in self.joints):
+            problems.append((("torque_per_amp_nm_a",), "must be absent, because arm.joints[].servo is null"))
         if self.torque_per_amp_nm_a is not None and len(names) > 1:
             text = f"one torque constant cannot hold for {' and '.join(names)}; set arm.joints[].torque_per_amp_nm_a instead"
             problems.append((("torque_per_amp_nm_a",), text))

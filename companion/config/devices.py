@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, JsonValue, model_validator
 
 from companion.config.base import Location, Model, Positive, refuse
-from companion.config.device_plugins import RFT60
+from companion.config.device_plugins import DYNAMIXEL, RFT60
 from companion.config.mocap import NATNET
 
 
@@ -59,23 +59,40 @@ ServoBaud = Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000]
 are too slow or too fast for a flight."""
 
 
-class ArmDevice(Model):
-    """The Dynamixel bus, connected by a U2D2 adapter."""
+class DynamixelOptions(Model):
+    """Dynamixel servos on a U2D2 adapter; their settings are keys of devices.arm and arm.joints."""
 
-    port: str
+
+class ArmDevice(Model):
+    """The arm's motors: Dynamixel servos on a U2D2 adapter, or motors that a plug-in drives (docs/own-devices.md)."""
+
+    type: str = DYNAMIXEL
+    """dynamixel, or the name of an installed arm (`companion plugins` lists them). With `--sitl`, dynamixel is used."""
+    port: str | None = None
+    """Serial port; required for dynamixel."""
     baud: ServoBaud = 3000000
     watchdog_ms: Annotated[int, Field(ge=20, le=2540)] = 100
     """Timeout of the bus watchdog (register 98), a multiple of 20 ms; after this time without an instruction, the servos release
-    torque.
+    torque. A plug-in sets or states the watchdog of its motors.
     """
+    options: dict[str, JsonValue] = Field(default={})
+    """Settings of the arm that a plug-in provides; must be empty for dynamixel."""
+
+    @property
+    def servo_port(self) -> str:
+        """Serial port of the servos; may be read only if `type` is dynamixel."""
+        assert self.port is not None
+        return self.port
 
     @model_validator(mode="after")
-    def _watchdog_steps(self) -> Self:
-        if self.watchdog_ms % 20:
-            refuse(
-                "arm device",
-                [(("watchdog_ms",), f"must be a multiple of 20 ms (the register's unit), got {self.watchdog_ms} ms")],
-            )
+    def _suits_the_type(self) -> Self:
+        problems: list[tuple[Location, str]] = []
+        if self.type == DYNAMIXEL and self.port is None:
+            problems.append((("port",), "missing; the serial port of the U2D2"))
+        if self.type == DYNAMIXEL and self.watchdog_ms % 20:
+            text = f"must be a multiple of 20 ms (the register's unit), got {self.watchdog_ms} ms"
+            problems.append((("watchdog_ms",), text))
+        refuse("arm device", problems)
         return self
 
 

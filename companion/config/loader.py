@@ -16,6 +16,7 @@ from companion.config.arm import NO_ARM
 from companion.config.base import Location, Model
 from companion.config.controller import LAWS, AnyControllerConfig, ControllerConfig, preset_file
 from companion.config.controller import PRESETS as PRESETS
+from companion.config.device_plugins import DYNAMIXEL
 from companion.config.devices import ANY_INTERFACE
 from companion.config.document import (
     RANK_MISSING,
@@ -34,7 +35,7 @@ from companion.config.shipped import named_file, near
 from companion.config.urdf import read_urdf
 from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import read_document
-from companion.plugins import FORCE_SENSORS
+from companion.plugins import ARMS, FORCE_SENSORS
 
 M = TypeVar("M", bound=Model)
 
@@ -267,12 +268,19 @@ def _unusable_mocap(vehicle: Vehicle, document: Document) -> list[str]:
 
 
 def _unusable_devices(vehicle: Vehicle, document: Document) -> list[str]:
-    """Return messages if the force sensor is not installed or its options are invalid. Logs are read without this check."""
+    """Return messages if force sensor or arm are not installed, or their options are invalid. Logs are read without this check."""
     found: list[tuple[Location, str]] = []
-    force = vehicle.devices.force
-    if force is not None:
-        problems = device_plugins.problems(FORCE_SENSORS, force.type, force.options)
-        found += [(("devices", "force", *at), text) for at, text in problems]
+    for name, group, device in (
+        ("force", FORCE_SENSORS, vehicle.devices.force),
+        ("arm", ARMS, vehicle.devices.arm),
+    ):
+        if device is not None:
+            problems = device_plugins.problems(group, device.type, device.options)
+            found += [(("devices", name, *at), text) for at, text in problems]
+    if vehicle.devices.arm is not None and vehicle.devices.arm.type == DYNAMIXEL:
+        text = f"expected the model of the servo, because devices.arm.type is {DYNAMIXEL}, got null"
+        joints = enumerate(vehicle.arm.joints)
+        found += [(("arm", "joints", index, "servo"), text) for index, joint in joints if joint.servo is None]
     return problem_lines([Problem(RANK_VALUE, document.origin(at), f"{key_path(at)}: {text}") for at, text in found])
 
 

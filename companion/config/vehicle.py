@@ -12,6 +12,7 @@ from companion.config.airframe import Airframe
 from companion.config.arm import FOLDED, LINK_RADIUS_M, UNFOLDED, Arm, Tool
 from companion.config.base import Location, Model, OrElse, refuse
 from companion.config.computer import Computer
+from companion.config.device_plugins import DYNAMIXEL
 from companion.config.devices import ArmDevice, Devices
 from companion.config.ground import Ground
 from companion.config.safety import Safety
@@ -86,7 +87,8 @@ class Vehicle(Model):
                 text = f"the centre of mass is beyond the end of the link: at {com_m:g} m on a link of {length_m:g} m"
                 problems.append((("arm", "link_com_m", index), text))
         problems += self._poses_within_limits()
-        coolest = min((joint.kind for joint in self.arm.joints), key=lambda kind: kind.temperature_max_c, default=None)
+        kinds = [joint.kind for joint in self.arm.joints if joint.servo is not None]
+        coolest = min(kinds, key=lambda kind: kind.temperature_max_c, default=None)
         if coolest is not None and self.safety.servo_max_c >= coolest.temperature_max_c:
             text = (
                 f"expected less than {coolest.temperature_max_c:g} degC, at which the {coolest.name} switches its torque off, got "
@@ -118,6 +120,7 @@ class Vehicle(Model):
                 else "must be null, because arm is null"
             )
             problems.append((("devices", "arm"), text))
+        problems += self._motors_fit()
         carried_kg = self.arm.mass_kg + self.tool_mass_kg
         if carried_kg >= self.airframe.mass_kg:
             text = f"{self.airframe.mass_kg:g} kg is the mass of the whole vehicle, but arm and tool alone have {carried_kg:g} kg"
@@ -140,6 +143,17 @@ class Vehicle(Model):
             problems.append((("safety", "battery_voltage_min_v"), text))
         refuse("vehicle", problems)
         return self
+
+    def _motors_fit(self) -> Iterator[tuple[Location, str]]:
+        """Yield the keys of servos that a vehicle has although a plug-in drives its arm."""
+        device, joints = self.devices.arm, self.arm.joints
+        if device is not None and device.type != DYNAMIXEL:
+            text = f"must be null, because devices.arm.type is {device.type}"
+            yield from (
+                (("arm", "joints", index, "servo"), text) for index, one in enumerate(joints) if one.servo is not None
+            )
+        if self.safety.servo_current_max_a is not None and any(joint.servo is None for joint in joints):
+            yield ("safety", "servo_current_max_a"), "must be null, because arm.joints[].servo is null"
 
     def _default_note(self, key: str) -> str:
         """Return a note for a message if the key of `safety` is not in the file, so that its default is used."""

@@ -274,7 +274,11 @@ class Flight:
 def _device_plugins(vehicle: Vehicle) -> dict[str, str]:
     """Return name, distribution and version of each device that a plug-in provides, for the log."""
     devices = vehicle.devices
-    named = [(plugins.MOCAP_SYSTEMS, devices.mocap.type), (plugins.FORCE_SENSORS, devices.force and devices.force.type)]
+    named = [
+        (plugins.MOCAP_SYSTEMS, devices.mocap.type),
+        (plugins.FORCE_SENSORS, devices.force and devices.force.type),
+        (plugins.ARMS, devices.arm and devices.arm.type),
+    ]
     found = [str(plugins.find(group, name)) for group, name in named if name and name not in BUILT_IN]
     return {"device_plugins": "; ".join(found)} if found else {}
 

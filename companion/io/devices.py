@@ -7,7 +7,11 @@ import contextlib
 from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass, field
 
+from companion.config.arm import Arm as ArmConfig
+from companion.config.device_plugins import DYNAMIXEL
+from companion.config.devices import ArmDevice
 from companion.config.loader import FlightConfig
+from companion.io.arm.plugin_driver import PluginArm
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.force_torque.plugin_driver import open_force
 from companion.io.mocap.plugin_driver import open_mocap
@@ -103,7 +107,8 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
             except DeviceError as error:
                 failures.append(str(error))
             except TimeoutError:
-                failures.append(f"arm {config.vehicle.arm_device.port}: not open within {ARM_TIMEOUT_S:g} s")
+                device = config.vehicle.arm_device
+                failures.append(f"arm {device.port or device.type}: not open within {ARM_TIMEOUT_S:g} s")
             if ground_address is not None:
                 failures.append(
                     f"ground.qgroundcontrol {ground_address}: MAVLink is not forwarded because PX4 was found armed"
@@ -217,7 +222,12 @@ def _autopilot(config: FlightConfig, clock: Clock) -> MavsdkAutopilot:
     return MavsdkAutopilot(config.vehicle.devices.autopilot, clock, forwarding=forwarding)
 
 
-def _arm(config: FlightConfig, clock: Clock) -> DynamixelArm | None:
+def open_arm(device: ArmDevice, arm: ArmConfig, clock: Clock) -> DynamixelArm | PluginArm:
+    """Return the driver of an arm, to be opened as a context manager."""
+    return (DynamixelArm if device.type == DYNAMIXEL else PluginArm)(device, arm, clock)
+
+
+def _arm(config: FlightConfig, clock: Clock) -> DynamixelArm | PluginArm | None:
     """Return the driver of the arm, or None if the vehicle has none."""
     vehicle = config.vehicle
-    return DynamixelArm(vehicle.arm_device, vehicle.arm, clock) if vehicle.arm.joints else None
+    return open_arm(vehicle.arm_device, vehicle.arm, clock) if vehicle.arm.joints else None

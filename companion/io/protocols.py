@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from companion.model.observations import (
+    ArmStatement,
     EstimatorReport,
     ForceCounts,
     MocapCounts,
@@ -120,7 +121,7 @@ class Mocap(Device, Protocol):
 
 
 class Arm(Device, Protocol):
-    """The two servos of the arm. A cycle is `begin_read`, `read`, then `write_torque`."""
+    """The motors of the arm. A cycle is `begin_read`, `read`, then `write_torque`."""
 
     def latest(self) -> ArmState | None:
         """Return the newest joint state, or None before the first."""
@@ -128,6 +129,10 @@ class Arm(Device, Protocol):
     @property
     def servos(self) -> tuple[ServoReport, ...]:
         """Return the servos' identity and settings as read when the arm was opened."""
+
+    @property
+    def statement(self) -> ArmStatement | None:
+        """Return what a plug-in states about its arm; None for servos, which are read instead."""
 
     @property
     def read_takes_s(self) -> float:

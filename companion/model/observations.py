@@ -50,6 +50,15 @@ class ServoReport(Record, frozen=True, kw_only=True):
     """Supply voltage (register 144)."""
 
 
+class ArmStatement(Record, frozen=True):
+    """What a plug-in states about its arm."""
+
+    product: str
+    """Model and firmware of the motors."""
+    watchdog: str
+    """What makes the arm limp when the companion dies."""
+
+
 class Machine(Record, frozen=True, kw_only=True):
     """State of the onboard computer. A field is None if the system does not provide it."""
 
@@ -160,6 +169,9 @@ class Observations(Record, frozen=True, kw_only=True):
     mocap_stream: MocapStream | None = None
     arm: tuple[ArmState, ...] = ()
     servos: tuple[ServoReport, ...] = ()
+    """The arm's servos; empty if a plug-in drives the arm."""
+    arm_statement: ArmStatement | None = None
+    """Statement of the plug-in that drives the arm; None for servos."""
     force: tuple[ForceSample, ...] = ()
     machine: Machine | None = None
     broker: str | None = None

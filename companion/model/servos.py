@@ -11,7 +11,7 @@ of ROBOTIS-GIT/dynamixel_hardware_interface.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, Literal
 
@@ -112,6 +112,11 @@ _NAMES: Final[Mapping[int, str]] = MappingProxyType(
 )
 
 
+def simulated_kind(torque_max_nm: float, speed_max_rpm: float) -> ServoKind:
+    """Return the servo that the simulated world has in place of a motor which a plug-in drives: one with its torque and speed."""
+    return replace(SERVOS["XM540-W270"], stall_torque_nm=torque_max_nm, speed_max_rpm=speed_max_rpm)
+
+
 def kind_of(number: int) -> ServoKind | None:
     """Return the model with this number (register 0), or None if it is not supported."""
     return _KINDS.get(number)
@@ -126,13 +131,17 @@ HARDWARE_ERROR_NAMES: Final[Mapping[int, str]] = MappingProxyType(
     {0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload"}
 )
 """Bits of register 70, Hardware Error Status."""
+MOTOR_ERROR: Final = 0x40
+"""Bit that the companion sets in `ArmState.hardware_error` for a fault of a motor that a plug-in drives; unused in register 70."""
 WATCHDOG_ERROR: Final = 0x80
 """Bit that the companion sets in `ArmState.hardware_error` after the bus watchdog has tripped; register 70 does not use it."""
 
 
 def hardware_error_text(error: int) -> str:
-    """Return the names of the bits of register 70 and of `WATCHDOG_ERROR`."""
-    names = [HARDWARE_ERROR_NAMES.get(bit, f"bit {bit}") for bit in range(7) if error >> bit & 1]
+    """Return the names of the bits of register 70, of `MOTOR_ERROR` and of `WATCHDOG_ERROR`."""
+    names = [HARDWARE_ERROR_NAMES.get(bit, f"bit {bit}") for bit in range(6) if error >> bit & 1]
+    if error & MOTOR_ERROR:
+        names.append("fault of the motor")
     if error & WATCHDOG_ERROR:
         names.append("bus watchdog")
     return ", ".join(names) if names else "none"

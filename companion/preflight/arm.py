@@ -49,7 +49,7 @@ RETURN_DELAY = Check(
 WATCHDOG = Check(
     "arm.watchdog",
     "bus watchdog",
-    "`devices.arm.watchdog_ms` (register 98)",
+    "`devices.arm.watchdog_ms` (register 98); of an arm that a plug-in drives, what the plug-in states",
     "the arm would keep its torque if the companion died",
 )
 CURRENT_LIMIT = Check(
@@ -128,15 +128,20 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     if failure is not None:
         yield DEVICE.bad(failure, "", "")
         return
-    yield DEVICE.good(f"{vehicle.arm_device.port} at {vehicle.arm_device.baud} baud")
+    stated = o.arm_statement
+    if stated is not None:
+        yield DEVICE.good(f"{vehicle.arm_device.type}: {stated.product}")
+        yield WATCHDOG.good(f"as {vehicle.arm_device.type} states: {stated.watchdog}")
+    else:
+        yield DEVICE.good(f"{vehicle.arm_device.port} at {vehicle.arm_device.baud} baud")
     if o.servos:
         yield _bus_time(vehicle, o.servos)
         yield from _settings(o.servos, vehicle)
     if o.arm:
-        yield from _states(o.arm, vehicle)
+        yield from _states(o.arm, vehicle, temperatures_unknown=stated is not None)
     if o.arm_reads is not None:
         yield _reads(*o.arm_reads)
-    if o.machine is not None:
+    if o.machine is not None and stated is None:
         yield usb_latency(USB, o.machine.arm_latency_ms)
 
 
@@ -230,11 +235,15 @@ def _current_limit(servos: Sequence[ServoReport], vehicle: Vehicle) -> Row:
     )
 
 
-def _states(states: Sequence[ArmState], vehicle: Vehicle) -> Iterator[Row]:
+def _states(states: Sequence[ArmState], vehicle: Vehicle, *, temperatures_unknown: bool) -> Iterator[Row]:
     last, safety = states[-1], vehicle.safety
     hottest_c = max(max(state.temperature_c) for state in states)
     read, wanted = f"{hottest_c:.0f} degC", f"below {safety.servo_warn_c:g} degC"
-    if hottest_c < safety.servo_warn_c:
+    if temperatures_unknown and min(states[-1].temperature_c) == 0.0:
+        yield TEMPERATURE.doubtful(
+            "not reported by every motor", wanted, "limit the motors' temperature by their own settings"
+        )
+    elif hottest_c < safety.servo_warn_c:
         yield TEMPERATURE.good(read, wanted)
     else:
         row = TEMPERATURE.doubtful if hottest_c < safety.servo_max_c else TEMPERATURE.bad

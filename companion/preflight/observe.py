@@ -219,6 +219,7 @@ class _Watcher:
             mocap_stream=self._mocap_stream(first, now),
             arm=tuple(self._arm),
             servos=devices.arm.servos if devices.arm is not None else (),
+            arm_statement=devices.arm.statement if devices.arm is not None else None,
             force=tuple(self._force),
             state_counts=_between(first.state, now.state) if devices.autopilot is not None else None,
             force_stream=self._force_stream(first, now),

@@ -22,6 +22,7 @@ from companion.model.codec import differences, to_packet
 from companion.model.constants import GRAVITY_M_S2, TICK_PERIOD_S
 from companion.model.frames import quat_from_euler_zyx, quat_rotate, tilt_rad
 from companion.model.types import Joints, Reference, Vec3
+from companion.testing.devices import check_arm as check_arm
 from companion.testing.devices import check_force_sensor as check_force_sensor
 
 RANDOM_TICKS = 300

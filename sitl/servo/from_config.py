@@ -30,9 +30,11 @@ def plugged_in(servos: Sequence[ServoModel], config: World) -> list[ServoModel]:
 def torque_constants_nm_a(vehicle: Vehicle) -> tuple[float, ...]:
     """Return the torque constant of each joint's servo in N m/A: that of the vehicle file, or of the servo's model."""
     arm = vehicle.arm
-    return tuple(
-        joint.torque_per_amp_nm_a or arm.torque_per_amp_nm_a or KINDS[joint.servo].nm_per_amp for joint in arm.joints
-    )
+    return tuple(joint.torque_per_amp_nm_a or arm.torque_per_amp_nm_a or _nm_per_amp(joint) for joint in arm.joints)
+
+
+def _nm_per_amp(joint: Joint) -> float:
+    return KINDS[joint.servo].nm_per_amp if joint.servo is not None else joint.kind.torque_per_amp_nm_a
 
 
 def servo_of(joint: Joint, device: ArmDevice, settings: Servo) -> ServoModel:
@@ -46,7 +48,7 @@ def servo_of(joint: Joint, device: ArmDevice, settings: Servo) -> ServoModel:
     servo = ServoModel(
         joint.servo_id if settings.id is None else settings.id,
         baud_bps=device.baud if settings.baud is None else settings.baud,
-        kind=joint.servo if settings.model is None else settings.model,
+        kind=joint.kind.name if settings.model is None else settings.model,
         firmware=settings.firmware,
     )
     low, high = settings.position_limit_counts

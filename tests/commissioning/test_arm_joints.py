@@ -123,7 +123,7 @@ def found(servo_id: int, servo: ServoModel) -> FoundServo:
 
 def mixed() -> tuple[Vehicle, list[ServoModel]]:
     vehicle = load_vehicle(SHIPPED, MIXED)
-    return vehicle, [ServoModel(joint.servo_id, kind=joint.servo) for joint in vehicle.arm.joints]
+    return vehicle, [ServoModel(joint.servo_id, kind=joint.kind.name) for joint in vehicle.arm.joints]
 
 
 def test_servos_of_two_models_are_assigned_and_set_up_by_their_own_limits() -> None:

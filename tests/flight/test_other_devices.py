@@ -16,6 +16,7 @@ from companion.flight.fallback_landing import unflown
 from companion.flight.main import Flight
 from companion.io.devices import Devices, VisionFilter
 from companion.model.observations import (
+    ArmStatement,
     EstimatorReport,
     ForceCounts,
     MocapCounts,
@@ -163,6 +164,7 @@ class OtherMocap(Standing):
 
 class OtherArm(Standing):
     servos: tuple[ServoReport, ...] = ()
+    statement: ArmStatement | None = None
     read_takes_s = 0.001
 
     def latest(self) -> ArmState | None:

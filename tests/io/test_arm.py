@@ -462,7 +462,7 @@ def test_three_models_on_one_bus_are_each_driven_in_their_own_units() -> None:
 
     async def main() -> None:
         servos = [
-            ServoModel(joint.servo_id, kind=joint.servo, shaft_angle_rad=shaft_rad(joint, 0.5)) for joint in joints
+            ServoModel(joint.servo_id, kind=joint.kind.name, shaft_angle_rad=shaft_rad(joint, 0.5)) for joint in joints
         ]
         async with (
             ServoBus(servos) as bus,
@@ -474,7 +474,7 @@ def test_three_models_on_one_bus_are_each_driven_in_their_own_units() -> None:
             await until(lambda: all(register(servo, 102, 2) for servo in servos))
             for joint, servo, torque_nm in zip(joints, servos, torques_nm, strict=True):
                 current_a = servo.update(0.1, shaft_rad(joint, 0.5), 0.0)
-                assert current_a * KINDS[joint.servo].nm_per_amp == pytest.approx(torque_nm, rel=0.01)
+                assert current_a * KINDS[joint.kind.name].nm_per_amp == pytest.approx(torque_nm, rel=0.01)
             state = await state_when(arm, lambda s: all(s.torque_nm))
             assert state.torque_nm == pytest.approx(sent_nm, rel=1e-9)
             assert state.angle_rad == pytest.approx((0.5, 0.5, 0.5), abs=0.002)

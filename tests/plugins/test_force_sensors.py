@@ -228,7 +228,7 @@ def test_a_sensor_that_breaks_the_contract_is_told_how(device: ForceDevice, foun
 
 
 def test_a_sensor_where_there_is_none_breaks_the_contract() -> None:
-    with pytest.raises(AssertionError, match="although no sensor is at this address"):
+    with pytest.raises(AssertionError, match="although nothing is at this address"):
         check_force_sensor(sensor("steady"), absent=sensor("steady"), duration_s=0.1)
 
 

@@ -10,7 +10,7 @@ from typing import Final, Protocol
 
 from companion.commissioning.arm.motion import Motion, Moved, gentle
 from companion.config.vehicle import Vehicle
-from companion.io.dynamixel.arm import DynamixelArm
+from companion.io.devices import open_arm
 from companion.io.protocols import DeviceError
 from companion.model.types import ArmState, Joints
 from companion.runtime.clock import flight_clock
@@ -63,7 +63,7 @@ async def drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
 async def _drive(vehicle: Vehicle, leader: Leader, bars: Bars) -> Driven:
     clock = flight_clock()
     limits = [joint.angle_deg for joint in vehicle.arm.joints]
-    async with DynamixelArm(vehicle.arm_device, gentle(vehicle.arm), clock) as arm:
+    async with open_arm(vehicle.arm_device, gentle(vehicle.arm), clock) as arm:
         state = arm.latest()
         assert state is not None, "the driver reads once while it opens"
         motion = Motion(vehicle, state)

@@ -91,7 +91,7 @@ def scan(
     servos: list[FoundServo] = []
     garbled: list[int] = []
     tried: list[int] = []
-    with ServoTalk(device.port) as talk:
+    with ServoTalk(device.servo_port) as talk:
         for baud in bauds:
             if only is None and baud < bus.FACTORY_BAUD and len(servos) > 1:
                 break  # 5 s for a rate that is rarely used
@@ -192,7 +192,7 @@ def _models(found: Scan, arm: Arm) -> Iterator[Row]:
         yield MODEL.bad(read, wanted, fix)
     if found.servos and not strange:
         names = ", ".join(dict.fromkeys(servo.kind.name for servo in found.servos))
-        yield MODEL.good(names, ", ".join(dict.fromkeys(joint.servo for joint in arm.joints)))
+        yield MODEL.good(names, ", ".join(dict.fromkeys(joint.kind.name for joint in arm.joints)))
 
 
 def _bauds(found: Scan, device: ArmDevice) -> Iterator[Row]:

@@ -199,8 +199,8 @@ def joint_in(arm: Arm, index: int | None) -> int | None:
 
 def expected_models(servo: FoundServo, arm: Arm) -> Sequence[str]:
     """Return the models that the vehicle file permits for this servo: that of the joint with its id, or those of all joints."""
-    own = [joint.servo for joint in arm.joints if joint.servo_id == servo.servo_id]
-    return own or sorted({joint.servo for joint in arm.joints})
+    own = [joint.kind.name for joint in arm.joints if joint.servo_id == servo.servo_id]
+    return own or sorted({joint.kind.name for joint in arm.joints})
 
 
 def is_strange(servo: FoundServo, arm: Arm) -> bool:

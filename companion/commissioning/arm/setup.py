@@ -240,7 +240,7 @@ def _set_up(session: Session, wanted: SetupPlan) -> Done:
         return Done(wanted, "not written", ("nothing was written; --yes writes without asking",), right=False)
     if not answer:
         raise Cancelled("nothing was written")
-    carry_out(vehicle.arm_device.port, needed, lambda text: session.say(f"  {text}"))
+    carry_out(vehicle.arm_device.servo_port, needed, lambda text: session.say(f"  {text}"))
     session.say("reading back")
     lines = _left(vehicle, wanted)
     right = not lines and not wanted.absent

@@ -187,9 +187,9 @@ def _value(estimate: Estimate | None, unit: str) -> str:
 
 
 TOOLS: Final[Mapping[str, Tool[Any]]] = {
-    "scan": Tool("arm scan", ARM, _scan, _judge_scan),
-    "setup": Tool("arm setup", ARM, arm_setup.set_up, arm_setup.judge),
-    "zero": Tool("arm zero", ARM, _zero, _judge_zero),
+    "scan": Tool("arm scan", ARM, _scan, _judge_scan, servos_only=True),
+    "setup": Tool("arm setup", ARM, arm_setup.set_up, arm_setup.judge, servos_only=True),
+    "zero": Tool("arm zero", ARM, _zero, _judge_zero, servos_only=True),
     "jog": Tool("arm jog", ARM, _jog, _judge_jog),
-    "friction": Tool("arm friction", ARM, _sweep, _judge_sweep),
+    "friction": Tool("arm friction", ARM, _sweep, _judge_sweep, servos_only=True),
 }

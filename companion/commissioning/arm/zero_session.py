@@ -31,7 +31,7 @@ def hold(vehicle: Vehicle, guide: ZeroGuide, console: Console) -> ZeroResult:
     """
     device, ids = vehicle.arm_device, [joint.servo_id for joint in vehicle.arm.joints]
     names = [*(f"servo {servo_id}" for servo_id in ids), "held"]
-    with ServoTalk(device.port) as talk, raw_keys() as keys, Bars(console, names) as bars:
+    with ServoTalk(device.servo_port) as talk, raw_keys() as keys, Bars(console, names) as bars:
         talk.open(device.baud)
         for servo_id in ids:
             _ready(talk, servo_id)

@@ -15,7 +15,7 @@ from companion.config.device_plugins import RFT60
 from companion.config.devices import ForceDevice
 from companion.config.document import ConfigError
 from companion.config.vehicle import Vehicle
-from companion.io.dynamixel.arm import DynamixelArm
+from companion.io.devices import open_arm
 from companion.io.force_torque.driver import RobotousForceTorque
 from companion.io.force_torque.plugin_driver import PluginForceTorque
 from companion.io.force_torque.rft import Command
@@ -121,7 +121,7 @@ async def arm_angles(
     if given_rad is not None:
         yield given
         return
-    arm = DynamixelArm(vehicle.arm_device, vehicle.arm, clock)
+    arm = open_arm(vehicle.arm_device, vehicle.arm, clock)
     try:
         await arm.__aenter__()
     except DeviceError as error:

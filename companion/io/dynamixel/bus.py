@@ -168,7 +168,7 @@ class ArmBus:
                 "USB adapter",
                 None,
                 f"latency timer is {latency_ms} ms, expected at most {_USB_LATENCY_MAX_MS}; write 1 to "
-                f"/sys/bus/usb-serial/devices/{self._device.port.rsplit('/', 1)[-1]}/latency_timer (a udev rule keeps it)",
+                f"/sys/bus/usb-serial/devices/{self._device.servo_port.rsplit('/', 1)[-1]}/latency_timer (a udev rule keeps it)",
             )
 
     def _check_identity(self, joint: Joint) -> None:
