@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, JsonValue, model_validator
 
@@ -28,10 +28,18 @@ FOLDED, UNFOLDED = "folded", "unfolded"
 """Names of poses that the shipped missions use."""
 
 
+SPEED_USUAL_DEG_S = 300.0
+
+
 def _with_current_control(name: object) -> object:
     if isinstance(name, str) and name in WITHOUT_CURRENT_CONTROL:
         raise ValueError(f"the {name} has no current control (operating mode 0), so that it cannot follow a torque")
     return name
+
+
+def _speed_of_servo_deg_s(joint: dict[str, Any]) -> float:
+    valid = "servo" in joint  # an invalid name is reported elsewhere
+    return min(SPEED_USUAL_DEG_S, SERVOS[joint["servo"]].speed_max_deg_s) if valid else SPEED_USUAL_DEG_S
 
 
 class Joint(Model):
@@ -50,10 +58,12 @@ class Joint(Model):
     """Lower and upper joint limit."""
     torque_max_nm: Positive
     """Largest commanded torque, at most the stall torque of the servo."""
-    velocity_max_deg_s: Positive = 300.0
-    """Largest planned speed, at most the speed of the servo without load."""
+    velocity_max_deg_s: Positive = Field(default_factory=_speed_of_servo_deg_s)
+    """Largest planned speed, at most the speed of the servo without load; if it is absent, that speed or 300 deg/s, if it is less."""
     torque_per_amp_nm_a: Positive | None = None
     """Torque constant of this servo; null for the value of the arm."""
+    armature_kg_m2: NonNegative | None = None
+    """Inertia of this servo's rotor and gears, referred to the joint; null for the value of the arm."""
     axis: Axis | None = None
     """Direction of the axis in the link's frame, for arms without `links`. If it is absent, the first joint turns about +y and the
     others about -y.
@@ -79,9 +89,8 @@ class Joint(Model):
         if self.torque_max_nm > kind.stall_torque_nm:
             text = f"the {kind.name} stalls at {kind.stall_torque_nm:g} N m, got {self.torque_max_nm:g} N m"
             problems.append((("torque_max_nm",), text))
-        speed_deg_s = 6.0 * kind.speed_max_rpm
-        if self.velocity_max_deg_s > speed_deg_s:
-            text = f"the {kind.name} turns at most at {speed_deg_s:g} deg/s, got {self.velocity_max_deg_s:g} deg/s"
+        if self.velocity_max_deg_s > kind.speed_max_deg_s:
+            text = f"the {kind.name} turns at most at {kind.speed_max_deg_s:g} deg/s, got {self.velocity_max_deg_s:g} deg/s"
             problems.append((("velocity_max_deg_s",), text))
         refuse("joint", problems)
         return self
@@ -144,7 +153,7 @@ class Arm(Model):
     """Torque constant of the servos, if all of them are of one model. null: stall torque divided by stall current of each model
     (docs/hardware.md)."""
     joint_armature_kg_m2: NonNegative = 0.008
-    """Inertia of a servo's rotor and gears, referred to the joint; used by the model-based laws and the simulated arm."""
+    """Inertia of a servo's rotor and gears, referred to the joint; used by the laws' gains and models and by the simulated arm."""
     joint_friction_nm: NonNegative = 0.04
     """Dry friction of one joint, for laws with friction feedforward."""
     joints: Annotated[tuple[Joint, ...], Field(max_length=JOINTS_MAX)]
@@ -160,6 +169,12 @@ class Arm(Model):
             joint.torque_per_amp_nm_a or self.torque_per_amp_nm_a or joint.kind.torque_per_amp_nm_a
             for joint in self.joints
         )
+
+    @property
+    def armatures_kg_m2(self) -> tuple[float, ...]:
+        """Return the inertia of each joint's rotor and gears, referred to the joint."""
+        usual = self.joint_armature_kg_m2
+        return tuple(usual if joint.armature_kg_m2 is None else joint.armature_kg_m2 for joint in self.joints)
 
     @model_validator(mode="after")
     def _one_value_per_joint(self) -> Self:

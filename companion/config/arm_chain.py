@@ -30,7 +30,7 @@ def chain_of(vehicle: Vehicle) -> ArmChain:
 
 
 def _bodies(arm: Arm) -> Iterator[ChainLink]:
-    for link in arm.links:
+    for link, armature_kg_m2 in zip(arm.links, arm.armatures_kg_m2, strict=True):
         xx, yy, zz, xy, xz, yz = link.inertia_kg_m2
         yield ChainLink(
             position_m=link.origin_m,
@@ -39,7 +39,7 @@ def _bodies(arm: Arm) -> Iterator[ChainLink]:
             mass_kg=link.mass_kg,
             com_m=link.com_m,
             inertia_kg_m2=((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)),
-            armature_kg_m2=arm.joint_armature_kg_m2,
+            armature_kg_m2=armature_kg_m2,
         )
 
 
@@ -49,8 +49,8 @@ def _rods(arm: Arm) -> Iterator[ChainLink]:
     """
     position: Vec3 = arm.shoulder_body_m
     usual: Vec3 = (0.0, 1.0, 0.0)
-    rods = zip(arm.joints, arm.link_lengths_m, arm.link_masses_kg, arm.link_com_m, strict=True)
-    for joint, length_m, mass_kg, com_m in rods:
+    lists = (arm.armatures_kg_m2, arm.link_lengths_m, arm.link_masses_kg, arm.link_com_m)
+    for joint, armature_kg_m2, length_m, mass_kg, com_m in zip(arm.joints, *lists, strict=True):
         xx, yy, zz = rod_inertia_kg_m2(mass_kg, length_m)
         yield ChainLink(
             position_m=position,
@@ -59,7 +59,7 @@ def _rods(arm: Arm) -> Iterator[ChainLink]:
             mass_kg=mass_kg,
             com_m=(com_m, 0.0, 0.0),
             inertia_kg_m2=((xx, 0.0, 0.0), (0.0, yy, 0.0), (0.0, 0.0, zz)),
-            armature_kg_m2=arm.joint_armature_kg_m2,
+            armature_kg_m2=armature_kg_m2,
         )
         position, usual = (length_m, 0.0, 0.0), (0.0, -1.0, 0.0)
 

@@ -64,6 +64,11 @@ class ServoKind:
     cycle: torque and current are then not proportional."""
 
     @property
+    def speed_max_deg_s(self) -> float:
+        """Return the speed without load at the highest voltage."""
+        return 6.0 * self.speed_max_rpm
+
+    @property
     def torque_per_amp_nm_a(self) -> float:
         """Return the torque constant as stall torque divided by stall current, as the e-manual does. It contains the friction of the
         gears; `companion arm friction` measures the constant itself."""

@@ -45,6 +45,17 @@ def test_the_torque_constant_is_that_of_the_joint_the_arm_or_the_model() -> None
     assert two_models.arm.torque_constants_nm_a == pytest.approx((10.6 / 4.4, 1.2))
 
 
+def test_without_a_speed_limit_the_speed_of_a_slow_servo_is_planned() -> None:
+    joints = (
+        "vehicle.arm.joints=[{servo: %s, servo_id: 1, sign: 1, zero_count: 0, angle_deg: [60, 175], torque_max_nm: 2}]"
+    )
+    rest = [f"vehicle.arm.link_{key}=[0.1]" for key in ("lengths_m", "masses_kg", "com_m")]
+    one = [*rest, "vehicle.safety.fold_arm_deg=[165]", "vehicle.arm.poses={}", NO_CONSTANT]
+    for servo, speed_deg_s in (("XM540-W270", 222.0), ("XM430-W210", 300.0)):
+        (joint,) = load_vehicle(SHIPPED, [joints % servo, *one]).arm.joints
+        assert joint.velocity_max_deg_s == pytest.approx(speed_deg_s)
+
+
 def test_the_gate_limits_the_current_of_each_servo_to_its_stall_current() -> None:
     strong, weak = "vehicle.arm.joints[0].torque_max_nm=10", "vehicle.arm.joints[1].torque_per_amp_nm_a=0.5"
     vehicle = load_vehicle(SHIPPED, [*XM540, NO_CONSTANT, strong, weak])

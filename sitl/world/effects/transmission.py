@@ -174,10 +174,9 @@ def transmissions_of(vehicle: Vehicle, world: World, start_rad: Joints, dt_s: fl
             backlash_deg=0.0,
             warm_up_k=0.0,
         )
-    armature = vehicle.arm.joint_armature_kg_m2
     return tuple(
         Transmission(servo, armature, gear_rad, link_rad if joint else mount_rad, arm.relaxation_s, angle_rad, dt_s)
-        for joint, angle_rad in enumerate(start_rad)
+        for joint, (angle_rad, armature) in enumerate(zip(start_rad, vehicle.arm.armatures_kg_m2, strict=True))
     )
 
 
