@@ -126,8 +126,8 @@ _ROBUST = (Parameter("rho_max", 0.5, 20.0), Parameter("row_weights_s", 0.01, 1.0
 _LOADS = (
     Parameter("load_rate_xyz", 0.3, 30.0, XY),
     Parameter("load_rate_xyz", 1.0, 200.0, Z),
-    Parameter("moment_rate", 0.002, 0.3),
-    Parameter("friction_rate", 0.01, 3.0),
+    Parameter("moment_rate", 0.002, 0.3, (0,)),
+    Parameter("friction_rate", 0.01, 3.0, (0,)),
 )
 SEARCHES: dict[str, tuple[str, str, tuple[Parameter, ...]]] = {
     "csc": ("csc", "tuned", (*_CSC, _ATTITUDE)),
@@ -322,7 +322,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     a = parser.parse_args(arguments)
     law, preset, parameters = SEARCHES[a.search]
     try:
-        config = load_sitl(MISSION, controller_law=law, preset=preset, overrides=a.overrides, world=a.world)
+        as_written = ("controller.found_for=null", *a.overrides)
+        config = load_sitl(MISSION, controller_law=law, preset=preset, overrides=as_written, world=a.world)
     except ConfigError as error:
         print(f"tune: {error}", file=sys.stderr)
         return 2

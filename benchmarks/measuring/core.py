@@ -22,7 +22,7 @@ from sitl.world.world import PHYSICS_DT_S, World
 from tests.support import CATCH
 
 REPEATS = 5
-NO_LOADS = {"load_rate_xyz": (0.0, 0.0, 0.0), "moment_rate": 0.0, "friction_rate": 0.0}
+NO_LOADS = {"load_rate_xyz": (0.0, 0.0, 0.0), "moment_rate": (0.0,), "friction_rate": (0.0,)}
 """Settings that switch the adaptive loads off."""
 _RAW_STARTS, _RAW_STEPS = 100, 50
 

@@ -26,6 +26,7 @@ from companion.config.left_out import figures_left_out
 from companion.config.loader import FlightConfig
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
+from companion.control.scaled_gains import scale_text
 from companion.io.devices import open_available
 from companion.io.protocols import DeviceError
 from companion.launcher.launcher import replace_device_settings
@@ -116,6 +117,8 @@ def _plan_only(arguments: argparse.Namespace, config: FlightConfig, found: list[
         print(f"  {line}")
     if left_out := figures_left_out(config.vehicle):
         print(f"  left out of the vehicle file, so that the values of the Tarot 650 are used: {'; '.join(left_out)}")
+    if scaled := scale_text(config.controller):
+        print(f"  {scaled}")
     return EXIT_OK
 
 

@@ -7,6 +7,7 @@ Control laws are plug-ins (`companion.plugins.CONTROL_LAWS`). An entry point nam
 from __future__ import annotations
 
 import functools
+import statistics
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
 from companion import plugins
-from companion.config.base import JOINTS_MAX, Location, Model, NonNegative, Positive, Positive3, refuse
+from companion.config.base import JOINTS_MAX, Location, Model, NonNegative, OrElse, Positive, Positive3, refuse
 
 PositiveRows = Annotated[tuple[Positive, ...], Field(min_length=7, max_length=6 + JOINTS_MAX)]
 """One value for each of x, y, z, roll, pitch, yaw and for each joint. A vehicle with n joints uses the first 6 + n values; if there are
@@ -26,6 +27,13 @@ PositiveJoints = Annotated[tuple[Positive, ...], Field(min_length=1, max_length=
 """One value for each joint. A vehicle with n joints uses the first n values; if there are fewer, the last value applies to the
 remaining joints too.
 """
+NonNegativeJoints = Annotated[
+    tuple[NonNegative, ...],
+    Field(min_length=1, max_length=JOINTS_MAX),
+    BeforeValidator(lambda given: (given,) if isinstance(given, int | float) else given),
+    OrElse({"type": "number"}),
+]
+"""As `PositiveJoints`, or one number for all joints."""
 NonNegative3 = tuple[NonNegative, NonNegative, NonNegative]
 Positive4 = tuple[Positive, Positive, Positive, Positive]
 
@@ -48,12 +56,34 @@ class ControllerConfig(Model):
     preset: str
 
 
+class Machine(Model):
+    """The inertia of the machine for which gains were found."""
+
+    mass_kg: Positive
+    """Mass of the vehicle, ready to fly (`airframe.mass_kg`)."""
+    joint_inertia_kg_m2: PositiveJoints
+    """Inertia of each joint, to four digits: the smallest within the joint limits of its diagonal element of the mass matrix of arm and
+    tool, with the armatures of the servos. The last value stands for further joints."""
+
+
 class LawConfig(ControllerConfig):
     """Settings that the companion's own laws share: for the measured force, additional compensation and limits of the commands."""
 
     gain_lists: ClassVar[tuple[str, ...]] = ()
     """Names of the lists of gains, one for each row or joint, which must have the same length."""
+    scaled_by_mass: ClassVar[tuple[str, ...]] = ("disturbance_max_n", "lateral_force_max_n")
+    """Names of the settings that are proportional to the vehicle's mass (`found_for`)."""
+    scaled_by_row: ClassVar[tuple[str, ...]] = ()
+    """Names of the lists of gains that are proportional to the mass in x, y and z and to the inertia of each joint."""
+    scaled_by_joint: ClassVar[tuple[str, ...]] = ()
+    """Names of the settings, a number or a list, that are proportional to the inertia of each joint."""
 
+    found_for: Machine | None = None
+    """Machine for which the gains were found: on another vehicle they are multiplied by the ratio of its inertia to this one. null: the
+    gains are used as written."""
+    scale: PositiveRows | None = None
+    """Factors on x, y, z, roll, pitch, yaw and each joint by which the gains in this record are multiplied already. The companion sets
+    it; files leave it out."""
     force_lowpass_hz: Positive
     desired_force_time_s: Positive | None = None
     """Time constant T_d of F_d = lowpass(F_ext) on the joint rows. If it is absent, F_d = 0 and the arm sags under a carried
@@ -82,10 +112,11 @@ class LawConfig(ControllerConfig):
     @model_validator(mode="after")
     def _gain_lists_fit(self) -> Self:
         lengths = {key: len(getattr(self, key)) for key in self.gain_lists}
+        wanted = statistics.mode(lengths.values()) if lengths else 0
         for key, length in lengths.items():
-            wanted = lengths[self.gain_lists[0]]
             if length != wanted:
-                text = f"expected {wanted} values, as many as {self.gain_lists[0]} has, got {length}"
+                other = next(key for key in lengths if lengths[key] == wanted)
+                text = f"expected {wanted} values, as many as {other} has, got {length}"
                 refuse("controller", [((key,), text)])
         return self
 
@@ -100,6 +131,9 @@ class AdaptiveConfig(LawConfig):
 
     presets = ("paper", "paper_slow_leakage", "model_free", "recommended")
     gain_lists = ("inertia_md", "lambda_gain", "phi", "damping_kd", "stiffness_kp", "row_weights_s")
+    scaled_by_mass = (*LawConfig.scaled_by_mass, "load_rate_xyz", "load_max_n")
+    scaled_by_row = ("inertia_md", "lambda_gain", "damping_kd", "stiffness_kp", "robust_scale")
+    scaled_by_joint = ("moment_rate", "friction_rate")
 
     law: Literal["adaptive"]
     inertia_md: PositiveRows
@@ -114,6 +148,8 @@ class AdaptiveConfig(LawConfig):
     """K_p of the paper; must equal (K_d - M_d Phi) Phi (gain_cond)."""
     row_weights_s: NonNegativeRows
     """S: weight of each row in ||s||, ||xi|| and ||chi_dd||; 0 masks a row that another loop controls."""
+    robust_scale: PositiveRows = (1.0,) * 7
+    """Factor on each row of the robust term, -rho S^2 s / max(||S s||, varpi): 1 on the machine of `found_for`."""
     h_initial: Positive4
     """Initial values H_0(0) to H_3(0)."""
     zeta_initial: Positive
@@ -134,11 +170,11 @@ class AdaptiveConfig(LawConfig):
     """Leakage of every adaptive load, 1/s."""
     load_max_n: NonNegative = 8.0
     """Bound of the adaptive load on x, y and z (projection)."""
-    moment_rate: NonNegative = 0.0
+    moment_rate: NonNegativeJoints = (0.0,)
     """Adaptation rate Gamma of the adaptive first moments of the links, kg s^2; 0 disables them."""
     moment_max_kg_m: NonNegative = 0.3
     """Bound of the adaptive first moments (projection)."""
-    friction_rate: NonNegative = 0.0
+    friction_rate: NonNegativeJoints = (0.0,)
     """Adaptation rate Gamma of the adaptive joint friction, kg m^2/s^2; 0 disables it."""
     friction_max_nm: NonNegative = 0.3
     """Bound of the adaptive joint friction (projection)."""
@@ -178,7 +214,7 @@ class CscConfig(LawConfig):
     """
 
     presets = ("tuned_extras", "tuned")
-    gain_lists = ("inertia_md", "damping_kd", "stiffness_kp")
+    gain_lists = scaled_by_row = ("inertia_md", "damping_kd", "stiffness_kp")
 
     law: Literal["csc"]
     inertia_md: PositiveRows
@@ -203,7 +239,7 @@ class PscConfig(LawConfig):
     """
 
     presets = ("tuned_extras", "tuned")
-    gain_lists = ("arm_inertia_md", "arm_damping_kd", "arm_stiffness_kp")
+    gain_lists = scaled_by_joint = ("arm_inertia_md", "arm_damping_kd", "arm_stiffness_kp")
 
     law: Literal["psc"]
     position_kp_xyz: Positive3

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from companion.config import device_plugins, mocap
 from companion.config.arm import NO_ARM
 from companion.config.base import Location, Model
-from companion.config.controller import LAWS, AnyControllerConfig, ControllerConfig, preset_file
+from companion.config.controller import LAWS, AnyControllerConfig, ControllerConfig, law_class, preset_file
 from companion.config.controller import PRESETS as PRESETS
 from companion.config.device_plugins import DYNAMIXEL
 from companion.config.devices import ANY_INTERFACE
@@ -131,6 +131,9 @@ def load_flight(
         raise ConfigError(lines)
     assert vehicle_file is not None
     assert controller_file is not None
+    for_vehicle = getattr(law_class(controller.law), "for_vehicle", None)
+    if for_vehicle is not None:
+        controller = for_vehicle(vehicle, controller)
     return FlightConfig(
         mission=mission,
         vehicle=vehicle,

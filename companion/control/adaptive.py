@@ -21,6 +21,7 @@ from companion.control.common import Actuation, DesiredForce, ForceFilter, base_
 from companion.control.compensation import FRICTION_RATE_RAD_S, Compensation
 from companion.control.impedance import Impedance
 from companion.control.load_adaptation import LoadAdaptation
+from companion.control.scaled_gains import for_vehicle
 from companion.control.types import PlantState, Wrench
 from companion.control.zero_order_hold import HoldTable
 from companion.model.constants import GRAVITY_M_S2
@@ -80,6 +81,7 @@ class AdaptiveController:
     """The adaptive impedance control law for vehicle and arm."""
 
     settings: ClassVar = AdaptiveConfig
+    for_vehicle: ClassVar = staticmethod(for_vehicle)
 
     def __init__(self, config: AdaptiveConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         self._manipulator = manipulator_of(vehicle)
@@ -89,15 +91,16 @@ class AdaptiveController:
         self._load = LoadAdaptation(config, self._manipulator)
         impedance, rows = self._impedance, 6 + joint_count
         weights = [weight**2 for weight in fitted(config.row_weights_s, rows)]
+        robust = [w * scale for w, scale in zip(weights, fitted(config.robust_scale, rows), strict=True)]
         gains = list(
-            zip(impedance.inertia, impedance.phi, fitted(config.lambda_gain, rows), weights, impedance.d, strict=True)
+            zip(impedance.inertia, impedance.phi, fitted(config.lambda_gain, rows), robust, impedance.d, strict=True)
         )
         self._base_gains = gains[:3]
-        """M_d, Phi, Lambda, S^2 and D of x, y and z."""
+        """M_d, Phi, Lambda, S^2 times `robust_scale`, and D of x, y and z."""
         self._joint_gains = [(joint, 6 + joint, *row) for joint, row in enumerate(gains[6:])]
         """Number of each joint and its row, then as in `_base_gains`."""
         self._base_phi, self._base_weights = (*impedance.phi[:3], impedance.phi[5]), weights[:3]
-        self._joint_weights = [(joint, row, phi, weight) for joint, row, _, phi, _, weight, _ in self._joint_gains]
+        self._joint_weights = [(joint, row, phi, weights[row]) for joint, row, _, phi, *_ in self._joint_gains]
         """Number of each joint, its row, Phi and S^2."""
         self._varpi = config.boundary_layer
         self._acceleration_cap = config.acceleration_cap

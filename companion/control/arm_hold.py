@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
-from companion.control.manipulator import Manipulator
+from companion.config.vehicle import Vehicle
+from companion.control.arm_model import manipulator_of
+from companion.control.scaled_gains import joint_ratios
 from companion.model.types import Joints, Quat
 
 STIFFNESS_NM_RAD = 5.0
 DAMPING_NMS_RAD = 0.45
+FOUND_FOR_KG_M2: Joints = (0.01666, 0.01778)
+"""Joint inertia, as in `companion.config.controller.Machine`, of the arm with these gains; those of another arm are proportional to its
+own, so that its joints do not swing.
+"""
 
 
-def hold_torque_nm(
-    manipulator: Manipulator,
-    angle_rad: Joints,
-    rate_rad_s: Joints,
-    target_rad: Joints,
-    target_rate_rad_s: Joints,
-    attitude: Quat,
-) -> Joints:
-    """Return the joint torques towards the target, N m, with nominal gravity compensation."""
-    gravity = manipulator.gravity_torque_nm(angle_rad, attitude)
-    torque = [
-        g + STIFFNESS_NM_RAD * (target - angle) + DAMPING_NMS_RAD * (target_rate - rate)
-        for g, angle, rate, target, target_rate in zip(
-            gravity, angle_rad, rate_rad_s, target_rad, target_rate_rad_s, strict=True
-        )
-    ]
-    return tuple(torque)
+class ArmHold:
+    """The controller of a vehicle's arm."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._manipulator = manipulator_of(vehicle)
+        self.ratios = joint_ratios(vehicle, FOUND_FOR_KG_M2)
+        """Factor on the gains of each joint."""
+        self._gains = [(STIFFNESS_NM_RAD * ratio, DAMPING_NMS_RAD * ratio) for ratio in self.ratios]
+
+    def torque_nm(
+        self, angle_rad: Joints, rate_rad_s: Joints, target_rad: Joints, target_rate_rad_s: Joints, attitude: Quat
+    ) -> Joints:
+        """Return the joint torques towards the target, N m, with nominal gravity compensation."""
+        gravity = self._manipulator.gravity_torque_nm(angle_rad, attitude)
+        torque = [
+            g + stiffness * (target - angle) + damping * (target_rate - rate)
+            for g, (stiffness, damping), angle, rate, target, target_rate in zip(
+                gravity, self._gains, angle_rad, rate_rad_s, target_rad, target_rate_rad_s, strict=True
+            )
+        ]
+        return tuple(torque)
 
 
 def towards(angle_rad: Joints, goal_rad: Joints, step_rad: float) -> Joints:

@@ -20,6 +20,7 @@ from companion.config.vehicle import Vehicle
 from companion.control.common import tracking_errors
 from companion.control.dynamics import chi_rate_from_body_rate
 from companion.control.model_based import ModelBasedLaw
+from companion.control.scaled_gains import for_vehicle
 from companion.control.types import PlantState, Wrench
 from companion.model.frames import euler_zyx_from_quat, rotation_matrix, yaw_from_quat
 from companion.model.types import Chi, Reference, Vec3
@@ -29,6 +30,7 @@ class CscController(ModelBasedLaw):
     """The CSC law for vehicle and arm."""
 
     settings: ClassVar = CscConfig
+    for_vehicle: ClassVar = staticmethod(for_vehicle)
 
     def __init__(self, config: CscConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         super().__init__(config, vehicle, hover_thrust, config.external_xyz, config.model_mass_scale)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from companion.config.controller import AdaptiveConfig
+from companion.config.controller import AdaptiveConfig, fitted
 from companion.control.compensation import FRICTION_RATE_RAD_S
 from companion.control.manipulator import Manipulator
 from companion.control.zero_order_hold import HoldTable
@@ -34,9 +34,12 @@ class LoadAdaptation:
         self._manipulator = manipulator
         leakage = config.load_leakage
         self._rate_xyz = config.load_rate_xyz
-        self._rate_moment, self._rate_friction = config.moment_rate, config.friction_rate
+        count = manipulator.joint_count
+        rates = fitted(config.moment_rate, count), fitted(config.friction_rate, count)
+        self._rates = list(zip(range(count), *rates, strict=True))
+        """Number of each joint, and the rates of its link's first moment and of its friction."""
         self._max_n, self._max_kg_m, self._max_nm = config.load_max_n, config.moment_max_kg_m, config.friction_max_nm
-        self.on = self._rate_moment + self._rate_friction + sum(self._rate_xyz) > 0.0
+        self.on = sum(map(sum, (self._rate_xyz, *rates))) > 0.0
 
         def held(dt_s: float) -> tuple[float, ...]:
             decay = math.exp(-leakage * dt_s)
@@ -45,12 +48,11 @@ class LoadAdaptation:
         self._held = HoldTable(held)
         self.force_n: Vec3 = (0.0, 0.0, 0.0)
         """Estimated additional force that the rotors must produce, world frame."""
-        self._joints = tuple(range(manipulator.joint_count))
-        nothing: Joints = (0.0,) * manipulator.joint_count
+        nothing: Joints = (0.0,) * count
         self.moments_kg_m: Joints = nothing
         """Estimated first moments of the links about their joints, in addition to the nominal ones."""
         self.friction_nm: Joints = nothing
-        self._levers: Matrix = (nothing,) * manipulator.joint_count
+        self._levers: Matrix = (nothing,) * count
         self.wanted_rate_rad_s: Sequence[float] = nothing
         """Joint rates that the target impedance requests in this tick; set before `advance`."""
         self.direction: Sequence[float] = nothing
@@ -88,21 +90,16 @@ class LoadAdaptation:
         rates, directions, s_joints = self.wanted_rate_rad_s, self.direction, s[6:]
         by_moments = self._manipulator.projected_on_moments(self._levers, s_joints)
         moments, frictions = [], []
-        rate_moment, most, rate_friction, most_nm = (
-            step * self._rate_moment,
-            self._max_kg_m,
-            step * self._rate_friction,
-            self._max_nm,
-        )
+        most, most_nm = self._max_kg_m, self._max_nm
         old_moments, old_frictions = self.moments_kg_m, self.friction_nm
-        for joint in self._joints:
+        for joint, rate_moment, rate_friction in self._rates:
             moment, friction = old_moments[joint], old_frictions[joint]
             error, direction = s_joints[joint], directions[joint]
-            new = decay * moment - rate_moment * by_moments[joint]
+            new = decay * moment - step * rate_moment * by_moments[joint]
             moments.append(new if -most <= new <= most else _projected(new, moment, -most, most))
             # The wanted rate + s is the measured rate.
             if (rates[joint] + error) * direction > FRICTION_RATE_RAD_S * abs(direction):
-                new = decay * friction - rate_friction * (error * direction)
+                new = decay * friction - step * rate_friction * (error * direction)
                 friction = new if 0.0 <= new <= most_nm else _projected(new, friction, 0.0, most_nm)
             frictions.append(friction)
         self.moments_kg_m, self.friction_nm = tuple(moments), tuple(frictions)

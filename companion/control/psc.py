@@ -19,6 +19,7 @@ from companion.config.vehicle import Vehicle
 from companion.control.common import tracking_errors
 from companion.control.model_based import ModelBasedLaw
 from companion.control.payload_mass import PayloadEstimator
+from companion.control.scaled_gains import for_vehicle
 from companion.control.thrust import collective_n
 from companion.control.types import PlantState, Wrench
 from companion.model.constants import GRAVITY_M_S2
@@ -30,6 +31,7 @@ class PscController(ModelBasedLaw):
     """The PSC law: the arm's impedance and the vehicle's PID."""
 
     settings: ClassVar = PscConfig
+    for_vehicle: ClassVar = staticmethod(for_vehicle)
 
     def __init__(self, config: PscConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         super().__init__(config, vehicle, hover_thrust)

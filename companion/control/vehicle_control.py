@@ -6,7 +6,7 @@ import math
 
 from companion.config.controller import law_class
 from companion.config.loader import FlightConfig
-from companion.control.arm_hold import hold_torque_nm, towards
+from companion.control.arm_hold import ArmHold, towards
 from companion.control.arm_model import manipulator_of
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.hover_thrust import HoverThrust, off_the_ground
@@ -51,8 +51,8 @@ class VehicleControl:
         self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
         self._thrust_sent = 0.0
         self._force_timeout_s = vehicle.safety.force_timeout_s
-        self._manipulator = manipulator_of(vehicle)
-        self._sensing = ForceSensing(vehicle.tool, self._manipulator)
+        self._arm_hold = ArmHold(vehicle)
+        self._sensing = ForceSensing(vehicle.tool, manipulator_of(vehicle))
         self._acceleration = MeanAcceleration()
         self._catch = CatchDetector()
         self._state: PlantState | None = None
@@ -116,9 +116,7 @@ class VehicleControl:
         if i.arm is None or i.vehicle is None:
             return None
         target, still = self._arm_target_rad or i.arm.angle_rad, (0.0,) * len(i.arm.angle_rad)
-        return hold_torque_nm(
-            self._manipulator, i.arm.angle_rad, i.arm.velocity_rad_s, target, still, i.vehicle.attitude_wxyz
-        )
+        return self._arm_hold.torque_nm(i.arm.angle_rad, i.arm.velocity_rad_s, target, still, i.vehicle.attitude_wxyz)
 
     def fly(self, i: Inputs, dt_s: float, reference: Reference, vertical_scale: float) -> Command:
         """Run one tick of the control law. `vertical_scale` is as in `Controller.step`."""

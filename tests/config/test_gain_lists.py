@@ -33,6 +33,13 @@ REFUSED = [
     ("adaptive", "phi=[1, 1, 1, 1, 1, 1]", "phi: expected a list of 7 to 13 numbers > 0, got [1, 1, 1, 1, 1, 1]"),
     ("adaptive", "phi=[1, 1, 1, 1, 1, 1, 1]", "phi: expected 8 values, as many as inertia_md has, got 7"),
     ("csc", "damping_kd=[1, 1, 1, 1, 1, 1, 1]", "damping_kd: expected 8 values, as many as inertia_md has, got 7"),
+    (
+        "adaptive",
+        "inertia_md=[1, 1, 1, 1, 1, 1, 1]",
+        "inertia_md: expected 8 values, as many as lambda_gain has, got 7",
+    ),
+    ("adaptive", "moment_rate=[]", "moment_rate: expected a list of 1 to 7 numbers >= 0, got []"),
+    ("adaptive", "found_for.mass_kg=0", "found_for.mass_kg: expected a number > 0, got 0"),
     ("psc", "arm_stiffness_kp=[]", "arm_stiffness_kp: expected a list of 1 to 7 numbers > 0, got []"),
     ("psc", "arm_stiffness_kp=[1]", "arm_stiffness_kp: expected 2 values, as many as arm_inertia_md has, got 1"),
 ]

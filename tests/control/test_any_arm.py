@@ -17,6 +17,7 @@ from companion.config.loader import load_flight
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import dynamics_of, manipulator_of
 from companion.control.dynamics import chi_rate_from_body_rate
+from companion.control.scaled_gains import for_vehicle
 from companion.control.trial import at_rest, build_law, hover
 from companion.control.types import PlantState, Wrench
 from companion.model.constants import GRAVITY_M_S2
@@ -124,10 +125,11 @@ def held(dt_s: float, time_s: float | None) -> float:
 @pytest.mark.parametrize("joints", JOINTS)
 def test_adaptive(joints: int, arm_inertia: bool) -> None:
     vehicle = with_arm(joints)
-    c = config_of(AdaptiveConfig, "adaptive", "recommended", arm_inertia_nominal=arm_inertia)
+    c = for_vehicle(vehicle, config_of(AdaptiveConfig, "adaptive", "recommended", arm_inertia_nominal=arm_inertia))
+    assert len(set(c.robust_scale[6:])) == joints > 0
     law, dynamics, count = build_law(c, vehicle), dynamics_of(vehicle), 6 + joints
     m_d, phi, lam, weight = (rows_of(gains, count) for gains in (c.inertia_md, c.phi, c.lambda_gain, c.row_weights_s))
-    d = rows_of(c.damping_kd, count) - m_d * phi
+    d, robust = rows_of(c.damping_kd, count) - m_d * phi, rows_of(c.robust_scale, count) * weight**2
     gamma, desired_n, acceleration = np.zeros(count), np.zeros(3), np.zeros(3 + joints)
     moments, friction, rates_before = np.zeros(joints), np.zeros(joints), np.zeros(joints)
     h, zeta, learns = np.array(c.h_initial), c.zeta_initial, True
@@ -154,7 +156,7 @@ def test_adaptive(joints: int, arm_inertia: bool) -> None:
         rho = min(h @ regressor + zeta, c.rho_max)
         assert log.rho == pytest.approx(rho)
 
-        tau = -(lam + rho * weight**2 / max(norm, c.boundary_layer)) * s - m_d * phi * v - d * gamma
+        tau = -(lam + rho * robust / max(norm, c.boundary_layer)) * s - m_d * phi * v - d * gamma
         wanted_rate = rates - s[6:]
         direction = np.tanh(wanted_rate / 0.1)
         torque = tau[6:] + m_d[6:] * seen.feed - tau_d + seen.gravity_nm + seen.levers @ moments + friction * direction
@@ -170,9 +172,9 @@ def test_adaptive(joints: int, arm_inertia: bool) -> None:
         desired_n += held(DT_S, c.desired_force_time_s) * (seen.force_n - desired_n)
         assert c.load_leakage == 0.0
         if learns:
-            grown = moments - DT_S * c.moment_rate * seen.levers.T @ s[6:]
+            grown = moments - DT_S * np.asarray(c.moment_rate) * (seen.levers.T @ s[6:])
             moments = np.clip(grown, -c.moment_max_kg_m, c.moment_max_kg_m)
-            turning = (rates * direction > 0.1 * abs(direction)) * c.friction_rate
+            turning = (rates * direction > 0.1 * abs(direction)) * np.asarray(c.friction_rate)
             friction = np.clip(friction - DT_S * turning * s[6:] * direction, 0.0, c.friction_max_nm)
         np.testing.assert_allclose(log.moment_estimate_kg_m or (), moments, atol=1e-12)
         np.testing.assert_allclose(log.friction_estimate_nm or (), friction, atol=1e-12)

@@ -136,8 +136,8 @@ OPTIONS_OFF = {
     "arm_inertia_nominal": False,
     "arm_friction_share": 0.0,
     "load_rate_xyz": (0.0, 0.0, 0.0),
-    "moment_rate": 0.0,
-    "friction_rate": 0.0,
+    "moment_rate": (0.0,),
+    "friction_rate": (0.0,),
 }
 
 

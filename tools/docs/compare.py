@@ -175,8 +175,8 @@ def _estimated(c: LawConfig) -> str:
     found = ["disturbance force"] if _observer(c) else []
     if isinstance(c, AdaptiveConfig):
         found += ["H, zeta"]
-        loads = (("load", any(c.load_rate_xyz)), ("moments", c.moment_rate > 0), ("friction", c.friction_rate > 0))
-        found += [name for name, used in loads if used]
+        loads = (("load", c.load_rate_xyz), ("moments", c.moment_rate), ("friction", c.friction_rate))
+        found += [name for name, rates in loads if any(rates)]
     if isinstance(c, PscConfig):
         found += ["payload mass"] if c.payload_max_kg > 0 else []
         found += ["integral of the position error"] if any(c.position_ki_xyz) else []

@@ -12,7 +12,7 @@ from typing import Final
 
 from companion.config.arm import Arm
 from companion.config.vehicle import Vehicle
-from companion.control.arm_hold import hold_torque_nm
+from companion.control.arm_hold import ArmHold
 from companion.control.arm_model import manipulator_of
 from companion.model.servos import WATCHDOG_ERROR, hardware_error_text
 from companion.model.types import IDENTITY_QUAT, ArmState, Joints
@@ -76,6 +76,7 @@ class Motion:
         self._vehicle = vehicle
         self._arm = vehicle.arm
         self._manipulator = manipulator_of(vehicle)
+        self._hold = ArmHold(vehicle)
         self._limit_nm = tuple(TORQUE_SHARE * joint.torque_max_nm for joint in vehicle.arm.joints)
         self._reference = list(state.angle_rad)
         self._count = len(vehicle.arm.joints)
@@ -137,7 +138,7 @@ class Motion:
         reference = self.reference_rad
         rate = tuple(self._rate)
         gravity = self._manipulator.gravity_torque_nm(state.angle_rad, IDENTITY_QUAT)
-        held = hold_torque_nm(self._manipulator, state.angle_rad, state.velocity_rad_s, reference, rate, IDENTITY_QUAT)
+        held = self._hold.torque_nm(state.angle_rad, state.velocity_rad_s, reference, rate, IDENTITY_QUAT)
         torque = [
             self._torque_nm(joint, held[joint], reference[joint] - state.angle_rad[joint], dt_s)
             for joint in range(self._count)
@@ -185,7 +186,7 @@ class Motion:
 
     def _torque_nm(self, joint: int, held_nm: float, error_rad: float, dt_s: float) -> float:
         most = self._limit_nm[joint]
-        grown = self._integral[joint] + _INTEGRAL_NM_RAD_S * error_rad * dt_s
+        grown = self._integral[joint] + self._hold.ratios[joint] * _INTEGRAL_NM_RAD_S * error_rad * dt_s
         self._integral[joint] = max(-_INTEGRAL_MAX_NM, min(_INTEGRAL_MAX_NM, grown))
         return max(-most, min(most, held_nm + self._integral[joint]))
 

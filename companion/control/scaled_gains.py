@@ -1,0 +1,83 @@
+"""Gains that follow the vehicle: those of a preset were found for one machine and are multiplied by ratios of inertia on another.
+
+With r, the inertia of a row on this vehicle divided by that on that machine, the law of the row becomes tau = r tau_found(e_tau / r).
+Bandwidths, damping ratios, `gain_new` and `gain_cond` are those of that machine, and so is the proof, with E / r as the disturbance.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import TypeVar
+
+from companion.config.arm_chain import chain_of
+from companion.config.controller import ControllerConfig, LawConfig, fitted
+from companion.config.vehicle import Vehicle
+from companion.control.arm_model.chain_dynamics import ChainDynamics
+from companion.model.arm_chain import ArmChain
+from companion.model.types import Joints
+
+C = TypeVar("C", bound=LawConfig)
+
+
+_POSES = 256
+_PRIMES = (2, 3, 5, 7, 11, 13, 17)
+"""Their roots spread the poses, one for each joint."""
+
+
+def joint_inertia_kg_m2(vehicle: Vehicle) -> Joints:
+    """Return the inertia of each joint as in `Machine`, to four digits, so that a preset can state it exactly."""
+    return _smallest_inertia_kg_m2(chain_of(vehicle), tuple([joint.angle_deg for joint in vehicle.arm.joints]))
+
+
+@functools.lru_cache(maxsize=8)
+def _smallest_inertia_kg_m2(chain: ArmChain, limits_deg: tuple[tuple[float, float], ...]) -> Joints:
+    """Return the smallest inertia of each joint in 256 poses, the same in every flight, which are denser towards the joint limits.
+
+    A joint's loop is the fastest where its inertia is the smallest: a yaw joint above a hanging arm turns little more than its own
+    rotor.
+    """
+    dynamics, still = ChainDynamics(chain, 1.0, (1.0, 1.0, 1.0), 1.0), (0.0,) * len(limits_deg)
+    smallest = [math.inf for _ in limits_deg]
+    for pose in range(_POSES):
+        shares = [0.5 - 0.5 * math.cos(math.pi * (pose * math.sqrt(prime) % 1.0)) for prime in _PRIMES]
+        spans = zip(limits_deg, shares, strict=False)
+        angles = tuple([math.radians(low + share * (high - low)) for (low, high), share in spans])
+        mass = dynamics.arm_terms(angles, still).mass
+        smallest = [min(before, mass[joint][joint]) for joint, before in enumerate(smallest)]
+    return tuple([float(f"{inertia:.4g}") for inertia in smallest])
+
+
+def joint_ratios(vehicle: Vehicle, found_for_kg_m2: Joints) -> Joints:
+    """Return the inertia of each joint divided by that of the machine for which gains were found; its last value is repeated."""
+    own = joint_inertia_kg_m2(vehicle)
+    return tuple([inertia / other for inertia, other in zip(own, fitted(found_for_kg_m2, len(own)), strict=True)])
+
+
+def for_vehicle(vehicle: Vehicle, config: C) -> C:
+    """Return the gains for the vehicle, with lists of its length; unchanged if `found_for` is absent."""
+    found = config.found_for
+    if found is None:
+        return config
+    mass = vehicle.airframe.mass_kg / found.mass_kg
+    scale = (mass, mass, mass, 1.0, 1.0, 1.0, *(joint_ratios(vehicle, found.joint_inertia_kg_m2) or (1.0,)))
+    already = fitted(config.scale or (1.0,), len(scale))
+    rows = [ratio / before for ratio, before in zip(scale, already, strict=True)]
+    changes: dict[str, object] = {key: fitted(getattr(config, key), len(rows)) for key in config.gain_lists}
+    for keys, ratios in ((config.scaled_by_row, rows), (config.scaled_by_joint, rows[6:])):
+        for key in keys:
+            gains = fitted(getattr(config, key), len(ratios))
+            changes[key] = tuple([gain * ratio for gain, ratio in zip(gains, ratios, strict=True)])
+    for key in config.scaled_by_mass:
+        value = getattr(config, key)
+        changes[key] = tuple([rows[0] * part for part in value]) if isinstance(value, tuple) else rows[0] * value
+    return config.model_copy(update={**changes, "scale": scale})
+
+
+def scale_text(config: ControllerConfig) -> str:
+    """Return by how much the gains that `for_vehicle` returned differ from those of the file; empty if they do not."""
+    scale = config.scale if isinstance(config, LawConfig) else None
+    if scale is None or set(scale) == {1.0}:
+        return ""
+    on_joints = ", ".join(f"{ratio:.2f}" for ratio in scale[6:])
+    return f"gains of {config.law}/{config.preset}: times {scale[0]:.2f} on x, y and z and {on_joints} on the joints (docs/arms.md)"
