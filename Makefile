@@ -6,6 +6,8 @@ STAMP := $(VENV)/.installed
 MINUTES ?= 10
 # Without bytecode each of some hundred processes would compile the project anew.
 unexport PYTHONDONTWRITEBYTECODE
+# All targets run the source, also after make compile.
+export PYTHONPATH := $(CURDIR)
 
 .PHONY: install lock audit fly compile test lint explore debian bench docs clean
 
@@ -36,7 +38,7 @@ audit:
 fly: install
 	@$(BIN)/companion fly configs/missions/catch.yaml --sitl
 
-# A compiled copy in build/compiled, which computes the same faster; without make compile nothing uses it.
+# Builds a wheel with compiled modules in build/compiled and installs it: .venv/bin/companion computes the same faster.
 compile: install
 	@$(BIN)/python -m tools.compiled
 

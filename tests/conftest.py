@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 import functools
+import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -36,6 +38,9 @@ settings.register_profile(
     suppress_health_check=_LOADED_COMPUTER,
 )
 settings.load_profile("test")
+
+# The tests' children run the source, also where `make compile` has installed the compiled build.
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH"))))
 
 # A process that a shell without job control starts in the background ignores SIGINT, and so do its children. The tests' children
 # are started as a terminal would start them.

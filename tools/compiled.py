@@ -1,8 +1,7 @@
-"""The compiled build: a copy of `companion` and `sitl` in build/compiled, in which mypyc has compiled the computational modules.
+"""The compiled build: a wheel of `companion` and `sitl` in which mypyc has compiled the computational modules.
 
-`python -m tools.compiled` makes it. The compiled build gives bit-identical results to the source. It runs in place of the source when
-it is first on the module path: `PYTHONSAFEPATH=1 PYTHONPATH=$PWD/build/compiled .venv/bin/companion ...`. The source tree is not
-changed.
+`python -m tools.compiled` builds the wheel in build/compiled and installs it in place of the program that is installed in this Python
+environment. The compiled build gives bit-identical results to the source, which is not changed.
 """
 
 from __future__ import annotations
@@ -10,14 +9,19 @@ from __future__ import annotations
 import filecmp
 import os
 import shutil
+import subprocess
 import sys
 import sysconfig
+import warnings
 from pathlib import Path
 
 from companion.recorder.versions import REVISION_FILE, versions
 
 ROOT = Path(__file__).parent.parent
-BUILD = ROOT / "build" / "compiled"
+WHEELS = ROOT / "build" / "compiled"
+"""Folder of the wheel."""
+BUILD = WHEELS / "files"
+"""The content of the wheel: first on the module path, it runs without being installed."""
 WORK = ROOT / "build" / "mypyc"
 """Folder for the generated C code, the object files and mypy's cache."""
 PACKAGES = ("companion", "sitl")
@@ -55,8 +59,10 @@ INTERPRETED = frozenset(
     }
 )
 """Files that match `COMPILED` but stay plain Python."""
-FLAGS = "-O2 -ffp-contract=off"
-"""Compiler flags without fused multiply-add, which would change the last bits on processors that have it (aarch64)."""
+FLAGS = "-O2 -ffp-contract=off -fvisibility=hidden"
+"""Compiler flags: without fused multiply-add, which would change the last bits on processors that have it (aarch64), and with direct
+calls between the modules, which lie in one library.
+"""
 
 
 def sources() -> list[Path]:
@@ -73,23 +79,29 @@ def modules() -> list[str]:
 
 def is_current() -> bool:
     """Return whether the compiled build exists and was made from the present source."""
-    return next(BUILD.glob("*.so"), None) is not None and all(
+    return next(WHEELS.glob("*.whl"), None) is not None and all(
         (BUILD / path).exists() and filecmp.cmp(ROOT / path, BUILD / path, shallow=False) for path in sources()
     )
 
 
-def build() -> None:
-    """Copy the packages and compile the modules of the copy."""
+def build() -> Path:
+    """Compile the modules and return the path of the wheel."""
     from mypyc.build import mypycify
     from setuptools import setup
+    from setuptools.command.build_py import build_py
 
-    shutil.rmtree(BUILD, ignore_errors=True)
-    for package in PACKAGES:
-        shutil.copytree(ROOT / package, BUILD / package, ignore=shutil.ignore_patterns("__pycache__"))
-    (BUILD / REVISION_FILE).write_text(versions().get("git", ""), encoding="utf-8")
-    WORK.mkdir(exist_ok=True)
+    class WithRevision(build_py):  # type: ignore[misc]
+        """Copies the packages, with the commit from which they are built."""
+
+        def run(self) -> None:
+            super().run()
+            (BUILD / "companion" / REVISION_FILE).write_text(revision, encoding="utf-8")
+
+    revision = versions().get("git", "")
+    shutil.rmtree(WHEELS, ignore_errors=True)
+    WORK.mkdir(parents=True, exist_ok=True)
     os.environ["CFLAGS"] = FLAGS
-    os.chdir(BUILD)
+    os.chdir(ROOT)
     extensions = mypycify(
         [f"--config-file={ROOT / 'pyproject.toml'}", f"--cache-dir={WORK / 'cache'}", *modules()],
         debug_level="0",
@@ -97,21 +109,27 @@ def build() -> None:
         multi_file=True,
         target_dir=str(WORK / "c"),
     )
-    folders = [f"--build-lib={WORK / 'lib'}", f"--build-temp={WORK / 'objects'}"]
-    setup(name="compiled", packages=[], ext_modules=extensions, script_args=["-q", "build_ext", "--inplace", *folders])
-    shutil.copy(
-        ROOT / "pyproject.toml", BUILD
-    )  # it announces the control laws; not earlier, because setup() would read it
+    warnings.filterwarnings("ignore", module="setuptools")  # it recommends other ways to call it
+    setup(
+        ext_modules=extensions,
+        cmdclass={"build_py": WithRevision},
+        options={"build": {"build_base": str(WORK), "build_lib": str(BUILD)}, "egg_info": {"egg_base": str(WORK)}},
+        script_args=["-q", "bdist_wheel", f"--dist-dir={WHEELS}"],
+    )
+    return next(WHEELS.glob("*.whl"))
 
 
 def main() -> int:
-    """Make the compiled build, print how to use it, and return the exit code."""
+    """Build and install the wheel unless a current one exists, print how to undo it, and return the exit code."""
     compiler = str(sysconfig.get_config_var("CC")).split()[0]
     if shutil.which(compiler) is None:
         print(f"no C compiler ({compiler}): on Debian, apt install gcc python3-dev", file=sys.stderr)
         return 1
-    build()
-    print(f"compiled: PYTHONSAFEPATH=1 PYTHONPATH={BUILD} .venv/bin/companion ...")
+    wheel = next(WHEELS.glob("*.whl")) if is_current() else build()
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
+    subprocess.run([*pip, "install", "--quiet", "--no-deps", "--no-index", "--force-reinstall", str(wheel)], check=True)
+    print(f"installed: {wheel}")
+    print("back to plain Python: .venv/bin/pip install --no-deps --no-build-isolation --editable .")
     return 0
 
 

@@ -48,7 +48,7 @@ class CampaignProcess:
         environment = {**os.environ, **dict.fromkeys(_THREADS, "1")}
         with open(log, "wb") as file:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "sitl.campaigns"],
+                [sys.executable, "-P", "-m", "sitl.campaigns"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=file,

@@ -322,7 +322,7 @@ def _sitl(arguments: argparse.Namespace) -> int:
     # The world replaces this process, so that signals reach it directly and it cannot outlive a parent.
     file = os.memfd_create("sitl-config", 0)
     os.write(file, config.model_dump_json().encode())
-    command = [sys.executable, "-m", "sitl", "--config", f"/proc/self/fd/{file}"]
+    command = [sys.executable, "-P", "-m", "sitl", "--config", f"/proc/self/fd/{file}"]
     if arguments.px4:
         stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
         command += ["--px4", str((Path("flights") / f"{stamp}-sitl" / "px4").resolve())]

@@ -41,7 +41,7 @@ class GuardianProcess:
             with theirs, heartbeats, open(self.log, "wb") as log:
                 self.process = subprocess.Popen(
                     [
-                        *(sys.executable, "-m", "companion.guardian", "--config", str(config_path)),
+                        *(sys.executable, "-P", "-m", "companion.guardian", "--config", str(config_path)),
                         *(
                             "--heartbeats",
                             str(heartbeats.fileno()),

@@ -187,7 +187,7 @@ class Launcher:
             with theirs, heartbeats_out, open(log_path, "wb") as log:
                 process = subprocess.Popen(
                     [
-                        *(sys.executable, "-m", "companion.flight.main"),
+                        *(sys.executable, "-P", "-m", "companion.flight.main"),
                         *("--config", str(config_path), "--out", str(self._out)),
                         *("--channel", str(theirs.fileno()), "--guardian", str(heartbeats_out.fileno())),
                         *(("--sitl",) if sitl is not None else ()),

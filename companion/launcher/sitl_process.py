@@ -44,7 +44,7 @@ class SitlProcess:
         with open(self.log, "wb") as log:
             self.process = subprocess.Popen(
                 [
-                    *(sys.executable, "-m", "sitl", "--config", str(path), "--for-launcher"),
+                    *(sys.executable, "-P", "-m", "sitl", "--config", str(path), "--for-launcher"),
                     *(("--px4", str((out / PX4_FOLDER).resolve())) if px4 else ()),
                 ],
                 stdin=subprocess.PIPE,

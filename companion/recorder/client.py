@@ -231,7 +231,7 @@ class RecorderProcess:
             os.lseek(config_fd, 0, os.SEEK_SET)
             process = subprocess.Popen(
                 [
-                    *(sys.executable, "-m", "companion.recorder.main"),
+                    *(sys.executable, "-P", "-m", "companion.recorder.main"),
                     *("--fd", str(theirs.fileno()), "--out", str(path), "--config", str(config_fd)),
                     *("--epoch-offset-ns", str(epoch_offset_ns), "--metadata", json.dumps(dict(metadata or {}))),
                     *(("--simulated",) if simulated else ()),

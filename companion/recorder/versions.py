@@ -23,7 +23,7 @@ _PACKAGES = (
     "mujoco",
 )
 REVISION_FILE = "revision"
-"""File beside the packages of a compiled build that names the commit from which it was built."""
+"""File in the package of a compiled build that names the commit from which it was built."""
 
 
 def versions() -> dict[str, str]:
@@ -40,9 +40,10 @@ def _git_revision() -> str | None:
     """Return the commit of this module's working copy, with `-dirty` if it was changed, or the commit that the compiled build was
     built from; None if neither is known.
     """
-    root = Path(__file__).resolve().parents[2]
-    if (root / REVISION_FILE).exists():
-        return (root / REVISION_FILE).read_text(encoding="utf-8") or None
+    package = Path(__file__).resolve().parents[1]
+    root = package.parent
+    if (package / REVISION_FILE).exists():
+        return (package / REVISION_FILE).read_text(encoding="utf-8") or None
     if not (root / ".git").exists():
         return None
     try:

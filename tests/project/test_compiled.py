@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -17,35 +18,54 @@ import hashlib, sys
 from companion.runtime.compiled import COMPILED
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
-mission, law, preset, world = sys.argv[1:]
-config = load_sitl(mission, controller_law=law, preset=preset, world=world, overrides=["world.payload_kg=0.2"])
+mission, law, preset, world, vehicle, *overrides = sys.argv[1:]
+config = load_sitl(mission, vehicle or None, law, preset, overrides, world=world)
 result = FastFlight(config).run()
-flown = repr((result.inputs, result.outputs, result.snapshots))
+flown = repr((result.inputs, result.outputs, result.snapshots, result.after))
 print(COMPILED, len(result.outputs), result.outputs[-1].outcome.value, hashlib.sha256(flown.encode()).hexdigest())
 """
-FLIGHTS = [("adaptive", "recommended", "lab"), ("psc", "tuned", "ideal"), ("csc", "tuned", "robustness")]
+FLIGHTS = [
+    ("catch", "adaptive", "recommended", "lab", ""),
+    ("catch", "psc", "tuned", "ideal", ""),
+    ("catch", "csc", "tuned", "robustness", "", "world.seed=7", "world.payload_kg=0.3"),
+    ("hover", "adaptive", "paper", "lab", ""),
+    ("circuit", "adaptive", "recommended", "lab", ""),
+    ("hover", "adaptive", "recommended", "lab", "tarot650_4r"),
+    ("hover", "adaptive", "recommended", "lab", "hexa_2r"),
+]
+ROBUSTNESS = ("robustness", str(CATCH), "--draws", "4", "--seed", "5", "--jobs", "1", "--json")
 
 
-def flown_by(path: Path, *flight: str) -> list[str]:
-    """Fly in a process of its own whose modules come from this folder. Return the words that it prints."""
+def run_by(path: Path, *arguments: str, cwd: Path = ROOT) -> str:
+    """Run Python with modules from this folder. Return what it prints."""
     done = subprocess.run(
-        [sys.executable, "-P", "-c", FLIGHT, str(CATCH), *flight],
+        [sys.executable, "-P", *arguments],
+        cwd=cwd,
         env={**os.environ, "PYTHONPATH": str(path)},
         stdout=subprocess.PIPE,
         text=True,
         check=True,
     )
-    return done.stdout.split()
+    return done.stdout
 
 
 @pytest.mark.skipif(not is_current(), reason="no compiled build of this source: make compile")
 @pytest.mark.parametrize("flight", FLIGHTS, ids=" ".join)
 def test_a_compiled_flight_is_bit_for_bit_the_interpreted_one(flight: tuple[str, ...]) -> None:
-    compiled, interpreted = flown_by(BUILD, *flight), flown_by(ROOT, *flight)
+    compiled, interpreted = (run_by(path, "-c", FLIGHT, *flight).split() for path in (BUILD, ROOT))
     assert compiled[0] == "True"
     assert interpreted[0] == "False"
     assert compiled[1:] == interpreted[1:]
     assert interpreted[2] == "completed"
+
+
+@pytest.mark.skipif(not is_current(), reason="no compiled build of this source: make compile")
+def test_a_compiled_robustness_campaign_gives_the_rows_of_the_interpreted_one(tmp_path: Path) -> None:
+    compiled, interpreted = (
+        json.loads(run_by(path, "-m", "companion", *ROBUSTNESS, cwd=tmp_path))["rows"] for path in (BUILD, ROOT)
+    )
+    assert len(compiled) == 4
+    assert compiled == interpreted
 
 
 def test_the_list_of_modules_names_only_files_that_exist() -> None:

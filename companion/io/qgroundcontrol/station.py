@@ -207,7 +207,7 @@ class GroundStation:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         ours.setblocking(False)
         arguments = [
-            *(sys.executable, "-m", "companion.io.qgroundcontrol.relay", "--fd", str(theirs.fileno())),
+            *(sys.executable, "-P", "-m", "companion.io.qgroundcontrol.relay", "--fd", str(theirs.fileno())),
             *("--host", ip, "--port", str(port), "--system", str(identity.autopilot_system)),
             *("--own", str(identity.own_system), str(identity.own_component)),
             *("--name", self.address.removeprefix("udpout://")),
