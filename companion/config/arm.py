@@ -38,8 +38,8 @@ def _with_current_control(name: object) -> object:
 
 
 def _speed_of_servo_deg_s(joint: dict[str, Any]) -> float:
-    valid = "servo" in joint  # an invalid name is reported elsewhere
-    return min(SPEED_USUAL_DEG_S, SERVOS[joint["servo"]].speed_max_deg_s) if valid else SPEED_USUAL_DEG_S
+    servo = joint.get("servo")  # absent if its name is invalid, None for another motor: both are reported elsewhere
+    return SPEED_USUAL_DEG_S if servo is None else min(SPEED_USUAL_DEG_S, SERVOS[servo].speed_max_deg_s)
 
 
 class Joint(Model):

@@ -56,6 +56,12 @@ def test_without_a_speed_limit_the_speed_of_a_slow_servo_is_planned() -> None:
         assert joint.velocity_max_deg_s == pytest.approx(speed_deg_s)
 
 
+def test_another_motor_without_a_speed_limit_is_refused_in_one_line() -> None:
+    joint = "{servo: null, servo_id: 1, sign: 1, zero_count: 0, angle_deg: [60, 175], torque_max_nm: 2}"
+    with pytest.raises(ConfigError, match=r"velocity_max_deg_s: missing; required if servo is null"):
+        load_vehicle(SHIPPED, [f"vehicle.arm.joints[0]={joint}"])
+
+
 def test_the_gate_limits_the_current_of_each_servo_to_its_stall_current() -> None:
     strong, weak = "vehicle.arm.joints[0].torque_max_nm=10", "vehicle.arm.joints[1].torque_per_amp_nm_a=0.5"
     vehicle = load_vehicle(SHIPPED, [*XM540, NO_CONSTANT, strong, weak])
