@@ -113,7 +113,7 @@ def _calm(log: FlightLog) -> Array:
         before_s = i.t_s
         carrying = carrying or any(event.id == "catch" for event in o.events)
         if sent is not None and i.vehicle is not None and o.control is not None:
-            force = o.control.force_ext_world_n
+            force = o.control.force_measured_world_n or o.control.force_ext_world_n
             now = balance.step(dt_s, sent, acceleration_world_m_s2(i.vehicle), force, i.vehicle.attitude_wxyz)
             blind = i.force is None or i.t_s - i.force.stamp_s > force_timeout_s
             if now is not None and o.phase_kind is PhaseKind.FLIGHT and not (carrying and blind):

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from companion.analysis.arm_skeleton import pose
 from companion.analysis.log import Array, FlightLog
-from companion.control.sensing import CatchDetector
+from companion.control.sensing import CatchDetector, ObservedCatchDetector
 from companion.model.arm_skeleton import logged_skeleton
 from companion.model.frames import quat_rotate
 from companion.model.types import PhaseKind
@@ -65,10 +65,13 @@ def unconfirmed_catch_index(log: FlightLog) -> int | None:
     """
     if _confirmed_catch_index(log) is not None:
         return None
-    detector = CatchDetector()
+    measured, observed = CatchDetector(), ObservedCatchDetector()
+    detector: CatchDetector = measured
     for outputs in log.outputs:
-        if outputs.phase_kind is PhaseKind.FLIGHT and outputs.control is not None:
-            detector.update(outputs.t_s, outputs.control.force_ext_world_n)
+        if outputs.phase_kind is PhaseKind.FLIGHT and (control := outputs.control) is not None:
+            force = control.force_observed_world_n
+            detector = measured if force is None else observed
+            detector.update(outputs.t_s, control.force_ext_world_n if force is None else force)
     felt_s = detector.unconfirmed_s
     return None if felt_s is None else int(np.searchsorted(log.columns.t_s, felt_s))
 
@@ -139,6 +142,16 @@ def final_e_z_m(log: FlightLog) -> float | None:
     e_z = position_error_m(log)[window, 2]
     e_z = e_z[np.isfinite(e_z)]
     return float(np.mean(e_z)) if len(e_z) else None
+
+
+def force_observer_error_n(log: FlightLog) -> tuple[float, float] | None:
+    """Return RMS and peak of the norm of observed minus measured force over FLIGHT, N; None if not both were logged."""
+    observed = log.column(lambda i, o, s: o.control.force_observed_world_n if o.control else None, 3)
+    measured = log.column(lambda i, o, s: o.control.force_measured_world_n if o.control else None, 3)
+    pre, post = flight_masks(log)
+    error = np.linalg.norm((observed - measured)[pre | post], axis=1)
+    error = error[np.isfinite(error)]
+    return (float(np.sqrt(np.mean(error * error))), float(error.max())) if len(error) else None
 
 
 def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:

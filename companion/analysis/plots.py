@@ -181,12 +181,17 @@ def _load(log: FlightLog) -> Figure | None:
 
 def _force(log: FlightLog) -> Figure | None:
     force = log.column(lambda i, o, s: o.control.force_ext_world_n if o.control else None, 3)
+    observed = log.column(lambda i, o, s: o.control.force_observed_world_n if o.control else None, 3)
     devices = (log.config.get("vehicle") or {}).get("devices") or {}
-    if devices.get("force", {}) is None or not np.isfinite(force).any():
+    blind = devices.get("force", {}) is None and not np.isfinite(observed).any()
+    if blind or not np.isfinite(force).any():
         return None
     figure, axes, t = _stack(log, "Contact force, world frame", (1.0,), height_in=3.2)
     for j, name in enumerate("xyz"):
         _line(axes[0], t, force[:, j], f"$F_{name}$", SERIES[j])
+    measured = log.column(lambda i, o, s: o.control.force_measured_world_n if o.control else None, 3)
+    if np.isfinite(measured).any():
+        _line(axes[0], t, measured[:, 2], "$F_z$ of the sensor", REFERENCE, reference=True)
     payload_kg = log.column(lambda i, o, s: o.control.payload_estimate_kg if o.control else None)
     if np.isfinite(payload_kg).any():
         weight_n = GRAVITY_M_S2 * payload_kg

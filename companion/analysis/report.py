@@ -90,6 +90,9 @@ def _results(summary: dict[str, Any], stride: int) -> list[Table]:
     ]
     if summary.get("catch_confirmed") is False:
         flight.insert(1, ("catch confirmed", "no, the flight ended too soon after the impact"))
+    if (observed := summary.get("force_observer_error_n")) is not None:
+        text = f"RMS {observed['rms']:.2f} N, largest {observed['max']:.1f} N"
+        flight.append(("momentum observer minus sensor", text))
     if stride > 1:
         flight.append(("ticks evaluated and drawn", f"one in {stride} (long flight)"))
     timing = [

@@ -85,6 +85,8 @@ def summarise(
     caught = metrics.catch_index(log)
     pre, post = metrics.flight_masks(log)
     position_n, arm_nm = metrics.impedance_error(log)
+    if (observed := metrics.force_observer_error_n(log)) is not None:
+        summary["force_observer_error_n"] = {"rms": observed[0], "max": observed[1]}
     summary.update(
         catch_t_s=None if caught is None else log.outputs[caught].mission_t_s,
         catch_confirmed=None if caught is None else metrics.unconfirmed_catch_index(log) is None,

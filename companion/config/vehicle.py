@@ -20,6 +20,8 @@ from companion.config.tether import Room, Tether
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Joints
 
+OBSERVER = "observer"
+"""Value of `force_source`."""
 _CELL_MIN_V = (2.8, 4.1)
 """Range of the lowest permitted voltage of a lithium-polymer cell."""
 
@@ -40,6 +42,10 @@ class Vehicle(Model):
     (docs/parts.md)."""
     room: Room
     devices: Devices
+    force_source: Literal["sensor", "observer"] = "sensor"
+    """Source of the force that the control law uses and from which a catch is detected: `devices.force` (no force if that is null), or
+    a momentum observer, which estimates the force from thrust and motion (docs/parts.md). With the observer, a force sensor is only
+    logged, to show the observer's error."""
     computer: Computer = Computer()
     safety: Safety = Safety()
     ground: Ground = Ground()

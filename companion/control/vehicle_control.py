@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 
+import msgspec
+
 from companion.config.controller import law_class
 from companion.config.loader import FlightConfig
+from companion.config.vehicle import OBSERVER
 from companion.control.arm_hold import ArmHold, towards
 from companion.control.arm_model import manipulator_of
 from companion.control.disturbance import DisturbanceObserver
+from companion.control.force_observer import ForceObserver
 from companion.control.hover_thrust import HoverThrust, off_the_ground
-from companion.control.sensing import CatchDetector, ForceSensing, MeanAcceleration
+from companion.control.sensing import CatchDetector, ForceSensing, MeanAcceleration, ObservedCatchDetector
 from companion.control.types import Controller, Law, PlantState
 from companion.model.codec import Record
 from companion.model.constants import GRAVITY_M_S2
@@ -54,7 +58,11 @@ class VehicleControl:
         self._arm_hold = ArmHold(vehicle)
         self._sensing = ForceSensing(vehicle.tool, manipulator_of(vehicle))
         self._acceleration = MeanAcceleration()
-        self._catch = CatchDetector()
+        self._observer = ForceObserver(vehicle) if vehicle.force_source == OBSERVER else None
+        self._catch = CatchDetector() if self._observer is None else ObservedCatchDetector()
+        self.tether_pulls = False
+        """Whether the tether pulls; set only with the momentum observer, which cannot tell that from a payload: no catch is then
+        confirmed."""
         self._state: PlantState | None = None
         """State in the last tick in which the law ran."""
         self._law: Law = law_class(config.controller.law)(config.controller, vehicle, hover_thrust)
@@ -68,6 +76,8 @@ class VehicleControl:
         )
         self.disturbance_world_n: Vec3 | None = None
         """Force on the vehicle other than rotor thrust and weight, payload included, world frame, N. None on the ground."""
+        self._known_n: Vec3 = (0.0, 0.0, 0.0)
+        """Rotor force commanded in the last tick and weight, world frame."""
 
     @property
     def thrust_share(self) -> float:
@@ -137,13 +147,16 @@ class VehicleControl:
             angular_rate_body_rad_s=vehicle.angular_rate_body_rad_s,
             arm_rad=arm_rad,
             arm_rate_rad_s=arm.velocity_rad_s if arm is not None else reference.arm_rate_rad_s,
-            force_ext_world_n=force,
+            force_ext_world_n=force if self._observer is None else None,
             airborne=airborne,
         )
-        self._state = state
+        carries = self._catch.carries(i.t_s)
         if self._hover_adapts:
-            self._hover.step(dt_s, self._thrust_sent, state, airborne, self._catch.caught_s is not None)
+            self._hover.step(dt_s, self._thrust_sent, state, airborne, carries)
         self._watch_disturbance(dt_s, state, vertical_scale)
+        if self._observer is not None:
+            state = self._observe(self._observer, dt_s, i, state, carries)
+        self._state = state
         self._law.hover_thrust = hover = self._hover.value
         wrench = self._controller.step(dt_s, state, reference, vertical_scale)
         error = wrench.log.error
@@ -154,10 +167,26 @@ class VehicleControl:
         ):  # NaN passes `thrust < 1.0` below and every limit on the error
             raise ValueError("the control law's thrust or tracking error is not finite")
         self._thrust_sent = thrust if thrust < 1.0 else 1.0
-        torque = wrench.arm_torque_nm if arm is not None else None
-        return Command(
-            attitude=AttitudeSetpoint(wrench.attitude_wxyz, self._thrust_sent), arm_torque_nm=torque, log=wrench.log
-        )
+        torque, log = wrench.arm_torque_nm if arm is not None else None, wrench.log
+        if self._observer is not None:
+            observed = self._observer.force_n
+            log = msgspec.structs.replace(log, force_observed_world_n=observed, force_measured_world_n=force)
+        return Command(AttitudeSetpoint(wrench.attitude_wxyz, self._thrust_sent), torque, log)
+
+    def _observe(self, observer: ForceObserver, dt_s: float, i: Inputs, state: PlantState, carries: bool) -> PlantState:
+        """Run the momentum observer and return the state with its estimate while something may be in the net.
+
+        At other times the estimate is wind and model error, to which the arm must not yield: the law then flies without a force.
+        """
+        if not state.airborne:
+            observer.reset()
+            return state
+        assert i.vehicle is not None
+        stamps_s = (i.vehicle.attitude_stamp_s, i.arm.stamp_s) if i.arm is not None else None
+        observer.step(dt_s, self._known_n, state, stamps_s, carries)
+        if not carries or (self.tether_pulls and self._catch.caught_s is None):
+            return state
+        return msgspec.structs.replace(state, force_ext_world_n=observer.used_n())
 
     def _watch_disturbance(self, dt_s: float, state: PlantState, vertical_scale: float) -> None:
         """Update the disturbance estimate with the measured attitude, because a slow attitude response is not a disturbance."""
@@ -167,12 +196,17 @@ class VehicleControl:
             return
         weight_n = self._weight_n
         x, y, z = quat_rotate(state.attitude_wxyz, (0.0, 0.0, self._thrust_sent / self._hover.value * weight_n))
-        known: Vec3 = (x, y, z - weight_n)
-        self.disturbance_world_n = self._pull.step(dt_s, known, state.acceleration_world_m_s2, learn=True)
+        self._known_n = (x, y, z - weight_n)
+        self.disturbance_world_n = self._pull.step(dt_s, self._known_n, state.acceleration_world_m_s2, learn=True)
 
     def catch_s(self, t_s: float, log: ControlLog) -> float | None:
         """Return the time of the impact in the tick that confirms a catch, and None in every other tick."""
-        return self._catch.caught_s if self._catch.update(t_s, log.force_ext_world_n) else None
+        observed = log.force_observed_world_n
+        if not self._catch.update(t_s, log.force_ext_world_n if observed is None else observed):
+            return None
+        if self.tether_pulls:
+            self._catch.reject()
+        return self._catch.caught_s
 
     def payload_left(self, t_s: float) -> bool:
         """Return True only in the tick that confirms that a caught payload has left the net. Call it after `fly`."""

@@ -10,6 +10,7 @@ import math
 import msgspec
 
 from companion.config.loader import FlightConfig
+from companion.config.vehicle import OBSERVER
 from companion.control.vehicle_control import Command, VehicleControl
 from companion.core.flight_state import Observation, Request, Tare
 from companion.core.sequence import missing_inputs
@@ -49,6 +50,8 @@ class FlightCore:
         Plan.build(config.mission, config.vehicle)
         self._monitors = Monitors(vehicle)
         self._watch = TetherWatch.of(vehicle)
+        self._observes = vehicle.force_source == OBSERVER
+        self._pull_min_n = vehicle.tether.pull_min_n if vehicle.tether is not None else math.inf
         self._governor = Governor(vehicle, config.mission.limits)
         self._gate = Gate(vehicle)
         self._parameters = Parameters.of(config)
@@ -162,15 +165,22 @@ class FlightCore:
         if v is None or watch is None or not self._tether_watched:
             return
         log, flying = self._log, self._state.stage is _PLAN
-        self._situation.tether = watch.update(
+        # The observer's force contains the tether's pull: subtracted, it would hide the pull.
+        if log is None or not flying:
+            tool_n = None
+        else:
+            tool_n = log.force_measured_world_n if self._observes else log.force_ext_world_n
+        self._situation.tether = state = watch.update(
             i.t_s,
             v.position_world_m,
             v.velocity_world_m_s,
             v.attitude_wxyz,
             i.arm.angle_rad if i.arm is not None else None,
             self._control.disturbance_world_n if flying else None,
-            log.force_ext_world_n if flying and log is not None else None,
+            tool_n,
         )
+        if self._observes:
+            self._control.tether_pulls = state.pull_n >= self._pull_min_n
 
     def _carry_out(self, request: Request, i: Inputs) -> None:
         """Carry out what a transition requests from the core."""

@@ -286,7 +286,8 @@ class ControlLog(Record, frozen=True, kw_only=True):
     zeta: float
     rho: float
     force_ext_world_n: Vec3
-    """External force on the net in the world frame: tared, without the net's weight, and low-pass filtered."""
+    """External force on the net in the world frame: tared, without the net's weight, and low-pass filtered. With the momentum observer
+    it is 0 while nothing was caught."""
     attitude_desired_rad: Vec3
     """Roll, pitch and yaw (ZYX) of the filtered desired attitude."""
     hover_thrust: float
@@ -301,6 +302,10 @@ class ControlLog(Record, frozen=True, kw_only=True):
     them."""
     friction_estimate_nm: Joints | None = None
     """Adapted friction of each joint; None if the law does not adapt it."""
+    force_observed_world_n: Vec3 | None = None
+    """Estimate of the momentum observer, also while the law does not use it; None if `force_source` is not `observer`."""
+    force_measured_world_n: Vec3 | None = None
+    """With the momentum observer: what the force sensor measures, tared and not filtered; None without a sensor."""
 
 
 class TetherState(Record, frozen=True, kw_only=True):

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 from companion.config.devices import ForceDevice
-from companion.config.vehicle import Vehicle
+from companion.config.vehicle import OBSERVER, Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.control.sensing import ForceSensing
 from companion.model.check_row import Row
@@ -65,6 +65,11 @@ USB = Check(
 )
 CHECKS = (DEVICE, RATE, CHECKSUMS, NOISE, OVERLOAD, TARE, STILL, USB)
 
+_OBSERVED = (
+    "a momentum observer estimates the force: gusts are part of it, payloads below 0.1 kg and a force on the empty net are not "
+    "detected, and a snagged tether may count as a catch"
+)
+_COMPARE = "fly a catch with force sensor and force_source: observer first, and compare both forces in the report"
 RATE_GOOD, RATE_MIN = 0.9, 0.5
 NOISE_GOOD_N, NOISE_MAX_N = 0.3, 1.5
 TARE_GOOD, TARE_MAX = 0.05, 0.10
@@ -72,8 +77,14 @@ TARE_GOOD, TARE_MAX = 0.05, 0.10
 
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     """Return the rows of the force sensor, or one warning if the vehicle has none."""
+    if vehicle.devices.force is None and vehicle.force_source == OBSERVER:
+        yield DEVICE.doubtful(f"none; {_OBSERVED}", "", _COMPARE)
+        return
     if vehicle.devices.force is None:
-        fix = "add devices.force to the vehicle file if the sensor is mounted; without it, the controller measures no force"
+        fix = (
+            "add devices.force to the vehicle file if the sensor is mounted, or set force_source: observer; without either, the "
+            "controller measures no force"
+        )
         yield DEVICE.doubtful("none; a catch, a lost payload and a force on the empty net are not detected", "", fix)
         return
     failure, stream = o.failures.get("force"), o.force_stream
@@ -112,7 +123,11 @@ def stream_rows(
         return
     tool = vehicle.tool
     assert tool is not None, "a vehicle file with a force sensor has a tool"
-    yield DEVICE.good(stream.product or "answers")
+    product = stream.product or "answers"
+    if vehicle.force_source == OBSERVER:
+        yield DEVICE.doubtful(f"{product}, but only logged; {_OBSERVED}", "", _COMPARE)
+    else:
+        yield DEVICE.good(product)
     yield _rate(stream.samples / duration_s, device)
     fix = "use a shielded cable, away from motors and their wires"
     yield CHECKSUMS.row(not stream.bad_sums, f"{stream.bad_sums or 'none'} wrong", "none", fix)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import pytest
 
-from companion.control.sensing import CatchDetector
+from companion.control.sensing import CatchDetector, ObservedCatchDetector
 from companion.model.types import Vec3
 
 DT_S = 0.005
@@ -119,3 +120,55 @@ def test_no_catch_no_leaving() -> None:
     net.feel(0.05, (5.0, 0.0, 1.0))
     net.feel(2.0, EMPTY)
     assert (net.caught, net.left) == ([], [])
+
+
+class ObservedNet(Net):
+    """Drives the detector of the momentum observer's force."""
+
+    def __init__(self, payload_kg: float = 0.2) -> None:
+        super().__init__(payload_kg)
+        self.detector = ObservedCatchDetector()
+
+
+@pytest.mark.parametrize("payload_kg", [0.1, 0.2, 0.3])
+def test_the_observed_impact_and_weight_are_a_catch(payload_kg: float) -> None:
+    net = ObservedNet(payload_kg)
+    net.feel(2.0, (0.4, -0.3, -0.4))
+    net.feel(0.1, (-2.0, 0.2, -0.5))
+    assert net.detector.carries(net.t_s), "the weight is held from the impact on"
+    net.feel(1.0, net.hang())
+    assert net.caught == pytest.approx([2.005 + net.detector.PULL_TIME_S], abs=1.5 * DT_S)
+    assert net.detector.carries(net.t_s + 100.0)
+    net.feel(1.5, (0.3, 0.2, -0.1 * payload_kg))
+    assert len(net.left) == 1
+    assert not net.detector.carries(net.t_s)
+
+
+@pytest.mark.parametrize("gust", [(1.5, 0.8, -0.4), (-1.3, 2.5, 0.3), (0.0, 0.0, -1.7)])
+def test_a_gust_is_no_catch_and_ends(gust: Vec3) -> None:
+    net = ObservedNet()
+    net.feel(0.3, gust)
+    net.feel(2.0, (0.1, 0.0, -0.3))
+    assert not net.caught
+    assert not net.detector.carries(net.t_s)
+
+
+def test_a_rejected_catch_is_not_carried_and_the_next_one_is_found() -> None:
+    net = ObservedNet()
+    net.feel(0.1, (0.0, -3.0, -2.5))
+    net.feel(0.8, (0.0, -2.0, -2.5))
+    net.detector.reject()
+    assert not net.detector.carries(net.t_s)
+    net.feel(2.0, EMPTY)
+    net.feel(0.1, (-2.0, 0.2, -0.5))
+    net.feel(1.0, net.hang())
+    assert len(net.caught) == 2
+
+
+@pytest.mark.parametrize("net", [Net(), ObservedNet()])
+def test_vibration_is_not_a_fall(net: Net) -> None:
+    """80 Hz, sampled at 200 Hz: single samples show less specific force than a fall."""
+    net.catch()
+    for n in range(400):
+        net.feel(DT_S, EMPTY, 6.0 * math.sin(2.0 * math.pi * 80.0 * n * DT_S))
+    assert len(net.left) == 1

@@ -11,10 +11,12 @@ from companion.config.loader import logged_flight
 from companion.core.flight_core import FlightCore
 from companion.model.types import Outcome, PhaseKind
 from companion.sitl_config.loader import load_sitl
-from sitl.fast.loop import FastFlight
-from tests.support import SHORT_CATCH
+from sitl.fast.loop import FastFlight, FastResult
+from tests.machines import overrides_with_joints
+from tests.support import CATCH, HOVER, SHORT_CATCH
 
 NO_FORCE, NO_TETHER, NO_TOOL = "vehicle.devices.force=null", "vehicle.tether=null", "vehicle.tool=null"
+OBSERVER = "vehicle.force_source=observer"
 
 
 @pytest.mark.parametrize("absent", [NO_FORCE, NO_TETHER])
@@ -80,3 +82,60 @@ def test_a_force_sensor_without_a_tool_is_refused() -> None:
         load_sitl(SHORT_CATCH, overrides=[NO_TOOL])
     (line,) = refused.value.lines
     assert "devices.force: the force-torque sensor is part of the tool, but tool is absent" in line
+
+
+def _reported(result: FastResult) -> list[str]:
+    return [event.id for o in result.outputs for event in o.events]
+
+
+def test_without_a_force_sensor_the_momentum_observer_detects_the_catch() -> None:
+    flight = FastFlight(load_sitl(SHORT_CATCH, overrides=[NO_FORCE, OBSERVER, "world.payload_kg=0.1"]))
+    result = flight.run()
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert _reported(result) == ["takeoff", "catch", "touchdown"]
+    (catch,) = [event for o in result.outputs for event in o.events if event.id == "catch"]
+    contact_s = flight.plant.world.payload.caught_t_s
+    assert contact_s is not None
+    assert 0.0 <= catch.t_s - contact_s < 0.2
+    carried = [o.control for o in result.outputs if o.control is not None and o.t_s > contact_s + 1.0]
+    assert all(c.force_measured_world_n is None for c in carried)
+    weights_n = [-c.force_ext_world_n[2] for c in carried if c.force_ext_world_n[2] != 0.0]
+    assert math.isclose(sum(weights_n) / len(weights_n), 0.98, abs_tol=0.5)
+    before = [o.control for o in result.outputs if o.control is not None and o.t_s < contact_s]
+    assert all(c.force_ext_world_n == (0.0, 0.0, 0.0) for c in before), "the law yields to no gust"
+    again = FlightCore(logged_flight(flight.config.flight.model_dump_json()))
+    assert all(again.step(i) == o for i, o in zip(result.inputs, result.outputs, strict=True)), "replay"
+
+
+def test_the_momentum_observer_takes_no_wind_for_a_catch() -> None:
+    gust = "world.faults=[{kind: gust, t_s: 4.5, duration_s: 0.5, size: 3.0}]"
+    result = FastFlight(load_sitl(SHORT_CATCH, overrides=[OBSERVER, gust, "world.payload_kg=0"])).run()
+    assert _reported(result) == ["takeoff", "touchdown"]
+    controls = [o.control for o in result.outputs if o.control is not None]
+    assert any(c.force_measured_world_n is not None for c in controls), "the sensor is logged beside the observer"
+
+
+def test_with_the_momentum_observer_a_jammed_tether_is_taut_and_no_catch() -> None:
+    jam = "world.faults=[{kind: tether_taut, t_s: 8.0, size: 0.05}]"
+    result = FastFlight(load_sitl(CATCH, overrides=[NO_FORCE, OBSERVER, jam, "world.payload_kg=0"])).run()
+    reported = _reported(result)
+    assert "tether_taut" in reported or "tether_snagged" in reported
+    assert "catch" not in reported
+    assert not result.crashed
+
+
+@pytest.mark.parametrize("joints", [0, 1, 4])
+def test_the_momentum_observer_flies_any_arm(joints: int) -> None:
+    overrides = [*overrides_with_joints(joints), "vehicle.devices.force=null", OBSERVER]
+    overrides += ["mission.phases[0].duration_s=2.0", "mission.phases[1].duration_s=1.0"]
+    result = FastFlight(load_sitl(HOVER, overrides=overrides)).run()
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert _reported(result) == ["takeoff", "touchdown"]
+
+
+def test_an_unknown_force_source_is_refused() -> None:
+    with pytest.raises(ConfigError) as refused:
+        load_sitl(SHORT_CATCH, overrides=["vehicle.force_source=obsever"])
+    (line,) = refused.value.lines
+    assert "force_source" in line
+    assert "observer" in line

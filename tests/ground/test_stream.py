@@ -292,6 +292,16 @@ def test_an_absent_force_sensor_is_shown_as_absent_and_no_force_is_shown() -> No
     assert stream_of(IN_FLIGHT).control.force_ext_world_n is not None  # type: ignore[union-attr]
 
 
+def test_the_force_of_the_momentum_observer_is_shown() -> None:
+    config = load_flight(CATCH, overrides=["vehicle.devices.force=null", "vehicle.force_source=observer"])
+    maker = StreamBuilder(config, "s")
+    maker.add_tick(*changed(IN_FLIGHT, force=None))
+    stream = maker.build(1.7e9)
+    assert light_of(stream, "force sensor") == (HealthLevel.OFF, "momentum observer")
+    assert stream.control is not None
+    assert stream.control.force_ext_world_n is not None
+
+
 def test_an_absent_tether_is_shown_as_absent() -> None:
     maker = StreamBuilder(load_flight(CATCH, overrides=["vehicle.tether=null"]), "s")
     maker.add_tick(*changed(IN_FLIGHT, outputs__tether=None))

@@ -191,6 +191,14 @@ CASES = {
         "force.device", "a catch, a lost payload and a force on the empty net are not detected", "add devices.force",
         {"force": (), "force_stream": None}, WARN, vehicle={"devices.force": None},
     ),
+    "vehicle with a momentum observer": Case(
+        "force.device", "a momentum observer estimates the force", "compare both forces",
+        {"force": (), "force_stream": None}, WARN, vehicle={"devices.force": None, "force_source": "observer"},
+    ),
+    "force sensor that is only logged": Case(
+        "force.device", "but only logged; a momentum observer", "compare both forces", {}, WARN,
+        vehicle={"force_source": "observer"},
+    ),
     "force port lost": Case("force.device", "was lost", "plug", force_stream(samples=9, lost="was lost")),
     "slow force": Case("force.rate", "150 Hz", "cable", force_stream(samples=750), WARN),
     "very slow force": Case("force.rate", "50 Hz", "cable", force_stream(samples=250)),

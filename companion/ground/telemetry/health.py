@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from companion.config.vehicle import Vehicle
+from companion.config.vehicle import OBSERVER, Vehicle
 from companion.ground.protocol.messages import DeviceHealth, HealthLevel
 from companion.model.frames import wrap_rad, yaw_from_quat
 from companion.model.listing import listed
@@ -84,6 +84,7 @@ class HealthEvaluator:
         self._tether = vehicle.tether
         self._has_arm = bool(vehicle.arm.joints)
         self._force_device = vehicle.devices.force
+        self._no_force = "momentum observer" if vehicle.force_source == OBSERVER else "none on this vehicle"
 
     def evaluate(self, snapshot: Snapshot) -> tuple[DeviceHealth, ...]:
         """Return the health of all devices, in the order of `DEVICE_NAMES`."""
@@ -165,7 +166,7 @@ class HealthEvaluator:
     def _force(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
         force, age_s, device = snapshot.inputs.force, snapshot.ages.force_s, self._force_device
         if device is None:
-            return HealthLevel.OFF, "none on this vehicle"
+            return HealthLevel.OFF, self._no_force
         if force is None:
             return HealthLevel.OFF, "no sample yet"
         size_n = math.hypot(*force.force_sensor_n)

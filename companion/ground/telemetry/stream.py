@@ -14,6 +14,7 @@ from typing import TypeVar
 import msgspec
 
 from companion.config.loader import FlightConfig
+from companion.config.vehicle import OBSERVER
 from companion.ground.protocol.messages import (
     EVENTS_KEPT,
     VERSION,
@@ -53,7 +54,7 @@ class StreamBuilder:
     def __init__(self, config: FlightConfig, session: str) -> None:
         self._session = session
         self._health = HealthEvaluator(config.vehicle)
-        self._has_force = config.vehicle.devices.force is not None
+        self._has_force = config.vehicle.devices.force is not None or config.vehicle.force_source == OBSERVER
         self._newest: tuple[Inputs, Outputs, Sent] | None = None
         self._ages = WorstAges()
         self._worst = WorstTimings()
