@@ -101,19 +101,23 @@ def _print_message(message: dict[str, Any]) -> None:
 
 
 def _print_addresses(devices: dict[str, dict[str, Any]], px4: RealPx4 | None) -> None:
-    mocap = devices["mocap"]
     port = 14540 + (px4.number if px4 is not None else 0)
     name = "PX4 stub" if px4 is None else f"PX4 {px4.about()['version']}"
     print(
         "companion sitl is running; Ctrl-C ends it\n"
         f"  {name:<13} MAVLink 2 on UDP 127.0.0.1:{port} (MAVSDK: udpin://0.0.0.0:{port}), from port {port + 40};\n"
         "                ground stations on 14550; it arms once motion capture arrives as VISION_POSITION_ESTIMATE\n"
-        f"  mocap         NatNet on 127.0.0.1, command port {mocap['command_port']}, multicast, data port "
-        f"{mocap.get('data_port')}\n"
+        f"  mocap         {_mocap_line(devices.get('mocap'))}\n"
         f"  arm bus       {devices['arm']['port'] if 'arm' in devices else 'none on this vehicle'}\n"
         f"  force sensor  {devices['force']['port'] if 'force' in devices else 'none on this vehicle'}",
         flush=True,
     )
+
+
+def _mocap_line(mocap: dict[str, Any] | None) -> str:
+    if mocap is None:
+        return "its poses are sent to PX4 here, as by another program (devices.mocap.type: external)"
+    return f"NatNet on 127.0.0.1, command port {mocap['command_port']}, multicast, data port {mocap.get('data_port')}"
 
 
 def main(argv: list[str] | None = None) -> int:

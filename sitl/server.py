@@ -23,6 +23,7 @@ from companion.sitl_config.faults import FaultKind
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.backend import AutopilotBackend, StubBackend
 from sitl.autopilot.mavlink import Ports as LinkPorts
+from sitl.external_vision import ExternalVision
 from sitl.faults.injector import Faults, Sample, sample
 from sitl.faults.processes import SIGNALS, ProcessFaults, environment, inject_process_fault
 from sitl.force_torque import ForceTorqueServer
@@ -93,7 +94,9 @@ class Sitl:
         self.servos = servos_of(vehicle, config)
         self._on_bus = plugged_in(self.servos, config)
         stub_ports = LinkPorts(ports.autopilot_local, ports.autopilot_remote)
-        self.autopilot: AutopilotBackend = autopilot or StubBackend(vehicle.airframe, config, stub_ports)
+        self.autopilot: AutopilotBackend = autopilot or StubBackend(
+            vehicle.airframe, config, stub_ports, external_vision=vehicle.devices.mocap.external
+        )
         pose = (start.position_m, start.yaw_rad, start.arm_rad)
         self.plant = Plant(vehicle, config, self.autopilot, self.servos, pose, between_steps=True)
         self.autopilot.attach(self.plant.world)
@@ -109,6 +112,8 @@ class Sitl:
             self.plant.faults = self.faults
         self.bus: ServoBus | None = None
         """The servo bus; None if the vehicle has no arm, or while the links are not open."""
+        self.mocap: NatNetServer | ExternalVision | None = None
+        """The simulated motion capture; None while the links are not open."""
         self.force: ForceTorqueServer | None = None
         """The emulated force sensor; None if the vehicle has none, or while the links are not open."""
         other = config.mocap_other_id
@@ -144,33 +149,14 @@ class Sitl:
                 self.bus = await stack.enter_async_context(ServoBus(self._on_bus))
             if device.force is not None:
                 self.force = await stack.enter_async_context(ForceTorqueServer())
-            self.mocap = await stack.enter_async_context(
-                NatNetServer(
-                    version=self._config.natnet_version,
-                    command_port=self._ports.mocap_command,
-                    data_port=self._ports.mocap_data,
-                    multicast_group=device.mocap.multicast_group if self._ports.multicast else None,
-                    bodies=((device.mocap.rigid_body_id, self._vehicle.name), *self._others),
-                    rate_hz=self._config.mocap_rate_hz,
-                )
-            )
-            address = await stack.enter_async_context(self.autopilot.wires())
-            mocap: dict[str, Any] = {
-                "server": "127.0.0.1",
-                "interface": "127.0.0.1",
-                "transport": "multicast" if self._ports.multicast else "unicast",
-                "command_port": self.mocap.command_port,
-                "up_axis": "z",
-                "rate_hz": self._config.mocap_rate_hz,
-            }
-            if device.mocap.type != NATNET:
-                mocap |= {"type": NATNET, "options": {}}
-            if self._ports.multicast:
-                mocap["data_port"] = self.mocap.data_port
-            addresses: dict[str, dict[str, Any]] = {
-                "autopilot": {"address": address},
-                "mocap": mocap,
-            }
+            addresses: dict[str, dict[str, Any]] = {}
+            if not device.mocap.external:
+                self.mocap = server = await stack.enter_async_context(self._natnet_server())
+                addresses["mocap"] = self._mocap_settings(server)
+            addresses["autopilot"] = {"address": await stack.enter_async_context(self.autopilot.wires())}
+            if device.mocap.external:
+                vision = ExternalVision(self.autopilot.vision_address)
+                self.mocap = await stack.enter_async_context(vision)
             if self.bus is not None:
                 addresses["arm"] = {"port": self.bus.path}
                 if device.arm is not None and device.arm.type != DYNAMIXEL:
@@ -185,6 +171,32 @@ class Sitl:
                     text = f"devices.{name}.type: the simulated world has a {ours}, which is used in place of {theirs}"
                     self._on_message({"type": "progress", "text": text})
             yield addresses
+
+    def _natnet_server(self) -> NatNetServer:
+        mocap = self._vehicle.devices.mocap
+        return NatNetServer(
+            version=self._config.natnet_version,
+            command_port=self._ports.mocap_command,
+            data_port=self._ports.mocap_data,
+            multicast_group=mocap.multicast_group if self._ports.multicast else None,
+            bodies=((mocap.rigid_body_id, self._vehicle.name), *self._others),
+            rate_hz=self._config.mocap_rate_hz,
+        )
+
+    def _mocap_settings(self, server: NatNetServer) -> dict[str, Any]:
+        settings: dict[str, Any] = {
+            "server": "127.0.0.1",
+            "interface": "127.0.0.1",
+            "transport": "multicast" if self._ports.multicast else "unicast",
+            "command_port": server.command_port,
+            "up_axis": "z",
+            "rate_hz": self._config.mocap_rate_hz,
+        }
+        if self._vehicle.devices.mocap.type != NATNET:
+            settings |= {"type": NATNET, "options": {}}
+        if self._ports.multicast:
+            settings["data_port"] = server.data_port
+        return settings
 
     def flight_environment(self) -> dict[str, str]:
         """Return the environment variables that the flight process needs for faults that hang it."""
@@ -286,6 +298,11 @@ class Sitl:
             world.hold_arm(held)
 
     def _publish(self, frame: MocapFrame, t_s: float) -> None:
+        if isinstance(self.mocap, ExternalVision):
+            self.mocap.publish(frame, t_s)
+            return
+        if self.mocap is None:
+            return
         body = self._vehicle.devices.mocap.rigid_body_id
         pose = BodyPose(body, frame.position_world_m, frame.attitude_wxyz, frame.valid)
         others = [BodyPose(number, OTHER_PLACE_M, IDENTITY_QUAT) for number, _ in self._others]
@@ -326,7 +343,7 @@ class Sitl:
             self.flight.resume()
 
     def _record_course(self) -> None:
-        plant, frame = self.plant, self.mocap.frame_number
+        plant, frame = self.plant, self.mocap.frame_number if isinstance(self.mocap, NatNetServer) else 0
         if not self.frames or (frame > self.frames[-1][0] and plant.t_s >= self.frames[-1][1] + FRAMES_PERIOD_S):
             self.frames.append((frame, plant.t_s))
         if self.faults.begun_s is None or plant.t_s < self._course_due_s:

@@ -20,6 +20,7 @@ from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
 from companion.analysis.plot_style import CATCH, INK
 from companion.analysis.scene import FRONT, LINK, Camera, Pose, Scene, Shape
+from companion.model.best_pose import best_pose
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import PhaseKind, Vec3
 
@@ -150,7 +151,7 @@ class _Track:
 
     def pose(self, k: int) -> Pose:
         """Return the pose at an index of the log."""
-        mocap = self._log.inputs[int(self._mocap[k])].mocap
+        mocap = best_pose(self._log.inputs[int(self._mocap[k])])
         arm = self._log.inputs[int(self._arm[k])].arm
         assert mocap is not None
         caught = self._caught is not None and k >= self._caught

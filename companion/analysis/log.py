@@ -20,10 +20,11 @@ from zstandard import ZstdError
 
 from companion import DISTRIBUTION
 from companion.analysis.timing import Stopwatch, Timing, timing_of
+from companion.model.best_pose import best_pose
 from companion.model.codec import RecordError, from_json
 from companion.model.constants import GRADED_POSE_MAX_AGE_S
 from companion.model.frames import euler_zyx_from_quat
-from companion.model.types import Inputs, Outputs, Sent
+from companion.model.types import Inputs, MocapPose, Outputs, Sent
 
 Array = npt.NDArray[np.float64]
 _RECORDS: dict[str, type] = {"/inputs": Inputs, "/outputs": Outputs, "/sent": Sent}
@@ -266,7 +267,7 @@ class Columns:
     t_s: Array
     mission_t_s: Array
     mocap_position_world_m: Array
-    """Position from valid frames with an age of `GRADED_POSE_MAX_AGE_S` or less."""
+    """Position from valid frames with an age of `GRADED_POSE_MAX_AGE_S` or less; PX4's estimate if another program fed PX4."""
     mocap_attitude_rad: Array
     """Roll, pitch, yaw (ZYX)."""
     mocap_age_s: Array
@@ -280,20 +281,20 @@ class Columns:
 
 
 def _columns(log: FlightLog) -> Columns:
-    def fresh(i: Inputs) -> bool:
-        return i.mocap is not None and i.mocap.tracking_valid and i.t_s - i.mocap.stamp_s <= GRADED_POSE_MAX_AGE_S
+    def graded(i: Inputs) -> MocapPose | None:
+        pose = best_pose(i)
+        fresh = pose is not None and pose.tracking_valid and i.t_s - pose.stamp_s <= GRADED_POSE_MAX_AGE_S
+        return pose if fresh else None
 
     return Columns(
         t_s=log.column(lambda i, o, s: i.t_s),
         mission_t_s=log.column(lambda i, o, s: o.mission_t_s),
-        mocap_position_world_m=log.column(
-            lambda i, o, s: i.mocap.position_world_m if i.mocap and fresh(i) else None, 3
-        ),
+        mocap_position_world_m=log.column(lambda i, o, s: pose.position_world_m if (pose := graded(i)) else None, 3),
         mocap_attitude_rad=log.column(
-            lambda i, o, s: euler_zyx_from_quat(i.mocap.attitude_wxyz) if i.mocap and fresh(i) else None, 3
+            lambda i, o, s: euler_zyx_from_quat(pose.attitude_wxyz) if (pose := graded(i)) else None, 3
         ),
         mocap_age_s=log.column(
-            lambda i, o, s: i.t_s - i.mocap.stamp_s + (i.mocap.latency_s or 0.0) if i.mocap and fresh(i) else None
+            lambda i, o, s: i.t_s - pose.stamp_s + (pose.latency_s or 0.0) if (pose := graded(i)) else None
         ),
         reference_velocity_world_m_s=log.column(
             lambda i, o, s: o.reference.velocity_world_m_s if o.reference else None, 3

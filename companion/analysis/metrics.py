@@ -14,6 +14,7 @@ from companion.analysis.arm_skeleton import pose
 from companion.analysis.log import Array, FlightLog
 from companion.control.sensing import CatchDetector, ObservedCatchDetector
 from companion.model.arm_skeleton import logged_skeleton
+from companion.model.best_pose import best_pose
 from companion.model.frames import quat_rotate
 from companion.model.types import PhaseKind
 
@@ -271,9 +272,9 @@ def slack_m(log: FlightLog) -> Array:
     anchor, offset = tether["anchor_world_m"], tuple(tether.get("attachment_body_m", (0.0, 0.0, 0.0)))
     known = np.isfinite(log.columns.mocap_position_world_m[:, 0])
     for k, (i, o, _) in enumerate(log.rows()):
-        if o.phase_kind not in (PhaseKind.GROUND, PhaseKind.DONE) and known[k] and i.mocap is not None:
-            arm = quat_rotate(i.mocap.attitude_wxyz, offset)
-            point = [p + a for p, a in zip(i.mocap.position_world_m, arm, strict=True)]
+        if o.phase_kind not in (PhaseKind.GROUND, PhaseKind.DONE) and known[k] and (pose := best_pose(i)) is not None:
+            arm = quat_rotate(pose.attitude_wxyz, offset)
+            point = [p + a for p, a in zip(pose.position_world_m, arm, strict=True)]
             slack[k] = float(tether["length_m"]) - math.dist(point, anchor)
     return slack
 

@@ -28,6 +28,7 @@ from companion.analysis.plot_style import (
     write_png,
 )
 from companion.analysis.timing import end_s
+from companion.model.best_pose import best_pose
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import tilt_rad
 from companion.model.types import Outputs, PhaseKind
@@ -55,7 +56,12 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
     if not log.inputs:
         return []
     makers: tuple[tuple[str, str, str, Callable[[FlightLog], Figure | None]], ...] = (
-        ("tracking", "Tracking", "Position and attitude measured by motion capture, and the reference.", _tracking),
+        (
+            "tracking",
+            "Tracking",
+            "Position and attitude by motion capture (without it, by PX4), and the reference.",
+            _tracking,
+        ),
         ("actuation", "Actuation", "Commands of the control law and the values sent.", _actuation),
         ("adaptation", "Adaptation", "Switching gain and its adapted parameters.", _adaptation),
         (
@@ -65,7 +71,12 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
             _load,
         ),
         ("force", "Contact force", "Tared force on the net in the world frame, without the weight of the net.", _force),
-        ("path", "Path", "Path measured by motion capture, seen from above and from the side.", _path),
+        (
+            "path",
+            "Path",
+            "Path measured by motion capture (without it, by PX4), seen from above and from the side.",
+            _path,
+        ),
         (
             "timing",
             "Timing",
@@ -122,7 +133,9 @@ def _actuation(log: FlightLog) -> Figure | None:
     axes[0].set_ylabel("thrust [%]")
     _legend(axes[0])
     asked = log.column(lambda i, o, s: tilt_rad(o.attitude.attitude_wxyz) if o.attitude else None)
-    flown = log.column(lambda i, o, s: tilt_rad(i.mocap.attitude_wxyz) if i.mocap and i.mocap.tracking_valid else None)
+    flown = log.column(
+        lambda i, o, s: tilt_rad(pose.attitude_wxyz) if (pose := best_pose(i)) and pose.tracking_valid else None
+    )
     _line(axes[1], t, np.degrees(flown), "flown", SERIES[0])
     _line(axes[1], t, np.degrees(asked), "commanded", REFERENCE, reference=True)
     axes[1].set_ylabel("tilt [deg]")

@@ -91,6 +91,13 @@ def _campaign(arguments: argparse.Namespace) -> Faults:
             )
     given = arguments.vehicle, arguments.controller, arguments.preset
     config = checked(arguments.mission, *given, arguments.overrides, world=arguments.world)
+    if arguments.wires and config.vehicle.devices.mocap.external:
+        raise ConfigError(
+            [
+                "companion faults: --wires needs frames of motion capture to relate the log to the simulated world, but "
+                "devices.mocap.type is external; fly without --wires"
+            ]
+        )
     absent = {v.kind: key for v, _ in flights if (key := absent_part(v.kind, config.vehicle)) is not None}
     if absent:
         missing = " and ".join(sorted(set(absent.values())))

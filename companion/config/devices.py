@@ -8,7 +8,7 @@ from pydantic import Field, JsonValue, model_validator
 
 from companion.config.base import Location, Model, Positive, refuse
 from companion.config.device_plugins import DYNAMIXEL, RFT60
-from companion.config.mocap import NATNET
+from companion.config.mocap import EXTERNAL, NATNET
 
 
 class AutopilotDevice(Model):
@@ -34,9 +34,10 @@ class MocapDevice(Model):
     """Motion capture: OptiTrack Motive over NatNet, or a system that a plug-in provides (docs/mocap-systems.md)."""
 
     type: str = NATNET
-    """natnet, or the name of an installed motion-capture system (`companion plugins` lists them). With `--sitl`, natnet is used."""
-    server: str
-    """Address of the computer that runs Motive or the other system."""
+    """natnet, or the name of an installed motion-capture system (`companion plugins` lists them); `--sitl` uses natnet for them.
+    external: another program feeds PX4 with poses, the companion reads none, and the other keys have no effect."""
+    server: str = ""
+    """Address of the computer that runs Motive or the other system; required unless `type` is external."""
     interface: str = ANY_INTERFACE
     """This computer's address on the camera network. Without `--sitl`, `fly` and `check` refuse 0.0.0.0 (all networks)."""
     transport: Literal["multicast", "unicast"] = "multicast"
@@ -45,13 +46,26 @@ class MocapDevice(Model):
     data_port: Annotated[int, Field(gt=0, le=65535)] = 1511
     natnet_version: NatNetVersion | None = None
     """Version that the server must use. If it is absent, all these versions and later ones are accepted."""
-    rigid_body_id: Annotated[int, Field(ge=0)]
+    rigid_body_id: Annotated[int, Field(ge=0)] = 0
+    """Number of the vehicle's rigid body; required unless `type` is external."""
     up_axis: Literal["y", "z"] = "z"
     """Up axis in Motive's streaming settings."""
     rate_hz: Positive = 200.0
     """Expected frame rate."""
     options: dict[str, JsonValue] = Field(default={})
-    """Settings of the system that a plug-in provides; must be empty for natnet."""
+    """Settings of the system that a plug-in provides; must be empty for natnet and external."""
+
+    @property
+    def external(self) -> bool:
+        """Return whether another program feeds PX4 with poses."""
+        return self.type == EXTERNAL
+
+    @model_validator(mode="after")
+    def _addresses(self) -> Self:
+        missing = [key for key in ("server", "rigid_body_id") if key not in self.model_fields_set]
+        if missing and not self.external:
+            refuse("motion capture", [((key,), "missing") for key in missing])
+        return self
 
 
 ServoBaud = Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000]

@@ -253,7 +253,7 @@ def _place_arm(document: Document, vehicle: Vehicle | None) -> None:
 def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:
     """Return a message if motion capture is received from every network, where any sender could use Motive's address; else nothing."""
     interface = vehicle.devices.mocap.interface
-    if interface != ANY_INTERFACE:
+    if interface != ANY_INTERFACE or vehicle.devices.mocap.external:
         return []
     location = ("devices", "mocap", "interface")
     text = (

@@ -13,6 +13,8 @@ from companion.config.base import Location, Model
 
 NATNET = "natnet"
 """Name of the built-in system, OptiTrack Motive over NatNet, which is not a plug-in."""
+EXTERNAL = "external"
+"""Another program feeds PX4 with poses; the companion reads no motion capture."""
 
 
 @functools.cache
@@ -32,14 +34,13 @@ def system_class(name: str) -> Any:
 
 def problems(name: str, options: Mapping[str, Any]) -> list[tuple[Location, str]]:
     """Return the problems of `type` and `options` in `devices.mocap`, each with the key to which it belongs."""
-    if name == NATNET:
-        return (
-            [(("options",), f"must be empty for {NATNET}, whose settings are keys of devices.mocap")] if options else []
-        )
+    if name in (NATNET, EXTERNAL):
+        why = "whose settings are keys of devices.mocap" if name == NATNET else "which has no settings"
+        return [(("options",), f"must be empty for {name}, {why}")] if options else []
     try:
         system_class(name).options.model_validate(dict(options))
     except plugins.PluginError as error:
-        return [(("type",), f"{error} (built in: {NATNET})")]
+        return [(("type",), f"{error} (built in: {NATNET}, {EXTERNAL})")]
     except ValidationError as error:
         return [(("options", *detail["loc"]), detail["msg"]) for detail in error.errors(include_url=False)]
     return []

@@ -18,6 +18,7 @@ from companion.core.state_machine import transition
 from companion.core.transition import Parameters, event_of
 from companion.mission.plan import Plan
 from companion.model import flight_stage as seq
+from companion.model.best_pose import pose_used_s
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.flight_stage import Stage
 from companion.model.types import ControlLog, Event, Inputs, Outputs, PhaseKind, Reference
@@ -62,7 +63,7 @@ class FlightCore:
         self._tether_watched = False
         self._last_t_s: float | None = None
         self._pose_s = -math.inf
-        """Stamp of the newest trusted pose, which was passed on to PX4."""
+        """Time at which PX4 last used a trusted pose, s."""
         self._reference: Reference | None = None
         """The last reference that the controller followed, constrained by the governor."""
         self._limited_by: tuple[str, ...] = ()
@@ -184,8 +185,8 @@ class FlightCore:
 
     def _carry_out(self, request: Request, i: Inputs) -> None:
         """Carry out what a transition requests from the core."""
-        if i.mocap is not None and i.mocap.tracking_valid:
-            self._pose_s = i.mocap.stamp_s
+        if (pose_s := pose_used_s(i)) is not None:
+            self._pose_s = pose_s
         if request.resumed:
             self._monitors.forget()
         for step in request.tare:

@@ -12,6 +12,7 @@ from companion.mission.check import check_start
 from companion.mission.plan import Plan
 from companion.mission.settled import SettledEstimate
 from companion.model import flight_stage as seq
+from companion.model.best_pose import best_pose, pose_used_s
 from companion.model.flight_stage import Stage
 from companion.model.frames import euler_zyx_from_quat
 from companion.model.types import AutopilotRequest, Inputs, Joints, Outcome, PhaseKind, SafetyAction, Severity
@@ -32,8 +33,8 @@ def advance(t: Transition) -> AutopilotRequest:
     """Advance the sequence and return the request of the current stage."""
     i, state = t.i, t.state
     assert state.entered_s is not None
-    if i.mocap is not None and i.mocap.tracking_valid:
-        t.pose_s = i.mocap.stamp_s
+    if (pose_s := pose_used_s(i)) is not None:
+        t.pose_s = pose_s
     return _STAGES[state.stage](t, i.t_s - state.entered_s)
 
 
@@ -129,7 +130,7 @@ def _begin_tare(t: Transition) -> None:
 
 def _weigh(t: Transition) -> None:
     i = t.i
-    assert i.vehicle is not None and i.mocap is not None
+    assert i.vehicle is not None
     t.tare.append(Tare.COLLECT)
     t.change_waiting(settled=t.state.waiting.settled.take(i.t_s, i.vehicle, i.mocap))
 
@@ -228,7 +229,7 @@ def _fly(t: Transition, _: float) -> AutopilotRequest:
     if vehicle is not None and course.plan.segment(plan_s).kind is PhaseKind.LANDING:
         reference_m = course.reference(i.t_s).position_world_m[2]
         touchdown = t.state.touchdown.update(
-            i.t_s, vehicle, i.mocap, reference_m, t.o.thrust_share, seq.on_ground(i.status)
+            i.t_s, vehicle, best_pose(i), reference_m, t.o.thrust_share, seq.on_ground(i.status)
         )
         t.change(touchdown=touchdown)
         if touchdown.certain:
@@ -313,11 +314,11 @@ def _crash(t: Transition, text: str) -> None:
 
 def missing_inputs(i: Inputs, vehicle: Vehicle) -> list[str]:
     """Return the devices of the vehicle that have delivered no data yet."""
-    devices: dict[str, object] = {
-        "PX4 state": i.vehicle,
-        "PX4": i.status,
-        "motion capture": i.mocap,
-    }
+    devices: dict[str, object] = {"PX4 state": i.vehicle, "PX4": i.status}
+    if vehicle.devices.mocap.external:
+        devices["PX4's ESTIMATOR_STATUS"] = i.estimator
+    else:
+        devices["motion capture"] = i.mocap
     if vehicle.arm.joints:
         devices["arm"] = i.arm
     if vehicle.devices.force is not None:

@@ -90,7 +90,7 @@ class Transition:
         self.o = observation
         self.i = observation.inputs
         self.pose_s = observation.pose_s
-        """Stamp of the newest pose that was passed on to PX4."""
+        """Time at which PX4 last used a pose, s."""
         self.start_asked = False
         """Whether the operator commanded take-off in this tick."""
         self.tare: list[Tare] = []

@@ -6,6 +6,7 @@ import msgspec
 
 from companion.guardian.client import GuardianClient
 from companion.guardian.heartbeat import Heartbeat
+from companion.model.best_pose import best_pose, pose_used_s
 from companion.model.flight_stage import PILOT_FLIES
 from companion.model.types import AutopilotRequest, AutopilotStatus, Inputs, LinkIdentity, Outputs, PhaseKind
 from companion.safety.rules import MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS, PILOT_TOOK_OVER
@@ -39,9 +40,9 @@ class Heartbeats:
         ids = {event.id for event in outputs.events}
         self._pilot = self._pilot or PILOT_TOOK_OVER in ids or outputs.phase == PILOT_FLIES
         self._lands_without_mocap = self._lands_without_mocap or not ids.isdisjoint(_REFUSALS)
-        mocap = inputs.mocap
-        if mocap is not None and mocap.tracking_valid and outputs.mocap_trusted:
-            self._pose_stamp_s, self._position_world_m = mocap.stamp_s, mocap.position_world_m
+        pose_s, pose = pose_used_s(inputs), best_pose(inputs)
+        if pose_s is not None and pose is not None and outputs.mocap_trusted:
+            self._pose_stamp_s, self._position_world_m = pose_s, pose.position_world_m
         armed = inputs.status is not None and inputs.status.armed
         # PX4 reports only once a second whether it is armed, so it may be armed as soon as arming is requested.
         may_lift = armed or outputs.request is AutopilotRequest.ARM or outputs.phase_kind in _IN_THE_AIR

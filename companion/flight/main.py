@@ -75,7 +75,9 @@ class Flight:
         clock: Clock,
         guardian: FlightGuard | None,
     ) -> None:
-        self._mocap_rate_hz = config.vehicle.devices.mocap.rate_hz
+        mocap = config.vehicle.devices.mocap
+        self._external = mocap.external
+        self._frame_rate_hz = 0.0 if mocap.external else mocap.rate_hz
         self._guardian = guardian
         self._devices = devices
         self._recorder = recorder
@@ -92,7 +94,7 @@ class Flight:
 
     async def run(self) -> Outcome:
         """Run ticks until the flight ends; return its outcome."""
-        ticker = Ticker(self._period_s, self._clock, self._mocap_rate_hz)
+        ticker = Ticker(self._period_s, self._clock, self._frame_rate_hz)
         self._devices.vision.on_frame = ticker.frame
         tick = 0
         before: Outputs | None = None
@@ -141,6 +143,7 @@ class Flight:
             command=command,
             recorder_dropped=self._recorder.client.dropped,
             guardian_ready=self._guardian.ready if self._guardian is not None else None,
+            estimator=devices.autopilot.estimator() if self._external else None,
         )
         outputs = self._core.step(inputs)
         devices.vision.open = outputs.mocap_trusted

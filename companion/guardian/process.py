@@ -118,7 +118,9 @@ class Guardian:
         self._heartbeats = heartbeats
         self._channel = channel
         self._flight = flight
+        self._external = settings.mocap.type == "external"
         self._mocap: MocapClient | PluginClient | None = None
+        """None until it is open, and if another program feeds PX4, which then needs no poses from the guardian."""
         self._problem = address_problem(settings.autopilot_address)
         self._status_s = float("-inf")
         self._errors: set[str] = set()
@@ -134,7 +136,8 @@ class Guardian:
         """Run until the flight has ended or the vehicle has landed; return the exit code."""
         try:
             try:
-                self._mocap = open_client(self._settings.mocap)
+                if not self._external:
+                    self._mocap = open_client(self._settings.mocap)
             except MocapProblem as problem:
                 self._problem = self._problem or str(problem)
             reason = self._stand_by()
@@ -282,6 +285,7 @@ class Guardian:
             link,
             time.monotonic() - last.origin_s,
             lambda notice: self._publish(last, notice),
+            external=self._external,
         )
         step_s = float("-inf")
         while landing.landed is None:

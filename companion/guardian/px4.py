@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from companion.io.px4 import messages
+from companion.model.estimator import EstimatorReport
 from companion.model.flight_stage import flown_by_pilot
 from companion.model.frames import attitude_enu_flu_from_ned_frd, euler_zyx_from_quat
 from companion.model.types import AutopilotStatus, FlightMode, Quat, Vec3, VehicleState
@@ -21,6 +22,8 @@ class Px4State:
     def __init__(self) -> None:
         self.refusal: str | None = None
         """Why PX4 rejected the newest command; None if it accepted it."""
+        self.estimator: EstimatorReport | None = None
+        """Newest ESTIMATOR_STATUS; None before the first."""
         self._heartbeat: tuple[float, bool, FlightMode, int] | None = None
         self._landed = 0
         self._position: tuple[float, Vec3, Vec3] = (-math.inf, _ZERO, _ZERO)
@@ -43,6 +46,8 @@ class Px4State:
                 self._attitude = (t_s, (m.q1, m.q2, m.q3, m.q4), (m.rollspeed, m.pitchspeed, m.yawspeed))
             case "HIGHRES_IMU" if _finite(m.xacc, m.yacc, m.zacc):
                 self._imu = (t_s, (m.xacc, m.yacc, m.zacc))
+            case "ESTIMATOR_STATUS":
+                self.estimator = messages.estimator_report(m.to_dict(), t_s)
             case "COMMAND_ACK" if m.command not in _NO_MANOEUVRES:
                 self.refusal = None if m.result == 0 else f"MAV_CMD {m.command} {messages.result_text(m.result)}"
 

@@ -52,6 +52,7 @@ _STREAMS = (
     (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, 50.0),
     (mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, 50.0),
     (mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 10.0),
+    (mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS, 10.0),
 )
 
 
@@ -79,11 +80,21 @@ class TakeoverLanding:
         link: an open link.
         t_s: current flight clock.
         notify: called with each notice.
+        external: another program feeds PX4 with poses; the report of PX4's estimator shows whether PX4 uses them.
     """
 
     def __init__(
-        self, last_heartbeat: Heartbeat, clearance_m: float, tilt_max_rad: float, link: Link, t_s: float, notify: Notify
+        self,
+        last_heartbeat: Heartbeat,
+        clearance_m: float,
+        tilt_max_rad: float,
+        link: Link,
+        t_s: float,
+        notify: Notify,
+        *,
+        external: bool = False,
     ) -> None:
+        self._external = external
         self._clearance_m = clearance_m
         self._tilt_max_rad = tilt_max_rad
         self._link = link
@@ -193,7 +204,7 @@ class TakeoverLanding:
             self._pilot = True
             self._landing = None
         if self._pilot:
-            text = "a pilot is flying: only motion capture is sent to PX4"
+            text = f"a pilot is flying: {'nothing' if self._external else 'only motion capture'} is sent to PX4"
             self._notify_once(t_s, "guardian_pilot", Severity.WARNING, text)
 
     def _apply(self, t_s: float, status: AutopilotStatus | None, step: LandingStep) -> None:
@@ -246,6 +257,7 @@ class TakeoverLanding:
             mocap=self._pose,
             command=OperatorCommand.NONE,
             recorder_dropped=0,
+            estimator=self._px4.estimator if self._external else None,
         )
 
     def _notify_once(self, t_s: float, event_id: str, severity: Severity, text: str) -> None:

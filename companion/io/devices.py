@@ -17,7 +17,9 @@ from companion.io.force_torque.plugin_driver import open_force
 from companion.io.mocap.plugin_driver import open_mocap
 from companion.io.protocols import Arm, Autopilot, DeviceError, ForceTorque, GroundLink, Mocap
 from companion.io.px4.driver import MavsdkAutopilot
+from companion.io.px4.inbox import ESTIMATOR_RATE_HZ
 from companion.io.qgroundcontrol.station import GroundStation, check_address
+from companion.model.estimator import WATCHED_RATE_HZ
 from companion.model.flight_stage import is_armed
 from companion.model.types import MocapPose
 from companion.runtime.clock import Clock
@@ -41,8 +43,8 @@ class VisionFilter:
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """All open devices of a flight. A device is None if the vehicle does not have it, or if PX4 was found armed and the device
-    could not be opened.
+    """All open devices of a flight. A device is None if the vehicle does not have it, as motion capture if another program feeds PX4,
+    or if PX4 was found armed and the device could not be opened.
     """
 
     vision: VisionFilter
@@ -89,7 +91,8 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
     async with contextlib.AsyncExitStack() as stack:
         problem: DeviceError | None = None
         try:
-            available.mocap = await stack.enter_async_context(_mocap(config, clock, available))
+            if (system := _mocap(config, clock, available)) is not None:
+                available.mocap = await stack.enter_async_context(system)
         except DeviceError as error:
             problem = error
         try:
@@ -161,8 +164,9 @@ async def open_available(
         if (sensor := _force(config, clock)) is not None:
             with noted("force", "force sensor"):
                 available.force = await stack.enter_async_context(sensor)
-        with noted("mocap", "motion capture"):
-            available.mocap = await stack.enter_async_context(_mocap(config, clock, available))
+        if (system := _mocap(config, clock, available)) is not None:
+            with noted("mocap", "motion capture"):
+                available.mocap = await stack.enter_async_context(system)
         with noted("autopilot", "PX4"):
             available.autopilot = await stack.enter_async_context(_autopilot(config, clock))
         if (driver := _arm(config, clock)) is not None:
@@ -186,7 +190,10 @@ def _force(config: FlightConfig, clock: Clock) -> ForceTorque | None:
     return open_force(device, clock) if device is not None else None
 
 
-def _mocap(config: FlightConfig, clock: Clock, available: AvailableDevices) -> Mocap:
+def _mocap(config: FlightConfig, clock: Clock, available: AvailableDevices) -> Mocap | None:
+    """Return the driver of motion capture, or None if another program feeds PX4."""
+    if config.vehicle.devices.mocap.external:
+        return None
     vision = available.vision
 
     def forward(pose: MocapPose) -> None:
@@ -219,7 +226,9 @@ def _ground(config: FlightConfig, address: str, autopilot: MavsdkAutopilot) -> G
 
 def _autopilot(config: FlightConfig, clock: Clock) -> MavsdkAutopilot:
     forwarding = config.vehicle.ground.qgroundcontrol is not None
-    return MavsdkAutopilot(config.vehicle.devices.autopilot, clock, forwarding=forwarding)
+    devices = config.vehicle.devices
+    rate_hz = WATCHED_RATE_HZ if devices.mocap.external else ESTIMATOR_RATE_HZ
+    return MavsdkAutopilot(devices.autopilot, clock, forwarding=forwarding, estimator_rate_hz=rate_hz)
 
 
 def open_arm(device: ArmDevice, arm: ArmConfig, clock: Clock) -> DynamixelArm | PluginArm:

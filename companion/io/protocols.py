@@ -10,9 +10,9 @@ from collections.abc import Iterable
 from types import TracebackType
 from typing import Protocol, Self
 
+from companion.model.estimator import EstimatorReport
 from companion.model.observations import (
     ArmStatement,
-    EstimatorReport,
     ForceCounts,
     MocapCounts,
     MocapServer,

@@ -2,7 +2,8 @@
 an argument.
 
 An estimate that has only begun to follow is close for a moment; one that has converged stays close. PX4's position and yaw are
-compared with those of motion capture while the vehicle is on the ground.
+compared with those of motion capture while the vehicle is on the ground. If another program feeds PX4 there is no motion capture to
+compare with; the estimate must then stay where it was.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ SPREAD_MAX_M = 0.02
 """Largest standard deviation of the distance over all three axes, m. EKF2 shows a few millimetres at rest with 1 cm of vision noise."""
 YAW_OFF_MAX_RAD = math.radians(5.0)
 YAW_SPREAD_MAX_RAD = math.radians(2.0)
+_NOWHERE: Vec3 = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,34 +31,44 @@ class SettledEstimate:
     """Differences between PX4's estimate and motion capture over the last `SETTLED_S`."""
 
     seen: tuple[tuple[float, Vec3, float], ...] = ()
-    """Time on the flight clock (s), and position (m) and yaw (rad) of the estimate minus those of motion capture."""
+    """Time on the flight clock (s), and position (m) and yaw (rad) of the estimate minus those of motion capture, if there is any."""
+    alone: bool = False
+    """Whether there is no motion capture to compare with."""
     since_s: float | None = None
     """Time on the flight clock of the first tick; None before it."""
 
-    def take(self, t_s: float, vehicle: VehicleState, pose: MocapPose) -> SettledEstimate:
-        """Return the evidence after one more tick."""
-        (x, y, z), (a, b, c) = vehicle.position_world_m, pose.position_world_m
-        yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2] - euler_zyx_from_quat(pose.attitude_wxyz)[2]
+    def take(self, t_s: float, vehicle: VehicleState, pose: MocapPose | None) -> SettledEstimate:
+        """Return the evidence after one more tick; `pose` is None if another program feeds PX4."""
+        x, y, z = vehicle.position_world_m
+        yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2]
+        a, b, c = pose.position_world_m if pose is not None else _NOWHERE
+        yaw_rad -= euler_zyx_from_quat(pose.attitude_wxyz)[2] if pose is not None else 0.0
         first = 0
         while first < len(self.seen) and self.seen[first][0] < t_s - SETTLED_S:
             first += 1
         seen = (*self.seen[first:], (t_s, (x - a, y - b, z - c), wrap_rad(yaw_rad)))
-        return SettledEstimate(seen, t_s if self.since_s is None else self.since_s)
+        return SettledEstimate(seen, pose is None, t_s if self.since_s is None else self.since_s)
+
+    @property
+    def _compared_with(self) -> str:
+        return f"that of {SETTLED_S:g} s ago" if self.alone else "that of motion capture"
 
     def problem(self, t_s: float) -> str | None:
         """Return a message that says what has not converged, or None if everything has for `SETTLED_S`."""
         if self.since_s is None or t_s - self.since_s < SETTLED_S:
             return f"PX4's estimate has not followed motion capture for {SETTLED_S:g} s without interruption"
-        count = len(self.seen)
-        mean = [math.fsum(off[axis] for _, off, _ in self.seen) / count for axis in range(3)]
-        spread_m = math.sqrt(math.fsum(math.dist(off, mean) ** 2 for _, off, _ in self.seen) / count)
-        yaw_rad = math.fsum(yaw for _, _, yaw in self.seen) / count
-        yaw_spread_rad = math.sqrt(math.fsum((yaw - yaw_rad) ** 2 for _, _, yaw in self.seen) / count)
+        count, (_, (a, b, c), first_rad) = len(self.seen), self.seen[0] if self.alone else (0.0, _NOWHERE, 0.0)
+        apart = [(x - a, y - b, z - c) for _, (x, y, z), _ in self.seen]
+        turned_rad = [wrap_rad(yaw - first_rad) for _, _, yaw in self.seen]
+        mean = [math.fsum(off[axis] for off in apart) / count for axis in range(3)]
+        spread_m = math.sqrt(math.fsum(math.dist(off, mean) ** 2 for off in apart) / count)
+        yaw_rad = math.fsum(turned_rad) / count
+        yaw_spread_rad = math.sqrt(math.fsum((yaw - yaw_rad) ** 2 for yaw in turned_rad) / count)
         off_m = math.hypot(*mean)
         wrong = []
         if off_m > OFF_MAX_M or spread_m > SPREAD_MAX_M:
             wrong.append(
-                f"its position is {off_m * 1e3:.0f} mm from that of motion capture and drifts by {spread_m * 1e3:.0f} mm "
+                f"its position is {off_m * 1e3:.0f} mm from {self._compared_with} and drifts by {spread_m * 1e3:.0f} mm "
                 f"(allowed: {OFF_MAX_M * 1e3:.0f} and {SPREAD_MAX_M * 1e3:.0f} mm)"
             )
         if abs(yaw_rad) > YAW_OFF_MAX_RAD or yaw_spread_rad > YAW_SPREAD_MAX_RAD:

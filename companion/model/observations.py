@@ -9,25 +9,8 @@ from collections.abc import Mapping
 import msgspec
 
 from companion.model.codec import Record
+from companion.model.estimator import EstimatorReport
 from companion.model.types import ArmState, AutopilotStatus, ForceSample, MocapPose, VehicleState
-
-
-class EstimatorReport(Record, frozen=True, kw_only=True):
-    """Content of ESTIMATOR_STATUS (MAVLink message 230), stamped with the flight clock on arrival."""
-
-    stamp_s: float
-    flags: int
-    """Bit mask of ESTIMATOR_STATUS_FLAGS."""
-    velocity_ratio: float
-    """Innovation test ratio of the velocity. Such a ratio is below 1 if the measurements are accepted, and exactly 0 if nothing is
-    fused.
-    """
-    position_horizontal_ratio: float
-    position_vertical_ratio: float
-    position_horizontal_accuracy_m: float
-    """Accuracy of the horizontal position, one standard deviation."""
-    position_vertical_accuracy_m: float
-    """Accuracy of the vertical position, one standard deviation."""
 
 
 class ServoReport(Record, frozen=True, kw_only=True):

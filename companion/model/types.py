@@ -15,6 +15,7 @@ from __future__ import annotations
 from enum import Enum
 
 from companion.model.codec import Record
+from companion.model.estimator import EstimatorReport
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
@@ -235,6 +236,8 @@ class Inputs(Record, frozen=True, kw_only=True):
     recorder_dropped: int
     guardian_ready: bool | None = None
     """Whether the guardian has reported within the last second that it can take over; None without a guardian (fast loop)."""
+    estimator: EstimatorReport | None = None
+    """Newest ESTIMATOR_STATUS, if another program feeds PX4 with poses (`devices.mocap.type: external`); else None."""
 
 
 class Reference(Record, frozen=True, kw_only=True):

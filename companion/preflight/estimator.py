@@ -8,13 +8,14 @@ observation prove fusion.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from companion.config.vehicle import Vehicle
 from companion.model.check_row import Row
 from companion.model.constants import GRAVITY_M_S2
+from companion.model.estimator import EstimatorReport
 from companion.model.frames import wrap_rad, yaw_from_quat
-from companion.model.observations import EstimatorReport, Observations
+from companion.model.observations import Observations
 from companion.model.types import FlightMode, MocapPose, VehicleState
 from companion.preflight.checks import Check
 from companion.px4.required import HOVER as HOVER_PARAM
@@ -58,7 +59,7 @@ AGREES = Check(
 STEADY = Check(
     "px4.steady",
     "PX4's estimate at rest",
-    "varies by less than 0.04 m and 3 deg relative to motion capture",
+    "varies by less than 0.04 m and 3 deg relative to motion capture; if another program feeds PX4, relative to the ground",
     "the vehicle follows a drifting estimate at take-off",
     settles=True,
 )
@@ -101,9 +102,12 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         yield _rates(o)
     if any(state.boot_s is not None for state in o.vehicle):
         yield _lag(o, vehicle)
-    yield vision(o)
+    external = vehicle.devices.mocap.external
+    yield vision(o, external)
     if o.mocap and o.vehicle:
         yield from agreement(o)
+    elif external and o.vehicle:
+        yield _steady(o.vehicle)
     if o.status:
         yield _battery(o, vehicle)
     hover = vehicle.airframe.hover_thrust or o.params.get(HOVER_PARAM)
@@ -157,8 +161,8 @@ def _lag(o: Observations, vehicle: Vehicle) -> Row:
     return LAG.bad(read, wanted, "reduce other traffic on the link and the load on this computer")
 
 
-def vision(o: Observations) -> Row:
-    """Return the row on evidence of fusion over the whole observation."""
+def vision(o: Observations, external: bool = False) -> Row:
+    """Return the row on evidence of fusion over the whole observation; `external` if another program feeds PX4."""
     missing = missing_evidence(o)
     wanted = f"fused for {o.duration_s:.0f} s"
     if missing is None:
@@ -169,7 +173,9 @@ def vision(o: Observations) -> Row:
             f"fused for {o.duration_s:.0f} s, accuracy {accuracy_m:.3f} m, test ratio {ratio:.2f}", wanted
         )
     fix = "check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3, and that the body is tracked; then reboot PX4"
-    if not o.mocap:
+    if external:
+        fix = "start the program that sends poses to PX4, and check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3"
+    elif not o.mocap:
         fix = "motion capture is missing: see its rows first"
     return VISION.bad(missing, wanted, fix)
 
@@ -231,18 +237,25 @@ def agreement(o: Observations) -> Iterator[Row]:
     else:
         fix = "check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3, and the body's axes in Motive; reboot PX4 after a change"
         yield AGREES.bad(read, wanted, fix)
-    wander_m = max(max(d[axis] for d in apart) - min(d[axis] for d in apart) for axis in range(3))
-    wander_rad = max(turned_rad) - min(turned_rad)
+    yield _wander(apart, turned_rad)
+
+
+def _steady(states: tuple[VehicleState, ...]) -> Row:
+    """Return the row on the variation of PX4's own estimate, without motion capture to compare it with."""
+    yaws_rad = [yaw_from_quat(state.attitude_wxyz) for state in states]
+    return _wander([state.position_world_m for state in states], [wrap_rad(yaw - yaws_rad[0]) for yaw in yaws_rad])
+
+
+def _wander(places_m: Sequence[Sequence[float]], yaws_rad: Sequence[float]) -> Row:
+    wander_m = max(max(p[axis] for p in places_m) - min(p[axis] for p in places_m) for axis in range(3))
+    wander_rad = max(yaws_rad) - min(yaws_rad)
     read = f"varies by {wander_m:.3f} m and {math.degrees(wander_rad):.1f} deg"
     wanted = f"{STEADY_M:g} m, {math.degrees(STEADY_RAD):.0f} deg"
     if wander_m <= STEADY_M and wander_rad <= STEADY_RAD:
-        yield STEADY.good(read, wanted)
-    else:
-        yield STEADY.bad(
-            read,
-            wanted,
-            "leave the vehicle at rest; if the estimate does not settle, reboot PX4 and calibrate its gyros",
-        )
+        return STEADY.good(read, wanted)
+    return STEADY.bad(
+        read, wanted, "leave the vehicle at rest; if the estimate does not settle, reboot PX4 and calibrate its gyros"
+    )
 
 
 def _pairs(states: tuple[VehicleState, ...], poses: tuple[MocapPose, ...]) -> Iterator[tuple[VehicleState, MocapPose]]:

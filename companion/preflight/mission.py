@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from companion.config.loader import FlightConfig
 from companion.config.mission import Start
 from companion.config.tether import Room
+from companion.model.best_pose import last_pose
 from companion.model.check_row import Row
 from companion.model.listing import listed
 from companion.model.observations import Observations
@@ -65,7 +66,7 @@ def rows(o: Observations, config: FlightConfig) -> Iterator[Row]:
             yield PLAN.good(f"'{mission.name}' can be flown{length}")
     if o.arm:
         yield _arm(o.arm[-1].angle_rad, mission.start)
-    pose = next((pose for pose in reversed(o.mocap) if pose.tracking_valid), None)
+    pose = last_pose(o, external=vehicle.devices.mocap.external)
     if pose is not None:
         yield _room(pose.position_world_m, vehicle.room, vehicle.airframe.radius_m)
 

@@ -14,6 +14,10 @@ from companion.model.types import MocapPose
 from companion.preflight.checks import Check
 
 DEVICE = Check("mocap.device", "motion capture", "the server answers and streams", "PX4 needs it for its position")
+NOT_CHECKED = (
+    "another program feeds PX4 (devices.mocap.type: external): rate, latency, axes and lost frames are not checked; in flight, poses "
+    "that jump, freeze, drift or belong to another body are noticed only as far as PX4's estimator rejects them"
+)
 RATE = Check(
     "mocap.rate",
     "mocap rate",
@@ -78,6 +82,9 @@ CLOCK_GOOD, WANDER_GOOD_S = 0.01, 0.020
 
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     """Return the rows of motion capture."""
+    if vehicle.devices.mocap.external:
+        yield DEVICE.doubtful(NOT_CHECKED, "", "")
+        return
     failure, stream = o.failures.get("mocap"), o.mocap_stream
     if failure is not None:
         yield DEVICE.bad(failure, "", "")

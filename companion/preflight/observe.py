@@ -19,8 +19,8 @@ from companion.config.loader import FlightConfig
 from companion.io.devices import AvailableDevices, Devices
 from companion.io.dynamixel.registers import usb_latency_ms
 from companion.io.protocols import Autopilot, DeviceError
+from companion.model.estimator import EstimatorReport
 from companion.model.observations import (
-    EstimatorReport,
     ForceStream,
     Machine,
     MocapStream,

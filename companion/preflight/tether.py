@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 from companion.config.tether import Tether
 from companion.config.vehicle import Vehicle
+from companion.model.best_pose import last_pose
 from companion.model.check_row import Row
 from companion.model.frames import quat_rotate
 from companion.model.observations import Observations
@@ -63,7 +64,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         yield STRENGTH.bad(read, wanted, "use a stronger tether, and correct tether.load_rating_n")
     if vehicle.arm.joints:
         yield _arm(vehicle, tether)
-    pose = next((pose for pose in reversed(o.mocap) if pose.tracking_valid), None)
+    pose = last_pose(o, external=vehicle.devices.mocap.external)
     if pose is None:
         return
     attachment = quat_rotate(pose.attitude_wxyz, tether.attachment_body_m)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from companion.model.best_pose import pose_used_s
 from companion.model.flight_stage import chosen_by_pilot, in_offboard, is_armed, on_ground
 from companion.model.types import AutopilotRequest, FlightMode, Inputs
 from companion.safety.rotor_stop import (
@@ -221,7 +222,8 @@ class AutopilotLanding:
         contradict it.
         """
         pose, vehicle, t_s = fresh_pose(i), i.vehicle, i.t_s
-        pose_s = pose.stamp_s if pose is not None else self.pose_s
+        used_s = pose_used_s(i) if i.mocap is None else None
+        pose_s = pose.stamp_s if pose is not None else self.pose_s if used_s is None else used_s
         sinking = self.sinking.update(t_s, i.mocap)
         since_s = self.landing_since_s
         if i.status is None or i.status.mode not in (FlightMode.LAND, FlightMode.OTHER):

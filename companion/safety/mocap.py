@@ -32,8 +32,14 @@ RATE_WINDOW_S = 1.0
 def unfused(i: Inputs) -> str | None:
     """Return why PX4 appears not to fuse vision, or None if position and yaw of its estimate agree with motion capture.
 
-    PX4 accepts poses without fusing them and does not report it, so having sent them proves nothing.
+    PX4 accepts poses without fusing them and does not report it, so having sent them proves nothing. If another program sends them,
+    there is only the report of PX4's estimator.
     """
+    if i.estimator is not None:
+        lacking = i.estimator.unaided
+        return (
+            None if lacking is None else f"PX4 fuses no external vision: its estimator has no measurement of {lacking}"
+        )
     if i.vehicle is None or i.mocap is None:
         return "no state to compare"
     apart_m = math.dist(i.vehicle.position_world_m, i.mocap.position_world_m)

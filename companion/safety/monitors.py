@@ -18,6 +18,7 @@ from companion.safety.px4 import Px4Tracker
 from companion.safety.rule import Subject
 from companion.safety.situation import Situation
 from companion.safety.validity import InputFilter
+from companion.safety.vision import VisionTracker
 
 AWAKE_STEP_MAX_S = 0.02
 """Largest time that one tick adds to the age of inputs."""
@@ -42,12 +43,16 @@ class Monitors:
         self._flight = FlightTracker(vehicle)
         trackers: dict[Subject, object] = {
             Subject.INPUTS: self._filter,
-            Subject.MOCAP: self._mocap,
             Subject.PX4: self._px4,
             Subject.PROCESS: self._process,
             Subject.FLIGHT: self._flight,
             Subject.OPERATOR: self._process,
         }
+        self._vision = VisionTracker() if vehicle.devices.mocap.external else None
+        if self._vision is None:
+            trackers[Subject.MOCAP] = self._mocap
+        else:
+            trackers[Subject.VISION] = self._vision
         if vehicle.arm.joints:
             trackers[Subject.ARM] = self._arm
         if vehicle.devices.force is not None:
@@ -93,6 +98,8 @@ class Monitors:
         if not situation.waiting:
             moving = i.vehicle is not None and _moves(i.vehicle)
             self._mocap.update(i, situation, awake_s, moving)
+            if self._vision is not None:
+                self._vision.update(i, awake_s)
             self._px4.update(i, situation, awake_s, moving)
             self._arm.update(i, awake_s, situation.torque_refused)
             self._force.update(i, situation, awake_s, gap_s, moving)

@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+from companion.model.best_pose import pose_used_s
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.flight_stage import HEARTBEAT_FRESH_S, flown_by_pilot
 from companion.model.frames import tilt_rad
@@ -100,7 +101,7 @@ class RotorStop:
     tilt_max_rad: float
     """`safety.tilt_abort_deg`; a vehicle that lies on the floor beyond it is tipped over."""
     pose_s: float = -math.inf
-    """Time on the flight clock of the newest pose that PX4 received; -inf if unknown."""
+    """Time on the flight clock at which PX4 last used a pose; -inf if unknown."""
     sinking: Sinking = field(default_factory=Sinking)
     rest: tuple[float, Places] | None = None
     """Time since which the vehicle has been at rest, and its position from each source; None if it is not at rest."""
@@ -132,7 +133,8 @@ class RotorStop:
         """
         pose, t_s = fresh_pose(i), i.t_s
         sinking = self.sinking.update(t_s, pose)
-        pose_s = max(self.pose_s, i.mocap.stamp_s) if i.mocap is not None and i.mocap.tracking_valid else self.pose_s
+        used_s = pose_used_s(i)
+        pose_s = self.pose_s if used_s is None else max(self.pose_s, used_s)
         rest = self._rest(i, _low_and_still(i, pose, sinking.speed_m_s, self.low_m, pose_s))
         rest_s = t_s - rest[0] if rest is not None else -math.inf
         flipped_since_s = _since(self.flipped_since_s, t_s, seems_flipped(i) and not flown_by_pilot(i.status))

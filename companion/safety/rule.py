@@ -19,6 +19,7 @@ class Subject(Enum):
     INPUTS = "inputs"
     OPERATOR = "operator"
     MOCAP = "motion capture"
+    VISION = "external vision"
     PX4 = "PX4"
     ARM = "arm"
     FORCE = "force sensor"

@@ -7,7 +7,7 @@ Ids are stable because logs, summaries and users' scripts contain them. Simultan
 from __future__ import annotations
 
 from companion.model.types import OperatorCommand, SafetyAction, Severity
-from companion.safety import arm, flight, mocap, process, px4
+from companion.safety import arm, flight, mocap, process, px4, vision
 from companion.safety.process import commanded
 from companion.safety.rule import Repeat, Rule, Subject
 from companion.safety.validity import invalid
@@ -142,6 +142,22 @@ RULES: tuple[Rule, ...] = (
         id="yaw_disagrees", subject=Subject.MOCAP, what="PX4's yaw disagrees with motion capture",
         predicate=mocap.yaw_disagrees, thresholds=("yaw_disagreement_deg",), hold_time=0.5, ground=None, air=_PX4_LANDS,
         message="PX4's yaw is {:.0f} deg from motion capture (limit {:.0f} deg)",
+    ),
+
+    Rule(
+        id="estimator_silent", subject=Subject.VISION, what="no ESTIMATOR_STATUS, so PX4's use of external vision is unknown",
+        predicate=vision.estimator_silent, thresholds=("vehicle_timeout_s",), ground=_PX4_LANDS, air=_PX4_LANDS,
+        message="no ESTIMATOR_STATUS from PX4 for more than {:.2f} s",
+    ),
+    Rule(
+        id="vision_lost", subject=Subject.VISION, what="PX4 fuses no external vision: the program that sends it has stopped",
+        predicate=vision.vision_lost, ground=_PX4_LANDS, air=_PX4_LANDS,
+        message="PX4 fuses no external vision: its estimator has no measurement of {}",
+    ),
+    Rule(
+        id="vision_rejected", subject=Subject.VISION, what="PX4 rejects external vision", predicate=vision.vision_rejected,
+        hold_time=0.2, ground=None, air=_WARN,
+        message="PX4 rejects external vision: innovation test ratio {:.1f} (limit {:.0f})",
     ),
 
     Rule(

@@ -80,10 +80,10 @@ class Kind:
     """Whether the fault acts on a process of the companion instead of on the world."""
 
 
-_MOCAP_GONE = ("mocap_lost", "mocap_invalid", "mocap_too_late")
+_MOCAP_GONE = ("mocap_lost", "mocap_invalid", "mocap_too_late", "vision_lost")
 _MOCAP_WRONG = (
     "mocap_jump", "mocap_swapped", "mocap_frozen", "mocap_dragged", "estimate_disagrees", "yaw_disagrees", "tracking_warn",
-    "tracking_hold", "tracking_error",
+    "tracking_hold", "tracking_error", "vision_rejected",
 )  # fmt: skip
 _PX4_GONE = ("vehicle_state_lost", "heartbeat_lost", "px4_rebooted", "px4_disarmed", "estimate_frozen", "offboard_left")
 _ARM_GONE = ("arm_lost", "arm_read_failures", "arm_let_go")

@@ -15,11 +15,12 @@ from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery, Px4Stub, gains_from_params
 from sitl.autopilot.cascade import Cascade
 from sitl.autopilot.estimator import Estimator
-from sitl.autopilot.mavlink import GROUND_PORTS, MavlinkServer, Ports
+from sitl.autopilot.mavlink import GROUND_PORTS, VISION_PORTS, MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Params, mav_type
 from sitl.autopilot.types import ImuSample, LearnedBias, RotorCommands
 from sitl.faults.injector import Autopilot as FaultyAutopilot
+from sitl.udp import Address
 from sitl.world.world import World
 
 STUB_VERSION = "1.16"
@@ -53,6 +54,10 @@ class AutopilotBackend(Protocol):
     @property
     def down(self) -> bool:
         """Whether the autopilot is booting and does not communicate."""
+
+    @property
+    def vision_address(self) -> Address:
+        """Address of the MAVLink link on which another program may send external vision, while the links are open."""
 
     def attach(self, world: World) -> None:
         """Set the world in which the autopilot flies; call this method before all others."""
@@ -146,7 +151,8 @@ class StubBackend:
 
     lockstep = False
 
-    def __init__(self, airframe: Airframe, config: WorldConfig, ports: Ports) -> None:
+    def __init__(self, airframe: Airframe, config: WorldConfig, ports: Ports, *, external_vision: bool = False) -> None:
+        self._external_vision = external_vision
         self._config = config
         self._ports = ports
         self.px4 = stub_of(config, airframe)
@@ -166,6 +172,11 @@ class StubBackend:
         """Whether the stub is booting after a restart."""
         return self.px4.t_s < self.px4.booted_at_s
 
+    @property
+    def vision_address(self) -> Address:
+        """Address of the link that is opened if the stub was made with `external_vision`."""
+        return ("127.0.0.1", self._mavlink.vision_port)
+
     def attach(self, world: World) -> None:
         """Set MPC_THR_HOVER to the hover thrust of this world's vehicle."""
         set_hover_thrust(self.px4, self._config, world)
@@ -174,7 +185,8 @@ class StubBackend:
     async def wires(self) -> AsyncIterator[str]:
         """Open MAVLink over UDP and yield the companion's address."""
         ground = GROUND_PORTS if self._ports.remote else None
-        async with MavlinkServer(self.px4, self._ports, ground) as self._mavlink:
+        vision = (VISION_PORTS if self._ports.remote else Ports(0, 0)) if self._external_vision else None
+        async with MavlinkServer(self.px4, self._ports, ground, vision) as self._mavlink:
             yield f"udpout://127.0.0.1:{self._mavlink.onboard_port}"
 
     async def prepare(self) -> None:

@@ -1,4 +1,4 @@
-"""MAVLink 2 of the PX4 stub over UDP on 127.0.0.1: an onboard link and, optionally, a link to a ground station.
+"""MAVLink 2 of the PX4 stub over UDP on 127.0.0.1: an onboard link and, optionally, links to a ground station and to another program.
 
 As in PX4 SITL, a link sends to its remote port until a message arrives, and then to the sender of that message until PX4 reboots;
 messages from other senders are handled too. A link without a remote port sends to the newest sender. Streams run on world time,
@@ -49,6 +49,8 @@ class Ports:
 
 ONBOARD_PORTS = Ports(14580, 14540)
 GROUND_PORTS = Ports(18570, 14550)
+VISION_PORTS = Ports(13030, 13280)
+"""The link of PX4 SITL that is meant for a gimbal; here another program sends external vision on it."""
 
 
 class Link(UdpEndpoint):
@@ -173,11 +175,18 @@ class MavlinkServer:
     """
 
     def __init__(
-        self, stub: Px4Stub, onboard: Ports = ONBOARD_PORTS, ground: Ports | None = None, host: str = "127.0.0.1"
+        self,
+        stub: Px4Stub,
+        onboard: Ports = ONBOARD_PORTS,
+        ground: Ports | None = None,
+        vision: Ports | None = None,
+        host: str = "127.0.0.1",
     ) -> None:
         self._stub = stub
         self._host = host
         self._wanted = [(onboard, False)] + ([(ground, True)] if ground is not None else [])
+        self._vision_wanted = vision
+        self._vision: Link | None = None
         self._links: list[Link] = []
         self._down = False
 
@@ -192,8 +201,14 @@ class MavlinkServer:
         return self._links[1].port if len(self._links) > 1 else None
 
     @property
+    def vision_port(self) -> int:
+        """Local port of the link to the program that sends external vision, while it is open."""
+        assert self._vision is not None
+        return self._vision.port
+
+    @property
     def link_down(self) -> bool:
-        """Fault: every link is down."""
+        """Fault: every link is down, except that to the program that sends external vision."""
         return self._down
 
     @link_down.setter
@@ -204,7 +219,7 @@ class MavlinkServer:
 
     @property
     def delay_s(self) -> float:
-        """Fault: delay of every link in each direction, s."""
+        """Fault: delay of these links in each direction, s."""
         return self._links[0].delay_s if self._links else 0.0
 
     @delay_s.setter
@@ -219,21 +234,27 @@ class MavlinkServer:
 
     async def __aenter__(self) -> Self:
         receiver = Receiver(self._stub)
-        loop = asyncio.get_running_loop()
         for ports, ground in self._wanted:
-            partner = (self._host, ports.remote) if ports.remote else None
-            link = Link(self._stub, receiver, partner, ground)
+            link = await self._open(receiver, ports, ground)
             link.down = self._down
-            try:
-                await loop.create_datagram_endpoint(lambda link=link: link, local_addr=(self._host, ports.local))  # type: ignore[misc]
-            except OSError as error:
-                await self._close()
-                found = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be opened ({error.strerror})"
-                raise LinkError(
-                    f"PX4 stub: UDP port {self._host}:{ports.local} {found}; end the program that uses it or choose another port"
-                ) from error
             self._links.append(link)
+        if self._vision_wanted is not None:
+            self._vision = await self._open(receiver, self._vision_wanted, False)
         return self
+
+    async def _open(self, receiver: Receiver, ports: Ports, ground: bool) -> Link:
+        partner = (self._host, ports.remote) if ports.remote else None
+        link = Link(self._stub, receiver, partner, ground)
+        loop = asyncio.get_running_loop()
+        try:
+            await loop.create_datagram_endpoint(lambda: link, local_addr=(self._host, ports.local))
+        except OSError as error:
+            await self._close()
+            found = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be opened ({error.strerror})"
+            raise LinkError(
+                f"PX4 stub: UDP port {self._host}:{ports.local} {found}; end the program that uses it or choose another port"
+            ) from error
+        return link
 
     async def __aexit__(self, *_: object) -> None:
         await self._close()
@@ -248,8 +269,12 @@ class MavlinkServer:
                 link.status_text(int(notice.severity), f"{notice.text}\t")
         for link in self._links:
             link.pump(t_s)
+        if self._vision is not None:
+            self._vision.pump(t_s)
 
     async def _close(self) -> None:
         links, self._links = self._links, []
         for link in links:
             await link.close()
+        if self._vision is not None:
+            await self._vision.close()

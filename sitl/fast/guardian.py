@@ -167,7 +167,9 @@ class Landing:
         self._wire = MemoryWire(px4)
         self._link = Link(self._wire, _OWN, beat.autopilot_system)
         clearance_m, tilt_max_rad = vehicle.airframe.ground_clearance_m, math.radians(vehicle.safety.tilt_abort_deg)
-        self._landing = TakeoverLanding(beat, clearance_m, tilt_max_rad, self._link, t_s, notify)
+        self._landing = TakeoverLanding(
+            beat, clearance_m, tilt_max_rad, self._link, t_s, notify, external=vehicle.devices.mocap.external
+        )
         self._round_s = float("-inf")
 
     @property

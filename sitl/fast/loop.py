@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from companion.core.flight_core import FlightCore
 from companion.io.px4.delta_velocity import DeltaVelocity
+from companion.io.px4.messages import estimator_report
 from companion.model.constants import TICK_PERIOD_S
+from companion.model.estimator import WATCHED_RATE_HZ, EstimatorReport
 from companion.model.frames import (
     attitude_enu_flu_from_ned_frd,
     attitude_ned_frd_from_enu_flu,
@@ -41,7 +44,7 @@ from sitl.autopilot.autopilot import Command7, Px4Stub
 from sitl.autopilot.backend import set_hover_thrust, stub_of
 from sitl.autopilot.commander import FORCE_MAGIC, Command
 from sitl.autopilot.modes import NavState
-from sitl.autopilot.telemetry import system_status
+from sitl.autopilot.telemetry import estimator_status, system_status
 from sitl.autopilot.types import AttitudeTarget, ImuSample, RotorCommands
 from sitl.fast.bus import FastBus, scales_of
 from sitl.fast.guardian import TAKE_OVER_S, FastGuardian, Landing
@@ -163,10 +166,14 @@ class FastFlight:
         scales = scales_of(vehicle, plugged_in(servos, world))
         watchdog_s = vehicle.arm_device.watchdog_ms * 1e-3 if drives else 0.0
         self._bus = FastBus(drives, scales, watchdog_s, self.faults if world.faults else None)
+        self._external = vehicle.devices.mocap.external
+        """Whether another program feeds PX4 with poses: the companion receives none."""
         self._mocap: MocapPose | None = None
         self._has_force = vehicle.devices.force is not None
         self._force: ForceSample | None = None
         self._position = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
+        self._estimator_s = -math.inf
+        self._report: EstimatorReport | None = None
         self._trusted = True
         """Whether the core trusts motion capture; only trusted poses are forwarded to PX4."""
         self._dropped = 0
@@ -225,6 +232,8 @@ class FastFlight:
         period_s = world.t_s
         while px4.armed and not world.crashed and world.t_s < end_s:
             self.plant.step(px4.armed)
+            if self._external:
+                self._poses_for_guardian()
             if world.t_s >= period_s + TICK_PERIOD_S - 1e-9:
                 period_s += TICK_PERIOD_S
                 result.after.append(world.snapshot())
@@ -247,7 +256,7 @@ class FastFlight:
         period_s = world.t_s
         while world.t_s < limit_s and not world.crashed and (landing is None or landing.landed is None):
             plant.step(px4.armed)
-            poses = [self._pose(frame) for frame in plant.take_mocap()]
+            poses = self._poses_for_guardian()
             if landing is None and world.t_s >= open_s:
                 landing = guardian.take_over(world.t_s)
             if landing is not None:
@@ -257,11 +266,22 @@ class FastFlight:
                 result.after.append(world.snapshot())
         result.guardian_landed = landing.landed if landing is not None else False
 
+    def _poses_for_guardian(self) -> list[MocapPose]:
+        """Return the poses of this step; none if another program sends them to PX4 itself, which it does here."""
+        frames = self.plant.take_mocap()
+        if not self._external:
+            return [self._pose(frame) for frame in frames]
+        for frame in frames:
+            self._deliver(frame)
+        return []
+
     def _deliver(self, frame: MocapFrame) -> None:
-        self._mocap = pose = self._pose(frame)
+        pose = self._pose(frame)
+        if not self._external:
+            self._mocap = pose
         if self._trusted and pose.tracking_valid:
             position, attitude = ned_from_enu(pose.position_world_m), attitude_ned_frd_from_enu_flu(pose.attitude_wxyz)
-            if self.plant.faults is None:
+            if self.plant.faults is None or self._external:
                 self.px4.on_vision(pose.stamp_s, position, attitude)
             elif self.faults.active.keys().isdisjoint(FLIGHT_PROCESS_FAULTS):
                 self._link.send(lambda: self._see(position, attitude))
@@ -318,11 +338,14 @@ class FastFlight:
             command=_LAND if land else _NO_COMMAND,
             recorder_dropped=dropped,
             guardian_ready=guardian_ready,
+            estimator=self._estimator(t_s) if self._external else None,
         )
 
     def _vehicle(self, t_s: float) -> VehicleState | None:
         estimate = self.px4.estimate
-        if estimate is None or (not estimate.vision_fused and self._mocap is None):
+        if estimate is None:
+            return None
+        if not (estimate.vision_fused or (estimate.position_valid if self._external else self._mocap is not None)):
             return None
         if t_s - self._position[2] >= POSITION_PERIOD_S - 1e-9:
             self._position = (enu_from_ned(estimate.position_ned_m), enu_from_ned(estimate.velocity_ned_m_s), t_s)
@@ -340,6 +363,14 @@ class FastFlight:
             imu_boot_s=self._imu.total.boot_s,
             delta_velocity_body_m_s=flu_from_frd(self._imu.total.sum_m_s),
         )
+
+    def _estimator(self, t_s: float) -> EstimatorReport | None:
+        """Return the newest ESTIMATOR_STATUS, as PX4 sends it; None before the first."""
+        if self._link.alive and t_s - self._estimator_s >= 1.0 / WATCHED_RATE_HZ - 1e-9:
+            message = estimator_status(self.px4)
+            if message is not None:
+                self._estimator_s, self._report = t_s, estimator_report(message.to_dict(), t_s)
+        return self._report
 
     def _status(self, t_s: float) -> AutopilotStatus:
         commander = self.px4.commander

@@ -26,6 +26,7 @@ from sitl.px4.parameter_file import restore, stored
 from sitl.px4.parameters import BEFORE_BOOT, VERSION_DEPENDENT, parameters
 from sitl.px4.process import HOW_TO_GET_IT, HOW_TO_START_IT, MODEL, Installation, Instance, Px4Process, find
 from sitl.px4.relay import Relay
+from sitl.udp import Address
 from sitl.world.world import World
 
 BOOT_DEADLINE_S = 30.0
@@ -112,6 +113,11 @@ class RealPx4:
     def down(self) -> bool:
         """Whether PX4 is booting; always False, because a real PX4 does not restart in flight."""
         return False
+
+    @property
+    def vision_address(self) -> Address:
+        """Address of the gimbal link, which nothing else uses."""
+        return self._instance.gimbal_address
 
     @property
     def fault_target(self) -> FaultyAutopilot:

@@ -121,6 +121,11 @@ class Instance:
         """Address on which PX4's camera link listens."""
         return (HOST, _CAMERA_OWN + self.number)
 
+    @property
+    def gimbal_address(self) -> tuple[str, int]:
+        """Address on which PX4's gimbal link listens."""
+        return (HOST, _GIMBAL_OWN + self.number)
+
     @classmethod
     def claim(cls, numbers: range = INSTANCES) -> Instance:
         """Reserve and return the first free instance.

@@ -15,9 +15,9 @@ from companion.flight.command_queue import Operator
 from companion.flight.fallback_landing import unflown
 from companion.flight.main import Flight
 from companion.io.devices import Devices, VisionFilter
+from companion.model.estimator import EstimatorReport
 from companion.model.observations import (
     ArmStatement,
-    EstimatorReport,
     ForceCounts,
     MocapCounts,
     MocapServer,

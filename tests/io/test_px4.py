@@ -18,8 +18,8 @@ from companion.config.devices import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4 import params as autopilot_params
 from companion.io.px4.driver import MavsdkAutopilot
+from companion.model.estimator import EstimatorReport
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
-from companion.model.observations import EstimatorReport
 from companion.model.types import (
     AttitudeSetpoint,
     AutopilotRequest,

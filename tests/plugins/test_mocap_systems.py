@@ -312,7 +312,7 @@ def test_the_guardian_lands_while_a_client_replaces_its_socket(monkeypatch: pyte
         pose = None
         overturned = False
 
-        def __init__(self, *_: object) -> None:
+        def __init__(self, *_: object, **__: object) -> None:
             self.poses = 0
 
         def take_poses(self, poses: list[MocapPose]) -> None:

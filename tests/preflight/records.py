@@ -6,9 +6,9 @@ import math
 from functools import cache
 
 from companion.config.loader import FlightConfig, load_flight
+from companion.model.estimator import EstimatorReport
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.observations import (
-    EstimatorReport,
     ForceStream,
     Machine,
     MocapStream,

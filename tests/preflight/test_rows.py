@@ -41,6 +41,10 @@ class Case:
     """Rows that must fail with it."""
 
 
+FED: dict[str, Any] = {"mocap": (), "mocap_stream": None}
+EXTERNAL = {"devices.mocap.type": "external"}
+
+
 def force_stream(samples: int = 1000, bad_sums: int = 0, lost: str | None = None) -> dict[str, Any]:
     return {"force_stream": ForceStream(samples=samples, bad_sums=bad_sums, product="RFT60", lost=lost)}
 
@@ -139,6 +143,13 @@ CASES = {
     "old firmware of PX4": Case("px4.firmware", "PX4 1.13.3", "flash", {"firmware": "PX4 1.13.3 release (git 0)"}),
     "hover thrust of the vehicle file": Case(
         "px4.hover_thrust", "airframe.hover_thrust", "airframe.hover_thrust", {}, vehicle={"airframe.hover_thrust": 0.2}
+    ),
+    "another program feeds PX4": Case("mocap.device", "lost frames are not checked", "", FED, WARN, EXTERNAL),
+    "another program, no estimator status": Case(
+        "px4.vision", "no ESTIMATOR_STATUS", "start the program", {**FED, "estimator": ()}, vehicle=EXTERNAL
+    ),
+    "another program, wandering": Case(
+        "px4.steady", "0.06", "at rest", {**FED, "vehicle": moved(x_m=0.06, until=200)}, vehicle=EXTERNAL
     ),
     "no motion capture": Case("mocap.device", "expected it", "", failure("mocap")),
     "slow": Case("mocap.rate", "120 Hz", "camera rate", {"mocap_stream": r.stream(frames=600)}, WARN),

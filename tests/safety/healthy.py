@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 import msgspec
 
 from companion.config.vehicle import Vehicle
+from companion.model.estimator import EstimatorReport
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import (
     ArmState,
@@ -100,6 +101,20 @@ def healthy(tick: int = 0, t_s: float | None = None) -> Inputs:
         command=OperatorCommand.NONE,
         recorder_dropped=0,
     )
+
+
+def fed_by_another(i: Inputs) -> Inputs:
+    """The same machine if another program feeds PX4: no motion capture, but the report of PX4's estimator."""
+    report = EstimatorReport(
+        stamp_s=i.t_s,
+        flags=831,
+        velocity_ratio=0.0,
+        position_horizontal_ratio=0.05,
+        position_vertical_ratio=0.04,
+        position_horizontal_accuracy_m=0.005,
+        position_vertical_accuracy_m=0.005,
+    )
+    return msgspec.structs.replace(i, mocap=None, estimator=i.estimator or report)
 
 
 def flying(**changes: object) -> Situation:

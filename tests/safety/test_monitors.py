@@ -17,7 +17,7 @@ from companion.model.types import Event, FlightMode, Inputs, OperatorCommand, Sa
 from companion.safety.arm import error_text
 from companion.safety.mocap import unfused
 from companion.safety.monitors import Monitors
-from companion.safety.rule import Rule
+from companion.safety.rule import Rule, Subject
 from companion.safety.rules import RULES
 from companion.safety.situation import Situation
 from tests.safety.healthy import (
@@ -27,6 +27,7 @@ from tests.safety.healthy import (
     Change,
     after_a_moment,
     control,
+    fed_by_another,
     flying,
     healthy,
     put,
@@ -36,6 +37,7 @@ from tests.safety.healthy import (
 )
 
 VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
+EXTERNAL = load_vehicle("configs/vehicles/tarot650_2r.yaml", overrides=["vehicle.devices.mocap.type=external"])
 replace = msgspec.structs.replace
 NAN = math.nan
 RULE = {rule.id: rule for rule in RULES}
@@ -142,7 +144,14 @@ def dragged(i: Inputs) -> Inputs:
     return both(moved("mocap", (by_m, 0.0, 0.0)), moved("vehicle", (by_m, 0.0, 0.0)))(i)
 
 
+def estimator(**fields: float) -> Change:
+    return lambda i: put("estimator", **fields)(fed_by_another(i))
+
+
 FAULTS: dict[str, Fault] = {
+    "estimator_silent": Fault(lambda i: replace(i, estimator=fed_by_another(healthy()).estimator)),
+    "vision_lost": Fault(estimator(flags=0b1111)),
+    "vision_rejected": Fault(estimator(position_horizontal_ratio=1.2)),
     "mocap_not_finite": Fault(put("mocap", position_world_m=(NAN, 0.0, 1.0)), also=frozenset({"mocap_lost"})),
     "vehicle_not_finite": Fault(
         put("vehicle", velocity_world_m_s=(0.0, math.inf, 0.0)), also=frozenset({"vehicle_state_lost"})
@@ -235,6 +244,13 @@ def stream(rule_id: str) -> list[Inputs]:
     return after_a_moment(fault.change, sound=fault.sound)
 
 
+def seen_by(rule: Rule) -> tuple[Vehicle, list[Inputs]]:
+    """The machine to which the rule belongs, and what it sees."""
+    if rule.subject is not Subject.VISION:
+        return VEHICLE, stream(rule.id)
+    return EXTERNAL, [fed_by_another(i) for i in stream(rule.id)]
+
+
 def test_every_rule_has_its_fault() -> None:
     assert set(FAULTS) == set(RULE)
     assert len(RULES) == len(RULE), "an id twice"
@@ -243,7 +259,7 @@ def test_every_rule_has_its_fault() -> None:
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
 def test_each_fault_is_reported_once_by_name_and_requests_its_action(rule: Rule) -> None:
     fault = FAULTS[rule.id]
-    events = watched(VEHICLE, stream(rule.id), fault.situation())
+    events = watched(*seen_by(rule), fault.situation())
     assert {event.id for event in events} == {rule.id, *fault.also}
     assert len(events) == 1 + len(fault.also), "told again"
     for event in events:
@@ -262,7 +278,7 @@ def test_on_the_ground_only_what_matters_there_is_reported(rule: Rule) -> None:
         found_armed=FOUND if rule.id == "reattached" else None,
         torque_refused="joint torque (nan, 0.0) is not finite" if rule.id == "torque_refused" else None,
     )
-    events = watched(VEHICLE, stream(rule.id), situation)
+    events = watched(*seen_by(rule), situation)
     expected = {rule.id, *fault.also} - IN_THE_AIR
     assert {event.id for event in events} == expected
     assert all(event.action is RULE[event.id].ground for event in events)
@@ -271,6 +287,15 @@ def test_on_the_ground_only_what_matters_there_is_reported(rule: Rule) -> None:
 @pytest.mark.parametrize("situation", [flying, standing])
 def test_a_machine_in_good_health_is_left_alone(situation: Callable[[], Situation]) -> None:
     assert watched(VEHICLE, [healthy(k) for k in range(4000)], situation()) == []
+
+
+@pytest.mark.parametrize("situation", [flying, standing])
+def test_a_machine_that_another_program_feeds_misses_no_motion_capture(situation: Callable[[], Situation]) -> None:
+    assert watched(EXTERNAL, [fed_by_another(healthy(k)) for k in range(700)], situation()) == []
+
+
+def test_vision_that_has_never_been_fused_is_not_lost() -> None:
+    assert watched(EXTERNAL, [estimator(flags=0b1111)(healthy(k)) for k in range(100)], standing()) == []
 
 
 def test_what_was_a_warning_on_the_ground_is_judged_anew_in_the_air() -> None:
@@ -524,17 +549,17 @@ def test_in_the_air_a_repeated_pose_is_not_passed_on_at_once() -> None:
     assert monitors.mocap_trusted, "on the ground a pose may well repeat"
 
 
-def scaled(key: str, factor: float) -> Vehicle:
+def scaled(key: str, factor: float, machine: Vehicle = VEHICLE) -> Vehicle:
     """The vehicle with one threshold multiplied."""
     section, _, name = ("safety." + key if "." not in key else key).rpartition(".")
-    part: Any = VEHICLE
+    part: Any = machine
     for step in section.split("."):
         part = getattr(part, step)
     value = getattr(part, name)
     changed = part.model_copy(update={name: type(value)(value * factor)})
     for step in reversed(section.split(".")[1:]):
-        changed = VEHICLE.devices.model_copy(update={step: changed})
-    return VEHICLE.model_copy(update={section.partition(".")[0]: changed})
+        changed = machine.devices.model_copy(update={step: changed})
+    return machine.model_copy(update={section.partition(".")[0]: changed})
 
 
 ELSEWHERE = {
@@ -554,11 +579,13 @@ def test_every_threshold_of_the_table_is_one_that_runs(rule: Rule) -> None:
         if key in ELSEWHERE:
             continue
         fault = TURNED.get(key, FAULTS[rule.id])
-        inputs = stream(rule.id) if fault is FAULTS[rule.id] else after_a_moment(fault.change)
+        machine, inputs = seen_by(rule)
+        if fault is not FAULTS[rule.id]:
+            inputs = after_a_moment(fault.change)
 
         def times_s(vehicle: Vehicle, fault: Fault = fault, inputs: list[Inputs] = inputs) -> list[float]:
             return [event.t_s for event in watched(vehicle, inputs, fault.situation()) if event.id == rule.id]
 
-        expected = times_s(VEHICLE)
+        expected = times_s(machine)
         assert expected
-        assert any(times_s(scaled(key, factor)) != expected for factor in (1e-3, 1e3, -1e3)), key
+        assert any(times_s(scaled(key, factor, machine)) != expected for factor in (1e-3, 1e3, -1e3)), key

@@ -54,8 +54,9 @@ async def watch(session: Session) -> Watched | NotStreaming:
     """
     arguments, device = session.arguments, session.vehicle.devices.mocap
     if device.type != NATNET:
+        watches = "PX4's estimator" if device.external else "this stream"
         raise DeviceError(
-            f"mocap {device.type} {device.server}: companion mocap check reads NatNet only; companion check observes this stream"
+            f"mocap {device.type} {device.server}: companion mocap check reads NatNet only; companion check observes {watches}"
         )
     clock = flight_clock()
     frames: list[FrameSeen] = []

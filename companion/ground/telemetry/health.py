@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from companion.config.vehicle import OBSERVER, Vehicle
 from companion.ground.protocol.messages import DeviceHealth, HealthLevel
+from companion.model.estimator import EstimatorReport
 from companion.model.frames import wrap_rad, yaw_from_quat
 from companion.model.listing import listed
 from companion.model.servos import WATCHDOG_ERROR
@@ -82,6 +83,7 @@ class HealthEvaluator:
     def __init__(self, vehicle: Vehicle) -> None:
         self._s = vehicle.safety
         self._tether = vehicle.tether
+        self._external = vehicle.devices.mocap.external
         self._has_arm = bool(vehicle.arm.joints)
         self._force_device = vehicle.devices.force
         self._no_force = "momentum observer" if vehicle.force_source == OBSERVER else "none on this vehicle"
@@ -115,6 +117,8 @@ class HealthEvaluator:
 
     def _estimate(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
         i, s, ages = snapshot.inputs, self._s, snapshot.ages
+        if self._external:
+            return _external_vision(i.estimator)
         if i.vehicle is None or i.mocap is None or not i.mocap.tracking_valid or not ages.mocap_s <= s.mocap_timeout_s:
             return HealthLevel.OFF, "no fresh pose to compare with"
         apart_m = math.dist(i.vehicle.position_world_m, i.mocap.position_world_m)
@@ -126,6 +130,8 @@ class HealthEvaluator:
 
     def _mocap(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
         mocap, s, rate_hz = snapshot.inputs.mocap, self._s, snapshot.mocap_rate_hz
+        if self._external:
+            return HealthLevel.OFF, "another program feeds PX4"
         if mocap is None:
             return HealthLevel.OFF, "no pose yet"
         age_s, late_s = snapshot.ages.mocap_s, mocap.latency_s or 0.0
@@ -223,6 +229,14 @@ class HealthEvaluator:
         if state.clearance_m < tether.clearance_min_m:
             return HealthLevel.WARN, f"{state.clearance_m * 100:.0f} cm from the rotors or the arm, {left}"
         return HealthLevel.WARN if state.stop_slack_m < tether.margin_m else HealthLevel.OK, left
+
+
+def _external_vision(report: EstimatorReport | None) -> tuple[HealthLevel, str]:
+    if report is None:
+        return HealthLevel.OFF, "no ESTIMATOR_STATUS yet"
+    if report.unaided is not None:
+        return HealthLevel.BAD, f"PX4 has no measurement of {report.unaided}"
+    return _level_by_ratio(report.worst_ratio), f"fuses external vision, test ratio {report.worst_ratio:.2f}"
 
 
 def _recorder(snapshot: Snapshot) -> tuple[HealthLevel, str]:

@@ -38,7 +38,14 @@ def open_mocap(device: MocapDevice, clock: Clock, on_pose: Callable[[MocapPose],
         device: `devices.mocap` of the vehicle file.
         clock: the flight clock.
         on_pose: called from the event loop with every new pose; an exception is logged once and never stops the reception.
+
+    Raises:
+        DeviceError: another program feeds PX4.
     """
+    if device.external:
+        raise DeviceError(
+            "devices.mocap.type: external: another program feeds PX4; the companion reads no motion capture"
+        )
     return (NatNetMocap if device.type == NATNET else PluginMocap)(device, clock, on_pose)
 
 

@@ -26,7 +26,7 @@ from companion.io.protocols import DeviceError
 from companion.io.px4 import messages
 from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls
 from companion.io.px4.claim import LinkClaim
-from companion.io.px4.inbox import Inbox, ask_for_streams
+from companion.io.px4.inbox import ESTIMATOR_RATE_HZ, Inbox, ask_for_streams
 from companion.io.px4.link import (
     add_connection,
     check_address,
@@ -40,7 +40,8 @@ from companion.io.px4.origin import ensure_origin
 from companion.io.px4.params import ParamTransfer
 from companion.io.px4.requests import SENT_ONCE, RequestQueue
 from companion.io.px4.setpoints import SetpointPath, setpoint_path
-from companion.model.observations import EstimatorReport, StateCounts
+from companion.model.estimator import EstimatorReport
+from companion.model.observations import StateCounts
 from companion.model.types import (
     AttitudeSetpoint,
     AutopilotRequest,
@@ -70,10 +71,19 @@ class MavsdkAutopilot:
         device: address and setpoint path.
         clock: the flight clock.
         forwarding: whether a second connection is needed; see `forward_to`.
+        estimator_rate_hz: requested rate of ESTIMATOR_STATUS.
     """
 
-    def __init__(self, device: AutopilotDevice, clock: Clock, *, forwarding: bool = False) -> None:
+    def __init__(
+        self,
+        device: AutopilotDevice,
+        clock: Clock,
+        *,
+        forwarding: bool = False,
+        estimator_rate_hz: float = ESTIMATOR_RATE_HZ,
+    ) -> None:
         self._device = device
+        self._estimator_rate_hz = estimator_rate_hz
         self._forwarding = forwarding
         self._clock = clock
         self._requests = RequestQueue()
@@ -129,7 +139,8 @@ class MavsdkAutopilot:
             self._info = Info(system)
             self._inbox.subscribe(telemetry, self._direct)
             self._direct.subscribe_message("COMMAND_ACK", self._on_ack)
-            await ask_for_streams(address, self._calls, telemetry, self._direct, self._system_id)
+            streams = (telemetry, self._direct, self._system_id, self._estimator_rate_hz)
+            await ask_for_streams(address, self._calls, *streams)
             self._open = True
             await self.ensure_origin()
             claim.refuse_rivals()

@@ -17,8 +17,9 @@ from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls
 from companion.io.px4.delta_velocity import DeltaVelocity
 from companion.io.px4.link import device_error
 from companion.io.px4.requests import RequestQueue
+from companion.model.estimator import EstimatorReport
 from companion.model.frames import flu_from_frd
-from companion.model.observations import EstimatorReport, StateCounts
+from companion.model.observations import StateCounts
 from companion.model.types import AutopilotStatus, FlightMode, Quat, Vec3, VehicleState
 from companion.runtime.clock import Clock
 from companion.runtime.native_threads import keep_interpreter_state
@@ -122,7 +123,7 @@ class Inbox:
         newest = self._estimator
         if newest is not None and newest is not self._estimator_read:
             self._estimator_read = newest
-            self._estimator_report = messages.estimator_report(newest[1], newest[0])
+            self._estimator_report = messages.estimator_report(json.loads(newest[1]), newest[0])
         return self._estimator_report
 
     def silent_s(self) -> float:
@@ -185,7 +186,12 @@ class Inbox:
 
 
 async def ask_for_streams(
-    address: str, calls: NativeCalls, telemetry: Telemetry, direct: MavlinkDirect, system_id: int
+    address: str,
+    calls: NativeCalls,
+    telemetry: Telemetry,
+    direct: MavlinkDirect,
+    system_id: int,
+    estimator_rate_hz: float = ESTIMATOR_RATE_HZ,
 ) -> None:
     """Request every stream that `Inbox` stores, at its rate.
 
@@ -205,7 +211,7 @@ async def ask_for_streams(
         ("ATTITUDE_QUATERNION", ATTITUDE_RATE_HZ, telemetry.set_rate_attitude_quaternion),
         ("HIGHRES_IMU", IMU_RATE_HZ, telemetry.set_rate_imu),
         ("EXTENDED_SYS_STATE", LANDED_RATE_HZ, telemetry.set_rate_landed_state),
-        ("ESTIMATOR_STATUS", ESTIMATOR_RATE_HZ, estimator_rate),
+        ("ESTIMATOR_STATUS", estimator_rate_hz, estimator_rate),
     ):
         expected = f"PX4 to stream {stream} at {rate_hz:g} Hz"
         try:

@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
+from typing import Any
 
+from companion.model.estimator import EstimatorReport
 from companion.model.frames import (
     attitude_enu_flu_from_ned_frd,
     attitude_ned_frd_from_enu_flu,
@@ -17,7 +20,6 @@ from companion.model.frames import (
     ned_from_enu,
     quat_normalize,
 )
-from companion.model.observations import EstimatorReport
 from companion.model.types import (
     AttitudeSetpoint,
     AutopilotRequest,
@@ -214,11 +216,10 @@ def set_message_interval_json(message_id: int, rate_hz: float, target_system: in
     return _command_json(_SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate_hz, target_system)
 
 
-def estimator_report(fields_json: str, stamp_s: float) -> EstimatorReport:
+def estimator_report(fields: Mapping[str, Any], stamp_s: float) -> EstimatorReport:
     """Convert ESTIMATOR_STATUS. PX4 sends NaN for the test ratio of a source that it does not fuse (converted to 0) and for an unknown
     accuracy (converted to infinity).
     """
-    fields = json.loads(fields_json)
 
     def number(key: str, unknown: float) -> float:
         value = fields[key]

@@ -74,6 +74,8 @@ async def perform(
 ) -> HandResult | str:
     """Guide the operator through the test and return the measurements, or why there are none. Arguments as in `run_hand_test`."""
     mocap, autopilot, arm = devices.mocap, devices.autopilot, devices.arm
+    if config.vehicle.devices.mocap.external:
+        return "another program feeds PX4 (devices.mocap.type: external): there is no motion capture to test"
     if mocap is None or autopilot is None:
         missing = "motion capture" if mocap is None else "PX4"
         return f"{missing} is not connected"
