@@ -7,6 +7,7 @@ import math
 import re
 import socket
 import struct
+import threading
 import tomllib
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
@@ -33,6 +34,7 @@ from companion.model.types import MocapPose
 from companion.plugins import MOCAP_SYSTEMS
 from companion.runtime import event_loop
 from companion.runtime.clock import flight_clock
+from companion.testing import check_mocap
 from tests.plugins.installed import on_path, write_distribution
 from tests.support import DEADLINE_S, ROOT
 
@@ -81,6 +83,11 @@ class Scripted(Failing):
             stamp_s=now_s + self.given["stamped_after_now_s"], frame_number=self.number,
             position_world_m=(self.given["x_m"], 0.0, 1.0), attitude_wxyz=(self.given["w"], 0.0, 0.0, 0.0),
             tracking_valid=self.given["tracking_valid"], marker_error_m=0.0)]
+class Stuck(Scripted):
+    """Repeats its frame number."""
+    def poses(self, now_s):
+        self.number = 6
+        return super().poses(now_s)
 class Reconnecting(Scripted):
     """Replaces its socket whenever it is called, and raises now and then."""
     def __init__(self, settings):
@@ -118,7 +125,7 @@ def installed(tmp_path: Path) -> Iterator[None]:
     (tmp_path / "lab_mocap.py").write_text(FAILING)
     announced = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]["entry-points"][MOCAP_SYSTEMS]
     write_distribution(tmp_path, "companion-vicon", "0.1.0", announced, MOCAP_SYSTEMS)
-    names = ("Failing", "Absent", "NoOptions", "Nonsense", "Nameless", "NoProblem", "Scripted", "Reconnecting")
+    names = ("Failing", "Absent", "NoOptions", "Nonsense", "Nameless", "NoProblem", "Scripted", "Stuck", "Reconnecting")
     failing = {name.lower(): f"lab_mocap:{name}" for name in names}
     write_distribution(tmp_path, "lab-mocap", "1.0", failing, MOCAP_SYSTEMS)
     with on_path(tmp_path):
@@ -204,6 +211,39 @@ def test_flight_and_guardian_receive_the_same_poses() -> None:
         client.close()
 
     asyncio.run(run())
+
+
+def test_the_example_and_a_system_that_answers_every_call_keep_the_contract() -> None:
+    port, stop = free_port(), threading.Event()
+
+    def send() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            sender.bind(("127.0.0.1", 0))
+            for number in count(1):
+                sender.sendto(datagram(number, STRANGER, QUAD), ("127.255.255.255", port))
+                if stop.wait(0.005):
+                    return
+
+    tracker = threading.Thread(target=send)
+    tracker.start()
+    try:
+        check_mocap(vicon(port), duration_s=0.3)
+    finally:
+        stop.set()
+        tracker.join()
+    check_mocap(scripted(), duration_s=0.1)
+
+
+def test_frame_numbers_that_do_not_increase_break_the_contract() -> None:
+    stuck = MocapDevice(type="stuck", server="server", rigid_body_id=1)
+    with pytest.raises(AssertionError, match="frame 7 follows frame 7 in the client of the flight"):
+        check_mocap(stuck, duration_s=0.1)
+
+
+def test_options_that_the_system_refuses_break_the_contract() -> None:
+    with pytest.raises(AssertionError, match="object_name"):
+        check_mocap(MocapDevice(type="vicon", server="server", rigid_body_id=1))
 
 
 def test_an_object_that_is_not_tracked_is_reported() -> None:
