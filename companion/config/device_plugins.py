@@ -13,7 +13,7 @@ from companion.config.base import Location, Model
 
 RFT60 = "rft60"
 DYNAMIXEL = "dynamixel"
-BUILT_IN = ("natnet", RFT60, DYNAMIXEL)
+BUILT_IN = ("natnet", "external", RFT60, DYNAMIXEL)
 """Types that the companion provides; they are announced as those of plug-ins are."""
 
 

@@ -112,6 +112,20 @@ def test_poses_that_are_dragged_are_found_and_px4_lands_it(tmp_path_factory: pyt
     assert [event["id"] for event in summary["events"] if event["id"] in wanted] == wanted
 
 
+def test_another_program_feeds_px4_and_its_end_is_found(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The simulated world sends the poses to PX4 on a link of its own; the companion has the report of PX4's estimator alone."""
+    with sandbox_in(tmp_path_factory.mktemp("external")) as sandbox:
+        loss = [{"kind": "mocap_loss", "t_s": HOVERS_S}]
+        options = set_options(**{"vehicle.devices.mocap.type": "external", "world.faults": loss})
+        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *options, report=True)
+        sandbox.assert_nobody_left()
+        summary = read_summary(sandbox.cwd / "out")
+    assert ended.code == EXIT_ABORTED, ended
+    events = [event["id"] for event in summary["events"]]
+    assert events[:3] == ["takeoff", "vision_lost", "autopilot_landing"]
+    assert summary["latency_ms"]["mocap_to_setpoint"]["p99"] is None
+
+
 def test_it_flies_without_force_sensor_tether_and_net(tmp_path_factory: pytest.TempPathFactory) -> None:
     """The simulated world then opens no port for the force sensor, and the flight waits for none."""
     with sandbox_in(tmp_path_factory.mktemp("parts")) as sandbox:
