@@ -152,7 +152,7 @@ def test_the_preflight_judges_each_servo_by_its_own_model() -> None:
         *records.servos(model=1200, firmware=52, voltage_v=5.0, current_limit_counts=1750)[1:],
     )
     rows = {row.id: row for row in preflight.rows(replace(records.sound(), servos=reports), vehicle)}
-    assert rows["arm.model"].level is Level.WARN and "current of its supply" in rows["arm.model"].fix
+    assert rows["arm.model"].level is Level.WARN and "current is that of the supply" in rows["arm.model"].fix
     assert (rows["arm.firmware"].ok, rows["arm.firmware"].wanted) == (False, "38 or newer and 53 or newer")
     assert (rows["arm.voltage"].ok, rows["arm.voltage"].wanted) == (True, "10 to 14.8 V and 3.7 to 6 V")
     assert rows["arm.current_limit"].read == "1193 (4.19 N m) and 1750 (0.62 N m)"
