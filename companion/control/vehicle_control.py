@@ -167,7 +167,7 @@ class VehicleControl:
         ):  # NaN passes `thrust < 1.0` below and every limit on the error
             raise ValueError("the control law's thrust or tracking error is not finite")
         self._thrust_sent = thrust if thrust < 1.0 else 1.0
-        torque, log = wrench.arm_torque_nm if arm is not None else None, wrench.log
+        torque, log = (wrench.arm_torque_nm or ()) if arm is not None else None, wrench.log
         if self._observer is not None:
             observed = self._observer.force_n
             log = msgspec.structs.replace(log, force_observed_world_n=observed, force_measured_world_n=force)

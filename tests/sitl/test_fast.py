@@ -10,9 +10,9 @@ from functools import cache
 import pytest
 from msgspec.structs import replace
 
-from companion.control.vehicle_control import Command
+from companion.control.types import PlantState, Wrench
 from companion.model.servos import WATCHDOG_ERROR
-from companion.model.types import Inputs, Outcome, PhaseKind, Reference, SafetyAction
+from companion.model.types import Joints, Outcome, PhaseKind, Reference, SafetyAction
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from tests.support import LOW_HOVER
@@ -96,24 +96,31 @@ def test_a_silent_servo_lets_go_and_that_is_reported_when_it_answers_again() -> 
     assert any(event.id == "arm_let_go" for o in result.outputs for event in o.events)
 
 
-def test_a_law_whose_torques_stay_unusable_is_landed_by_px4_with_the_arm_folded() -> None:
-    """From 1 s after take-off on the law's joint torques are not finite, and the arm is limp; a single such tick does no harm."""
+@pytest.mark.parametrize(
+    ("torques_nm", "text"),
+    [((float("nan"), 0.1), "joint torque (nan, 0.1) is not finite"), (None, "0 joint torques for 2 joints")],
+    ids=["nan", "none"],
+)
+def test_a_law_whose_torques_stay_unusable_is_landed_by_px4_with_the_arm_folded(
+    torques_nm: Joints | None, text: str
+) -> None:
+    """From 1 s after take-off on the law's joint torques are unusable, and the arm is limp; a single such tick does no harm."""
     flight = FastFlight(configured())
-    control, ticks, nan = flight.core._control, 0, float("nan")
-    fly = control.fly
+    law, ticks = flight.core._control._controller, 0
+    step = law.step
 
-    def spoiled(i: Inputs, dt_s: float, reference: Reference, vertical_scale: float) -> Command:
+    def spoiled(dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
         nonlocal ticks
-        command, ticks = fly(i, dt_s, reference, vertical_scale), ticks + (vertical_scale >= 1.0)
-        return replace(command, arm_torque_nm=(nan, 0.1)) if ticks in (100, 110) or ticks > 200 else command
+        wrench, ticks = step(dt_s, state, reference, vertical_scale), ticks + (vertical_scale >= 1.0)
+        return replace(wrench, arm_torque_nm=torques_nm) if ticks in (100, 110) or ticks > 200 else wrench
 
-    control.fly = spoiled  # type: ignore[method-assign]
+    law.step = spoiled  # type: ignore[method-assign]
     result = flight.run()
     events = [(o.t_s, event) for o in result.outputs for event in o.events]
     assert [event.id for _, event in events].count("torque_refused") == 1
     at_s, event = next(found for found in events if found[1].id == "torque_refused")
     refused_s = [o.t_s for o in result.outputs if o.arm_torque_nm is None and o.phase_kind is not PhaseKind.GROUND]
-    assert event.action is SafetyAction.AUTOPILOT_LAND and "joint torque (nan, 0.1) is not finite" in event.text
+    assert event.action is SafetyAction.AUTOPILOT_LAND and text in event.text
     assert at_s - refused_s[2] == pytest.approx(0.1, abs=0.02), "the two single ticks did not count"
     assert not result.crashed and not result.armed and result.outputs[-1].outcome is Outcome.ABORTED
     fold_deg = flight.config.vehicle.fold_arm_deg
