@@ -156,7 +156,7 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (
             r"phase 'catch' flies too fast",
             r"phase 'catch' could not stop within the tether sphere",
-            r"mission\.yaml:\d+:\d+: .*phase 'catch' leaves the room.*x = 2\.45 m.*inwards",
+            r"mission\.yaml:\d+:\d+: .*phase 'catch' leaves the room.*x = 2\.49 m.*inwards",
         ),
     ),
     "Foxglove without a port": (

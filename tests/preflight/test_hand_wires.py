@@ -127,8 +127,8 @@ def test_ctrl_c_ends_it_and_is_itself_again_afterwards(config: SitlConfig) -> No
 def test_a_whole_round_passes_and_is_kept(config: SitlConfig, tmp_path: Path) -> None:
     console, path = terminal(), tmp_path / "state" / "hand-tests.json"
     rows = asyncio.run(over_wires(config, console, path))
-    assert [row.id for row in rows] == [*(check.id for check in hand_test_evaluation.CHECKS), "hand.record"], rows
     assert all(row.ok for row in rows), [row.line() for row in rows if not row.ok]
+    assert [row.id for row in rows] == [*(check.id for check in hand_test_evaluation.CHECKS), "hand.record"]
     for words in ("1/4", "2/4", "lift it straight up", "3/4", "forward", "4/4", "to the left", "put it back"):
         assert words in text_of(console)
     setup = hand_record.Setup.of(config.vehicle, config.world.natnet_version)

@@ -501,7 +501,7 @@ def test_while_inputs_are_missing_only_people_and_broken_values_are_heard() -> N
 
 def test_hardware_errors_are_reported_by_name() -> None:
     assert error_text((0, 0b100100)) == "servo 2: overheating, overload"
-    assert error_text((0b1, 0b1000000)) == "servo 1: input voltage; servo 2: bit 6"
+    assert error_text((0b1, 0b1000000)) == "servo 1: input voltage; servo 2: fault of the motor"
 
 
 @pytest.mark.parametrize(
