@@ -229,11 +229,10 @@ def print_result(console: Console, summary: dict[str, Any], out: Path, report: P
     facts.add_row("catch", "none" if catch is None else f"t = {catch:.2f} s{doubt}")
     loop = summary.get("loop") or {}
     if loop.get("ticks"):
-        late = loop["lateness_ms"]
-        text = (
-            f"{loop['rate_hz']:.0f} Hz, {loop['ticks']} ticks, {loop['missed']} missed, late p99 {late['p99']:.1f} ms"
-        )
-        facts.add_row("control loop", text)
+        rate_hz, late_ms = loop["rate_hz"], loop["lateness_ms"]["p99"]  # None after a tick or two
+        rate = "" if rate_hz is None else f"{rate_hz:.0f} Hz, "
+        late = "" if late_ms is None else f", late p99 {late_ms:.1f} ms"
+        facts.add_row("control loop", f"{rate}{loop['ticks']} ticks, {loop['missed']} missed{late}")
     recorder = summary.get("recorder") or {}
     if recorder.get("samples") is not None:
         facts.add_row("recorder", f"{recorder['samples']} ticks, {recorder['dropped']} dropped")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
 
 from rich.console import Console
 
 from companion.model.types import Outputs
-from companion.runtime.console import FlightDisplay
+from companion.runtime.console import FlightDisplay, print_result
 from companion.runtime.realtime import Realtime
 from tests.flights.test_fast_flights import flown
 
@@ -31,6 +32,19 @@ def test_what_the_system_refused_is_no_markup() -> None:
     got = "normal priority (PermissionError: [bold]no[/] permission)"
     [line] = shown({"type": "started", "recorder_pid": 1, "realtime": got})
     assert line.endswith(got)
+
+
+def test_a_flight_of_one_tick_has_neither_rate_nor_lateness() -> None:
+    """As of a flight that finds the vehicle in the air and leaves it to PX4 at once."""
+    spread = dict.fromkeys(("p50", "p99", "max"))
+    summary = {"outcome": "aborted", "controller": "adaptive", "preset": "recommended", "rms": {}} | {
+        "loop": {"rate_hz": None, "ticks": 1, "missed": 0, "lateness_ms": spread}
+    }
+    out = io.StringIO()
+    print_result(Console(file=out, width=60), summary, Path("out"), None)
+    assert [line.split() for line in out.getvalue().splitlines() if line.startswith("control loop")] == [
+        ["control", "loop", "1", "ticks,", "0", "missed"]
+    ]
 
 
 def messages_of(outputs: Outputs) -> list[dict[str, object]]:
