@@ -77,6 +77,9 @@ class LawConfig(ControllerConfig):
     """Names of the lists of gains that are proportional to the mass in x, y and z and to the inertia of each joint."""
     scaled_by_joint: ClassVar[tuple[str, ...]] = ()
     """Names of the settings, a number or a list, that are proportional to the inertia of each joint."""
+    shared_by_links: ClassVar[tuple[str, ...]] = ()
+    """Names of those that are divided by the ratio of the numbers of joints on an arm with more joints than the machine of
+    `found_for`: the moments of all links further out act on a joint, so its integral gain is the sum of their rates."""
 
     found_for: Machine | None = None
     """Machine for which the gains were found: on another vehicle they are multiplied by the ratio of its inertia to this one. null: the
@@ -134,6 +137,7 @@ class AdaptiveConfig(LawConfig):
     scaled_by_mass = (*LawConfig.scaled_by_mass, "load_rate_xyz", "load_max_n")
     scaled_by_row = ("inertia_md", "lambda_gain", "damping_kd", "stiffness_kp", "robust_scale")
     scaled_by_joint = ("moment_rate", "friction_rate")
+    shared_by_links = ("moment_rate",)
 
     law: Literal["adaptive"]
     inertia_md: PositiveRows

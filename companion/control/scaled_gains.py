@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from companion.config.arm_chain import chain_of
 from companion.config.controller import ControllerConfig, LawConfig, fitted
@@ -63,11 +63,15 @@ def for_vehicle(vehicle: Vehicle, config: C) -> C:
     scale = (mass, mass, mass, 1.0, 1.0, 1.0, *(joint_ratios(vehicle, found.joint_inertia_kg_m2) or (1.0,)))
     already = fitted(config.scale or (1.0,), len(scale))
     rows = [ratio / before for ratio, before in zip(scale, already, strict=True)]
-    changes: dict[str, object] = {key: fitted(getattr(config, key), len(rows)) for key in config.gain_lists}
+    changes: dict[str, Any] = {key: fitted(getattr(config, key), len(rows)) for key in config.gain_lists}
     for keys, ratios in ((config.scaled_by_row, rows), (config.scaled_by_joint, rows[6:])):
         for key in keys:
             gains = fitted(getattr(config, key), len(ratios))
             changes[key] = tuple([gain * ratio for gain, ratio in zip(gains, ratios, strict=True)])
+    if config.scale is None and len(rows) - 6 > len(found.joint_inertia_kg_m2):
+        share = len(found.joint_inertia_kg_m2) / (len(rows) - 6)
+        for key in config.shared_by_links:
+            changes[key] = tuple([share * gain for gain in changes[key]])
     for key in config.scaled_by_mass:
         value = getattr(config, key)
         changes[key] = tuple([rows[0] * part for part in value]) if isinstance(value, tuple) else rows[0] * value

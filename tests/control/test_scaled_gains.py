@@ -11,7 +11,7 @@ import pytest
 from msgspec.structs import replace
 
 from companion.config.arm_chain import chain_of
-from companion.config.controller import LAWS, LawConfig, fitted
+from companion.config.controller import LAWS, AdaptiveConfig, LawConfig, fitted
 from companion.config.loader import PRESETS, load_flight, load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.control.arm_hold import DAMPING_NMS_RAD, STIFFNESS_NM_RAD, ArmHold
@@ -92,6 +92,19 @@ def test_scaled_gains_satisfy_the_laws_conditions_and_are_not_scaled_again(law: 
     again = for_vehicle(config.vehicle, flown)
     assert again == flown
     assert "times 1.50 on x, y and z" in scale_text(flown)
+
+
+@pytest.mark.parametrize(("joints", "share"), [(1, 1.0), (2, 1.0), (3, 2.0 / 3.0), (4, 0.5)])
+def test_the_links_of_a_longer_arm_share_the_rate_of_their_moments(joints: int, share: float) -> None:
+    """All of them act on the first joint: with the rates of two links, four made the joints swing if torques came 10 ms late."""
+    found = gains("adaptive", "recommended")
+    own = gains("adaptive", "recommended", *overrides_with_joints(joints))
+    assert isinstance(found, AdaptiveConfig) and isinstance(own, AdaptiveConfig)
+    assert own.scale is not None
+    wanted = [
+        share * ratio * rate for ratio, rate in zip(own.scale[6:], fitted(found.moment_rate, joints), strict=True)
+    ]
+    assert own.moment_rate == pytest.approx(wanted)
 
 
 def test_gains_without_a_machine_are_used_as_written() -> None:
