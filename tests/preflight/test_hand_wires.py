@@ -33,7 +33,8 @@ from tests.support import CATCH, DEADLINE_S, Sandbox, World, sandbox_in
 
 pytestmark = [pytest.mark.flight, pytest.mark.xdist_group("the world with a hand")]
 
-FIRST_ROUND_S = 12.0
+FIRST_ROUND_S = 20.0
+"""The first test must be ready by then, on a busy computer too."""
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +87,21 @@ async def said(console: Console, words: str) -> None:
             await asyncio.sleep(0.01)
 
 
+def test_a_whole_round_passes_and_is_kept(config: SitlConfig, tmp_path: Path) -> None:
+    console, path = terminal(), tmp_path / "state" / "hand-tests.json"
+    rows = asyncio.run(over_wires(config, console, path))
+    assert all(row.ok for row in rows), [row.line() for row in rows if not row.ok]
+    assert [row.id for row in rows] == [*(check.id for check in hand_test_evaluation.CHECKS), "hand.record"]
+    for words in ("1/4", "2/4", "lift it straight up", "3/4", "forward", "4/4", "to the left", "put it back"):
+        assert words in text_of(console)
+    setup = hand_record.Setup.of(config.vehicle, config.world.natnet_version)
+    passed, changed = hand_record.on_record(setup, hand_record.load(path))
+    assert passed.startswith("passed on 20")
+    assert not changed
+    (kept,) = json.loads(path.read_text(encoding="utf-8"))["passed"]
+    assert kept["measured"]["hand.turn"].startswith("IMU +4")
+
+
 def test_any_key_ends_it_and_the_terminal_is_as_before(config: SitlConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     keyboard, tty = pty.openpty()
     console = terminal()
@@ -122,21 +138,6 @@ def test_ctrl_c_ends_it_and_is_itself_again_afterwards(config: SitlConfig) -> No
 
     (row,) = asyncio.run(both())
     assert (row.id, row.read) == ("hand.done", "ended by the operator")
-
-
-def test_a_whole_round_passes_and_is_kept(config: SitlConfig, tmp_path: Path) -> None:
-    console, path = terminal(), tmp_path / "state" / "hand-tests.json"
-    rows = asyncio.run(over_wires(config, console, path))
-    assert all(row.ok for row in rows), [row.line() for row in rows if not row.ok]
-    assert [row.id for row in rows] == [*(check.id for check in hand_test_evaluation.CHECKS), "hand.record"]
-    for words in ("1/4", "2/4", "lift it straight up", "3/4", "forward", "4/4", "to the left", "put it back"):
-        assert words in text_of(console)
-    setup = hand_record.Setup.of(config.vehicle, config.world.natnet_version)
-    passed, changed = hand_record.on_record(setup, hand_record.load(path))
-    assert passed.startswith("passed on 20")
-    assert not changed
-    (kept,) = json.loads(path.read_text(encoding="utf-8"))["passed"]
-    assert kept["measured"]["hand.turn"].startswith("IMU +4")
 
 
 def test_it_is_refused_when_px4_is_armed() -> None:
