@@ -506,15 +506,15 @@ def test_a_log_is_read_without_the_arm(tmp_path: Path) -> None:
 
 def test_the_simulated_world_has_servos_with_the_torque_of_the_motors(tmp_path: Path) -> None:
     vehicle = load_flight("hover", vehicle_file(tmp_path, "type: moteus")).vehicle
-    told: list[dict[str, Any]] = []
-    server = Sitl(vehicle, load_sitl("hover").world, start_of((0.0, 0.0), 0.0, (0.0, 0.0)), Ports(), told.append)
+    messages: list[dict[str, Any]] = []
+    server = Sitl(vehicle, load_sitl("hover").world, start_of((0.0, 0.0), 0.0, (0.0, 0.0)), Ports(), messages.append)
 
     async def served() -> None:
         async with server.wires() as devices:
             assert devices["arm"].items() >= {"type": "dynamixel", "options": {}}.items()
 
     asyncio.run(served())
-    assert [message["text"] for message in told] == [
+    assert [message["text"] for message in messages] == [
         "devices.arm.type: the simulated world has a dynamixel, which is used in place of moteus"
     ]
 

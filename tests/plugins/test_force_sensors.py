@@ -386,8 +386,8 @@ def test_the_simulated_world_has_the_built_in_devices_and_says_so() -> None:
         "vehicle.devices.force.rate_hz=500",
     ]
     vehicle = load_flight("hover", overrides=settings).vehicle
-    told: list[dict[str, Any]] = []
-    server = Sitl(vehicle, World(), start_of((0.0, 0.0), 0.0, (0.0, 0.0)), Ports(), told.append)
+    messages: list[dict[str, Any]] = []
+    server = Sitl(vehicle, World(), start_of((0.0, 0.0), 0.0, (0.0, 0.0)), Ports(), messages.append)
 
     async def served() -> dict[str, dict[str, Any]]:
         async with server.wires() as devices:
@@ -396,7 +396,7 @@ def test_the_simulated_world_has_the_built_in_devices_and_says_so() -> None:
     devices = asyncio.run(served())
     assert devices["force"].items() >= {"type": "rft60", "options": {}, "rate_hz": 200}.items()
     assert devices["mocap"]["type"] == "natnet"
-    assert [message["text"] for message in told] == [
+    assert [message["text"] for message in messages] == [
         "devices.mocap.type: the simulated world has a natnet, which is used in place of vicon",
         "devices.force.type: the simulated world has a rft60, which is used in place of ati",
     ]

@@ -109,12 +109,12 @@ def test_a_law_whose_torques_stay_unusable_is_landed_by_px4_with_the_arm_folded(
     law, ticks = flight.core._control._controller, 0
     step = law.step
 
-    def spoiled(dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
+    def with_unusable_torques(dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
         nonlocal ticks
         wrench, ticks = step(dt_s, state, reference, vertical_scale), ticks + (vertical_scale >= 1.0)
         return replace(wrench, arm_torque_nm=torques_nm) if ticks in (100, 110) or ticks > 200 else wrench
 
-    law.step = spoiled  # type: ignore[method-assign]
+    law.step = with_unusable_torques  # type: ignore[method-assign]
     result = flight.run()
     events = [(o.t_s, event) for o in result.outputs for event in o.events]
     assert [event.id for _, event in events].count("torque_refused") == 1
