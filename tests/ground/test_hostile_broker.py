@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import json
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ from rich.console import Console
 
 from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.commands import Accepted, Verifier, make_command
+from companion.ground.protocol.connection import Connection
 from companion.ground.protocol.messages import (
     VERSION,
     CommandName,
@@ -316,6 +318,26 @@ async def test_a_message_that_nobody_thought_of_ends_nothing(broker: Broker) -> 
         assert len(changes) == 1
 
     await until_first(station.run(), fight())
+
+
+@played
+async def test_ctrl_c_before_the_broker_has_answered_prints_nothing() -> None:
+    said: list[str] = []
+    asyncio.get_running_loop().set_exception_handler(lambda loop, context: said.append(str(context["message"])))
+    accepted: asyncio.Queue[tuple[asyncio.StreamReader, asyncio.StreamWriter]] = asyncio.Queue()
+    async with await asyncio.start_server(lambda *streams: accepted.put_nowait(streams), "127.0.0.1", 0) as silent:
+        access = broker_access(f"mqtt://127.0.0.1:{silent.sockets[0].getsockname()[1]}", None, None)
+        connection = Connection(access, "ground", lambda *message: None, packet_max_bytes=1000, answer_s=30.0)
+        opening = asyncio.ensure_future(connection.open())
+        reader, writer = await accepted.get()
+        assert await reader.readexactly(1) == b"\x10"  # CONNECT
+        await until(lambda: connection._misc_task is not None)
+        opening.cancel()
+        await asyncio.wait((opening,))
+        writer.transport.abort()
+        await until(lambda: connection._client.socket() is None)  # paho has seen that the broker is gone
+        await connection.shut_down()
+    assert opening.cancelled() and said == []
 
 
 def test_proofs_are_of_the_whole_message() -> None:

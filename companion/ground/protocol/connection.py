@@ -159,6 +159,14 @@ class Connection(aiomqtt.Client):
             self._misc_task.cancel()
             await asyncio.wait((self._misc_task,))
 
+    def _on_disconnect(
+        self, client: Any, userdata: Any, flags: Any, reason_code: ReasonCode, properties: Any = None
+    ) -> None:
+        if (
+            not self._connected.cancelled()
+        ):  # aiomqtt asks a cancelled attempt for its exception, which raises CancelledError
+            super()._on_disconnect(client, userdata, flags, reason_code, properties)
+
     def _on_message(self, client: Any, userdata: Any, message: MQTTMessage) -> None:
         with contextlib.suppress(UnicodeDecodeError):
             self._take(message.topic, bytes(message.payload), message.retain)
