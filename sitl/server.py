@@ -15,8 +15,7 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from typing import Any
 
-from companion.config.device_plugins import DYNAMIXEL, RFT60
-from companion.config.mocap import NATNET
+from companion.config.device_plugins import DYNAMIXEL, NATNET, RFT60
 from companion.config.vehicle import Vehicle
 from companion.model.types import IDENTITY_QUAT, Joints, Vec2
 from companion.sitl_config.faults import FaultKind

@@ -9,13 +9,12 @@ from typing import Any
 from companion.config.base import Model
 from companion.config.controller import LAWS
 from companion.config.device_plugins import OptionsOf
-from companion.config.mocap import SYSTEMS
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.plugins import ARMS, CONTROL_LAWS, FORCE_SENSORS, KINDS, MOCAP_SYSTEMS, PluginError, installed
 
 _SETTINGS: dict[str, Mapping[str, type[Model]]] = {
     CONTROL_LAWS: LAWS,
-    MOCAP_SYSTEMS: SYSTEMS,
+    MOCAP_SYSTEMS: OptionsOf(MOCAP_SYSTEMS),
     FORCE_SENSORS: OptionsOf(FORCE_SENSORS),
     ARMS: OptionsOf(ARMS),
 }

@@ -1,4 +1,6 @@
-"""Force sensors and arms: `devices.force.type` and `devices.arm.type` name a built-in one or a plug-in (`companion.plugins`)."""
+"""Types of devices: those that the companion provides, and plug-ins (`companion.plugins`). `type` and `options` of `devices.mocap`,
+`devices.force` and `devices.arm` name them.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +13,17 @@ from pydantic import ValidationError
 from companion import plugins
 from companion.config.base import Location, Model
 
+NATNET = "natnet"
+EXTERNAL = "external"
+"""Another program feeds PX4 with poses; the companion reads no motion capture."""
 RFT60 = "rft60"
 DYNAMIXEL = "dynamixel"
-BUILT_IN = ("natnet", "external", RFT60, DYNAMIXEL)
-"""Types that the companion provides; they are announced as those of plug-ins are."""
+BUILT_IN = {
+    plugins.MOCAP_SYSTEMS: (NATNET, EXTERNAL),
+    plugins.FORCE_SENSORS: (RFT60,),
+    plugins.ARMS: (DYNAMIXEL,),
+}
+"""Types that the companion provides, by group; all but external are announced as plug-ins are."""
 
 
 @functools.cache
@@ -38,8 +47,11 @@ def device_class(group: str, name: str) -> Any:
 
 def problems(group: str, name: str, options: Mapping[str, Any]) -> list[tuple[Location, str]]:
     """Return the problems of `type` and `options` of a device, each with the key to which it belongs."""
-    if name in BUILT_IN and not options:
+    built_in = BUILT_IN[group]
+    if name in built_in and not options:
         return []  # nothing to check: the search for plug-ins takes some hundredths of a second
+    if name == EXTERNAL and name in built_in:
+        return [(("options",), "Extra inputs are not permitted")]
     try:
         device_class(group, name).options.model_validate(dict(options))
     except plugins.PluginError as error:

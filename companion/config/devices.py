@@ -7,8 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, JsonValue, model_validator
 
 from companion.config.base import Location, Model, Positive, refuse
-from companion.config.device_plugins import DYNAMIXEL, RFT60
-from companion.config.mocap import EXTERNAL, NATNET
+from companion.config.device_plugins import DYNAMIXEL, EXTERNAL, NATNET, RFT60
 
 
 class AutopilotDevice(Model):
@@ -28,6 +27,10 @@ ANY_INTERFACE = "0.0.0.0"
 
 NatNetVersion = Literal["3.0", "3.1", "4.0", "4.1", "4.2", "4.3", "4.4"]
 """Versions of the NatNet bitstream that the NatNet SDK describes: those of Motive 2.0, 2.1, 3.0, 3.1, 3.2, 3.3 and 3.4."""
+
+
+class NatNetOptions(Model):
+    """OptiTrack Motive over NatNet; its settings are keys of devices.mocap."""
 
 
 class MocapDevice(Model):

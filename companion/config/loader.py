@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from pydantic import ValidationError
 
-from companion.config import device_plugins, mocap
+from companion.config import device_plugins
 from companion.config.arm import NO_ARM
 from companion.config.base import Location, Model
 from companion.config.controller import LAWS, AnyControllerConfig, ControllerConfig, law_class, preset_file
@@ -35,7 +35,7 @@ from companion.config.shipped import named_file, near
 from companion.config.urdf import read_urdf
 from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import read_document
-from companion.plugins import ARMS, FORCE_SENSORS
+from companion.plugins import ARMS, FORCE_SENSORS, MOCAP_SYSTEMS
 
 M = TypeVar("M", bound=Model)
 
@@ -106,11 +106,7 @@ def load_flight(
     if vehicle_file is not None:
         vehicle = check_document(Vehicle, vehicle_file, "vehicle", parsed, of_vehicle)
         if hardware and vehicle is not None:
-            of_vehicle += (
-                _open_to_every_network(vehicle, vehicle_file)
-                + _unusable_mocap(vehicle, vehicle_file)
-                + _unusable_devices(vehicle, vehicle_file)
-            )
+            of_vehicle += _open_to_every_network(vehicle, vehicle_file) + _unusable_devices(vehicle, vehicle_file)
     _place_arm(mission_file, vehicle)
     mission = _validated(Mission, mission_file, lines)
     lines += of_vehicle
@@ -158,7 +154,7 @@ def load_vehicle(path: str | Path, overrides: Sequence[str] = ()) -> Vehicle:
     document = read_document(named_file("vehicles", path, "--vehicle"))
     vehicle = check_document(Vehicle, document, "vehicle", parse_overrides(overrides), lines)
     if vehicle is not None:
-        lines += _unusable_mocap(vehicle, document) + _unusable_devices(vehicle, document)
+        lines += _unusable_devices(vehicle, document)
     if vehicle is None or lines:
         raise ConfigError(lines)
     return vehicle
@@ -263,17 +259,11 @@ def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:
     return problem_lines([Problem(RANK_VALUE, document.origin(location), text)])
 
 
-def _unusable_mocap(vehicle: Vehicle, document: Document) -> list[str]:
-    """Return messages if the motion-capture system is not installed or its options are invalid. Logs are read without this check."""
-    device = vehicle.devices.mocap
-    found = [(("devices", "mocap", *at), text) for at, text in mocap.problems(device.type, device.options)]
-    return problem_lines([Problem(RANK_VALUE, document.origin(at), f"{key_path(at)}: {text}") for at, text in found])
-
-
 def _unusable_devices(vehicle: Vehicle, document: Document) -> list[str]:
-    """Return messages if force sensor or arm are not installed, or their options are invalid. Logs are read without this check."""
+    """Return messages if a device is of a type that is not installed, or its options are invalid. Logs are read without this check."""
     found: list[tuple[Location, str]] = []
     for name, group, device in (
+        ("mocap", MOCAP_SYSTEMS, vehicle.devices.mocap),
         ("force", FORCE_SENSORS, vehicle.devices.force),
         ("arm", ARMS, vehicle.devices.arm),
     ):

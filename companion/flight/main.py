@@ -282,7 +282,7 @@ def _device_plugins(vehicle: Vehicle) -> dict[str, str]:
         (plugins.FORCE_SENSORS, devices.force and devices.force.type),
         (plugins.ARMS, devices.arm and devices.arm.type),
     ]
-    found = [str(plugins.find(group, name)) for group, name in named if name and name not in BUILT_IN]
+    found = [str(plugins.find(group, name)) for group, name in named if name and name not in BUILT_IN[group]]
     return {"device_plugins": "; ".join(found)} if found else {}
 
 

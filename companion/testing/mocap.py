@@ -9,12 +9,13 @@ import threading
 import time
 from dataclasses import fields
 
-from companion.config import mocap
+from companion.config import device_plugins
 from companion.config.devices import MocapDevice
 from companion.guardian.mocap import open_client
 from companion.io.mocap.plugin_driver import open_mocap
 from companion.io.mocap.system import MocapSettings
 from companion.model.types import MocapPose
+from companion.plugins import MOCAP_SYSTEMS
 from companion.runtime.clock import flight_clock
 
 FIRST_POSE_S = 5.0
@@ -40,7 +41,7 @@ def check_mocap(device: MocapDevice, duration_s: float = 1.0) -> None:
         AssertionError: a check fails; the text states what was found.
         DeviceError, MocapProblem: the client cannot be opened.
     """
-    problems = mocap.problems(device.type, device.options)
+    problems = device_plugins.problems(MOCAP_SYSTEMS, device.type, device.options)
     assert not problems, f"devices.mocap: {problems}"
     for _ in range(2):
         asyncio.run(_both_clients(device, duration_s))

@@ -11,7 +11,6 @@ from companion import plugins
 from companion.config.controller import law_class
 from companion.config.device_plugins import device_class
 from companion.config.explain import schema_of
-from companion.config.mocap import system_class
 from companion.config.shipped import FILES
 
 
@@ -47,7 +46,6 @@ def _forget() -> None:
     device_class.cache_clear()
     law_class.cache_clear()
     schema_of.cache_clear()
-    system_class.cache_clear()
 
 
 LAW = """

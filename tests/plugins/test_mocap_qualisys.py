@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
+from companion.config.device_plugins import device_class
 from companion.config.devices import MocapDevice
-from companion.config.mocap import system_class
 from companion.io.mocap.system import MocapSettings
 from companion.model.frames import quat_from_euler_zyx, rotation_matrix
 from companion.model.types import MocapPose
@@ -85,7 +85,7 @@ def test_it_keeps_the_contract() -> None:
 
 def test_position_attitude_and_time_are_those_of_the_named_body() -> None:
     with streaming(WAND, QUAD) as qtm:
-        tracker = system_class("qualisys")(settings(qtm.port))
+        tracker = device_class(MOCAP_SYSTEMS, "qualisys")(settings(qtm.port))
         pose = until(tracker, bool)[-1]
         tracker.close()
     assert pose.tracking_valid
@@ -99,7 +99,7 @@ def test_position_attitude_and_time_are_those_of_the_named_body() -> None:
 def test_any_attitude_is_decoded(seed: int) -> None:
     draw = random.Random(seed)
     attitude = quat_from_euler_zyx(draw.uniform(-3, 3), draw.uniform(-1.5, 1.5), draw.uniform(-3, 3))
-    tracker = system_class("qualisys")(settings(1))
+    tracker = device_class(MOCAP_SYSTEMS, "qualisys")(settings(1))
     tracker._bodies = ["quad"]
     pose = tracker._pose(frame(1, [body("quad", attitude=attitude)[1]]), 0.0)
     tracker.close()
@@ -109,7 +109,7 @@ def test_any_attitude_is_decoded(seed: int) -> None:
 
 def test_a_body_that_is_not_tracked_is_reported_and_comes_back() -> None:
     with streaming(WAND, LOST) as qtm:
-        tracker = system_class("qualisys")(settings(qtm.port))
+        tracker = device_class(MOCAP_SYSTEMS, "qualisys")(settings(qtm.port))
         assert not until(tracker, bool)[-1].tracking_valid
         qtm.bodies[1] = QUAD
         until(tracker, lambda poses: bool(poses) and poses[-1].tracking_valid)
@@ -118,7 +118,7 @@ def test_a_body_that_is_not_tracked_is_reported_and_comes_back() -> None:
 
 def test_a_body_that_qtm_does_not_have_is_named_with_those_that_it_has() -> None:
     with streaming(WAND) as qtm:
-        tracker = system_class("qualisys")(settings(qtm.port))
+        tracker = device_class(MOCAP_SYSTEMS, "qualisys")(settings(qtm.port))
         until(tracker, lambda _: tracker.problem is not None)
         tracker.close()
     assert tracker.problem == "QTM has no 6DOF body 'quad'; it has: wand"
@@ -126,7 +126,7 @@ def test_a_body_that_qtm_does_not_have_is_named_with_those_that_it_has() -> None
 
 def test_a_body_that_is_added_in_front_is_not_taken_for_the_vehicle() -> None:
     with streaming(QUAD) as qtm:
-        tracker = system_class("qualisys")(settings(qtm.port))
+        tracker = device_class(MOCAP_SYSTEMS, "qualisys")(settings(qtm.port))
         until(tracker, bool)
         qtm.bodies.insert(0, WAND)
         until(tracker, lambda _: tracker.problem is not None)
@@ -136,7 +136,7 @@ def test_a_body_that_is_added_in_front_is_not_taken_for_the_vehicle() -> None:
 
 def test_the_stream_is_requested_again_after_qtm_has_hung_up() -> None:
     with streaming(QUAD) as qtm:
-        tracker = system_class("qualisys")(settings(qtm.port))
+        tracker = device_class(MOCAP_SYSTEMS, "qualisys")(settings(qtm.port))
         until(tracker, bool)
         qtm.hang_up()
         until(tracker, lambda _: tracker.problem is not None)
@@ -149,14 +149,14 @@ def test_the_stream_is_requested_again_after_qtm_has_hung_up() -> None:
 def test_without_qtm_the_problem_says_so() -> None:
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
-        tracker = system_class("qualisys")(settings(unused.getsockname()[1]))
+        tracker = device_class(MOCAP_SYSTEMS, "qualisys")(settings(unused.getsockname()[1]))
         until(tracker, lambda _: tracker.problem is not None)
         tracker.close()
     assert "no connection (is QTM running" in tracker.problem
 
 
 def test_damaged_datagrams_are_rejected() -> None:
-    tracker = system_class("qualisys")(settings(1))
+    tracker = device_class(MOCAP_SYSTEMS, "qualisys")(settings(1))
     tracker._bodies = ["wand", "quad"]
     whole = frame(7, [WAND[1], QUAD[1]])
     draw = random.Random(1)
@@ -177,4 +177,6 @@ def test_damaged_datagrams_are_rejected() -> None:
 def test_y_up_is_refused() -> None:
     given = device(1, up_axis="y")
     with pytest.raises(ValueError, match="z axis must point up"):
-        system_class("qualisys")(MocapSettings(**{key: getattr(given, key) for key in MocapSettings.__slots__}))
+        device_class(MOCAP_SYSTEMS, "qualisys")(
+            MocapSettings(**{key: getattr(given, key) for key in MocapSettings.__slots__})
+        )

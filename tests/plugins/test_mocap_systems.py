@@ -19,10 +19,10 @@ import pytest
 from pydantic import JsonValue
 
 from companion.cli.main import main
+from companion.config.device_plugins import device_class
 from companion.config.devices import MocapDevice
 from companion.config.document import ConfigError
 from companion.config.loader import load_flight, load_vehicle, logged_flight
-from companion.config.mocap import system_class
 from companion.guardian import process
 from companion.guardian.mocap import MocapProblem, open_client
 from companion.io.mocap.plugin_driver import PluginMocap, open_mocap
@@ -274,7 +274,7 @@ def test_damaged_datagrams_are_rejected() -> None:
 @pytest.mark.parametrize("at", [0, 4])
 def test_a_vicon_object_that_is_not_finite_does_not_stop_the_others(value: float, at: int) -> None:
     port = free_port()
-    tracker = system_class("vicon")(settings_of(vicon(port)))
+    tracker = device_class(MOCAP_SYSTEMS, "vicon")(settings_of(vicon(port)))
     broken = list(QUAD[1])
     broken[at] = value
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -381,7 +381,7 @@ def test_a_client_without_a_name_refuses_the_flight_and_is_closed() -> None:
     driver = PluginMocap(MocapDevice(type="nameless", server="server", rigid_body_id=1), flight_clock(), lambda _: None)
     with pytest.raises(DeviceError, match="mocap nameless server: the client cannot be made: ValueError: no name"):
         asyncio.run(driver.__aenter__())
-    assert system_class("nameless").closed == 1
+    assert device_class(MOCAP_SYSTEMS, "nameless").closed == 1
 
 
 def test_a_problem_that_raises_is_reported_by_the_guardian() -> None:
@@ -437,9 +437,11 @@ def test_a_client_that_cannot_be_made_refuses_the_flight() -> None:
     [
         ("type: vicon\n    options: {object_name: 3}", "options.object_name: Input should be a valid string"),
         ("type: vicon\n    options: {object_nam: quad}", "options.object_nam: Extra inputs are not permitted"),
-        ("type: qualisys", "type: motion-capture system 'qualisys': is not installed; installed: absent, failing, nameless"),
+        ("type: qualisys", "type: motion-capture system 'qualisys': is not installed; installed: natnet, absent, failing"),
         ("type: nooptions", "(lab-mocap 1.0): its attribute 'options' is not a subclass"),
-        ("options: {a: 1}", "options: must be empty for natnet"),
+        ("options: {a: 1}", "options.a: Extra inputs are not permitted"),
+        ("type: external\n    options: {a: 1}", "options: Extra inputs are not permitted"),
+        ("type: rft60", "type: motion-capture system 'rft60': is not installed; installed: natnet, absent"),
     ],
 )  # fmt: skip
 def test_settings_are_checked_with_the_vehicle_file(tmp_path: Path, lines: str, expected: str) -> None:

@@ -15,11 +15,11 @@ from companion.commissioning.mocap.judge import FrameSeen, Watched
 from companion.commissioning.mocap.watch import discover, path_to, watcher
 from companion.commissioning.tool import SENSORS, Cancelled, Report, Session, Tool
 from companion.config.base import Location
+from companion.config.device_plugins import NATNET
 from companion.config.devices import MocapDevice, NatNetVersion
 from companion.config.document import Data
 from companion.config.loader import load_flight
 from companion.config.mission import Start
-from companion.config.mocap import NATNET
 from companion.config.vehicle import Vehicle
 from companion.io.mocap.natnet import ServerInfo
 from companion.io.protocols import DeviceError

@@ -11,7 +11,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Final, Self
 
-from companion.config.devices import MocapDevice
+from companion.config.devices import MocapDevice, NatNetOptions
 from companion.io.arrival import arrived_s
 from companion.io.mocap import natnet, sockets
 from companion.io.mocap.client import CONNECT_PERIOD_S, SUPPORTED_VERSIONS, NatNetClient
@@ -42,6 +42,8 @@ class NatNetMocap:
         body_timeout_s: timeout for the first frame in which the body is tracked.
         on_frame: called with every frame, delivered or not. If given, opening waits for any frame, not for the body.
     """
+
+    options = NatNetOptions
 
     def __init__(
         self,

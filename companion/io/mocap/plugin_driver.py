@@ -10,14 +10,14 @@ from dataclasses import fields
 from types import TracebackType
 from typing import Final, Self, TypeVar
 
+from companion.config.device_plugins import NATNET, device_class
 from companion.config.devices import MocapDevice
-from companion.config.mocap import NATNET, system_class
 from companion.io.mocap.driver import NatNetMocap
 from companion.io.mocap.system import MocapSettings, PoseClient, valid_poses
 from companion.io.protocols import DeviceError, Mocap
 from companion.model.observations import MocapCounts, MocapServer
 from companion.model.types import MocapPose
-from companion.plugins import PluginError, one_line
+from companion.plugins import MOCAP_SYSTEMS, PluginError, one_line
 from companion.runtime.clock import Clock
 
 _LOG: Final = logging.getLogger(__name__)
@@ -117,7 +117,7 @@ class PluginMocap:
         """
         try:
             settings = MocapSettings(**{each.name: getattr(self._device, each.name) for each in fields(MocapSettings)})
-            self._client = client = system_class(self._device.type)(settings)
+            self._client = client = device_class(MOCAP_SYSTEMS, self._device.type)(settings)
             self._server_name = str(client.server_name)
         except PluginError as error:
             raise DeviceError(f"{self._where}: {error}") from error

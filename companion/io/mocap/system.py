@@ -1,4 +1,4 @@
-"""What a motion-capture system that is a plug-in provides. `companion.config.mocap` checks its settings before a flight.
+"""What a motion-capture system that is a plug-in provides. `companion.config.device_plugins` checks its settings before a flight.
 
 The flight process and the guardian each make a client of their own from the same settings, because the guardian lands the vehicle
 after the flight process has died. `companion.io.mocap.plugin_driver` runs the flight's, `companion.guardian.plugin_mocap` the
