@@ -380,6 +380,7 @@ class Sitl:
             "throws": world.payload.throws,
             "catches": world.payload.catches,
             "crashed": world.crashed,
+            "contact": world.surfaces.report() if world.surfaces is not None else None,
             "slipped_s": self.slipped_s,
             "flight_fault": self.flight.report(),
         }

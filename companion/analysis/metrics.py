@@ -192,7 +192,7 @@ def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:
 def _joint_torque_error_nm(log: FlightLog, used: Mask, period_s: float) -> Array:
     """Return J'(F - F_d) for the ticks of the mask, N m, (ticks, joints); NaN if the logged configuration does not describe the arm."""
     joints = log.joint_count
-    skeleton = logged_skeleton((log.config.get("vehicle") or {}).get("arm"))
+    skeleton = logged_skeleton(log.config.get("vehicle"))
     if skeleton is None or len(skeleton.joint_axes) != joints:
         return np.full((int(used.sum()), joints), np.nan)
     force = log.column(lambda i, o, s: o.control.force_ext_world_n if o.control else None, 3)[used]

@@ -120,8 +120,8 @@ class Scene:
         self._hub_m: float = rotors.arm_m * math.sqrt(0.5)
         self._disk_m = disk_radius_m(rotors, airframe["radius_m"])
         self._foot_m: float = airframe["ground_clearance_m"]
-        self._arm = logged_skeleton(vehicle["arm"]) or NO_ARM
-        self._net_radius_m: float = 0.0 if tool is None else tool["net_radius_m"]
+        self._arm = logged_skeleton(vehicle) or NO_ARM
+        self._net_radius_m: float = (tool or {}).get("net_radius_m") or 0.0
         self._tether_line: dict[str, Any] | None = vehicle["tether"]
         room = vehicle["room"]
         self._low, self._high = (np.array([room[axis][k] for axis in ("x_m", "y_m", "z_m")]) for k in (0, 1))

@@ -127,7 +127,7 @@ def _poses(vehicle: Vehicle) -> Iterator[str]:
     if not vehicle.arm.joints:
         return
     arm = manipulator_of(vehicle)
-    tip = "net" if vehicle.tool is not None else "end of the arm"
+    tip = vehicle.tip_name
     for name, angles_deg in vehicle.poses_deg.items():
         # Adding 0 turns -0.0 into 0.0.
         x_m, y_m, z_m = (round(m, 2) + 0.0 for m in arm.net_body_m(tuple(map(math.radians, angles_deg))))

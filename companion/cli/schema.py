@@ -19,7 +19,7 @@ from companion.config.base import Model
 from companion.config.controller import LAWS
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
-from companion.sitl_config.distributions import Normal, Uniform
+from companion.sitl_config.distributions import Distribution
 from companion.sitl_config.world import World
 
 
@@ -95,7 +95,7 @@ def schema_json(kind: str) -> str:
     schema |= KINDS[kind]().json_schema(schema_generator=_Brief)
     if kind == "world":
         schema = _with_distributions(schema)
-        distributions = TypeAdapter(Uniform | Normal).json_schema(schema_generator=_Brief)
+        distributions = TypeAdapter(Distribution).json_schema(schema_generator=_Brief)
         schema["$defs"] |= {**distributions.pop("$defs"), "Distribution": distributions}
     schema["title"] = f"companion {kind}"
     return json.dumps(schema, indent=2, ensure_ascii=False)

@@ -249,13 +249,73 @@ LINK_RADIUS_M = 0.03
 """Half the thickness of servos and links."""
 
 
-class Tool(Model):
-    """Force-torque sensor and net at the tip of the arm."""
+TOOL_KEYS = {
+    "net": ("net_mass_kg", "net_radius_m"),
+    "rod": ("mass_kg", "length_m", "tip_radius_m"),
+    "brush": ("mass_kg", "length_m", "tip_radius_m", "stiffness_n_m"),
+}
+"""Keys of each kind of tool, in addition to those of the sensor."""
 
+
+class Tool(Model):
+    """Force-torque sensor and, beyond it, the net, rod or brush with which the arm works."""
+
+    kind: Literal["net", "rod", "brush"] = "net"
+    """net: catches a payload; sensor and net are at the tip of the arm. rod: a rod with a ball at its end, in line with the last link.
+    brush: a rod with a brush at its end."""
     sensor_mass_kg: NonNegative
     """Mass of the sensor and the mount on the arm's side, which the sensor does not measure."""
-    net_mass_kg: NonNegative
-    """Mass of all parts on the tool side of the sensor; their weight is subtracted from the readings."""
-    net_radius_m: Positive
+    net_mass_kg: NonNegative | None = None
+    """Mass of all parts on the tool side of the sensor; their weight is subtracted from the readings. Nets only."""
+    net_radius_m: Positive | None = None
+    """Nets only."""
+    mass_kg: NonNegative | None = None
+    """Mass of rod and ball or brush, all beyond the sensor; its weight is subtracted from the readings. Rods and brushes only."""
+    length_m: Positive | None = None
+    """Distance of the centre of the ball or brush from the sensor, which is at the end of the last link, along the x axis of the tip's
+    frame. It is the tip of the arm that missions, checks and control laws mean. Rods and brushes only."""
+    tip_radius_m: Positive | None = None
+    """Radius of the ball or brush. Rods and brushes only."""
+    stiffness_n_m: Positive | None = None
+    """Stiffness of the bristles. Brushes only."""
     sensor_rpy_deg: Vector3 = (0.0, 0.0, 0.0)
     """Attitude of the sensor frame in the tip's frame (x outwards; for rods, the frame of the last link): roll, pitch, yaw (ZYX)."""
+
+    @model_validator(mode="after")
+    def _keys_of_kind(self) -> Self:
+        own, problems = TOOL_KEYS[self.kind], list[tuple[Location, str]]()
+        for key in dict.fromkeys(key for keys in TOOL_KEYS.values() for key in keys):
+            if (getattr(self, key) is None) == (key in own):
+                text = (
+                    f"missing; a {self.kind} has it"
+                    if key in own
+                    else f"must be absent; a {self.kind} does not have it"
+                )
+                problems.append(((key,), text))
+        refuse("tool", problems)
+        return self
+
+    @property
+    def is_net(self) -> bool:
+        """Whether a payload can be caught."""
+        return self.kind == "net"
+
+    @property
+    def mass_key(self) -> str:
+        """Key of `beyond_sensor_kg`."""
+        return TOOL_KEYS[self.kind][0]
+
+    @property
+    def beyond_sensor_kg(self) -> float:
+        """Mass of everything on the tool side of the sensor."""
+        return (self.net_mass_kg if self.is_net else self.mass_kg) or 0.0
+
+    @property
+    def beyond_sensor_m(self) -> float:
+        """Distance of the tool's centre or tip from the sensor; 0 for a net."""
+        return self.length_m or 0.0
+
+    @property
+    def radius_m(self) -> float:
+        """Radius of the net, ball or brush."""
+        return (self.net_radius_m if self.is_net else self.tip_radius_m) or 0.0

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
-from companion.config.arm import Arm
+from companion.config.arm import Arm, Tool
 from companion.config.vehicle import Vehicle
+from companion.model.algebra import dot, mat_mat, transpose
 from companion.model.arm_chain import TOOL_PART_INERTIA_KG_M2, ArmChain, ChainLink, rod_inertia_kg_m2
-from companion.model.frames import quat_from_euler_zyx, quat_multiply
-from companion.model.types import IDENTITY_QUAT, Quat, Vec3
+from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate, rotation_matrix
+from companion.model.types import IDENTITY_QUAT, Mat3, Quat, Vec3
 
 
 def chain_of(vehicle: Vehicle) -> ArmChain:
@@ -19,14 +21,79 @@ def chain_of(vehicle: Vehicle) -> ArmChain:
         return ArmChain(())
     sensor = _attitude(tool.sensor_rpy_deg) if tool is not None else IDENTITY_QUAT
     tip = _attitude(arm.tip_rpy_deg) if arm.links else IDENTITY_QUAT
+    links = tuple(_bodies(arm) if arm.links else _rods(arm))
+    end_m: Vec3 = arm.tip_m if arm.links else (arm.link_lengths_m[-1], 0.0, 0.0)
+    if tool is not None and not tool.is_net:
+        return ArmChain(
+            links=(*links[:-1], _with_rod(links[-1], tool, end_m, tip)),
+            tip_m=_along(end_m, tip, tool.beyond_sensor_m),
+            tip_wxyz=tip,
+            sensor_wxyz=quat_multiply(tip, sensor),
+        )
     return ArmChain(
-        links=tuple(_bodies(arm) if arm.links else _rods(arm)),
-        tip_m=arm.tip_m if arm.links else (arm.link_lengths_m[-1], 0.0, 0.0),
+        links=links,
+        tip_m=end_m,
         tip_wxyz=tip,
         sensor_wxyz=quat_multiply(tip, sensor),
         tool_mass_kg=vehicle.tool_mass_kg,
         tool_inertia_kg_m2=2.0 * TOOL_PART_INERTIA_KG_M2 if tool is not None else 0.0,
     )
+
+
+def without_tool(vehicle: Vehicle) -> Vehicle:
+    """Return the vehicle whose arm ends at the force-torque sensor."""
+    return vehicle.model_copy(update={"tool": None})
+
+
+def rod_of(tool: Tool) -> tuple[float, Vec3]:
+    """Return the distance of a rod's centre of mass from the sensor, and its moments of inertia about its own axis, which is x, and
+    across it. The mass is spread evenly over the length.
+    """
+    return 0.5 * tool.beyond_sensor_m, rod_inertia_kg_m2(tool.beyond_sensor_kg, tool.beyond_sensor_m)
+
+
+def _with_rod(link: ChainLink, tool: Tool, end_m: Vec3, tip: Quat) -> ChainLink:
+    """Return the last link together with the sensor at its end and a rod beyond it, as one rigid body."""
+    half_m, moments = rod_of(tool)
+    ball = TOOL_PART_INERTIA_KG_M2
+    parts: list[tuple[float, Vec3, Mat3]] = [
+        (link.mass_kg, link.com_m, link.inertia_kg_m2),
+        (tool.sensor_mass_kg, end_m, _diagonal((ball, ball, ball))),
+        (tool.beyond_sensor_kg, _along(end_m, tip, half_m), _turned(tip, moments)),
+    ]
+    mass_kg = sum(mass for mass, _, _ in parts)
+    cx, cy, cz = (sum(mass * at[axis] for mass, at, _ in parts) / mass_kg for axis in range(3))
+    rows = [[0.0] * 3 for _ in range(3)]
+    for mass, (px, py, pz), own in parts:
+        at = (px - cx, py - cy, pz - cz)
+        square = dot(at, at)
+        for i in range(3):
+            for j in range(3):
+                rows[i][j] += own[i][j] + mass * ((square if i == j else 0.0) - at[i] * at[j])
+    inertia: Mat3 = (
+        (rows[0][0], rows[0][1], rows[0][2]),
+        (rows[1][0], rows[1][1], rows[1][2]),
+        (rows[2][0], rows[2][1], rows[2][2]),
+    )
+    return replace(link, mass_kg=mass_kg, com_m=(cx, cy, cz), inertia_kg_m2=inertia)
+
+
+def _along(start_m: Vec3, attitude: Quat, length_m: float) -> Vec3:
+    """Return the point at this distance from another one along the x axis of an attitude."""
+    x, y, z = quat_rotate(attitude, (length_m, 0.0, 0.0))
+    return (start_m[0] + x, start_m[1] + y, start_m[2] + z)
+
+
+def _diagonal(moments: Vec3) -> Mat3:
+    return ((moments[0], 0.0, 0.0), (0.0, moments[1], 0.0), (0.0, 0.0, moments[2]))
+
+
+def _turned(attitude: Quat, moments: Vec3) -> Mat3:
+    """Return the inertia of a body with these moments about the axes of an attitude."""
+    if attitude == IDENTITY_QUAT:
+        return _diagonal(moments)
+    rotation = rotation_matrix(attitude)
+    return mat_mat(mat_mat(rotation, _diagonal(moments)), transpose(rotation))
 
 
 def _bodies(arm: Arm) -> Iterator[ChainLink]:

@@ -35,8 +35,8 @@ class Vehicle(Model):
     arm: Annotated[Arm, OrElse({"type": "null"})]
     """Arm; null states that there is none, and `arm.joints` is then empty (docs/parts.md)."""
     tool: Tool | None
-    """Net, with the force-torque sensor between the last link and the net; null states that there is none, and nothing can be caught
-    (docs/parts.md)."""
+    """Net, rod or brush, with the force-torque sensor between the last link and it; null states that there is none. Only a net can
+    catch (docs/parts.md)."""
     tether: Tether | None
     """Safety tether; null states that there is none: only the room then limits the flight, and no tether rule is evaluated
     (docs/parts.md)."""
@@ -77,13 +77,30 @@ class Vehicle(Model):
 
     @property
     def tip_radius_m(self) -> float:
-        """Radius around the end of link 2, m: the radius of the net or, without a tool, half the thickness of the link."""
-        return self.tool.net_radius_m if self.tool is not None else LINK_RADIUS_M
+        """Radius around the tip, m: that of the net, ball or brush or, without a tool, half the thickness of the link."""
+        return self.tool.radius_m if self.tool is not None else LINK_RADIUS_M
+
+    @property
+    def tip_name(self) -> str:
+        """Name of the tip in messages."""
+        if self.tool is None:
+            return "end of the arm"
+        return "net" if self.tool.is_net else f"{self.tool.kind}'s tip"
 
     @property
     def tool_mass_kg(self) -> float:
-        """Mass of sensor and net, kg; 0 without a tool."""
-        return self.tool.sensor_mass_kg + self.tool.net_mass_kg if self.tool is not None else 0.0
+        """Mass of the sensor and of what is beyond it, kg; 0 without a tool."""
+        return self.tool.sensor_mass_kg + self.tool.beyond_sensor_kg if self.tool is not None else 0.0
+
+    @property
+    def reach_m(self) -> float:
+        """Largest possible distance of the tip, of which a rod is part, from the first joint, m."""
+        return self.arm.reach_m + (self.tool.beyond_sensor_m if self.tool is not None else 0.0)
+
+    @property
+    def has_net(self) -> bool:
+        """Whether a payload can be caught."""
+        return self.tool is not None and self.tool.is_net
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Self:

@@ -55,7 +55,7 @@ class ForceSensing:
     """Tare and gravity compensation of the force-torque sensor."""
 
     def __init__(self, tool: Tool | None, manipulator: Manipulator) -> None:
-        self._net_weight_n = 0.0 if tool is None else tool.net_mass_kg * GRAVITY_M_S2
+        self._net_weight_n = 0.0 if tool is None else tool.beyond_sensor_kg * GRAVITY_M_S2
         self._manipulator = manipulator
         self._sum = [0.0, 0.0, 0.0]
         self._count = 0

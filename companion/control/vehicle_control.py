@@ -60,6 +60,7 @@ class VehicleControl:
         self._acceleration = MeanAcceleration()
         self._observer = ForceObserver(vehicle) if vehicle.force_source == OBSERVER else None
         self._catch = CatchDetector() if self._observer is None else ObservedCatchDetector()
+        self._has_net = vehicle.has_net
         self.tether_pulls = False
         """Whether the tether pulls; set only with the momentum observer, which cannot tell that from a payload: no catch is then
         confirmed."""
@@ -202,7 +203,7 @@ class VehicleControl:
     def catch_s(self, t_s: float, log: ControlLog) -> float | None:
         """Return the time of the impact in the tick that confirms a catch, and None in every other tick."""
         observed = log.force_observed_world_n
-        if not self._catch.update(t_s, log.force_ext_world_n if observed is None else observed):
+        if not self._has_net or not self._catch.update(t_s, log.force_ext_world_n if observed is None else observed):
             return None
         if self.tether_pulls:
             self._catch.reject()

@@ -59,7 +59,7 @@ class ArmClearance:
         self._manipulator = manipulator_of(vehicle)
         self._joints = len(vehicle.arm.joints)
         self._tip_radius_m = vehicle.tip_radius_m
-        self._tip = "net" if vehicle.tool is not None else "end of the arm"
+        self._tip = vehicle.tip_name
         self._fold_rad: Joints = tuple(map(math.radians, vehicle.fold_arm_deg))
 
     def parts(self, arm_rad: Joints) -> list[tuple[str, Vec3, float]]:

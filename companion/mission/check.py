@@ -219,10 +219,12 @@ def _whole(mission: Mission, vehicle: Vehicle, plan: Plan, phase_origins: Sequen
             key=lambda found: found[0],
             default=(math.inf, takeoff),
         )
-        if vehicle.tool is None:
+        if not vehicle.has_net:
+            instead = f", but a {vehicle.tool.kind}" if vehicle.tool is not None else ""
+            fix = "choose a vehicle with a net" if instead else "add tool to the vehicle file"
             problems.append(
                 f"{_place(mission, catching, phase_origins)} expects a payload in the net, but vehicle '{vehicle.name}' has no net "
-                "(tool); add tool to the vehicle file, or remove catch from the mission"
+                f"(tool){instead}; {fix}, or remove catch from the mission"
             )
         elif near_m > CATCH_NEAR_M:
             x_m, y_m = mission.catch.expected_at_m

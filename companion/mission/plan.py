@@ -208,7 +208,7 @@ def landing_from(
     builder.fold_arm(arm_fold_rad, fold_s)
     stop_s = builder.stop(velocity_world_m_s)
     arm = vehicle.arm
-    reach_m = arm.reach_m - arm.first_joint_body_m[2] + vehicle.tip_radius_m
+    reach_m = vehicle.reach_m - arm.first_joint_body_m[2] + vehicle.tip_radius_m
     free_s = max(0.0, builder.height_m - reach_m) / speed_m_s
     builder.t_s = max(stop_s, fold_s - free_s)
     builder.segments.append(Segment(name="stop", kind=PhaseKind.LANDING, start_s=0.0, end_s=builder.t_s, index=-1))

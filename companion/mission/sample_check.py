@@ -55,7 +55,7 @@ class SampleCheck:
         self._watch = TetherWatch.of(vehicle)
         airframe, tether = vehicle.airframe, vehicle.tether
         self._payload_kg = airframe.payload_max_kg if mission.catch is None else mission.catch.payload_max_kg
-        if vehicle.tool is None:
+        if not vehicle.has_net:
             self._payload_kg = 0.0
         self._tether_n = 0.0 if tether is None else tether.weight_n_per_m * tether.length_m
         self._blow_until_s = 0.0
@@ -131,7 +131,11 @@ class SampleCheck:
         radius_m = vehicle.airframe.radius_m
         room = vehicle.room
         why = _allowance(off_m)
-        parts = "the rotors, the arm and the net" if vehicle.arm.joints else "the rotors"
+        parts = (
+            f"the rotors, the arm and the {vehicle.tool.kind if vehicle.tool is not None else 'net'}"
+            if vehicle.arm.joints
+            else "the rotors"
+        )
         for axis, name, span in ((0, "x", room.x_m), (1, "y", room.y_m), (2, "z", room.z_m)):
             if axis == 2 and position[2] < vehicle.airframe.ground_clearance_m:
                 continue  # reported as flying into the floor

@@ -43,16 +43,26 @@ def skeleton_of(chain: ArmChain) -> ArmSkeleton:
     return _skeleton([(link.position_m, link.attitude_wxyz, link.axis) for link in chain.links], chain.tip_m)
 
 
-def logged_skeleton(arm: Any) -> ArmSkeleton | None:
-    """Return the skeleton of the section `vehicle.arm` of a logged configuration (docs/arms.md); None if it is not a valid arm."""
+def logged_skeleton(vehicle: Any) -> ArmSkeleton | None:
+    """Return the skeleton of arm and tool in the section `vehicle` of a logged configuration (docs/arms.md); None if it has no valid
+    arm.
+    """
+    arm = vehicle.get("arm") if isinstance(vehicle, dict) else None
     if not isinstance(arm, dict):
         return None
+    tool = vehicle.get("tool")
+    rod_m: Any = tool.get("length_m") if isinstance(tool, dict) else None
+    rod: Vec3 = (float(rod_m) if _are_numbers([rod_m]) else 0.0, 0.0, 0.0)
     links = arm.get("links")
     if links:
         joints = [_logged_link(link) for link in links] if isinstance(links, list | tuple) else [None]
         tip = _vector(arm.get("tip_m", (0.0, 0.0, 0.0)))
-        if tip is None or None in joints:
+        rpy_deg = _vector(arm.get("tip_rpy_deg", (0.0, 0.0, 0.0)))
+        if tip is None or rpy_deg is None or None in joints:
             return None
+        roll, pitch, yaw = map(math.radians, rpy_deg)
+        x, y, z = quat_rotate(quat_from_euler_zyx(roll, pitch, yaw), rod)
+        tip = (tip[0] + x, tip[1] + y, tip[2] + z)
         return _skeleton([joint for joint in joints if joint is not None], tip)
     shoulder = _vector(arm.get("shoulder_body_m", (0.0, 0.0, 0.0)))
     lengths: Any = arm.get("link_lengths_m")
@@ -62,7 +72,10 @@ def logged_skeleton(arm: Any) -> ArmSkeleton | None:
     for index, joint in enumerate((arm.get("joints") or ())[: len(axes)]):
         axis = _unit(joint.get("axis")) if isinstance(joint, dict) else None
         axes[index] = axis or axes[index]
-    return ArmSkeleton(shoulder, tuple((float(length), 0.0, 0.0) for length in lengths), tuple(axes))
+    vectors: list[Vec3] = [(float(length), 0.0, 0.0) for length in lengths]
+    if vectors:
+        vectors[-1] = (vectors[-1][0] + rod[0], 0.0, 0.0)
+    return ArmSkeleton(shoulder, tuple(vectors), tuple(axes))
 
 
 def _skeleton(joints: Sequence[tuple[Vec3, Quat, Vec3]], tip: Vec3) -> ArmSkeleton:

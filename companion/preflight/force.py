@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 
+from companion.config.arm import Tool
 from companion.config.devices import ForceDevice
 from companion.config.vehicle import OBSERVER, Vehicle
 from companion.control.arm_model import manipulator_of
@@ -135,7 +136,7 @@ def stream_rows(
         yield _noise(samples)
         yield _overload(samples, device)
         if pose is not None:
-            yield _tare(tare_bias_n(samples, vehicle, *pose), tool.net_mass_kg, device)
+            yield _tare(tare_bias_n(samples, vehicle, *pose), tool, device)
         yield _still(samples, vehicle)
 
 
@@ -171,14 +172,18 @@ def _overload(samples: Sequence[ForceSample], device: ForceDevice) -> Row:
     return OVERLOAD.bad(f"{count} of {len(samples)} samples", "none", fix)
 
 
-def _tare(bias_n: Vec3, net_kg: float, device: ForceDevice) -> Row:
+def _tare(bias_n: Vec3, tool: Tool, device: ForceDevice) -> Row:
     size_n, full_n = math.hypot(*bias_n), device.force_max_n
     x, y, z = bias_n
-    read = f"({x:.1f}, {y:.1f}, {z:.1f}) N besides the net's {net_kg:g} kg"
+    kind, tool_kg = tool.kind, tool.beyond_sensor_kg
+    read = f"({x:.1f}, {y:.1f}, {z:.1f}) N besides the {kind}'s {tool_kg:g} kg"
     wanted = f"{TARE_GOOD * full_n:g} N"
     if size_n <= TARE_GOOD * full_n:
         return TARE.good(read, wanted)
-    fix = "free the net; if it is free, correct tool.net_mass_kg, loosen the sensor's mount or set its bias with the vendor's tool"
+    fix = (
+        f"free the {kind}; if it is free, correct tool.{tool.mass_key}, loosen the sensor's mount or set its bias with the vendor's "
+        "tool"
+    )
     return (TARE.doubtful if size_n <= TARE_MAX * full_n else TARE.bad)(read, wanted, fix)
 
 

@@ -46,10 +46,11 @@ _UPRIGHT = Quaternion(w=1.0, x=0.0, y=0.0, z=0.0)
 
 @dataclass(frozen=True, slots=True)
 class ArmShape:
-    """The arm and its net."""
+    """The arm and its tool."""
 
     skeleton: ArmSkeleton
     net_radius_m: float | None
+    """Radius of the net or of the rod's tip."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,9 +85,10 @@ class Machine:
 
 def machine_of(config: Any) -> Machine:
     """Return the geometry of an effective configuration (nested dicts); missing and invalid values become None."""
-    skeleton, arm = logged_skeleton(_at(config, ("vehicle", "arm"))), None
+    skeleton, arm = logged_skeleton(_at(config, ("vehicle",))), None
     if skeleton is not None and skeleton.links_body_m:
-        arm = ArmShape(skeleton, _number(config, "vehicle", "tool", "net_radius_m"))
+        radius_m = _number(config, "vehicle", "tool", "net_radius_m")
+        arm = ArmShape(skeleton, radius_m or _number(config, "vehicle", "tool", "tip_radius_m"))
     anchor = _numbers(config, 3, "vehicle", "tether", "anchor_world_m")
     length_m = _number(config, "vehicle", "tether", "length_m")
     tether = None

@@ -34,9 +34,14 @@ _FAULTLESS = Machine(
 """The vehicle exactly as the vehicle file describes it."""
 NORMAL_ENDS = 3.0
 """Number of standard deviations at which a normal distribution is truncated."""
-DISTRIBUTIONS = ("uniform", "normal")
+_PARAMETERS = {
+    "uniform": "[low, high] with low < high",
+    "log_uniform": "[low, high] with 0 < low < high",
+    "normal": "[mean, sigma] with sigma > 0",
+}
+DISTRIBUTIONS = tuple(_PARAMETERS)
 _DIGITS = 6
-_EXPECTED = "expected a number, {uniform: [low, high]} or {normal: [mean, sigma]}"
+_EXPECTED = "expected a number, {uniform: [low, high]}, {log_uniform: [low, high]} or {normal: [mean, sigma]}"
 
 
 class Uniform(Model):
@@ -46,6 +51,13 @@ class Uniform(Model):
     """[low, high], with low < high."""
 
 
+class LogUniform(Model):
+    """A number whose logarithm is drawn uniformly from an interval."""
+
+    log_uniform: Vector2
+    """[low, high], with 0 < low < high."""
+
+
 class Normal(Model):
     """A number drawn from a normal distribution, truncated at 3 sigma."""
 
@@ -53,12 +65,15 @@ class Normal(Model):
     """[mean, sigma], with sigma > 0."""
 
 
+Distribution = Uniform | LogUniform | Normal
+
+
 class Range(Model):
     """One number of the world and its distribution."""
 
     at: tuple[str | int, ...]
     """Keys and indices of the number in the world."""
-    distribution: Uniform | Normal
+    distribution: Distribution
 
     @property
     def key(self) -> str:
@@ -70,6 +85,8 @@ class Range(Model):
         """Smallest and largest number that can be drawn."""
         if isinstance(self.distribution, Uniform):
             return self.distribution.uniform
+        if isinstance(self.distribution, LogUniform):
+            return self.distribution.log_uniform
         mean, sigma = self.distribution.normal
         return (mean - NORMAL_ENDS * sigma, mean + NORMAL_ENDS * sigma)
 
@@ -79,6 +96,8 @@ class Range(Model):
         low, high = self.ends
         if isinstance(self.distribution, Uniform):
             value = float(rng.uniform(low, high))
+        elif isinstance(self.distribution, LogUniform):
+            value = math.exp(float(rng.uniform(math.log(low), math.log(high))))
         else:
             mean, sigma = self.distribution.normal
             value = math.inf
@@ -197,7 +216,7 @@ def check_world(document: Document, ranges: Sequence[Range], seed: int) -> World
     return world
 
 
-def _distribution(value: dict[str, Any]) -> Uniform | Normal:
+def _distribution(value: dict[str, Any]) -> Distribution:
     """Parse a distribution.
 
     Raises:
@@ -211,11 +230,18 @@ def _distribution(value: dict[str, Any]) -> Uniform | Normal:
         raise ValueError(
             f"unknown distribution {json.dumps(name)}; " + (f"did you mean {close}?" if close else _EXPECTED)
         )
-    names = "[low, high] with low < high" if name == "uniform" else "[mean, sigma] with sigma > 0"
+    names = _PARAMETERS[name]
     numbers = isinstance(pair, list) and all(type(x) in (int, float) and math.isfinite(x) for x in pair)
-    if not numbers or len(pair) != 2 or not (pair[0] < pair[1] if name == "uniform" else pair[1] > 0):
+    if (
+        not numbers
+        or len(pair) != 2
+        or not (pair[1] > 0 if name == "normal" else pair[0] < pair[1])
+        or (name == "log_uniform" and not pair[0] > 0)
+    ):
         raise ValueError(f"{name}: expected {names}, got {pair}")
     first, second = map(float, pair)
+    if name == "log_uniform":
+        return LogUniform(log_uniform=(first, second))
     return Uniform(uniform=(first, second)) if name == "uniform" else Normal(normal=(first, second))
 
 

@@ -274,8 +274,8 @@ def absent_part(kind: FaultKind, vehicle: Vehicle) -> str | None:
         return "tether"
     if (kind.startswith("servo_") or kind == "bus_noise") and not vehicle.arm.joints:
         return "arm"
-    if kind.startswith("payload_") and vehicle.tool is None:
-        return "tool"
+    if kind.startswith("payload_") and not vehicle.has_net:
+        return "tool (a net)"
     return None
 
 

@@ -27,6 +27,7 @@ from companion.sitl_config.effects.tether_line import TetherLine
 from companion.sitl_config.effects.thrower import Thrower
 from companion.sitl_config.faults import Fault as Fault
 from companion.sitl_config.per_joint import RelativeErrors
+from companion.sitl_config.surfaces import Surface
 
 REAL32_MAX = 3.4e38
 SignedAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -178,6 +179,8 @@ class World(Model):
     px4_params: Px4Params = Field(default={})
     """PX4 parameters by name; they override the parameters of the simulated vehicle."""
     faults: tuple[Fault, ...] = ()
+    surfaces: Annotated[tuple[Surface, ...], Field(max_length=8)] = ()
+    """Surfaces that the tip of the arm can touch. Touching one with a rotor is a crash."""
     air: Air = Air()
     downwash: Downwash = Downwash()
     tether_line: TetherLine = TetherLine()

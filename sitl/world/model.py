@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 
+from companion.config.arm import Tool
+from companion.config.arm_chain import rod_of
 from companion.config.vehicle import Vehicle
 from companion.model.arm_chain import TOOL_PART_INERTIA_KG_M2, ChainLink
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.frames import quat_from_euler_zyx, quat_multiply
+from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.types import IDENTITY_QUAT, Joints, Quat, Vec3
 from companion.sitl_config.effects.rotors import of_rotors
 from companion.sitl_config.world import World
+from sitl.world import surfaces
 from sitl.world.effects import machine, transmission
 
 PAYLOAD_RADIUS_M = 0.035
@@ -25,7 +28,7 @@ def base_mass_kg(vehicle: Vehicle, world: World) -> float:
     arm, tool = vehicle.arm, vehicle.tool
     rest = arm.mass_kg
     if tool is not None:
-        rest = rest + tool.sensor_mass_kg + tool.net_mass_kg
+        rest = rest + tool.sensor_mass_kg + tool.beyond_sensor_kg
     return (vehicle.airframe.mass_kg - rest) * (1.0 + world.mass_error)
 
 
@@ -64,13 +67,15 @@ def _links(vehicle: Vehicle, world: World) -> str:
         inertia = " ".join(3 * (str(TOOL_PART_INERTIA_KG_M2),))
         sensor, net = (
             f'<inertial pos="0 0 0" mass="{max(mass_kg, 1e-4)}" diaginertia="{inertia}"/>'
-            for mass_kg in (tool.sensor_mass_kg, tool.net_mass_kg)
+            for mass_kg in (tool.sensor_mass_kg, tool.beyond_sensor_kg)
         )
+        if not tool.is_net:
+            net = _rod(vehicle, tool)
     bodies = f"""<body name="sensor" pos="{_xyz(chain.tip_m)}" {_quat(chain.tip_wxyz)}>
         {sensor}
         <body name="net" {turn}>
           {net}
-          <site name="net"/>
+          <site name="net"/>{_tip(vehicle, world)}
         </body>
       </body>"""
     friction_nm, damping_nms = world.joint_friction_nm, world.joint_damping_nms
@@ -86,6 +91,32 @@ def _links(vehicle: Vehicle, world: World) -> str:
         {bodies}
       </body>"""
     return bodies
+
+
+def _rod(vehicle: Vehicle, tool: Tool) -> str:
+    """Return the inertia of a rod in the frame of the force-torque sensor."""
+    half_m, moments = rod_of(tool)
+    back = quat_conjugate(surfaces.sensor_turn(vehicle))
+    centre_m = quat_rotate(back, (half_m, 0.0, 0.0))
+    return f'<inertial pos="{_xyz(centre_m)}" {_quat(back)} mass="{max(tool.beyond_sensor_kg, 1e-4)}" diaginertia="{_xyz(moments)}"/>'
+
+
+def _tip(vehicle: Vehicle, world: World) -> str:
+    """Return the massless body at the tip, which touches the surfaces; it is left out where the net is the tip and touches nothing."""
+    if not has_tip(vehicle, world):
+        return ""
+    back = quat_conjugate(surfaces.sensor_turn(vehicle))
+    ball = f'<geom name="tip" type="sphere" size="{vehicle.tip_radius_m}" mass="0" contype="0" conaffinity="0"/>'
+    return f"""
+          <body name="tip" pos="{_xyz(surfaces.tip_offset_m(vehicle))}" {_quat(back)}>
+            <site name="tip"/>
+            {ball if world.surfaces else ""}
+          </body>"""
+
+
+def has_tip(vehicle: Vehicle, world: World) -> bool:
+    """Return whether the model has a body, a site and sensors named after the tip."""
+    return bool(world.surfaces) or (vehicle.tool is not None and not vehicle.tool.is_net)
 
 
 def _turn(link: ChainLink, number: int, world: World) -> str:
@@ -126,6 +157,13 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     </spatial>
   </tendon>"""
         tension = '<tendonlimitfrc name="tether" tendon="tether"/>'
+    tip = ""
+    if has_tip(vehicle, world):
+        tip = """
+    <force name="contact" site="tip"/>
+    <framepos name="tip" objtype="site" objname="tip"/>
+    <framequat name="tip attitude" objtype="site" objname="tip"/>"""
+    options = surfaces.OPTIONS if world.surfaces else 'cone="pyramidal"'
     payload = ""
     connect = ""
     balls = [("payload", "catch", world.payload_kg)]
@@ -144,10 +182,10 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     return f"""
 <mujoco model="{vehicle.name}">
   <compiler angle="radian" eulerseq="zyx" inertiafromgeom="auto"/>
-  <option timestep="{timestep_s}" gravity="0 0 -{GRAVITY_M_S2}" integrator="implicitfast" cone="pyramidal"/>
+  <option timestep="{timestep_s}" gravity="0 0 -{GRAVITY_M_S2}" integrator="implicitfast" {options}/>
   <size memory="2M"/>
   <worldbody>
-    <geom name="floor" type="plane" size="20 20 1" contype="2" conaffinity="1"/>
+    <geom name="floor" type="plane" size="20 20 1" contype="2" conaffinity="1"/>{surfaces.geoms(world)}
     {anchor}
     <body name="base" pos="0 0 {clearance}">
       <freejoint name="base"/>
@@ -163,7 +201,7 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
   <equality>
     {"".join(f'<joint name="park{i}" joint1="alpha{i}" solref="0.01 1"/>' for i in joints)}{connect}
   </equality>
-  {tendon}
+  {tendon}{surfaces.pairs(world)}
   <actuator>
     {motors}
     {"".join(f'<motor name="alpha{i}" joint="alpha{i}"/>' for i in joints)}
@@ -173,6 +211,6 @@ def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
     <gyro name="gyro" site="imu"/>
     <force name="force" site="net"/>
     <torque name="torque" site="net"/>
-    {tension}
+    {tension}{tip}
   </sensor>
 </mujoco>"""

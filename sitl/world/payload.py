@@ -52,11 +52,11 @@ class Payload:
         self._thrower = Thrower.of(config.thrower, config.seed)
         self.bag = (
             Net.of(config.net, model, data, world.loads, self._net_radius_m, PAYLOAD_RADIUS_M)
-            if vehicle.tool is not None
+            if vehicle.has_net
             else None
         )
         """The bag of the net, or None if its effect is off or there is no net."""
-        self.ball = Ball.of(model, "payload", "catch") if vehicle.tool is not None and config.payload_kg > 0 else None
+        self.ball = Ball.of(model, "payload", "catch") if vehicle.has_net and config.payload_kg > 0 else None
         """Indices of the payload; None if no payload is configured, or the vehicle has no net to throw it into."""
         self.aside_m = 0.0
         """Distance by which the throw misses the net."""

@@ -10,7 +10,9 @@ from typing import NamedTuple, Protocol
 import mujoco
 
 from companion.config.vehicle import Vehicle
+from companion.model.algebra import cross
 from companion.model.constants import GRAVITY_M_S2
+from companion.model.frames import quat_rotate
 from companion.model.types import Joints, Quat, Vec2, Vec3
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.air import Air
@@ -21,8 +23,9 @@ from sitl.world.effects.tether_line import TetherLine
 from sitl.world.effects.transmission import Transmission, added_inertia_kg_m2
 from sitl.world.handling import Wrench
 from sitl.world.loads import EFFECT_PERIOD_S, ZERO, Loads
-from sitl.world.model import mjcf
+from sitl.world.model import has_tip, mjcf
 from sitl.world.payload import Payload
+from sitl.world.surfaces import Surfaces
 
 PHYSICS_DT_S = 0.002
 DRAG_N_PER_M_S = 0.25
@@ -71,6 +74,9 @@ class Layout:
     torque: int
     tether: int | None
     """Index of the tether's tension; None without a tether."""
+    tip: int | None = None
+    """Index of the contact force on the tip, which is followed by the tip's position and attitude; None in a world without surfaces
+    for a vehicle with a net."""
 
     def truth(self, snapshot: Snapshot) -> Truth:
         """Return the true state that a snapshot contains."""
@@ -90,6 +96,12 @@ class Layout:
             tether_tension_n=self.tension_n(s),
         )
 
+    def contact(self, sensors: Sequence[float]) -> tuple[Vec3, Vec3]:
+        """Return the tip's position (m) and the force of a surface on it (N), world frame; the world has surfaces."""
+        assert self.tip is not None
+        fx, fy, fz, x, y, z, qw, qx, qy, qz = sensors[self.tip : self.tip + 10]
+        return (x, y, z), quat_rotate((qw, qx, qy, qz), (-fx, -fy, -fz))
+
     def tension_n(self, sensors: Sequence[float]) -> float:
         """Return the tension of the tether, N; 0 without a tether."""
         return 0.0 if self.tether is None else sensors[self.tether]
@@ -101,7 +113,8 @@ class WorldEvent:
 
     t_s: float
     kind: str
-    """Kind: thrown, caught, taken (out of the net), missed, bounced_out (of the bag) or crashed."""
+    """Kind: thrown, caught, taken (out of the net), missed, bounced_out (of the bag), touched or gave_way (a surface), rotor_touched
+    (a surface) or crashed."""
 
 
 class Effect(Protocol):
@@ -134,9 +147,13 @@ class World:
             force=int(m.sensor("force").adr[0]),
             torque=int(m.sensor("torque").adr[0]),
             tether=int(m.sensor("tether").adr[0]) if vehicle.tether is not None else None,
+            tip=int(m.sensor("contact").adr[0]) if has_tip(vehicle, config) else None,
         )
         self._base = m.body("base").id
         self._net = m.body("net").id
+        self._tip = m.body("tip" if has_tip(vehicle, config) else "net").id
+        self.surfaces = Surfaces.of(vehicle, config, m)
+        """Surfaces; None if there are none."""
         self._park = [m.equality(name).id for name in (f"park{number + 1}" for number in range(len(arm_rad)))]
         self.parked = True
         """Whether a support holds the arm."""
@@ -205,8 +222,12 @@ class World:
         return self._sensors
 
     def push(self, force_world_n: Vec3) -> None:
-        """Set the external force on the centre of the net in N, world frame."""
-        self.loads.set(self._net, "push", force_world_n)
+        """Set the external force on the tip, which is the centre of the net or the end of the rod, in N, world frame."""
+        torque_nm = ZERO
+        if self._tip != self._net:
+            tx, ty, tz = (self.data.xpos[self._tip] - self.data.xipos[self._net]).tolist()
+            torque_nm = cross((tx, ty, tz), force_world_n)
+        self.loads.set(self._net, "push", force_world_n, torque_nm)
 
     def hold(self, wrench: Wrench | None) -> None:
         """Set the force and torque of handling on the base; None releases the base."""
@@ -277,6 +298,8 @@ class World:
         self.t_s = self.data.time
         self.q, self.v = self._qpos.tolist(), self._qvel.tolist()
         self._sensors = None
+        if self.surfaces is not None:
+            self.surfaces.step(self)
         self.payload.step(airborne)
         self._watch_crash()
 
@@ -348,8 +371,20 @@ class World:
         up = 1.0 - 2.0 * (x * x + y * y)
         fell = z < self._standing_m and self.v[2] < -FALL_M_S
         if fell or z < 0.6 * self._standing_m or up < 0.3 or not math.isfinite(z):
-            self.crashed = True
-            self.report("crashed")
+            self.crash()
+
+    def crash(self, cause: str | None = None) -> None:
+        """End the flight as a crash.
+
+        Args:
+            cause: an event to report before the crash.
+        """
+        if self.crashed:
+            return
+        self.crashed = True
+        if cause is not None:
+            self.report(cause)
+        self.report("crashed")
 
     def report(self, kind: str) -> None:
         """Record an event at the present time."""

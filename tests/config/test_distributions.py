@@ -114,9 +114,9 @@ def test_another_seed_draws_the_laboratory_anew_but_keeps_what_was_set(file: str
         (
             "rotor_lag_s: {poisson: [1, 2]}",
             "1:14: rotor_lag_s: unknown distribution \"poisson\"; "
-            "expected a number, {uniform: [low, high]} or {normal: [mean, sigma]}",
+            "expected a number, {uniform: [low, high]}, {log_uniform: [low, high]} or {normal: [mean, sigma]}",
         ),
-        ("rotor_lag_s: {}", "1:14: rotor_lag_s: expected a number, {uniform: [low, high]} or {normal: [mean, sigma]}, got a mapping with 0 keys"),
+        ("rotor_lag_s: {}", "1:14: rotor_lag_s: expected a number, {uniform: [low, high]}, {log_uniform: [low, high]} or {normal: [mean, sigma]}, got a mapping with 0 keys"),
         ("rotor_lag_s: {uniform: [-0.1, 0.1]}", "1:14: rotor_lag_s: expected a number > 0, got -0.1 at the lower end of the drawn range"),
         ("rotor_lag_s: {normal: [0.03, 0.02]}", "1:14: rotor_lag_s: expected a number > 0, got -0.03 at the lower end of the drawn range"),
         ("mass_error: {uniform: [0, 0.6]}", "1:13: mass_error: expected a number from -0.5 to 0.5, got 0.6 at the upper end of the drawn range"),
@@ -236,7 +236,7 @@ def test_both_loops_fly_the_machine_with_the_model_error() -> None:
     assert plant.world.weight_n == true
     tool, errs = tool_of(config.vehicle), with_model_error(config.world, 2)
     links_kg = link_masses_kg(config.vehicle, errs)
-    true_kg = base_mass_kg(config.vehicle, errs) + sum(links_kg) + tool.sensor_mass_kg + tool.net_mass_kg
+    true_kg = base_mass_kg(config.vehicle, errs) + sum(links_kg) + tool.sensor_mass_kg + tool.beyond_sensor_kg
     assert true == pytest.approx(GRAVITY_M_S2 * true_kg, rel=1e-6)
     assert true != pytest.approx(believed, rel=0.05)
 

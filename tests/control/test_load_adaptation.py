@@ -95,7 +95,7 @@ def test_moments_and_friction_are_found_while_the_arm_moves() -> None:
 
 def test_the_levers_of_gravity_times_the_moments_are_the_gravity_torque() -> None:
     arm, tool = CONFIG.vehicle.arm, tool_of(CONFIG.vehicle)
-    carried_kg = tool.sensor_mass_kg + tool.net_mass_kg
+    carried_kg = tool.sensor_mass_kg + tool.beyond_sensor_kg
     first = arm.link_masses_kg[0] * arm.link_com_m[0] + (arm.link_masses_kg[1] + carried_kg) * arm.link_lengths_m[0]
     second = arm.link_masses_kg[1] * arm.link_com_m[1] + carried_kg * arm.link_lengths_m[1]
     levers = MANIPULATOR.gravity_levers_m_s2((1.7, 1.0), (0.0, 0.0, GRAVITY_M_S2))

@@ -169,7 +169,7 @@ def margins_m(config: SitlConfig, result: FastResult) -> tuple[float, float]:
     """Return the true minimum in flight of the slack beyond the margin, and of the distance to walls and ceiling."""
     vehicle, room = config.vehicle, config.vehicle.room
     manipulator = manipulator_of(vehicle)
-    reach_m, net_reach_m = vehicle.airframe.radius_m, tool_of(vehicle).net_radius_m
+    reach_m, net_reach_m = vehicle.airframe.radius_m, tool_of(vehicle).radius_m
     tether_m = fence_m = math.inf
     for outputs, truth in zip(result.outputs, result.truth, strict=True):
         if outputs.phase_kind in (PhaseKind.GROUND, PhaseKind.DONE):

@@ -155,7 +155,7 @@ def test_a_landing_folds_the_arm_before_the_net_can_touch_the_floor(height_m: fl
     unfolded = (math.radians(90.0), math.radians(0.0))  # straight down: the longest reach
     plan = landing_from((0.0, 0.0, height_m), (0.0, 0.0, 0.0), 0.0, unfolded, FOLD, 0.35, VEHICLE)
     arm = VEHICLE.arm
-    reach_m = sum(arm.link_lengths_m) - arm.shoulder_body_m[2] + tool_of(VEHICLE).net_radius_m
+    reach_m = sum(arm.link_lengths_m) - arm.shoulder_body_m[2] + tool_of(VEHICLE).radius_m
     at_rest_height_m = plan.reference(plan.segments[0].end_s).position_world_m[2]
     for index in range(500):
         reference = plan.reference(plan.duration_s * index / 499)

@@ -47,7 +47,7 @@ def test_the_skeleton_of_a_logged_arm_is_that_of_its_chain() -> None:
     )
     for arm in (two.arm, turned, bodies):
         expected = skeleton_of(chain_of(two.model_copy(update={"arm": arm})))
-        found = logged_skeleton(arm.model_dump(mode="json"))
+        found = logged_skeleton({"arm": arm.model_dump(mode="json"), "tool": {"net_radius_m": 0.09}})
         assert isinstance(found, ArmSkeleton)
         assert found.shoulder_body_m == pytest.approx(expected.shoulder_body_m)
         np.testing.assert_allclose(found.links_body_m, expected.links_body_m, atol=1e-15)
@@ -71,7 +71,7 @@ def test_the_skeleton_of_a_logged_arm_is_that_of_its_chain() -> None:
     ],
 )
 def test_an_invalid_logged_arm_has_no_skeleton(arm: object) -> None:
-    assert logged_skeleton(arm) is None
+    assert logged_skeleton({"arm": arm}) is None
 
 
 def test_no_arm_is_an_empty_skeleton() -> None:

@@ -50,7 +50,7 @@ def oracle(vehicle: Vehicle) -> pin.Model:
     link2 = model.addJoint(link1, pin.JointModelRevoluteUnaligned(np.array([0.0, -1.0, 0.0])), elbow, "alpha2")
     model.appendBodyToJoint(link2, rod(m2, c2, l2), pin.SE3.Identity())
     end = pin.SE3(np.eye(3), np.array([l2, 0, 0]))
-    for mass in (tool.sensor_mass_kg, tool.net_mass_kg):
+    for mass in (tool.sensor_mass_kg, tool.beyond_sensor_kg):
         model.appendBodyToJoint(link2, pin.Inertia(mass, np.zeros(3), np.eye(3) * 1e-4), end)
     model.addFrame(pin.Frame("net", link2, end, pin.FrameType.OP_FRAME))
     model.armature = np.array([0.0] * 6 + [arm.joint_armature_kg_m2] * 2)
@@ -157,7 +157,7 @@ def test_the_catch_conserves_momentum(vehicle: Vehicle, payload_kg: float) -> No
         world.step((0, 0, 0, 0), (0, 0), False, drag=False)
     assert world.payload.caught_t_s is not None
     away = d.xpos[payload] - d.xpos[m.body("net").id]
-    assert np.linalg.norm(away) < 1.1 * tool_of(vehicle).net_radius_m, "the net did not keep the payload"
+    assert np.linalg.norm(away) < 1.1 * tool_of(vehicle).radius_m, "the net did not keep the payload"
     assert np.linalg.norm(momentum() - before) <= 0.005 * np.linalg.norm(before)
 
 

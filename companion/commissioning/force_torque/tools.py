@@ -143,11 +143,11 @@ def judge(seen: Watched, vehicle: Vehicle) -> Report:
 
 def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
     """Return the preflight's rows, and the row on whether the readings change."""
-    samples = seen.empty
+    samples, tool = seen.empty, tool_of(vehicle)
     duration_s = samples[-1].stamp_s - samples[0].stamp_s
     bias_fix = (
-        "free the net; if it is free, correct tool.net_mass_kg or loosen the sensor's mount, then remove the remaining force "
-        "with companion ft tare --sensor"
+        f"free the {tool.kind}; if it is free, correct tool.{tool.mass_key} or loosen the sensor's mount, then remove the remaining "
+        "force with companion ft tare --sensor"
     )
     return [
         *(
@@ -217,7 +217,7 @@ def judge_drift(seen: Tared, vehicle: Vehicle) -> Report:
     rows.append(DRIFT.row(worst_n <= DRIFT_WARN_N_MIN, read, f"{DRIFT_WARN_N_MIN:g} N per minute", fix))
     rows.append(ft_fit.stuck_row(seen.samples, vehicle))
     x, y, z = bias_n = tare_bias_n(seen.first, vehicle, IDENTITY_QUAT, seen.arm_rad)
-    net_kg = tool_of(vehicle).net_mass_kg
+    net_kg = tool_of(vehicle).beyond_sensor_kg
     data = {
         "drift": [{"axis": name, **asdict(axis)} for name, axis in axes.items()],
         "tare": {"bias_n": list(bias_n), "net_mass_kg": net_kg},

@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from companion.config.arm_chain import chain_of
+from companion.config.arm_chain import chain_of, without_tool
 from companion.config.vehicle import Vehicle
 from companion.model.rotors import RotorLayout
 from companion.model.types import Vec3
@@ -81,7 +81,7 @@ def _links_of(vehicle: Vehicle) -> list[tuple[int, Vec3, float]]:
     """Return the number of each link of more than zero length, the direction from its joint to its end in its own frame, and its length
     in m.
     """
-    chain, found = chain_of(vehicle), []
+    chain, found = chain_of(without_tool(vehicle)), []
     for number in range(1, len(chain.links) + 1):
         x, y, z = chain.links[number].position_m if number < len(chain.links) else chain.tip_m
         length_m = math.hypot(x, y, z)
@@ -120,7 +120,7 @@ class Downwash:
         )
         names = {model.body(k).name: k for k in range(model.nbody)}
         payload_m2 = config.payload_drag_coefficient * math.pi * PAYLOAD_RADIUS_M**2
-        compact = [("net", config.net_drag_area_m2, vehicle.tool.net_radius_m)] if vehicle.tool is not None else []
+        compact = [("net", config.net_drag_area_m2, vehicle.tip_radius_m)] if vehicle.has_net else []
         compact.append(("payload", payload_m2, PAYLOAD_RADIUS_M))
         self._compact = tuple(
             (names[name], data.xipos[names[name]], area_m2, radius_m / 2.0)

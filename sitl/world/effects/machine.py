@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from companion.config.arm import Arm, Link
-from companion.config.arm_chain import chain_of
+from companion.config.arm_chain import chain_of, without_tool
 from companion.config.vehicle import Vehicle
 from companion.model.arm_chain import ArmChain
 from companion.model.types import Joints, Vec3
@@ -18,7 +18,7 @@ from companion.sitl_config.world import World
 
 
 def true_chain(vehicle: Vehicle, world: World) -> ArmChain:
-    """Return the true arm and tool; the turn of the arm's mount (`shoulder_ypr_rad`) is not included.
+    """Return the true arm, which ends at the force-torque sensor; the turn of the arm's mount (`shoulder_ypr_rad`) is not included.
 
     The inertia of a rod follows from its true mass and length. That of any other link changes in proportion to its mass.
     """
@@ -30,7 +30,7 @@ def true_chain(vehicle: Vehicle, world: World) -> ArmChain:
     shoulder_m = machine.shoulder_offset_m if machine.on else (0.0, 0.0, 0.0)
     built = _links_as_built if arm.links else _rods_as_built
     changed = arm.model_copy(update=built(arm, shoulder_m, masses, longer_m, farther_m))
-    return chain_of(vehicle.model_copy(update={"arm": changed}))
+    return chain_of(without_tool(vehicle).model_copy(update={"arm": changed}))
 
 
 def _rods_as_built(arm: Arm, shoulder_m: Vec3, masses: Joints, longer_m: Joints, farther_m: Joints) -> dict[str, Any]:

@@ -133,10 +133,10 @@ def test_mass_errors_and_the_section_act_together() -> None:
     config = WorldConfig(mass_error=0.03, link_mass_error=(0.1, -0.1), machine=Machine(on=True))
     arm, tool = VEHICLE.arm, tool_of(VEHICLE)
     m1, m2 = arm.link_masses_kg
-    base_kg = VEHICLE.airframe.mass_kg - m1 - m2 - tool.sensor_mass_kg - tool.net_mass_kg
+    base_kg = VEHICLE.airframe.mass_kg - m1 - m2 - tool.sensor_mass_kg - tool.beyond_sensor_kg
     model = World(VEHICLE, config, (0.0, 0.0), 0.0, ARM_RAD).model
     masses = [float(model.body(name).mass[0]) for name in ("base", "link1", "link2", "sensor", "net")]
-    assert masses == pytest.approx([1.03 * base_kg, 1.1 * m1, 0.9 * m2, tool.sensor_mass_kg, tool.net_mass_kg])
+    assert masses == pytest.approx([1.03 * base_kg, 1.1 * m1, 0.9 * m2, tool.sensor_mass_kg, tool.beyond_sensor_kg])
     assert model.body("base").ipos == pytest.approx(Machine().centre_of_mass_m)
 
 

@@ -260,10 +260,10 @@ def test_a_payload_that_settles_off_centre_turns_the_force_sensor(vehicle: Vehic
         world.step((0, 0, 0, 0), (0, 0), False)
     assert [event.kind for event in world.take_events()] == ["caught"]
     truth = world.truth()
-    net_weight_n = tool_of(vehicle).net_mass_kg * GRAVITY_M_S2
+    net_weight_n = tool_of(vehicle).beyond_sensor_kg * GRAVITY_M_S2
     weight_n = 0.2 * GRAVITY_M_S2
     assert truth.force_sensor_n[2] == pytest.approx(-weight_n - net_weight_n, rel=0.01)
-    lever_x_m, lever_y_m = world.data.xpos[ball_of(world).body][0:2] - world.data.xpos[world._net][0:2]
+    lever_x_m, lever_y_m = world.data.xpos[ball_of(world).body][0:2] - world.data.xpos[world._tip][0:2]
     assert lever_y_m == pytest.approx(0.06, abs=0.01)
     assert truth.torque_sensor_nm[0] == pytest.approx(-weight_n * lever_y_m, rel=0.02)
     assert truth.torque_sensor_nm[1] == pytest.approx(weight_n * lever_x_m, rel=0.05)
@@ -308,7 +308,7 @@ def test_two_payloads_lie_in_the_bag(vehicle: Vehicle) -> None:
         world.step((0, 0, 0, 0), (0, 0), False)
     assert world.payload.catch(second)
     assert world.payload.catches == 1
-    both_n = GRAVITY_M_S2 * (config.payload_kg + config.faults[0].magnitude + tool_of(vehicle).net_mass_kg)
+    both_n = GRAVITY_M_S2 * (config.payload_kg + config.faults[0].magnitude + tool_of(vehicle).beyond_sensor_kg)
     assert world.truth().force_sensor_n[2] == pytest.approx(-both_n, rel=0.01)
 
 
