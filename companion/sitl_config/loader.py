@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from companion.config.document import ConfigError, Data
+from companion.config.document import ConfigError, Data, Document
 from companion.config.loader import FlightConfig, load_flight
 from companion.config.overrides import apply_overrides, parse_overrides
-from companion.config.shipped import named_file, names
+from companion.config.shipped import named_file, names, shipped_file
 from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import read_document
 from companion.control.trial import try_law
@@ -114,12 +114,27 @@ def load_world(
     Raises:
         ConfigError: the world has problems; the exception has one message per problem.
     """
-    document = read_document(named_file("worlds", world, "--world"))
+    document = _extended(read_document(named_file("worlds", world, "--world")))
     apply_overrides(document, "world", parse_overrides(overrides))
     repeat_for_joints(document, joints)
     repeat_for_rotors(document, rotors)
     ranges = take_ranges(document)
     return check_world(document, ranges, _seed_of(document.data)), Laboratory(name=world, ranges=ranges)
+
+
+def _extended(document: Document) -> Document:
+    """Return the document of a world with the keys of the world that it extends; an invalid name is left to validation."""
+    name, own = document.data.get("extends"), document.data
+    if name not in WORLDS:
+        return document
+    base = _extended(read_document(shipped_file("worlds", str(name))))
+    return Document(
+        document.source,
+        base.data | own,
+        {at: origin for at, origin in base.values.items() if at and at[0] not in own} | document.values,
+        {at: origin for at, origin in base.keys.items() if at and at[0] not in own} | document.keys,
+        base.problems + document.problems,
+    )
 
 
 def _seed_of(data: dict[str, Data]) -> int:

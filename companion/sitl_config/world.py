@@ -98,6 +98,8 @@ class Servo(Model):
 class World(Model):
     """The simulated world."""
 
+    extends: Literal["ideal", "lab", "robustness", "wall"] | None = None
+    """Built-in world whose values hold for every key that this file does not give; null for the default of each key."""
     payload_kg: Annotated[float, Field(ge=0, le=2)] = 0.2
     """Mass of the payload; 0 if nothing is thrown."""
     seed: Annotated[int, Field(ge=0)] = 1

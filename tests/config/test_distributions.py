@@ -51,6 +51,24 @@ def test_every_built_in_world_can_be_drawn_by_any_seed() -> None:
             assert (world.seed, laboratory.name) == (seed, name)
 
 
+def test_a_world_has_the_values_of_the_world_that_it_extends(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("extends: lab\npayload_kg: 0.1\nforce_noise_n: -1.0\nmass_error: {uniform: [0.1, 0.2]}")
+    with pytest.raises(ConfigError) as refused:
+        load_world([], str(path))
+    assert [line.split(" expected")[0] for line in refused.value.lines] == [f"{path}:3:16: force_noise_n:"]
+    world, laboratory = load_world(["world.force_noise_n=0.1"], str(path))
+    lab, lab_ranges = load_world([], "lab")
+    own = {"extends", "payload_kg", "force_noise_n", "mass_error"}
+    assert world.model_dump(exclude=own) == lab.model_dump(exclude=own)
+    assert (world.payload_kg, world.force_noise_n) == (0.1, 0.1)
+    assert 0.1 <= world.mass_error <= 0.2
+    assert {one.key for one in laboratory.ranges} == {one.key for one in lab_ranges.ranges}
+    path.write_text("extends: lob")
+    with pytest.raises(ConfigError, match=r"1:10: extends: .*did you mean lab"):
+        load_world([], str(path))
+
+
 def test_the_ideal_world_is_the_one_without_a_file() -> None:
     world, laboratory = load_world([], "ideal")
     assert world == World()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import get_args
 
 import jsonschema
 import pytest
@@ -14,6 +15,7 @@ from companion.config.loader import PRESETS
 from companion.config.shipped import names
 from companion.config.yaml_strict import read_document
 from companion.sitl_config.loader import WORLDS
+from companion.sitl_config.world import World
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 FOLDERS = {"missions": "mission", "vehicles": "vehicle", "controllers": "controller", "worlds": "world"}
@@ -64,4 +66,5 @@ def test_every_preset_is_shipped() -> None:
 
 
 def test_every_world_is_shipped() -> None:
-    assert WORLDS == ("ideal", "lab", "robustness")
+    assert WORLDS == ("ideal", "lab", "robustness", "wall")
+    assert set(get_args(get_args(World.model_fields["extends"].annotation)[0])) == set(WORLDS)

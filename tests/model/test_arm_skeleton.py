@@ -57,6 +57,14 @@ def test_the_skeleton_of_a_logged_arm_is_that_of_its_chain() -> None:
     assert skeleton_of(chain_of(two)).reach_m == pytest.approx(two.arm.reach_m)
 
 
+def test_a_logged_rod_lengthens_the_last_link() -> None:
+    rod = load_vehicle("configs/vehicles/tarot650_2r_rod.yaml")
+    found = logged_skeleton(rod.model_dump(mode="json"))
+    assert found is not None
+    np.testing.assert_allclose(found.links_body_m, skeleton_of(chain_of(rod)).links_body_m, atol=1e-15)
+    assert found.reach_m == pytest.approx(rod.reach_m) == pytest.approx(0.85)
+
+
 @pytest.mark.parametrize(
     "arm",
     [

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.config.arm import Link
+from companion.config.arm import Link, Tool
 from companion.config.arm_chain import chain_of
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
-from companion.control.arm_model import dynamics_of
+from companion.control.arm_model import dynamics_of, manipulator_of
 from companion.control.dynamics import euler_rate_matrices
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, rotation_matrix
@@ -77,6 +77,13 @@ def with_random_links(joints: int, rng: np.random.Generator) -> Vehicle:
     return vehicle.model_copy(update={"arm": arm, "tool": tool})
 
 
+def with_rod(vehicle: Vehicle) -> Vehicle:
+    tool = Tool(
+        kind="rod", sensor_mass_kg=0.15, mass_kg=0.2, length_m=0.3, tip_radius_m=0.01, sensor_rpy_deg=(10, 20, 30)
+    )
+    return vehicle.model_copy(update={"tool": tool})
+
+
 def free(vehicle: Vehicle, config: WorldConfig = NO_FRICTION) -> World:
     """A world whose arm is not held."""
     world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0,) * len(vehicle.arm.joints))
@@ -87,8 +94,11 @@ def free(vehicle: Vehicle, config: WorldConfig = NO_FRICTION) -> World:
 @pytest.mark.parametrize(
     "vehicle",
     [vehicle_with_joints(joints) for joints in (0, 1, 3, 4)]
-    + [with_random_links(joints, np.random.default_rng(joints)) for joints in (1, 2, 3, 4)],
-    ids=lambda vehicle: f"{len(vehicle.arm.joints)} {'links' if vehicle.arm.links else 'rods'}",
+    + [with_random_links(joints, np.random.default_rng(joints)) for joints in (1, 2, 3, 4)]
+    + [with_rod(with_random_links(3, np.random.default_rng(7))), load_vehicle("configs/vehicles/tarot650_2r_rod.yaml")],
+    ids=lambda vehicle: (
+        f"{len(vehicle.arm.joints)} {'links' if vehicle.arm.links else 'rods'} {vehicle.tool.kind if vehicle.tool else ''}"
+    ),
 )
 def test_mass_matrix_coriolis_and_gravity_are_those_of_the_laws_model(vehicle: Vehicle) -> None:
     joints = len(vehicle.arm.joints)
@@ -125,6 +135,25 @@ def test_the_sensor_and_the_net_are_at_the_tip_of_any_chain() -> None:
     np.testing.assert_allclose(d.site_xmat[site].reshape(3, 3), last @ rotation_matrix(chain.sensor_wxyz), atol=1e-12)
     hoop = last @ rotation_matrix(chain.tip_wxyz)
     np.testing.assert_allclose(d.xmat[m.body("sensor").id].reshape(3, 3), hoop, atol=1e-12)
+
+
+def test_the_tip_of_a_rod_is_beyond_the_sensor_along_the_tips_axis() -> None:
+    net = with_random_links(3, np.random.default_rng(5))
+    vehicle = with_rod(net)
+    world, chain = free(vehicle), chain_of(vehicle)
+    m, d = world.model, world.data
+    d.qpos[list(world.layout.joint_q)] = alpha = (0.5, -1.0, 2.0)
+    mujoco.mj_forward(m, d)
+    link = m.body("link3").id
+    last = d.xmat[link].reshape(3, 3)
+    sensor = chain_of(net)
+    np.testing.assert_allclose(d.site_xpos[m.site("net").id], d.xpos[link] + last @ sensor.tip_m, atol=1e-12)
+    np.testing.assert_allclose(d.site_xpos[m.site("tip").id], d.xpos[link] + last @ chain.tip_m, atol=1e-12)
+    outwards = np.array(rotation_matrix(chain.tip_wxyz)) @ (0.3, 0.0, 0.0)
+    np.testing.assert_allclose(np.subtract(chain.tip_m, sensor.tip_m), outwards, atol=1e-12)
+    tip_m = d.site_xpos[m.site("tip").id] - d.xpos[m.body("base").id]
+    np.testing.assert_allclose(manipulator_of(vehicle).net_body_m(alpha), tip_m, atol=1e-12)
+    assert m.body_subtreemass[m.body("base").id] == pytest.approx(vehicle.airframe.mass_kg)
 
 
 def test_the_errors_of_the_machine_act_on_any_chain() -> None:
