@@ -43,8 +43,8 @@ RATE_HZ = 200.0
 GROUND_S = 1.0
 TAKEOFF_S = 3.0
 CATCH_S = 6.5
-FLIGHT_END_S = 18.0
-LANDED_S = 21.0
+FLIGHT_END_S = 12.0
+LANDED_S = 14.0
 FOLDED_RAD: Joints = (math.radians(165), math.radians(140))
 CATCH_RAD: Joints = (math.radians(100), math.radians(60))
 
@@ -88,8 +88,8 @@ def phase_at(mission_t_s: float) -> tuple[str, PhaseKind]:
 
 def reference_at(t_s: float) -> tuple[Vec3, Joints]:
     up = _blend(t_s / TAKEOFF_S) - _blend((t_s - FLIGHT_END_S) / (LANDED_S - FLIGHT_END_S))
-    x = -1.0 + 2.0 * _blend((t_s - 3.5) / 6.0) - 2.0 * _blend((t_s - 10.5) / 6.0)
-    open_ = _blend((t_s - 3.5) / 2.0) - _blend((t_s - 15.0) / 2.0)
+    x = -1.0 + 2.0 * _blend((t_s - 3.5) / 6.0) - 2.0 * _blend((t_s - 9.5) / 2.5)
+    open_ = _blend((t_s - 3.5) / 2.0) - _blend((t_s - 10.0) / 2.0)
     arm = (_mix(FOLDED_RAD[0], CATCH_RAD[0], open_), _mix(FOLDED_RAD[1], CATCH_RAD[1], open_))
     return (x, 0.0, 0.15 + 0.85 * up), arm
 

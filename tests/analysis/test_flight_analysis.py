@@ -323,8 +323,8 @@ def test_loop_and_latency_count_what_they_should() -> None:
         return replace(i, mocap=replace(i.mocap, stamp_s=stamp_s)), o, s
 
     summary = summarise(changed(slow), outcome="completed", controller="adaptive", preset="paper")
-    assert summary["loop"]["ticks"] == 4401
-    assert summary["loop"]["missed"] == 4
+    assert summary["loop"]["ticks"] == 3001
+    assert summary["loop"]["missed"] == 3
     assert summary["loop"]["lateness_ms"]["max"] == pytest.approx(6.0)
     assert summary["loop"]["lateness_ms"]["p50"] == pytest.approx(1.0)
     assert summary["latency_ms"]["joint_read_to_write"]["p99"] == pytest.approx(1.5)
@@ -408,7 +408,7 @@ def test_every_key_is_there_whatever_is_missing(flight: FlightLog, tmp_path: Pat
     caught = [event for event in full["events"] if event["id"] == "catch"]
     assert len(caught) == 1
     assert caught[0].keys() >= {"t_s", "id", "severity", "action"}
-    assert full["recorder"] == {"samples": 4401, "dropped": 0, "error": None}
+    assert full["recorder"] == {"samples": 3001, "dropped": 0, "error": None}
 
 
 def test_without_a_catch_the_whole_flight_is_before_it() -> None:
@@ -600,7 +600,7 @@ def test_a_log_that_cannot_be_replayed_says_why_in_one_line(flight: FlightLog) -
         raise ValueError("field x is unknown\nmore lines")
 
     for log, make, reason in (
-        (gap, refuse, "3 of 4401 ticks are missing"),
+        (gap, refuse, "3 of 3001 ticks are missing"),
         (late, refuse, "the first 5 ticks are missing"),
         (older, refuse, "recorded by companion 0.0.1"),
         (bare, refuse, "has no configuration"),

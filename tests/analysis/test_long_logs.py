@@ -17,7 +17,7 @@ from companion.launcher.run import TICKS_MAX
 from companion.recorder.client import RecorderProcess
 from tests.analysis.synthetic_flight import CONFIG, record_flight, synthetic_flight
 
-TICKS = 500
+TICKS = 350
 
 
 @pytest.fixture(scope="module")

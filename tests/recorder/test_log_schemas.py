@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import select
-import time
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,7 @@ from companion.analysis.log import FlightLog
 from tests.recorder.flights import EPOCH_NS, config_json, offer, record, started, tethered
 from tests.recorder.protobuf_wire import Descriptors, WireError
 from tests.recorder.viewers import Viewed, view
-from tests.support import DEADLINE_S
+from tests.support import DEADLINE_S, wait_until
 
 JSON = {
     "/inputs": "companion.Inputs",
@@ -140,15 +138,13 @@ def test_the_log_of_a_killed_recorder_opens_and_keeps_to_its_schemas(tmp_path: P
     path = tmp_path / "flight.mcap"
     recorder = started(path, config_json())
     offer(recorder, tethered(end_s=4.0))
-    deadline_s = time.monotonic() + DEADLINE_S
-    while path.stat().st_size < 50_000:  # it writes a chunk now and then
-        assert time.monotonic() < deadline_s, "the recorder writes nothing"
-        select.select([], [], [], 0.02)
+    topics = {"/inputs", "/outputs", "/sent", "/tf", "/tf_arm", "/scene", "/scene_static"}
+    wait_until(lambda: view(path, whole=False).by_topic.keys() >= topics, lambda: "the recorder writes no chunk")
     recorder.process.kill()
     recorder.process.wait(DEADLINE_S)
     recorder.finish(DEADLINE_S)
     found = view(path, whole=False)
-    assert found.by_topic.keys() >= {"/inputs", "/outputs", "/sent", "/tf", "/tf_arm", "/scene", "/scene_static"}
+    assert found.by_topic.keys() >= topics
     check(found)
     counts = {len(found.by_topic[topic]) for topic in ("/inputs", "/outputs", "/sent")}
     assert len(counts) == 1, "a chunk holds whole ticks"
