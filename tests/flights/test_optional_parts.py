@@ -3,26 +3,37 @@
 from __future__ import annotations
 
 import math
+from functools import cache
+from pathlib import Path
 
 import pytest
 
+from companion.analysis.report import write_report
+from companion.analysis.summary import summarise
 from companion.config.document import ConfigError
 from companion.config.loader import logged_flight
 from companion.core.flight_core import FlightCore
 from companion.model.types import Outcome, PhaseKind
 from companion.sitl_config.loader import load_sitl
+from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight, FastResult
 from tests.machines import overrides_with_joints
 from tests.support import CATCH, HOVER, SHORT_CATCH
 
 NO_FORCE, NO_TETHER, NO_TOOL = "vehicle.devices.force=null", "vehicle.tether=null", "vehicle.tool=null"
+NO_PART = (NO_FORCE, NO_TETHER, NO_TOOL, "mission.catch=null")
 OBSERVER = "vehicle.force_source=observer"
+
+
+@cache
+def flown_without(*absent: str) -> tuple[FastFlight, FastResult]:
+    flight = FastFlight(load_sitl(SHORT_CATCH, overrides=absent))
+    return flight, flight.run()
 
 
 @pytest.mark.parametrize("absent", [NO_FORCE, NO_TETHER])
 def test_the_catch_is_flown_without_the_part(absent: str) -> None:
-    flight = FastFlight(load_sitl(SHORT_CATCH, overrides=[absent]))
-    result = flight.run()
+    flight, result = flown_without(absent)
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     assert result.caught, "the payload hangs in the net"
     assert [event.id for o in result.outputs for event in o.events if event.id != "catch"] == ["takeoff", "touchdown"]
@@ -37,10 +48,10 @@ def test_the_catch_is_flown_without_the_part(absent: str) -> None:
 
 
 def test_without_a_force_sensor_no_catch_is_reported() -> None:
-    result = FastFlight(load_sitl(SHORT_CATCH, overrides=[NO_FORCE])).run(limit_s=6.5)
+    _, result = flown_without(NO_FORCE)
     assert result.caught
     assert all(i.force is None for i in result.inputs)
-    assert [event.id for o in result.outputs for event in o.events] == ["takeoff"]
+    assert [event.id for o in result.outputs for event in o.events] == ["takeoff", "touchdown"]
 
 
 def test_without_a_tether_a_commanded_landing_and_a_gust_are_flown() -> None:
@@ -53,12 +64,17 @@ def test_without_a_tether_a_commanded_landing_and_a_gust_are_flown() -> None:
 
 
 def test_without_all_three_the_path_is_flown_and_nothing_is_thrown() -> None:
-    absent = (NO_FORCE, NO_TETHER, NO_TOOL, "mission.catch=null")
-    flight = FastFlight(load_sitl(SHORT_CATCH, overrides=absent))
-    result = flight.run()
+    flight, result = flown_without(*NO_PART)
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     assert flight.plant.world.payload.throws == 0
     assert [event.id for o in result.outputs for event in o.events] == ["takeoff", "touchdown"]
+
+
+def test_without_all_three_the_flight_has_its_report(tmp_path: Path) -> None:
+    flight, result = flown_without(*NO_PART)
+    log = log_of(flight.config.flight, result, None)
+    summary = summarise(log, outcome="completed", controller="adaptive", preset="recommended")
+    assert "completed" in write_report(log, summary, tmp_path).read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

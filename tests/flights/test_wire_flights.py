@@ -117,7 +117,7 @@ def test_another_program_feeds_px4_and_its_end_is_found(tmp_path_factory: pytest
     with sandbox_in(tmp_path_factory.mktemp("external")) as sandbox:
         loss = [{"kind": "mocap_loss", "t_s": HOVERS_S}]
         options = set_options(**{"vehicle.devices.mocap.type": "external", "world.faults": loss})
-        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *options, report=True)
+        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *options)
         sandbox.assert_nobody_left()
         summary = read_summary(sandbox.cwd / "out")
     assert ended.code == EXIT_ABORTED, ended
@@ -130,7 +130,7 @@ def test_it_flies_without_force_sensor_tether_and_net(tmp_path_factory: pytest.T
     """The simulated world then opens no port for the force sensor, and the flight waits for none."""
     with sandbox_in(tmp_path_factory.mktemp("parts")) as sandbox:
         absent = set_options(**{"vehicle.devices.force": None, "vehicle.tether": None, "vehicle.tool": None})
-        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *absent, report=True)
+        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *absent)
         sandbox.assert_nobody_left()
         summary = read_summary(sandbox.cwd / "out")
         rows = json.loads((sandbox.cwd / "out/preflight.json").read_text(encoding="utf-8"))["rows"]

@@ -5,15 +5,19 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from companion.analysis.report import write_report
+from companion.analysis.summary import summarise
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import Event, Outcome, SafetyAction
 from companion.safety.stop import StopModel
 from companion.sitl_config.loader import load_sitl
 from sitl.autopilot.mavlink import MavlinkServer, Ports
+from sitl.campaigns.flights import log_of
 from sitl.external_vision import ExternalVision
 from sitl.fast.loop import FastFlight, FastResult
 from sitl.world.plant import MocapFrame
@@ -64,7 +68,7 @@ def test_a_catch_completes_on_px4s_estimate_alone() -> None:
     assert not [event for event in events_of(result) if event.action.rank >= SafetyAction.WARN.rank]
 
 
-def test_the_other_programs_end_is_found_and_px4_lands() -> None:
+def test_the_other_programs_end_is_found_px4_lands_and_the_flight_has_its_report(tmp_path: Path) -> None:
     flight, result = fly(HOVER, {"kind": "mocap_loss", "t_s": 6.0})
     begun_s = flight.faults.begun_s
     assert begun_s is not None
@@ -75,6 +79,10 @@ def test_the_other_programs_end_is_found_and_px4_lands() -> None:
     assert not result.crashed and not result.armed
     start, end = result.truth[0].position_world_m, result.truth[-1].position_world_m
     assert math.dist(start[:2], end[:2]) <= StopModel(flight.config.vehicle.safety).distance_m(1.0)
+    log = log_of(flight.config.flight, result, None)
+    summary = summarise(log, outcome="aborted", controller="adaptive", preset="recommended")
+    assert summary["latency_ms"]["mocap_to_setpoint"]["p99"] is None
+    assert "aborted" in write_report(log, summary, tmp_path).read_text(encoding="utf-8")
 
 
 def test_the_guardian_lands_on_the_other_programs_poses() -> None:
