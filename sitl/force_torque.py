@@ -16,7 +16,7 @@ from sitl.pty import PtyLine
 
 FORCE_CAPACITY_N: Final = 200.0
 TORQUE_CAPACITY_NM: Final = 4.0
-_ZERO: Final[Vec3] = (0.0, 0.0, 0.0)
+_ZERO: Vec3 = (0.0, 0.0, 0.0)
 _FORCE_BITS = (Overload.FX, Overload.FY, Overload.FZ)
 _TORQUE_BITS = (Overload.TX, Overload.TY, Overload.TZ)
 _MAX_CATCH_UP = 8  # packets; if the world's time jumps further, the rest is skipped

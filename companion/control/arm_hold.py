@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.control.scaled_gains import joint_ratios
 from companion.model.types import Joints, Quat
 
-STIFFNESS_NM_RAD = 5.0
-DAMPING_NMS_RAD = 0.45
+STIFFNESS_NM_RAD: Final = 5.0
+DAMPING_NMS_RAD: Final = 0.45
 FOUND_FOR_KG_M2: Joints = (0.01666, 0.01778)
 """Joint inertia, as in `companion.config.controller.Machine`, of the arm with these gains; those of another arm are proportional to its
 own, so that its joints do not swing.

@@ -6,6 +6,7 @@ All laws share it, so that they can be compared with the same options.
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from companion.config.controller import LawConfig
 from companion.config.vehicle import Vehicle
@@ -14,7 +15,7 @@ from companion.control.types import PlantState
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Joints, Reference, Vec3
 
-FRICTION_RATE_RAD_S = 0.1
+FRICTION_RATE_RAD_S: Final = 0.1
 """Joint rate below which the friction torque fades out, so that a joint at rest does not shake."""
 
 

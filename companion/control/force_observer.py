@@ -16,6 +16,7 @@ lasts is removed by `ForceObserver.step`; a gust is not.
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from companion.config.arm_chain import chain_of
 from companion.config.vehicle import Vehicle
@@ -36,7 +37,7 @@ USED_MAX_N = 8.0
 """Largest estimate per axis that a control law gets. More is not a payload, and a law that compensated it would fight the tether."""
 MEAN_S = 0.7
 """Averaging time of the mean that is subtracted. A longer one leaves more of the drag, which turns with the direction of flight."""
-GAP_MAX_S = 0.03
+GAP_MAX_S: Final = 0.03
 """Longest time between two attitudes, or two joint states, over which the change of the arm's moment is a motion."""
 _NO_FORCE: Vec3 = (0.0, 0.0, 0.0)
 

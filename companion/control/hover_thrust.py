@@ -9,6 +9,7 @@ air density and the true mass.
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from companion.control.types import PlantState
 from companion.model.constants import GRAVITY_M_S2
@@ -17,17 +18,18 @@ from companion.model.types import Inputs, LandedState, Quat, Vec3
 
 SHARE_MAX = 0.25
 """Largest relative deviation of the estimate from its start value. It keeps a faulty accelerometer from making the vehicle sink."""
-AIRBORNE_M = 0.10
+AIRBORNE_M: Final = 0.10
 """Height above standing height at which the ground no longer carries the vehicle, m."""
-_LAG_S = 0.05
+_LAG_S: Final = 0.05
 """Lag from command to thrust: transmission and rotors. Its exact value does not matter because the estimator's time constants are
 seconds.
 """
-_TIME_MIN_S, _TIME_MAX_S = 1.0, 6.0
+_TIME_MIN_S: Final = 1.0
+_TIME_MAX_S: Final = 6.0
 """Minimum and maximum averaging time. The estimate is a running mean over the time in the air, limited to this range."""
-_TILT_COS_MIN = math.cos(math.radians(15.0))
-_ACCELERATION_MAX_M_S2 = 1.5
-_ACCELERATION_LOWPASS_S = 0.05
+_TILT_COS_MIN: Final = math.cos(math.radians(15.0))
+_ACCELERATION_MAX_M_S2: Final = 1.5
+_ACCELERATION_LOWPASS_S: Final = 0.05
 
 
 class Balance:

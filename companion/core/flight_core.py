@@ -6,6 +6,7 @@ One `step` is one control tick: monitors -> state machine -> reference -> govern
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import msgspec
 
@@ -31,9 +32,12 @@ from companion.safety.rules import OPERATOR_RESUME
 from companion.safety.situation import Situation
 from companion.safety.tether import TetherWatch
 
-_DT_MIN_S, _DT_MAX_S = 0.001, 0.05
+_DT_MIN_S: Final = 0.001
+_DT_MAX_S: Final = 0.05
 # Looking up members of an enum costs time in every tick.
-_PLAN, _SPOOL, _TOUCHDOWN = Stage.PLAN, Stage.SPOOL, Stage.TOUCHDOWN
+_PLAN: Final = Stage.PLAN
+_SPOOL: Final = Stage.SPOOL
+_TOUCHDOWN: Final = Stage.TOUCHDOWN
 
 
 class FlightCore:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from companion.core.transition import Transition
 from companion.mission.plan import landing_from
 from companion.mission.retract import inward_only, retract_from
@@ -21,8 +23,9 @@ _EXPIRED = {
     notices.RETRACT_EXPIRED.id: (notices.RETRACT_EXPIRED, "the retract took too long; landing here"),
 }
 # Looking up members of an enum costs time in every tick.
-_HOLD, _RETRACT = SafetyAction.HOLD, SafetyAction.RETRACT
-_COMMANDED_HOLD = OperatorCommand.HOLD
+_HOLD: Final = SafetyAction.HOLD
+_RETRACT: Final = SafetyAction.RETRACT
+_COMMANDED_HOLD: Final = OperatorCommand.HOLD
 
 
 def supervise(t: Transition) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Final
 
 from companion.config.vehicle import Vehicle
 from companion.core.flight_state import Tare
@@ -24,9 +25,9 @@ from companion.safety.rules import CRASHED, PILOT_TOOK_OVER
 
 ARMED_SHOWN_S = 1.5
 """PX4's HEARTBEAT reports once a second whether it is armed: for this time after a request to arm, "not armed" may be outdated."""
-NO_TOUCHDOWN_S = 5.0
+NO_TOUCHDOWN_S: Final = 5.0
 """Time after the plan's end within which touchdown must be detected; otherwise PX4 lands."""
-_NONE = AutopilotRequest.NONE
+_NONE: Final = AutopilotRequest.NONE
 
 
 def advance(t: Transition) -> AutopilotRequest:
@@ -333,7 +334,7 @@ def _nothing_from(missing: list[str]) -> str:
     return f"no data from: {', '.join(missing)}{hint}"
 
 
-_STAGES: Mapping[Stage, Callable[[Transition, float], AutopilotRequest]] = {
+_STAGES: Final[Mapping[Stage, Callable[[Transition, float], AutopilotRequest]]] = {
     Stage.WAIT: _wait,
     Stage.READY: _ready,
     Stage.OFFBOARD: _offboard,

@@ -10,19 +10,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 from companion.model.flight_stage import TARE_S
 from companion.model.frames import euler_zyx_from_quat, wrap_rad
 from companion.model.types import MocapPose, Vec3, VehicleState
 
-SETTLED_S = TARE_S
+SETTLED_S: Final = TARE_S
 """Time for which the estimate must be close and steady; equal to the duration of the tare, which runs at the same time."""
-OFF_MAX_M = 0.05
+OFF_MAX_M: Final = 0.05
 """Largest mean distance, m; the mean removes the noise of EKF2."""
-SPREAD_MAX_M = 0.02
+SPREAD_MAX_M: Final = 0.02
 """Largest standard deviation of the distance over all three axes, m. EKF2 shows a few millimetres at rest with 1 cm of vision noise."""
-YAW_OFF_MAX_RAD = math.radians(5.0)
-YAW_SPREAD_MAX_RAD = math.radians(2.0)
+YAW_OFF_MAX_RAD: Final = math.radians(5.0)
+YAW_SPREAD_MAX_RAD: Final = math.radians(2.0)
 _NOWHERE: Vec3 = (0.0, 0.0, 0.0)
 
 

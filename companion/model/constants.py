@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-GRAVITY_M_S2 = 9.81
+from typing import Final
+
+GRAVITY_M_S2: Final = 9.81
 """Gravitational acceleration used by control, safety, preflight and the simulated world."""
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 """The unit g as defined by PX4 (CONSTANTS_ONE_G) and used in MAVLink messages in milli-g."""
 
-TICK_PERIOD_S = 0.005
+TICK_PERIOD_S: Final = 0.005
 """Nominal period of the control loop: 200 Hz. A tick that starts more than one period late counts as missed."""
 
 GRADED_POSE_MAX_AGE_S = 0.1

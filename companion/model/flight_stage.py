@@ -9,6 +9,7 @@ before SPOOL, at any time: -> STAND_DOWN -> DONE
 from __future__ import annotations
 
 from enum import Enum
+from typing import Final
 
 from companion.model.types import AutopilotStatus, FlightMode, LandedState
 
@@ -57,7 +58,7 @@ COMMANDING = frozenset({Stage.ARM, Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN})
 """Stages in which the companion commands the vehicle, so that PX4 must be in OFFBOARD."""
 PILOT_FLIES = "a pilot flies"
 """Name of the phase in which the companion sends nothing because a pilot has control."""
-PILOT_MODES = frozenset({FlightMode.MANUAL, FlightMode.HOLD, FlightMode.RETURN, FlightMode.TAKEOFF})
+PILOT_MODES: Final = frozenset({FlightMode.MANUAL, FlightMode.HOLD, FlightMode.RETURN, FlightMode.TAKEOFF})
 """Modes that only a pilot or one of PX4's failsafes chooses. While a pilot is flying, the companion sends nothing."""
 FAILSAFE_STATES = frozenset({5, 6, 8})
 """Values of HEARTBEAT.system_status while a PX4 failsafe is active: MAV_STATE_CRITICAL, EMERGENCY and FLIGHT_TERMINATION."""

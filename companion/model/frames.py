@@ -7,10 +7,11 @@ The companion's world frame shares its origin with PX4's local frame: x_enu = y_
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from companion.model.types import Mat3, Quat, Vec3
 
-_SQRT_HALF = math.sqrt(0.5)
+_SQRT_HALF: Final = math.sqrt(0.5)
 
 
 def quat_multiply(a: Quat, b: Quat) -> Quat:

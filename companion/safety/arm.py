@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Final
 
 from companion.model.listing import listed
 from companion.model.servos import WATCHDOG_ERROR, hardware_error_text
 from companion.model.types import ArmState, ForceSample, Inputs, Joints, Vec2, Vec3
 from companion.safety.situation import HOLDS, Age, Situation, Values
 
-AT_LIMIT = 0.97
+AT_LIMIT: Final = 0.97
 """Fraction of the torque limit at which a joint counts as being at its limit."""
-DRIFT_TIME_S = 1.0
+DRIFT_TIME_S: Final = 1.0
 """Time constant of the mean force."""
 _NO_FORCE: Vec3 = (0.0, 0.0, 0.0)
 

@@ -11,6 +11,7 @@ that is flipped or tipped over. Pure; time is an argument.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 from companion.model.best_pose import pose_used_s
 from companion.model.flight_stage import chosen_by_pilot, in_offboard, is_armed, on_ground
@@ -52,8 +53,8 @@ DRIFT_M_S2 = 0.5
 """Without motion capture the estimated height may be off by half of this times the square of the time."""
 STANDING_S = 3.0
 TIMEOUT_S = 30.0
-FLIPPED = "flipped: FORCE_DISARM is requested at once"
-TIPPED = "tipped over on the floor: FORCE_DISARM is requested at once"
+FLIPPED: Final = "flipped: FORCE_DISARM is requested at once"
+TIPPED: Final = "tipped over on the floor: FORCE_DISARM is requested at once"
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 from companion.config.vehicle import Vehicle
 from companion.model.codec import Record
 from companion.model.frames import tilt_rad
 from companion.model.types import AttitudeSetpoint, Joints
 
-SLEW_MEMORY_S = 0.1
+SLEW_MEMORY_S: Final = 0.1
 """After this time without a setpoint, when PX4 has discarded the previous one, the next may have any value."""
-ARM_FRESH_S = 0.05
+ARM_FRESH_S: Final = 0.05
 """Largest age of a joint state from which a torque may be computed."""
 
 

@@ -15,6 +15,7 @@ accepted plan is never constrained.
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from companion.config.mission import Limits
 from companion.config.vehicle import Vehicle
@@ -22,12 +23,12 @@ from companion.model.codec import Record
 from companion.model.types import Reference, TetherState, Vec3
 from companion.safety.stop import StopModel
 
-BODY_TOP_M = 0.15
+BODY_TOP_M: Final = 0.15
 """Height of the rotors and the markers above the body's origin."""
 BELOW_STANDING_M = 0.75
 """The set reaches this far below standing height: a landing's reference continues below the floor until touchdown is detected, and its
 predicted stop lies lower still."""
-JUMP_M = 0.002
+JUMP_M: Final = 0.002
 """A reference continues the previous one if its position is within this distance of the extrapolated one."""
 RETURN_PER_S = 2.5
 """Rate at which a constrained reference returns to the input reference. Its velocity follows four times as fast, so that it does not
@@ -35,7 +36,7 @@ overshoot."""
 SPEED_PER_S = 4.0 * RETURN_PER_S
 INSIDE_M = 0.001
 """A target outside the set is replaced by the nearest point this far inside it."""
-_TOLERANCE = 1e-9
+_TOLERANCE: Final = 1e-9
 _HALVINGS = 5
 _PROJECTIONS = 6
 

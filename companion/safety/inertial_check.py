@@ -16,20 +16,21 @@ capture and PX4 (`RemoteClock`), not of arrival, because transport delays vary.
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from companion.model.types import Vec3
 
-POLE_RAD_S = 3.0
+POLE_RAD_S: Final = 3.0
 """All three poles of the observer."""
-SETTLE_S = 9.0 / POLE_RAD_S
+SETTLE_S: Final = 9.0 / POLE_RAD_S
 """The innovation is not judged for this time after a start: velocity and bias are unknown then."""
-IMU_GAP_MAX_S = 0.05
+IMU_GAP_MAX_S: Final = 0.05
 """The observer starts again after a longer gap between IMU samples: motion in the gap was not measured."""
 
 
-CLOCK_GROWTH = 1e-3
+CLOCK_GROWTH: Final = 1e-3
 """Largest drift between two clocks, s/s."""
-CLOCK_RESTART_S = 0.5
+CLOCK_RESTART_S: Final = 0.5
 """A message that is later than this shows that the device has restarted and its clock with it."""
 
 

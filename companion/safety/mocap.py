@@ -9,6 +9,7 @@ the operator, are in `companion.safety.rules`.
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from companion.config.safety import Safety
 from companion.model.constants import GRAVITY_M_S2
@@ -18,15 +19,15 @@ from companion.safety.inertial_check import IMU_GAP_MAX_S, InertialCheck, Remote
 from companion.safety.situation import HOLDS, Situation, Values
 from companion.safety.stream_watch import StreamWatch
 
-FUSED_WITHIN_M = 0.10
-FUSED_WITHIN_RAD = math.radians(8.0)
-CONTINUOUS_S = 0.1
+FUSED_WITHIN_M: Final = 0.10
+FUSED_WITHIN_RAD: Final = math.radians(8.0)
+CONTINUOUS_S: Final = 0.1
 """After a longer gap a pose is compared with PX4's position, not with the previous pose."""
-FORGET_S = 1.0
+FORGET_S: Final = 1.0
 """After a gap this long the next frame is trusted: `mocap_lost` has reported the gap."""
-DRIFT_M_S = 0.3
+DRIFT_M_S: Final = 0.3
 """Permitted drift of PX4's position while no pose is trusted, m/s."""
-RATE_WINDOW_S = 1.0
+RATE_WINDOW_S: Final = 1.0
 
 
 def unfused(i: Inputs) -> str | None:

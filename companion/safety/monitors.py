@@ -5,6 +5,8 @@ See `companion.safety` for how to add a rule.
 
 from __future__ import annotations
 
+from typing import Final
+
 import msgspec
 
 from companion.config.vehicle import Vehicle
@@ -20,9 +22,10 @@ from companion.safety.situation import Situation
 from companion.safety.validity import InputFilter
 from companion.safety.vision import VisionTracker
 
-AWAKE_STEP_MAX_S = 0.02
+AWAKE_STEP_MAX_S: Final = 0.02
 """Largest time that one tick adds to the age of inputs."""
-MOVING_M_S, MOVING_RAD_S = 0.03, 0.05
+MOVING_M_S: Final = 0.03
+MOVING_RAD_S: Final = 0.05
 """Motion that exceeds the noise of a vehicle at rest, so that its measurements must change."""
 
 

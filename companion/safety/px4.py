@@ -6,6 +6,7 @@ The rows of these rules, with the actions and the texts for the operator, are in
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from companion.model.flight_stage import chosen_by_pilot, failsafe_chose
 from companion.model.types import AutopilotStatus, FlightMode, Inputs, VehicleState
@@ -13,8 +14,8 @@ from companion.safety.situation import HOLDS, Age, Situation, Values
 
 DISARMED_ABOVE_M = 0.15
 """Margin over standing height below which PX4's own disarm after a landing is not a fault."""
-CLOCK_BACK_S = 1.0
-LAG_FORGOTTEN_S_PER_S = 0.05
+CLOCK_BACK_S: Final = 1.0
+LAG_FORGOTTEN_S_PER_S: Final = 0.05
 """Rate at which a lasting lag is reduced, because it is an offset between the clocks."""
 
 

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 from companion.model.best_pose import pose_used_s
 from companion.model.constants import GRAVITY_M_S2
@@ -33,17 +34,17 @@ from companion.safety.touchdown import MOCAP_FRESH_S, STILL_M_S, Sinking
 
 LOW_WITHIN_M = 0.25
 """Margin over standing height: above it the vehicle does not count as being on the ground."""
-STILL_WITHIN_M = 0.05
+STILL_WITHIN_M: Final = 0.05
 """A vehicle that has moved further than this since it came to rest is not at rest."""
-DISARM_STILL_S = 0.35
-FORCE_DISARM_S = 4.0
+DISARM_STILL_S: Final = 0.35
+FORCE_DISARM_S: Final = 4.0
 """Time at rest after which the vehicle is disarmed although PX4's land detector reports no landing."""
 ESTIMATE_TRUSTED_S = 4.2
 """Time after the last motion-capture pose for which PX4's dead-reckoned height counts. PX4 drops it after 4.5 s."""
 STATE_FRESH_S = 0.3
 FLIPPED_TILT_RAD = math.radians(70.0)
-FLIPPED_HOLD_S = 0.3
-TIPPED_HOLD_S = 0.5
+FLIPPED_HOLD_S: Final = 0.3
+TIPPED_HOLD_S: Final = 0.5
 _UPRIGHT_MIN_M_S2 = GRAVITY_M_S2 * math.cos(FLIPPED_TILT_RAD)
 """Specific force along body z; a vehicle that rests or hovers with less tilt measures more."""
 Places = dict[str, Vec3]

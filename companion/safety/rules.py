@@ -6,19 +6,29 @@ Ids are stable because logs, summaries and users' scripts contain them. Simultan
 
 from __future__ import annotations
 
+from typing import Final
+
 from companion.model.types import OperatorCommand, SafetyAction, Severity
 from companion.safety import arm, flight, mocap, process, px4, vision
 from companion.safety.process import commanded
 from companion.safety.rule import Repeat, Rule, Subject
 from companion.safety.validity import invalid
 
-_NOMINAL, _WARN, _HOLD, _RETRACT = SafetyAction.NOMINAL, SafetyAction.WARN, SafetyAction.HOLD, SafetyAction.RETRACT
-_LAND, _PX4_LANDS, _TERMINATE = SafetyAction.LAND, SafetyAction.AUTOPILOT_LAND, SafetyAction.TERMINATE
+_NOMINAL: Final = SafetyAction.NOMINAL
+_WARN: Final = SafetyAction.WARN
+_HOLD: Final = SafetyAction.HOLD
+_RETRACT: Final = SafetyAction.RETRACT
+_LAND: Final = SafetyAction.LAND
+_PX4_LANDS: Final = SafetyAction.AUTOPILOT_LAND
+_TERMINATE: Final = SafetyAction.TERMINATE
 
 MOCAP_DRAGGED, MOCAP_FROZEN = "mocap_dragged", "mocap_frozen"
 MOCAP_SWAPPED, MOCAP_TWO_STREAMS = "mocap_swapped", "mocap_two_streams"
-REATTACHED, PILOT_TOOK_OVER, CRASHED = "reattached", "pilot_took_over", "crashed"
-OPERATOR_START, OPERATOR_RESUME = "operator_start", "operator_resume"
+REATTACHED: Final = "reattached"
+PILOT_TOOK_OVER: Final = "pilot_took_over"
+CRASHED: Final = "crashed"
+OPERATOR_START: Final = "operator_start"
+OPERATOR_RESUME: Final = "operator_resume"
 OPERATOR_LAND, OPERATOR_ABORT = "operator_land", "operator_abort"
 
 

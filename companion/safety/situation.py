@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 from companion.model.types import ControlLog, TetherState
 
 Values = tuple[object, ...]
 """Values for a rule's message, returned by a predicate whose condition holds."""
-HOLDS: Values = ()
+HOLDS: Final[Values] = ()
 """The condition holds, and the message contains no values."""
 
 

@@ -10,10 +10,11 @@ decelerations: its stopping distance D(v) is never shorter than that of either, 
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from companion.config.safety import Safety
 
-LAND_AHEAD_S = 0.6
+LAND_AHEAD_S: Final = 0.6
 """PX4 sets the stop point of LAND this far ahead, in addition to the braking distance. Confirmed by measurement: docs/px4.md."""
 LAND_DECELERATION_M_S2 = 8.0
 """MPC_ACC_HOR of configs/px4/indoor_mocap.params; enters only the distance of LAND's stop point."""

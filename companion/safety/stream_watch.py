@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import Final
 
-STEPS_BACK_MAX = 2
+STEPS_BACK_MAX: Final = 2
 """A server that restarts begins its numbers again: one step back, and another one at a second restart."""
-WINDOW_S = 1.0
-REORDERED_MAX = 8
+WINDOW_S: Final = 1.0
+REORDERED_MAX: Final = 8
 """A network may deliver a frame up to this many numbers behind the newest one."""
-_MASK = 0xFFFFFFFF
-_HALF = 0x80000000
+_MASK: Final = 0xFFFFFFFF
+_HALF: Final = 0x80000000
 
 
 class StreamWatch:

@@ -8,6 +8,7 @@ floats: the watch runs in the control tick.
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from companion.config.tether import Tether
 from companion.config.vehicle import Vehicle
@@ -17,10 +18,10 @@ from companion.safety.stop import StopModel
 from companion.safety.tether_pull import PullEstimate
 from companion.safety.tether_shape import Clearance, steepest_slope
 
-_TWO_PI = 2.0 * math.pi
-_ABOVE_M = 0.05
+_TWO_PI: Final = 2.0 * math.pi
+_ABOVE_M: Final = 0.05
 """Distance to a vertical below which the direction to it is undefined and the winding stays unchanged."""
-_DT_MAX_S = 0.05
+_DT_MAX_S: Final = 0.05
 """Longest time step of the filters; a longer gap between two updates counts as this."""
 
 

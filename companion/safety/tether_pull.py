@@ -10,6 +10,7 @@ pull along the line also has a horizontal part.
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from companion.config.tether import Tether
 from companion.model.types import Vec3
@@ -18,17 +19,18 @@ HORIZONTAL_N = 0.7
 """Standard deviation of the horizontal residual without a tether: air flow in the room, drag, tilt errors."""
 VERTICAL_N = 2.0
 """Standard deviation of the vertical residual: 7 % of the hover thrust."""
-CERTAIN = 3.0
+CERTAIN: Final = 3.0
 """Number of standard deviations of the fit from which a pull is accepted as one."""
-RELEASE = 0.6
+RELEASE: Final = 0.6
 """A pull ends when it falls below this fraction of its threshold."""
-SIDEWAYS_N = 6.0
+SIDEWAYS_N: Final = 6.0
 """A horizontal residual of this size in any direction means that something other than the anchor holds the vehicle."""
-_FLAT, _STEEP = 1.0 / HORIZONTAL_N**2, 1.0 / VERTICAL_N**2
-GROWTH_S = 0.3
-GROWTH_N_PER_M = 10.0
+_FLAT: Final = 1.0 / HORIZONTAL_N**2
+_STEEP: Final = 1.0 / VERTICAL_N**2
+GROWTH_S: Final = 0.3
+GROWTH_N_PER_M: Final = 10.0
 """Slope of the pull over the range (the distance to the anchor) from which the line counts as tightening."""
-GROWTH_SPREAD_M2 = 1e-6
+GROWTH_SPREAD_M2: Final = 1e-6
 """Below this variance of the range no slope can be estimated."""
 
 

@@ -9,6 +9,7 @@ same length, which with much slack goes straight down, as the line does. `cleara
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from companion.config.arm_chain import chain_of
 from companion.config.tether import Tether
@@ -16,7 +17,7 @@ from companion.config.vehicle import Vehicle
 from companion.model.arm_skeleton import skeleton_of
 from companion.model.types import Joints, Vec2, Vec3
 
-_NEVER = 1.0
+_NEVER: Final = 1.0
 """Length, m, over which a line that does not leave the disk is followed."""
 
 

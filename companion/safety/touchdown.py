@@ -11,27 +11,28 @@ sources is the only one, thrust is therefore reduced gradually (`relief`) as lon
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 from companion.model.types import MocapPose, VehicleState
 
 HEIGHT_MARGIN_M = 0.12
 """Margin over standing height below which the vehicle may be on the ground."""
-STILL_M_S = 0.08
-REFERENCE_BELOW_M = 0.05
+STILL_M_S: Final = 0.08
+REFERENCE_BELOW_M: Final = 0.05
 HEIGHT_HOLD_S = 0.35
-THRUST_SHARE = 0.75
+THRUST_SHARE: Final = 0.75
 """Fraction of hover thrust at which a vehicle in the air falls 0.2 m within 0.4 s."""
-THRUST_HOLD_S = 0.2
+THRUST_HOLD_S: Final = 0.2
 NEVER_ABOVE_M = 0.5
 """Margin over standing height. If motion capture is above it, thrust and PX4 are not evidence: the tether may carry the vehicle."""
-ALONE_S = 0.4
+ALONE_S: Final = 0.4
 """Time for which a single source may report touchdown before thrust is reduced."""
-RELIEF_S = 1.0
+RELIEF_S: Final = 1.0
 """Time in which thrust is reduced from full to zero."""
-RELIEF_SINK_MAX_M_S = 0.15
+RELIEF_SINK_MAX_M_S: Final = 0.15
 """A vehicle that sinks faster than this while thrust is reduced is still flying."""
-SINK_WINDOW_S = 0.15
-MOCAP_FRESH_S = 0.3
+SINK_WINDOW_S: Final = 0.15
+MOCAP_FRESH_S: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 
 from companion.model.types import ArmState, AutopilotStatus, ForceSample, Inputs, MocapPose, Quat, Vec3, VehicleState
 from companion.safety.situation import Values
 
-OUT_OF_RANGE = 1.0e4
+OUT_OF_RANGE: Final = 1.0e4
 """Largest permitted value; no valid quantity reaches it in any unit."""
-_STAMP_MAX_S = 1.0e9
+_STAMP_MAX_S: Final = 1.0e9
 
 
 class InputFilter:

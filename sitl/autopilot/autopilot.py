@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import Final
 
 from companion.model.frames import quat_multiply
 from companion.model.types import Quat, Vec3
@@ -25,16 +26,17 @@ from sitl.autopilot.types import AttitudeTarget, Estimate, Fusion, ImuSample, Le
 
 Command7 = tuple[float, float, float, float, float, float, float]
 
-_COMMANDER_PERIOD_S = 0.01
-_POSITION_PERIOD_S = 0.004
+_COMMANDER_PERIOD_S: Final = 0.01
+_POSITION_PERIOD_S: Final = 0.004
 _EARTH_RADIUS_M = 6371000.0
-_EV_POSITION_AND_YAW = 1 | 2 | 8
+_EV_POSITION_AND_YAW: Final = 1 | 2 | 8
 """Bits of EKF2_EV_CTRL for horizontal position, vertical position and yaw. Without magnetometer, barometer and GPS, PX4 needs all of
 them.
 """
-_TIME_EPSILON_S = 1e-9
+_TIME_EPSILON_S: Final = 1e-9
 # Looking up an Enum member costs as much as ten comparisons; these two are used at 250 Hz.
-_OFFBOARD, _TERMINATION = NavState.OFFBOARD, NavState.TERMINATION
+_OFFBOARD: Final = NavState.OFFBOARD
+_TERMINATION: Final = NavState.TERMINATION
 
 
 @dataclass(frozen=True, slots=True)

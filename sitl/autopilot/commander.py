@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Final
 
 from sitl.autopilot.modes import PREVENT_ARMING, Health, NavState, nav_state_from_custom
 from sitl.autopilot.params import Params
 
-FORCE_MAGIC = 21196
-OFFBOARD_LOSS_EXTRA_S = 0.05
+FORCE_MAGIC: Final = 21196
+OFFBOARD_LOSS_EXTRA_S: Final = 0.05
 """Delay of the failsafe after COM_OF_LOSS_T has passed, measured on PX4 1.16."""
 
 
@@ -252,12 +253,12 @@ class Commander:
         self.notices.append(Notice(severity, text))
 
 
-_FALLBACKS = {
+_FALLBACKS: Final = {
     NavState.RTL: (NavState.RTL, NavState.LAND, NavState.DESCEND),
     NavState.LAND: (NavState.LAND, NavState.DESCEND),
     NavState.TERMINATION: (NavState.TERMINATION,),
 }
-_FAILSAFE_NAMES = {
+_FAILSAFE_NAMES: Final = {
     NavState.RTL: "Return",
     NavState.LAND: "Land",
     NavState.DESCEND: "Descend",

@@ -9,40 +9,41 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import Final
 
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_multiply, quat_normalize, wrap_rad, yaw_from_quat
 from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 from sitl.autopilot.types import Estimate, Fusion, ImuSample
 
-VISION_FUSED_TIMEOUT_S = 0.55
-POSITION_VALID_TIMEOUT_S = 4.5
-_HISTORY_S = 0.3
-_GATE_M = 0.5
-_GATE_RESET_S = 1.0
+VISION_FUSED_TIMEOUT_S: Final = 0.55
+POSITION_VALID_TIMEOUT_S: Final = 4.5
+_HISTORY_S: Final = 0.3
+_GATE_M: Final = 0.5
+_GATE_RESET_S: Final = 1.0
 
 # What EKF2's gains settle to with vision at 100 Hz, EKF2_EVP_NOISE 0.01, EKF2_EVA_NOISE 0.05, EKF2_ACC_NOISE 0.35 and
 # EKF2_GYR_NOISE 0.015 (steady Kalman filter over position, velocity and g times tilt): poles 5.9 rad/s, damped by 0.7,
 # and 0.42 rad/s on the tilt. A tilt error of 0.1 deg, which EKF2 has too, causes 4 mm of position error with this
 # control law. The vertical accelerometer bias is slower: with EKF2_ABIAS_INIT 0.2 and EKF2_ACC_B_NOISE 0.003 its gain
 # is 1.8, 1.2 and 0.7 m/s^3 per m after 20, 30 and 50 s.
-_L_POSITION = 8.8
-_L_VELOCITY = 38.5
-_L_ACCELERATION = 14.7
-_L_BIAS = 1.0
-_L_YAW = 0.3
-_BIAS_MAX_M_S2 = 0.4
+_L_POSITION: Final = 8.8
+_L_VELOCITY: Final = 38.5
+_L_ACCELERATION: Final = 14.7
+_L_BIAS: Final = 1.0
+_L_YAW: Final = 0.3
+_BIAS_MAX_M_S2: Final = 0.4
 """Limit of the accelerometer bias (EKF2_ABL_LIM)."""
 
 # EKF2's defaults: gate in standard deviations (EKF2_EVP_GATE), accelerometer noise (EKF2_ACC_NOISE). The rest was
 # measured on 1.16.1: a filtered ratio falls by e in 1 s, is 2 at most, and the position is good to 4 mm with vision at
 # 100 Hz and EKF2_EVP_NOISE 0.01.
 _VISION_NOISE_M = 0.01
-_TEST_GATE = 5.0
-_TEST_FILTER_S = 0.5
-_TEST_MAX = 4.0
-_ACCEL_NOISE_M_S2 = 0.35
-_DIFFUSION_M2_S = 2.6e-4
+_TEST_GATE: Final = 5.0
+_TEST_FILTER_S: Final = 0.5
+_TEST_MAX: Final = 4.0
+_ACCEL_NOISE_M_S2: Final = 0.35
+_DIFFUSION_M2_S: Final = 2.6e-4
 _FAKE_POSITION_SIGMA_M = 0.015
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from sitl.autopilot.params import Params
 from sitl.autopilot.types import Estimate
 
 _DESCENT_THRESHOLD_M_S = 0.3
-_BLIND_S = 8.0
+_BLIND_S: Final = 8.0
 """Without a velocity estimate, the vehicle counts as landed after this time at minimum thrust without rotation."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum, auto
+from typing import Final
 
 
 class NavState(Enum):
@@ -66,7 +67,7 @@ class Need(Enum):
 
 _POSITION = (Need.ATTITUDE, Need.LOCAL_ALTITUDE, Need.LOCAL_POSITION)
 
-REQUIREMENTS: dict[NavState, tuple[Need, ...]] = {
+REQUIREMENTS: Final[dict[NavState, tuple[Need, ...]]] = {
     NavState.MANUAL: (Need.MANUAL_CONTROL,),
     NavState.ACRO: (Need.MANUAL_CONTROL,),
     NavState.STABILIZED: (Need.ATTITUDE, Need.MANUAL_CONTROL),
@@ -82,7 +83,7 @@ REQUIREMENTS: dict[NavState, tuple[Need, ...]] = {
     NavState.TERMINATION: (),
 }
 
-PREVENT_ARMING = frozenset({NavState.RTL, NavState.LAND, NavState.DESCEND, NavState.TERMINATION})
+PREVENT_ARMING: Final = frozenset({NavState.RTL, NavState.LAND, NavState.DESCEND, NavState.TERMINATION})
 """Modes in which PX4 does not arm (mode_req_prevent_arming) and which it leaves on disarming."""
 
 

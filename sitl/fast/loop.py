@@ -10,6 +10,7 @@ import gc
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Final
 
 from companion.core.flight_core import FlightCore
 from companion.io.px4.delta_velocity import DeltaVelocity
@@ -59,15 +60,21 @@ from sitl.world.world import Layout, Snapshot, Truth
 
 LINK_DELAY_S = 0.002
 """Time from sending a setpoint to its arrival at PX4."""
-POSITION_PERIOD_S = 1.0 / 124.0
+POSITION_PERIOD_S: Final = 1.0 / 124.0
 """Period of PX4's fastest position stream; attitude and IMU data arrive with every tick."""
-_NO_COMMAND, _LAND = OperatorCommand.NONE, OperatorCommand.LAND
-_ON_GROUND, _IN_AIR = LandedState.ON_GROUND, LandedState.IN_AIR
-_NO_REQUEST = AutopilotRequest.NONE
-SETTLE_S = 30.0
+_NO_COMMAND: Final = OperatorCommand.NONE
+_LAND: Final = OperatorCommand.LAND
+_ON_GROUND: Final = LandedState.ON_GROUND
+_IN_AIR: Final = LandedState.IN_AIR
+_NO_REQUEST: Final = AutopilotRequest.NONE
+SETTLE_S: Final = 30.0
 """Longest time for which the world continues after a flight that ends while armed."""
-FLIGHT_PROCESS_FAULTS: frozenset[FaultKind] = frozenset({"stall_loop", "hold_gil", "stop_flight", "kill_flight"})
-_MODES = {NavState.OFFBOARD: FlightMode.OFFBOARD, NavState.LAND: FlightMode.LAND, NavState.LOITER: FlightMode.HOLD}
+FLIGHT_PROCESS_FAULTS: Final[frozenset[FaultKind]] = frozenset({"stall_loop", "hold_gil", "stop_flight", "kill_flight"})
+_MODES: Final = {
+    NavState.OFFBOARD: FlightMode.OFFBOARD,
+    NavState.LAND: FlightMode.LAND,
+    NavState.LOITER: FlightMode.HOLD,
+}
 _OFFBOARD_MODE: Command7 = (1.0, 6.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _NOTHING: Command7 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from sitl.world.model import SECOND, SECOND_CATCH
 from sitl.world.payload import Ball
 from sitl.world.world import World
 
-CELL_FULL_V = 4.15
+CELL_FULL_V: Final = 4.15
 OVERHEATED_C = 80.0
 OVERLOAD, OVERHEATING = 0x20, 0x04
 """Bits of register 70 (hardware error status)."""

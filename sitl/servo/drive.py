@@ -7,20 +7,23 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import Final
 
 COUNTS_PER_TURN = 4096
-RAD_PER_COUNT = 2.0 * math.pi / COUNTS_PER_TURN
+RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_TURN
 AMP_PER_COUNT = 2.69e-3
 """Unit of current of the XM430-W210, the default of `ServoDrive.amp_per_count`."""
-RAD_S_PER_COUNT = 0.229 * 2.0 * math.pi / 60.0
+RAD_S_PER_COUNT: Final = 0.229 * 2.0 * math.pi / 60.0
 
-MODE_CURRENT, MODE_POSITION, MODE_CURRENT_POSITION = 0, 3, 5
+MODE_CURRENT: Final = 0
+MODE_POSITION: Final = 3
+MODE_CURRENT_POSITION: Final = 5
 
 # Position loop of modes 3 and 5 at the default P gain: about 23 N m/rad and 1.3 N m s/rad at 1.3 N m/A.
 _AMP_PER_RAD = 17.5
 _AMP_PER_RAD_S = 1.0
-_INT32 = 1 << 31
-_TIME_EPSILON_S = 1e-9
+_INT32: Final = 1 << 31
+_TIME_EPSILON_S: Final = 1e-9
 
 
 class ServoDrive:

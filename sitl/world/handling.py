@@ -60,7 +60,7 @@ TAP_S: Final = 0.024
 TAP_EVERY_S: Final = 1.1
 _HELD_S: Final = _GRIP_S + 1.6
 """Time from the grip until the vehicle is steady enough to be tapped."""
-_TAP_LEVER_BODY_M: Final[Vec3] = (0.06, 0.04, 0.02)
+_TAP_LEVER_BODY_M: Vec3 = (0.06, 0.04, 0.02)
 _TAPS_WORLD: Final[tuple[Vec3, ...]] = (
     (1.0, 0.0, 0.0),
     (0.0, 1.0, 0.0),

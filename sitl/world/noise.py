@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Final
 
 import numpy as np
 
 from companion.model.types import Vec3
 
-_BLOCK = 4096
+_BLOCK: Final = 4096
 
 
 def noise(seed: int, source: int) -> Iterator[Vec3]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import mujoco
 import numpy as np
@@ -17,9 +17,9 @@ from sitl.world.model import PAYLOAD_RADIUS_M
 if TYPE_CHECKING:
     from sitl.world.world import World
 
-THROW_LEAD_S = 0.45
+THROW_LEAD_S: Final = 0.45
 """Time from the throw to the catch."""
-_THROW_BESIDE_M = 0.5
+_THROW_BESIDE_M: Final = 0.5
 """Largest lateral distance from `catch_at_m` at which a payload is thrown to a passing vehicle."""
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from companion.config.arm import Joint
 from companion.config.vehicle import Vehicle
@@ -32,9 +32,10 @@ from sitl.world.mocap_misalignment import MocapMisalignment
 from sitl.world.noise import noise
 from sitl.world.world import PHYSICS_DT_S, Truth, World
 
-IMU_EVERY = 2
+IMU_EVERY: Final = 2
 """Physics steps per IMU sample: 250 Hz, the rate of PX4's rate loop."""
-CELL_FULL_V, CELL_EMPTY_V = 4.15, 3.5
+CELL_FULL_V: Final = 4.15
+CELL_EMPTY_V: Final = 3.5
 _COUNTS_PER_RAD = 4096.0 / (2.0 * math.pi)
 
 
@@ -92,7 +93,7 @@ def battery_voltage_v(remaining: float, cells: int) -> float:
 
 
 _MOCAP, _IMU, _FORCE = range(3)
-_IMU_DRIFT = 11
+_IMU_DRIFT: Final = 11
 
 
 class Plant:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import mujoco
 
@@ -27,11 +27,11 @@ from sitl.world.model import has_tip, mjcf
 from sitl.world.payload import Payload
 from sitl.world.surfaces import Surfaces
 
-PHYSICS_DT_S = 0.002
-DRAG_N_PER_M_S = 0.25
-FALL_M_S = 2.5
+PHYSICS_DT_S: Final = 0.002
+DRAG_N_PER_M_S: Final = 0.25
+FALL_M_S: Final = 2.5
 """Speed of impact on the floor at which the legs break: the speed after a fall from 0.3 m. PX4 descends at 0.7 m/s at most."""
-_EFFECT_STEPS = round(EFFECT_PERIOD_S / PHYSICS_DT_S)
+_EFFECT_STEPS: Final = round(EFFECT_PERIOD_S / PHYSICS_DT_S)
 SNAG_STIFFNESS_N_M, SNAG_DAMPING_NS_M = 400.0, 30.0
 
 

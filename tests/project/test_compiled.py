@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import subprocess
@@ -71,3 +72,20 @@ def test_a_compiled_robustness_campaign_gives_the_rows_of_the_interpreted_one(tm
 def test_the_list_of_modules_names_only_files_that_exist() -> None:
     assert set(modules()) >= {"companion/core/flight_core.py", "sitl/fast/loop.py", "sitl/world/effects/net.py"}
     assert all((ROOT / name).exists() for name in INTERPRETED)
+
+
+def test_no_tuple_of_floats_is_final() -> None:
+    """mypyc 2.4 compiles some reads of such a constant to a NameError: `if (value.f0 != -113.0 && PyErr_Occurred())` is inverted."""
+    final = [
+        f"{name}:{node.lineno}"
+        for name in modules()
+        for node in ast.walk(ast.parse((ROOT / name).read_text(encoding="utf-8")))
+        if isinstance(node, ast.AnnAssign) and "Final" in ast.unparse(node.annotation)
+        if isinstance(node.value, ast.Tuple) and any(is_float(element) for element in node.value.elts)
+    ]
+    assert final == []
+
+
+def is_float(node: ast.expr) -> bool:
+    """Return whether the expression is the literal of a float, with or without a sign."""
+    return isinstance(getattr(node, "operand", node), ast.Constant) and "." in ast.unparse(node)

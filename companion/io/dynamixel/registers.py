@@ -14,6 +14,7 @@ import struct
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import serial
 from dynamixel_sdk import PortHandler
@@ -23,15 +24,15 @@ from companion.config.arm import Joint
 from companion.io.protocols import DeviceError
 from companion.model.servos import COUNTS_PER_TURN, RPM_PER_COUNT
 
-MODE_CURRENT = 0
+MODE_CURRENT: Final = 0
 WATCHDOG_UNIT_MS = 20
 RETURN_DELAY_UNIT_US = 2
 VOLTAGE_UNIT_V = 0.1
 WATCHDOG_TRIPPED = 0xFF
 """Value of register 98 after the bus watchdog has tripped."""
 
-RAD_PER_COUNT = 2.0 * math.pi / COUNTS_PER_TURN
-RAD_S_PER_COUNT = RPM_PER_COUNT * 2.0 * math.pi / 60.0
+RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_TURN
+RAD_S_PER_COUNT: Final = RPM_PER_COUNT * 2.0 * math.pi / 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +71,7 @@ INDIRECT_DATA_1 = 224
 BLOCK = (PRESENT_POSITION, HARDWARE_ERROR, PRESENT_VELOCITY, PRESENT_TEMPERATURE, PRESENT_CURRENT, BUS_WATCHDOG)
 BLOCK_SIZE = sum(register.size for register in BLOCK)
 BLOCK_ADDRESSES = tuple(register.address + i for register in BLOCK for i in range(register.size))
-_BLOCK = struct.Struct("<iBiBhB")
+_BLOCK: Final = struct.Struct("<iBiBhB")
 _INSTRUCTION_BYTES, _STATUS_BYTES, _GOAL_BYTES = 14, 11, 3
 """Bytes of a sync read or sync write without its servos, of a status packet without its data, and per servo in the sync write."""
 

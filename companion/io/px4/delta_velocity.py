@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from companion.model.types import Vec3
 
-GAP_MAX_S = 0.05
+GAP_MAX_S: Final = 0.05
 """Longest gap that the sum bridges. A longer one adds nothing, because the motion during it was not measured."""
-_REORDERED_MAX_S = 1.0
-_LOST_INTERVALS = 1.5
+_REORDERED_MAX_S: Final = 1.0
+_LOST_INTERVALS: Final = 1.5
 """After a gap of more than this many usual intervals at least one sample was lost."""
-_SMOOTHING = 1.0 / 16.0
+_SMOOTHING: Final = 1.0 / 16.0
 """Weight of a new sample in the means."""
 
 

@@ -11,6 +11,7 @@ restitution^2 times that stiffness while it relaxes, which returns the payload w
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import mujoco
 
@@ -20,7 +21,7 @@ from companion.sitl_config.effects.net import Net as NetConfig
 from sitl.world.loads import ZERO, Loads
 
 RIM_STIFFNESS_N_M = 3000.0
-SETTLED_S = 0.4
+SETTLED_S: Final = 0.4
 """Time in the bag after which a payload counts as caught; a payload that bounces out leaves the bag within 0.2 s."""
 _TURN_M_S = 0.1
 """Speed range over which the stiffness changes between its stretching and relaxing values; the transition damps a payload at rest."""
