@@ -59,7 +59,7 @@ INTERPRETED = frozenset(
     }
 )
 """Files that match `COMPILED` but stay plain Python."""
-FLAGS = "-O2 -ffp-contract=off -fvisibility=hidden"
+FLAGS = "-ffp-contract=off -fvisibility=hidden"
 """Compiler flags: without fused multiply-add, which would change the last bits on processors that have it (aarch64), and with direct
 calls between the modules, which lie in one library.
 """
@@ -104,6 +104,7 @@ def build() -> Path:
     os.chdir(ROOT)
     extensions = mypycify(
         [f"--config-file={ROOT / 'pyproject.toml'}", f"--cache-dir={WORK / 'cache'}", *modules()],
+        opt_level="2",
         debug_level="0",
         group_name="companion_sitl",
         multi_file=True,
