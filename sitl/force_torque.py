@@ -24,7 +24,8 @@ _MAX_CATCH_UP = 8  # packets; if the world's time jumps further, the rest is ski
 
 def quantised(force_n: Vec3, torque_nm: Vec3) -> tuple[Vec3, Vec3]:
     """Return a reading as the companion receives it, rounded to the protocol's counts."""
-    (fx, fy, fz), (tx, ty, tz) = force_n, torque_nm
+    fx, fy, fz = force_n
+    tx, ty, tz = torque_nm
     force, torque = rft.FORCE_PER_N, rft.TORQUE_PER_NM
     return (
         (round(fx * force) / force, round(fy * force) / force, round(fz * force) / force),
@@ -34,7 +35,16 @@ def quantised(force_n: Vec3, torque_nm: Vec3) -> tuple[Vec3, Vec3]:
 
 def overloaded(force_n: Vec3, torque_nm: Vec3) -> bool:
     """Return whether the load on any axis exceeds that axis's capacity."""
-    return max(map(abs, force_n)) > FORCE_CAPACITY_N or max(map(abs, torque_nm)) > TORQUE_CAPACITY_NM
+    fx, fy, fz = force_n
+    tx, ty, tz = torque_nm
+    return (
+        abs(fx) > FORCE_CAPACITY_N
+        or abs(fy) > FORCE_CAPACITY_N
+        or abs(fz) > FORCE_CAPACITY_N
+        or abs(tx) > TORQUE_CAPACITY_NM
+        or abs(ty) > TORQUE_CAPACITY_NM
+        or abs(tz) > TORQUE_CAPACITY_NM
+    )
 
 
 class ForceTorqueServer:

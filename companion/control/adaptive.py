@@ -39,7 +39,8 @@ class Adaptation:
         nu = config.nu
 
         def held(dt_s: float) -> tuple[float, ...]:
-            (n0, n1, n2, n3), exp = nu, math.exp
+            n0, n1, n2, n3 = nu
+            exp = math.exp
             k0, k1, k2, k3 = exp(-n0 * dt_s), exp(-n1 * dt_s), exp(-n2 * dt_s), exp(-n3 * dt_s)
             return (k0, k1, k2, k3, (1.0 - k0) / n0, (1.0 - k1) / n1, (1.0 - k2) / n2, (1.0 - k3) / n3)
 
@@ -51,7 +52,8 @@ class Adaptation:
 
     def rho(self, regressor: Vec4) -> float:
         """Return the gain of the robust term: H . b + zeta, capped."""
-        (h0, h1, h2, h3), (b0, b1, b2, b3) = self.h, regressor
+        h0, h1, h2, h3 = self.h
+        b0, b1, b2, b3 = regressor
         rho = h0 * b0 + h1 * b1 + h2 * b2 + h3 * b3 + self.zeta
         return rho if rho < self._rho_max else self._rho_max
 
@@ -59,7 +61,8 @@ class Adaptation:
         """Integrate one step with ||S s|| and the regressor held. With `frozen` the gains do not change, because the actuators are
         saturated.
         """
-        (h0, h1, h2, h3), (b0, b1, b2, b3) = self.h, regressor
+        h0, h1, h2, h3 = self.h
+        b0, b1, b2, b3 = regressor
         if norm_s < self._varpi:
             c = 1.0 + (h0 * b0 + h1 * b1 + h2 * b2 + h3 * b3) * norm_s
             decay = math.exp(-c * dt_s)
@@ -250,11 +253,14 @@ class AdaptiveController:
         friction at alpha'*. The star marks what the target impedance requests at this instant: alpha''* = alpha''_d - Phi e' + gamma'
         and alpha'* = alpha'_d - Phi e + gamma = alpha' - s.
         """
-        (xx, xy, xz), (zx, zy, zz) = body_x, body_z
+        xx, xy, xz = body_x
+        zx, zy, zz = body_z
         yz, arm_rad = zx * xy - zy * xx, state.arm_rad
         up = (GRAVITY_M_S2 * xz, GRAVITY_M_S2 * yz, GRAVITY_M_S2 * zz)
         (jx, jy, jz), gravity, levers = self._manipulator.joint_terms_and_levers(arm_rad, up)
-        (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = force, self._desired.world_n, self._compliance
+        f0, f1, f2 = force
+        d0, d1, d2 = self._desired.world_n
+        c0, c1, c2 = self._compliance
         f_x, f_z = xx * f0 + xy * f1 + xz * f2, zx * f0 + zy * f1 + zz * f2
         d_x, d_z = xx * d0 + xy * d1 + xz * d2, zx * d0 + zy * d1 + zz * d2
         f_y = d_y = 0.0

@@ -63,7 +63,8 @@ class ForceFilter:
         if sample_world_n is None:
             sample_world_n = (0.0, 0.0, 0.0)
         elif before is not None:
-            (x, y, z), (sx, sy, sz) = before, sample_world_n
+            x, y, z = before
+            sx, sy, sz = sample_world_n
             k = 1.0 - math.exp(-self._w * dt_s)
             sample_world_n = (x + k * (sx - x), y + k * (sy - y), z + k * (sz - z))
         self._force_n = sample_world_n
@@ -88,7 +89,8 @@ class DesiredForce:
         k = dt_s / self._time_s
         if k > 1.0:
             k = 1.0
-        (x, y, z), (fx, fy, fz) = self.world_n, force_world_n
+        x, y, z = self.world_n
+        fx, fy, fz = force_world_n
         self.world_n = (x + k * (fx - x), y + k * (fy - y), z + k * (fz - z))
 
 

@@ -57,13 +57,17 @@ class Compensation:
 
     def base_force_n(self, wanted_n: Vec3, force: Vec3, reference: Reference) -> Vec3:
         """Return the desired force with the measured force, the estimated disturbance and the lead compensated, world frame."""
-        (x, y, z), (f0, f1, f2), (d0, d1, d2), (c0, c1, c2) = wanted_n, force, self._observer.force_n, self._force_share
+        x, y, z = wanted_n
+        f0, f1, f2 = force
+        d0, d1, d2 = self._observer.force_n
+        c0, c1, c2 = self._force_share
         x -= c0 * f0 + d0
         y -= c1 * f1 + d1
         z -= c2 * f2 + d2
         lead_s = self._lead_s
         if lead_s > 0.0:
-            jerk, (mx, my) = reference.jerk_world_m_s3, self._inertia
+            jerk = reference.jerk_world_m_s3
+            mx, my = self._inertia
             x += mx * lead_s * jerk[0]
             y += my * lead_s * jerk[1]
         return (x, y, z)
@@ -81,5 +85,7 @@ class Compensation:
         """Store the force that was sent, and the part of the measured force that is accounted for, for the observer."""
         if not self._observer.on:
             return
-        (x, y, z), (f0, f1, f2), (c0, c1, c2) = sent_n, force, self._accounted
+        x, y, z = sent_n
+        f0, f1, f2 = force
+        c0, c1, c2 = self._accounted
         self._known_n = (x + c0 * f0, y + c1 * f1, z + c2 * f2 - self._weight_n)

@@ -44,14 +44,17 @@ class DisturbanceObserver:
         """
         if not self.on:
             return self.force_n
-        (lx, ly, lz), (kx, ky, kz) = self._lagged or known_n, known_n
+        lx, ly, lz = self._lagged or known_n
+        kx, ky, kz = known_n
         k = 1.0 - math.exp(-dt_s / self._lag_s) if self._lag_s > 0 else 1.0
         lx += k * (kx - lx)
         ly += k * (ky - ly)
         lz += k * (kz - lz)
         self._lagged = (lx, ly, lz)
         if learn:
-            (x, y, z), (ax, ay, az), (tx, ty, tz) = self.force_n, acceleration_world_m_s2, self._times_s
+            x, y, z = self.force_n
+            ax, ay, az = acceleration_world_m_s2
+            tx, ty, tz = self._times_s
             mass_kg, most = self._mass_kg, self._max_n
             # d' = (m a - F - d) / T, implicit Euler; an axis without time constant stays 0.
             if tx > 0.0:

@@ -93,12 +93,14 @@ class ForceObserver:
         if not math.isfinite(sum(known_n) + sum(acceleration) + sum(moment)):
             return self.force_n
         k = dt_s / (dt_s + TIME_S)
-        (dx, dy, dz), (fx, fy, fz) = self._base.step(dt_s, known_n, acceleration, learn=True), self._force_n
+        dx, dy, dz = self._base.step(dt_s, known_n, acceleration, learn=True)
+        fx, fy, fz = self._force_n
         fx, fy, fz = fx + k * (dx - fx), fy + k * (dy - fy), fz + k * (dz - fz)
         self._force_n = (fx, fy, fz)
         ax, ay, az = self._arm_n(k, moment, stamps_s)
         fx, fy, fz = fx + ax, fy + ay, fz + az
-        (nx, ny, nz), share = self._mean_n, dt_s / MEAN_S
+        nx, ny, nz = self._mean_n
+        share = dt_s / MEAN_S
         nx, ny = nx + share * (fx - nx), ny + share * (fy - ny)
         if not contact:
             nz += share * (fz - nz)

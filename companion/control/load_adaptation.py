@@ -76,7 +76,9 @@ class LoadAdaptation:
         if not self.on or not learn:
             return
         decay, step = self._held[dt_s]
-        (x, y, z), (rx, ry, rz), most = self.force_n, self._rate_xyz, self._max_n
+        x, y, z = self.force_n
+        rx, ry, rz = self._rate_xyz
+        most = self._max_n
         x_new = decay * x - step * rx * s[0]
         y_new = decay * y - step * ry * s[1]
         z_new = decay * z - step * rz * s[2]

@@ -43,7 +43,8 @@ class MeanAcceleration:
             return self._value_m_s2
         self._before = vehicle
         if 0.0 < dt_s <= self.GAP_MAX_S:
-            (x, y, z), (bx, by, bz) = total, before.delta_velocity_body_m_s
+            x, y, z = total
+            bx, by, bz = before.delta_velocity_body_m_s
             x, y, z = quat_rotate(vehicle.attitude_wxyz, ((x - bx) / dt_s, (y - by) / dt_s, (z - bz) / dt_s))
             self._value_m_s2 = (x, y, z - GRAVITY_M_S2)
         else:
@@ -182,7 +183,8 @@ class CatchDetector:
             return False
         dt_s, self._last_s = t_s - self._last_s, t_s
         k = 1.0 - math.exp(-dt_s / self.LOWPASS_S)
-        (x, y, z), (fx, fy, fz) = self._carried_n, force_world_n
+        x, y, z = self._carried_n
+        fx, fy, fz = force_world_n
         x, y, z = self._carried_n = (x + k * (fx - x), y + k * (fy - y), z + k * (fz - z))
         force_n, light_n = math.sqrt(x * x + y * y + z * z), self.LEFT_SHARE * self._weight_n
         self._acceleration_z_m_s2 += k * (acceleration_z_m_s2 - self._acceleration_z_m_s2)

@@ -72,7 +72,8 @@ def roll_pitch_from_force(force_world_n: Vec3, yaw_rad: float) -> tuple[float, f
 
 def collective_n(force_world_n: Vec3, body_z_world: Vec3) -> float:
     """Return u = F . z_body, N: the thrust along the current body z axis."""
-    (fx, fy, fz), (zx, zy, zz) = force_world_n, body_z_world
+    fx, fy, fz = force_world_n
+    zx, zy, zz = body_z_world
     return fx * zx + fy * zy + fz * zz
 
 

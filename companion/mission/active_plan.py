@@ -103,8 +103,10 @@ class Course:
 def _paced(r: Reference, rate: float, change: float, jerk: float) -> Reference:
     """Return the reference for a plan time with rate s: s v, s^2 a + s_d v, s^3 j + 3 s s_d a + s_dd v (chain rule)."""
     squared, mixed, cubed = rate * rate, 3.0 * rate * change, rate * rate * rate
-    (vx, vy, vz), (ax, ay, az) = r.velocity_world_m_s, r.acceleration_world_m_s2
-    (jx, jy, jz), arm_rate = r.jerk_world_m_s3, r.arm_rate_rad_s
+    vx, vy, vz = r.velocity_world_m_s
+    ax, ay, az = r.acceleration_world_m_s2
+    jx, jy, jz = r.jerk_world_m_s3
+    arm_rate = r.arm_rate_rad_s
     return Reference(
         position_world_m=r.position_world_m,
         velocity_world_m_s=(rate * vx, rate * vy, rate * vz),

@@ -102,7 +102,8 @@ class Move:
         dddf /= duration_s * duration_s * duration_s
         delta = self.delta
         if len(delta) == 3:  # the case of most of a flight; written out it takes a third of the time
-            (x, y, z), (a, b, c) = self.origin, delta
+            x, y, z = self.origin
+            a, b, c = delta
             return (
                 (x + a * f, y + b * f, z + c * f),
                 (a * df, b * df, c * df),
@@ -110,7 +111,8 @@ class Move:
                 (a * dddf, b * dddf, c * dddf),
             )
         if len(delta) == 2:
-            (x, y), (a, b) = self.origin, delta
+            x, y = self.origin
+            a, b = delta
             return (x + a * f, y + b * f), (a * df, b * df), (a * ddf, b * ddf), (a * dddf, b * dddf)
         return (
             tuple([a + d * f for a, d in zip(self.origin, delta, strict=True)]),

@@ -58,7 +58,8 @@ class SettledEstimate:
         """Return a message that says what has not converged, or None if everything has for `SETTLED_S`."""
         if self.since_s is None or t_s - self.since_s < SETTLED_S:
             return f"PX4's estimate has not followed motion capture for {SETTLED_S:g} s without interruption"
-        count, (_, (a, b, c), first_rad) = len(self.seen), self.seen[0] if self.alone else (0.0, _NOWHERE, 0.0)
+        count = len(self.seen)
+        _, (a, b, c), first_rad = self.seen[0] if self.alone else (0.0, _NOWHERE, 0.0)
         apart = [(x - a, y - b, z - c) for _, (x, y, z), _ in self.seen]
         turned_rad = [wrap_rad(yaw - first_rad) for _, _, yaw in self.seen]
         mean = [math.fsum(off[axis] for off in apart) / count for axis in range(3)]

@@ -190,7 +190,8 @@ class ForceTracker:
         if control is None or situation.caught or not situation.airborne:
             self.mean_n = _NO_FORCE
             return
-        (mx, my, mz), (x, y, z) = self.mean_n, control.force_measured_world_n or control.force_ext_world_n
+        mx, my, mz = self.mean_n
+        x, y, z = control.force_measured_world_n or control.force_ext_world_n
         k = dt_s / DRIFT_TIME_S
         self.mean_n = (mx + k * (x - mx), my + k * (y - my), mz + k * (z - mz))
 

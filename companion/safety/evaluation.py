@@ -79,7 +79,8 @@ class Evaluation:
             self._since_s = {id_: since_s for id_, since_s in self._since_s.items() if id_ in ids}
         events = []
         for rule, values in found:
-            id_, (action, severity) = rule.id, rule.verdict(airborne)
+            id_ = rule.id
+            action, severity = rule.verdict(airborne)
             since_s = self._since_s.setdefault(id_, t_s)
             active = self._active.get(id_)
             if active is not None and active[0] is action:

@@ -31,7 +31,9 @@ class FlightTracker:
         self._upright_max = math.sin(0.5 * min(tilt_max_rad, FLIPPED_TILT_RAD)) ** 2
         self._weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
         room, tolerance_m = vehicle.room, vehicle.safety.geofence_tolerance_m
-        (x_low, x_high), (y_low, y_high), inset_m = room.x_m, room.y_m, vehicle.airframe.radius_m - tolerance_m
+        x_low, x_high = room.x_m
+        y_low, y_high = room.y_m
+        inset_m = vehicle.airframe.radius_m - tolerance_m
         self._fence_m = (
             (x_low + inset_m, x_high - inset_m),
             (y_low + inset_m, y_high - inset_m),
@@ -130,7 +132,9 @@ def geofence_near(f: FlightTracker, _: None) -> Values | None:
     """Fires if at the predicted stop after a fault the rotors would be outside the room by more than the tolerance."""
     if f.vehicle is None:
         return None
-    (x, y, z), (vx, vy, vz), stop_s = f.vehicle.position_world_m, f.vehicle.velocity_world_m_s, f.stop_s(f.vehicle)
+    x, y, z = f.vehicle.position_world_m
+    vx, vy, vz = f.vehicle.velocity_world_m_s
+    stop_s = f.stop_s(f.vehicle)
     x, y, z = x + vx * stop_s, y + vy * stop_s, z + vz * stop_s
     return None if f.rotors_in_room(x, y, z) else (x, y, z)
 

@@ -79,7 +79,8 @@ class SafeSet:
                     f"vehicle '{vehicle.name}': room.{name}_m is {span[0]:g} to {span[1]:g} m, too "
                     f"small for the vehicle; measure the room, or airframe.radius_m ({reach_m:g} m)"
                 )
-        (x, y, z), (x_high, y_high, _) = self.low_m, self.high_m
+        x, y, z = self.low_m
+        x_high, y_high, _ = self.high_m
         self._least_m, self._most_m = (
             (x - _TOLERANCE, y - _TOLERANCE, z - _TOLERANCE),
             (x_high + _TOLERANCE, y_high + _TOLERANCE),
@@ -99,7 +100,9 @@ class SafeSet:
 
     def holds_within(self, p: Vec3, radius_m: float, top_m: float) -> bool:
         """Return whether the point is within this distance of the anchor and inside the box with this ceiling."""
-        (x_low, y_low, z_low), (x_high, y_high), (ax, ay, az) = self._least_m, self._most_m, self.anchor_m
+        x_low, y_low, z_low = self._least_m
+        x_high, y_high = self._most_m
+        ax, ay, az = self.anchor_m
         x, y, z = p
         return (
             x_low <= x <= x_high
@@ -304,7 +307,8 @@ class Governor:
     def _braked(self, dt_s: float) -> tuple[Vec3, Vec3]:
         """Return the position and the velocity after straight braking; exact even if the reference comes to rest within the step."""
         assert self._p is not None
-        (px, py, pz), (vx, vy, vz) = self._p, self._v
+        px, py, pz = self._p
+        vx, vy, vz = self._v
         speed = math.sqrt(vx * vx + vy * vy + vz * vz)
         loss = self.stop_deceleration_m_s2 * dt_s
         if speed <= loss:
@@ -317,7 +321,8 @@ class Governor:
     def _wished(self, dt_s: float, target: Vec3, follow: Vec3, feed: Vec3) -> tuple[Vec3, Vec3]:
         """Return the position and the velocity after a step towards the target, within the speed and acceleration limits."""
         assert self._p is not None
-        (px, py, pz), (vx, vy, vz) = self._p, self._v
+        px, py, pz = self._p
+        vx, vy, vz = self._v
         ex, ey, ez = target[0] - px, target[1] - py, target[2] - pz
         away = math.sqrt(ex * ex + ey * ey + ez * ez)
         rate = 0.0

@@ -115,7 +115,9 @@ class InertialCheck:
             self._position, self._velocity, self._bias = position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
             self._started_s, self._above_since_s, self.innovation_m = stamp_s, None, 0.0
             return False
-        (px, py, pz), (vx, vy, vz), (bx, by, bz) = self._position, self._velocity, self._bias
+        px, py, pz = self._position
+        vx, vy, vz = self._velocity
+        bx, by, bz = self._bias
         x, y, z = position_world_m
         x, y, z = x - px + vx * age_s, y - py + vy * age_s, z - pz + vz * age_s
         # Gains that put three discrete poles at exp(-POLE_RAD_S dt) (fading-memory filter of second order), so any rate is stable.

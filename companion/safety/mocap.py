@@ -151,7 +151,8 @@ class MocapTracker:
         if now is None or then is None:
             return
         dt_s = boot_s - before.imu_boot_s
-        (x, y, z), (bx, by, bz) = now, then
+        x, y, z = now
+        bx, by, bz = then
         x, y, z = quat_rotate(vehicle.attitude_wxyz, (x - bx, y - by, z - bz))
         self._inertial.imu(vehicle.imu_stamp_s, dt_s, (x, y, z - GRAVITY_M_S2 * dt_s))
 

@@ -117,5 +117,6 @@ class Monitors:
 
 
 def _moves(v: VehicleState) -> bool:
-    (x, y, z), (p, q, r) = v.velocity_world_m_s, v.angular_rate_body_rad_s
+    x, y, z = v.velocity_world_m_s
+    p, q, r = v.angular_rate_body_rad_s
     return x * x + y * y + z * z > MOVING_M_S * MOVING_M_S or p * p + q * q + r * r > MOVING_RAD_S * MOVING_RAD_S

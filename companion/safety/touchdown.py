@@ -85,7 +85,8 @@ class Sinking:
         """Return the descent speed, positive downward, or None if the poses do not span enough time."""
         if not self.seen:
             return None
-        (first_s, first_m), (last_s, last_m) = self.seen[0], self.seen[-1]
+        first_s, first_m = self.seen[0]
+        last_s, last_m = self.seen[-1]
         return (first_m - last_m) / (last_s - first_s) if last_s - first_s >= 0.5 * SINK_WINDOW_S else None
 
 

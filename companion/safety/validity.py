@@ -88,9 +88,13 @@ def _is_rotation(q: Quat) -> bool:
 
 def _vehicle_is_valid(v: VehicleState) -> bool:
     low, high, old, new, boot_s = -OUT_OF_RANGE, OUT_OF_RANGE, -_STAMP_MAX_S, _STAMP_MAX_S, v.boot_s
-    (px, py, pz), (vx, vy, vz), (w, x, y, z) = v.position_world_m, v.velocity_world_m_s, v.attitude_wxyz
-    (rx, ry, rz), (fx, fy, fz) = v.angular_rate_body_rad_s, v.specific_force_body_m_s2
-    imu_boot_s, (dx, dy, dz) = v.imu_boot_s, v.delta_velocity_body_m_s or (0.0, 0.0, 0.0)
+    px, py, pz = v.position_world_m
+    vx, vy, vz = v.velocity_world_m_s
+    w, x, y, z = v.attitude_wxyz
+    rx, ry, rz = v.angular_rate_body_rad_s
+    fx, fy, fz = v.specific_force_body_m_s2
+    imu_boot_s = v.imu_boot_s
+    dx, dy, dz = v.delta_velocity_body_m_s or (0.0, 0.0, 0.0)
     return (
         (low < px < high and low < py < high and low < pz < high)
         and (low < vx < high and low < vy < high and low < vz < high)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from companion.model.frames import quat_multiply
 from companion.model.types import Quat, Vec3
@@ -39,8 +39,7 @@ _OFFBOARD: Final = NavState.OFFBOARD
 _TERMINATION: Final = NavState.TERMINATION
 
 
-@dataclass(frozen=True, slots=True)
-class Battery:
+class Battery(NamedTuple):
     """Measurement of the power module."""
 
     voltage_v: float = 16.2
@@ -409,5 +408,7 @@ class Px4Stub:
 
 
 def _without(imu: ImuSample, learned: LearnedBias) -> ImuSample:
-    (p, q, r), (x, y, z), (bp, bq, br) = imu.gyro_frd_rad_s, imu.accel_frd_m_s2, learned.gyro_frd_rad_s
+    p, q, r = imu.gyro_frd_rad_s
+    x, y, z = imu.accel_frd_m_s2
+    bp, bq, br = learned.gyro_frd_rad_s
     return ImuSample(imu.t_s, (p - bp, q - bq, r - br), (x, y, z - learned.accel_down_m_s2))

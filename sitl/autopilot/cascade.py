@@ -89,7 +89,8 @@ class Cascade:
         # The rest is a turn about the body's z axis, of which a fraction is commanded: a* (.) = target.
         left_w = aw * wd + ax * xd + ay * yd + az * zd
         left_z = aw * zd - ax * yd + ay * xd - az * wd
-        (p_roll, p_pitch, p_yaw), (most_roll, most_pitch, most_yaw) = self._gains.attitude_p, self._gains.rate_max_rad_s
+        p_roll, p_pitch, p_yaw = self._gains.attitude_p
+        most_roll, most_pitch, most_yaw = self._gains.rate_max_rad_s
         sine = left_z if left_w >= 0 else -left_z
         half = math.asin(1.0 if sine > 1.0 else -1.0 if sine < -1.0 else sine) * (p_yaw / p_roll)
         c, s = math.cos(half), math.sin(half)
@@ -112,7 +113,9 @@ class Cascade:
 
     def _rate_loop(self, dt_s: float, rate: Vec3, rate_sp: Vec3, thrust: float) -> Vec3:
         gains = self._gains
-        (x, y, z), (to_x, to_y, to_z), (px, py, pz) = rate, rate_sp, self._rate_previous or rate
+        x, y, z = rate
+        to_x, to_y, to_z = rate_sp
+        px, py, pz = self._rate_previous or rate
         self._rate_previous = rate
         error_x, error_y, error_z = to_x - x, to_y - y, to_z - z
         blend = 1.0 - math.exp(-2 * math.pi * gains.d_cutoff_hz * dt_s)
@@ -125,11 +128,14 @@ class Cascade:
             self._integral = (0.0, 0.0, 0.0)
         elif self.mixer.unsaturated:
             most = gains.integrator_max
-            (kx, ky, kz), (ix, iy, iz) = gains.rate_i, self._integral
+            kx, ky, kz = gains.rate_i
+            ix, iy, iz = self._integral
             self._integral = (
                 max(-most, min(most, ix + kx * error_x * dt_s)),
                 max(-most, min(most, iy + ky * error_y * dt_s)),
                 max(-most, min(most, iz + kz * error_z * dt_s)),
             )
-        (ix, iy, iz), (kx, ky, kz), (lx, ly, lz) = self._integral, gains.rate_p, gains.rate_d
+        ix, iy, iz = self._integral
+        kx, ky, kz = gains.rate_p
+        lx, ly, lz = gains.rate_d
         return (kx * error_x + ix - lx * dx, ky * error_y + iy - ly * dy, kz * error_z + iz - lz * dz)

@@ -142,7 +142,9 @@ class Navigator:
             self._hold_ned_m = (home_ned_m[0], home_ned_m[1], self._hold_ned_m[2])
             self._descending = math.hypot(x - home_ned_m[0], y - home_ned_m[1]) < _HOME_RADIUS_M
         self._way.step(dt_s, self._hold_ned_m[:2], self._params)
-        (x, y), (vx, vy), (ax, ay) = self._way.position_m, self._way.velocity_m_s, self._way.acceleration_m_s2
+        x, y = self._way.position_m
+        vx, vy = self._way.velocity_m_s
+        ax, ay = self._way.acceleration_m_s2
         if self._descending:
             speed = self._descent(dt_s, estimate, home_ned_m)
             return PositionTarget((x, y, None), (vx, vy, speed), (ax, ay, None), yaw_rad=self._yaw_rad)

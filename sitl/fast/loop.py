@@ -328,10 +328,10 @@ class FastFlight:
                 self._dropped += 1
             dropped = self._dropped
         if self._has_force and plant.fault("force_loss") is None:
-            load = plant.force_torque()
-            force, torque = quantised(*load)
+            force_n, torque_nm = plant.force_torque()
+            force, torque = quantised(force_n, torque_nm)
             self._force = ForceSample(
-                stamp_s=t_s, force_sensor_n=force, torque_sensor_nm=torque, overload=overloaded(*load)
+                stamp_s=t_s, force_sensor_n=force, torque_sensor_nm=torque, overload=overloaded(force_n, torque_nm)
             )
         land = self._land_at_s is not None and t_s >= self._land_at_s
         return Inputs(

@@ -133,7 +133,8 @@ class Handling:
         d = TURN_DAMPING_NMS * grip
         torque = quat_rotate(attitude, (k * ex - d * v[3], k * ey - d * v[4], k * ez - d * v[5]))
         if self._taps:
-            (tx, ty, tz), lever = self._tap(t_s), quat_rotate(attitude, _TAP_LEVER_BODY_M)
+            tx, ty, tz = self._tap(t_s)
+            lever = quat_rotate(attitude, _TAP_LEVER_BODY_M)
             fx, fy, fz = fx + tx, fy + ty, fz + tz
             torque = _plus(torque, _cross(lever, (tx, ty, tz)))
         return Wrench(force_n=(fx, fy, fz + grip * self._weight_n), torque_nm=torque)

@@ -53,5 +53,6 @@ class MocapMisalignment:
         return self._axes(position_world_m), (w, m * x, m * y, m * z)
 
     def _axes(self, v: Vec3) -> Vec3:
-        (i, j, k), (a, b, c) = self._index, self._sign
+        i, j, k = self._index
+        a, b, c = self._sign
         return (a * v[i], b * v[j], c * v[k])

@@ -273,7 +273,8 @@ class Plant:
         force = (s[a] + accel * mx, s[a + 1] + accel * my, s[a + 2] + accel * mz)
         if self._imu_errors is not None:
             rates, force = self._imu_errors.measure(world.thrust_n, rates, force)
-        (p, q, r), (ax, ay, az) = rates, force
+        p, q, r = rates
+        ax, ay, az = force
         return ImuSample(world.t_s, (p, -q, -r), (ax, -ay, -az))
 
     def _expose_mocap(self, t_s: float) -> None:
@@ -350,7 +351,8 @@ class Plant:
     def force_torque(self) -> tuple[Vec3, Vec3]:
         """Return a reading of the force-torque sensor in N and N m, in the sensor frame, with noise, bias, faults and scale error."""
         s, f, tq = self.world.sensors(), self.world.layout.force, self.world.layout.torque
-        (fx, fy, fz), (tx, ty, tz) = (-s[f], -s[f + 1], -s[f + 2]), (-s[tq], -s[tq + 1], -s[tq + 2])
+        fx, fy, fz = (-s[f], -s[f + 1], -s[f + 2])
+        tx, ty, tz = (-s[tq], -s[tq + 1], -s[tq + 2])
         if self._force_sensor is not None:
             (fx, fy, fz), (tx, ty, tz) = self._force_sensor.measure(self.world.t_s, (fx, fy, fz), (tx, ty, tz))
         bx, by, bz = self._config.force_bias_n

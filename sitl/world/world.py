@@ -307,12 +307,14 @@ class World:
         """Return the force of the air and of a snagged tether on the base in N, world frame."""
         force_n = ZERO
         if drag:
-            (wx, wy, wz), v = self.wind_m_s, self.v
+            wx, wy, wz = self.wind_m_s
+            v = self.v
             wx, wy, wz = wx - v[0], wy - v[1], wz - v[2]
             hx, hy, hz = self._rotors.drag_n(sum(thrust_n), (wx, wy, wz), self.q)
             force_n = (DRAG_N_PER_M_S * wx + hx, DRAG_N_PER_M_S * wy + hy, DRAG_N_PER_M_S * wz + hz)
         if self.snag is not None:
-            (x, y, z), (px, py, pz) = force_n, self._snag_pull_n(*self.snag)
+            x, y, z = force_n
+            px, py, pz = self._snag_pull_n(*self.snag)
             force_n = (x + px, y + py, z + pz)
         return force_n
 

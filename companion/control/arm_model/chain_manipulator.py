@@ -113,7 +113,8 @@ def masses_with_tool(chain: ArmChain) -> tuple[tuple[float, Vec3], ...]:
     ]
     if masses:
         kg, (x, y, z) = masses[-1]
-        tool, (tx, ty, tz) = chain.tool_mass_kg, chain.tip_m
+        tool = chain.tool_mass_kg
+        tx, ty, tz = chain.tip_m
         masses[-1] = (kg + tool, (x + tool * tx, y + tool * ty, z + tool * tz))
     return tuple(masses)
 

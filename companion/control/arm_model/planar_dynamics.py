@@ -70,7 +70,8 @@ class PlanarDynamics(Dynamics):
         """See `Dynamics`."""
         m11 = m12 = m22 = c1 = c2 = 0.0
         for part in self._parts(angle_rad, rate_rad_s):
-            m, jx, jz, (t1, t2) = part.mass_kg, part.jx, part.jz, part.turn
+            m, jx, jz = part.mass_kg, part.jx, part.jz
+            t1, t2 = part.turn
             m11 += m * (jx[0] * jx[0] + jz[0] * jz[0]) + part.yy * t1 * t1
             m12 += m * (jx[0] * jx[1] + jz[0] * jz[1]) + part.yy * t1 * t2
             m22 += m * (jx[1] * jx[1] + jz[1] * jz[1]) + part.yy * t2 * t2
@@ -112,7 +113,8 @@ class PlanarDynamics(Dynamics):
         nx, ny, nz = oy * oz * (bz - by), oz * ox * (bx - bz), ox * oy * (by - bx)
         c1 = c2 = g1 = g2 = 0.0
         for part in self._parts(angle_rad, (a1, a2)):
-            m, x, z, jx, jz, (t1, t2) = part.mass_kg, part.x, part.z, part.jx, part.jz, part.turn
+            m, x, z, jx, jz = part.mass_kg, part.x, part.z, part.jx, part.jz
+            t1, t2 = part.turn
             hx, hy, hz = hx + m * x, hy + m * sy, hz + m * z
             ixx += part.xx + m * (sy * sy + z * z)
             iyy += part.yy + m * (x * x + z * z)

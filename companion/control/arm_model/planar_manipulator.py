@@ -113,12 +113,14 @@ class PlanarManipulator(Manipulator):
 
     def moment_torque_nm(self, levers_m_s2: Matrix, moment_kg_m: Joints) -> Joints:
         """See `Manipulator`."""
-        (u1, u2), (m1, m2) = levers_m_s2[0], moment_kg_m
+        u1, u2 = levers_m_s2[0]
+        m1, m2 = moment_kg_m
         return (m1 * u1 + m2 * u2, -m2 * u2)
 
     def projected_on_moments(self, levers_m_s2: Matrix, joint_values: Joints) -> Joints:
         """See `Manipulator`."""
-        (u1, u2), (v1, v2) = levers_m_s2[0], joint_values
+        u1, u2 = levers_m_s2[0]
+        v1, v2 = joint_values
         return (v1 * u1, (v1 - v2) * u2)
 
     def sensor_attitude_body(self, angle_rad: Joints) -> Quat:

@@ -59,7 +59,8 @@ class ForceSensor:
         a, b, c = force_n
         d, e, f = torque_nm
         minutes, warm_k = t_s / 60.0, config.warm_up_k * (1.0 - math.exp(-t_s / config.warm_up_s))
-        (rate_x, rate_y, rate_z), (per_k_x, per_k_y, per_k_z) = config.drift_n_per_min, config.temperature_drift_n_per_k
+        rate_x, rate_y, rate_z = config.drift_n_per_min
+        per_k_x, per_k_y, per_k_z = config.temperature_drift_n_per_k
         x, y, z = (
             rate_x * minutes + per_k_x * warm_k,
             rate_y * minutes + per_k_y * warm_k,

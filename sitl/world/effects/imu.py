@@ -90,12 +90,14 @@ class ImuErrors:
             self._tick += 1
         (xx, yx, zx), (xy, yy, zy), (xz, yz, zz) = self._columns
         x, y, z = gyro_rad_s
-        (bx, by, bz), (dx, dy, dz) = self._gyro_bias, self._gyro_drift
+        bx, by, bz = self._gyro_bias
+        dx, dy, dz = self._gyro_drift
         p = xx * x + xy * y + xz * z + bx + dx
         q = yx * x + yy * y + yz * z + by + dy
         r = zx * x + zy * y + zz * z + bz + dz
         x, y, z = accel_m_s2
-        (bx, by, bz), (dx, dy, dz) = self._accel_bias, self._accel_drift
+        bx, by, bz = self._accel_bias
+        dx, dy, dz = self._accel_drift
         ax = xx * x + xy * y + xz * z + bx + dx
         ay = yx * x + yy * y + yz * z + by + dy
         az = zx * x + zy * y + zz * z + bz + dz
