@@ -12,6 +12,7 @@ from typing import Any
 
 from rich.console import Console
 
+from companion.campaigns.plan import SAMPLE, plan
 from companion.campaigns.runner import Campaign, run
 from companion.cli.options import add_law, add_world
 from companion.config.document import ConfigError
@@ -53,6 +54,16 @@ def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | 
     parser.add_argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, to fly on its workers")
     parser.add_argument("--out", metavar="DIR", help="folder for the results (default: a new one named after the time)")
     parser.add_argument("--json", action="store_true", help="print only the rows and their summary, as JSON")
+
+
+def add_plan(parser: argparse.ArgumentParser) -> None:
+    """Add `--plan`, for a campaign that flies in the fast closed loop only."""
+    parser.add_argument(
+        "--plan",
+        action="store_true",
+        help=f"fly at most {SAMPLE} of the flights, measure their processor time, and print how long all of them take here or with "
+        "--scheduler on its workers",
+    )
 
 
 def common(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -102,11 +113,14 @@ def checked(
 
 
 def fly(campaign: Campaign, arguments: argparse.Namespace, parent: str) -> int:
-    """Fly a campaign into `--out`, or into a new folder under `parent`; return the exit code.
+    """Fly a campaign into `--out`, or into a new folder under `parent`, or plan it with `--plan`; return the exit code.
 
     Raises:
         ConfigError: the folder cannot be used.
     """
+    console = None if arguments.json else wide_console(CAMPAIGN_WIDTH)
+    if getattr(arguments, "plan", False):
+        return plan(campaign, console)
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
     folder = Path(arguments.out) if arguments.out is not None else Path(parent) / stamp
     empty_name = "expected the name of a folder, got an empty one" if arguments.out == "" else None
@@ -114,7 +128,7 @@ def fly(campaign: Campaign, arguments: argparse.Namespace, parent: str) -> int:
     if problem is not None:
         raise ConfigError([f"companion {campaign.name}: --out {folder}: {problem}"])
     try:
-        return run(campaign, folder, None if arguments.json else wide_console(CAMPAIGN_WIDTH))
+        return run(campaign, folder, console)
     finally:
         # Removes empty folders only: those of a campaign in which no flight ended.
         with contextlib.suppress(OSError):

@@ -8,7 +8,7 @@ from typing import Any
 
 from companion.campaigns.compare.campaign import Compare
 from companion.campaigns.compare.grid import ADAPTATION, flights_of, variants_of
-from companion.cli.campaign import add_options, checked, common, count, fly, names
+from companion.cli.campaign import add_options, add_plan, checked, common, count, fly, names
 from companion.cli.options import MISSION_OR_DEFAULT_HELP
 from companion.config.controller import PRESETS
 from companion.config.document import ConfigError
@@ -53,6 +53,7 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--mission", default=DEFAULT_MISSION, metavar="FILE", help=MISSION_OR_DEFAULT_HELP)
     add_options(parser, one_law=False)
+    add_plan(parser)
     parser.set_defaults(run=run)
 
 

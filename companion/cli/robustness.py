@@ -8,7 +8,7 @@ from typing import Any
 
 from companion.campaigns.robustness.campaign import Robustness
 from companion.campaigns.robustness.cases import Case, Cases, read_cases
-from companion.cli.campaign import add_options, checked, common, count, fly
+from companion.cli.campaign import add_options, add_plan, checked, common, count, fly
 from companion.cli.options import MISSION_OR_DEFAULT_HELP
 from companion.config.document import ConfigError
 from companion.config.shipped import DEFAULT_MISSION
@@ -43,6 +43,7 @@ def add_parser(commands: Any) -> None:
         "--keep", metavar="FILE", help="write the ten worst draws, or the flown cases, with their results to FILE"
     )
     add_options(parser, one_law=True, world=None)
+    add_plan(parser)
     parser.set_defaults(run=run)
 
 

@@ -25,7 +25,9 @@ import it.
 def fly_all(
     fly: Fly, configs: Sequence[SitlConfig], flights: Sequence[Data], jobs: int | None, scheduler: str | None
 ) -> Generator[Data, None, None]:
-    """Fly all flights; yield results with their `index` and `wall_s` in the order in which the flights end.
+    """Fly all flights; yield results in the order in which the flights end.
+
+    Each has also its `index`, `wall_s`, `cpu_s` (processor time), and `at_once`, the number of simultaneous flights.
 
     Raises:
         CampaignError: there is no scheduler or no worker, or a worker died.
@@ -38,22 +40,24 @@ def fly_all(
 
 
 def _fly(fly: Fly, index: int, config_json: str, flight: Data) -> Data:
-    begin_s = time.perf_counter()
+    begin_s, begin_cpu_s = time.perf_counter(), time.thread_time()
     result = fly(SitlConfig.model_validate_json(config_json), flight)
-    return {"index": index, **result, "wall_s": time.perf_counter() - begin_s}
+    cpu_s, wall_s = time.thread_time() - begin_cpu_s, time.perf_counter() - begin_s
+    return {"index": index, **result, "wall_s": wall_s, "cpu_s": cpu_s}
 
 
 def _over_cores(tasks: Sequence[tuple[Fly, int, str, Data]], jobs: int) -> Generator[Data, None, None]:
     from joblib import Parallel, delayed, parallel_config
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    jobs = min(jobs, len(tasks))
+    at_once, jobs = jobs, min(jobs, len(tasks))
     if jobs <= 1:
-        yield from (_fly(*task) for task in tasks)
+        yield from ({**_fly(*task), "at_once": at_once} for task in tasks)
         return
     with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1):
         try:
-            yield from Parallel(return_as="generator_unordered", batch_size=1)(delayed(_fly)(*task) for task in tasks)
+            results = Parallel(return_as="generator_unordered", batch_size=1)(delayed(_fly)(*task) for task in tasks)
+            yield from ({**result, "at_once": at_once} for result in results)
         except TerminatedWorkerError:
             raise CampaignError(
                 "a worker process died (killed, or out of memory?); fewer --jobs use less memory"
@@ -80,10 +84,11 @@ def _over_machines(tasks: Sequence[tuple[Fly, int, str, Data]], scheduler: str) 
                 f"--scheduler {scheduler}: no worker has joined it; start one with: dask worker {scheduler}",
                 bad_input=True,
             ) from None
+        at_once = sum(client.nthreads().values())
         futures = [client.submit(_fly, *task, pure=False) for task in tasks]
         try:
             for _, result in as_completed(futures, with_results=True):
-                yield result
+                yield {**result, "at_once": at_once}
         except KilledWorker:
             raise CampaignError(f"--scheduler {scheduler}: its workers keep dying; see their logs") from None
         except ImportError as error:

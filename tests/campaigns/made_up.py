@@ -38,7 +38,9 @@ def fly_made_up(
     def start(campaign: Campaign, out: Path) -> contextlib.AbstractContextManager[Flights]:
         made = [(index, row_of(flight)) for index, flight in enumerate(campaign.job()["flights"])]
         messages = [
-            {"index": index, "row": row, "series": series, "wall_s": 0.1} for index, row in made if row is not None
+            {"index": index, "row": row, "series": series, "wall_s": 0.1, "cpu_s": 0.5 + index % 2, "at_once": 4}
+            for index, row in made
+            if row is not None
         ]
         return contextlib.nullcontext(Flights(messages[::-1], error))
 
