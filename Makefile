@@ -68,7 +68,7 @@ debian:
 	fi; \
 	echo "not installed:$$missing; the tests that need them are skipped (on Debian: apt install$$missing)"
 
-# 14 minutes, ten of them a hover; one minute of it: make bench BENCH=--quick
+# 16 minutes, ten of them a hover; one minute of it: make bench BENCH=--quick
 bench: install debian
 	@$(BIN)/python -m benchmarks $(BENCH)
 

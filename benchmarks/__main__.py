@@ -34,11 +34,12 @@ from benchmarks.measuring.figures import problems
 from benchmarks.measuring.page import markdown, show
 from benchmarks.measuring.rows import sections
 from companion.recorder.versions import versions
+from tools.compiled import BUILD
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "build" / "benchmarks"
 PAGE = ROOT / "docs" / "benchmarks.md"
-DEADLINE_S = {"core": 300.0, "joints": 120.0, "setpoint": 900.0, "hover": 1500.0}
+DEADLINE_S = {"core": 300.0, "compiled": 300.0, "pi": 300.0, "joints": 120.0, "setpoint": 900.0, "hover": 1500.0}
 """Deadline of each part, in the order in which they run."""
 LAND_S = 400.0
 """Time that a part has to end after Ctrl-C: its flight lands first."""
@@ -55,6 +56,18 @@ def _core(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
     from benchmarks.measuring.core import REPEATS, measure
 
     return measure(say, 2 if quick else REPEATS)
+
+
+def _compiled(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
+    from benchmarks.measuring.core import REPEATS, measure_compiled
+
+    return measure_compiled(say, 2 if quick else REPEATS)
+
+
+def _pi(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
+    from benchmarks.measuring.pi import measure
+
+    return measure(say)
 
 
 def _joints(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
@@ -82,7 +95,7 @@ def _hover(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
     return measure(folder, QUICK_HOVER_S if quick else HOVER_S, say)
 
 
-PARTS = {"core": _core, "joints": _joints, "setpoint": _setpoint, "hover": _hover}
+PARTS = {"core": _core, "compiled": _compiled, "pi": _pi, "joints": _joints, "setpoint": _setpoint, "hover": _hover}
 
 
 def run_part(name: str, folder: Path, quick: bool) -> int:
@@ -115,8 +128,13 @@ def measure(name: str, out: Path, quick: bool) -> dict[str, Any]:
     with (folder / "stderr.txt").open("wb") as stderr:
         pressed: list[int] = []
         before = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))  # while the part starts
+        first = (BUILD, ROOT) if name == "compiled" else (ROOT,)
         process = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks", *words], cwd=ROOT, stderr=stderr, start_new_session=True
+            [sys.executable, "-P", "-m", "benchmarks", *words],
+            cwd=ROOT,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, first))},
+            stderr=stderr,
+            start_new_session=True,
         )
         try:
             signal.signal(signal.SIGINT, before)

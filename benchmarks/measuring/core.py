@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -16,6 +17,7 @@ from companion.control.types import PlantState, Wrench
 from companion.core.flight_core import FlightCore
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.types import Inputs, Outcome, Reference
+from companion.runtime.compiled import COMPILED
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from sitl.world.world import PHYSICS_DT_S, World
@@ -43,11 +45,34 @@ def measure(say: Callable[[str], None], repeats: int = REPEATS, mission: Path = 
     return {
         "core_ms": asdict(Latency.of(core_s(flight.config, result.inputs))),
         "tick_us": tick_us,
+        "catches_min": catches_min(tick_us, len(result.inputs)),
         "law_us": law_us(flight.config, result.inputs, repeats),
         "law_without_loads_us": law_us(flight.config.model_copy(update={"controller": plain}), result.inputs, repeats),
         "raw_step_us": raw_us,
         "raw_tick_us": raw_us * TICK_PERIOD_S / PHYSICS_DT_S,
     }
+
+
+def measure_compiled(say: Callable[[str], None], repeats: int = REPEATS, mission: Path = CATCH) -> dict[str, Any]:
+    """Time the core and the tick of the compiled build.
+
+    Raises:
+        RuntimeError: there is no compiled build, or the flight did not complete.
+    """
+    if not COMPILED:
+        raise RuntimeError("there is no compiled build; run make compile")
+    say("flights in the fast closed loop")
+    tick_us, flight, result = flight_us(load_sitl(mission), repeats)
+    return {
+        "core_ms": asdict(Latency.of(core_s(flight.config, result.inputs))),
+        "tick_us": tick_us,
+        "catches_min": catches_min(tick_us, len(result.inputs)),
+    }
+
+
+def catches_min(tick_us: float, ticks: int) -> float:
+    """Return how long 10,000 flights of so many ticks take on all cores of this computer, if they are free."""
+    return 1e4 * ticks * tick_us * 1e-6 / (os.cpu_count() or 1) / 60.0
 
 
 def flight_us(config: SitlConfig, repeats: int) -> tuple[float, FastFlight, FastResult]:

@@ -30,7 +30,7 @@ from benchmarks.measuring.hovering import (
 )
 from benchmarks.measuring.late import alone_late
 from benchmarks.measuring.latency import RATE_HZ, Latency
-from benchmarks.soaking.processes import Usage, family, usage
+from benchmarks.soaking.processes import Usage, family, threads, usage
 from benchmarks.soaking.verdict import ROLES as FLIGHT_ROLES
 from companion.model.constants import TICK_PERIOD_S
 from companion.runtime.realtime import FLIGHT_PRIORITY, realtime_permitted
@@ -48,6 +48,10 @@ EMPTY, BARE = "empty loop", "bare loop"
 ROLES = (*FLIGHT_ROLES, EMPTY, BARE)
 
 Figures = dict[str, Any]
+
+
+Threads = tuple[float, dict[str, tuple[float, float]]]
+"""A time, and the user and system time of each thread of the flight process until then, s."""
 
 
 class PartError(Exception):
@@ -91,10 +95,10 @@ def measure(folder: Path, hover_s: float, say: Callable[[str], None]) -> Figures
         frames = round((hover_s - BARE_LEAD_S) * RATE_HZ)
         bare = stack.enter_context(_beside("bare", folder, *_loop("bare", folder / "bare.json"), str(frames)))
         say(f"hovering for {hover_s:g} s")
-        samples, machine = _watch(flight, empty.pid, bare, hover_s, say)
+        samples, machine, by_thread = _watch(flight, empty.pid, bare, hover_s, say)
         viewer = _viewer(watching, folder / "viewer.txt")
     say("reading the log")
-    return _judge(folder, flight.returncode, samples, machine, viewer, to_wall_s)
+    return _judge(folder, flight.returncode, samples, machine, by_thread, viewer, to_wall_s)
 
 
 def _await_viewer(process: subprocess.Popen[bytes], said: Path) -> None:
@@ -150,11 +154,12 @@ def _watch(
     bare: subprocess.Popen[bytes],
     hover_s: float,
     say: Callable[[str], None],
-) -> tuple[dict[str, _Sampled], list[tuple[float, ...]]]:
+) -> tuple[dict[str, _Sampled], list[tuple[float, ...]], list[Threads]]:
     """Sample every process and the whole computer once a second until the flight has ended."""
     begun_s = next_s = time.monotonic()
     samples: dict[str, _Sampled] = {}
     machine: list[tuple[float, ...]] = []
+    by_thread: list[Threads] = []
     pids: dict[str, int] = {}
     number = 0
     while flight.poll() is None:
@@ -170,13 +175,15 @@ def _watch(
                 sampled.t_s.append(now_s)
                 sampled.used.append(used)
         machine.append((now_s, *machine_cpu()))
+        if "flight" in pids and (found := threads(pids["flight"])):
+            by_thread.append((now_s, found))
         number += 1
         if number % SAY_EVERY == 0:
             say(f"{number} of {hover_s:g} s")
         next_s += SAMPLE_S
         with contextlib.suppress(subprocess.TimeoutExpired):
             flight.wait(max(0.0, next_s - time.monotonic()))
-    return samples, machine
+    return samples, machine, by_thread
 
 
 def machine_cpu() -> tuple[float, float, float]:
@@ -197,6 +204,7 @@ def _judge(
     code: int,
     samples: dict[str, _Sampled],
     machine: Sequence[tuple[float, ...]],
+    by_thread: Sequence[Threads],
     viewer: str,
     to_wall_s: float,
 ) -> Figures:
@@ -232,6 +240,7 @@ def _judge(
         **_latencies(log),
         "bare": _bare(folder),
         "processes": {role: _of_process(sampled, begin_s, end_s) for role, sampled in samples.items()},
+        "threads": of_threads([row for row in by_thread if begin_s <= row[0] <= end_s]),
         "machine": _machine([row for row in machine if begin_s <= row[0] <= end_s]),
     }
 
@@ -293,6 +302,20 @@ def _of_process(sampled: _Sampled, begin_s: float, end_s: float) -> Figures | No
         "cpu_percent_worst": max(seconds),
         "rss_mb": max(used.rss_mb for _, used in kept),
         "minor_faults_s": (last.minor_faults - first.minor_faults) / span_s,
+    }
+
+
+def of_threads(rows: Sequence[Threads]) -> Figures | None:
+    """Return user and system time of each thread between the first and the last row, % of one core; None if there are too few."""
+    if len(rows) < 2:
+        return None
+    (first_s, first), (last_s, last) = rows[0], rows[-1]
+    return {
+        name: {
+            kind: 100.0 * (after - before) / (last_s - first_s)
+            for kind, after, before in zip(("user", "system"), last[name], first.get(name, (0.0, 0.0)), strict=True)
+        }
+        for name in last
     }
 
 

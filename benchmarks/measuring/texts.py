@@ -48,6 +48,17 @@ time, median of repeats, as for the law and the whole tick. In flight the core r
 caches.
 """)
 
+PI = _paragraphs("""
+Nothing was measured on a Raspberry Pi. The CPU time of the flight's threads here, during the hover above, is multiplied by how much
+slower the Pi runs other programs: nine programs of pyperformance in pure Python, run here with the Python of the flight, beside their
+published times on a Pi 5; for the Pi 4 also the published times of 25 C++ programs on both. The estimate takes the geometric mean; from
+and to are two standard deviations of the programs away, which holds 19 programs of 20. Sources: `benchmarks/measuring/pi.py`.
+
+This was preferred to counting instructions, because no measured instructions per cycle of CPython on these cores were found. Time in
+the kernel and in native code is multiplied by the same factor. Drivers of USB serial ports and of the card are not included. The
+check applies the same factors to a program whose time on a Pi 4 is published.
+""")
+
 COST = _paragraphs("""
 During the same hover, from the kernel's accounting, once a second. % of one core.
 """)

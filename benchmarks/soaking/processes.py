@@ -72,6 +72,25 @@ def usage(pid: int) -> Usage | None:
     return Usage(pages * _PAGE_BYTES / 1e6, (int(fields[11]) + int(fields[12])) / _CLOCK_TICKS, int(fields[7]))
 
 
+MAIN, NATIVE = "main", "native"
+"""Names under which `threads` counts the main thread, and all threads that have no name of their own: those of native libraries."""
+
+
+def threads(pid: int) -> dict[str, tuple[float, float]]:
+    """Return the user and the system time of a process's threads by name since their start, s; empty if it has ended."""
+    found: dict[str, tuple[float, float]] = {}
+    with contextlib.suppress(OSError):
+        own_name = Path(f"/proc/{pid}/comm").read_text()
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            with contextlib.suppress(OSError, IndexError):
+                name = (task / "comm").read_text()
+                fields = (task / "stat").read_text().rpartition(")")[2].split()
+                kind = MAIN if task.name == str(pid) else NATIVE if name == own_name else name.strip()
+                user_s, system_s = found.get(kind, (0.0, 0.0))
+                found[kind] = user_s + int(fields[11]) / _CLOCK_TICKS, system_s + int(fields[12]) / _CLOCK_TICKS
+    return found
+
+
 def pss_mb(pid: int) -> float | None:
     """Return the proportional set size in 1e6 bytes. It is expensive, because the kernel walks all pages."""
     try:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Final, TypeVar
 
 from companion.io.protocols import DeviceError
+from companion.runtime.native_threads import name_thread
 
 _CLOSE_TIMEOUT_S: Final = 2.0
 _T = TypeVar("_T")
@@ -82,6 +83,7 @@ class DeviceThread:
 
     def _run(self, opened: asyncio.Future[DeviceError | None]) -> None:
         try:
+            name_thread(self._name)
             failure = self._open_device()
             self.post(functools.partial(resolve, opened, failure))
             if failure is None:
