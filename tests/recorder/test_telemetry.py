@@ -139,7 +139,7 @@ def test_a_broker_that_dies_and_comes_back_costs_no_sample_and_is_reported_every
         flight.wait(
             lambda: "no broker" in (flight.recorder.client.telemetry_status or ""), "the flight is not told of the loss"
         )
-        flight.fly(3000)
+        flight.fly(2500)
         broker.start()
         with Listener(broker.port) as listener:
             events = listener.wait(Topic.EVENTS, Events, lambda events: events.count >= 3)
