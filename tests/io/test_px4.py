@@ -522,6 +522,24 @@ def test_an_origin_that_px4_has_is_left_alone() -> None:
     asyncio.run(fly())
 
 
+@pytest.mark.parametrize(
+    ("forwarding", "armed", "interval_us"), [(False, False, -1.0), (True, False, 0.0), (False, True, None)]
+)
+def test_streams_without_a_reader_are_stopped(forwarding: bool, armed: bool, interval_us: float | None) -> None:
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            peer.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
+            device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+            async with MavsdkAutopilot(device, flight_clock(), forwarding=forwarding):
+                pass
+            for unread in (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ODOMETRY):
+                assert peer.asked_interval_us.get(unread) == interval_us
+            assert peer.asked_interval_us[mavlink.MAVLINK_MSG_ID_HIGHRES_IMU] > 0.0
+
+    asyncio.run(fly())
+
+
 def test_estimator_status_is_asked_for_and_reported() -> None:
     async def fly() -> None:
         port = free_udp_port()

@@ -35,6 +35,19 @@ def test_px4_modes(main: int, sub: int, mode: FlightMode) -> None:
     assert messages.flight_mode(CUSTOM, main << 16 | sub << 24) is mode
 
 
+def test_mavsdks_null_is_nan_and_a_missing_time_is_none() -> None:
+    position_m, velocity_m_s = messages.local_position_ned('{"x":1,"y":-2.5,"z":null,"vx":0.1,"vy":0.2,"vz":0.3}')
+    assert position_m[:2] == (1.0, -2.5)
+    assert math.isnan(position_m[2])
+    assert velocity_m_s == (0.1, 0.2, 0.3)
+    fields = '"q1":1.0,"q2":0.0,"q3":0.0,"q4":null,"rollspeed":0.5,"pitchspeed":-0.5,"yawspeed":0.25,"more":[0]}'
+    q, rates_rad_s, boot_s = messages.attitude_quaternion('{"time_boot_ms":1500,' + fields)
+    assert (q[:3], math.isnan(q[3]), rates_rad_s, boot_s) == ((1.0, 0.0, 0.0), True, (0.5, -0.5, 0.25), 1.5)
+    assert messages.attitude_quaternion('{"time_boot_ms":0,' + fields)[2] is None
+    assert messages.highres_imu('{"time_usec":2500000,"xacc":1,"yacc":2,"zacc":3}') == ((1.0, 2.0, 3.0), 2.5)
+    assert messages.highres_imu('{"time_usec":0,"xacc":1,"yacc":2,"zacc":3}')[1] is None
+
+
 def test_a_mode_without_the_custom_flag_is_unknown() -> None:
     assert messages.flight_mode(0, 6 << 16) is FlightMode.UNKNOWN
 

@@ -26,7 +26,7 @@ from companion.io.protocols import DeviceError
 from companion.io.px4 import messages
 from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls
 from companion.io.px4.claim import LinkClaim
-from companion.io.px4.inbox import ESTIMATOR_RATE_HZ, Inbox, ask_for_streams
+from companion.io.px4.inbox import ESTIMATOR_RATE_HZ, Inbox, ask_for_streams, stop_unread_streams
 from companion.io.px4.link import (
     add_connection,
     check_address,
@@ -143,6 +143,9 @@ class MavsdkAutopilot:
             await ask_for_streams(address, self._calls, *streams)
             self._open = True
             await self.ensure_origin()
+            if not await self._armed():  # a vehicle in flight does not wait for it
+                link = (address, self._calls, self._direct, self._system_id)
+                await stop_unread_streams(*link, forwarded=self._forwarding)
             claim.refuse_rivals()
         except BaseException:
             await self._close()

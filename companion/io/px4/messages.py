@@ -10,6 +10,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import msgspec
+
 from companion.model.estimator import EstimatorReport
 from companion.model.frames import (
     attitude_enu_flu_from_ned_frd,
@@ -33,6 +35,11 @@ from companion.model.types import (
 
 GPS_GLOBAL_ORIGIN_ID = 49
 ESTIMATOR_STATUS_ID = 230
+UNREAD_IDS = (30, 33, 36, 65, 74, 83, 85, 87, 141, 290, 291, 331)
+"""Streams of PX4's onboard mode (mavlink_main.cpp, MAVLINK_MODE_ONBOARD) at 10 Hz and above that the companion does not read:
+ATTITUDE, GLOBAL_POSITION_INT, SERVO_OUTPUT_RAW, RC_CHANNELS, VFR_HUD, ATTITUDE_TARGET, POSITION_TARGET_LOCAL_NED,
+POSITION_TARGET_GLOBAL_INT, ALTITUDE, ESC_INFO, ESC_STATUS, ODOMETRY. TIMESYNC stays, for PX4's clock.
+"""
 _REQUEST_MESSAGE, _SET_MESSAGE_INTERVAL = 512, 511
 GROUND_STATION_HEARTBEAT_JSON = (
     '{"type":6,"autopilot":8,"base_mode":0,"custom_mode":0,"system_status":4,"mavlink_version":3}'
@@ -100,6 +107,62 @@ def flight_mode(base_mode: int, custom_mode: int) -> FlightMode:
     if main == _PX4_MAIN_MODE_AUTO:
         return _PX4_AUTO_SUB_MODES.get(sub, FlightMode.OTHER)
     return FlightMode.MANUAL if main in _PX4_PILOT_MAIN_MODES else FlightMode.OTHER
+
+
+class _LocalPosition(msgspec.Struct):
+    x: float | None
+    y: float | None
+    z: float | None
+    vx: float | None
+    vy: float | None
+    vz: float | None
+
+
+class _Attitude(msgspec.Struct):
+    time_boot_ms: int
+    q1: float | None
+    q2: float | None
+    q3: float | None
+    q4: float | None
+    rollspeed: float | None
+    pitchspeed: float | None
+    yawspeed: float | None
+
+
+class _Imu(msgspec.Struct):
+    time_usec: int
+    xacc: float | None
+    yacc: float | None
+    zacc: float | None
+
+
+_local_position = msgspec.json.Decoder(_LocalPosition)
+_attitude = msgspec.json.Decoder(_Attitude)
+_imu = msgspec.json.Decoder(_Imu)
+
+
+def local_position_ned(fields_json: str) -> tuple[Vec3, Vec3]:
+    """Return position (m) and velocity (m/s) of LOCAL_POSITION_NED in NED. MAVSDK writes NaN as null; it is NaN again here."""
+    m = _local_position.decode(fields_json)
+    return (_number(m.x), _number(m.y), _number(m.z)), (_number(m.vx), _number(m.vy), _number(m.vz))
+
+
+def attitude_quaternion(fields_json: str) -> tuple[Quat, Vec3, float | None]:
+    """Return attitude FRD -> NED, body rates FRD (rad/s) and time since boot (s; None if it is 0) of ATTITUDE_QUATERNION."""
+    m = _attitude.decode(fields_json)
+    q = (_number(m.q1), _number(m.q2), _number(m.q3), _number(m.q4))
+    rates_rad_s = (_number(m.rollspeed), _number(m.pitchspeed), _number(m.yawspeed))
+    return q, rates_rad_s, m.time_boot_ms * 1e-3 if m.time_boot_ms else None
+
+
+def highres_imu(fields_json: str) -> tuple[Vec3, float | None]:
+    """Return specific force FRD (m/s^2) and time since boot (s; None if it is 0) of HIGHRES_IMU."""
+    m = _imu.decode(fields_json)
+    return (_number(m.xacc), _number(m.yacc), _number(m.zacc)), m.time_usec * 1e-6 if m.time_usec else None
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def landed_state(value: int) -> LandedState:
@@ -214,6 +277,16 @@ def request_message_json(message_id: int, target_system: int) -> str:
 def set_message_interval_json(message_id: int, rate_hz: float, target_system: int) -> str:
     """Return COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL (511), which requests a stream; PX4 expects the interval in us."""
     return _command_json(_SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate_hz, target_system)
+
+
+def stop_message_json(message_id: int, target_system: int) -> str:
+    """Return COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL (511) with interval -1, which stops a stream."""
+    return _command_json(_SET_MESSAGE_INTERVAL, float(message_id), -1.0, target_system)
+
+
+def default_message_interval_json(message_id: int, target_system: int) -> str:
+    """Return COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL (511) with interval 0, which requests PX4's default rate."""
+    return _command_json(_SET_MESSAGE_INTERVAL, float(message_id), 0.0, target_system)
 
 
 def estimator_report(fields: Mapping[str, Any], stamp_s: float) -> EstimatorReport:
