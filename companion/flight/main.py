@@ -104,7 +104,7 @@ class Flight:
         while True:
             now = await ticker.next()
             turn = self._operator.next()
-            inputs, outputs, sent = await self._tick(tick, now.start_s, now.lateness_s, turn.command, ticker.due_s)
+            inputs, outputs, sent = await self._tick(tick, now.start_s, now.lateness_s, turn.command)
             if turn.asked is not None:
                 self._answer(turn.asked, turn.refused, before, outputs)
             before = outputs
@@ -118,6 +118,8 @@ class Flight:
                 return outputs.outcome
             if tick == 0 and self._devices.found_armed and not self._goes_on(outputs):
                 return Outcome.ABORTED
+            # At the end, because it wakes the bus thread, which competes for the interpreter.
+            self._begin_read(ticker.due_s)
             tick += 1
 
     def _begin_read(self, due_s: float) -> None:
@@ -127,7 +129,7 @@ class Flight:
             arm.begin_read(due_s - min(JOINT_LEAD_MAX_S, arm.read_takes_s + JOINT_MARGIN_S))
 
     async def _tick(
-        self, tick: int, start_s: float, lateness_s: float, command: OperatorCommand, next_due_s: float
+        self, tick: int, start_s: float, lateness_s: float, command: OperatorCommand
     ) -> tuple[Inputs, Outputs, Sent]:
         devices = self._devices
         arm_state = await devices.arm.read(JOINT_READ_TIMEOUT_S) if devices.arm is not None else None
@@ -148,13 +150,11 @@ class Flight:
         outputs = self._core.step(inputs)
         devices.vision.open = outputs.mocap_trusted
         core_s = self._clock()
-        # The setpoint first: passing the currents wakes the bus thread, which competes for the interpreter.
         attitude_sent = devices.autopilot.send_attitude(outputs.attitude)
         setpoint_s = self._clock()
         torque_sent: Joints | None = None
         if outputs.arm_torque_nm is not None and devices.arm is not None:
             torque_sent = devices.arm.write_torque(outputs.arm_torque_nm)
-        self._begin_read(next_due_s)  # right after the write, so that the bus thread wakes once for both
         current_s = self._clock()
         if outputs.request is not AutopilotRequest.NONE:
             devices.autopilot.request(outputs.request)

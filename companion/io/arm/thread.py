@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import queue
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Final, Generic, Self, TypeVar
+from typing import ClassVar, Final, Generic, Self, TypeVar
 
 from msgspec.structs import replace
 
@@ -50,7 +52,10 @@ Goal = TypeVar("Goal")
 
 
 class ThreadedArm(ABC, Generic[Answer, Goal]):
-    """An arm on a bus behind the `Arm` protocol. The methods at the end are the bus; only the thread calls them.
+    """An arm on a bus behind the `Arm` protocol. The methods at the end are the bus, which the thread calls.
+
+    The thread makes all transactions but one: with `writes_at_once` a goal is sent by the event loop itself, unless the thread is using
+    the bus at that moment. That costs one system call, less than waking the thread, which would then compete for the interpreter.
 
     Without read requests the thread reads by itself, often enough that the bus watchdogs do not trip. A torque that is not renewed
     within the timeout of the watchdog is set to 0. The watchdogs themselves cover the case that the whole process stops.
@@ -62,6 +67,9 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
         clock: the flight clock, source of all stamps.
     """
 
+    writes_at_once: ClassVar[bool] = False
+    """Whether `_write_bus` never waits and may be called in the event loop."""
+
     def __init__(self, where: str, watchdog_ms: int, limp: Goal, clock: Clock) -> None:
         self._where = where
         self._watchdog_s = watchdog_ms * 1e-3
@@ -71,6 +79,7 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
         """Queue of `_Read` objects and of the markers above."""
         self._goals: deque[Goal] = deque(maxlen=1)
         self._goal_handed_s = 0.0
+        self._bus_in_use = threading.Lock()
         self._state: ArmState | None = None
         self._failures = 0
         self._written_s: float | None = None
@@ -152,7 +161,7 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
         return self._state
 
     def write_torque(self, torque_nm: Joints) -> Joints:
-        """Pass one command to the bus thread.
+        """Send one command, or pass it to the bus thread; never waits.
 
         Args:
             torque_nm: joint torques with the paper's signs, N m.
@@ -165,8 +174,15 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
         """
         goal, sent_nm = self._encode(torque_nm)
         self._goal_handed_s = time.monotonic()
-        self._goals.append(goal)
-        self._jobs.put(_WRITE)
+        if self.writes_at_once and self._bus_in_use.acquire(blocking=False):
+            try:
+                self._goals.clear()  # an older one that the thread has not sent yet
+                self._write(goal)
+            finally:
+                self._bus_in_use.release()
+        else:
+            self._goals.append(goal)
+            self._jobs.put(_WRITE)
         return sent_nm
 
     # --- bus thread --------------------------------------------------------------------------------------------------
@@ -187,7 +203,6 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
 
     def _serve(self) -> None:
         watchdog_s, limp = self._watchdog_s, self._limp
-        sent = limp
         later: _Read | None = None
         while True:
             wait_s = watchdog_s / KEEPALIVES_PER_WATCHDOG
@@ -200,7 +215,7 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
             if job is _STOP:
                 return
             if job is _WRITE:
-                sent = self._write_newest(sent)
+                self._write_newest()
                 continue
             if isinstance(job, _Read):
                 later = job
@@ -214,27 +229,30 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
             if reading is not None:
                 later = None
                 reading.begun = True
-            tripped = self._read_once()
+            with self._bus_in_use:
+                tripped = self._read_once()
             if reading is not None:
                 reading.done = True
                 if reading.waiter is not None:
                     self._thread.post(functools.partial(resolve, reading.waiter, None))
             if tripped:
-                sent = limp
-                self._try(self._restart_watchdogs)
+                with self._bus_in_use:
+                    self._try(self._restart_watchdogs)
             elif self._goal_handed_s > 0.0 and time.monotonic() - self._goal_handed_s > watchdog_s:
                 # Repeated, because a sync write has no reply and our reads keep the servos' watchdogs from tripping.
-                sent = limp
-                self._try(lambda: self._write_bus(limp))
+                with self._bus_in_use:
+                    self._try(lambda: self._write_bus(limp))
 
-    def _write_newest(self, sent: Goal) -> Goal:
-        try:
-            goal = self._goals.pop()
-        except IndexError:
-            return sent  # an earlier pass has already taken the newest
+    def _write_newest(self) -> None:
+        with (
+            self._bus_in_use,
+            contextlib.suppress(IndexError),
+        ):  # an earlier pass or the event loop has sent a newer one
+            self._write(self._goals.pop())
+
+    def _write(self, goal: Goal) -> None:
         self._try(lambda: self._write_bus(goal))
         self._written_s = self._clock()
-        return goal
 
     def _read_once(self) -> bool:
         """Read and publish the state. Return whether a bus watchdog had tripped."""
@@ -287,7 +305,7 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
 
     @abstractmethod
     def _write_bus(self, goal: Goal) -> None:
-        """Send a goal to all joints."""
+        """Send a goal to all joints; with `writes_at_once` also called in the event loop."""
 
     @abstractmethod
     def _restart_watchdogs(self) -> None:

@@ -25,6 +25,7 @@ class DynamixelArm(ThreadedArm[tuple[Block, ...], Counts]):
     """
 
     options = DynamixelOptions
+    writes_at_once = True
 
     def __init__(self, device: ArmDevice, arm: Arm, clock: Clock) -> None:
         super().__init__(f"arm bus {device.port}", device.watchdog_ms, (0,) * len(arm.joints), clock)

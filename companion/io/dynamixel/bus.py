@@ -95,7 +95,7 @@ class ArmBus:
             OSError: the port is gone.
         """
         port, protocol, ids = self._port, self._protocol, self._ids
-        port.is_using = False  # an exception in an earlier transaction leaves it set
+        self._begin()
         if protocol.syncReadTx(port, dxl.INDIRECT_DATA_1, dxl.BLOCK_SIZE, ids, len(ids), False) != COMM_SUCCESS:
             return None
         blocks: list[Block] = []
@@ -117,7 +117,7 @@ class ArmBus:
         Raises:
             OSError: the port is gone.
         """
-        self._port.is_using = False
+        self._begin(discard=False)  # it has no reply; the next read discards
         parameters: list[int] = []
         for servo_id, count in zip(self._ids, counts, strict=True):
             parameters += (servo_id, count & 0xFF, count >> 8 & 0xFF)
@@ -174,7 +174,7 @@ class ArmBus:
     def _check_identity(self, joint: Joint) -> None:
         for _ in range(SETUP_ATTEMPTS):
             self._check_time()
-            self._port.is_using = False
+            self._begin()
             model, result, error = self._protocol.ping(self._port, joint.servo_id)
             if _arrived(result, error):
                 break
@@ -265,6 +265,11 @@ class ArmBus:
             voltage_v=round(self._read(joint, dxl.PRESENT_VOLTAGE) * dxl.VOLTAGE_UNIT_V, 1),
         )
 
+    def _begin(self, *, discard: bool = True) -> None:
+        """Prepare the port for a transaction that first discards what has arrived, unless `discard` is False."""
+        self._port.is_using = False  # an exception in an earlier transaction leaves it set
+        self._port.discards_input = discard
+
     # --- registers ---------------------------------------------------------------------------------------------------
 
     def _read(self, joint: Joint, register: Register) -> int:
@@ -274,7 +279,7 @@ class ArmBus:
     def _read_bytes(self, joint: Joint, register: Register) -> bytes:
         for _ in range(SETUP_ATTEMPTS):
             self._check_time()
-            self._port.is_using = False
+            self._begin()
             data, result, error = self._protocol.readTxRx(self._port, joint.servo_id, register.address, register.size)
             if _arrived(result, error):
                 break
@@ -288,7 +293,7 @@ class ArmBus:
         """Write and read back; a lost or corrupt packet is repeated, as in `_read_bytes`."""
         for _ in range(SETUP_ATTEMPTS):
             self._check_time()
-            self._port.is_using = False
+            self._begin()
             result, error = self._protocol.writeTxRx(self._port, joint.servo_id, register.address, len(data), data)
             if _arrived(result, error):
                 break
@@ -300,7 +305,7 @@ class ArmBus:
             )
 
     def _try_write(self, servo_id: int, register: Register, value: int) -> None:
-        self._port.is_using = False
+        self._begin()
         data = list(value.to_bytes(register.size, "little"))
         self._protocol.writeTxRx(self._port, servo_id, register.address, register.size, data)
 

@@ -199,6 +199,8 @@ class ServoPort(PortHandler):  # type: ignore[misc]
     late_reply_ms = 100.0
     """Pause after a timeout, in which a late reply is discarded. A reply does not name its register: without the pause it
     would be taken for the reply to the next request. 0 where all requests are the same."""
+    discards_input = True
+    """Whether `clearPort` discards what has arrived. A request without a reply needs no such system call."""
 
     def setupPort(self, cflag_baud: int) -> bool:
         """Open the port at `self.baudrate` (called by the SDK).
@@ -244,12 +246,14 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         self._taken_bytes = 0
 
     def clearPort(self) -> None:
-        """Discard the bytes that have arrived; after a timeout, also wait for a late reply and discard it. The SDK calls this before
-        each request.
+        """Discard the bytes that have arrived; after a timeout, also wait for a late reply and discard it. Do nothing unless
+        `discards_input`. The SDK calls this before each request.
 
         Raises:
             OSError: the port is gone.
         """
+        if not self.discards_input:
+            return
         if self._reply_missing:
             self._reply_missing = False
             end_ms = self.getCurrentTime() + self.late_reply_ms
