@@ -17,11 +17,11 @@ from companion.control.types import PlantState, Wrench
 from companion.core.flight_core import FlightCore
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.types import Inputs, Outcome, Reference
-from companion.runtime.compiled import COMPILED
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from sitl.world.world import PHYSICS_DT_S, World
 from tests.support import CATCH
+from tools.compiled import is_current
 
 REPEATS = 5
 NO_LOADS = {"load_rate_xyz": (0.0, 0.0, 0.0), "moment_rate": (0.0,), "friction_rate": (0.0,)}
@@ -57,10 +57,10 @@ def measure_compiled(say: Callable[[str], None], repeats: int = REPEATS, mission
     """Time the core and the tick of the compiled build.
 
     Raises:
-        RuntimeError: there is no compiled build, or the flight did not complete.
+        RuntimeError: there is no compiled build of the present source, or the flight did not complete.
     """
-    if not COMPILED:
-        raise RuntimeError("there is no compiled build; run make compile")
+    if not is_current():
+        raise RuntimeError("there is no compiled build of the present source; run make compile")
     say("flights in the fast closed loop")
     tick_us, flight, result = flight_us(load_sitl(mission), repeats)
     return {

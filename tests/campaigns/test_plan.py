@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import pytest
 from companion.campaigns.plan import SAMPLE, Plan
 from companion.campaigns.process import CampaignError
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
+from companion.sitl_config.loader import SitlConfig, load_sitl
+from sitl.campaigns.runner import fly_all
 from tests.campaigns.made_up import compare_row, fly_made_up
 from tests.support import CATCH, run_here
 
@@ -63,6 +66,17 @@ def test_a_plan_flies_a_sample_of_the_whole_campaign_and_writes_nothing(
     assert re.search(r"10000 flights, 4 at a time on this computer: 42 min\n", text)
     assert re.search(r"10000 flights on 100 Dask workers, .*: 100 s\n", text)
     assert list(tmp_path.iterdir()) == []
+
+
+def _nap(config: SitlConfig, flight: dict[str, Any]) -> dict[str, Any]:
+    time.sleep(0.05)
+    return {"row": {"seed": flight["seed"], "mission": config.mission.name}}
+
+
+def test_a_flight_reports_its_processor_time_and_how_many_fly_at_once() -> None:
+    [result] = fly_all(_nap, [load_sitl(CATCH)], [{"variant": 0, "seed": 7}], jobs=3, scheduler=None)
+    assert (result["index"], result["row"]["seed"], result["at_once"]) == (0, 7, 3)
+    assert 0.0 <= result["cpu_s"] <= result["wall_s"] - 0.04, "sleeping takes no processor time"
 
 
 def test_a_plan_without_a_scheduler_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
