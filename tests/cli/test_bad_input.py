@@ -90,7 +90,7 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "no such built-in vehicle": (
         (*FLY, "--vehicle", "tarot"),
-        (r"^--vehicle tarot: expected hexa_2r, tarot650_2r, tarot650_4r or a file, found neither",),
+        (r"^--vehicle tarot: expected hexa_2r, tarot650_2r, tarot650_2r_rod, tarot650_4r or a file, found neither",),
     ),
     "the shipped vehicle file is not written": (
         ("arm", "scan", "--write"),
