@@ -143,7 +143,9 @@ class FlightDisplay:
                 if self._phase == Stage.READY.value:
                     self.say("everything is ready; take off with: companion command start (Ctrl-C cancels the start)")
         elif kind == "event" and message.get("source") == "sitl":
-            if message["kind"] in ("missed", "crashed"):
+            if message["kind"] == "rotor_touched":
+                self._line("", "a rotor touched a surface", "red")
+            elif message["kind"] in ("missed", "crashed"):
                 self._line(
                     "", f"the payload was {message['kind']}" if message["kind"] == "missed" else "crashed", "red"
                 )
