@@ -69,6 +69,16 @@ def test_a_compiled_robustness_campaign_gives_the_rows_of_the_interpreted_one(tm
     assert compiled == interpreted
 
 
+@pytest.mark.skipif(not is_current(), reason="no compiled build of this source: make compile")
+def test_the_compiled_build_makes_the_devices_of_a_flight_over_wires() -> None:
+    made = """
+from companion.io.dynamixel.registers import ServoPort
+from sitl.force_torque import ForceTorqueServer
+print(ServoPort("/dev/none").is_open, ForceTorqueServer().silent)
+"""
+    assert run_by(BUILD, "-c", made).split() == ["False", "False"]
+
+
 def test_the_list_of_modules_names_only_files_that_exist() -> None:
     assert set(modules()) >= {"companion/core/flight_core.py", "sitl/fast/loop.py", "sitl/world/effects/net.py"}
     assert all((ROOT / name).exists() for name in INTERPRETED)
