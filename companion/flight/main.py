@@ -96,6 +96,8 @@ class Flight:
         """Run ticks until the flight ends; return its outcome."""
         ticker = Ticker(self._period_s, self._clock, self._frame_rate_hz)
         self._devices.vision.on_frame = ticker.frame
+        if self._devices.force is not None:
+            self._devices.force.read_in_ticks()
         tick = 0
         before: Outputs | None = None
         if self._devices.ground is not None:

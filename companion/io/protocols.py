@@ -158,6 +158,9 @@ class ForceTorque(Device, Protocol):
     def latest(self) -> ForceSample | None:
         """Return the newest sample as measured, or None before the first."""
 
+    def read_in_ticks(self) -> None:
+        """Read the port in `latest` from now on instead of on arrival, if the event loop reads it: a wake-up less per sample."""
+
     def counts(self) -> ForceCounts:
         """Return the numbers of samples and invalid packets since the device was opened."""
 

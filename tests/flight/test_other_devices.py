@@ -191,6 +191,9 @@ class OtherArm(Standing):
 class OtherForceTorque(Standing):
     product_name, firmware, sample = "another sensor", "", 0
 
+    def read_in_ticks(self) -> None:
+        pass
+
     def counts(self) -> ForceCounts:
         return ForceCounts(samples=self.sample, skipped_bytes=0, bad_sums=0, lost=None)
 

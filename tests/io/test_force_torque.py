@@ -261,6 +261,29 @@ def test_sensor_falls_silent_in_flight() -> None:
 
 
 @pytest.mark.waits
+def test_in_flight_the_ticks_read_the_port() -> None:
+    async def run() -> None:
+        async with ForceTorqueServer() as server:
+            async with world(server):
+                edge = await driver(server.port).__aenter__()
+                edge.read_in_ticks()
+                server.set_wrench((5.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+                before = edge.counts().samples
+                async with asyncio.timeout(WAIT_S):
+                    while (sample := edge.latest()) is None or sample.force_sensor_n[0] != 5.0:  # noqa: ASYNC110 - as the ticks do
+                        await asyncio.sleep(0.005)
+                assert edge.counts().samples > before
+            edge.latest()
+            assert edge.latest() is edge.latest()  # no new bytes: not lost
+            assert edge.counts().lost is None
+        edge.latest()
+        assert edge.counts().lost is not None
+        await edge.__aexit__(None, None, None)
+
+    asyncio.run(run())
+
+
+@pytest.mark.waits
 def test_port_vanishes_in_flight() -> None:
     async def run() -> None:
         server = ForceTorqueServer()

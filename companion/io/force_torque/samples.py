@@ -38,6 +38,9 @@ class SampleStream:
         """Return the newest raw sample; never blocks."""
         return self._latest
 
+    def read_in_ticks(self) -> None:
+        """Do nothing, because a thread reads the sensor; a driver that reads in the event loop overrides it."""
+
     async def tare_samples(self, duration_s: float) -> list[ForceSample]:
         """Return the samples of the next `duration_s` (counted at the configured rate), for the caller to average.
 
