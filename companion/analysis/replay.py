@@ -16,6 +16,8 @@ from companion.plugins import CONTROL_LAWS, installed
 
 PAIRS_FINGERPRINT = "1e7b00d5cd62de28"
 """Fingerprint of the records of versions up to 0.2.0, which differ only in that every arm has two joints."""
+NO_CONTACT_FINGERPRINT = "9b601c4b6d344318"
+"""Fingerprint of the records before there were contact phases, which differ only in the fields of the contact."""
 
 
 class Core(Protocol):
@@ -91,7 +93,7 @@ def check_replayable(log: FlightLog) -> str:
         raise LogError(
             f"{log.path}: was recorded by {found}, but this is companion {__version__}; replay it with the version that recorded it"
         )
-    if about.get("records") not in {fingerprint(Inputs, Outputs, Sent), PAIRS_FINGERPRINT}:
+    if about.get("records") not in {fingerprint(Inputs, Outputs, Sent), PAIRS_FINGERPRINT, NO_CONTACT_FINGERPRINT}:
         raise LogError(
             f"{log.path}: the fields of its records differ from those of this version; it was written by "
             f"{writer(log.metadata)}; replay it with that version"

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.analysis import metrics
+from companion.analysis.contact import contact_summary
 from companion.analysis.log import FlightLog
 from companion.analysis.metrics import Percentiles, TrackingRms
 
@@ -46,6 +47,7 @@ def empty_summary(
         },
         "events": [],
         "tether": {"min_slack_m": None},
+        "contact": None,
         "graded_every": 1,
         "world": None,
         "autopilot": None,
@@ -106,6 +108,7 @@ def summarise(
         stages_ms={stage: _spread(metrics.percentiles(getattr(timing, f"{stage}_s"))) for stage in STAGES},
         events=_events(log),
         tether={"min_slack_m": metrics.min_slack_m(log)},
+        contact=contact_summary(log),
         graded_every=log.stride,
     )
     return summary

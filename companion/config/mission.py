@@ -104,7 +104,53 @@ class Land(Model):
     speed_m_s: Annotated[float, Field(ge=0.05, le=1.0)]
 
 
-Phase = Annotated[Takeoff | Hold | Line | Path | ArmMove | Land, Field(discriminator="type")]
+ContactForce = Annotated[float, Field(gt=0, le=50)]
+ContactSpeed = Annotated[float, Field(ge=0.02, le=0.2)]
+
+
+class Approach(Model):
+    """Move in one direction until the tool touches a surface; the arm keeps its pose. A press must follow."""
+
+    type: Literal["approach"]
+    name: Name | None = None
+    direction: Vector3
+    """Direction of the motion and of the force, world frame, of any length: into the surface, as far as its position is known."""
+    distance_max_m: Annotated[float, Field(gt=0, le=2)]
+    """Largest distance. If the surface was not touched by then, the vehicle moves back and skips the contact."""
+    speed_m_s: ContactSpeed
+    touch_n: Annotated[float, Field(ge=0.5, le=10)] = 1.0
+    """Force against the direction that counts as a touch."""
+
+    @model_validator(mode="after")
+    def _has_a_direction(self) -> Self:
+        if math.hypot(*self.direction) < 1e-3:
+            refuse("approach", [(("direction",), "has no length")])
+        return self
+
+
+class Press(Model):
+    """Press on the surface that the approach has touched."""
+
+    type: Literal["press"]
+    name: Name | None = None
+    force_n: ContactForce
+    """Force along the direction of the approach."""
+    duration_s: Duration
+
+
+class Detach(Model):
+    """Release the force and move back to where the approach began."""
+
+    type: Literal["detach"]
+    name: Name | None = None
+    speed_m_s: ContactSpeed
+
+
+Phase = Annotated[
+    Takeoff | Hold | Line | Path | ArmMove | Approach | Press | Detach | Land, Field(discriminator="type")
+]
+_TOUCHING = ("approach", "press")
+"""Phases during which, or at whose end, the tool touches a surface."""
 
 
 class Start(Model):
@@ -212,6 +258,28 @@ class Mission(Model):
         return self
 
     @model_validator(mode="after")
+    def _contact_is_left(self) -> Self:
+        problems: list[tuple[Location, str]] = []
+        before = ""
+        for index, phase in enumerate(self.phases):
+            at = ("phases", index, "type")
+            if isinstance(phase, Press):
+                if before not in _TOUCHING:
+                    problems.append((at, "a press must follow an approach or a press"))
+            elif isinstance(phase, Detach):
+                if before != "press":
+                    problems.append((at, "a detach must follow a press"))
+            elif before == "approach":
+                problems.append((at, f"a press must follow the approach, not a {phase.type}"))
+            elif before == "press":
+                problems.append(
+                    (at, f"a detach must come before this {phase.type}: the tool still touches the surface")
+                )
+            before = phase.type
+        refuse("mission", problems)
+        return self
+
+    @model_validator(mode="after")
     def _paths_go_somewhere(self) -> Self:
         problems: dict[Location, str] = {}
         at_m = (*self.start.position_m, 0.0)
@@ -236,9 +304,11 @@ class Mission(Model):
 
 
 __all__ = [
+    "Approach",
     "ArmMove",
     "Catch",
     "ControllerChoice",
+    "Detach",
     "Hold",
     "Land",
     "Limits",
@@ -246,6 +316,7 @@ __all__ = [
     "Mission",
     "Path",
     "Phase",
+    "Press",
     "Start",
     "Takeoff",
 ]

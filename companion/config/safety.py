@@ -105,6 +105,8 @@ class Safety(Model):
     """Largest difference between the time at the upper thrust limit and the time below it."""
     speed_max_m_s: Positive = 2.0
     """Largest horizontal speed; a mission's speed limit must be lower."""
+    contact_force_max_n: Positive = 12.0
+    """Largest force against the direction of an approach; above it, the vehicle moves back from the surface and holds."""
     climb_max_m_s: Positive = 1.5
     sink_max_m_s: Positive = 1.5
     geofence_tolerance_m: NonNegative = 0.10

@@ -56,7 +56,9 @@ class Compensation:
             self._observer.step(dt_s, self._known_n, state.acceleration_world_m_s2, learn)
 
     def base_force_n(self, wanted_n: Vec3, force: Vec3, reference: Reference) -> Vec3:
-        """Return the desired force with the measured force, the estimated disturbance and the lead compensated, world frame."""
+        """Return the desired force with the measured force, the estimated disturbance and the lead compensated, and with the push on a
+        surface, world frame.
+        """
         x, y, z = wanted_n
         f0, f1, f2 = force
         d0, d1, d2 = self._observer.force_n
@@ -70,6 +72,8 @@ class Compensation:
             mx, my = self._inertia
             x += mx * lead_s * jerk[0]
             y += my * lead_s * jerk[1]
+        if (push := reference.push_world_n) is not None:
+            x, y, z = x + push[0], y + push[1], z + push[2]
         return (x, y, z)
 
     def joint_torque_nm(self, torque_nm: Joints, wanted_rate_rad_s: Joints) -> Joints:

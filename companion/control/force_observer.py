@@ -73,7 +73,13 @@ class ForceObserver:
         return (x, y, z)
 
     def step(
-        self, dt_s: float, known_n: Vec3, state: PlantState, stamps_s: tuple[float, float] | None, contact: bool
+        self,
+        dt_s: float,
+        known_n: Vec3,
+        state: PlantState,
+        stamps_s: tuple[float, float] | None,
+        contact: bool,
+        touching: bool = False,
     ) -> Vec3:
         """Run one tick and return the estimate, world frame, N.
 
@@ -86,7 +92,8 @@ class ForceObserver:
             known_n: rotor force commanded in the last tick and weight, world frame.
             state: state of this tick.
             stamps_s: stamps of attitude and joint state; after a gap in either, the arm's motion is not judged. None without arm.
-            contact: whether something may be in contact with the tip.
+            contact: whether a payload may be in contact with the tip.
+            touching: whether the tip may touch a surface, whose force has any direction: the whole mean is held.
         """
         acceleration = state.acceleration_world_m_s2
         moment = quat_rotate(state.attitude_wxyz, self.first_moment_body_kg_m(state.arm_rad))
@@ -101,8 +108,9 @@ class ForceObserver:
         fx, fy, fz = fx + ax, fy + ay, fz + az
         nx, ny, nz = self._mean_n
         share = dt_s / MEAN_S
-        nx, ny = nx + share * (fx - nx), ny + share * (fy - ny)
-        if not contact:
+        if not touching:
+            nx, ny = nx + share * (fx - nx), ny + share * (fy - ny)
+        if not (contact or touching):
             nz += share * (fz - nz)
         self._mean_n = (nx, ny, nz)
         self.force_n = (fx - nx, fy - ny, fz - nz)

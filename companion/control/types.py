@@ -22,7 +22,9 @@ class PlantState(Record, frozen=True, kw_only=True):
     force_ext_world_n: Vec3 | None = None
     """Force on the net, tared, without the net's weight, not filtered; None without a valid sample."""
     airborne: bool = True
-    """Whether only the rotors carry the vehicle. While the ground may carry a part of it, a law's integrators do not change."""
+    """Whether only the rotors carry the vehicle. While the ground or a surface may carry a part of it, a law's integrators do not
+    change.
+    """
 
 
 class Wrench(Record, frozen=True, kw_only=True):

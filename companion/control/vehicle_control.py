@@ -64,6 +64,11 @@ class VehicleControl:
         self.tether_pulls = False
         """Whether the tether pulls; set only with the momentum observer, which cannot tell that from a payload: no catch is then
         confirmed."""
+        self.press_direction: Vec3 | None = None
+        """Direction in which the tool presses on a surface, world frame; None if it touches none. While it does, the integrators of the
+        law and the estimators do not change, and the law gets only the force along this direction: an arm that held the friction, and
+        a base that carried it, would work against each other.
+        """
         self._state: PlantState | None = None
         """State in the last tick in which the law ran."""
         self._law: Law = law_class(config.controller.law)(config.controller, vehicle, hover_thrust)
@@ -139,7 +144,9 @@ class VehicleControl:
         force = None
         if i.force is not None and i.t_s - i.force.stamp_s <= self._force_timeout_s:
             force = self._sensing.external_world_n(i.force, vehicle.attitude_wxyz, arm_rad)
-        airborne = vertical_scale >= 1.0 and off_the_ground(i, self._ground_clearance_m)
+        off_the_floor = vertical_scale >= 1.0 and off_the_ground(i, self._ground_clearance_m)
+        pressing = self.press_direction
+        airborne = off_the_floor and pressing is None
         state = PlantState(
             position_world_m=vehicle.position_world_m,
             velocity_world_m_s=vehicle.velocity_world_m_s,
@@ -148,7 +155,7 @@ class VehicleControl:
             angular_rate_body_rad_s=vehicle.angular_rate_body_rad_s,
             arm_rad=arm_rad,
             arm_rate_rad_s=arm.velocity_rad_s if arm is not None else reference.arm_rate_rad_s,
-            force_ext_world_n=force if self._observer is None else None,
+            force_ext_world_n=_used(force, pressing) if self._observer is None else None,
             airborne=airborne,
         )
         carries = self._catch.carries(i.t_s)
@@ -156,7 +163,7 @@ class VehicleControl:
             self._hover.step(dt_s, self._thrust_sent, state, airborne, carries)
         self._watch_disturbance(dt_s, state, vertical_scale)
         if self._observer is not None:
-            state = self._observe(self._observer, dt_s, i, state, carries)
+            state = self._observe(self._observer, dt_s, i, state, carries, off_the_floor)
         self._state = state
         self._law.hover_thrust = hover = self._hover.value
         wrench = self._controller.step(dt_s, state, reference, vertical_scale)
@@ -172,19 +179,26 @@ class VehicleControl:
         if self._observer is not None:
             observed = self._observer.force_n
             log = msgspec.structs.replace(log, force_observed_world_n=observed, force_measured_world_n=force)
+        elif pressing is not None:
+            log = msgspec.structs.replace(log, force_measured_world_n=force)
         return Command(AttitudeSetpoint(wrench.attitude_wxyz, self._thrust_sent), torque, log)
 
-    def _observe(self, observer: ForceObserver, dt_s: float, i: Inputs, state: PlantState, carries: bool) -> PlantState:
-        """Run the momentum observer and return the state with its estimate while something may be in the net.
+    def _observe(
+        self, observer: ForceObserver, dt_s: float, i: Inputs, state: PlantState, carries: bool, off_the_floor: bool
+    ) -> PlantState:
+        """Run the momentum observer and return the state with its estimate while something may be in the net or touches the tool.
 
         At other times the estimate is wind and model error, to which the arm must not yield: the law then flies without a force.
         """
-        if not state.airborne:
+        if not off_the_floor:
             observer.reset()
             return state
         assert i.vehicle is not None
         stamps_s = (i.vehicle.attitude_stamp_s, i.arm.stamp_s) if i.arm is not None else None
-        observer.step(dt_s, self._known_n, state, stamps_s, carries)
+        pressing = self.press_direction
+        observer.step(dt_s, self._known_n, state, stamps_s, carries, pressing is not None)
+        if pressing is not None:
+            return msgspec.structs.replace(state, force_ext_world_n=_used(observer.used_n(), pressing))
         if not carries or (self.tether_pulls and self._catch.caught_s is None):
             return state
         return msgspec.structs.replace(state, force_ext_world_n=observer.used_n())
@@ -216,3 +230,12 @@ class VehicleControl:
             return False
         # Not from the law's log record, which is also zero while the sensor is silent.
         return self._catch.left(t_s, state.force_ext_world_n, state.acceleration_world_m_s2[2])
+
+
+def _used(force: Vec3 | None, direction: Vec3 | None) -> Vec3 | None:
+    """Return the force that the law gets: with a direction, only the part along it."""
+    if force is None or direction is None:
+        return force
+    (fx, fy, fz), (nx, ny, nz) = force, direction
+    along = fx * nx + fy * ny + fz * nz
+    return (along * nx, along * ny, along * nz)

@@ -13,10 +13,12 @@ import msgspec
 from companion.config.loader import FlightConfig
 from companion.config.vehicle import OBSERVER
 from companion.control.vehicle_control import Command, VehicleControl
+from companion.core.contact import force_on_tool_n
 from companion.core.flight_state import Observation, Request, Tare
 from companion.core.sequence import missing_inputs
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters, event_of
+from companion.mission.contact import along
 from companion.mission.plan import Plan
 from companion.model import flight_stage as seq
 from companion.model.best_pose import pose_used_s
@@ -78,7 +80,7 @@ class FlightCore:
     def step(self, inputs: Inputs) -> Outputs:
         """Run one control tick."""
         t_s, dt_s = inputs.t_s, self._dt_s(inputs.t_s)
-        observed, observation = self._observe(inputs)
+        observed, observation = self._observe(inputs, dt_s)
         i = observation.inputs
         state, request = transition(self._parameters, self._state, observed, observation)
         self._state = state
@@ -87,7 +89,7 @@ class FlightCore:
         self._log = command.log
         phase, kind, progress = state.phase(t_s)
         events = list(request.events)
-        if command.log is not None and kind is PhaseKind.FLIGHT:
+        if command.log is not None and kind is PhaseKind.FLIGHT and state.contact is None:
             self._watch_for_catch(t_s, command.log, events)
         arm, vehicle = i.arm, i.vehicle
         verdict = self._gate.check(
@@ -121,6 +123,7 @@ class FlightCore:
             tether=self._situation.tether,
             limited_by=self._limited_by,
             mocap_innovation_m=self._monitors.mocap_innovation_m,
+            contact=state.contact,
         )
 
     def _dt_s(self, t_s: float) -> float:
@@ -132,7 +135,7 @@ class FlightCore:
 
     # -- observation -----------------------------------------------------------------------------------------------
 
-    def _observe(self, inputs: Inputs) -> tuple[tuple[Event, ...], Observation]:
+    def _observe(self, inputs: Inputs, dt_s: float) -> tuple[tuple[Event, ...], Observation]:
         """Run the monitors and the tether watch. Return this tick's events and the observation for the transition."""
         situation, stage = self._situation, self._state.stage
         if stage is not self._situation_stage:
@@ -143,6 +146,8 @@ class FlightCore:
             situation.found_armed = None
         situation.tracking_error_m = self._control.tracking_error_m if stage is _PLAN else None
         situation.control = self._log
+        contact = self._state.contact
+        situation.contact_n = contact.force_n if contact is not None and contact.touches else None
         situation.waiting = stage is Stage.WAIT and bool(missing_inputs(inputs, self._vehicle))
         armed_by_others = stage in seq.BEFORE_ARMING and seq.is_armed(inputs.status)
         if armed_by_others:
@@ -162,6 +167,9 @@ class FlightCore:
             tether=situation.tether,
             thrust_share=self._control.thrust_share,
             pose_s=self._pose_s,
+            dt_s=dt_s,
+            force_world_n=None if self._log is None else force_on_tool_n(self._log),
+            yaw_error_rad=0.0 if self._log is None else self._log.error[5],
         )
 
     def _watch_tether(self, i: Inputs) -> None:
@@ -171,10 +179,16 @@ class FlightCore:
             return
         log, flying = self._log, self._state.stage is _PLAN
         # The observer's force contains the tether's pull: subtracted, it would hide the pull.
+        contact = self._state.contact
+        touching = contact is not None and contact.touches > 0
         if log is None or not flying:
             tool_n = None
+        elif touching and self._observes:
+            assert contact is not None
+            nx, ny, nz = contact.direction_world
+            tool_n = (-contact.force_n * nx, -contact.force_n * ny, -contact.force_n * nz)
         else:
-            tool_n = log.force_measured_world_n if self._observes else log.force_ext_world_n
+            tool_n = log.force_measured_world_n if touching or self._observes else log.force_ext_world_n
         self._situation.tether = state = watch.update(
             i.t_s,
             v.position_world_m,
@@ -216,6 +230,10 @@ class FlightCore:
         if course is None or not (stage is _PLAN or stage is _SPOOL or stage is _TOUCHDOWN):
             return None, self._without_reference(stage, dt_s, i)
         reference = course.plan.reference(0.0) if stage is _SPOOL else course.reference(i.t_s)
+        contact = state.contact
+        self._control.press_direction = contact.direction_world if contact is not None and contact.touches else None
+        if contact is not None:
+            reference = along(reference, contact)
         if stage is _PLAN:
             governed = self._governor.constrain(dt_s, reference, self._situation.tether)
             reference, self._limited_by = governed.reference, governed.limited_by

@@ -7,11 +7,22 @@ from enum import Enum
 
 from companion.mission.active_plan import Course
 from companion.mission.plan import Plan
+from companion.mission.segments import Segment
 from companion.mission.settled import SettledEstimate
 from companion.model import flight_stage as seq
 from companion.model.codec import Record
 from companion.model.flight_stage import Stage
-from companion.model.types import AutopilotRequest, Event, Inputs, Outcome, PhaseKind, Reference, TetherState
+from companion.model.types import (
+    AutopilotRequest,
+    ContactState,
+    Event,
+    Inputs,
+    Outcome,
+    PhaseKind,
+    Reference,
+    TetherState,
+    Vec3,
+)
 from companion.safety.autopilot_landing import AutopilotLanding
 from companion.safety.rotor_stop import RotorStop
 from companion.safety.supervisor import SupervisorState
@@ -67,6 +78,11 @@ class FlightState(Record, frozen=True):
     """The landing by PX4 needs level setpoints with zero thrust."""
     waiting: Waiting = Waiting()
     landing: AutopilotLanding | None = None
+    contact: ContactState | None = None
+    contact_segment: Segment | None = None
+    """Segment of the plan that the contact belongs to."""
+    contact_over: bool = False
+    """Whether the contact of these phases has ended: what is left of them is skipped."""
 
     @property
     def pilot_flies(self) -> bool:
@@ -123,6 +139,12 @@ class Observation(Record, frozen=True):
     """Thrust of the last command divided by hover thrust."""
     pose_s: float
     """Stamp of the newest trusted pose before this tick; -inf before the first."""
+    dt_s: float
+    """Time since the previous tick."""
+    force_world_n: Vec3 | None
+    """Force on the tool in the last tick, world frame; None if the law did not run."""
+    yaw_error_rad: float
+    """Yaw minus reference in the last tick; 0 if the law did not run."""
 
 
 class Request(Record, frozen=True):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
+from companion.core.contact import leave
 from companion.core.transition import Transition
+from companion.mission.contact import before_approach_m
 from companion.mission.plan import landing_from
 from companion.mission.retract import inward_only, retract_from
 from companion.model import flight_stage as seq
@@ -109,6 +111,7 @@ def _hold(t: Transition) -> None:
         _land_instead(t, "too low to hold; landing")
     else:
         t.change(course=course.hold(t_s))
+        leave(t)
 
 
 def _retract(t: Transition) -> None:
@@ -131,8 +134,8 @@ def _land_instead(t: Transition, text: str) -> None:
 
 
 def _land(t: Transition) -> None:
-    """Stop from the last reference, fold the arm and descend."""
-    now, p = t.o.reference, t.parameters
+    """Stop from the last reference, fold the arm and descend; move back from a surface first."""
+    now, p, contact = t.o.reference, t.parameters, t.state.contact
     if now is None:  # the controller has not flown yet
         t.finish(Outcome.ABORTED)
         t.enter(Stage.AUTOPILOT_LAND)
@@ -146,6 +149,7 @@ def _land(t: Transition) -> None:
             p.fold_rad,
             p.vehicle.safety.land_speed_m_s,
             p.vehicle,
+            None if contact is None else before_approach_m(now, contact),
         )
     )
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from companion.config.vehicle import Vehicle
+from companion.core.contact import advance_contact
 from companion.core.flight_state import Tare
 from companion.core.transition import Transition
 from companion.mission.active_plan import Course
@@ -224,6 +225,8 @@ def _spool(t: Transition, elapsed_s: float) -> AutopilotRequest:
 
 
 def _fly(t: Transition, _: float) -> AutopilotRequest:
+    if t.parameters.touches and not t.state.aborting:
+        advance_contact(t)
     i, course, vehicle = t.i, t.state.course, t.i.vehicle
     assert course is not None
     plan_s = course.pace(i.t_s)[0]

@@ -9,7 +9,10 @@ from typing import Any
 from msgspec.structs import replace
 
 from companion.config.loader import FlightConfig
+from companion.config.mission import Approach
 from companion.config.vehicle import Vehicle
+from companion.control.arm_model import manipulator_of
+from companion.control.manipulator import Manipulator
 from companion.core.flight_state import FlightState, Observation, Tare
 from companion.mission.active_plan import Course
 from companion.mission.plan import Plan
@@ -38,6 +41,9 @@ class Parameters:
     times: LadderTimes
     waits_for_start: bool
     """Whether the take-off waits for the operator's start command."""
+    manipulator: Manipulator
+    touches: bool
+    """Whether the mission has contact phases."""
 
     @classmethod
     def of(cls, config: FlightConfig) -> Parameters:
@@ -51,6 +57,8 @@ class Parameters:
             fold_rad=tuple(map(math.radians, vehicle.fold_arm_deg)),
             times=LadderTimes.of(safety),
             waits_for_start=config.mission.start.takeoff == "by_operator",
+            manipulator=manipulator_of(vehicle),
+            touches=any(isinstance(phase, Approach) for phase in config.mission.phases),
         )
 
     def initial_state(self) -> FlightState:
@@ -149,4 +157,4 @@ class Transition:
     def leave_mission(self, plan: Plan) -> None:
         """Replace the mission with this plan."""
         self.finish(Outcome.ABORTED)
-        self.change(course=Course(plan, self.i.t_s), aborting=True)
+        self.change(course=Course(plan, self.i.t_s), aborting=True, contact=None)

@@ -79,6 +79,13 @@ class Course:
         """Return the course that continues from the point of the hold."""
         return self._turned_to(1.0, t_s) if self.held else self
 
+    def moved_to(self, plan_s: float, t_s: float) -> Course:
+        """Return the course with another plan time at `t_s`, held if this one is held. The plan must be at rest at both times."""
+        if not self.held:
+            return replace(self, start_s=t_s - plan_s, change=None)
+        change = Change(begin_s=t_s, plan_s=plan_s, duration_s=STOP_MIN_S, before=0.0, after=0.0)
+        return replace(self, change=change)
+
     def _turned_to(self, after: float, t_s: float) -> Course:
         plan_s, rate, _, _ = self.pace(t_s)
         speed_m_s = math.hypot(*self.plan.reference(plan_s).velocity_world_m_s)

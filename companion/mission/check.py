@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 
 from companion.config.mission import ArmMove, Mission
 from companion.config.vehicle import Vehicle
+from companion.mission.contact_check import contact_problems
 from companion.mission.minsnap import Progress
 from companion.mission.plan import Plan
 from companion.mission.sample_check import CATCH_NEAR_M, STOP, SampleCheck
@@ -65,6 +66,8 @@ def check_mission(
     plan = Plan.build(mission, vehicle, position, yaw_rad, start_arm_rad, progress)
     problems = check_start(mission, vehicle, position, yaw_rad, start_arm_rad)
     problems += [*_speed(mission, vehicle), *_whole(mission, vehicle, plan, phase_origins)]
+    for segment, text in contact_problems(mission, vehicle, plan):
+        problems.append(f"{_place(mission, segment, phase_origins)} {text}")
     samples = SampleCheck(mission, vehicle)
     told: dict[str, str] = {}
     where: dict[str, set[int]] = {}

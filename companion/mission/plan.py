@@ -9,9 +9,10 @@ import math
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 
-from companion.config.mission import ArmMove, Land, Line, Mission, Path, Takeoff
+from companion.config.mission import Approach, ArmMove, Detach, Land, Line, Mission, Path, Press, Takeoff
 from companion.config.vehicle import Vehicle
 from companion.mission.arm_motion import ArmLimits
+from companion.mission.contact import PRESS_RAMP_S, RELEASE_S, approach_s, travel_s
 from companion.mission.minsnap import Progress, VehicleLimits, least_line_s
 from companion.mission.plan_builder import PlanBuilder
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED, Track, reference_at
@@ -24,6 +25,9 @@ flies up to 0.35 m above its reference; on the ground the vehicle stays within `
 """
 FOLD_SPEED_RAD_S = math.radians(75.0)
 FOLD_MIN_S = 0.5
+BACK_SPEED_M_S = 0.2
+"""Largest speed of the retreat from a surface before a landing."""
+BACK_MIN_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +82,7 @@ class Plan:
         )
         limits, arm_limits = _vehicle_limits(mission), _arm_limits(mission, vehicle)
         flown = flown_phases(mission)
+        approach: Approach | None = None
         paths, solved = sum(isinstance(mission.phases[index], Path) for index, _ in flown), 0
         for index, repetition in flown:
             phase = mission.phases[index]
@@ -100,6 +105,14 @@ class Plan:
                 duration_s = phase.duration_s or builder.least_arm_s(to_rad, arm_limits)
                 builder.move_arm(to_rad, 0.0, duration_s, arm_limits)
                 builder.t_s += duration_s
+            elif isinstance(phase, Approach):
+                approach = phase
+                builder.t_s += approach_s(approach)
+            elif isinstance(phase, Press):
+                builder.t_s += PRESS_RAMP_S + phase.duration_s
+            elif isinstance(phase, Detach):
+                assert approach is not None, "the mission file is checked: an approach comes first"
+                builder.t_s += RELEASE_S + travel_s(approach.distance_max_m, phase.speed_m_s)
             elif isinstance(phase, Land):
                 kind = PhaseKind.LANDING
                 builder.t_s = builder.descend(phase.speed_m_s, vehicle.airframe.ground_clearance_m - BELOW_GROUND_M)
@@ -188,6 +201,7 @@ def landing_from(
     arm_fold_rad: Joints,
     speed_m_s: float,
     vehicle: Vehicle,
+    back_to_m: Vec3 | None = None,
 ) -> Plan:
     """Plan an immediate landing from any state: come to rest, then descend in place while the arm folds.
 
@@ -202,19 +216,27 @@ def landing_from(
         arm_fold_rad: joint angles at the end.
         speed_m_s: speed of the descent.
         vehicle: provides the height of the floor and the reach of the arm.
+        back_to_m: position to go to before everything else, from a surface that the tool may touch.
     """
     builder = PlanBuilder(position_world_m, yaw_rad, arm_rad)
+    if back_to_m is not None:
+        velocity_world_m_s = (0.0, 0.0, 0.0)
+        duration_s = max(BACK_MIN_S, REST_TO_REST_PEAK_SPEED * builder.line_m(back_to_m) / BACK_SPEED_M_S)
+        builder.go(back_to_m, duration_s)
+        builder.segments.append(Segment(name="back", kind=PhaseKind.LANDING, start_s=0.0, end_s=duration_s, index=-1))
+        builder.t_s = duration_s
+    back_s = builder.t_s
     fold_s = fold_time_s(arm_rad, arm_fold_rad)
     builder.fold_arm(arm_fold_rad, fold_s)
     stop_s = builder.stop(velocity_world_m_s)
     arm = vehicle.arm
     reach_m = vehicle.reach_m - arm.first_joint_body_m[2] + vehicle.tip_radius_m
     free_s = max(0.0, builder.height_m - reach_m) / speed_m_s
-    builder.t_s = max(stop_s, fold_s - free_s)
-    builder.segments.append(Segment(name="stop", kind=PhaseKind.LANDING, start_s=0.0, end_s=builder.t_s, index=-1))
+    builder.t_s = max(stop_s, back_s + fold_s - free_s)
+    builder.segments.append(Segment(name="stop", kind=PhaseKind.LANDING, start_s=back_s, end_s=builder.t_s, index=-1))
     start_s = builder.t_s
     end_s = builder.descend(speed_m_s, vehicle.airframe.ground_clearance_m - BELOW_GROUND_M)
-    builder.t_s = max(end_s, fold_s)
+    builder.t_s = max(end_s, back_s + fold_s)
     builder.segments.append(Segment(name="land", kind=PhaseKind.LANDING, start_s=start_s, end_s=builder.t_s, index=-1))
     return Plan.of("landing", builder)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from companion.config.mission import ArmMove, Line, Mission, Path, Phase
+from companion.config.mission import ArmMove, Line, Mission, Path, Phase, Press
 from companion.model.types import PhaseKind
 
 
@@ -92,7 +92,7 @@ def counted(name: str, repetition: int, count: int) -> str:
     return f"{name} ({repetition} of {count})" if repetition else name
 
 
-_PLAIN_NAMES = {"takeoff": "take-off", "hold": "hold", "land": "land"}
+_PLAIN_NAMES = {"takeoff": "take-off"}
 
 
 def phase_name(phase: Phase) -> str:
@@ -105,4 +105,6 @@ def phase_name(phase: Phase) -> str:
         return f"path to ({', '.join(f'{value:g}' for value in phase.through_m[-1])}) m"
     if isinstance(phase, ArmMove):
         return f"arm to ({', '.join(f'{value:g}' for value in phase.arm_deg)}) deg"
-    return _PLAIN_NAMES[phase.type]
+    if isinstance(phase, Press):
+        return f"press with {phase.force_n:g} N"
+    return _PLAIN_NAMES.get(phase.type, phase.type)

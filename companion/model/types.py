@@ -240,6 +240,54 @@ class Inputs(Record, frozen=True, kw_only=True):
     """Newest ESTIMATOR_STATUS, if another program feeds PX4 with poses (`devices.mocap.type: external`); else None."""
 
 
+class ContactMode(Enum):
+    """What the flight does about a surface during its contact phases."""
+
+    WEIGH = "weigh"  # at rest before the approach: average the force that is there without contact
+    APPROACH = "approach"  # move along the direction until the surface is touched
+    PRESS = "press"  # touched: hold the force
+    LOST = "lost"  # the force has ended: wait at rest, then approach again
+    LEAVE = "leave"  # release the force, then move back
+
+    # An enum's own hash is a Python function.
+    __hash__ = object.__hash__
+
+
+class ContactState(Record, frozen=True, kw_only=True):
+    """Contact with a surface: the part of the reference that depends on the measured force."""
+
+    mode: ContactMode
+    since_s: float
+    """Flight clock at the beginning of the mode."""
+    direction_world: Vec3
+    """Unit vector of the approach, into the surface."""
+    offset_m: float
+    """Offset of the reference from the plan along the direction, its rate and its acceleration."""
+    rate_m_s: float
+    acceleration_m_s2: float
+    bias_n: float
+    """Mean force against the direction before the approach."""
+    force_n: float
+    """Measured force of the surface against the direction, less `bias_n`."""
+    beyond_s: float
+    """Time for which the force has been beyond the threshold that ends the mode."""
+    wanted_n: float
+    """Force that is to be measured now; 0 without contact."""
+    correction_n: float
+    """Integral of the force error."""
+    push_n: float
+    """Force along the direction that the vehicle adds to what its control law needs."""
+    tilting_n: float
+    """Low-passed push, for which the reference has moved with the vehicle's tilt."""
+    tip_per_n_m: Vec3
+    """Shift of the reference per push that keeps the tip in place, m/N, world frame."""
+    touches: int
+    touched_offset_m: float
+    """Offset at the last touch."""
+    failed: bool
+    """Whether the contact ended before its planned end."""
+
+
 class Reference(Record, frozen=True, kw_only=True):
     """Reference motion of vehicle and arm at one instant."""
 
@@ -253,6 +301,8 @@ class Reference(Record, frozen=True, kw_only=True):
     arm_acceleration_rad_s2: Joints
     jerk_world_m_s3: Vec3
     """Reference jerk, used by laws whose acceleration feed-forward has a lead."""
+    push_world_n: Vec3 | None = None
+    """Force that the vehicle is to exert on a surface, world frame; None without contact."""
 
 
 class AttitudeSetpoint(Record, frozen=True):
@@ -308,7 +358,9 @@ class ControlLog(Record, frozen=True, kw_only=True):
     force_observed_world_n: Vec3 | None = None
     """Estimate of the momentum observer, also while the law does not use it; None if `force_source` is not `observer`."""
     force_measured_world_n: Vec3 | None = None
-    """With the momentum observer: what the force sensor measures, tared and not filtered; None without a sensor."""
+    """What the force sensor measures, tared and not filtered: with the momentum observer, and while the tool touches a surface, when
+    `force_ext_world_n` has only the part along the press. Else None, as without a sensor.
+    """
 
 
 class TetherState(Record, frozen=True, kw_only=True):
@@ -368,6 +420,8 @@ class Outputs(Record, frozen=True, kw_only=True):
     """Reasons why the governor constrained the reference."""
     mocap_innovation_m: float | None = None
     """Distance between the newest pose and the position predicted from the IMU; 0 if it is not evaluated, None in older logs."""
+    contact: ContactState | None = None
+    """Contact with a surface; None outside contact phases."""
 
 
 class Sent(Record, frozen=True, kw_only=True):

@@ -187,7 +187,7 @@ class ForceTracker:
         if force is not None:
             self._compare(force, situation, awake_s, moving)
         control = situation.control
-        if control is None or situation.caught or not situation.airborne:
+        if control is None or situation.caught or situation.contact_n is not None or not situation.airborne:
             self.mean_n = _NO_FORCE
             return
         mx, my, mz = self.mean_n

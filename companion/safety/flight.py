@@ -47,6 +47,7 @@ class FlightTracker:
         """PX4's tilt; 0 while it is below `safety.tilt_abort_deg` and `FLIPPED_TILT_RAD`."""
         self.tracking_error_m: float | None = None
         self.tether: TetherState | None = None
+        self.contact_n: float | None = None
         self.vertical_n: float | None = None
         """Vertical force commanded by the control law while it is limited above the weight; else None."""
         self.saturated_s = 0.0
@@ -63,6 +64,7 @@ class FlightTracker:
                 self.tilt_rad = tilt_rad(vehicle.attitude_wxyz)
         self.tracking_error_m = situation.tracking_error_m
         self.tether = situation.tether
+        self.contact_n = situation.contact_n
         self._count_saturation(situation.control, dt_s)
 
     def _count_saturation(self, control: ControlLog | None, dt_s: float) -> None:
@@ -157,6 +159,12 @@ def thrust_saturated(f: FlightTracker, saturated_max_s: float) -> Values | None:
     """Fires if the vertical force has been limited for longer than the threshold."""
     found = f.vertical_n is not None and f.saturated_s > saturated_max_s
     return (f.vertical_n, saturated_max_s) if found else None
+
+
+def contact_force_high(f: FlightTracker, force_max_n: float) -> Values | None:
+    """Fires if the force of the surface that the mission touches exceeds the threshold."""
+    force_n = f.contact_n
+    return (force_n, force_max_n) if force_n is not None and force_n > force_max_n else None
 
 
 def tether_short(f: FlightTracker, slack_min_m: float) -> Values | None:

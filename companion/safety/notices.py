@@ -70,6 +70,28 @@ PAYLOAD_LEFT = Notice(
     "payload_left", _INFO, _NOMINAL,
     "no pull on the net for 0.5 s without free fall: the net is empty and ready for the next catch",
 )  # fmt: skip
+TOUCHED = Notice("touched", _INFO, _NOMINAL, "the tool touched the surface that the mission approaches")
+CONTACT_INTERRUPTED = Notice(
+    "contact_interrupted", _WARNING, _WARN,
+    "no force for 0.5 s while pressing: the vehicle waits 0.5 s and approaches the surface again",
+)  # fmt: skip
+CONTACT_LOST = Notice(
+    "contact_lost", _WARNING, _WARN,
+    "the surface was not found again within 0.1 m of where it was touched: the vehicle moves back, and the mission goes on as aborted",
+)  # fmt: skip
+CONTACT_BOUNCE = Notice(
+    "contact_bounce", _WARNING, _WARN,
+    "the surface was touched three times in one contact: the vehicle moves back, and the mission goes on as aborted",
+)  # fmt: skip
+CONTACT_SLIPPED = Notice(
+    "contact_slipped", _WARNING, _WARN,
+    "the yaw error exceeded 5 deg while pressing, because the tool slips along the surface: the vehicle moves back, and the "
+    "mission goes on as aborted",
+)  # fmt: skip
+SURFACE_MISSING = Notice(
+    "surface_missing", _WARNING, _WARN,
+    "nothing was touched within `distance_max_m`: the vehicle moves back, and the mission goes on as aborted",
+)  # fmt: skip
 TOUCHDOWN = Notice("touchdown", _INFO, _NOMINAL, "the vehicle is on the ground")
 NO_TOUCHDOWN = Notice("no_touchdown", _CRITICAL, _PX4_LANDS, "no touchdown 5 s after the plan's end: PX4 lands")
 DISARM_REFUSED = Notice(
@@ -93,6 +115,7 @@ NO_ROOM_TO_STAY = Notice(
 
 NOTICES: tuple[Notice, ...] = (
     INPUTS_MISSING, VISION_NOT_FUSED, ESTIMATE_UNSTEADY, START_REFUSED, OFFBOARD_REFUSED, ARMING_REFUSED, NOT_READY,
-    START_DECLINED, CALLED_OFF, RESUME_REFUSED, TAKEOFF, CATCH, PAYLOAD_LEFT, TOUCHDOWN, NO_TOUCHDOWN, DISARM_REFUSED,
+    START_DECLINED, CALLED_OFF, RESUME_REFUSED, TAKEOFF, CATCH, PAYLOAD_LEFT, TOUCHED, CONTACT_INTERRUPTED, CONTACT_LOST,
+    CONTACT_BOUNCE, CONTACT_SLIPPED, SURFACE_MISSING, TOUCHDOWN, NO_TOUCHDOWN, DISARM_REFUSED,
     AUTOPILOT_LANDING, GATE, HOLD_EXPIRED, RETRACT_EXPIRED, RETRACT_DONE, NO_ROOM_TO_STAY,
 )  # fmt: skip

@@ -383,6 +383,12 @@ RULES: tuple[Rule, ...] = (
         predicate=flight.thrust_saturated, thresholds=("thrust_saturated_s",), ground=None, air=_LAND,
         message="thrust at its limit of {:.0f} N for more than {:.1f} s: the vehicle is too heavy or its rotors are too weak",
     ),
+    Rule(
+        id="contact_force_high", subject=Subject.FLIGHT,
+        what="the surface that the mission touches is pressed too hard; the vehicle moves back from it first",
+        predicate=flight.contact_force_high, thresholds=("contact_force_max_n",), hold_time=0.1, ground=None, air=_HOLD,
+        message="the surface presses with {:.1f} N (limit {:.1f} N)",
+    ),
 
     Rule(
         id="tether_short", subject=Subject.TETHER, what="the vehicle would stop with too little tether left",

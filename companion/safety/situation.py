@@ -29,6 +29,8 @@ class Situation:
     caught: bool = False
     """A payload is on board."""
     tether: TetherState | None = None
+    contact_n: float | None = None
+    """Measured force of the surface that the mission touches; None if it touches none."""
     found_armed: str | None = None
     """Event text if PX4 was armed without a request from the companion; `airborne` then shows whether the vehicle is flying."""
     torque_refused: str | None = None

@@ -212,6 +212,7 @@ FAULTS: dict[str, Fault] = {
     "tracking_error": Fault(
         situation=lambda: flying(tracking_error_m=1.2), also=frozenset({"tracking_warn", "tracking_hold"})
     ),
+    "contact_force_high": Fault(situation=lambda: flying(contact_n=15.0)),
     "thrust_saturated": Fault(
         situation=lambda: flying(
             control=control(saturated=(True, False, False), tau=(0.0, 0.0, 54.0, 0.0, 0.0, 0.0, 0.0, 0.0))

@@ -1,0 +1,105 @@
+"""Contact of a flight with a surface, measured from its log: force, touches, path and place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from companion.analysis.arm_skeleton import pose
+from companion.analysis.log import Array, FlightLog
+from companion.model.arm_skeleton import ArmSkeleton, logged_skeleton
+from companion.model.best_pose import best_pose
+from companion.model.frames import quat_rotate
+from companion.model.types import ContactMode, Vec3
+
+SETTLED_S = 1.5
+"""Time after the end of the force's ramp from which the force counts as steady."""
+PLANE_M = 0.05
+"""Extent of the touched points, in both directions, from which the surface's normal is fitted to them."""
+
+
+def contact_summary(log: FlightLog) -> dict[str, Any] | None:
+    """Return `contact` of summary.json; None if the mission has no contact phases.
+
+    Force is that along the direction of the approach, as measured in flight: `mean_n` and `rms_error_n` while it is steady,
+    `overshoot_n` from the first touch on. `path_rms_m` is the distance of the tip, across that direction, from the path on which the
+    reference would lead it; for a press that is a point. `surface` is the mean point that was touched while the force was steady, and
+    the normal of the touched points or, if they lie too close together, the direction of the approach reversed.
+    """
+    states = [outputs.contact for outputs in log.outputs]
+    last = next((state for state in reversed(states) if state is not None), None)
+    if last is None:
+        return None
+    touches = max((state.touches for state in states if state is not None), default=0)
+    pressing = np.array([state is not None and state.mode is ContactMode.PRESS for state in states], dtype=np.bool_)
+    force = np.array([np.nan if state is None else state.force_n for state in states])
+    wanted = np.array([0.0 if state is None else state.wanted_n for state in states])
+    row: dict[str, Any] = {
+        "wanted_n": None, "mean_n": None, "rms_error_n": None, "overshoot_n": None, "touches": touches, "path_rms_m": None,
+        "surface": None,
+    }  # fmt: skip
+    if not pressing.any():
+        return row
+    most = float(wanted[pressing].max())
+    row.update(wanted_n=most, overshoot_n=max(0.0, float(force[pressing].max()) - most))
+    steady = _steady(log.columns.t_s, pressing, wanted)
+    if not steady.any():
+        return row
+    row.update(mean_n=float(force[steady].mean()), rms_error_n=float(np.sqrt(np.mean((force - wanted)[steady] ** 2))))
+    direction = np.array(last.direction_world)
+    found = _tips_m(log, steady)
+    if found is not None:
+        tip, planned = found
+        off = tip - planned
+        off -= np.outer(off @ direction, direction)
+        off -= off.mean(axis=0) if float(np.ptp(planned, axis=0).max()) < PLANE_M else 0.0
+        row["path_rms_m"] = float(np.sqrt(np.mean(np.sum(off * off, axis=1))))
+        row["surface"] = {"point_m": tip.mean(axis=0).tolist(), "normal": _normal(tip, direction).tolist()}
+    return row
+
+
+def _steady(t_s: Array, pressing: Any, wanted: Array) -> Any:
+    """Return the ticks in which the wanted force has been constant for `SETTLED_S`."""
+    steady = np.zeros(len(t_s), dtype=np.bool_)
+    since_s = np.inf
+    for k in np.flatnonzero(pressing):
+        if k == 0 or not pressing[k - 1] or wanted[k] != wanted[k - 1]:
+            since_s = t_s[k]
+        steady[k] = t_s[k] - since_s > SETTLED_S
+    return steady
+
+
+def _tips_m(log: FlightLog, used: Any) -> tuple[Array, Array] | None:
+    """Return the measured and the planned position of the tip in these ticks, world frame, m; None if they are unknown."""
+    skeleton = logged_skeleton(log.config.get("vehicle"))
+    if skeleton is None:
+        return None
+    measured, planned = [], []
+    for k in np.flatnonzero(used):
+        i, o = log.inputs[k], log.outputs[k]
+        at, contact, reference = best_pose(i), o.contact, o.reference
+        if at is None or i.arm is None or contact is None or reference is None:
+            continue
+        tip = _tip_body_m(skeleton, np.array([i.arm.angle_rad]))
+        level = _tip_body_m(skeleton, np.array([reference.arm_rad]))
+        cos, sin = np.cos(0.5 * reference.yaw_rad), np.sin(0.5 * reference.yaw_rad)
+        measured.append(np.add(at.position_world_m, quat_rotate(at.attitude_wxyz, tip)))
+        ahead = np.add(reference.position_world_m, quat_rotate((float(cos), 0.0, 0.0, float(sin)), level))
+        planned.append(ahead - contact.tilting_n * np.array(contact.tip_per_n_m))
+    return (np.array(measured), np.array(planned)) if measured else None
+
+
+def _tip_body_m(skeleton: ArmSkeleton, arm_rad: Array) -> Vec3:
+    x, y, z = pose(skeleton, arm_rad)[0][0, -1]
+    return (float(x), float(y), float(z))
+
+
+def _normal(tip: Array, direction: Array) -> Array:
+    """Return the normal of the touched points, or the direction reversed if they lie too close together."""
+    centred = tip - tip.mean(axis=0)
+    _, _, axes = np.linalg.svd(centred, full_matrices=False)
+    if min(float(np.ptp(centred @ axes[0])), float(np.ptp(centred @ axes[1]))) < PLANE_M:
+        return -direction
+    normal: Array = axes[2]
+    return -normal if float(normal @ direction) > 0.0 else normal

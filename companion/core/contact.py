@@ -1,0 +1,171 @@
+"""Drives the contact phases of a mission: what the measured force does to the contact state and to the plan's time. Pure.
+
+The plan's time stands at the end of a phase until the phase's aim is reached, and jumps to its end when it is reached earlier: approach
+until the touch, detach until the vehicle is back. After a failed contact the vehicle moves back first; the remaining phases of the same
+contact are then skipped.
+"""
+
+from __future__ import annotations
+
+import math
+
+from msgspec.structs import replace
+
+from companion.config.mission import Approach, Detach, Phase, Press
+from companion.core.transition import Transition
+from companion.mission import contact as c
+from companion.mission.segments import Segment
+from companion.model.constants import GRAVITY_M_S2
+from companion.model.types import ContactMode, ContactState, ControlLog, Outcome, SafetyAction, Vec3
+from companion.safety import notices
+from companion.safety.notices import Notice
+
+_BEFORE_END_S = 1e-6
+_WEIGH, _APPROACH, _PRESS = ContactMode.WEIGH, ContactMode.APPROACH, ContactMode.PRESS
+_LOST, _LEAVE = ContactMode.LOST, ContactMode.LEAVE
+
+
+def advance_contact(t: Transition) -> None:
+    """Advance the contact by one tick; called in every tick of the mission."""
+    course, contact, t_s = t.state.course, t.state.contact, t.i.t_s
+    assert course is not None
+    segment = course.segment(t_s)
+    phase = _phase(t, segment)
+    if contact is None:
+        if isinstance(phase, Approach) and not t.state.contact_over:
+            nx, ny, nz = phase.direction
+            length = (nx * nx + ny * ny + nz * nz) ** 0.5
+            direction = (nx / length, ny / length, nz / length)
+            shift = c.tip_per_n_m(direction, _tip_world_m(t), t.parameters.vehicle.airframe.mass_kg * GRAVITY_M_S2)
+            contact = c.begun(t_s, direction, shift)
+            t.change(contact=contact, contact_segment=segment)
+        elif isinstance(phase, Approach | Press | Detach):
+            t.change(course=course.moved_to(segment.end_s, t_s))
+        elif t.state.contact_over:
+            t.change(contact_over=False)
+        return
+    dt_s = t.o.dt_s
+    contact = c.measured(contact, dt_s, t.o.force_world_n)
+    approach = _approach(t, segment)
+    engaged = t.state.contact_segment
+    assert engaged is not None
+    if contact.mode is _LEAVE:
+        speed_m_s = phase.speed_m_s if isinstance(phase, Detach) else approach.speed_m_s
+        contact = c.released(contact, dt_s) if contact.push_n > 0.0 else c.moved(contact, dt_s, -speed_m_s)
+        if contact.offset_m <= 0.0:
+            if course.held and t.state.supervisor.action is not SafetyAction.HOLD:
+                course = course.resume(t_s)
+            t.change(contact=None, contact_over=True, course=course)
+            return
+        _stay_in(t, engaged)
+    elif contact.mode is _WEIGH:
+        if t_s - contact.since_s >= c.WEIGH_S:
+            contact = c.entered(contact, t_s, _APPROACH)
+    elif contact.mode is _APPROACH:
+        contact = _approached(t, contact, approach, dt_s)
+    elif contact.mode is _LOST:
+        contact = c.released(contact, dt_s)
+        if t_s - contact.since_s >= c.WAIT_S:
+            contact = c.entered(contact, t_s, _APPROACH)
+    elif isinstance(phase, Detach):
+        contact = c.entered(contact, t_s, _LEAVE)
+        t.change(contact_segment=segment)
+    elif isinstance(phase, Press):
+        contact = c.pressed(contact, t_s, dt_s, approach.touch_n, phase.force_n)
+        contact = c.timed(contact, dt_s, not c.touches(contact, approach.touch_n))
+        t.change(contact_segment=segment)
+        if abs(t.o.yaw_error_rad) > c.TURNED_RAD:
+            text = f"turned by {math.degrees(abs(t.o.yaw_error_rad)):.0f} deg while pressing: the tool slips; leaving the surface"
+            contact = _failed(t, contact, notices.CONTACT_SLIPPED, text)
+        elif contact.beyond_s >= c.LOST_S:
+            contact = _lost(t, contact)
+    t.change(contact=contact)
+
+
+def force_on_tool_n(log: ControlLog) -> Vec3:
+    """Return the force on the tool that a tick of the control law measured or, without a force sensor, observed."""
+    return log.force_ext_world_n if log.force_observed_world_n is None else log.force_observed_world_n
+
+
+def leave(t: Transition) -> None:
+    """Leave the surface, because the flight is to hold."""
+    contact = t.state.contact
+    if contact is not None and contact.mode is not _LEAVE:
+        t.change(contact=c.entered(contact, t.i.t_s, _LEAVE, failed=True))
+
+
+def _approached(t: Transition, contact: ContactState, approach: Approach, dt_s: float) -> ContactState:
+    """Return the state after one tick of an approach, which a touch or the end of the way ends."""
+    course, t_s, engaged = t.state.course, t.i.t_s, t.state.contact_segment
+    assert course is not None and engaged is not None
+    again = contact.touches > 0
+    contact = c.moved(contact, dt_s, c.SLOWEST_M_S if again else approach.speed_m_s)
+    contact = c.timed(contact, dt_s, contact.force_n > approach.touch_n)
+    if contact.beyond_s >= c.TOUCH_S:
+        touches = contact.touches + 1
+        contact = replace(
+            c.entered(contact, t_s, _PRESS),
+            touches=touches,
+            touched_offset_m=contact.offset_m,
+            wanted_n=approach.touch_n,
+        )
+        t.report(notices.TOUCHED, f"touched the surface after {contact.offset_m:.3f} m")
+        if touches >= c.TOUCHES_MAX:
+            return _failed(t, contact, notices.CONTACT_BOUNCE, f"touched the surface {touches} times; leaving it")
+        # After an interruption the press begins anew.
+        t.change(course=course.moved_to(engaged.start_s if again else engaged.end_s, t_s))
+        return contact
+    _stay_in(t, engaged)
+    if again and contact.offset_m > contact.touched_offset_m + c.BEYOND_M:
+        return _failed(t, contact, notices.CONTACT_LOST, "no surface where it was touched before; leaving it")
+    if contact.offset_m >= approach.distance_max_m:
+        text = f"no surface within {approach.distance_max_m:g} m of the approach; moving back"
+        return _failed(t, contact, notices.SURFACE_MISSING, text)
+    return contact
+
+
+def _lost(t: Transition, contact: ContactState) -> ContactState:
+    text = f"no contact for {c.LOST_S:g} s; approaching the surface again"
+    t.report(notices.CONTACT_INTERRUPTED, text)
+    return c.entered(contact, t.i.t_s, _LOST)
+
+
+def _failed(t: Transition, contact: ContactState, notice: Notice, text: str) -> ContactState:
+    t.report(notice, text)
+    t.finish(Outcome.ABORTED)
+    course = t.state.course
+    assert course is not None
+    t.change(course=course.hold(t.i.t_s))
+    return c.entered(contact, t.i.t_s, _LEAVE, failed=True)
+
+
+def _stay_in(t: Transition, engaged: Segment) -> None:
+    """Keep the plan's time before the end of a phase."""
+    course, t_s = t.state.course, t.i.t_s
+    assert course is not None
+    if not course.held and course.pace(t_s)[0] >= engaged.end_s - _BEFORE_END_S:
+        t.change(course=course.moved_to(engaged.end_s - _BEFORE_END_S, t_s))
+
+
+def _tip_world_m(t: Transition) -> Vec3:
+    """Return the tip relative to the body's origin in the present reference, world frame, with the vehicle level."""
+    course = t.state.course
+    assert course is not None
+    reference = course.reference(t.i.t_s)
+    x, y, z = t.parameters.manipulator.net_body_m(reference.arm_rad)
+    cos, sin = math.cos(reference.yaw_rad), math.sin(reference.yaw_rad)
+    return (cos * x - sin * y, sin * x + cos * y, z)
+
+
+def _phase(t: Transition, segment: Segment) -> Phase | None:
+    return t.parameters.config.mission.phases[segment.index] if segment.index >= 0 else None
+
+
+def _approach(t: Transition, segment: Segment) -> Approach:
+    """Return the approach of the contact to which a segment belongs."""
+    phases = t.parameters.config.mission.phases
+    for index in range(segment.index, -1, -1):
+        phase = phases[index]
+        if isinstance(phase, Approach):
+            return phase
+    raise AssertionError("the mission file is checked: an approach comes first")

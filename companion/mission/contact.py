@@ -1,0 +1,204 @@
+"""Contact with a surface: the offset of the reference along the direction of an approach, and the force with which to press. Pure.
+
+The plan is the motion in front of the surface and a function of time alone. What depends on the measured force is one record,
+`ContactState`, which `companion.core.contact` advances in every tick. It adds two quantities to the plan's reference: an offset along
+the direction, until the surface is touched, and from then on the push, a force on the base (`Reference.push_world_n`, the desired force
+F_d of the paper on the rows of the base). The push is the wanted force plus the integral of the force error; the position reference
+rests at the place of the touch, so that the stiffness of the control law limits how far the vehicle moves if the surface gives way.
+"""
+
+from __future__ import annotations
+
+import math
+
+from msgspec.structs import replace
+
+from companion.config.mission import Approach
+from companion.model.types import ContactMode, ContactState, Reference, Vec3
+
+WEIGH_S = 1.0
+"""Time at rest before the approach, in which the force without contact is averaged."""
+ACCELERATION_M_S2 = 0.1
+STOP_M_S2 = 0.05
+"""Deceleration of the offset after a touch."""
+TOUCH_S = 0.015
+"""Time for which the force must exceed the touch's threshold."""
+LOST_SHARE, LOST_S = 0.3, 0.5
+"""Contact is lost when the force is below this fraction of the touch's threshold for this time."""
+WAIT_S = 0.5
+"""Time at rest after contact was lost."""
+SLOWEST_M_S = 0.02
+"""Speed of the approach after contact was lost."""
+BEYOND_M = 0.10
+"""Distance beyond the last touch within which the surface is sought again."""
+TOUCHES_MAX = 3
+"""Number of touches in one contact at which the vehicle leaves, because it bounces."""
+PRESS_RAMP_S = 1.5
+"""Time in which the wanted force rises."""
+FORCE_RATE_PER_S = 1.5
+"""Rate at which the push removes the force error. Above the bandwidth of the attitude loop, about 5 rad/s, the force would swing."""
+CORRECTION_SHARE, CORRECTION_N = 0.5, 2.0
+"""Bound of the integral: this fraction of the wanted force, and this force."""
+RELEASE_S = 0.7
+"""Planned time for the release of the force."""
+RELEASE_N_S, RELEASE_FAST_N_S = 15.0, 40.0
+"""Rates at which the push ends, as planned and after a failure."""
+TILT_S = 0.2
+"""Time constant with which the reference follows the tilt that the push causes."""
+TURNED_RAD = math.radians(5.0)
+"""Yaw error from which the vehicle leaves: the tool slips along the surface, and its force, far ahead of the rotors, turns the vehicle
+further. The rotors' yaw torque is too small to turn it back under the force.
+"""
+_ARRIVED_M = 0.0002
+
+
+def travel_s(distance_m: float, speed_m_s: float) -> float:
+    """Return the time in which the offset travels a distance from rest to rest, s."""
+    return distance_m / speed_m_s + speed_m_s / ACCELERATION_M_S2
+
+
+def approach_s(approach: Approach) -> float:
+    """Return the largest duration of an approach, s."""
+    return WEIGH_S + travel_s(approach.distance_max_m, approach.speed_m_s)
+
+
+def begun(t_s: float, direction_world: Vec3, tip_per_n_m: Vec3) -> ContactState:
+    """Return the state at the beginning of an approach."""
+    return ContactState(
+        mode=ContactMode.WEIGH,
+        since_s=t_s,
+        direction_world=direction_world,
+        offset_m=0.0,
+        rate_m_s=0.0,
+        acceleration_m_s2=0.0,
+        bias_n=0.0,
+        force_n=0.0,
+        beyond_s=0.0,
+        wanted_n=0.0,
+        correction_n=0.0,
+        push_n=0.0,
+        tilting_n=0.0,
+        tip_per_n_m=tip_per_n_m,
+        touches=0,
+        touched_offset_m=0.0,
+        failed=False,
+    )
+
+
+def along(reference: Reference, contact: ContactState) -> Reference:
+    """Return the reference with the contact's offset and push."""
+    (x, y, z), (vx, vy, vz), (ax, ay, az) = (
+        reference.position_world_m,
+        reference.velocity_world_m_s,
+        reference.acceleration_world_m_s2,
+    )
+    nx, ny, nz = contact.direction_world
+    d, v, a, push = contact.offset_m, contact.rate_m_s, contact.acceleration_m_s2, contact.push_n
+    if contact.touches:
+        # The push tilts the vehicle, and the tool with it: this shift keeps the tip in place.
+        (sx, sy, sz), tilting = contact.tip_per_n_m, contact.tilting_n
+        rate = (push - tilting) / TILT_S
+        x, y, z = x + tilting * sx, y + tilting * sy, z + tilting * sz
+        vx, vy, vz = vx + rate * sx, vy + rate * sy, vz + rate * sz
+    return replace(
+        reference,
+        position_world_m=(x + d * nx, y + d * ny, z + d * nz),
+        velocity_world_m_s=(vx + v * nx, vy + v * ny, vz + v * nz),
+        acceleration_world_m_s2=(ax + a * nx, ay + a * ny, az + a * nz),
+        push_world_n=(push * nx, push * ny, push * nz) if contact.touches else None,
+    )
+
+
+def tip_per_n_m(direction_world: Vec3, tip_world_m: Vec3, weight_n: float) -> Vec3:
+    """Return by how much the reference must move per push, m/N, so that the tip stays where it is while the push tilts the vehicle.
+
+    The thrust is weight e_z + push n, so the vehicle turns by push / weight about e_z x n, for small angles.
+
+    Args:
+        direction_world: direction n of the push, a unit vector.
+        tip_world_m: the tip relative to the body's origin, world frame, with the vehicle level.
+        weight_n: weight of the vehicle.
+    """
+    (nx, ny, _), (x, y, z) = direction_world, tip_world_m
+    level = nx * x + ny * y
+    return (-z * nx / weight_n, -z * ny / weight_n, level / weight_n)
+
+
+def before_approach_m(reference: Reference, contact: ContactState) -> Vec3:
+    """Return the position of the reference without the contact's offset, world frame, m: in front of the surface."""
+    (x, y, z), (nx, ny, nz), d = reference.position_world_m, contact.direction_world, contact.offset_m
+    return (x - d * nx, y - d * ny, z - d * nz)
+
+
+def measured(contact: ContactState, dt_s: float, force_world_n: Vec3 | None) -> ContactState:
+    """Return the state with this tick's force. While it weighs, the force is averaged; no force counts as none."""
+    nx, ny, nz = contact.direction_world
+    fx, fy, fz = force_world_n or (0.0, 0.0, 0.0)
+    against_n = -(fx * nx + fy * ny + fz * nz)
+    bias_n = contact.bias_n
+    if contact.mode is ContactMode.WEIGH:
+        bias_n += 3.0 * dt_s / WEIGH_S * (against_n - bias_n)
+    tilting_n = contact.tilting_n + dt_s / TILT_S * (contact.push_n - contact.tilting_n)
+    return replace(contact, bias_n=bias_n, force_n=against_n - bias_n, tilting_n=tilting_n)
+
+
+def timed(contact: ContactState, dt_s: float, holds: bool) -> ContactState:
+    """Return the state with the time for which a condition has held."""
+    return replace(contact, beyond_s=contact.beyond_s + dt_s if holds else 0.0)
+
+
+def moved(contact: ContactState, dt_s: float, rate_m_s: float) -> ContactState:
+    """Return the state with the offset moved by one tick, its rate changing towards `rate_m_s`.
+
+    Back at 0 the offset stops: the rate falls with the root of the remaining way.
+    """
+    before = contact.rate_m_s
+    if rate_m_s < 0.0:
+        rate_m_s = -min(-rate_m_s, (2.0 * 0.8 * ACCELERATION_M_S2 * max(0.0, contact.offset_m)) ** 0.5)
+    most = (ACCELERATION_M_S2 if rate_m_s != 0.0 else STOP_M_S2) * dt_s
+    rate = min(before + most, max(before - most, rate_m_s))
+    offset_m = contact.offset_m + 0.5 * dt_s * (before + rate)
+    if rate_m_s < 0.0 and offset_m < _ARRIVED_M:
+        return replace(contact, offset_m=0.0, rate_m_s=0.0, acceleration_m_s2=0.0)
+    return replace(contact, offset_m=offset_m, rate_m_s=rate, acceleration_m_s2=(rate - before) / dt_s)
+
+
+def touches(contact: ContactState, touch_n: float) -> bool:
+    """Return whether the measured force shows that the tool still touches the surface."""
+    return contact.force_n > LOST_SHARE * touch_n
+
+
+def pressed(contact: ContactState, t_s: float, dt_s: float, touch_n: float, force_n: float) -> ContactState:
+    """Return the state after one tick of pressing: the offset comes to rest and the force follows its ramp from the touch's.
+
+    Args:
+        contact: state in mode PRESS.
+        t_s: flight clock.
+        dt_s: time since the last tick.
+        touch_n: threshold of the touch, where the ramp begins.
+        force_n: force at the ramp's end.
+    """
+    wanted_n, correction_n = contact.wanted_n, contact.correction_n
+    if not touches(contact, touch_n):  # nothing winds up, and the offset creeps on until the surface is touched again
+        contact = moved(contact, dt_s, SLOWEST_M_S)
+    else:
+        contact = moved(contact, dt_s, 0.0)
+        rate = abs(force_n - touch_n) / PRESS_RAMP_S * dt_s
+        wanted_n = min(wanted_n + rate, max(wanted_n - rate, force_n))
+        most = CORRECTION_SHARE * force_n + CORRECTION_N
+        correction_n += FORCE_RATE_PER_S * dt_s * (wanted_n - contact.force_n)
+        correction_n = min(most, max(-most, correction_n))
+    push_n = max(0.0, wanted_n - touch_n + correction_n)
+    return replace(contact, wanted_n=wanted_n, correction_n=correction_n, push_n=push_n)
+
+
+def released(contact: ContactState, dt_s: float) -> ContactState:
+    """Return the state with less push; at rest."""
+    contact = moved(contact, dt_s, 0.0)
+    rate_n_s = RELEASE_FAST_N_S if contact.failed else RELEASE_N_S
+    return replace(contact, wanted_n=0.0, correction_n=0.0, push_n=max(0.0, contact.push_n - rate_n_s * dt_s))
+
+
+def entered(contact: ContactState, t_s: float, mode: ContactMode, *, failed: bool = False) -> ContactState:
+    """Return the state at the beginning of a mode."""
+    return replace(contact, mode=mode, since_s=t_s, beyond_s=0.0, failed=contact.failed or failed)

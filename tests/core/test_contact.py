@@ -1,0 +1,171 @@
+"""Contact phases in the fast loop: press and leave, a missing surface, a surface that gives way, and commands while pressing."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from companion.analysis.contact import contact_summary
+from companion.analysis.log import FlightLog
+from companion.core.flight_core import FlightCore
+from companion.mission.check import check_mission
+from companion.model.types import ContactMode, Inputs, OperatorCommand, Outcome, Outputs
+from companion.sitl_config.loader import load_sitl
+from sitl.campaigns.flights import row_of
+from sitl.fast.loop import FastFlight, FastResult
+
+PRESS = "configs/missions/press.yaml"
+WALL = {"point_m": [1.5, 0.0, 1.09], "normal": [-1.0, 0.0, 0.0], "stiffness_n_m": 1e4, "friction": 0.5}
+
+
+def press(
+    wall: dict[str, Any] | None = None,
+    *,
+    command: tuple[float, OperatorCommand] | None = None,
+    approach_m_s: float = 0.03,
+    force_max_n: float = 12.0,
+) -> tuple[FastFlight, FastResult]:
+    """Fly the mission press in the ideal world.
+
+    Args:
+        wall: keys of the wall that differ from `WALL`.
+        command: time after the first touch, s, and the operator's command then.
+        approach_m_s: speed of the approach.
+        force_max_n: `safety.contact_force_max_n`.
+    """
+    overrides = [
+        f"world.surfaces={json.dumps([WALL | (wall or {})])}",
+        f"mission.phases[3].speed_m_s={approach_m_s}",
+        f"vehicle.safety.contact_force_max_n={force_max_n}",
+    ]
+    flight = FastFlight(load_sitl(PRESS, world="ideal", overrides=overrides))
+    if command is not None:
+        step, after_s, sent = flight.core.step, command[0], command[1]
+        touched: list[float] = []
+
+        def commanded(inputs: Inputs) -> Outputs:
+            due = bool(touched) and touched[0] + after_s <= inputs.t_s < touched[0] + after_s + 0.02
+            outputs = step(replace(inputs, command=sent) if due else inputs)
+            if outputs.contact is not None and outputs.contact.touches and not touched:
+                touched.append(outputs.t_s)
+            return outputs
+
+        flight.core.step = commanded  # type: ignore[method-assign]
+    return flight, flight.run(120.0)
+
+
+def events(result: FastResult) -> list[str]:
+    return [event.id for outputs in result.outputs for event in outputs.events]
+
+
+def force_n(result: FastResult) -> np.ndarray[Any, Any]:
+    """True force of the wall on the tip along -x in each tick."""
+    assert result.layout is not None
+    return np.array([-result.layout.contact(snapshot.sensors)[1][0] for snapshot in result.snapshots])
+
+
+@pytest.fixture(scope="module")
+def pressed() -> tuple[FastFlight, FastResult]:
+    return press({"tilt_error_deg": [8.0, -6.0], "place_error_m": -0.03})
+
+
+def test_the_force_is_held_on_a_tilted_wall_that_is_not_where_the_mission_expects_it(
+    pressed: tuple[FastFlight, FastResult],
+) -> None:
+    flight, result = pressed
+    assert result.outputs[-1].outcome is Outcome.COMPLETED and not result.crashed
+    assert not {"contact_lost", "contact_bounce", "surface_missing", "tether_snagged", "catch"} & set(events(result))
+    steady = np.array([o.contact is not None and o.contact.wanted_n == 5.0 for o in result.outputs])
+    settled = np.flatnonzero(steady)[300:]
+    assert abs(force_n(result)[settled].mean() - 5.0) < 0.25
+    assert force_n(result)[steady].max() < 7.5
+    assert flight.plant.world.surfaces is not None and flight.plant.world.surfaces.rotor_distance_min_m > 0.1
+
+
+def test_after_the_contact_nothing_presses_and_the_vehicle_is_back_on_its_plan(
+    pressed: tuple[FastFlight, FastResult],
+) -> None:
+    _, result = pressed
+    last = max(k for k, o in enumerate(result.outputs) if o.contact is not None)
+    assert result.outputs[last].contact.mode is ContactMode.LEAVE  # type: ignore[union-attr]
+    after = result.outputs[last + 1].reference
+    assert after is not None and after.push_world_n is None
+    assert after.position_world_m == pytest.approx((0.6, 0.0, 1.1), abs=1e-3)
+    assert force_n(result)[last + 1 :].max() == 0.0
+
+
+def test_the_reference_never_jumps(pressed: tuple[FastFlight, FastResult]) -> None:
+    _, result = pressed
+    ticks = [(o.t_s, o.reference) for o in result.outputs if o.contact is not None]
+    assert not any(o.limited_by for o in result.outputs)
+    for (t0, a), (t1, b) in pairwise(ticks):
+        assert a is not None and b is not None
+        step = np.subtract(b.position_world_m, a.position_world_m)
+        mean = 0.5 * np.add(a.velocity_world_m_s, b.velocity_world_m_s) * (t1 - t0)
+        assert np.linalg.norm(step - mean) < 0.002
+
+
+def test_the_summary_has_the_contact_and_a_replay_is_identical(pressed: tuple[FastFlight, FastResult]) -> None:
+    flight, result = pressed
+    log: FlightLog = row_of(flight.config.flight, result, None)[1]
+    found = contact_summary(log)
+    assert found is not None and found["touches"] >= 1
+    assert found["wanted_n"] == 5.0 and found["mean_n"] == pytest.approx(5.0, abs=0.1)
+    assert 0.0 < found["rms_error_n"] < 0.75 and found["overshoot_n"] < 2.5 and found["path_rms_m"] < 0.02
+    assert flight.plant.world.surfaces is not None
+    off_m = flight.plant.world.surfaces.placed[0].local_m(tuple(found["surface"]["point_m"]))[2]
+    assert off_m == pytest.approx(0.015, abs=0.005)  # the ball's radius
+    core = FlightCore(flight.config.flight)
+    assert all(core.step(i) == o for i, o in zip(result.inputs, result.outputs, strict=True))
+
+
+def test_a_missing_surface_ends_in_a_retreat_and_an_aborted_mission() -> None:
+    _, result = press({"point_m": [2.1, 0.0, 1.09]})
+    assert "surface_missing" in events(result) and "touched" not in events(result)
+    assert result.outputs[-1].outcome is Outcome.ABORTED and not result.crashed
+
+
+def test_a_surface_that_gives_way_is_not_followed() -> None:
+    _, result = press({"gives_way_n": 4.8}, approach_m_s=0.02)
+    assert {"contact_interrupted", "contact_lost"} <= set(events(result))
+    assert result.outputs[-1].outcome is Outcome.ABORTED and not result.crashed
+    assert max(o.contact.offset_m for o in result.outputs if o.contact is not None) < 0.45
+
+
+@pytest.mark.parametrize(
+    ("command", "outcome"), [(OperatorCommand.HOLD, Outcome.ABORTED), (OperatorCommand.LAND, Outcome.ABORTED)]
+)
+def test_a_command_while_pressing_leads_away_from_the_wall_first(command: OperatorCommand, outcome: Outcome) -> None:
+    _, result = press(command=(5.0, command))
+    assert result.outputs[-1].outcome is outcome and not result.crashed
+    since_s = next(o.t_s for o in result.outputs for e in o.events if e.id == f"operator_{command.value}")
+    pressing = force_n(result)[[o.t_s > since_s + 1.0 for o in result.outputs]]
+    assert pressing.max() == 0.0
+    floor = [o.reference.position_world_m for o in result.outputs if o.t_s > since_s + 1.0 and o.reference is not None]
+    assert all(x < 0.85 for x, _, z in floor if z < 1.0)
+
+
+def test_a_force_that_is_too_high_leads_away_from_the_wall() -> None:
+    _, result = press(force_max_n=4.0)
+    assert "contact_force_high" in events(result)
+    assert not result.crashed and force_n(result)[-1] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"mission.phases[4].force_n": 9.0}, "safety.contact_force_max_n"),
+        ({"mission.phases[4].force_n": 8.0, "vehicle.safety.contact_force_max_n": 30.0}, "tilts by"),
+        ({"mission.phases[3].distance_max_m": 1.5}, "if it touches nothing"),
+        ({"mission.phases[3].direction": [-1.0, 0.0, 0.0]}, "beyond the rotors"),
+        ({"mission.phases[2].arm_deg": [60.0, 60.0]}, "N m of joint 1"),
+    ],
+)
+def test_the_check_refuses_what_cannot_press(changes: dict[str, object], text: str) -> None:
+    config = load_sitl(PRESS, overrides=[f"{key}={json.dumps(value)}" for key, value in changes.items()])
+    assert any(text in problem for problem in check_mission(config.mission, config.vehicle))
