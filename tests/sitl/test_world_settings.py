@@ -14,9 +14,11 @@ from companion.sitl_config.world import World
 from sitl.fast.loop import FastFlight, FastResult
 from tests.sitl.simulated_devices import END_STEPS, Emitted, emitted
 from tests.sitl.world_settings import Pair, Settings, fault_pairs, pairs
-from tests.support import SHORT_CATCH
+from tests.support import HOVER, SHORT_CATCH
 
 BASE = load_sitl(SHORT_CATCH)
+WITH_ROD = load_sitl(HOVER, vehicle_path="tarot650_2r_rod")
+"""Flown in worlds with surfaces, which a net does not touch."""
 PAIRS = [*pairs(), *fault_pairs()]
 
 _SET_UP = "the companion's set-up of the bus writes this register, or a row of its preflight judges it; the fast loop has neither"
@@ -28,6 +30,8 @@ ON_WIRES_ONLY = {
     "servos.return_delay_us": _SET_UP,
     "servos.operating_mode": _SET_UP,
     "servos.position_limit_counts": "mode 0 has no position limits",
+    "extends": "a world file's key: the loader has read the other world",
+    "surfaces.name": "it stands in the report alone",
     "servos.shadow_id": "a second address on the bus",
 }
 """Settings without a meaning in the fast closed loop, and why."""
@@ -75,18 +79,21 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def world(settings: Settings) -> SitlConfig:
-    return BASE.model_copy(update={"world": World.model_validate(settings)})
+    return in_world(World.model_validate(settings))
+
+
+def in_world(world: World) -> SitlConfig:
+    return (WITH_ROD if world.surfaces else BASE).model_copy(update={"world": world})
 
 
 @cache
 def usual_flight(world_json: str, limit_s: float) -> FastResult:
-    config = BASE.model_copy(update={"world": World.model_validate_json(world_json)})
-    return FastFlight(config).run(limit_s)
+    return FastFlight(in_world(World.model_validate_json(world_json))).run(limit_s)
 
 
 @cache
 def usual_emitted(world_json: str, end: int) -> Emitted:
-    return emitted(BASE.model_copy(update={"world": World.model_validate_json(world_json)}), end)
+    return emitted(in_world(World.model_validate_json(world_json)), end)
 
 
 def flights_differ(pair: Pair, limit_s: float) -> bool:

@@ -17,6 +17,7 @@ from pydantic.fields import FieldInfo
 from companion.config.base import Model
 from companion.sitl_config.effects.mocap import Mocap
 from companion.sitl_config.faults import KINDS, Fault
+from companion.sitl_config.surfaces import Surface
 from companion.sitl_config.world import Push, Servo, World
 
 Settings = dict[str, Any]
@@ -37,6 +38,13 @@ EXAMPLES: dict[type[Model], Settings] = {
     Servo: {},
     Fault: {"kind": "gust", "t_s": 0.1},
     Mocap: {"on": True, "lost_share": 0.2, "wobble_every_s": 0.5},
+    # The corner of a plate under the tip of the rod, which `test_world_settings.WITH_ROD` carries folded.
+    Surface: {
+        "point_m": (-0.544, -0.03, 0.136),
+        "normal": (0.1, 0.1, 1.0),
+        "size_m": (0.05, 0.05),
+        "stiffness_n_m": 500.0,
+    },
 }
 """Examples of the parts of the world whose fields are tested; an effect that is not listed is switched on."""
 
@@ -54,6 +62,7 @@ VALUES: dict[str, Any] = {
     "servos.current_limit_counts": 600,
     "catch_at_m[1]": 1.0,
     "faults.phase": "takeoff",
+    "surfaces.name": "panel",
     "faults.duration_s": 0.1,
     "faults.size": 3.0,
     "faults.after": "start",
