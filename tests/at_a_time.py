@@ -1,8 +1,9 @@
 """How many tests of a kind run at a time, and whether other programs take a core.
 
-A flight takes about half a core, a waiting test a third. The bytes of a pty are carried by a thread of the kernel that waits for a core
-like any other program, so neither fills two cores. Where the flight, the guardian and the simulated world get real-time priority, they
-go on in time whatever else two cores have to do. Without it their limits are met by fewer.
+A flight takes about a core (the flight process 0.4, the simulated world 0.3, recorder, guardian and launcher the rest), a waiting test
+a third. The bytes of a pty are carried by a thread of the kernel that waits for a core like any other program. Where the flight, the
+guardian and the simulated world get real-time priority, they go on in time whatever else two cores have to do. Without it their limits
+are met by fewer.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from pathlib import Path
 
 from companion.runtime.realtime import FLIGHT_PRIORITY
 
-AT_A_TIME = {"waiting": (2, 3), "flights": (1, 3)}
+AT_A_TIME = {"waiting": (2, 3), "flights": (1, 2)}
 """By stage: without and with real-time priority, on two cores or more."""
 
 
