@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import functools
 import queue
 import threading
@@ -244,11 +243,9 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
                     self._try(lambda: self._write_bus(limp))
 
     def _write_newest(self) -> None:
-        with (
-            self._bus_in_use,
-            contextlib.suppress(IndexError),
-        ):  # an earlier pass or the event loop has sent a newer one
-            self._write(self._goals.pop())
+        with self._bus_in_use:
+            if self._goals:  # otherwise an earlier pass, or the event loop, has sent a newer one
+                self._write(self._goals.pop())
 
     def _write(self, goal: Goal) -> None:
         self._try(lambda: self._write_bus(goal))

@@ -1,6 +1,7 @@
 """Blocking communication with the arm's servos: check and set up, one read and one write per cycle, release.
 
-Everything here runs in the one thread that owns the bus. The dynamixel-sdk implements the protocol.
+Everything here runs in the bus thread, but for `write_currents`, which the event loop calls while the thread does not use the bus
+(`companion.io.arm.thread`). The dynamixel-sdk implements the protocol.
 """
 
 from __future__ import annotations
