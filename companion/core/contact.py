@@ -12,6 +12,7 @@ import math
 from msgspec.structs import replace
 
 from companion.config.mission import Approach, Detach, Phase, Press
+from companion.config.vehicle import OBSERVER
 from companion.core.transition import Transition
 from companion.mission import contact as c
 from companion.mission.segments import Segment
@@ -49,7 +50,9 @@ def advance_contact(t: Transition) -> None:
     approach = _approach(t, segment)
     engaged = t.state.contact_segment
     assert engaged is not None
-    if contact.mode is _LEAVE:
+    if contact.mode is not _LEAVE and not _is_force_known(t):
+        contact = _failed(t, contact, notices.CONTACT_LOST, "the force is not measured any more; leaving the surface")
+    elif contact.mode is _LEAVE:
         speed_m_s = phase.speed_m_s if isinstance(phase, Detach) else approach.speed_m_s
         contact = c.released(contact, dt_s) if contact.push_n > 0.0 else c.moved(contact, dt_s, -speed_m_s)
         if contact.offset_m <= 0.0:
@@ -85,6 +88,16 @@ def advance_contact(t: Transition) -> None:
 def force_on_tool_n(log: ControlLog) -> Vec3:
     """Return the force on the tool that a tick of the control law measured or, without a force sensor, observed."""
     return log.force_ext_world_n if log.force_observed_world_n is None else log.force_observed_world_n
+
+
+def _is_force_known(t: Transition) -> bool:
+    """Return whether the force is observed, or measured and not older than `safety.force_timeout_s`: without it the approach would not
+    end at the surface.
+    """
+    vehicle, force = t.parameters.vehicle, t.i.force
+    if vehicle.force_source == OBSERVER:
+        return True
+    return force is not None and t.i.t_s - force.stamp_s <= vehicle.safety.force_timeout_s
 
 
 def leave(t: Transition) -> None:

@@ -77,7 +77,8 @@ CONTACT_INTERRUPTED = Notice(
 )  # fmt: skip
 CONTACT_LOST = Notice(
     "contact_lost", _WARNING, _WARN,
-    "the surface was not found again within 0.1 m of where it was touched: the vehicle moves back, and the mission goes on as aborted",
+    "the surface was not found again within 0.1 m of where it was touched, or the force is not measured any more: the vehicle moves "
+    "back, and the mission goes on as aborted",
 )  # fmt: skip
 CONTACT_BOUNCE = Notice(
     "contact_bounce", _WARNING, _WARN,

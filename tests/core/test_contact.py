@@ -130,6 +130,17 @@ def test_a_missing_surface_ends_in_a_retreat_and_an_aborted_mission() -> None:
     assert result.outputs[-1].outcome is Outcome.ABORTED and not result.crashed
 
 
+@pytest.mark.parametrize("t_s", [9.0, 22.0])
+def test_a_force_sensor_that_dies_during_approach_or_press_leads_away_from_the_wall(t_s: float) -> None:
+    config = load_sitl("press", world="wall", overrides=[f"world.faults=[{{kind: force_loss, t_s: {t_s}}}]"])
+    flight = FastFlight(config)
+    result = flight.run(90.0)
+    surfaces = flight.plant.world.surfaces
+    assert "contact_lost" in events(result) and "tether_snagged" not in events(result)
+    assert result.outputs[-1].outcome is Outcome.ABORTED and not result.crashed
+    assert surfaces is not None and surfaces.force_max_n < 7.5 and surfaces.rotor_distance_min_m > 0.15
+
+
 def test_a_surface_that_gives_way_is_not_followed() -> None:
     _, result = press({"gives_way_n": 4.8}, approach_m_s=0.02)
     assert {"contact_interrupted", "contact_lost"} <= set(events(result))
