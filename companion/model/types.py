@@ -159,6 +159,8 @@ class VehicleState(Record, frozen=True, kw_only=True):
     """End of the newest IMU sample's interval on PX4's clock (HIGHRES_IMU.time_usec), s; None in older logs."""
     delta_velocity_body_m_s: Vec3 | None = None
     """Integral of the specific force over all IMU samples since the link was opened, up to `imu_boot_s`; None in older logs."""
+    imu_gaps: int | None = None
+    """Number of gaps between IMU samples that the integral does not bridge; None in older logs."""
 
 
 class AutopilotStatus(Record, frozen=True, kw_only=True):

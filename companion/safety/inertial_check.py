@@ -24,8 +24,8 @@ POLE_RAD_S: Final = 3.0
 """All three poles of the observer."""
 SETTLE_S: Final = 9.0 / POLE_RAD_S
 """The innovation is not judged for this time after a start: velocity and bias are unknown then."""
-IMU_GAP_MAX_S: Final = 0.05
-"""The observer starts again after a longer gap between IMU samples: motion in the gap was not measured."""
+IMU_LATE_MAX_S: Final = 0.05
+"""A pose that comes longer than this after the newest IMU sample is not compared."""
 
 
 CLOCK_GROWTH: Final = 1e-3
@@ -63,7 +63,7 @@ class InertialCheck:
     Args:
         limit_m: threshold of the innovation's length.
         hold_s: hold time: the innovation must exceed the threshold at every pose for this long.
-        gap_max_s: the observer starts again after a longer gap between poses.
+        gap_max_s: the observer starts again after a longer gap between poses, or between two calls of `imu`.
     """
 
     def __init__(self, limit_m: float, hold_s: float, gap_max_s: float) -> None:
@@ -81,11 +81,12 @@ class InertialCheck:
 
         Args:
             stamp_s: arrival of that sample.
-            dt_s: interval since the last call on the clock of the samples; unless it is positive and short, the observer starts again.
+            dt_s: interval since the last call on the clock of the samples; infinite if a sample of it is missing. Unless it is
+                positive and short, the observer starts again. A late tick brings all samples of its interval and does no harm.
             delta_velocity_world_m_s: change of the velocity in that interval: specific force turned into the world, gravity removed.
         """
         self._imu_s = stamp_s
-        if not 0.0 < dt_s <= IMU_GAP_MAX_S:
+        if not 0.0 < dt_s <= self._gap_max_s:
             self._pose_s = None
             return
         dx, dy, dz = delta_velocity_world_m_s
@@ -108,10 +109,11 @@ class InertialCheck:
         Returns:
             True if the innovation has exceeded the threshold for the hold time.
         """
+        if self._imu_s is not None and stamp_s - self._imu_s > IMU_LATE_MAX_S:
+            return False
         before_s, self._pose_s = self._pose_s, stamp_s
         dt_s = stamp_s - before_s if before_s is not None else math.inf
-        stale = self._imu_s is None or stamp_s - self._imu_s > IMU_GAP_MAX_S
-        if stale or not 0.0 < dt_s <= self._gap_max_s:
+        if self._imu_s is None or not 0.0 < dt_s <= self._gap_max_s:
             self._position, self._velocity, self._bias = position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
             self._started_s, self._above_since_s, self.innovation_m = stamp_s, None, 0.0
             return False

@@ -15,7 +15,7 @@ from companion.config.safety import Safety
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_rotate, wrap_rad
 from companion.model.types import Inputs, MocapPose, Quat, Vec2, VehicleState
-from companion.safety.inertial_check import IMU_GAP_MAX_S, InertialCheck, RemoteClock
+from companion.safety.inertial_check import IMU_LATE_MAX_S, InertialCheck, RemoteClock
 from companion.safety.situation import HOLDS, Situation, Values
 from companion.safety.stream_watch import StreamWatch
 
@@ -150,7 +150,7 @@ class MocapTracker:
         now, then = vehicle.delta_velocity_body_m_s, before.delta_velocity_body_m_s
         if now is None or then is None:
             return
-        dt_s = boot_s - before.imu_boot_s
+        dt_s = boot_s - before.imu_boot_s if vehicle.imu_gaps == before.imu_gaps else math.inf
         x, y, z = now
         bx, by, bz = then
         x, y, z = quat_rotate(vehicle.attitude_wxyz, (x - bx, y - by, z - bz))
@@ -195,7 +195,7 @@ class MocapTracker:
         latency_s, sent_s = pose.latency_s or 0.0, pose.stamp_s
         if pose.exposure_server_s is not None:
             sent_s = self._server_clock.local_s(pose.exposure_server_s + latency_s, sent_s)
-        return min(max(-IMU_GAP_MAX_S, self._imu_s - sent_s + latency_s), self._s.mocap_timeout_s)
+        return min(max(-IMU_LATE_MAX_S, self._imu_s - sent_s + latency_s), self._s.mocap_timeout_s)
 
     def _follows(self, before: MocapPose, pose: MocapPose, vehicle: VehicleState) -> bool:
         """Return whether the pose is reachable from the previous pose or from PX4's estimate within the jump limit."""

@@ -369,6 +369,7 @@ class FastFlight:
             boot_s=None if self.plant.faults is None else t_s - self.px4.booted_at_s,
             imu_boot_s=self._imu.total.boot_s,
             delta_velocity_body_m_s=flu_from_frd(self._imu.total.sum_m_s),
+            imu_gaps=self._imu.total.gaps,
         )
 
     def _estimator(self, t_s: float) -> EstimatorReport | None:

@@ -43,7 +43,7 @@ def test_what_was_not_measured_adds_nothing(jump_s: float) -> None:
     total = DeltaVelocity()
     total.add(200.0, (1.0, 0.0, 0.0))
     total.add(200.0 + jump_s, (1.0, 0.0, 0.0))
-    assert (total.boot_s, total.sum_m_s) == (200.0 + jump_s, (0.0, 0.0, 0.0))
+    assert (total.boot_s, total.sum_m_s, total.gaps) == (200.0 + jump_s, (0.0, 0.0, 0.0), 1)
     total.add(200.0 + jump_s + INTERVAL_S, (1.0, 0.0, 0.0))
     assert total.sum_m_s == pytest.approx((INTERVAL_S, 0.0, 0.0))
 

@@ -26,13 +26,15 @@ class DeltaVelocity:
     aliased.
     """
 
-    __slots__ = ("_interval_s", "_mean_m_s2", "boot_s", "sum_m_s")
+    __slots__ = ("_interval_s", "_mean_m_s2", "boot_s", "gaps", "sum_m_s")
 
     def __init__(self) -> None:
         self.boot_s: float | None = None
         """End of the newest sample's interval on PX4's clock; None before the first sample."""
         self.sum_m_s: Vec3 = (0.0, 0.0, 0.0)
         """Integral of the specific force since the first sample, in the axes of the samples."""
+        self.gaps = 0
+        """Number of gaps that the sum does not bridge."""
         self._interval_s = math.inf
         self._mean_m_s2: Vec3 = (0.0, 0.0, 0.0)
 
@@ -65,5 +67,7 @@ class DeltaVelocity:
                 if math.isinf(self._interval_s):
                     self._interval_s = dt_s
                 self._interval_s += _SMOOTHING * (min(dt_s, 2.0 * self._interval_s) - self._interval_s)
+            else:
+                self.gaps += 1
         self.boot_s = boot_s
         self._mean_m_s2 = (mx + _SMOOTHING * (x - mx), my + _SMOOTHING * (y - my), mz + _SMOOTHING * (z - mz))

@@ -45,7 +45,7 @@ class Inbox:
         self._after_heartbeat = after_heartbeat
         self._position: tuple[float, Vec3, Vec3] | None = None
         self._attitude: tuple[float, Quat, Vec3, float | None] | None = None
-        self._imu: tuple[float, Vec3, float | None, Vec3] | None = None
+        self._imu: tuple[float, Vec3, float | None, Vec3, int] | None = None
         self._delta_velocity_frd = DeltaVelocity()
         self._heartbeat: tuple[float, str] | None = None
         self._estimator: tuple[float, str] | None = None
@@ -93,7 +93,9 @@ class Inbox:
             )
             if state is not None:
                 total = flu_from_frd(imu[3])
-                state = replace(state, boot_s=attitude[3], imu_boot_s=imu[2], delta_velocity_body_m_s=total)
+                state = replace(
+                    state, boot_s=attitude[3], imu_boot_s=imu[2], delta_velocity_body_m_s=total, imu_gaps=imu[4]
+                )
             # Values that are not finite count as not received: the last valid state stays and becomes stale.
             self._vehicle = state or self._vehicle
         return self._vehicle
@@ -158,7 +160,7 @@ class Inbox:
         total = self._delta_velocity_frd
         if boot_s is not None:
             total.add(boot_s, force_m_s2)
-        self._imu = (self._clock(), force_m_s2, total.boot_s, total.sum_m_s)
+        self._imu = (self._clock(), force_m_s2, total.boot_s, total.sum_m_s, total.gaps)
         self._imus += 1
 
     def _on_landed(self, value: Any, _: Any) -> None:
