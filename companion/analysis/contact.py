@@ -47,16 +47,47 @@ def contact_summary(log: FlightLog) -> dict[str, Any] | None:
     if not steady.any():
         return row
     row.update(mean_n=float(force[steady].mean()), rms_error_n=float(np.sqrt(np.mean((force - wanted)[steady] ** 2))))
-    direction = np.array(last.direction_world)
-    found = _tips_m(log, steady)
+    found = tips_m(log, steady)
     if found is not None:
-        tip, planned = found
+        tip, planned, direction, _ = found
         off = tip - planned
         off -= np.outer(off @ direction, direction)
         off -= off.mean(axis=0) if float(np.ptp(planned, axis=0).max()) < PLANE_M else 0.0
         row["path_rms_m"] = float(np.sqrt(np.mean(np.sum(off * off, axis=1))))
         row["surface"] = {"point_m": tip.mean(axis=0).tolist(), "normal": _normal(tip, direction).tolist()}
     return row
+
+
+def true_force_n(summary: dict[str, Any]) -> float | None:
+    """Return the true force along the surface's normal, as the simulated world reports it; None if it is unknown."""
+    surface = (summary.get("contact") or {}).get("surface")
+    force_n = ((summary.get("world") or {}).get("contact") or {}).get("force_held_world_n")
+    return None if surface is None or force_n is None else float(np.dot(force_n, surface["normal"]))
+
+
+def contact_lines(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return name and text of what a summary says about the contact; empty for a flight without contact."""
+    contact = summary.get("contact")
+    if contact is None:
+        return []
+    touches = "touch" if contact["touches"] == 1 else "touches"
+    text = f"{contact['touches']} {touches}"
+    if contact["mean_n"] is not None:
+        text += (
+            f", {contact['wanted_n']:.2f} N wanted, {contact['mean_n']:.2f} N measured (RMS error {contact['rms_error_n']:.2f} N, "
+            f"overshoot {contact['overshoot_n']:.1f} N)"
+        )
+    true_n, surface = true_force_n(summary), contact["surface"]
+    if true_n is not None:
+        text += f"; true: {true_n:.2f} N (known to the simulated world only)"
+    lines = [("contact", text)]
+    if surface is None:
+        return lines
+    x, y, z = surface["point_m"]
+    text = (
+        f"touched at [{x:.3f}, {y:.3f}, {z:.3f}] m, tip within {1e3 * contact['path_rms_m']:.0f} mm (RMS) of its path"
+    )
+    return [*lines, ("surface", text)]
 
 
 def _steady(t_s: Array, pressing: Any, wanted: Array) -> Any:
@@ -70,12 +101,22 @@ def _steady(t_s: Array, pressing: Any, wanted: Array) -> Any:
     return steady
 
 
-def _tips_m(log: FlightLog, used: Any) -> tuple[Array, Array] | None:
-    """Return the measured and the planned position of the tip in these ticks, world frame, m; None if they are unknown."""
+def surface_axes(direction: Array) -> tuple[Array, Array]:
+    """Return the unit vectors to the right and up in a surface, as seen along a direction into it; of a floor, up is the world's x."""
+    level = np.array([direction[1], -direction[0], 0.0])
+    length = float(np.linalg.norm(level))
+    right = level / length if length > 1e-6 else np.array([0.0, -1.0, 0.0])
+    return right, np.cross(right, direction)
+
+
+def tips_m(log: FlightLog, used: Any) -> tuple[Array, Array, Array, Array] | None:
+    """Return the measured and the planned position of the tip, world frame, m, the last direction of the contact, and the ticks to
+    which they belong: those of `used` in which all is known. None if it never is.
+    """
     skeleton = logged_skeleton(log.config.get("vehicle"))
     if skeleton is None:
         return None
-    measured, planned = [], []
+    measured, planned, ticks, direction = [], [], [], (0.0, 0.0, 0.0)
     for k in np.flatnonzero(used):
         i, o = log.inputs[k], log.outputs[k]
         at, contact, reference = best_pose(i), o.contact, o.reference
@@ -87,7 +128,9 @@ def _tips_m(log: FlightLog, used: Any) -> tuple[Array, Array] | None:
         measured.append(np.add(at.position_world_m, quat_rotate(at.attitude_wxyz, tip)))
         ahead = np.add(reference.position_world_m, quat_rotate((float(cos), 0.0, 0.0, float(sin)), level))
         planned.append(ahead - contact.tilting_n * np.array(contact.tip_per_n_m))
-    return (np.array(measured), np.array(planned)) if measured else None
+        ticks.append(k)
+        direction = contact.direction_world
+    return (np.array(measured), np.array(planned), np.array(direction), np.array(ticks)) if measured else None
 
 
 def _tip_body_m(skeleton: ArmSkeleton, arm_rad: Array) -> Vec3:

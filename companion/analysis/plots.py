@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from companion.analysis import metrics
+from companion.analysis.contact_plots import contact_force, contact_path, has_contact
 from companion.analysis.log import Array, FlightLog
 from companion.analysis.plot_style import (
     CATCH,
@@ -23,23 +24,14 @@ from companion.analysis.plot_style import (
     SERIES,
     SERIES_DARK,
     dress,
-    mark_catch,
     new_figure,
     write_png,
 )
+from companion.analysis.time_axes import legend, line, stack
 from companion.analysis.timing import end_s
 from companion.model.best_pose import best_pose
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import tilt_rad
-from companion.model.types import Outputs, PhaseKind
-
-_PHASES_NAMED_MAX = 40
-"""Number of phases above which only kinds of phases are distinguished."""
-_PHASES = {
-    PhaseKind.TAKEOFF: "#eaf3fb",
-    PhaseKind.FLIGHT: "#ffffff",
-    PhaseKind.LANDING: "#f6f0e3",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +62,19 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
             "Loads estimated by the adaptation: force on the base, first moments of the links, joint friction.",
             _load,
         ),
+        (
+            "contact",
+            "Force on the tool",
+            "Force of the surface on the tool in the frame of the surface, as seen from the vehicle, without the mean before the "
+            "approach. The shaded bands are what the flight does about the surface.",
+            contact_force,
+        ),
+        (
+            "surface",
+            "Contact in the plane of the surface",
+            "Centre of the tip while it touches, as seen from the vehicle, and the path on which the reference would lead it.",
+            contact_path,
+        ),
         ("force", "Contact force", "Tared force on the net in the world frame, without the weight of the net.", _force),
         (
             "path",
@@ -97,11 +102,11 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
 def _tracking(log: FlightLog) -> Figure | None:
     joints = log.joint_count
     title = "Tracking errors and arm" if joints else "Tracking errors"
-    figure, axes, t = _stack(log, title, (1.0, 1.0, *((1.25,) if joints else ())), 6.8 if joints else 4.8)
-    _line(axes[0], t, _norm(metrics.position_error_m(log)), r"$\|e_p\|$", SERIES[0])
-    _line(axes[0], t, log.column(lambda i, o, s: o.mocap_innovation_m or None), "motion capture against IMU", SERIES[1])
-    _legend(axes[0], columns=2)
-    _line(axes[1], t, np.degrees(_norm(metrics.attitude_error_rad(log))), r"$\|e_q\|$", SERIES[0])
+    figure, axes, t = stack(log, title, (1.0, 1.0, *((1.25,) if joints else ())), 6.8 if joints else 4.8)
+    line(axes[0], t, _norm(metrics.position_error_m(log)), r"$\|e_p\|$", SERIES[0])
+    line(axes[0], t, log.column(lambda i, o, s: o.mocap_innovation_m or None), "motion capture against IMU", SERIES[1])
+    legend(axes[0], columns=2)
+    line(axes[1], t, np.degrees(_norm(metrics.attitude_error_rad(log))), r"$\|e_q\|$", SERIES[0])
     axes[0].set_ylabel("position error [m]")
     axes[1].set_ylabel("attitude error [deg]")
     pre, post = metrics.flight_masks(log)
@@ -116,30 +121,30 @@ def _tracking(log: FlightLog) -> Figure | None:
     if joints:
         angles, wanted = np.degrees(log.columns.arm_rad), np.degrees(log.columns.arm_reference_rad)
         for j in range(joints):
-            _line(axes[2], t, angles[:, j], rf"$\alpha_{j + 1}$", SERIES[j])
-            _line(axes[2], t, wanted[:, j], rf"$\alpha_{j + 1}$ reference", SERIES_DARK[j], reference=True)
+            line(axes[2], t, angles[:, j], rf"$\alpha_{j + 1}$", SERIES[j])
+            line(axes[2], t, wanted[:, j], rf"$\alpha_{j + 1}$ reference", SERIES_DARK[j], reference=True)
         axes[2].set_ylabel("arm angle [deg]")
-        _legend(axes[2], columns=4)
+        legend(axes[2], columns=4)
     return figure
 
 
 def _actuation(log: FlightLog) -> Figure | None:
     joints = log.joint_count
-    figure, axes, t = _stack(log, "Actuation", (1.0, 1.0, *((1.25,) if joints else ())), 6.8 if joints else 4.8)
+    figure, axes, t = stack(log, "Actuation", (1.0, 1.0, *((1.25,) if joints else ())), 6.8 if joints else 4.8)
     thrust = log.column(lambda i, o, s: o.attitude.thrust if o.attitude else None)
     hover = log.column(lambda i, o, s: o.control.hover_thrust if o.control else None)
-    _line(axes[0], t, 100 * thrust, "collective", SERIES[0])
-    _line(axes[0], t, 100 * hover, "hover", REFERENCE, reference=True)
+    line(axes[0], t, 100 * thrust, "collective", SERIES[0])
+    line(axes[0], t, 100 * hover, "hover", REFERENCE, reference=True)
     axes[0].set_ylabel("thrust [%]")
-    _legend(axes[0])
+    legend(axes[0])
     asked = log.column(lambda i, o, s: tilt_rad(o.attitude.attitude_wxyz) if o.attitude else None)
     flown = log.column(
         lambda i, o, s: tilt_rad(pose.attitude_wxyz) if (pose := best_pose(i)) and pose.tracking_valid else None
     )
-    _line(axes[1], t, np.degrees(flown), "flown", SERIES[0])
-    _line(axes[1], t, np.degrees(asked), "commanded", REFERENCE, reference=True)
+    line(axes[1], t, np.degrees(flown), "flown", SERIES[0])
+    line(axes[1], t, np.degrees(asked), "commanded", REFERENCE, reference=True)
     axes[1].set_ylabel("tilt [deg]")
-    _legend(axes[1])
+    legend(axes[1])
     if not joints:
         return figure
     commanded = log.column(lambda i, o, s: o.arm_torque_nm, joints)
@@ -147,9 +152,9 @@ def _actuation(log: FlightLog) -> Figure | None:
     for j in range(joints):
         # Drawn below the values sent, which are noisy and mostly the same: only a difference shall show.
         axes[2].plot(t, commanded[:, j], color=SERIES_DARK[j], lw=1.2, label=f"joint {j + 1} commanded")
-        _line(axes[2], t, sent[:, j], f"joint {j + 1} sent", SERIES[j])
+        line(axes[2], t, sent[:, j], f"joint {j + 1} sent", SERIES[j])
     axes[2].set_ylabel("joint torque [N m]")
-    _legend(axes[2], columns=4)
+    legend(axes[2], columns=4)
     return figure
 
 
@@ -157,15 +162,15 @@ def _adaptation(log: FlightLog) -> Figure | None:
     rho = log.column(lambda i, o, s: o.control.rho if o.control else None)
     if not np.isfinite(rho).any():
         return None
-    figure, axes, t = _stack(log, "Adaptation", (1.0, 1.25, 0.8))
-    _line(axes[0], t, rho, r"$\rho$", SERIES[0])
+    figure, axes, t = stack(log, "Adaptation", (1.0, 1.25, 0.8))
+    line(axes[0], t, rho, r"$\rho$", SERIES[0])
     axes[0].set_ylabel(r"switching gain $\rho$")
     h_hat = log.column(lambda i, o, s: o.control.h_hat if o.control else None, 4)
     for j in range(4):
-        _line(axes[1], t, h_hat[:, j], rf"$\hat{{H}}_{j}$", SERIES[j])
+        line(axes[1], t, h_hat[:, j], rf"$\hat{{H}}_{j}$", SERIES[j])
     axes[1].set_ylabel(r"$\hat{H}_0 \ldots \hat{H}_3$")
-    _legend(axes[1], columns=4)
-    _line(axes[2], t, log.column(lambda i, o, s: o.control.zeta if o.control else None), r"$\zeta$", SERIES[0])
+    legend(axes[1], columns=4)
+    line(axes[2], t, log.column(lambda i, o, s: o.control.zeta if o.control else None), r"$\zeta$", SERIES[0])
     axes[2].set_ylabel(r"$\zeta$")
     for ax in axes:
         ax.set_ylim(bottom=0.0)
@@ -178,17 +183,17 @@ def _load(log: FlightLog) -> Figure | None:
         return None
     joints = log.joint_count
     heights = (1.0, 0.8, 0.8) if joints else (1.0,)
-    figure, axes, t = _stack(log, "Adaptive load", heights, 6.8 if joints else 3.2)
+    figure, axes, t = stack(log, "Adaptive load", heights, 6.8 if joints else 3.2)
     moments = log.column(lambda i, o, s: o.control.moment_estimate_kg_m if o.control else None, joints)
     friction = log.column(lambda i, o, s: o.control.friction_estimate_nm if o.control else None, joints)
     for j, name in enumerate("xyz"):
-        _line(axes[0], t, force[:, j], f"${name}$", SERIES[j])
+        line(axes[0], t, force[:, j], f"${name}$", SERIES[j])
     for j in range(joints):
-        _line(axes[1], t, moments[:, j], f"link {j + 1}", SERIES[j])
-        _line(axes[2], t, friction[:, j], f"joint {j + 1}", SERIES[j])
+        line(axes[1], t, moments[:, j], f"link {j + 1}", SERIES[j])
+        line(axes[2], t, friction[:, j], f"joint {j + 1}", SERIES[j])
     for ax, label in zip(axes, ("load [N]", "first moment [kg m]", "friction [N m]"), strict=False):
         ax.set_ylabel(label)
-        _legend(ax, columns=3)
+        legend(ax, columns=3)
     return figure
 
 
@@ -197,20 +202,22 @@ def _force(log: FlightLog) -> Figure | None:
     observed = log.column(lambda i, o, s: o.control.force_observed_world_n if o.control else None, 3)
     devices = (log.config.get("vehicle") or {}).get("devices") or {}
     blind = devices.get("force", {}) is None and not np.isfinite(observed).any()
+    if has_contact(log):  # drawn in the frame of the surface
+        return None
     if blind or not np.isfinite(force).any():
         return None
-    figure, axes, t = _stack(log, "Contact force, world frame", (1.0,), height_in=3.2)
+    figure, axes, t = stack(log, "Contact force, world frame", (1.0,), height_in=3.2)
     for j, name in enumerate("xyz"):
-        _line(axes[0], t, force[:, j], f"$F_{name}$", SERIES[j])
+        line(axes[0], t, force[:, j], f"$F_{name}$", SERIES[j])
     measured = log.column(lambda i, o, s: o.control.force_measured_world_n if o.control else None, 3)
     if np.isfinite(measured).any():
-        _line(axes[0], t, measured[:, 2], "$F_z$ of the sensor", REFERENCE, reference=True)
+        line(axes[0], t, measured[:, 2], "$F_z$ of the sensor", REFERENCE, reference=True)
     payload_kg = log.column(lambda i, o, s: o.control.payload_estimate_kg if o.control else None)
     if np.isfinite(payload_kg).any():
         weight_n = GRAVITY_M_S2 * payload_kg
-        _line(axes[0], t, -weight_n, "weight of the estimated payload", REFERENCE, reference=True)
+        line(axes[0], t, -weight_n, "weight of the estimated payload", REFERENCE, reference=True)
     axes[0].set_ylabel("force [N]")
-    _legend(axes[0], columns=4)
+    legend(axes[0], columns=4)
     return figure
 
 
@@ -235,7 +242,7 @@ def _path(log: FlightLog) -> Figure | None:
     axes[0].set_title("From above", loc="left", fontsize=10, color=INK)
     axes[1].set_title("From the side", loc="left", fontsize=10, color=INK)
     axes[1].set_xlabel("x [m]")
-    _legend(axes[0], columns=3)
+    legend(axes[0], columns=3)
     figure.suptitle("Path", fontsize=13, fontweight="bold", color=INK)
     return figure
 
@@ -260,7 +267,7 @@ def _timing(log: FlightLog) -> Figure | None:
     panes["time"].set_ylim(bottom=0.0)
     panes["time"].set_xlabel("flight clock [s]")
     panes["time"].set_ylabel("time [ms]")
-    _legend(panes["time"], columns=3)
+    legend(panes["time"], columns=3)
     for name, title, values_s in (
         ("late", "tick lateness", log.columns.lateness_s),
         ("joint", "joint read to current write", log.timing.joint_read_to_write_s),
@@ -280,78 +287,10 @@ def _timing(log: FlightLog) -> Figure | None:
             ax.axvline(value_ms, color=CATCH, lw=1.2, ls=dash, label=f"{label} {value_ms:.2f} ms")
         ax.plot([], [], " ", label=f"max {spread.max_ms:.2f} ms")
         ax.set_ylim(top=1.45 * ax.get_ylim()[1])  # room for the legend
-        _legend(ax)
+        legend(ax)
     panes["late"].set_ylabel("ticks")
     figure.suptitle("Timing", fontsize=13, fontweight="bold", color=INK)
     return figure
-
-
-def _stack(
-    log: FlightLog, title: str, heights: tuple[float, ...], height_in: float = 6.8
-) -> tuple[Figure, list[Any], Array]:
-    """Return a figure, its axes stacked over a common time axis on which the phases and the catch are marked, and the mission
-    time of each tick, s (NaN outside the marked phases).
-    """
-    figure = new_figure(height_in)
-    grid = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)
-    axes = [row[0] for row in grid]
-    flying = np.array([o.phase_kind in _PHASES for o in log.outputs], dtype=np.bool_)
-    t_s = log.columns.mission_t_s
-    span = t_s[flying] if flying.any() else t_s
-    for ax in axes:
-        dress(ax)
-        ax.set_xlim(float(span[0]), float(max(span[-1], span[0] + 0.1)))
-        ax.margins(y=0.12)
-    _mark_phases(log, axes)
-    axes[-1].set_xlabel("mission time [s]")
-    figure.suptitle(title, fontsize=13, fontweight="bold", color=INK)
-    return figure, axes, np.where(flying, t_s, np.nan) if flying.any() else t_s
-
-
-def _mark_phases(log: FlightLog, axes: list[Any]) -> None:
-    start = 0
-    outputs = log.outputs
-    whole_s = max(outputs[-1].mission_t_s, 1e-3)
-    named = len({o.phase for o in outputs}) <= _PHASES_NAMED_MAX
-
-    def same(one: Outputs, other: Outputs) -> bool:
-        return one.phase_kind == other.phase_kind and (one.phase == other.phase or not named)
-
-    for k in range(1, len(outputs) + 1):
-        if k < len(outputs) and same(outputs[k], outputs[start]):
-            continue
-        colour = _PHASES.get(outputs[start].phase_kind)
-        if colour is not None:
-            begin_s, end_s = outputs[start].mission_t_s, outputs[min(k, len(outputs) - 1)].mission_t_s
-            for ax in axes:
-                ax.axvspan(begin_s, end_s, facecolor=colour, zorder=0, lw=0)
-                if start:
-                    ax.axvline(begin_s, color="#d5dbe1", lw=0.8, zorder=1)
-            name = outputs[start].phase if named else outputs[start].phase_kind.value
-            # A name is written only where it fits: about 90 characters fill the whole axis.
-            if (end_s - begin_s) / whole_s > 0.012 * len(name):
-                middle_s = (begin_s + end_s) / 2
-                transform = axes[0].get_xaxis_transform()
-                axes[0].text(
-                    middle_s, 1.02, name, transform=transform, ha="center", va="bottom", fontsize=8.5, color="#5b6b79"
-                )
-        start = k
-    caught = metrics.catch_index(log)
-    if caught is not None:
-        mark_catch(axes, outputs[caught].mission_t_s)
-
-
-def _line(ax: Any, t: Array, values: Array, label: str, colour: str, *, reference: bool = False) -> None:
-    style: dict[str, Any] = (
-        {"lw": 1.2, "ls": DASHED, "alpha": 0.9, "zorder": 4} if reference else {"lw": 1.2, "zorder": 3}
-    )
-    ax.plot(t, values, color=colour, label=label, **style)
-
-
-def _legend(ax: Any, columns: int = 1) -> None:
-    ax.legend(
-        fontsize=8.5, ncols=columns, framealpha=0.9, edgecolor="none", handlelength=1.8, columnspacing=1.2, loc="best"
-    )
 
 
 def _norm(rows: Array) -> Array:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.analysis.animation import movie_of, player_html
+from companion.analysis.contact import true_force_n
 from companion.analysis.log import FlightLog
 from companion.analysis.page import Page, Picture, Section, write_page
 from companion.analysis.plots import write_plots
@@ -118,9 +119,30 @@ def _results(summary: dict[str, Any], stride: int) -> list[Table]:
     return [
         _pairs("RMS error", rms, "before catch", "after catch"),
         _pairs("Flight", flight),
+        *_contact(summary),
         _pairs("Timing [ms]", timing, "p50", "p99", "max"),
         _pairs("Loop and log", processes),
     ]
+
+
+def _contact(summary: dict[str, Any]) -> list[Table]:
+    """Return the table of a contact; nothing for a flight without contact."""
+    contact = summary.get("contact")
+    if contact is None:
+        return []
+    true_n, surface = true_force_n(summary), contact["surface"]
+    rows = [
+        ("force wanted", _number(contact["wanted_n"], 2, " N")),
+        ("force measured", _number(contact["mean_n"], 2, " N")),
+        *([] if true_n is None else [("true force (simulation)", f"{true_n:.2f} N")]),
+        ("force error, RMS", _number(contact["rms_error_n"], 2, " N")),
+        ("overshoot", _number(contact["overshoot_n"], 2, " N")),
+        ("touches", str(contact["touches"])),
+        ("tip from its path, RMS", _number(contact["path_rms_m"], 4, " m")),
+    ]
+    if surface is not None:
+        rows.append(("surface touched at", ", ".join(f"{value:z.3f}" for value in surface["point_m"]) + " m"))
+    return [_pairs("Contact", rows)]
 
 
 def _pairs(title: str, rows: Sequence[tuple[str, ...]], *heads: str) -> Table:

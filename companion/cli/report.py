@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from companion import DISTRIBUTION
+from companion.analysis.contact import contact_lines
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.summary import summarise, write_summary
 from companion.campaigns.runner import to_json
@@ -172,6 +173,8 @@ def _one(path: Path, arguments: argparse.Namespace) -> int:
     if report is None:
         return _no_pictures()
     if not arguments.json:
+        for name, text in contact_lines(flight.summary):
+            print(f"{name}: {text}")
         print(report)
     return EXIT_OK
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
+from companion.analysis.contact import contact_lines
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.summary import empty_summary, summarise, write_summary
 from companion.launcher.launcher import FlightResult, Launcher, Sitl, landing_signals
@@ -58,7 +59,7 @@ def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Con
             print_error(f"report cancelled; write it with: companion report {out / 'flight.mcap'}")
         except OSError as error:
             print_error(f"{out}: the report cannot be written: {error.strerror}")
-    print_result(console, summary, out, page)
+    print_result(console, summary, out, page, contact_lines(summary))
     return result.exit_code
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any, TextIO, cast
 
@@ -193,8 +194,10 @@ class FlightDisplay:
         )
 
 
-def print_result(console: Console, summary: dict[str, Any], out: Path, report: Path | None) -> None:
-    """Print the result table and the paths of the flight's files."""
+def print_result(
+    console: Console, summary: dict[str, Any], out: Path, report: Path | None, contact: Sequence[tuple[str, str]] = ()
+) -> None:
+    """Print the result table and the paths of the flight's files; `contact` holds names and texts of facts about a contact."""
     outcome = summary["outcome"]
     table = Table(title=None, show_header=True, header_style="bold", box=None, pad_edge=False)
     table.add_column("")
@@ -229,6 +232,8 @@ def print_result(console: Console, summary: dict[str, Any], out: Path, report: P
         else ", not confirmed: the flight ended too soon after the impact"
     )
     facts.add_row("catch", "none" if catch is None else f"t = {catch:.2f} s{doubt}")
+    for name, text in contact:
+        facts.add_row(name, escape(text))
     loop = summary.get("loop") or {}
     if loop.get("ticks"):
         rate_hz, late_ms = loop["rate_hz"], loop["lateness_ms"]["p99"]  # None after a tick or two

@@ -31,7 +31,7 @@ APART_S = 0.05
 _DAMPED_KG = 1.0
 """Mass to which `damping_ratio` refers."""
 _WATCH_STEPS = 5
-"""Physics steps between two measurements of the rotors' distance."""
+"""Physics steps between two measurements of the rotors' distance, and between two samples of the contact force."""
 _RIM_POINTS = 36
 
 
@@ -140,6 +140,7 @@ class Surfaces:
         """Number of touches of any surface by the tip."""
         self.force_max_n = 0.0
         """Largest contact force."""
+        self._forces_n: list[Vec3] = []
         self.rotor_distance_m = self.rotor_distance_min_m = math.inf
         """Smallest distance of a rotor's disk from a surface, now and so far."""
         self._last_touch_s = -math.inf
@@ -183,6 +184,8 @@ class Surfaces:
             if 0.0 < surface.config.gives_way_n < dot(force_n, surface.normal):
                 self.give_way(number)
                 world.report("gave_way")
+            if self._step % _WATCH_STEPS == 0:
+                self._forces_n.append(force_n)
         if self._step % _WATCH_STEPS == 0:
             self._watch_rotors(world)
         self._step += 1
@@ -212,12 +215,18 @@ class Surfaces:
         if nearest_m <= 0.0:
             world.crash("rotor_touched")
 
+    def _force_held_n(self) -> list[float] | None:
+        """Return the median of the contact forces of more than half the largest one: without touch and release."""
+        held = [force_n for force_n in self._forces_n if 2.0 * math.hypot(*force_n) > self.force_max_n]
+        return np.median(held, axis=0).tolist() if held else None
+
     def report(self) -> dict[str, Any]:
         """Return the truth about the surfaces for `summary.json`."""
         distance_m = self.rotor_distance_min_m
         return {
             "touches": self.touches,
             "force_max_n": self.force_max_n,
+            "force_held_world_n": self._force_held_n(),
             "rotor_distance_min_m": distance_m if math.isfinite(distance_m) else None,
             "surfaces": [
                 {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from itertools import pairwise
 from typing import Any
@@ -10,7 +11,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from companion.analysis.contact import contact_summary
+from companion.analysis.contact import contact_lines, contact_summary
+from companion.analysis.contact_plots import contact_force, contact_path
 from companion.analysis.log import FlightLog
 from companion.core.flight_core import FlightCore
 from companion.mission.check import check_mission
@@ -122,6 +124,27 @@ def test_the_summary_has_the_contact_and_a_replay_is_identical(pressed: tuple[Fa
     assert off_m == pytest.approx(0.015, abs=0.005)  # the ball's radius
     core = FlightCore(flight.config.flight)
     assert all(core.step(i) == o for i, o in zip(result.inputs, result.outputs, strict=True))
+
+
+def test_the_report_shows_the_force_with_the_true_one_and_where_the_tip_was(
+    pressed: tuple[FastFlight, FastResult],
+) -> None:
+    flight, result = pressed
+    log = row_of(flight.config.flight, result, None)[1]
+    assert flight.plant.world.surfaces is not None
+    about, surface = contact_lines(
+        {"contact": contact_summary(log), "world": {"contact": flight.plant.world.surfaces.report()}}
+    )
+    assert about[1].startswith("1 touch, 5.00 N wanted") and surface[1].startswith("touched at [1.5")
+    true_n = float(about[1].partition("true: ")[2].split()[0])
+    assert true_n == pytest.approx(5.0, abs=0.25)
+    force = contact_force(log)
+    assert force is not None and contact_path(log) is not None
+    shown = {text.get_text() for text in force.legends[0].get_texts()}
+    assert shown == {"weigh", "approach", "press", "leave"}
+    on_the_ground = dataclasses.replace(log, outputs=log.outputs[:50], inputs=log.inputs[:50], sent=log.sent[:50])
+    assert contact_force(on_the_ground) is None and contact_path(on_the_ground) is None
+    assert contact_lines({"contact": contact_summary(on_the_ground)}) == []
 
 
 def test_a_missing_surface_ends_in_a_retreat_and_an_aborted_mission() -> None:
