@@ -24,6 +24,7 @@ from companion.safety.notices import Notice
 _BEFORE_END_S = 1e-6
 _WEIGH, _APPROACH, _PRESS = ContactMode.WEIGH, ContactMode.APPROACH, ContactMode.PRESS
 _LOST, _LEAVE = ContactMode.LOST, ContactMode.LEAVE
+_MEASURING = (_APPROACH, _PRESS, _LOST)
 
 
 def advance_contact(t: Transition) -> None:
@@ -46,12 +47,18 @@ def advance_contact(t: Transition) -> None:
             t.change(contact_over=False)
         return
     dt_s = t.o.dt_s
-    contact = c.measured(contact, dt_s, t.o.force_world_n)
+    limit_n = t.parameters.vehicle.safety.contact_disagreement_n
+    contact = c.measured(contact, dt_s, t.o.force_world_n, t.o.disturbance_world_n, limit_n)
     approach = _approach(t, segment)
     engaged = t.state.contact_segment
     assert engaged is not None
     if contact.mode is not _LEAVE and not _is_force_known(t):
         contact = _failed(t, contact, notices.CONTACT_LOST, "the force is not measured any more; leaving the surface")
+    elif contact.mode in _MEASURING and (found := _contradiction(t, contact)) is not None:
+        contact = _failed(t, contact, found[0], f"{found[1]}; leaving the surface")
+    elif contact.mode in _MEASURING and abs(t.o.yaw_error_rad) > c.TURNED_RAD:
+        text = f"turned by {math.degrees(abs(t.o.yaw_error_rad)):.0f} deg while in contact: the tool slips; leaving the surface"
+        contact = _failed(t, contact, notices.CONTACT_SLIPPED, text)
     elif contact.mode is _LEAVE:
         speed_m_s = phase.speed_m_s if isinstance(phase, Detach) else approach.speed_m_s
         contact = c.released(contact, dt_s) if contact.push_n > 0.0 else c.moved(contact, dt_s, -speed_m_s)
@@ -77,10 +84,7 @@ def advance_contact(t: Transition) -> None:
         contact = c.pressed(contact, t_s, dt_s, approach.touch_n, phase.force_n)
         contact = c.timed(contact, dt_s, not c.touches(contact, approach.touch_n))
         t.change(contact_segment=segment)
-        if abs(t.o.yaw_error_rad) > c.TURNED_RAD:
-            text = f"turned by {math.degrees(abs(t.o.yaw_error_rad)):.0f} deg while pressing: the tool slips; leaving the surface"
-            contact = _failed(t, contact, notices.CONTACT_SLIPPED, text)
-        elif contact.beyond_s >= c.LOST_S:
+        if contact.beyond_s >= c.LOST_S:
             contact = _lost(t, contact)
     t.change(contact=contact)
 
@@ -98,6 +102,28 @@ def _is_force_known(t: Transition) -> bool:
     if vehicle.force_source == OBSERVER:
         return True
     return force is not None and t.i.t_s - force.stamp_s <= vehicle.safety.force_timeout_s
+
+
+def _contradiction(t: Transition, contact: ContactState) -> tuple[Notice, str] | None:
+    """Return how the vehicle's motion contradicts the measured force or the push; None if it does not."""
+    ahead_m, limit_n = c.along_m(contact, t.o.position_error_m), t.parameters.vehicle.safety.contact_disagreement_n
+    if ahead_m < -c.ASTRAY_M:
+        text = f"{-ahead_m:.2f} m behind the reference (limit {c.ASTRAY_M:g} m): something blocks the vehicle"
+    elif ahead_m > c.ASTRAY_M:
+        text = f"{ahead_m:.2f} m ahead of the reference (limit {c.ASTRAY_M:g} m): the vehicle pushes against nothing"
+        return notices.CONTACT_LOST, text
+    elif contact.disagreed_s < c.DISAGREEMENT_S:
+        return None
+    elif abs(contact.disagreement_n) <= limit_n:
+        text = f"{contact.unopposed_n:.1f} N of the push act against nothing (limit {limit_n:g} N)"
+        return notices.CONTACT_LOST, text
+    else:
+        shown_n = contact.force_n + contact.disagreement_n
+        text = (
+            f"the force sensor measures {contact.force_n:.1f} N, the vehicle's motion shows {shown_n:.1f} N "
+            f"(limit {limit_n:g} N apart)"
+        )
+    return notices.CONTACT_DISAGREES, text
 
 
 def leave(t: Transition) -> None:

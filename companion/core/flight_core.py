@@ -40,6 +40,7 @@ _DT_MAX_S: Final = 0.05
 _PLAN: Final = Stage.PLAN
 _SPOOL: Final = Stage.SPOOL
 _TOUCHDOWN: Final = Stage.TOUCHDOWN
+_NO_ERROR: Final = (0.0, 0.0, 0.0)
 
 
 class FlightCore:
@@ -169,6 +170,10 @@ class FlightCore:
             pose_s=self._pose_s,
             dt_s=dt_s,
             force_world_n=None if self._log is None else force_on_tool_n(self._log),
+            disturbance_world_n=None if self._observes else self._control.disturbance_world_n,
+            position_error_m=_NO_ERROR
+            if self._log is None
+            else (self._log.error[0], self._log.error[1], self._log.error[2]),
             yaw_error_rad=0.0 if self._log is None else self._log.error[5],
         )
 

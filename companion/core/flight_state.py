@@ -143,6 +143,10 @@ class Observation(Record, frozen=True):
     """Time since the previous tick."""
     force_world_n: Vec3 | None
     """Force on the tool in the last tick, world frame; None if the law did not run."""
+    disturbance_world_n: Vec3 | None
+    """Force on the vehicle that its motion shows, world frame; None on the ground, and if it is the force on the tool as well."""
+    position_error_m: Vec3
+    """Position minus reference in the last tick, world frame; 0 if the law did not run."""
     yaw_error_rad: float
     """Yaw minus reference in the last tick; 0 if the law did not run."""
 

@@ -120,11 +120,36 @@ def _retract(t: Transition) -> None:
     if now is None or course is None or course.segment(t.i.t_s).kind is PhaseKind.LANDING:
         _land_instead(t, "already landing; no retract")
         return
-    arm_rad = t.i.arm.angle_rad if t.i.arm is not None else now.arm_rad
-    p = t.parameters
+    if _faces_the_anchor(t):
+        _land_instead(t, "the surface is between vehicle and anchor; no retract")
+        return
     t.leave_mission(
-        retract_from(now.position_world_m, now.velocity_world_m_s, now.yaw_rad, arm_rad, p.fold_rad, p.vehicle, tether)
+        retract_from(
+            now.position_world_m,
+            now.velocity_world_m_s,
+            now.yaw_rad,
+            t.i.arm.angle_rad if t.i.arm is not None else now.arm_rad,
+            t.parameters.fold_rad,
+            t.parameters.vehicle,
+            tether,
+            _before_surface_m(t, now),
+        )
     )
+
+
+def _faces_the_anchor(t: Transition) -> bool:
+    """Return whether the way to the anchor leads towards the surface that the tool may touch."""
+    now, contact, tether = t.o.reference, t.state.contact, t.parameters.vehicle.tether
+    if now is None or contact is None or tether is None:
+        return False
+    (nx, ny, _), (x, y, _), (ax, ay, _) = contact.direction_world, now.position_world_m, tether.anchor_world_m
+    return nx * (ax - x) + ny * (ay - y) > 0.0
+
+
+def _before_surface_m(t: Transition, now: Reference) -> Vec3 | None:
+    """Return the position in front of the surface that the tool may touch; None if it touches none."""
+    contact = t.state.contact
+    return None if contact is None else before_approach_m(now, contact)
 
 
 def _land_instead(t: Transition, text: str) -> None:
@@ -135,7 +160,7 @@ def _land_instead(t: Transition, text: str) -> None:
 
 def _land(t: Transition) -> None:
     """Stop from the last reference, fold the arm and descend; move back from a surface first."""
-    now, p, contact = t.o.reference, t.parameters, t.state.contact
+    now, p = t.o.reference, t.parameters
     if now is None:  # the controller has not flown yet
         t.finish(Outcome.ABORTED)
         t.enter(Stage.AUTOPILOT_LAND)
@@ -149,7 +174,7 @@ def _land(t: Transition) -> None:
             p.fold_rad,
             p.vehicle.safety.land_speed_m_s,
             p.vehicle,
-            None if contact is None else before_approach_m(now, contact),
+            _before_surface_m(t, now),
         )
     )
 

@@ -220,11 +220,7 @@ def landing_from(
     """
     builder = PlanBuilder(position_world_m, yaw_rad, arm_rad)
     if back_to_m is not None:
-        velocity_world_m_s = (0.0, 0.0, 0.0)
-        duration_s = max(BACK_MIN_S, REST_TO_REST_PEAK_SPEED * builder.line_m(back_to_m) / BACK_SPEED_M_S)
-        builder.go(back_to_m, duration_s)
-        builder.segments.append(Segment(name="back", kind=PhaseKind.LANDING, start_s=0.0, end_s=duration_s, index=-1))
-        builder.t_s = duration_s
+        velocity_world_m_s = go_back(builder, back_to_m, PhaseKind.LANDING)
     back_s = builder.t_s
     fold_s = fold_time_s(arm_rad, arm_fold_rad)
     builder.fold_arm(arm_fold_rad, fold_s)
@@ -239,6 +235,15 @@ def landing_from(
     builder.t_s = max(end_s, back_s + fold_s)
     builder.segments.append(Segment(name="land", kind=PhaseKind.LANDING, start_s=start_s, end_s=builder.t_s, index=-1))
     return Plan.of("landing", builder)
+
+
+def go_back(builder: PlanBuilder, to_m: Vec3, kind: PhaseKind) -> Vec3:
+    """Begin a plan with the way back from a surface; return the velocity at its end."""
+    duration_s = max(BACK_MIN_S, REST_TO_REST_PEAK_SPEED * builder.line_m(to_m) / BACK_SPEED_M_S)
+    builder.go(to_m, duration_s)
+    builder.segments.append(Segment(name="back", kind=kind, start_s=0.0, end_s=duration_s, index=-1))
+    builder.t_s = duration_s
+    return (0.0, 0.0, 0.0)
 
 
 def fold_time_s(arm_rad: Joints, arm_fold_rad: Joints) -> float:

@@ -6,7 +6,7 @@ import math
 
 from companion.config.tether import Room, Tether
 from companion.config.vehicle import Vehicle
-from companion.mission.plan import Plan, fold_time_s
+from companion.mission.plan import Plan, fold_time_s, go_back
 from companion.mission.plan_builder import PlanBuilder, stopping
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED
 from companion.mission.segments import Segment
@@ -41,12 +41,13 @@ def retract_from(
     arm_fold_rad: Joints,
     vehicle: Vehicle,
     tether: Tether,
+    back_to_m: Vec3 | None = None,
 ) -> Plan:
     """Plan a stop and a slow return towards the anchor's vertical until the tether has `retract_slack_m` of slack, while the arm
     folds.
 
     Neither the distance from the anchor's vertical nor the height ever increases, and the path stays in the room. The plan has two
-    segments; a landing follows.
+    segments, three with the way back from a surface, which the governor keeps within the tether; a landing follows.
 
     Args:
         position_world_m: start of the reference: the last reference.
@@ -57,14 +58,17 @@ def retract_from(
         arm_fold_rad: joint angles at the end.
         vehicle: provides room, airframe and the speed of the return.
         tether: its anchor and length.
+        back_to_m: position to go to before everything else, from a surface that the tool may touch.
     """
     safety, anchor = vehicle.safety, tether.anchor_world_m
     builder = PlanBuilder(position_world_m, yaw_rad, arm_rad)
-    fold_s = fold_time_s(arm_rad, arm_fold_rad)
+    if back_to_m is not None:
+        position_world_m, velocity_world_m_s = back_to_m, go_back(builder, back_to_m, PhaseKind.FLIGHT)
+    back_s, fold_s = builder.t_s, fold_time_s(arm_rad, arm_fold_rad)
     builder.fold_arm(arm_fold_rad, fold_s)
     velocity, stop_s = stopping(inward_only(velocity_world_m_s, position_world_m, anchor))
     builder.t_s = builder.stop_within(_never_outward(velocity, stop_s, position_world_m, anchor), stop_s)
-    segments = [Segment(name="stop", kind=PhaseKind.FLIGHT, start_s=0.0, end_s=builder.t_s, index=-1)]
+    segments = [Segment(name="stop", kind=PhaseKind.FLIGHT, start_s=back_s, end_s=builder.t_s, index=-1)]
     x, y, z = builder.position_m
     away_m = math.hypot(x - anchor[0], y - anchor[1])
     lever_m = math.hypot(*tether.attachment_body_m)
@@ -79,7 +83,7 @@ def retract_from(
         start_s = builder.t_s
         builder.go((*to, z), duration_s)
         builder.t_s = start_s + duration_s
-    builder.t_s = max(builder.t_s, fold_s)
+    builder.t_s = max(builder.t_s, back_s + fold_s)
     segments.append(
         Segment(name="return", kind=PhaseKind.FLIGHT, start_s=segments[0].end_s, end_s=builder.t_s, index=-1)
     )

@@ -288,6 +288,14 @@ class ContactState(Record, frozen=True, kw_only=True):
     """Offset at the last touch."""
     failed: bool
     """Whether the contact ended before its planned end."""
+    disagreement_bias_n: float = 0.0
+    """Mean before the approach of the force that the vehicle's motion shows minus the measured one, both against the direction."""
+    disagreement_n: float = 0.0
+    """The same difference now, less its mean and low-passed."""
+    unopposed_n: float = 0.0
+    """Push minus the force that the vehicle's motion shows, low-passed: what the vehicle pushes against nothing."""
+    disagreed_s: float = 0.0
+    """Time for which one of the two has been beyond `safety.contact_disagreement_n`."""
 
 
 class Reference(Record, frozen=True, kw_only=True):

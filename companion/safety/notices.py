@@ -77,8 +77,15 @@ CONTACT_INTERRUPTED = Notice(
 )  # fmt: skip
 CONTACT_LOST = Notice(
     "contact_lost", _WARNING, _WARN,
-    "the surface was not found again within 0.1 m of where it was touched, or the force is not measured any more: the vehicle moves "
-    "back, and the mission goes on as aborted",
+    "the surface was not found again within 0.1 m of where it was touched, the force is not measured any more, more than "
+    "`contact_disagreement_n` of the push acts against nothing for 0.1 s, or the vehicle is 0.08 m ahead of its reference: "
+    "the vehicle moves back, and the mission goes on as aborted",
+)  # fmt: skip
+CONTACT_DISAGREES = Notice(
+    "contact_disagrees", _WARNING, _WARN,
+    "for 0.1 s the measured contact force differs by more than `contact_disagreement_n` from the force that thrust, tilt and "
+    "acceleration show, or the vehicle is 0.08 m behind its reference although no touch was measured: the vehicle moves back, and the "
+    "mission goes on as aborted",
 )  # fmt: skip
 CONTACT_BOUNCE = Notice(
     "contact_bounce", _WARNING, _WARN,
@@ -86,8 +93,8 @@ CONTACT_BOUNCE = Notice(
 )  # fmt: skip
 CONTACT_SLIPPED = Notice(
     "contact_slipped", _WARNING, _WARN,
-    "the yaw error exceeded 5 deg while pressing, because the tool slips along the surface: the vehicle moves back, and the "
-    "mission goes on as aborted",
+    "the yaw error exceeded 5 deg while approaching or pressing, because the tool slips along the surface: the vehicle moves back, "
+    "and the mission goes on as aborted",
 )  # fmt: skip
 SURFACE_MISSING = Notice(
     "surface_missing", _WARNING, _WARN,
@@ -111,12 +118,13 @@ NO_ROOM_TO_STAY = Notice(
     "no_room_to_stay",
     _CRITICAL,
     _LAND,
-    "a HOLD less than 0.3 m above standing height, or a RETRACT during a landing: the vehicle lands",
+    "a HOLD less than 0.3 m above standing height, or a RETRACT during a landing or towards the surface that the tool touches: the "
+    "vehicle lands",
 )
 
 NOTICES: tuple[Notice, ...] = (
     INPUTS_MISSING, VISION_NOT_FUSED, ESTIMATE_UNSTEADY, START_REFUSED, OFFBOARD_REFUSED, ARMING_REFUSED, NOT_READY,
     START_DECLINED, CALLED_OFF, RESUME_REFUSED, TAKEOFF, CATCH, PAYLOAD_LEFT, TOUCHED, CONTACT_INTERRUPTED, CONTACT_LOST,
-    CONTACT_BOUNCE, CONTACT_SLIPPED, SURFACE_MISSING, TOUCHDOWN, NO_TOUCHDOWN, DISARM_REFUSED,
+    CONTACT_DISAGREES, CONTACT_BOUNCE, CONTACT_SLIPPED, SURFACE_MISSING, TOUCHDOWN, NO_TOUCHDOWN, DISARM_REFUSED,
     AUTOPILOT_LANDING, GATE, HOLD_EXPIRED, RETRACT_EXPIRED, RETRACT_DONE, NO_ROOM_TO_STAY,
 )  # fmt: skip

@@ -76,6 +76,8 @@ class Kind:
     """Events that report the fault or its consequence."""
     phases: tuple[FlightPhase, ...] = IN_FLIGHT
     """Phases in which a campaign injects the fault."""
+    signed: bool = False
+    """Whether the size may be negative."""
     process: bool = False
     """Whether the fault acts on a process of the companion instead of on the world."""
 
@@ -178,6 +180,7 @@ KINDS: dict[FaultKind, Kind] = {
         unit="N",
         default=4.0,
         named_by=("force_drift", "force_overload", "tether_snagged", "tether_taut", "catch"),
+        signed=True,
     ),
     "motor_weak": Kind(
         what="a rotor loses thrust", size="fraction lost", unit="", default=0.15, named_by=(*_WEAK, "crashed")
@@ -310,7 +313,7 @@ class Fault(Model):
         kind = KINDS[self.kind]
         if self.size is not None and kind.size is None:
             problems.append((("size",), f"a {self.kind} has no size; remove it"))
-        elif self.magnitude < 0.0:
+        elif self.magnitude < 0.0 and not kind.signed:
             problems.append((("size",), f"must not be negative, got {self.magnitude:g}"))
         elif kind.unit == "Hz" and self.magnitude == 0.0:
             problems.append((("size",), "must be above 0"))

@@ -68,6 +68,18 @@ def test_it_frees_the_tether() -> None:
     assert tether_of(VEHICLE).length_m - math.dist(end, ANCHOR) >= VEHICLE.safety.retract_slack_m - 1e-6
 
 
+def test_from_a_surface_it_moves_back_before_the_arm_folds_and_the_vehicle_returns() -> None:
+    position, back_m, unfolded = (1.4, 0.9, 1.2), (1.1, 0.9, 1.2), tuple(a - 0.5 for a in FOLD)
+    plan = retract_from(position, (0.03, 0.0, 0.0), 0.0, unfolded, FOLD, VEHICLE, tether_of(VEHICLE), back_m)
+    back = plan.segments[0]
+    assert back.name == "back" and plan.reference(0.0).position_world_m == position
+    at = plan.reference(back.end_s)
+    assert at.position_world_m == pytest.approx(back_m) and at.arm_rad == pytest.approx(unfolded)
+    assert all(plan.reference(back.end_s * k / 20).position_world_m[0] <= 1.4 for k in range(21))
+    end = plan.reference(plan.duration_s)
+    assert away_m(end.position_world_m) < away_m(back_m) and end.arm_rad == pytest.approx(FOLD)
+
+
 @given(velocity, inside)
 def test_inward_only_leaves_what_leads_inward(v: Vec3, p: Vec3) -> None:
     x, y, z = inward_only(v, p, ANCHOR)
