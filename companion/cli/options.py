@@ -15,7 +15,9 @@ MISSION_OR_DEFAULT_HELP = f"{MISSION_HELP} (default: {DEFAULT_MISSION})"
 
 def add_law(parser: argparse.ArgumentParser) -> None:
     """Add `--controller` and `--preset`."""
-    parser.add_argument("--controller", metavar="LAW", help=f"control law: {', '.join(PRESETS)}")
+    parser.add_argument(
+        "--controller", metavar="LAW|FILE", help=f"control law: {', '.join(PRESETS)}, or a controller file (*.yaml)"
+    )
     parser.add_argument("--preset", metavar="NAME", help="gains")
 
 

@@ -97,4 +97,5 @@ def _campaign(arguments: argparse.Namespace) -> Robustness:
         cases_file=arguments.cases,
         keep=arguments.keep,
         vehicle=vehicle,
+        controller=law,
     )

@@ -85,7 +85,7 @@ def load_flight(
     Args:
         mission_path: mission file, or the name of a shipped one (`companion.config.shipped`).
         vehicle_path: vehicle file in place of the mission's, or the name of a shipped one.
-        controller_law: control law in place of the mission's (a key of `PRESETS`).
+        controller_law: control law (a key of `PRESETS`) or controller file (`*.yaml`) in place of the mission's.
         preset: built-in preset of that law in place of the mission's.
         overrides: `--set` options, `section.key[index].key=value`, applied before anything is checked. Options of the section
             `world` are ignored, because they belong to the simulated world (`companion.sitl_config`).
@@ -115,11 +115,11 @@ def load_flight(
     controller_file: Document | None = None
     choice = mission.controller if mission is not None else _controller_choice(mission_file)
     if controller_law is not None or preset is not None:
-        controller_file = _open_preset(controller_law or (choice.law if choice is not None else None), preset)
+        controller_file = _open_controller(controller_law or (choice.law if choice is not None else None), preset)
     elif choice is not None and choice.file is not None:
         controller_file = _open_named(mission_file, ("controller", "file"), None, lines)
     elif choice is not None:
-        controller_file = _open_preset(choice.law, choice.preset)
+        controller_file = _open_controller(choice.law, choice.preset)
     if controller_file is not None:
         controller = _check_controller(controller_file, parsed, lines)
 
@@ -336,10 +336,21 @@ def _controller_choice(mission_file: Document) -> ControllerChoice | None:
         return None
 
 
-def _open_preset(law: str | None, preset: str | None) -> Document:
+def _open_controller(law: str | None, preset: str | None) -> Document:
+    """Read the file of a law's preset, or the file whose path is given in place of the law."""
     law = law or next(iter(PRESETS))
+    if Path(law).suffix in (".yaml", ".yml"):
+        document = read_document(law)
+        own = document.data.get("preset")
+        if preset not in (None, own):
+            raise ConfigError(
+                [f"--preset {preset}: the file {law} has the gains {json.dumps(own)}; leave --preset out"]
+            )
+        return document
     if law not in PRESETS:
-        raise ConfigError([f"--controller {law}: no such controller; available: {', '.join(PRESETS)}"])
+        raise ConfigError(
+            [f"--controller {law}: no such controller; available: {', '.join(PRESETS)}, or a file (*.yaml)"]
+        )
     preset = preset or PRESETS[law][-1]
     if preset not in PRESETS[law]:
         raise ConfigError([f"--preset {preset}: no such preset of '{law}'; available: {', '.join(PRESETS[law])}"])

@@ -270,7 +270,7 @@ def test_problems_of_all_files_are_reported_together(project: Path) -> None:
 
 def test_unknown_controller_and_preset(project: Path) -> None:
     assert lines_of(lambda: load_sitl(CATCH, controller_law="cscc")) == [
-        "--controller cscc: no such controller; available: adaptive, csc, psc"
+        "--controller cscc: no such controller; available: adaptive, csc, psc, or a file (*.yaml)"
     ]
     assert lines_of(lambda: load_sitl(CATCH, controller_law="psc", preset="paper")) == [
         "--preset paper: no such preset of 'psc'; available: tuned_extras, tuned"

@@ -36,12 +36,14 @@ class Robustness(Campaign):
     """File to which the worst flights, or the flown cases, are written."""
     vehicle: str | None = None
     """Vehicle file; None for the mission's."""
+    controller: str | None = None
+    """Control law, or controller file, as named by the user; None for the mission's."""
 
     @property
     def law(self) -> tuple[str, str]:
-        """Control law and preset."""
+        """Control law, or controller file, and preset."""
         controller = self.configs[0].controller
-        return controller.law, controller.preset
+        return self.controller or controller.law, controller.preset
 
     def job(self) -> Message:
         """Return the job for `sitl.campaigns`."""
