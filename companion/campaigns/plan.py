@@ -81,10 +81,10 @@ def _show(found: Plan, scheduler: str | None, console: Console) -> None:
     lines = [
         f"processor time of a flight: {found.cpu_s:.2f} s, standard error {found.cpu_error_s:.2f} s "
         f"({found.sample} of {found.flights} flights flown {where})",
-        f"{found.flights} flights, {found.at_once} at a time {where}: {_duration(found.duration_s(found.at_once))}",
+        f"{found.flights} flights, {found.at_once} at a time {where}: {duration_text(found.duration_s(found.at_once))}",
         *(
             f"{found.flights} flights on {workers} Dask workers, one core as fast as these for each: "
-            f"{_duration(found.duration_s(workers))}"
+            f"{duration_text(found.duration_s(workers))}"
             for workers in WORKERS
         ),
     ]
@@ -92,7 +92,7 @@ def _show(found: Plan, scheduler: str | None, console: Console) -> None:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-def _duration(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Return a duration as text: `45 s`, `12 min`, `3 h 20 min`."""
     if seconds < 120.0:
         return f"{seconds:.0f} s"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import select
@@ -10,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -57,9 +58,7 @@ class CampaignProcess:
             )
         assert self._process.stdin is not None
         # The pipe stays open: the campaign ends when it closes.
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.write(json.dumps(job).encode() + b"\n")
-            self._process.stdin.flush()
+        self._send(job)
 
     def __enter__(self) -> Self:
         return self
@@ -80,9 +79,24 @@ class CampaignProcess:
             if self._stop_asked or self._log.stat().st_size == 0:
                 self._log.unlink()
 
+    def _send(self, data: Message) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write(json.dumps(data).encode() + b"\n")
+            self._process.stdin.flush()
+
     def ask_to_stop(self) -> None:
         """Make `results` end soon. May be called in a signal handler."""
         self._stop_asked = True
+
+    def fly(self, flights: Sequence[Message]) -> Iterator[Message]:
+        """Fly a batch of a job with `batches`; yield the result of each flight as it ends, until the last one or until asked to stop.
+
+        Raises:
+            CampaignError: as `results`.
+        """
+        self._send({"flights": list(flights)})
+        yield from itertools.islice(self.results(), len(flights))
 
     def results(self) -> Iterator[Message]:
         """Yield the result of each flight as it ends, until the last one or until asked to stop.

@@ -174,18 +174,7 @@ def fly(campaign: Campaign, out: Path) -> Flown:
     results: dict[int, Message] = {}
     notes: list[str] = []
     code, whole, bad = EXIT_OK, len(campaign.flights), 0
-    console = Console(stderr=True)
-    bar = Progress(
-        TextColumn("flying"),
-        BarColumn(bar_width=32),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("[dim]{task.description}[/]"),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
-    with campaign.start(out) as flights, _interrupted_by(flights.ask_to_stop), bar:
+    with campaign.start(out) as flights, interrupted_by(flights.ask_to_stop), progress_bar() as bar:
         task = bar.add_task("", total=whole)
         try:
             for message in flights.results():
@@ -208,8 +197,24 @@ def _progress(campaign: Campaign, newest: Message, bad: int) -> str:
     return f"{campaign.label(row)}: {row['outcome']}" + (f"; {bad} bad" if bad else "")
 
 
+def progress_bar() -> Progress:
+    """Return a progress bar on standard error, which is shown on a terminal only."""
+    console = Console(stderr=True)
+    return Progress(
+        TextColumn("flying"),
+        BarColumn(bar_width=32),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("[dim]{task.description}[/]"),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+
+
 @contextlib.contextmanager
-def _interrupted_by(stop: Callable[[], None]) -> Iterator[None]:
+def interrupted_by(stop: Callable[[], None]) -> Iterator[None]:
+    """Call `stop` at Ctrl-C and SIGTERM instead of ending the process."""
     handlers = {number: signal.signal(number, lambda *_: stop()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield

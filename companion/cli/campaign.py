@@ -145,17 +145,17 @@ def wide_console(width: int = PIPED_WIDTH) -> Console:
     return console
 
 
-def why_unusable(folder: Path, result: str) -> str | None:
+def why_unusable(folder: Path, result: str | None) -> str | None:
     """Create the folder if it does not exist. Return why results cannot be written into it, or None if they can.
 
     Args:
         folder: folder for the results.
-        result: name of the file by which earlier results are recognised.
+        result: name of the file by which earlier results are recognised; None to accept them.
     """
     try:
         if folder.exists() and not folder.is_dir():
             return "is a file; choose a folder"
-        if (folder / result).exists():
+        if result is not None and (folder / result).exists():
             return f"already contains {result}; choose another folder"
         folder.mkdir(parents=True, exist_ok=True)
         # Permission bits prove nothing: root ignores them, and a read-only file system overrides them.

@@ -36,6 +36,7 @@ _WITH_MODULES = (
         "compare",
         "robustness",
         "faults",
+        "tune",
         "hover",
         "install",
         "arm",

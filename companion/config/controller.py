@@ -17,6 +17,15 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
 from companion import plugins
 from companion.config.base import JOINTS_MAX, Location, Model, NonNegative, OrElse, Positive, Positive3, refuse
+from companion.config.tuned_gain import JOINTS, XY, XYZ, TunedGain, Z
+
+
+def _as_joints(given: Any) -> Any:
+    """Return one number as the gain of all joints, and a list as the tuple that strict validation expects after this function."""
+    if isinstance(given, int | float):
+        return (given,)
+    return tuple(given) if isinstance(given, list) else given
+
 
 PositiveRows = Annotated[tuple[Positive, ...], Field(min_length=7, max_length=6 + JOINTS_MAX)]
 """One value for each of x, y, z, roll, pitch, yaw and for each joint. A vehicle with n joints uses the first 6 + n values; if there are
@@ -30,12 +39,26 @@ remaining joints too.
 NonNegativeJoints = Annotated[
     tuple[NonNegative, ...],
     Field(min_length=1, max_length=JOINTS_MAX),
-    BeforeValidator(lambda given: (given,) if isinstance(given, int | float) else given),
+    BeforeValidator(_as_joints),
     OrElse({"type": "number"}),
 ]
 """As `PositiveJoints`, or one number for all joints."""
 NonNegative3 = tuple[NonNegative, NonNegative, NonNegative]
 Positive4 = tuple[Positive, Positive, Positive, Positive]
+
+
+COMPENSATION = (
+    TunedGain("disturbance_time_xyz_s", 0.2, 5.0, XY),
+    TunedGain("disturbance_time_xyz_s", 0.2, 5.0, Z),
+    TunedGain("feedforward_lead_s", 0.01, 0.4),
+    TunedGain("attitude_filter_rad_s", 15.0, 150.0),
+)
+"""What `companion tune` searches of the settings that the companion's own laws share."""
+
+
+def six_digits(value: float) -> float:
+    """Return the value rounded to six significant digits, as a file of found gains states it."""
+    return float(f"{value:.6g}")
 
 
 def fitted(gains: tuple[float, ...], count: int) -> tuple[float, ...]:
@@ -50,10 +73,21 @@ class ControllerConfig(Model):
     """Names of the built-in presets, with the default last. Their files are files/controllers/LAW_PRESET.yaml next to the class's
     module.
     """
+    tuned_gains: ClassVar[tuple[TunedGain, ...]] = ()
+    """What `companion tune` searches."""
 
     schema_version: Literal[1]
     law: str
     preset: str
+
+    def with_gains(self, gains: Mapping[str, Any]) -> Self:
+        """Return the settings with other values of some keys. A law whose gains must meet conditions overrides this, so that they hold
+        for every value within the bounds of `tuned_gains`.
+
+        Raises:
+            ValidationError: a value is invalid.
+        """
+        return type(self).model_validate(self.model_dump() | dict(gains))
 
 
 class Machine(Model):
@@ -138,6 +172,24 @@ class AdaptiveConfig(LawConfig):
     scaled_by_row = ("inertia_md", "lambda_gain", "damping_kd", "stiffness_kp", "robust_scale")
     scaled_by_joint = ("moment_rate", "friction_rate")
     shared_by_links = ("moment_rate",)
+    tuned_gains = (
+        TunedGain("inertia_md", 0.25, 1.5, XYZ),
+        TunedGain("lambda_gain", 0.3, 10.0, XY),
+        TunedGain("lambda_gain", 0.6, 27.0, Z),
+        TunedGain("lambda_gain", 12.0, 180.0, JOINTS),
+        TunedGain("phi", 0.7, 6.0, XY),
+        TunedGain("phi", 0.7, 8.0, Z),
+        TunedGain("phi", 1.0, 10.0, JOINTS),
+        TunedGain("damping_d", 4.0, 180.0, JOINTS, scaled_as="damping_kd"),
+        TunedGain("nu", 0.05, 50.0),
+        TunedGain("rho_max", 0.5, 20.0),
+        TunedGain("row_weights_s", 0.01, 1.0, JOINTS),
+        TunedGain("load_rate_xyz", 0.1, 10.0, XY),
+        TunedGain("load_rate_xyz", 0.3, 66.0, Z),
+        TunedGain("moment_rate", 0.1, 18.0),
+        TunedGain("friction_rate", 0.6, 180.0),
+        *COMPENSATION,
+    )
 
     law: Literal["adaptive"]
     inertia_md: PositiveRows
@@ -208,6 +260,24 @@ class AdaptiveConfig(LawConfig):
         refuse("controller", problems)
         return self
 
+    @property
+    def damping_d(self) -> tuple[float, ...]:
+        """D = K_d - M_d Phi of the paper, one value for each row. It is positive: this is gain_new."""
+        rows = zip(self.damping_kd, self.inertia_md, self.phi, strict=True)
+        return tuple([k_d - m_d * phi for k_d, m_d, phi in rows])
+
+    def with_gains(self, gains: Mapping[str, Any]) -> Self:
+        """Return the settings with other values of some keys; `damping_d` is D.
+
+        K_d = D + M_d Phi and K_p = D Phi follow, so that gain_new and gain_cond hold for all positive M_d, Phi and D.
+        """
+        changed = {key: value for key, value in gains.items() if key != "damping_d"}
+        m_d, phi = (changed.get(key, getattr(self, key)) for key in ("inertia_md", "phi"))
+        rows = [*zip(gains.get("damping_d", self.damping_d), m_d, phi, strict=True)]
+        changed["damping_kd"] = tuple([d + m_d * phi for d, m_d, phi in rows])
+        changed["stiffness_kp"] = tuple([d * phi for d, _, phi in rows])
+        return super().with_gains(changed)
+
 
 class CscConfig(LawConfig):
     """Complete-system compliance (after Cataldi et al., IROS 2016): one impedance for vehicle and arm, realised by the nominal model.
@@ -219,6 +289,16 @@ class CscConfig(LawConfig):
 
     presets = ("tuned_extras", "tuned")
     gain_lists = scaled_by_row = ("inertia_md", "damping_kd", "stiffness_kp")
+    tuned_gains = (
+        TunedGain("stiffness_kp", 1.0, 50.0, XY),
+        TunedGain("damping_kd", 1.0, 20.0, XY),
+        TunedGain("stiffness_kp", 1.7, 200.0, Z),
+        TunedGain("damping_kd", 1.7, 50.0, Z),
+        TunedGain("inertia_md", 0.3, 18.0, JOINTS),
+        TunedGain("damping_kd", 6.0, 180.0, JOINTS),
+        TunedGain("stiffness_kp", 24.0, 1200.0, JOINTS),
+        *COMPENSATION,
+    )
 
     law: Literal["csc"]
     inertia_md: PositiveRows
@@ -244,6 +324,19 @@ class PscConfig(LawConfig):
 
     presets = ("tuned_extras", "tuned")
     gain_lists = scaled_by_joint = ("arm_inertia_md", "arm_damping_kd", "arm_stiffness_kp")
+    tuned_gains = (
+        TunedGain("position_kp_xyz", 1.0, 40.0, XY),
+        TunedGain("position_kd_xyz", 1.0, 20.0, XY),
+        TunedGain("position_ki_xyz", 0.05, 20.0, XY),
+        TunedGain("position_kp_xyz", 2.0, 200.0, Z),
+        TunedGain("position_kd_xyz", 1.0, 40.0, Z),
+        TunedGain("position_ki_xyz", 0.05, 100.0, Z),
+        TunedGain("arm_inertia_md", 0.3, 18.0),
+        TunedGain("arm_damping_kd", 6.0, 180.0),
+        TunedGain("arm_stiffness_kp", 24.0, 1200.0),
+        TunedGain("payload_time_s", 0.03, 2.0, only_with="payload_max_kg"),
+        *COMPENSATION,
+    )
 
     law: Literal["psc"]
     position_kp_xyz: Positive3

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from companion import DISTRIBUTION
 
 _WORLD = ("mujoco", "sitl")
-_NEEDS = {"sitl": _WORLD, "compare": _WORLD, "robustness": _WORLD, "faults": _WORLD}
+_NEEDS = {"sitl": _WORLD, "compare": _WORLD, "robustness": _WORLD, "faults": _WORLD, "tune": _WORLD}
 """The package that a command needs and the extra that installs it, by command. `monitor` and `broker init` check their own."""
 
 

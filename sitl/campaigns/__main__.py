@@ -8,34 +8,41 @@ import signal
 import sys
 import threading
 from contextlib import closing
+from queue import SimpleQueue
 
 from companion.campaigns.process import CampaignError
 from companion.sitl_config.loader import SitlConfig
-from sitl.campaigns import compare, faults, robustness
+from sitl.campaigns import compare, faults, robustness, tune
 from sitl.campaigns.runner import Data, fly_all
 
 _CAMPAIGNS = {
     "compare": (compare.prepare, compare.fly),
     "robustness": (robustness.prepare, robustness.fly),
     "faults": (faults.prepare, faults.fly),
+    "tune": (tune.prepare, tune.fly),
 }
 
 
 def main() -> int:
     """Read a job from standard input and fly it; return the exit code."""
-    job = json.loads(sys.stdin.buffer.readline())
-    threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
+    lines: SimpleQueue[bytes] = SimpleQueue()
+    threading.Thread(target=_read_until_parent_ends, args=(lines,), name="parent", daemon=True).start()
+    job = json.loads(lines.get())
     prepare, fly = _CAMPAIGNS[job["campaign"]]
     try:
         configs = [SitlConfig.model_validate_json(json.dumps(config)) for config in job["configs"]]
-        flights = prepare(job, configs)
-        with closing(fly_all(fly, configs, flights, job["jobs"], job["scheduler"])) as results:
-            for result in results:
-                _send({"type": "flight", **result})
+        while True:
+            if job.get("batches"):
+                job |= json.loads(lines.get())
+            flights = prepare(job, configs)
+            with closing(fly_all(fly, configs, flights, job["jobs"], job["scheduler"])) as results:
+                for result in results:
+                    _send({"type": "flight", **result})
+            if not job.get("batches"):
+                return 0
     except CampaignError as error:
         _send({"type": "error", "text": str(error), "bad_input": error.bad_input})
         return 1
-    return 0
 
 
 def _send(message: Data) -> None:
@@ -43,10 +50,13 @@ def _send(message: Data) -> None:
     sys.stdout.flush()
 
 
-def _end_with_parent() -> None:
-    """End this process and its workers when standard input closes."""
-    while os.read(sys.stdin.fileno(), 4096):
-        pass
+def _read_until_parent_ends(lines: SimpleQueue[bytes]) -> None:
+    """Queue the lines of standard input; end this process and its workers when it closes."""
+    unfinished = b""
+    while data := os.read(sys.stdin.fileno(), 1 << 16):
+        *whole, unfinished = (unfinished + data).split(b"\n")
+        for line in whole:
+            lines.put(line)
     if os.getpgrp() == os.getpid():
         os.killpg(0, signal.SIGTERM)
     os._exit(1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,17 +57,19 @@ def laboratory_of(config: SitlConfig) -> Data:
     return {"world_seed": config.world.seed, "model_error": config.world.model_error}
 
 
-def fly_to_end(config: SitlConfig, limit_s: float = 90.0) -> Flown:
-    """Fly the mission, at most until world time `limit_s`. An exception ends only this flight; it is returned in `Flown.error`."""
+def fly_to_end(config: SitlConfig, limit_s: float = 90.0, until_mission_s: float = math.inf) -> Flown:
+    """Fly the mission, at most until world time `limit_s` and until `until_mission_s` on its own clock. An exception ends only this
+    flight; it is returned in `Flown.error`.
+    """
     try:
         fast = FastFlight(config)
-        return Flown(fast.config, fast, fast.run(limit_s), None)
+        return Flown(fast.config, fast, fast.run(limit_s, until_mission_s), None)
     except Exception as error:
         return Flown(config, None, FastResult(), f"{type(error).__name__}: {error}")
 
 
 def row_of(
-    config: FlightConfig, result: FastResult, caught_t_s: float | None, error: str | None = None
+    config: FlightConfig, result: FastResult, caught_t_s: float | None, error: str | None = None, *, cut: bool = False
 ) -> tuple[Data, FlightLog]:
     """Return the row of a flight and its log.
 
@@ -77,9 +80,13 @@ def row_of(
         result: result of the flight.
         caught_t_s: world time of the true catch; None if the payload was not caught.
         error: the exception that ended the flight, if any.
+        cut: whether the flight was ended in the air on purpose: it is completed if the supervisor did no more than warn.
     """
     log = log_of(config, result, caught_t_s)
-    ended = result.outputs[-1].outcome if result.outputs else None
+    last = result.outputs[-1] if result.outputs else None
+    ended = last.outcome if last is not None else None
+    if cut and last is not None and ended is None:
+        ended = Outcome.COMPLETED if last.action.rank <= SafetyAction.WARN.rank else Outcome.ABORTED
     outcome = Outcome.CRASHED if result.crashed else ended or Outcome.LOST
     completed = outcome is Outcome.COMPLETED
     index = metrics.catch_index(log)

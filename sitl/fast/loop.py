@@ -185,17 +185,17 @@ class FastFlight:
         """Whether the core trusts motion capture; only trusted poses are forwarded to PX4."""
         self._dropped = 0
 
-    def run(self, limit_s: float = 90.0) -> FastResult:
-        """Fly until the mission ends, the vehicle crashes or world time reaches `limit_s`."""
+    def run(self, limit_s: float = 90.0, until_mission_s: float = math.inf) -> FastResult:
+        """Fly until the mission ends, the vehicle crashes, world time reaches `limit_s` or the mission's clock `until_mission_s`."""
         world = self.plant.world
         result = FastResult(layout=world.layout)
         with _garbage_collection_paused():
-            self._run(result, limit_s)
+            self._run(result, limit_s, until_mission_s)
         result.crashed = world.crashed
         result.caught = world.payload.caught_t_s is not None
         return result
 
-    def _run(self, result: FastResult, limit_s: float) -> None:
+    def _run(self, result: FastResult, limit_s: float, until_mission_s: float = math.inf) -> None:
         plant, core, px4 = self.plant, self.core, self.px4
         world, guardian = plant.world, self._guardian
         period = tick = 0
@@ -225,7 +225,7 @@ class FastFlight:
             result.outputs.append(outputs)
             result.snapshots.append(world.snapshot())
             tick += 1
-            if outputs.outcome is not None or world.crashed:
+            if outputs.outcome is not None or world.crashed or outputs.mission_t_s >= until_mission_s:
                 break
         if guardian is not None:
             result.guardian_events = guardian.events

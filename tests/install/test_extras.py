@@ -11,7 +11,7 @@ from companion import DISTRIBUTION
 from companion.cli.main import _normalised, make_parser
 from companion.install.extras import missing_extra
 
-EXTRAS = ("mujoco", "joblib", "dask", "distributed", "matplotlib", "aiohttp", "cryptography")
+EXTRAS = ("mujoco", "joblib", "cma", "dask", "distributed", "matplotlib", "aiohttp", "cryptography")
 
 
 @pytest.mark.parametrize(
@@ -24,6 +24,7 @@ EXTRAS = ("mujoco", "joblib", "dask", "distributed", "matplotlib", "aiohttp", "c
         ("compare --payloads 0.2", "companion compare"),
         ("robustness --draws 1", "companion robustness"),
         ("faults", "companion faults"),
+        ("tune", "companion tune"),
         ("faults --list", None),
         ("fly m.yaml", None),
         ("check", None),

@@ -17,6 +17,7 @@ from typing import Any
 
 from companion.campaigns.compare.grid import ADAPTATION_OFF, is_ablation
 from companion.campaigns.compare.paper_results import PrintedFlight, printed
+from companion.campaigns.cost import cost_of, flight_cost
 from companion.campaigns.runner import Row, flat
 
 COMPLETED = "completed"
@@ -74,6 +75,11 @@ class Group:
         if not values or math.isinf(values[0]):
             return None
         return Spread(_percentile(values, 0.5), _percentile(values, 0.95), len(values))
+
+    @property
+    def cost(self) -> float:
+        """Cost of the flights, m."""
+        return cost_of([flight_cost(row) for row in self.rows])
 
     @property
     def failures(self) -> dict[str, int]:

@@ -57,6 +57,7 @@ def tracking_table(groups: Sequence[Group], *, p95: bool = True) -> Table:
 def compliance_table(groups: Sequence[Group], *, p95: bool = True) -> Table:
     """Return the table of compliance after the catch, which the tracking errors do not show."""
     columns = [_ours(*of, p95, failures=position == 0) for position, of in enumerate(_COMPLIANCE)]
+    columns.append(Column("cost\n[m]", lambda group: f"{group.cost:.3f}"))
     return _table("After the catch", columns, groups)
 
 

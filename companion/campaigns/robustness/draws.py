@@ -124,10 +124,17 @@ def influence(rows: Sequence[Row]) -> dict[str, float]:
     for key in DRIVERS:
         pairs = [(d[key], row["e_p_m"]) for d, row in zip(known, flown, strict=True) if d[key] is not None]
         if len(pairs) >= 10:
-            x, y = np.array(pairs, dtype=np.float64).T
-            if np.ptp(x) > 0 and np.ptp(y) > 0:
-                found[key] = float(np.corrcoef(_ranks(x), _ranks(y))[0, 1])
+            correlation = rank_correlation(*zip(*pairs, strict=True))
+            if correlation is not None:
+                found[key] = correlation
     return dict(sorted(found.items(), key=lambda item: -abs(item[1])))
+
+
+def rank_correlation(x: Sequence[float], y: Sequence[float]) -> float | None:
+    """Return Spearman's rank correlation; None if one of the quantities does not vary."""
+    if not (np.ptp(x) > 0 and np.ptp(y) > 0):
+        return None
+    return float(np.corrcoef(_ranks(np.array(x, np.float64)), _ranks(np.array(y, np.float64)))[0, 1])
 
 
 def _ranks(values: Any) -> Any:

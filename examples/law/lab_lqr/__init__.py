@@ -6,6 +6,7 @@ import numpy as np
 
 from companion.config.base import Positive3
 from companion.config.controller import LawConfig, PositiveJoints, fitted
+from companion.config.tuned_gain import TunedGain
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.control.common import Actuation, ForceFilter, tracking_errors, wrench_of
@@ -20,6 +21,12 @@ class LqrConfig(LawConfig):
 
     presets = ("tuned",)
     gain_lists = ("arm_kp_nm_rad", "arm_kd_nms_rad")
+    tuned_gains = (
+        *(TunedGain("cost_xy", 0.5, 500.0, (row, row + 1)) for row in range(3)),
+        *(TunedGain("cost_z", 0.5, 500.0, (row, row + 1)) for row in range(3)),
+        TunedGain("arm_kp_nm_rad", 2.0, 50.0),
+        TunedGain("arm_kd_nms_rad", 0.1, 3.0),
+    )
     law: Literal["lqr"]
     cost_xy: Positive3
     """Cost of the integral of the horizontal error (m s), the error (m) and its rate (m/s); that of the acceleration (m/s^2) is 1."""

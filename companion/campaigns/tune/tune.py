@@ -1,0 +1,215 @@
+"""`companion tune`: searches gains, judges them in held-out laboratories, and writes them if they are better."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+from rich.console import Console
+
+from companion.campaigns.cost import flight_cost
+from companion.campaigns.plan import WORKERS, duration_text
+from companion.campaigns.process import CampaignError, Message
+from companion.campaigns.runner import Row, to_json, versions
+from companion.campaigns.tune.draws import Draws, draws_of
+from companion.campaigns.tune.flights import Flights, Interrupted
+from companion.campaigns.tune.output import publish
+from companion.campaigns.tune.result import HeldOut, Result
+from companion.campaigns.tune.search import Evaluation, Search, batches_of
+from companion.campaigns.tune.space import Point, Space
+from companion.config.controller import ControllerConfig
+from companion.config.document import ConfigError
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
+from companion.plugins import CONTROL_LAWS, find
+from companion.runtime.console import print_error
+from companion.sitl_config.loader import SitlConfig
+
+PLAN_SAMPLE = 4
+"""Number of flights of the search, and of whole missions, that a plan flies."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tune:
+    """What to search.
+
+    Raises:
+        ConfigError: the control law declares too few gains.
+    """
+
+    config: SitlConfig
+    """Effective configuration; its gains are the start."""
+    budget: int
+    """Number of candidates, the start included."""
+    seed: int
+    training: int
+    """Number of laboratories of the search."""
+    held_out: int
+    """Number of held-out laboratories."""
+    command: str
+    """The command line, for the record."""
+    fly: str
+    """The command line that flies the gains, without the option for the controller file."""
+    overrides: Sequence[str] = ()
+    jobs: int | None = None
+    scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.space.axes) < 2:
+            law = find(CONTROL_LAWS, self.config.controller.law)
+            text = f"companion tune: {law}: expected a law that declares two or more gains to tune, found "
+            raise ConfigError([f"{text}{len(self.space.axes)} (tuned_gains of its settings; docs/tune.md)"])
+
+    @property
+    def space(self) -> Space:
+        """Return the search space."""
+        return Space.of(self.config.controller, self.config.vehicle)
+
+    @property
+    def draws(self) -> tuple[Draws, Draws]:
+        """Return the laboratories of the search and the held-out ones."""
+        config = self.config
+        return draws_of(config.mission, config.vehicle, self.overrides, self.seed, self.training, self.held_out)
+
+    @property
+    def job(self) -> Message:
+        """Return the job for `sitl.campaigns`, whose flights follow in batches."""
+        job = {"campaign": "tune", "configs": [self.config.model_dump(mode="json")], "batches": True}
+        return {**job, "jobs": self.jobs or os.cpu_count() or 1, "scheduler": self.scheduler}
+
+    def settings(self) -> dict[str, Any]:
+        """Return what the result of the search depends on, except for the budget."""
+        sources, controller = self.config.sources, self.config.controller
+        plain = self.config.model_dump(mode="json", exclude={"sources"})
+        whole = hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
+        used = {key: value for key, value in versions().items() if key in ("git", "companion", "mujoco", "numpy")}
+        return {
+            "controller": controller.law,
+            "preset": controller.preset,
+            "controller_file": sources.controller,
+            "vehicle": sources.vehicle,
+            "mission": sources.mission,
+            "world": self.config.laboratory.name,
+            "overrides": list(self.overrides),
+            "seed": self.seed,
+            "training_laboratories": self.training,
+            "held_out_laboratories": self.held_out,
+            "configuration": whole,
+            "versions": {**used, "cma": importlib.metadata.version("cma")},
+        }
+
+
+def run(tune: Tune, out: Path, console: Console | None) -> int:
+    """Search, judge, write the results into `out` and print them; return the exit code.
+
+    Args:
+        tune: what to search.
+        out: an existing folder; if it has the flights of the same search, that search goes on.
+        console: where to print; None to print JSON instead.
+
+    Raises:
+        ConfigError: the folder holds another search.
+    """
+    space, (training, held_out) = tune.space, tune.draws
+    total = sum(batches_of(tune.budget, len(space.axes), training.count)) + 2 * held_out.count
+    flights = Flights(tune.job, out, tune.settings(), total, out / "campaign.log")
+
+    def evaluate(points: Sequence[Point], numbers: Sequence[int]) -> list[list[float]]:
+        settings = [space.settings(point) for point in points]
+        best = f"best {search.best.cost:.4f}" if search.evaluations and search.start.costs else "start"
+        rows = flights.fly(_flights(settings, training, numbers), f"{len(search.evaluations)}/{tune.budget}, {best}")
+        costs = [flight_cost(row) for row in rows]
+        return [costs[at : at + len(numbers)] for at in range(0, len(costs), len(numbers))]
+
+    search = Search(space.start_point, training.count, tune.budget, tune.seed, evaluate)
+    try:
+        with flights:
+            search.run(space.start_point)
+            judged = _judge(search, space, held_out, flights)
+    except Interrupted:
+        _explain(out, "interrupted")
+        return EXIT_ABORTED
+    except CampaignError as error:
+        print_error(f"companion tune: {error}")
+        return EXIT_BAD_INPUT if error.bad_input else EXIT_LOST
+    result = Result(tune.settings(), tune.command, tune.fly, space, search, training, held_out, judged)
+    publish(result, out, console)
+    return EXIT_OK if result.better else EXIT_REFUSED
+
+
+def _explain(out: Path, why: str) -> None:
+    print_error(f"companion tune: {why}; the same command with --out {out} goes on from there")
+
+
+def _flights(settings: Sequence[ControllerConfig], draws: Draws, numbers: Sequence[int]) -> list[Message]:
+    plain = [one.model_dump(mode="json") for one in settings]
+    return [draws.flight(one, number) for one in plain for number in numbers]
+
+
+def _judge(search: Search, space: Space, draws: Draws, flights: Flights) -> HeldOut:
+    """Fly start and found gains in the held-out laboratories."""
+
+    def rows_of(one: Evaluation, about: str) -> list[Row]:
+        return flights.fly(_flights([space.settings(one.point)], draws, range(draws.count)), about)
+
+    return HeldOut(rows_of(search.start, "held out, before"), rows_of(search.best, "held out, after"))
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Measured cost of some flights of the start, and the duration of the whole search computed from it."""
+
+    batches: tuple[tuple[int, float], ...]
+    """Number of flights of each batch, and the processor time of one of them, s."""
+    at_once: int
+
+    def duration_s(self, at_once: int) -> float:
+        """Return the duration with this number of simultaneous flights, each on a free core."""
+        return sum(-(-flights // at_once) * cpu_s for flights, cpu_s in self.batches)
+
+
+def plan(tune: Tune, console: Console | None) -> int:
+    """Fly some flights of the start and print how long the whole search takes; no files are written; return the exit code."""
+    space, (training, held_out) = tune.space, tune.draws
+    with tempfile.TemporaryDirectory() as folder:
+        flights = Flights(tune.job, None, {}, 2 * PLAN_SAMPLE, Path(folder) / "campaign.log")
+        cpu_s = []
+        try:
+            with flights:
+                for draws in (training, held_out):
+                    flights.fly(_flights([space.start], draws, range(min(PLAN_SAMPLE, draws.count))), "")
+                    cpu_s.append(mean(message["cpu_s"] for message in flights.flown))
+                    at_once = flights.flown[-1]["at_once"]
+                    flights.flown.clear()
+        except Interrupted:
+            print_error("companion tune: interrupted")
+            return EXIT_ABORTED
+        except CampaignError as error:
+            print_error(f"companion tune: {error}")
+            return EXIT_BAD_INPUT if error.bad_input else EXIT_LOST
+    searched = batches_of(tune.budget, len(space.axes), training.count)
+    found = Plan((*((flown, cpu_s[0]) for flown in searched), (2 * held_out.count, cpu_s[1])), at_once)
+    count = sum(flown for flown, _ in found.batches)
+    seconds = {workers: found.duration_s(workers) for workers in (found.at_once, *WORKERS)}
+    if console is None:
+        data = {"flights": count, "cpu_s": cpu_s[0], "whole_mission_cpu_s": cpu_s[1], "at_once": found.at_once}
+        sys.stdout.write(to_json({**data, "duration_s": seconds[found.at_once], "durations_s": seconds}))
+        return EXIT_OK
+    where = "on this computer" if tune.scheduler is None else f"on the workers of {tune.scheduler}"
+    lines = [
+        f"processor time of a flight: {cpu_s[0]:.2f} s in the search, {cpu_s[1]:.2f} s of a whole mission",
+        f"{count} flights of {tune.budget} candidates, {found.at_once} at a time {where}: "
+        f"{duration_text(seconds[found.at_once])}",
+        *(f"on {workers} Dask workers, one core each: {duration_text(seconds[workers])}" for workers in WORKERS),
+    ]
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    return EXIT_OK
