@@ -6,6 +6,7 @@ import msgspec
 
 from companion.guardian.client import GuardianClient
 from companion.guardian.heartbeat import Heartbeat
+from companion.mission.contact import way_back_m
 from companion.model.best_pose import best_pose, pose_used_s
 from companion.model.flight_stage import PILOT_FLIES
 from companion.model.types import AutopilotRequest, AutopilotStatus, Inputs, LinkIdentity, Outputs, PhaseKind
@@ -63,6 +64,7 @@ class Heartbeats:
             pose_stamp_s=self._pose_stamp_s,
             position_world_m=self._position_world_m,
             peer=link.peer,
+            back_world_m=None if outputs.contact is None else way_back_m(outputs.contact),
         )
 
 

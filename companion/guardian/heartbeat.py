@@ -57,6 +57,8 @@ class Heartbeat(Record, frozen=True, kw_only=True):
     """Position of the newest accepted pose."""
     peer: tuple[_Ipv4, _Port] | None = None
     """IPv4 address and UDP port of PX4, confirmed by the flight process; None if the link is not UDP."""
+    back_world_m: Vec3 | None = None
+    """The way back from a surface that the tool touches or approaches, before a landing; None if there is none."""
 
 
 def pack(heartbeat: Heartbeat) -> bytes:
@@ -73,5 +75,5 @@ def unpack(datagram: bytes) -> Heartbeat | None:
     except RecordError:
         return None
     times = heartbeat.t_s, heartbeat.origin_s, heartbeat.mission_t_s
-    finite = all(map(math.isfinite, (*times, *heartbeat.position_world_m)))
+    finite = all(map(math.isfinite, (*times, *heartbeat.position_world_m, *(heartbeat.back_world_m or ()))))
     return heartbeat if finite and not math.isnan(heartbeat.pose_stamp_s) else None

@@ -12,10 +12,11 @@ from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.guardian.retreat import Setpoint
 from companion.io.px4 import messages
 from companion.io.px4.udp_peer import REPIN_SILENCE_S, disconnect_udp
 from companion.io.qgroundcontrol.frames import autopilot_heartbeat
-from companion.model.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
+from companion.model.frames import attitude_ned_frd_from_enu_flu, ned_from_enu, quat_from_euler_zyx, wrap_rad
 from companion.model.types import AutopilotRequest, MocapPose
 
 Message = Any
@@ -343,6 +344,24 @@ class Link:
         self.send(
             mavlink.MAVLink_set_attitude_target_message(
                 int(t_s * 1e3) & 0xFFFFFFFF, target, component, _TYPE_MASK_IGNORE_RATES, q, 0.0, 0.0, 0.0, 0.0
+            )
+        )
+
+    def send_position(self, t_s: float, setpoint: Setpoint) -> None:
+        """Send SET_POSITION_TARGET_LOCAL_NED with position, velocity, acceleration and yaw."""
+        target, component = self._autopilot_system, messages.MAV_COMP_ID_AUTOPILOT1
+        self.send(
+            mavlink.MAVLink_set_position_target_local_ned_message(
+                int(t_s * 1e3) & 0xFFFFFFFF,
+                target,
+                component,
+                mavlink.MAV_FRAME_LOCAL_NED,
+                mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE,
+                *ned_from_enu(setpoint.position_world_m),
+                *ned_from_enu(setpoint.velocity_world_m_s),
+                *ned_from_enu(setpoint.acceleration_world_m_s2),
+                wrap_rad(0.5 * math.pi - setpoint.yaw_rad),
+                0.0,
             )
         )
 

@@ -1,4 +1,5 @@
 """The landing after a takeover: the guardian keeps sending motion capture to PX4, PX4 lands, and the guardian disarms if PX4 does not.
+Before the landing the vehicle moves back from a surface that its tool may touch.
 
 The rules are those of the companion's own landing on PX4 (`companion.safety.autopilot_landing`). Pure except for the link; time is
 an argument.
@@ -16,6 +17,7 @@ from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
 from companion.guardian.monitors import PoseFilter
 from companion.guardian.px4 import Px4State
+from companion.guardian.retreat import Retreat
 from companion.model.types import (
     AutopilotRequest,
     AutopilotStatus,
@@ -40,6 +42,10 @@ MODE_TIMEOUT_S = 0.15
 REPEAT_S = 0.25
 """Period at which a command is repeated until the status shows its effect."""
 ZERO_THRUST_PERIOD_S = 0.02
+RETREAT_PERIOD_S = 0.02
+POSITION_FRESH_S = 0.1
+RETREAT_WAIT_S = 0.3
+"""Timeout for PX4's position, from which the way back from a surface begins; it is streamed every 20 ms."""
 LINK_FRESH_S = 2.5
 TOUCH_DOWN = "touchdown"
 """Text of `LandingStep` at touchdown."""
@@ -107,6 +113,10 @@ class TakeoverLanding:
         self._mocap_refused = last_heartbeat.mocap_refused
         self._pose_s = last_heartbeat.pose_stamp_s
         """Stamp of the newest pose that PX4 received, from the flight process or the guardian."""
+        self._back_world_m = None if last_heartbeat.mocap_refused else last_heartbeat.back_world_m
+        """The way back from a surface; None if there is none to fly."""
+        self._retreat: Retreat | None = None
+        self._retreat_s = float("-inf")
         self._landing: AutopilotLanding | None = None
         self._attempts = 0
         self._tick = last_heartbeat.tick
@@ -179,6 +189,8 @@ class TakeoverLanding:
         if status is None and t_s - self._spoken_s < MODE_TIMEOUT_S:
             return
         self._check_pilot(t_s)
+        if self._retreats(t_s, status):
+            return
         if self._landing is None:
             self._attempts += 1
             self._landing = AutopilotLanding.begin(
@@ -191,13 +203,39 @@ class TakeoverLanding:
 
     def restart(self, t_s: float) -> None:
         """Start a new landing after an internal error. PX4 is commanded to land even if no landing had begun."""
-        self._landing = None
+        self._landing = self._back_world_m = None
         status = self._px4.status()
         if not self._pilot and status is not None and status.mode is not FlightMode.LAND and status.armed:
             self._send_request(t_s, AutopilotRequest.LAND)
         disarmed = status is not None and not status.armed and t_s - self._start_s > DISARMED_AFTER_S
         if disarmed or t_s - self._start_s > ATTEMPTS_MAX * TIMEOUT_S:
             self.landed = disarmed
+
+    def _retreats(self, t_s: float, status: AutopilotStatus | None) -> bool:
+        """Move back from the surface; return whether that goes on. If PX4 is not in OFFBOARD or sends no position, it lands at once."""
+        back_m, vehicle = self._back_world_m, self._px4.vehicle()
+        if back_m is None:
+            return False
+        self._back_world_m = None  # unless the motion goes on: it is not begun again
+        if self._pilot or status is None or status.mode is not FlightMode.OFFBOARD or not status.armed:
+            return False
+        if self._retreat is None:
+            if vehicle is None or t_s - vehicle.position_stamp_s > POSITION_FRESH_S:
+                waits = self._spoken_s is not None and t_s - self._spoken_s < RETREAT_WAIT_S
+                self._back_world_m = back_m if waits else None
+                return waits
+            self._retreat = Retreat.begin(t_s, vehicle, back_m)
+            self._notify_once(
+                t_s, "guardian_retreat", Severity.WARNING, "moving back from the surface before PX4 lands"
+            )
+        setpoint = self._retreat.setpoint(t_s)
+        if setpoint is None:
+            return False
+        self._back_world_m = back_m
+        if t_s - self._retreat_s >= RETREAT_PERIOD_S:
+            self._retreat_s = t_s
+            self._link.send_position(t_s, setpoint)
+        return True
 
     def _check_pilot(self, t_s: float) -> None:
         if not self._pilot and self._px4.pilot:

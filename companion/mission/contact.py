@@ -57,6 +57,8 @@ DISAGREEMENT_S = 0.1
 """Time constant of the comparison of the measured force with the one that the vehicle's motion shows, and the time for which they must
 disagree.
 """
+BACK_M = (0.2, 0.4)
+"""Smallest and largest way back from the surface before a landing without the core."""
 _ARRIVED_M = 0.0002
 _NO_FORCE: Vec3 = (0.0, 0.0, 0.0)
 
@@ -137,6 +139,13 @@ def before_approach_m(reference: Reference, contact: ContactState) -> Vec3:
     """Return the position of the reference without the contact's offset, world frame, m: in front of the surface."""
     (x, y, z), (nx, ny, nz), d = reference.position_world_m, contact.direction_world, contact.offset_m
     return (x - d * nx, y - d * ny, z - d * nz)
+
+
+def way_back_m(contact: ContactState) -> Vec3:
+    """Return the way back from the surface before a landing without the core: to where the approach began, within `BACK_M`."""
+    (nx, ny, nz), (least_m, most_m) = contact.direction_world, BACK_M
+    d = min(most_m, max(least_m, contact.offset_m))
+    return (-d * nx, -d * ny, -d * nz)
 
 
 def measured(

@@ -20,6 +20,7 @@ _TICK = next(iter(synthetic_flight()))
 _BEAT = Heartbeat(
     tick=7, t_s=1.5, origin_s=100.0, mission_t_s=0.5, lifting=True, pilot=False, goodbye=False, mocap_refused=False,
     autopilot_system=1, own_system=1, own_component=191, local_port=14540, pose_stamp_s=1.49, position_world_m=(1.0, 2.0, 3.0),
+    back_world_m=(-0.3, 0.0, 0.0),
 )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.guardian.heartbeat import Heartbeat
@@ -23,7 +24,7 @@ LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
 ON_ITS_BACK = quat_from_euler_zyx(math.pi, 0.0, 0.0)
 ON_ITS_ROTORS = quat_from_euler_zyx(math.radians(-55.0), 0.0, 0.0)
 ARMED = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-LAND_MODE = 4 << 16 | 6 << 24
+LAND_MODE, OFFBOARD_MODE = 4 << 16 | 6 << 24, 6 << 16
 
 
 class Wire:
@@ -93,8 +94,9 @@ class Landing:
         messages: tuple[str, ...] = ("position", "attitude", "imu"),
         mocap: bool = True,
         corrupt: Callable[[Any], None] = lambda message: None,
+        mode: int = LAND_MODE,
     ) -> None:
-        """Run with PX4 in LAND, armed, at rest at a height, without its land detector; `corrupt` changes each state message."""
+        """Run with PX4 in a mode, armed, at rest at a height, without its land detector; `corrupt` changes each state message."""
         q = attitude_ned_frd_from_enu_flu(attitude)
         for _ in range(round(duration_s / STEP_S)):
             self.t_s += STEP_S
@@ -106,7 +108,7 @@ class Landing:
             said = [state[name] for name in messages]
             for message in said:
                 corrupt(message)
-            heartbeat = mavlink.MAVLink_heartbeat_message(2, 12, ARMED, LAND_MODE, 4, 3)
+            heartbeat = mavlink.MAVLink_heartbeat_message(2, 12, ARMED, mode, 4, 3)
             if mocap:
                 number = round(self.t_s / STEP_S)
                 position: Vec3 = (0.0, 0.0, height_m)
@@ -125,6 +127,10 @@ class Landing:
             self.takeover.take_messages(self.t_s, [heartbeat, *said])
             if self.takeover.landed is None:
                 self.takeover.step(self.t_s)
+
+    @property
+    def positions(self) -> list[Any]:
+        return [m for m in self.wire.sent if m.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
 
     @property
     def forced(self) -> bool:
@@ -167,6 +173,26 @@ def test_tipped_over_on_the_floor_it_is_disarmed_by_force() -> None:
     landing.run(0.4, attitude=ON_ITS_ROTORS, height_m=0.45)
     assert landing.forced
     assert "tipped over on the floor: FORCE_DISARM is requested at once" in [notice.text for notice in landing.notices]
+
+
+def test_from_a_surface_the_vehicle_moves_back_before_px4_is_told_to_land() -> None:
+    landing = Landing(replace(beat(), back_world_m=(-0.3, 0.0, 0.0)))
+    landing.run(1.0, mode=OFFBOARD_MODE, height_m=1.1)
+    assert landing.positions and not landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)
+    landing.run(1.5, mode=OFFBOARD_MODE, height_m=1.1)
+    east_m = [m.y for m in landing.positions]
+    assert east_m == sorted(east_m, reverse=True) and east_m[-1] == pytest.approx(-0.3, abs=1e-3)
+    assert {round(m.z, 6) for m in landing.positions} == {-1.1}
+    assert {round(m.yaw, 6) for m in landing.positions} == {round(0.5 * math.pi, 6)}
+    assert landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)
+
+
+@pytest.mark.parametrize("mode", [LAND_MODE, OFFBOARD_MODE])
+def test_without_a_position_or_out_of_offboard_px4_lands_at_once(mode: int) -> None:
+    landing = Landing(replace(beat(), back_world_m=(-0.3, 0.0, 0.0)))
+    landing.run(0.6, mode=mode, messages=("attitude",) if mode == OFFBOARD_MODE else ("position", "attitude"))
+    assert not landing.positions
+    assert landing.wire.commands(mavlink.MAV_CMD_NAV_LAND) or mode == LAND_MODE
 
 
 def test_poses_that_the_flight_process_rejected_are_neither_passed_on_nor_evaluated() -> None:
