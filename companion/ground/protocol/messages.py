@@ -132,6 +132,8 @@ class Scene(Record, frozen=True, kw_only=True):
     path_world_m: tuple[Vec3, ...]
     """Planned path at equal time steps, at most 300 points; empty until it is planned."""
     phases: tuple[str, ...]
+    has_contact: bool = False
+    """Whether the mission has contact phases."""
 
 
 class PreflightRow(Record, frozen=True):
@@ -212,6 +214,16 @@ class ControlView(Record, frozen=True, kw_only=True):
     payload_estimate_kg: float | None = None
 
 
+class ContactView(Record, frozen=True, kw_only=True):
+    """Contact with a surface; see `companion.model.types.ContactState`."""
+
+    mode: str
+    """`companion.model.types.ContactMode`."""
+    force_n: float
+    """Measured force of the surface against the direction of the approach."""
+    wanted_n: float
+
+
 class Timing(Record, frozen=True, kw_only=True):
     """Durations of the loop and the links: the largest of all ticks since the previous message."""
 
@@ -271,6 +283,8 @@ class Stream(Record, frozen=True, kw_only=True):
     battery_remaining: float | None = None
     tether: TetherView | None = None
     control: ControlView | None = None
+    contact: ContactView | None = None
+    """None outside contact phases."""
     timing: Timing
     lights: tuple[DeviceHealth, ...]
     limited_by: tuple[str, ...]

@@ -213,6 +213,10 @@ def _figures(stream: Stream) -> list[str]:
         parts.append(f"|e_q| {stream.e_q_deg:.1f} deg")
     if stream.tether is not None:
         parts.append(f"slack {stream.tether.slack_m:.2f} m")
+    if stream.contact is not None:
+        parts.append(
+            f"{printable(stream.contact.mode)} {stream.contact.force_n:.1f} of {stream.contact.wanted_n:.1f} N"
+        )
     if stream.battery_v is not None:
         left = "" if stream.battery_remaining is None else f" {100 * stream.battery_remaining:.0f} %"
         parts.append(f"battery {stream.battery_v:.1f} V{left}")

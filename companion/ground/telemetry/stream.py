@@ -18,6 +18,7 @@ from companion.config.vehicle import OBSERVER
 from companion.ground.protocol.messages import (
     EVENTS_KEPT,
     VERSION,
+    ContactView,
     ControlView,
     EventLine,
     Events,
@@ -30,7 +31,18 @@ from companion.ground.telemetry.health import HealthEvaluator, Snapshot, WorstAg
 from companion.ground.telemetry.timings import WorstTimings, merge_timings
 from companion.model.constants import GRADED_POSE_MAX_AGE_S, TICK_PERIOD_S
 from companion.model.flight_stage import Stage
-from companion.model.types import ControlLog, Inputs, Outputs, Quat, Reference, SafetyAction, Sent, TetherState, Vec3
+from companion.model.types import (
+    ContactState,
+    ControlLog,
+    Inputs,
+    Outputs,
+    Quat,
+    Reference,
+    SafetyAction,
+    Sent,
+    TetherState,
+    Vec3,
+)
 
 STREAM_PERIOD_S = 0.05
 """Period of the stream messages over MQTT."""
@@ -191,6 +203,7 @@ class StreamBuilder:
             battery_remaining=_number(status.battery_remaining, 4) if status is not None else None,
             tether=_tether(o.tether),
             control=_control(o.control, self._has_force),
+            contact=_contact(o.contact),
             timing=timing,
             lights=self._health.evaluate(snapshot),
             limited_by=o.limited_by,
@@ -343,6 +356,13 @@ def _control(control: ControlLog | None, has_force: bool) -> ControlView | None:
         saturated=any(control.saturated),
         payload_estimate_kg=_number(control.payload_estimate_kg, 4),
     )
+
+
+def _contact(contact: ContactState | None) -> ContactView | None:
+    numbers = None if contact is None else _rounded((contact.force_n, contact.wanted_n), 3)
+    if contact is None or numbers is None:
+        return None
+    return ContactView(mode=contact.mode.value, force_n=numbers[0], wanted_n=numbers[1])
 
 
 def truncated(text: str) -> str:

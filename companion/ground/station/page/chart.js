@@ -2,7 +2,7 @@
 
 import { colours, FONT, levelColour } from "./colours.js";
 import { fitCanvas, make, setText } from "./dom.js";
-import { fixed } from "./format.js";
+import { fixed, readable } from "./format.js";
 import { after } from "./vehicle.js";
 
 const LEFT = 42;
@@ -42,8 +42,8 @@ function write(context, { text, colour, x, y }) {
 
 export class StripChart {
   /**
-   * @param spec {title, digits, floor, span, spanRight, series: [{label, unit, colour, dashed, right, value(record)}], limits(scene): [{value, label, level}]}
-   *   `floor`: lower end of the axes; `span`, `spanRight`: smallest range of the axes.
+   * @param spec {title, digits, floor, span, spanRight, state(record), series: [{label, unit, colour, dashed, right, value(record)}], limits(scene): [{value, label, level}]}
+   *   `state`: word beside the title; `floor`: lower end of the axes; `span`, `spanRight`: smallest range of the axes.
    */
   constructor(spec) {
     this.spec = spec;
@@ -54,7 +54,9 @@ export class StripChart {
       const data = { colour: series.colour, ...(series.dashed ? { dashed: "" } : {}) };
       return make("span", { className: "series", data, children: [make("i"), `${series.label} `, this._values[index], series.unit ? ` ${series.unit}` : ""] });
     });
-    this.element = make("div", { className: "plot card", children: [make("header", { children: [make("h2", { text: spec.title }), ...legend] }), this.canvas] });
+    this._state = make("b");
+    const header = [make("h2", { text: spec.title }), ...(spec.state ? [this._state] : []), ...legend];
+    this.element = make("div", { className: "plot card", children: [make("header", { children: header }), this.canvas] });
     this.canvas.setAttribute("role", "img");
     this.canvas.setAttribute("aria-label", `${spec.title}, last 30 s`);
   }
@@ -224,6 +226,7 @@ export class StripChart {
   _legend(records, t_s) {
     const index = after(records, t_s + 1e-9) - 1;
     const record = index >= 0 ? records[index] : null;
+    if (this.spec.state) setText(this._state, readable((record && this.spec.state(record)) ?? "no contact"));
     this.spec.series.forEach((series, k) => setText(this._values[k], fixed(record ? series.value(record) : null, this.spec.digits)));
   }
 }

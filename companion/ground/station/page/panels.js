@@ -131,6 +131,7 @@ const DETAILS = [
   ["pose from", ({ stream: s }) => s.pose_from ?? NOTHING],
   ["commanded force", ({ stream: s }) => vector(s.control?.tau, 1, "N")],
   ["external force", ({ stream: s }) => vector(s.control?.force_ext_world_n, 1, "N")],
+  ["contact", ({ stream: s }) => (s.contact ? `${readable(s.contact.mode)}, ${fixed(s.contact.force_n, 1)} of ${quantity(s.contact.wanted_n, 1, "N")}` : "none")],
   ["arm torque", ({ stream: s }) => vector(s.control?.arm_torque_nm, 2, "N m")],
   ["ρ", ({ stream: s }) => fixed(s.control?.rho, 5)],
   ["H", ({ stream: s }) => (s.control ? s.control.h_hat.map((part) => part.toExponential(1)).join("  ") : NOTHING)],

@@ -24,8 +24,17 @@ function armPlot(joints) {
   return { title: "Arm, °", digits: 0, span: 20, series, limits: jointLimits };
 }
 
+const CONTACT = {
+  title: "Force on the surface, N", digits: 1, span: 2, state: (r) => r.contact?.mode,
+  series: [
+    { label: "measured", unit: "", colour: "1", value: (r) => r.contact?.force_n },
+    { label: "wanted", unit: "", colour: "2", dashed: true, value: (r) => r.contact?.wanted_n },
+  ],
+};
+
 /** All plots for an arm of this many joints, from top to bottom. */
-const plotsOf = (joints) => [
+const plotsOf = (joints, contact) => [
+  ...(contact ? [CONTACT] : []),
   {
     title: "Position error ‖e_p‖, m", digits: 3, floor: 0, span: 0.02,
     series: [{ label: "", unit: "", colour: "1", value: (r) => r.e_p_m }],
@@ -86,13 +95,14 @@ export class Plots {
     this._cursor = null; // position of the pointer in the window, 0 to 1
     this._parent = parent;
     this._changed = changed;
-    this._build(JOINTS_SHOWN);
+    this._build(JOINTS_SHOWN, false);
   }
 
-  _build(joints) {
+  _build(joints, contact) {
     const changed = this._changed;
     this._joints = joints;
-    this.charts = plotsOf(joints).map((spec) => new StripChart(spec));
+    this._contact = contact;
+    this.charts = plotsOf(joints, contact).map((spec) => new StripChart(spec));
     this._parent.replaceChildren(...this.charts.map((chart) => chart.element));
     for (const chart of this.charts) {
       chart.canvas.addEventListener("pointermove", (event) => {
@@ -110,7 +120,8 @@ export class Plots {
 
   draw(vehicle) {
     const joints = vehicle?.scene?.joint_max_rad.length ?? this._joints;
-    if (joints !== this._joints) this._build(joints);
+    const contact = vehicle?.scene ? Boolean(vehicle.scene.has_contact) : this._contact;
+    if (joints !== this._joints || contact !== this._contact) this._build(joints, contact);
     const span = vehicle ? windowOf(vehicle) : { from: 0, to: WINDOW_S, now: 0 };
     const shown = {
       ...span,
