@@ -64,6 +64,9 @@ class VehicleControl:
         self.tether_pulls = False
         """Whether the tether pulls; set only with the momentum observer, which cannot tell that from a payload: no catch is then
         confirmed."""
+        self.near_surface = False
+        """Whether the force of a surface is looked for: the momentum observer then holds its mean, which would hide a force that
+        rises slowly."""
         self.press_direction: Vec3 | None = None
         """Direction in which the tool presses on a surface, world frame; None if it touches none. While it does, the integrators of the
         law and the estimators do not change, and the law gets only the force along this direction: an arm that held the friction, and
@@ -196,7 +199,7 @@ class VehicleControl:
         assert i.vehicle is not None
         stamps_s = (i.vehicle.attitude_stamp_s, i.arm.stamp_s) if i.arm is not None else None
         pressing = self.press_direction
-        observer.step(dt_s, self._known_n, state, stamps_s, carries, pressing is not None)
+        observer.step(dt_s, self._known_n, state, stamps_s, carries, self.near_surface)
         if pressing is not None:
             return msgspec.structs.replace(state, force_ext_world_n=_used(observer.used_n(), pressing))
         if not carries or (self.tether_pulls and self._catch.caught_s is None):

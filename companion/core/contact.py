@@ -48,7 +48,8 @@ def advance_contact(t: Transition) -> None:
         return
     dt_s = t.o.dt_s
     limit_n = t.parameters.vehicle.safety.contact_disagreement_n
-    contact = c.measured(contact, dt_s, t.o.force_world_n, t.o.disturbance_world_n, limit_n)
+    weigh_s = c.WEIGH_OBSERVED_S if _observes(t) else c.WEIGH_S
+    contact = c.measured(contact, dt_s, t.o.force_world_n, t.o.disturbance_world_n, limit_n, weigh_s)
     approach = _approach(t, segment)
     engaged = t.state.contact_segment
     assert engaged is not None
@@ -69,7 +70,7 @@ def advance_contact(t: Transition) -> None:
             return
         _stay_in(t, engaged)
     elif contact.mode is _WEIGH:
-        if t_s - contact.since_s >= c.WEIGH_S:
+        if t_s - contact.since_s >= weigh_s:
             contact = c.entered(contact, t_s, _APPROACH)
     elif contact.mode is _APPROACH:
         contact = _approached(t, contact, approach, dt_s)
@@ -94,12 +95,17 @@ def force_on_tool_n(log: ControlLog) -> Vec3:
     return log.force_ext_world_n if log.force_observed_world_n is None else log.force_observed_world_n
 
 
+def _observes(t: Transition) -> bool:
+    """Return whether the momentum observer is the source of the force."""
+    return t.parameters.vehicle.force_source == OBSERVER
+
+
 def _is_force_known(t: Transition) -> bool:
     """Return whether the force is observed, or measured and not older than `safety.force_timeout_s`: without it the approach would not
     end at the surface.
     """
     vehicle, force = t.parameters.vehicle, t.i.force
-    if vehicle.force_source == OBSERVER:
+    if _observes(t):
         return True
     return force is not None and t.i.t_s - force.stamp_s <= vehicle.safety.force_timeout_s
 
@@ -140,7 +146,7 @@ def _approached(t: Transition, contact: ContactState, approach: Approach, dt_s: 
     again = contact.touches > 0
     contact = c.moved(contact, dt_s, c.SLOWEST_M_S if again else approach.speed_m_s)
     contact = c.timed(contact, dt_s, contact.force_n > approach.touch_n)
-    if contact.beyond_s >= c.TOUCH_S:
+    if contact.beyond_s >= (c.TOUCH_OBSERVED_S if _observes(t) else c.TOUCH_S):
         touches = contact.touches + 1
         contact = replace(
             c.entered(contact, t_s, _PRESS),

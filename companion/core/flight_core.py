@@ -236,6 +236,7 @@ class FlightCore:
             return None, self._without_reference(stage, dt_s, i)
         reference = course.plan.reference(0.0) if stage is _SPOOL else course.reference(i.t_s)
         contact = state.contact
+        self._control.near_surface = contact is not None
         self._control.press_direction = contact.direction_world if contact is not None and contact.touches else None
         if contact is not None:
             reference = along(reference, contact)

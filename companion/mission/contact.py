@@ -21,8 +21,10 @@ WEIGH_S = 1.0
 ACCELERATION_M_S2 = 0.1
 STOP_M_S2 = 0.05
 """Deceleration of the offset after a touch."""
-TOUCH_S = 0.015
-"""Time for which the force must exceed the touch's threshold."""
+WEIGH_OBSERVED_S = 3.0
+"""The same without a force sensor, where gusts of some tenths of a second are part of the force."""
+TOUCH_S, TOUCH_OBSERVED_S = 0.015, 0.2
+"""Time for which the force must exceed the touch's threshold, with and without a force sensor."""
 LOST_SHARE, LOST_S = 0.3, 0.5
 """Contact is lost when the force is below this fraction of the touch's threshold for this time."""
 WAIT_S = 0.5
@@ -154,6 +156,7 @@ def measured(
     force_world_n: Vec3 | None,
     disturbance_world_n: Vec3 | None,
     disagreement_max_n: float,
+    weigh_s: float = WEIGH_S,
 ) -> ContactState:
     """Return the state with this tick's force. While it weighs, the force is averaged; no force counts as none.
 
@@ -163,18 +166,19 @@ def measured(
         force_world_n: force on the tool.
         disturbance_world_n: force on the vehicle that its motion shows, to compare the force with; None to compare with nothing.
         disagreement_max_n: `safety.contact_disagreement_n`.
+        weigh_s: time of the weighing.
     """
     against_n = -_along(contact.direction_world, force_world_n or _NO_FORCE)
     contact = replace(contact, tilting_n=contact.tilting_n + dt_s / TILT_S * (contact.push_n - contact.tilting_n))
     if contact.mode is ContactMode.WEIGH:
-        contact = replace(contact, bias_n=contact.bias_n + 3.0 * dt_s / WEIGH_S * (against_n - contact.bias_n))
+        contact = replace(contact, bias_n=contact.bias_n + 3.0 * dt_s / weigh_s * (against_n - contact.bias_n))
     contact = replace(contact, force_n=against_n - contact.bias_n)
     if disturbance_world_n is None:
         return contact
     unlike_n = -_along(contact.direction_world, disturbance_world_n) - against_n
     mean_n, disagreement_n, unopposed_n = contact.disagreement_bias_n, contact.disagreement_n, contact.unopposed_n
     if contact.mode is ContactMode.WEIGH:
-        return replace(contact, disagreement_bias_n=mean_n + 3.0 * dt_s / WEIGH_S * (unlike_n - mean_n))
+        return replace(contact, disagreement_bias_n=mean_n + 3.0 * dt_s / weigh_s * (unlike_n - mean_n))
     shown_n = contact.force_n + unlike_n - mean_n
     disagreement_n += dt_s / DISAGREEMENT_S * (unlike_n - mean_n - disagreement_n)
     unopposed_n += dt_s / DISAGREEMENT_S * (contact.push_n - shown_n - unopposed_n)
