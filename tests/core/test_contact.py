@@ -15,6 +15,8 @@ from companion.analysis.contact import contact_lines, contact_summary
 from companion.analysis.contact_plots import contact_force, contact_path
 from companion.analysis.log import FlightLog
 from companion.core.flight_core import FlightCore
+from companion.ground.telemetry.scene import scene_of
+from companion.ground.telemetry.stream import replay
 from companion.mission.check import check_mission
 from companion.model.types import ContactMode, Inputs, OperatorCommand, Outcome, Outputs
 from companion.sitl_config.loader import load_sitl
@@ -126,7 +128,7 @@ def test_the_summary_has_the_contact_and_a_replay_is_identical(pressed: tuple[Fa
     assert all(core.step(i) == o for i, o in zip(result.inputs, result.outputs, strict=True))
 
 
-def test_the_report_shows_the_force_with_the_true_one_and_where_the_tip_was(
+def test_report_and_ground_station_show_the_force_and_the_report_the_true_one(
     pressed: tuple[FastFlight, FastResult],
 ) -> None:
     flight, result = pressed
@@ -138,10 +140,14 @@ def test_the_report_shows_the_force_with_the_true_one_and_where_the_tip_was(
     assert about[1].startswith("1 touch, 5.00 N wanted") and surface[1].startswith("touched at [1.5")
     true_n = float(about[1].partition("true: ")[2].split()[0])
     assert true_n == pytest.approx(5.0, abs=0.25)
+    streams, _ = replay(log.rows(), flight.config.flight, "s", 0.0, rate_hz=2.0)
+    shown = [stream.contact for stream in streams if stream.contact is not None and stream.contact.mode == "press"]
+    assert any(4.0 < view.force_n < 6.0 and view.wanted_n == 5.0 for view in shown)
+    assert scene_of(flight.config.flight, "s").has_contact
     force = contact_force(log)
     assert force is not None and contact_path(log) is not None
-    shown = {text.get_text() for text in force.legends[0].get_texts()}
-    assert shown == {"weigh", "approach", "press", "leave"}
+    bands = {text.get_text() for text in force.legends[0].get_texts()}
+    assert bands == {"weigh", "approach", "press", "leave"}
     on_the_ground = dataclasses.replace(log, outputs=log.outputs[:50], inputs=log.inputs[:50], sent=log.sent[:50])
     assert contact_force(on_the_ground) is None and contact_path(on_the_ground) is None
     assert contact_lines({"contact": contact_summary(on_the_ground)}) == []
@@ -172,6 +178,17 @@ def test_a_force_sensor_whose_zero_shifts_during_the_approach_neither_pushes_int
     assert "contact_lost" in events(result)
     assert result.outputs[-1].outcome is Outcome.ABORTED and not result.crashed
     assert surfaces is not None and surfaces.force_max_n < 7.5 and surfaces.rotor_distance_min_m > 0.15
+
+
+def test_without_a_force_sensor_gusts_feign_no_touch_and_the_force_is_held() -> None:
+    sets = ["world.seed=318", "vehicle.force_source=observer", "mission.phases[4].duration_s=4.0"]
+    result = FastFlight(load_sitl(PRESS, world="wall", overrides=sets)).run(90.0)
+    assert result.outputs[-1].outcome is Outcome.COMPLETED and not result.crashed
+    true_n = force_n(result)
+    touched = next(k for k, o in enumerate(result.outputs) if o.contact is not None and o.contact.touches)
+    assert true_n[touched - 60 : touched].max() > 0.3
+    wanted = np.array([o.contact is not None and o.contact.wanted_n == 5.0 for o in result.outputs])
+    assert abs(true_n[np.flatnonzero(wanted)[200:]].mean() - 5.0) < 0.75
 
 
 def test_a_surface_that_gives_way_is_not_followed() -> None:

@@ -132,8 +132,8 @@ class Scene(Record, frozen=True, kw_only=True):
     path_world_m: tuple[Vec3, ...]
     """Planned path at equal time steps, at most 300 points; empty until it is planned."""
     phases: tuple[str, ...]
-    has_contact: bool = False
-    """Whether the mission has contact phases."""
+    has_contact: bool | None = None
+    """True if the mission has contact phases, else None."""
 
 
 class PreflightRow(Record, frozen=True):

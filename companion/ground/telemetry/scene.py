@@ -53,7 +53,7 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
         mission_s=mission_s,
         path_world_m=thinned(path_world_m),
         phases=tuple(map(phase_name, config.mission.phases)),
-        has_contact=any(isinstance(phase, Approach) for phase in config.mission.phases),
+        has_contact=any(isinstance(phase, Approach) for phase in config.mission.phases) or None,
     )
 
 
