@@ -1,4 +1,6 @@
-"""The flight process is killed or hung in the air, over real wires: the guardian lands the vehicle."""
+"""The flight process is killed or hung in the air, over real wires: the guardian lands the vehicle. A guardian that dies in the air:
+test_shared_flight.py.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +14,10 @@ import pytest
 from mcap.reader import make_reader
 
 from companion.analysis.log import FlightLog
-from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
-from tests.support import HOVER, HOVERS_S, Ended, Sandbox, read_summary, sandbox_in
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_REFUSED
+from tests.support import HOVER, HOVERS_S, Sandbox, read_summary, sandbox_in
 
 FLY = ("fly", HOVER, "--sitl", "--out", "out", "--set", "mission.phases[1].duration_s=2.0")
-IN_FLIGHT = "  hold\n"
-UNGUARDED = pytest.mark.xdist_group("a flight that loses its guardian")
 
 
 @pytest.fixture
@@ -57,42 +57,6 @@ def test_hung_in_the_air_the_guardian_lands(sandbox: Sandbox) -> None:
     with open(out / "flight.mcap", "rb") as file:
         lines = b"".join(message.data for _, _, message in make_reader(file).iter_messages(topics=["/log"]))
     assert b"guardian_landed" in lines, "the log goes on to the end"
-
-
-@pytest.fixture(scope="module")
-def unguarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Ended]]:
-    """A flight whose guardian dies in the air, and whose first request to disarm is lost."""
-    folder = tmp_path_factory.mktemp("unguarded")
-    (folder / "sitecustomize.py").write_text(_DEAF_ONCE.format(file=str(folder / "disarms")), encoding="utf-8")
-    with sandbox_in(folder / "sandbox", hooked(folder)) as sandbox:
-        with sandbox.start(*FLY) as running:
-            running.wait_for(IN_FLIGHT)
-            os.kill(int((sandbox.cwd / "out/guardian.pid").read_text()), signal.SIGKILL)
-            ended = running.end()
-        sandbox.assert_nobody_left()
-        yield folder, ended
-
-
-@pytest.mark.flight
-@UNGUARDED
-def test_a_guardian_that_dies_in_the_air_is_reported_and_the_flight_goes_on(unguarded: tuple[Path, Ended]) -> None:
-    folder, ended = unguarded
-    assert ended.code == EXIT_OK
-    assert ended.err_lines == ["guardian: the guardian process was ended by SIGKILL; see out/guardian.log"]
-    assert "guardian_lost" in events_of(read_summary(folder / "sandbox/cwd/out"))
-
-
-@pytest.mark.flight
-@UNGUARDED
-def test_a_lost_request_to_disarm_is_made_again_and_the_flight_ends_disarmed(unguarded: tuple[Path, Ended]) -> None:
-    """It leaves as one datagram, which may be lost."""
-    folder, ended = unguarded
-    assert ended.code == EXIT_OK, (ended.out, ended.err)
-    assert int((folder / "disarms").read_text(encoding="utf-8")) >= 2, "the first one was lost"
-    out = folder / "sandbox/cwd/out"
-    assert read_summary(out)["outcome"] == "completed"
-    status = FlightLog.read(out / "flight.mcap").inputs[-1].status
-    assert status is not None and not status.armed
 
 
 @pytest.mark.flight
@@ -153,27 +117,4 @@ if "companion.flight.main" in sys.orig_argv:
             return outputs
 
     companion.core.flight_core.FlightCore = Breaking
-"""
-
-_DEAF_ONCE = """
-import sys
-
-if "sitl" in sys.orig_argv:
-    from sitl.autopilot.receive import Receiver
-
-    class Heard:
-        disarms = 0
-
-    handle = Receiver.handle
-
-    def deaf_once(self, link, message):
-        if message.get_type() == "COMMAND_LONG" and message.command == 400 and message.param1 == 0.0:
-            Heard.disarms += 1
-            with open({file!r}, "w") as file:
-                file.write(str(Heard.disarms))
-            if Heard.disarms == 1:
-                return
-        handle(self, link, message)
-
-    Receiver.handle = deaf_once
 """

@@ -15,7 +15,7 @@ import pytest
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK
 from sitl.campaigns.flights import row_of
 from tests.flights.test_fast_flights import configured, flown
-from tests.support import CATCH, HOVER, HOVERS_S, Ended, Sandbox, read_summary, sandbox_in, set_options
+from tests.support import CATCH, HOVER, HOVERS_S, Ended, Sandbox, read_summary, run_here, sandbox_in, set_options
 
 pytestmark = pytest.mark.flight
 THE_CATCH = pytest.mark.xdist_group("the catch over wires")
@@ -75,7 +75,7 @@ def test_it_leaves_a_report_with_its_plots(the_catch: Flown) -> None:
 
 @THE_CATCH
 def test_its_log_replays_bit_for_bit(the_catch: Flown) -> None:
-    replayed = the_catch.sandbox.run("replay", "out/flight.mcap")
+    replayed = run_here("replay", the_catch.sandbox.cwd / "out/flight.mcap")
     assert replayed.code == EXIT_OK, (replayed.out, replayed.err)
 
 
@@ -125,19 +125,3 @@ def test_another_program_feeds_px4_and_its_end_is_found(tmp_path_factory: pytest
     wanted = ["takeoff", "vision_lost"]
     assert [event["id"] for event in summary["events"] if event["id"] in wanted] == wanted
     assert summary["latency_ms"]["mocap_to_setpoint"]["p99"] is None
-
-
-def test_it_flies_without_force_sensor_tether_and_net(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """The simulated world then opens no port for the force sensor, and the flight waits for none."""
-    with sandbox_in(tmp_path_factory.mktemp("parts")) as sandbox:
-        absent = set_options(**{"vehicle.devices.force": None, "vehicle.tether": None, "vehicle.tool": None})
-        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *absent)
-        sandbox.assert_nobody_left()
-        summary = read_summary(sandbox.cwd / "out")
-        rows = json.loads((sandbox.cwd / "out/preflight.json").read_text(encoding="utf-8"))["rows"]
-    assert ended.code == EXIT_OK, ended
-    assert not {event["id"] for event in summary["events"] if event["id"].startswith(("force", "tether", "retract"))}
-    wanted = ["takeoff", "touchdown"]
-    assert [event["id"] for event in summary["events"] if event["id"] in wanted] == wanted
-    assert {"force.device", "tether.line"} <= {row["id"] for row in rows if row["level"] == "warn" and not row["ok"]}
-    assert not any(row["id"].startswith(("force.", "tether.")) for row in rows if row["ok"])

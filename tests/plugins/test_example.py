@@ -1,4 +1,7 @@
-"""The outside package of docs/own-law.md, installed by pip: its own tests, its row in a comparison, a flight and its log."""
+"""The outside package of docs/own-law.md, installed by pip: its own tests and its row in a comparison.
+
+A flight over wires and its log: tests/flights/test_shared_flight.py.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from companion.analysis.log import FlightLog
 from companion.campaigns.compare.campaign import Compare
 from companion.cli.main import main
-from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
+from companion.model.exit_codes import EXIT_OK
 from tests.plugins.installed import on_path
-from tests.support import HOVER, ROOT, SHORT_CATCH, sandbox_in
+from tests.support import ROOT, SHORT_CATCH
 
 EXAMPLE = ROOT / "examples" / "law"
 pytestmark = pytest.mark.xdist_group("the example of a control law")
@@ -77,21 +79,3 @@ def test_it_has_a_row_in_the_comparison(
     [variant] = json.loads(Path("out/compare.json").read_text(encoding="utf-8"))["settings"]["variants"]
     assert variant["plugin"] == "control law 'lqr' (lab-lqr 0.1.0)"
     assert "lqr/tuned" in Path("out/compare.html").read_text(encoding="utf-8")
-
-
-@pytest.mark.flight
-def test_it_flies_and_its_log_is_replayed_where_it_is_installed(site: Path, tmp_path: Path) -> None:
-    with sandbox_in(tmp_path, path_of(site)) as sandbox:
-        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", "--controller", "lqr")
-        assert ended.code == EXIT_OK, (ended.out, ended.err)
-        flight = FlightLog.read(sandbox.cwd / "out/flight.mcap").metadata["flight"]
-        assert (flight["law"], flight["law_distribution"], flight["law_version"]) == ("lqr", "lab-lqr", "0.1.0")
-        replayed = sandbox.run("replay", "out/flight.mcap")
-        assert replayed.code == EXIT_OK, (replayed.out, replayed.err)
-        sandbox.assert_nobody_left()
-    command = [sys.executable, "-m", "companion", "replay", str(sandbox.cwd / "out/flight.mcap")]
-    without = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert without.returncode == EXIT_BAD_INPUT
-    assert without.stderr.endswith(
-        "was flown by control law 'lqr' of lab-lqr 0.1.0, but it is not installed; install that version to replay it\n"
-    )
