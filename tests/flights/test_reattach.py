@@ -1,4 +1,6 @@
-"""Launcher, flight and guardian die together in the air, over real wires; a new `companion fly` finds what they left."""
+"""Launcher, flight and guardian die together in the air, or flight and guardian hang, over real wires; a new `companion fly` finds what
+they left.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ from typing import Any
 import pytest
 
 from companion.analysis.log import FlightLog
-from companion.model.exit_codes import EXIT_ABORTED, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_REFUSED
 from companion.model.types import AutopilotRequest
 from tests.support import HOVER, Running, Sandbox, World, read_summary, sandbox_in, set_options, wait_until
 
@@ -98,10 +100,20 @@ def test_started_again_in_the_air_it_lands_what_it_finds(sandbox: Sandbox, arm_o
 
 
 @pytest.mark.flight
-def test_left_alone_px4_lands_by_itself_and_the_next_companion_judges_it_as_any_other_start(sandbox: Sandbox) -> None:
-    """Disarmed by the time, the arm limp, and not where the next mission begins."""
+def test_hung_beside_a_hung_guardian_px4_lands_it_and_the_next_companion_judges_it_as_any_other_start(
+    sandbox: Sandbox,
+) -> None:
+    """The launcher kills both and reports it. The vehicle stands disarmed, its arm limp, and not where the next mission begins."""
     with World(sandbox, HOVER, ["world.payload_kg=0"]) as world:
-        fly_until_hover(sandbox, world, set_options(**{"mission.phases[1].duration_s": 10.0}))
+        with sandbox.start("fly", HOVER, "--out", "first", *world.addresses()) as first:
+            first.wait_for(IN_FLIGHT)
+            for name in ("guardian.pid", "flight.pid"):
+                os.kill(int((sandbox.cwd / "first" / name).read_text()), signal.SIGSTOP)
+            ended = first.end()
+        assert ended.code == EXIT_LOST, (ended.out, ended.err)
+        assert "flight: the flight process sent nothing for 5 s and was killed" in ended.err
+        assert "guardian: the guardian process hung and was killed" in ended.err
+        assert read_summary(sandbox.cwd / "first")["outcome"] == "lost"
         wait_until(lambda: at_rest(world), lambda: str(world.messages[-3:]))
         assert not world.crashes
         elsewhere = set_options(**{"mission.start.position_m": [0.6, 0.0]})

@@ -1,4 +1,7 @@
-"""The launcher outlives its children and leaves nothing behind: Ctrl-C, a killed launcher, a world or flight that dies."""
+"""The launcher outlives its children and leaves nothing behind: Ctrl-C, a killed launcher, a world that dies.
+
+A flight that hangs beside its guardian: tests/flights/test_reattach.py.
+"""
 
 from __future__ import annotations
 
@@ -231,18 +234,3 @@ def test_a_world_that_does_not_leave_is_heard_to_its_last_word(tmp_path: Path) -
     assert world.process.returncode == 0, "it was killed"
     assert world.final["payload_kg"] == json.loads((tmp_path / "sitl_config.json").read_text())["world"]["payload_kg"]
     assert not world.final["crashed"]
-
-
-@pytest.mark.flight
-def test_a_flight_process_that_hangs_in_the_air_is_ended_without_a_guardian(sandbox: Sandbox) -> None:
-    """Flight and guardian hang: PX4 lands by itself; the launcher kills both and reports it."""
-    with sandbox.start(*FLY) as running:
-        running.wait_for(IN_FLIGHT)
-        os.kill(int((sandbox.cwd / "out/guardian.pid").read_text()), signal.SIGSTOP)
-        os.kill(int((sandbox.cwd / "out/flight.pid").read_text()), signal.SIGSTOP)
-        ended = running.end()
-    sandbox.assert_nobody_left()
-    assert ended.code == EXIT_LOST
-    assert "flight: the flight process sent nothing for 5 s and was killed" in ended.err
-    assert "guardian: the guardian process hung and was killed" in ended.err
-    assert read_summary(sandbox.cwd / "out")["outcome"] == "lost"
