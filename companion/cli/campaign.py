@@ -53,7 +53,7 @@ def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | 
     )
     parser.add_argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, to fly on its workers")
     parser.add_argument("--out", metavar="DIR", help="folder for the results (default: a new one named after the time)")
-    parser.add_argument("--json", action="store_true", help="print only the rows and their summary, as JSON")
+    parser.add_argument("--json", action="store_true", help="print only the results, as JSON")
 
 
 def add_plan(parser: argparse.ArgumentParser) -> None:

@@ -7,11 +7,12 @@ import math
 from typing import Any
 
 from companion.campaigns.compare.campaign import Compare
-from companion.campaigns.compare.grid import ADAPTATION, flights_of, variants_of
+from companion.campaigns.compare.grid import ADAPTATION, Variant, flights_of, variants_of
 from companion.cli.campaign import add_options, add_plan, checked, common, count, fly, names
 from companion.cli.options import MISSION_OR_DEFAULT_HELP
 from companion.config.controller import PRESETS
 from companion.config.document import ConfigError
+from companion.config.loader import is_controller_file, preset_of_file
 from companion.config.shipped import DEFAULT_MISSION
 from companion.sitl_config.loader import SitlConfig, load_sitl
 
@@ -31,7 +32,11 @@ def add_parser(commands: Any) -> None:
         "--payloads", type=_payloads, default=(0.1, 0.2, 0.3), metavar="KG,...", help="default: 0.1,0.2,0.3"
     )
     parser.add_argument(
-        "--controllers", type=names, default=(), metavar="LAW,...", help=f"default: {','.join(PRESETS)}"
+        "--controllers",
+        type=names,
+        default=(),
+        metavar="LAW|FILE,...",
+        help=f"control laws, and controller files (*.yaml), e.g. of companion tune (default: {','.join(PRESETS)})",
     )
     parser.add_argument(
         "--presets", type=names, default=(), metavar="NAME,...", help="default: all presets of each law"
@@ -96,10 +101,12 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
         for key, option in _OPTIONS.items():
             if override.partition("=")[0].strip() == key:
                 raise ConfigError([f"companion compare: --set {key}: the grid sets this key; use {option}"])
+    files = [name for name in arguments.controllers if is_controller_file(name)]
+    laws = [name for name in arguments.controllers if name not in files]
+    variants = [Variant(file, preset := preset_of_file(file), preset) for file in files]
     try:
-        variants = variants_of(
-            PRESETS, arguments.controllers, arguments.presets, arguments.ablation, arguments.adaptation
-        )
+        if laws or not files:
+            variants += variants_of(PRESETS, laws, arguments.presets, arguments.ablation, arguments.adaptation)
     except ValueError as error:
         raise ConfigError([f"companion compare: {error}"]) from None
     configs: list[SitlConfig] = []

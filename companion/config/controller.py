@@ -16,8 +16,9 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
 from companion import plugins
+from companion.config import tuned_gain
 from companion.config.base import JOINTS_MAX, Location, Model, NonNegative, OrElse, Positive, Positive3, refuse
-from companion.config.tuned_gain import JOINTS, XY, XYZ, TunedGain, Z
+from companion.config.tuned_gain import TunedGain
 
 
 def _as_joints(given: Any) -> Any:
@@ -45,15 +46,6 @@ NonNegativeJoints = Annotated[
 """As `PositiveJoints`, or one number for all joints."""
 NonNegative3 = tuple[NonNegative, NonNegative, NonNegative]
 Positive4 = tuple[Positive, Positive, Positive, Positive]
-
-
-COMPENSATION = (
-    TunedGain("disturbance_time_xyz_s", 0.2, 5.0, XY),
-    TunedGain("disturbance_time_xyz_s", 0.2, 5.0, Z),
-    TunedGain("feedforward_lead_s", 0.01, 0.4),
-    TunedGain("attitude_filter_rad_s", 15.0, 150.0),
-)
-"""What `companion tune` searches of the settings that the companion's own laws share."""
 
 
 def six_digits(value: float) -> float:
@@ -172,24 +164,7 @@ class AdaptiveConfig(LawConfig):
     scaled_by_row = ("inertia_md", "lambda_gain", "damping_kd", "stiffness_kp", "robust_scale")
     scaled_by_joint = ("moment_rate", "friction_rate")
     shared_by_links = ("moment_rate",)
-    tuned_gains = (
-        TunedGain("inertia_md", 0.25, 1.5, XYZ),
-        TunedGain("lambda_gain", 0.3, 10.0, XY),
-        TunedGain("lambda_gain", 0.6, 27.0, Z),
-        TunedGain("lambda_gain", 12.0, 180.0, JOINTS),
-        TunedGain("phi", 0.7, 6.0, XY),
-        TunedGain("phi", 0.7, 8.0, Z),
-        TunedGain("phi", 1.0, 10.0, JOINTS),
-        TunedGain("damping_d", 4.0, 180.0, JOINTS, scaled_as="damping_kd"),
-        TunedGain("nu", 0.05, 50.0),
-        TunedGain("rho_max", 0.5, 20.0),
-        TunedGain("row_weights_s", 0.01, 1.0, JOINTS),
-        TunedGain("load_rate_xyz", 0.1, 10.0, XY),
-        TunedGain("load_rate_xyz", 0.3, 66.0, Z),
-        TunedGain("moment_rate", 0.1, 18.0),
-        TunedGain("friction_rate", 0.6, 180.0),
-        *COMPENSATION,
-    )
+    tuned_gains = tuned_gain.ADAPTIVE
 
     law: Literal["adaptive"]
     inertia_md: PositiveRows
@@ -289,16 +264,7 @@ class CscConfig(LawConfig):
 
     presets = ("tuned_extras", "tuned")
     gain_lists = scaled_by_row = ("inertia_md", "damping_kd", "stiffness_kp")
-    tuned_gains = (
-        TunedGain("stiffness_kp", 1.0, 50.0, XY),
-        TunedGain("damping_kd", 1.0, 20.0, XY),
-        TunedGain("stiffness_kp", 1.7, 200.0, Z),
-        TunedGain("damping_kd", 1.7, 50.0, Z),
-        TunedGain("inertia_md", 0.3, 18.0, JOINTS),
-        TunedGain("damping_kd", 6.0, 180.0, JOINTS),
-        TunedGain("stiffness_kp", 24.0, 1200.0, JOINTS),
-        *COMPENSATION,
-    )
+    tuned_gains = tuned_gain.CSC
 
     law: Literal["csc"]
     inertia_md: PositiveRows
@@ -324,19 +290,7 @@ class PscConfig(LawConfig):
 
     presets = ("tuned_extras", "tuned")
     gain_lists = scaled_by_joint = ("arm_inertia_md", "arm_damping_kd", "arm_stiffness_kp")
-    tuned_gains = (
-        TunedGain("position_kp_xyz", 1.0, 40.0, XY),
-        TunedGain("position_kd_xyz", 1.0, 20.0, XY),
-        TunedGain("position_ki_xyz", 0.05, 20.0, XY),
-        TunedGain("position_kp_xyz", 2.0, 200.0, Z),
-        TunedGain("position_kd_xyz", 1.0, 40.0, Z),
-        TunedGain("position_ki_xyz", 0.05, 100.0, Z),
-        TunedGain("arm_inertia_md", 0.3, 18.0),
-        TunedGain("arm_damping_kd", 6.0, 180.0),
-        TunedGain("arm_stiffness_kp", 24.0, 1200.0),
-        TunedGain("payload_time_s", 0.03, 2.0, only_with="payload_max_kg"),
-        *COMPENSATION,
-    )
+    tuned_gains = tuned_gain.PSC
 
     law: Literal["psc"]
     position_kp_xyz: Positive3

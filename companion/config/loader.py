@@ -336,10 +336,24 @@ def _controller_choice(mission_file: Document) -> ControllerChoice | None:
         return None
 
 
+def is_controller_file(law: str) -> bool:
+    """Return whether the name of a controller file was given in place of a control law."""
+    return Path(law).suffix in (".yaml", ".yml")
+
+
+def preset_of_file(path: str) -> str:
+    """Return the name that a controller file gives its gains; an invalid one is left to validation.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
+    return str(read_document(path).data.get("preset"))
+
+
 def _open_controller(law: str | None, preset: str | None) -> Document:
     """Read the file of a law's preset, or the file whose path is given in place of the law."""
     law = law or next(iter(PRESETS))
-    if Path(law).suffix in (".yaml", ".yml"):
+    if is_controller_file(law):
         document = read_document(law)
         own = document.data.get("preset")
         if preset not in (None, own):

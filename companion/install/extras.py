@@ -8,9 +8,15 @@ from collections.abc import Callable
 
 from companion import DISTRIBUTION
 
-_WORLD = ("mujoco", "sitl")
-_NEEDS = {"sitl": _WORLD, "compare": _WORLD, "robustness": _WORLD, "faults": _WORLD, "tune": _WORLD}
-"""The package that a command needs and the extra that installs it, by command. `monitor` and `broker init` check their own."""
+_WORLD = (("the simulated world", "mujoco"),)
+_NEEDS = {
+    "sitl": _WORLD,
+    "compare": _WORLD,
+    "robustness": _WORLD,
+    "faults": _WORLD,
+    "tune": (*_WORLD, ("the search", "cma")),
+}
+"""What needs which package of the extra `sitl`, by command. `monitor` and `broker init` check their own."""
 
 
 def _installed(package: str) -> bool:
@@ -27,7 +33,7 @@ def missing_extra(arguments: argparse.Namespace, here: Callable[[str], bool] = _
     what, needs = f"companion {arguments.command}", _NEEDS.get(arguments.command)
     if needs is None and getattr(arguments, "sitl", None):
         what, needs = f"{what} --sitl", _WORLD
-    if needs is None or getattr(arguments, "list", False) or here(needs[0]):
+    if needs is None or getattr(arguments, "list", False):
         return None
-    package, extra = needs
-    return f"{what}: the simulated world needs {package}: pip install '{DISTRIBUTION}[{extra}]'"
+    missing = [f"{part} needs {package}" for part, package in needs if not here(package)]
+    return f"{what}: {missing[0]}: pip install '{DISTRIBUTION}[sitl]'" if missing else None

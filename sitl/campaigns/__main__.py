@@ -31,14 +31,15 @@ def main() -> int:
     prepare, fly = _CAMPAIGNS[job["campaign"]]
     try:
         configs = [SitlConfig.model_validate_json(json.dumps(config)) for config in job["configs"]]
+        batch = job.get("batches", False)
         while True:
-            if job.get("batches"):
+            if batch:
                 job |= json.loads(lines.get())
             flights = prepare(job, configs)
-            with closing(fly_all(fly, configs, flights, job["jobs"], job["scheduler"])) as results:
+            with closing(fly_all(fly, configs, flights, job["jobs"], job["scheduler"], batch=batch)) as results:
                 for result in results:
                     _send({"type": "flight", **result})
-            if not job.get("batches"):
+            if not batch:
                 return 0
     except CampaignError as error:
         _send({"type": "error", "text": str(error), "bad_input": error.bad_input})

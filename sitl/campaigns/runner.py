@@ -23,9 +23,17 @@ import it.
 
 
 def fly_all(
-    fly: Fly, configs: Sequence[SitlConfig], flights: Sequence[Data], jobs: int | None, scheduler: str | None
+    fly: Fly,
+    configs: Sequence[SitlConfig],
+    flights: Sequence[Data],
+    jobs: int | None,
+    scheduler: str | None,
+    *,
+    batch: bool = False,
 ) -> Generator[Data, None, None]:
     """Fly all flights; yield results in the order in which the flights end.
+
+    With `batch` there are as many processes as `jobs` even for fewer flights, so that the next batch finds them.
 
     Each has also its `index`, `wall_s`, `cpu_s` (processor time), and `at_once`, the number of simultaneous flights.
 
@@ -36,7 +44,8 @@ def fly_all(
     tasks = [(fly, index, texts[flight["variant"]], flight) for index, flight in enumerate(flights)]
     if scheduler is not None:
         return _over_machines(tasks, scheduler)
-    return _over_cores(tasks, jobs or os.cpu_count() or 1)
+    jobs = jobs or os.cpu_count() or 1
+    return _over_cores(tasks, jobs, jobs if batch else min(jobs, len(tasks)))
 
 
 def _fly(fly: Fly, index: int, config_json: str, flight: Data) -> Data:
@@ -46,15 +55,16 @@ def _fly(fly: Fly, index: int, config_json: str, flight: Data) -> Data:
     return {"index": index, **result, "wall_s": wall_s, "cpu_s": cpu_s}
 
 
-def _over_cores(tasks: Sequence[tuple[Fly, int, str, Data]], jobs: int) -> Generator[Data, None, None]:
+def _over_cores(
+    tasks: Sequence[tuple[Fly, int, str, Data]], at_once: int, processes: int
+) -> Generator[Data, None, None]:
     from joblib import Parallel, delayed, parallel_config
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    at_once, jobs = jobs, min(jobs, len(tasks))
-    if jobs <= 1:
+    if processes <= 1:
         yield from ({**_fly(*task), "at_once": at_once} for task in tasks)
         return
-    with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1):
+    with parallel_config(backend="loky", n_jobs=processes, inner_max_num_threads=1):
         try:
             results = Parallel(return_as="generator_unordered", batch_size=1)(delayed(_fly)(*task) for task in tasks)
             yield from ({**result, "at_once": at_once} for result in results)

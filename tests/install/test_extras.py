@@ -40,6 +40,11 @@ def test_what_lacks_the_world_says_so(words: str, what: str | None) -> None:
     assert missing_extra(arguments, here=lambda package: True) is None
 
 
+def test_a_search_needs_cma_too() -> None:
+    said = missing_extra(make_parser().parse_args(["tune"]), here=lambda package: package == "mujoco")
+    assert said == f"companion tune: the search needs cma: pip install '{DISTRIBUTION}[sitl]'"
+
+
 @pytest.mark.parametrize(
     "module", ["companion.flight.main", "companion.guardian.process", "companion.recorder.main", "companion.cli.main"]
 )

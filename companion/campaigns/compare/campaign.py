@@ -50,7 +50,7 @@ class Compare(Campaign):
                 {
                     "controller": variant.controller,
                     "preset": variant.preset,
-                    "plugin": str(find(CONTROL_LAWS, variant.controller)),
+                    "plugin": str(find(CONTROL_LAWS, config.controller.law)),
                     "file": config.sources.controller,
                     "overrides": list(variant.overrides),
                 }

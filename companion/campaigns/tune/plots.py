@@ -13,14 +13,14 @@ from companion.analysis.plot_style import CATCH, COLOURS, INK, SOFT, dress, figu
 from companion.campaigns.tune.result import Result, first_costs
 
 _COLUMNS = 4
-_WIDEST = 5.0
+_HIGHEST = 2.0
 """Costs above this multiple of the start's cost are drawn at the upper edge."""
 
 
 def write_pictures(result: Result, out: Path) -> list[Picture]:
     """Draw both plots into a folder and return them."""
     first = np.array(first_costs(result.search.evaluations, result.training.count))
-    top = min(_WIDEST * result.search.start.cost, 1.05 * float(first.max()))
+    top = min(_HIGHEST * result.search.start.cost, 1.05 * float(first.max()))
     convergence, gains = out / "convergence.png", out / "gains.png"
     _draw_convergence(result, np.minimum(first, top), convergence)
     _draw_gains(result, np.minimum(first, top), gains)
@@ -72,6 +72,10 @@ def _draw_gains(result: Result, first: Any, path: Path) -> None:
         ax.axvline(gain.start, color=INK, lw=1.0, ls=(0, (4, 2)))
         ax.axvline(gain.found, color=CATCH, lw=1.2)
         ax.set_xscale("log")
+        # Labels of a logarithmic axis overlap in a small picture.
+        ends = [gain.low, (gain.low * gain.high) ** 0.5, gain.high]
+        ax.set_xticks(ends, [f"{value:.3g}" for value in ends])
+        ax.set_xticks([], minor=True)
         ax.set_ylim(bottom=0.0)
         ax.set_xlabel(gain.name)
         dress(ax)

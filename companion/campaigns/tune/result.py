@@ -95,6 +95,8 @@ class Result:
     @property
     def verdict(self) -> str:
         """Return one sentence on the result."""
+        if self.search.best is self.search.start:
+            return "no candidate costs less than the start in the laboratories of the search; no controller file was written"
         before, after = self.judged.costs()
         share = f"{abs(after / before - 1.0):.0%} {'less' if after < before else 'more'}"
         text = f"cost in {self.held_out.count} held-out laboratories: {before:.4f} before, {after:.4f} after ({share})"

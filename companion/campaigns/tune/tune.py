@@ -83,7 +83,9 @@ class Tune:
     def job(self) -> Message:
         """Return the job for `sitl.campaigns`, whose flights follow in batches."""
         job = {"campaign": "tune", "configs": [self.config.model_dump(mode="json")], "batches": True}
-        return {**job, "jobs": self.jobs or os.cpu_count() or 1, "scheduler": self.scheduler}
+        # More processes than a batch has flights would never fly.
+        most = max(*batches_of(self.budget, len(self.space.axes), self.training), self.held_out)
+        return {**job, "jobs": min(self.jobs or os.cpu_count() or 1, most), "scheduler": self.scheduler}
 
     def settings(self) -> dict[str, Any]:
         """Return what the result of the search depends on, except for the budget."""
