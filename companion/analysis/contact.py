@@ -8,10 +8,11 @@ import numpy as np
 
 from companion.analysis.arm_skeleton import pose
 from companion.analysis.log import Array, FlightLog
+from companion.mission.surface import axes
 from companion.model.arm_skeleton import ArmSkeleton, logged_skeleton
 from companion.model.best_pose import best_pose
 from companion.model.frames import quat_rotate
-from companion.model.types import ContactMode, Vec3
+from companion.model.types import ContactMode, ContactState, Vec3
 
 SETTLED_S = 1.5
 """Time after the end of the force's ramp from which the force counts as steady."""
@@ -24,21 +25,26 @@ def contact_summary(log: FlightLog) -> dict[str, Any] | None:
 
     Force is that along the direction of the approach, as measured in flight: `mean_n` and `rms_error_n` while it is steady,
     `overshoot_n` from the first touch on. `path_rms_m` is the distance of the tip, across that direction, from the path on which the
-    reference would lead it; for a press that is a point. `surface` is the mean point that was touched while the force was steady, and
-    the normal of the touched points or, if they lie too close together, the direction of the approach reversed.
+    reference would lead it; for a press that is a point. `surface` is the plane through the points touched by a probe, or by an
+    approach that turns to the surface. Without those it is the mean point that was touched while the force was steady, and the normal
+    of the touched points or, if they lie too close together, the direction of the approach reversed.
     """
     states = [outputs.contact for outputs in log.outputs]
     last = next((state for state in reversed(states) if state is not None), None)
     if last is None:
         return None
     touches = max((state.touches for state in states if state is not None), default=0)
-    pressing = np.array([state is not None and state.mode is ContactMode.PRESS for state in states], dtype=np.bool_)
+    pressing = np.array([state is not None and presses(state) for state in states], dtype=np.bool_)
     force = np.array([np.nan if state is None else state.force_n for state in states])
     wanted = np.array([0.0 if state is None else state.wanted_n for state in states])
     row: dict[str, Any] = {
         "wanted_n": None, "mean_n": None, "rms_error_n": None, "overshoot_n": None, "touches": touches, "path_rms_m": None,
         "surface": None,
     }  # fmt: skip
+    if (
+        found := next((state.surface for state in reversed(states) if state is not None and state.surface), None)
+    ) is not None:
+        row["surface"] = {"point_m": list(found.point_world_m), "normal": list(found.normal_world)}
     if not pressing.any():
         return row
     most = float(wanted[pressing].max())
@@ -47,14 +53,19 @@ def contact_summary(log: FlightLog) -> dict[str, Any] | None:
     if not steady.any():
         return row
     row.update(mean_n=float(force[steady].mean()), rms_error_n=float(np.sqrt(np.mean((force - wanted)[steady] ** 2))))
-    found = tips_m(log, steady)
-    if found is not None:
-        tip, planned, direction, _ = found
+    tips = tips_m(log, steady)
+    if tips is not None:
+        tip, planned, direction, _ = tips
         off = tip - planned
         off -= np.outer(off @ direction, direction)
         off -= off.mean(axis=0) if float(np.ptp(planned, axis=0).max()) < PLANE_M else 0.0
         row["path_rms_m"] = float(np.sqrt(np.mean(np.sum(off * off, axis=1))))
-        row["surface"] = {"point_m": tip.mean(axis=0).tolist(), "normal": _normal(tip, direction).tolist()}
+        if found is None:
+            normal = _normal(tip, direction)
+            row["surface"] = {
+                "point_m": (tip.mean(axis=0) - _radius_m(log) * normal).tolist(),
+                "normal": normal.tolist(),
+            }
     return row
 
 
@@ -84,10 +95,21 @@ def contact_lines(summary: dict[str, Any]) -> list[tuple[str, str]]:
     if surface is None:
         return lines
     x, y, z = surface["point_m"]
-    text = (
-        f"touched at [{x:.3f}, {y:.3f}, {z:.3f}] m, tip within {1e3 * contact['path_rms_m']:.0f} mm (RMS) of its path"
-    )
+    text = f"touched at [{x:.3f}, {y:.3f}, {z:.3f}] m"
+    if contact["path_rms_m"] is not None:
+        text += f", tip within {1e3 * contact['path_rms_m']:.0f} mm (RMS) of its path"
     return [*lines, ("surface", text)]
+
+
+def presses(state: ContactState) -> bool:
+    """Return whether the vehicle presses: the light touches by which a surface is found do not count."""
+    return state.mode is ContactMode.PRESS and (state.surface is not None or state.shift.length_m == 0.0)
+
+
+def _radius_m(log: FlightLog) -> float:
+    """Return the radius of the tool's tip."""
+    tool = (log.config.get("vehicle") or {}).get("tool") or {}
+    return float(tool.get("tip_radius_m") or 0.0)
 
 
 def _steady(t_s: Array, pressing: Any, wanted: Array) -> Any:
@@ -103,10 +125,9 @@ def _steady(t_s: Array, pressing: Any, wanted: Array) -> Any:
 
 def surface_axes(direction: Array) -> tuple[Array, Array]:
     """Return the unit vectors to the right and up in a surface, as seen along a direction into it; of a floor, up is the world's x."""
-    level = np.array([direction[1], -direction[0], 0.0])
-    length = float(np.linalg.norm(level))
-    right = level / length if length > 1e-6 else np.array([0.0, -1.0, 0.0])
-    return right, np.cross(right, direction)
+    x, y, z = direction
+    right, up = axes((float(x), float(y), float(z)))
+    return np.array(right), np.array(up)
 
 
 def tips_m(log: FlightLog, used: Any) -> tuple[Array, Array, Array, Array] | None:
@@ -141,8 +162,8 @@ def _tip_body_m(skeleton: ArmSkeleton, arm_rad: Array) -> Vec3:
 def _normal(tip: Array, direction: Array) -> Array:
     """Return the normal of the touched points, or the direction reversed if they lie too close together."""
     centred = tip - tip.mean(axis=0)
-    _, _, axes = np.linalg.svd(centred, full_matrices=False)
-    if min(float(np.ptp(centred @ axes[0])), float(np.ptp(centred @ axes[1]))) < PLANE_M:
+    _, _, main = np.linalg.svd(centred, full_matrices=False)
+    if min(float(np.ptp(centred @ main[0])), float(np.ptp(centred @ main[1]))) < PLANE_M:
         return -direction
-    normal: Array = axes[2]
+    normal: Array = main[2]
     return -normal if float(normal @ direction) > 0.0 else normal

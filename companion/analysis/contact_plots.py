@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from companion.analysis.contact import PLANE_M, surface_axes, tips_m
+from companion.analysis.contact import PLANE_M, presses, surface_axes, tips_m
 from companion.analysis.log import Array, FlightLog
 from companion.analysis.plot_style import CATCH, DASHED, INK, REFERENCE, SERIES, SOFT, dress, figure_legend, new_figure
 from companion.analysis.time_axes import legend, line
@@ -20,7 +20,10 @@ _BANDS = {
     ContactMode.APPROACH: ("approach", "#dcebf9"),
     ContactMode.PRESS: ("press", "#dff3e6"),
     ContactMode.LOST: ("contact lost", "#fbdfe3"),
+    ContactMode.BACK: ("back", "#f3efe6"),
+    ContactMode.SHIFT: ("shift", "#f1e9f7"),
     ContactMode.LEAVE: ("leave", "#f8eed8"),
+    ContactMode.RETURN: ("return", "#f4f4f4"),
 }
 """Name and colour of what the flight does about the surface."""
 _MEAN_S = 0.1
@@ -72,7 +75,7 @@ def contact_force(log: FlightLog) -> Figure | None:
 
 def contact_path(log: FlightLog) -> Figure | None:
     """Draw the path of the tip in the plane of the surface while it presses."""
-    pressing = np.array([o.contact is not None and o.contact.mode is ContactMode.PRESS for o in log.outputs])
+    pressing = np.array([o.contact is not None and presses(o.contact) for o in log.outputs])
     found = tips_m(log, pressing)
     if found is None:
         return None

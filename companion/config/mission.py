@@ -108,10 +108,9 @@ ContactForce = Annotated[float, Field(gt=0, le=50)]
 ContactSpeed = Annotated[float, Field(ge=0.02, le=0.2)]
 
 
-class Approach(Model):
-    """Move in one direction until the tool touches a surface; the arm keeps its pose. A press must follow."""
+class _Contact(Model):
+    """Way to a surface."""
 
-    type: Literal["approach"]
     name: Name | None = None
     direction: Vector3
     """Direction of the motion and of the force, world frame, of any length: into the surface, as far as its position is known."""
@@ -126,6 +125,26 @@ class Approach(Model):
         if math.hypot(*self.direction) < 1e-3:
             refuse("approach", [(("direction",), "has no length")])
         return self
+
+
+class Approach(_Contact):
+    """Move in one direction until the tool touches a surface; the arm keeps its pose. A press must follow."""
+
+    type: Literal["approach"]
+    face_m: Annotated[float, Field(ge=0.1, le=0.5)] | None = None
+    """Side of a triangle of three light touches, by which the vehicle finds the surface's normal. It then turns to the surface and
+    presses along its normal. If it is absent, the force acts along `direction`, and friction must keep the tool from slipping.
+    """
+
+
+class Probe(_Contact):
+    """Touch a grid of points, find the plane through them, and move back to where the probe began; the arm keeps its pose."""
+
+    type: Literal["probe"]
+    rows: Annotated[int, Field(ge=2, le=10)] = 3
+    columns: Annotated[int, Field(ge=2, le=10)] = 3
+    spacing_m: Annotated[float, Field(ge=0.05, le=0.5)]
+    """Distance between neighbouring points. The middle of the grid is straight ahead in the direction."""
 
 
 class Press(Model):
@@ -147,7 +166,7 @@ class Detach(Model):
 
 
 Phase = Annotated[
-    Takeoff | Hold | Line | Path | ArmMove | Approach | Press | Detach | Land, Field(discriminator="type")
+    Takeoff | Hold | Line | Path | ArmMove | Approach | Press | Detach | Probe | Land, Field(discriminator="type")
 ]
 _TOUCHING = ("approach", "press")
 """Phases during which, or at whose end, the tool touches a surface."""
@@ -317,6 +336,7 @@ __all__ = [
     "Path",
     "Phase",
     "Press",
+    "Probe",
     "Start",
     "Takeoff",
 ]

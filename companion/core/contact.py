@@ -11,19 +11,20 @@ import math
 
 from msgspec.structs import replace
 
-from companion.config.mission import Approach, Detach, Phase, Press
+from companion.config.mission import Approach, Detach, Phase, Press, Probe
 from companion.config.vehicle import OBSERVER
+from companion.core import probing
 from companion.core.transition import Transition
 from companion.mission import contact as c
 from companion.mission.segments import Segment
-from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import ContactMode, ContactState, ControlLog, Outcome, SafetyAction, Vec3
 from companion.safety import notices
 from companion.safety.notices import Notice
 
 _BEFORE_END_S = 1e-6
 _WEIGH, _APPROACH, _PRESS = ContactMode.WEIGH, ContactMode.APPROACH, ContactMode.PRESS
-_LOST, _LEAVE = ContactMode.LOST, ContactMode.LEAVE
+_LOST, _BACK, _SHIFT = ContactMode.LOST, ContactMode.BACK, ContactMode.SHIFT
+_LEAVE, _RETURN = ContactMode.LEAVE, ContactMode.RETURN
 _MEASURING = (_APPROACH, _PRESS, _LOST)
 
 
@@ -34,14 +35,9 @@ def advance_contact(t: Transition) -> None:
     segment = course.segment(t_s)
     phase = _phase(t, segment)
     if contact is None:
-        if isinstance(phase, Approach) and not t.state.contact_over:
-            nx, ny, nz = phase.direction
-            length = (nx * nx + ny * ny + nz * nz) ** 0.5
-            direction = (nx / length, ny / length, nz / length)
-            shift = c.tip_per_n_m(direction, _tip_world_m(t), t.parameters.vehicle.airframe.mass_kg * GRAVITY_M_S2)
-            contact = c.begun(t_s, direction, shift)
-            t.change(contact=contact, contact_segment=segment)
-        elif isinstance(phase, Approach | Press | Detach):
+        if isinstance(phase, Approach | Probe) and not t.state.contact_over:
+            t.change(contact=probing.begun(t, phase), contact_segment=segment)
+        elif isinstance(phase, Approach | Press | Detach | Probe):
             t.change(course=course.moved_to(segment.end_s, t_s))
         elif t.state.contact_over:
             t.change(contact_over=False)
@@ -53,31 +49,41 @@ def advance_contact(t: Transition) -> None:
     approach = _approach(t, segment)
     engaged = t.state.contact_segment
     assert engaged is not None
-    if contact.mode is not _LEAVE and not _is_force_known(t):
+    if contact.mode is _LEAVE or contact.mode is _RETURN:
+        _stay_in(t, engaged)
+        contact = _left(contact, t_s, dt_s, phase.speed_m_s if isinstance(phase, Detach) else approach.speed_m_s)
+        if contact.mode is _RETURN and c.is_shifted(contact):
+            _end(t, contact, engaged)
+            return
+    elif not _is_force_known(t):
         contact = _failed(t, contact, notices.CONTACT_LOST, "the force is not measured any more; leaving the surface")
     elif contact.mode in _MEASURING and (found := _contradiction(t, contact)) is not None:
         contact = _failed(t, contact, found[0], f"{found[1]}; leaving the surface")
-    elif contact.mode in _MEASURING and abs(t.o.yaw_error_rad) > c.TURNED_RAD:
+    elif contact.mode in _MEASURING and abs(t.o.yaw_error_rad) > _turn_max_rad(contact, approach):
         text = f"turned by {math.degrees(abs(t.o.yaw_error_rad)):.0f} deg while in contact: the tool slips; leaving the surface"
         contact = _failed(t, contact, notices.CONTACT_SLIPPED, text)
-    elif contact.mode is _LEAVE:
-        speed_m_s = phase.speed_m_s if isinstance(phase, Detach) else approach.speed_m_s
-        contact = c.released(contact, dt_s) if contact.push_n > 0.0 else c.moved(contact, dt_s, -speed_m_s)
-        if contact.offset_m <= 0.0:
-            if course.held and t.state.supervisor.action is not SafetyAction.HOLD:
-                course = course.resume(t_s)
-            t.change(contact=None, contact_over=True, course=course)
-            return
-        _stay_in(t, engaged)
     elif contact.mode is _WEIGH:
+        _stay_in(t, engaged)
         if t_s - contact.since_s >= weigh_s:
-            contact = c.entered(contact, t_s, _APPROACH)
+            contact = probing.weighed(t, contact, approach)
     elif contact.mode is _APPROACH:
         contact = _approached(t, contact, approach, dt_s)
+    elif contact.mode is _SHIFT:
+        _stay_in(t, engaged)
+        contact = probing.shifting(t, contact, approach)
+    elif contact.mode is _BACK:
+        _stay_in(t, engaged)
+        back = probing.moving_back(t, contact, approach)
+        contact = back or _failed(t, contact, notices.SURFACE_MISSING, probing.steep(contact))
     elif contact.mode is _LOST:
         contact = c.released(contact, dt_s)
         if t_s - contact.since_s >= c.WAIT_S:
             contact = c.entered(contact, t_s, _APPROACH)
+            if probing.seeks_points(contact, approach):
+                contact = replace(contact, touches=0)
+    elif probing.seeks_points(contact, approach):
+        _stay_in(t, engaged)
+        contact = probing.touching(t, contact, approach)
     elif isinstance(phase, Detach):
         contact = c.entered(contact, t_s, _LEAVE)
         t.change(contact_segment=segment)
@@ -88,6 +94,33 @@ def advance_contact(t: Transition) -> None:
         if contact.beyond_s >= c.LOST_S:
             contact = _lost(t, contact)
     t.change(contact=contact)
+
+
+def _turn_max_rad(contact: ContactState, approach: Approach | Probe) -> float:
+    return c.TURNED_LIGHTLY_RAD if probing.seeks_points(contact, approach) else c.TURNED_RAD
+
+
+def _left(contact: ContactState, t_s: float, dt_s: float, speed_m_s: float) -> ContactState:
+    """Return the state after one tick of leaving: release the force, move back, then return to the plan."""
+    if contact.mode is _RETURN:
+        return c.shifted(contact, dt_s, c.SHIFT_M_S)
+    contact = c.shifted(contact, dt_s, 0.0)
+    contact = c.released(contact, dt_s) if contact.push_n > 0.0 else c.moved(contact, dt_s, -speed_m_s)
+    if contact.offset_m > 0.0 or contact.shift.rate_m_s > 0.0:
+        return contact
+    home = c.shift_to(contact, (0.0, 0.0, 0.0), 0.0, 0.0)
+    return c.entered(replace(contact, shift=home, touches=0), t_s, _RETURN)
+
+
+def _end(t: Transition, contact: ContactState, engaged: Segment) -> None:
+    """End the contact. What is left of a contact that failed is skipped."""
+    course, t_s = t.state.course, t.i.t_s
+    assert course is not None
+    if course.held and t.state.supervisor.action is not SafetyAction.HOLD:
+        course = course.resume(t_s)
+    if not contact.failed:
+        course = course.moved_to(engaged.end_s, t_s)
+    t.change(contact=None, contact_over=contact.failed, course=course)
 
 
 def force_on_tool_n(log: ControlLog) -> Vec3:
@@ -135,16 +168,17 @@ def _contradiction(t: Transition, contact: ContactState) -> tuple[Notice, str] |
 def leave(t: Transition) -> None:
     """Leave the surface, because the flight is to hold."""
     contact = t.state.contact
-    if contact is not None and contact.mode is not _LEAVE:
+    if contact is not None and contact.mode is not _LEAVE and contact.mode is not _RETURN:
         t.change(contact=c.entered(contact, t.i.t_s, _LEAVE, failed=True))
 
 
-def _approached(t: Transition, contact: ContactState, approach: Approach, dt_s: float) -> ContactState:
+def _approached(t: Transition, contact: ContactState, approach: Approach | Probe, dt_s: float) -> ContactState:
     """Return the state after one tick of an approach, which a touch or the end of the way ends."""
     course, t_s, engaged = t.state.course, t.i.t_s, t.state.contact_segment
     assert course is not None and engaged is not None
     again = contact.touches > 0
-    contact = c.moved(contact, dt_s, c.SLOWEST_M_S if again else approach.speed_m_s)
+    fast = not again and contact.offset_m < contact.free_m
+    contact = c.moved(contact, dt_s, c.SLOWEST_M_S if again else c.SHIFT_M_S if fast else approach.speed_m_s)
     contact = c.timed(contact, dt_s, contact.force_n > approach.touch_n)
     if contact.beyond_s >= (c.TOUCH_OBSERVED_S if _observes(t) else c.TOUCH_S):
         touches = contact.touches + 1
@@ -155,6 +189,8 @@ def _approached(t: Transition, contact: ContactState, approach: Approach, dt_s: 
             wanted_n=approach.touch_n,
         )
         t.report(notices.TOUCHED, f"touched the surface after {contact.offset_m:.3f} m")
+        if probing.seeks_points(contact, approach):
+            return contact
         if touches >= c.TOUCHES_MAX:
             return _failed(t, contact, notices.CONTACT_BOUNCE, f"touched the surface {touches} times; leaving it")
         # After an interruption the press begins anew.
@@ -192,25 +228,15 @@ def _stay_in(t: Transition, engaged: Segment) -> None:
         t.change(course=course.moved_to(engaged.end_s - _BEFORE_END_S, t_s))
 
 
-def _tip_world_m(t: Transition) -> Vec3:
-    """Return the tip relative to the body's origin in the present reference, world frame, with the vehicle level."""
-    course = t.state.course
-    assert course is not None
-    reference = course.reference(t.i.t_s)
-    x, y, z = t.parameters.manipulator.net_body_m(reference.arm_rad)
-    cos, sin = math.cos(reference.yaw_rad), math.sin(reference.yaw_rad)
-    return (cos * x - sin * y, sin * x + cos * y, z)
-
-
 def _phase(t: Transition, segment: Segment) -> Phase | None:
     return t.parameters.config.mission.phases[segment.index] if segment.index >= 0 else None
 
 
-def _approach(t: Transition, segment: Segment) -> Approach:
-    """Return the approach of the contact to which a segment belongs."""
+def _approach(t: Transition, segment: Segment) -> Approach | Probe:
+    """Return the approach or probe of the contact to which a segment belongs."""
     phases = t.parameters.config.mission.phases
     for index in range(segment.index, -1, -1):
         phase = phases[index]
-        if isinstance(phase, Approach):
+        if isinstance(phase, Approach | Probe):
             return phase
     raise AssertionError("the mission file is checked: an approach comes first")

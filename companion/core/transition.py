@@ -9,7 +9,7 @@ from typing import Any
 from msgspec.structs import replace
 
 from companion.config.loader import FlightConfig
-from companion.config.mission import Approach
+from companion.config.mission import Approach, Probe
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.control.manipulator import Manipulator
@@ -58,7 +58,7 @@ class Parameters:
             times=LadderTimes.of(safety),
             waits_for_start=config.mission.start.takeoff == "by_operator",
             manipulator=manipulator_of(vehicle),
-            touches=any(isinstance(phase, Approach) for phase in config.mission.phases),
+            touches=any(isinstance(phase, Approach | Probe) for phase in config.mission.phases),
         )
 
     def initial_state(self) -> FlightState:

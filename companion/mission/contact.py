@@ -13,8 +13,10 @@ import math
 
 from msgspec.structs import replace
 
-from companion.config.mission import Approach
-from companion.model.types import ContactMode, ContactState, Reference, Vec3
+from companion.config.mission import Approach, Probe
+from companion.mission.surface import farthest_step_m, points_of
+from companion.model.frames import wrap_rad
+from companion.model.types import ContactMode, ContactShift, ContactState, Joints, Reference, Vec3
 
 WEIGH_S = 1.0
 """Time at rest before the approach, in which the force without contact is averaged."""
@@ -25,7 +27,7 @@ WEIGH_OBSERVED_S = 3.0
 """The same without a force sensor, where gusts of some tenths of a second are part of the force."""
 TOUCH_S, TOUCH_OBSERVED_S = 0.015, 0.2
 """Time for which the force must exceed the touch's threshold, with and without a force sensor."""
-LOST_SHARE, LOST_S = 0.3, 0.5
+LOST_SHARE, LOST_S = 0.3, 1.0
 """Contact is lost when the force is below this fraction of the touch's threshold for this time."""
 WAIT_S = 0.5
 """Time at rest after contact was lost."""
@@ -51,6 +53,8 @@ TURNED_RAD = math.radians(5.0)
 """Yaw error from which the vehicle leaves: the tool slips along the surface, and its force, far ahead of the rotors, turns the vehicle
 further. The rotors' yaw torque is too small to turn it back under the force.
 """
+TURNED_LIGHTLY_RAD = math.radians(15.0)
+"""The same while light touches find the normal of the surface: until then it may be tilted, and slippery."""
 ASTRAY_M = 0.08
 """Position error along the direction from which the vehicle leaves: something blocks it that the force sensor does not measure, or it
 pushes against nothing. In simulated laboratories with a healthy sensor the error stayed below 0.03 m.
@@ -64,15 +68,41 @@ BACK_M = (0.2, 0.4)
 _ARRIVED_M = 0.0002
 _NO_FORCE: Vec3 = (0.0, 0.0, 0.0)
 
+TOUCH_SETTLE_S, TOUCH_MEAN_S = 0.4, 0.5
+"""Time from the touch of a point until the tip's position is averaged, and for which it is averaged."""
+SHIFT_M_S = 0.1
+"""Speed of moves that are not towards an unknown surface."""
+FREE_M = 0.08
+"""Distance from a known surface up to which an approach is as fast."""
+FROM_POINT_M, FROM_POINT_SHARE = 0.03, 0.4
+"""Distance to which the tip moves back from a point, and additionally as a fraction of the way to the next point: a surface may be
+tilted by 15 deg about both axes.
+"""
+
 
 def travel_s(distance_m: float, speed_m_s: float) -> float:
     """Return the time in which the offset travels a distance from rest to rest, s."""
     return distance_m / speed_m_s + speed_m_s / ACCELERATION_M_S2
 
 
-def approach_s(approach: Approach) -> float:
-    """Return the largest duration of an approach, s."""
-    return WEIGH_S + travel_s(approach.distance_max_m, approach.speed_m_s)
+def approach_s(approach: Approach | Probe) -> float:
+    """Return the duration of an approach or a probe, s: the largest of an approach, about that of what touches points."""
+    duration_s = WEIGH_S + travel_s(approach.distance_max_m, approach.speed_m_s)
+    points = points_of(approach)
+    if not points:
+        return duration_s
+    step_m = farthest_step_m(points)
+    back_m = back_from_point_m(approach)
+    each_s = (
+        travel_s(back_m, SHIFT_M_S) + travel_s(back_m, approach.speed_m_s) + travel_s(step_m, SHIFT_M_S)
+        + TOUCH_SETTLE_S + TOUCH_MEAN_S
+    )  # fmt: skip
+    return len(points) * each_s + (2.0 if isinstance(approach, Approach) else 1.0) * duration_s
+
+
+def back_from_point_m(approach: Approach | Probe) -> float:
+    """Return how far the tip moves back from a point before it moves in front of the next one, m."""
+    return FROM_POINT_M + FROM_POINT_SHARE * farthest_step_m(points_of(approach))
 
 
 def begun(t_s: float, direction_world: Vec3, tip_per_n_m: Vec3) -> ContactState:
@@ -113,13 +143,38 @@ def along(reference: Reference, contact: ContactState) -> Reference:
         rate = (push - tilting) / TILT_S
         x, y, z = x + tilting * sx, y + tilting * sy, z + tilting * sz
         vx, vy, vz = vx + rate * sx, vy + rate * sy, vz + rate * sz
+    yaw, yaw_rate, shift = reference.yaw_rad, reference.yaw_rate_rad_s, contact.shift
+    arm, arm_rate, arm_acceleration = reference.arm_rad, reference.arm_rate_rad_s, reference.arm_acceleration_rad_s2
+    if shift.length_m > 0.0:
+        (fx, fy, fz), (tx, ty, tz), turn = shift.from_m, shift.to_m, shift.to_yaw_rad - shift.from_yaw_rad
+        share, rate = shift.way_m / shift.length_m, shift.rate_m_s / shift.length_m
+        change = shift.acceleration_m_s2 / shift.length_m
+        sx, sy, sz = tx - fx, ty - fy, tz - fz
+        x, y, z = x + fx + share * sx, y + fy + share * sy, z + fz + share * sz
+        vx, vy, vz = vx + rate * sx, vy + rate * sy, vz + rate * sz
+        ax, ay, az = ax + change * sx, ay + change * sy, az + change * sz
+        yaw = wrap_rad(yaw + shift.from_yaw_rad + share * turn)
+        yaw_rate += rate * turn
+        if (tool := shift.to_tool_rad - shift.from_tool_rad) != 0.0 or shift.to_tool_rad != 0.0:
+            arm = _last(arm, shift.from_tool_rad + share * tool)
+            arm_rate, arm_acceleration = _last(arm_rate, rate * tool), _last(arm_acceleration, change * tool)
     return replace(
         reference,
         position_world_m=(x + d * nx, y + d * ny, z + d * nz),
         velocity_world_m_s=(vx + v * nx, vy + v * ny, vz + v * nz),
         acceleration_world_m_s2=(ax + a * nx, ay + a * ny, az + a * nz),
+        yaw_rad=yaw,
+        yaw_rate_rad_s=yaw_rate,
+        arm_rad=arm,
+        arm_rate_rad_s=arm_rate,
+        arm_acceleration_rad_s2=arm_acceleration,
         push_world_n=(push * nx, push * ny, push * nz) if contact.touches else None,
     )
+
+
+def _last(values: Joints, more: float) -> Joints:
+    """Return the values with an addition to that of the last joint."""
+    return (*values[:-1], values[-1] + more)
 
 
 def tip_per_n_m(direction_world: Vec3, tip_world_m: Vec3, weight_n: float) -> Vec3:
@@ -206,20 +261,77 @@ def timed(contact: ContactState, dt_s: float, holds: bool) -> ContactState:
     return replace(contact, beyond_s=contact.beyond_s + dt_s if holds else 0.0)
 
 
-def moved(contact: ContactState, dt_s: float, rate_m_s: float) -> ContactState:
+def moved(contact: ContactState, dt_s: float, rate_m_s: float, least_m: float = 0.0) -> ContactState:
     """Return the state with the offset moved by one tick, its rate changing towards `rate_m_s`.
 
-    Back at 0 the offset stops: the rate falls with the root of the remaining way.
+    On its way back the offset stops at `least_m`: the rate falls with the root of the remaining way.
     """
     before = contact.rate_m_s
     if rate_m_s < 0.0:
-        rate_m_s = -min(-rate_m_s, (2.0 * 0.8 * ACCELERATION_M_S2 * max(0.0, contact.offset_m)) ** 0.5)
+        rate_m_s = -min(-rate_m_s, _stopping_m_s(contact.offset_m - least_m))
     most = (ACCELERATION_M_S2 if rate_m_s != 0.0 else STOP_M_S2) * dt_s
     rate = min(before + most, max(before - most, rate_m_s))
     offset_m = contact.offset_m + 0.5 * dt_s * (before + rate)
-    if rate_m_s < 0.0 and offset_m < _ARRIVED_M:
-        return replace(contact, offset_m=0.0, rate_m_s=0.0, acceleration_m_s2=0.0)
+    if rate_m_s < 0.0 and offset_m < least_m + _ARRIVED_M:
+        return replace(contact, offset_m=least_m, rate_m_s=0.0, acceleration_m_s2=0.0)
     return replace(contact, offset_m=offset_m, rate_m_s=rate, acceleration_m_s2=(rate - before) / dt_s)
+
+
+def _stopping_m_s(left_m: float) -> float:
+    """Return the speed from which a move stops within the way that is left."""
+    return math.sqrt(2.0 * 0.8 * ACCELERATION_M_S2 * max(0.0, left_m))
+
+
+def shift_to(contact: ContactState, to_m: Vec3, to_yaw_rad: float, to_tool_rad: float) -> ContactShift:
+    """Return the move from where the present one has ended, or has stopped, to a position, a yaw and a turn of the last joint relative
+    to the plan.
+    """
+    shift = contact.shift
+    share = shift.way_m / shift.length_m if shift.length_m > 0.0 else 1.0
+    (fx, fy, fz), (tx, ty, tz) = shift.from_m, shift.to_m
+    at_m = (fx + share * (tx - fx), fy + share * (ty - fy), fz + share * (tz - fz))
+    yaw_rad = shift.from_yaw_rad + share * (shift.to_yaw_rad - shift.from_yaw_rad)
+    tool_rad = shift.from_tool_rad + share * (shift.to_tool_rad - shift.from_tool_rad)
+    turn_rad = wrap_rad(to_yaw_rad - yaw_rad)
+    return ContactShift(
+        from_m=at_m,
+        to_m=to_m,
+        from_yaw_rad=yaw_rad,
+        to_yaw_rad=yaw_rad + turn_rad,
+        from_tool_rad=tool_rad,
+        to_tool_rad=to_tool_rad,
+        length_m=max(math.dist(at_m, to_m), abs(turn_rad), abs(to_tool_rad - tool_rad)),
+    )
+
+
+def shifted(contact: ContactState, dt_s: float, speed_m_s: float) -> ContactState:
+    """Return the state with its move advanced by one tick; with speed 0 the move brakes."""
+    shift = contact.shift
+    left_m = shift.length_m - shift.way_m
+    before, most = shift.rate_m_s, ACCELERATION_M_S2 * dt_s
+    rate = min(before + most, max(before - most, min(speed_m_s, _stopping_m_s(left_m))))
+    way_m = shift.way_m + 0.5 * dt_s * (before + rate)
+    if left_m < _ARRIVED_M or way_m > shift.length_m:
+        way_m, rate = shift.length_m, 0.0
+    acceleration = (rate - before) / dt_s if rate != 0.0 else 0.0
+    return replace(contact, shift=replace(shift, way_m=way_m, rate_m_s=rate, acceleration_m_s2=acceleration))
+
+
+def is_shifted(contact: ContactState) -> bool:
+    """Return whether the present move has ended."""
+    return contact.shift.way_m >= contact.shift.length_m
+
+
+def averaged(contact: ContactState, tip_world_m: Vec3) -> ContactState:
+    """Return the state with one more sample of the touched point."""
+    count = contact.samples + 1
+    (mx, my, mz), (x, y, z), force_n = contact.mean_tip_m, tip_world_m, contact.mean_force_n
+    return replace(
+        contact,
+        samples=count,
+        mean_tip_m=(mx + (x - mx) / count, my + (y - my) / count, mz + (z - mz) / count),
+        mean_force_n=force_n + (contact.force_n - force_n) / count,
+    )
 
 
 def touches(contact: ContactState, touch_n: float) -> bool:

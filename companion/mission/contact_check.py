@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import product
 
-from companion.config.mission import Approach, Mission, Press
+from companion.config.mission import Approach, Mission, Press, Probe
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.control.thrust import attitude_from_roll_pitch_yaw, roll_pitch_from_force
 from companion.mission.plan import Plan
 from companion.mission.segments import Segment
+from companion.mission.surface import axes, points_of, tool_turn_rad
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_conjugate, quat_rotate
 from companion.model.types import Reference, Vec3
 from companion.safety.governor import SafeSet
 
+TURN_RAD = math.radians(15.0)
+"""Turn to a surface for which the check leaves room."""
 AHEAD_M = 0.05
 """Smallest distance by which the tool must reach beyond the rotors."""
 TRACKING_M = 0.05
@@ -30,23 +34,26 @@ FORCE_SHARE_MAX = 0.6
 def contact_problems(mission: Mission, vehicle: Vehicle, plan: Plan) -> Iterator[tuple[Segment, str]]:
     """Return each segment that cannot be flown, with the reason and the advice."""
     direction: Vec3 = (0.0, 0.0, 0.0)
+    faces = False
     for segment in plan.segments:
         if segment.repetition > 1:
             continue
         phase = mission.phases[segment.index]
-        if isinstance(phase, Approach):
+        if isinstance(phase, Approach | Probe):
             length = math.hypot(*phase.direction)
             x, y, z = phase.direction
             direction = (x / length, y / length, z / length)
+            faces = isinstance(phase, Approach) and phase.face_m is not None
             yield from (
                 (segment, text) for text in _approach(vehicle, plan.reference(segment.start_s), direction, phase)
             )
         elif isinstance(phase, Press):
             reference = plan.reference(segment.start_s)
             yield from ((segment, text) for text in _force(vehicle, reference, direction, phase.force_n))
+            yield from ((segment, text) for text in _torque(vehicle, reference, direction, phase.force_n, faces))
 
 
-def _approach(vehicle: Vehicle, reference: Reference, direction: Vec3, phase: Approach) -> Iterator[str]:
+def _approach(vehicle: Vehicle, reference: Reference, direction: Vec3, phase: Approach | Probe) -> Iterator[str]:
     if vehicle.tool is None or vehicle.has_net:
         yield f"touches a surface, but vehicle '{vehicle.name}' has no rod or brush (tool.kind); add one to the vehicle file"
         return
@@ -62,16 +69,38 @@ def _approach(vehicle: Vehicle, reference: Reference, direction: Vec3, phase: Ap
             f"approaches with the tip {ahead_m:.2f} m beyond the rotors (minimum {AHEAD_M:g} m); stretch the arm in the direction of "
             "the approach, or turn the vehicle"
         )
-    px, py, pz = reference.position_world_m
-    way_m = phase.distance_max_m
-    far = (px + way_m * nx, py + way_m * ny, pz + way_m * nz)
     safe = SafeSet(vehicle)
-    beyond_m = max(safe.breach_walls_m(far), safe.breach_tether_m(far)) + TRACKING_M
+    far, beyond_m = max(
+        (
+            (at, max(safe.breach_walls_m(at), safe.breach_tether_m(at)) + TRACKING_M)
+            for at in _corners(reference, direction, phase, math.hypot(x, y))
+        ),
+        key=lambda found: found[1],
+    )
     if beyond_m > 0.0:
         yield (
             f"may move to ({far[0]:.2f}, {far[1]:.2f}, {far[2]:.2f}) m if it touches nothing, {beyond_m:.2f} m beyond what room and "
             f"tether allow with a margin of {TRACKING_M:g} m; lower distance_max_m or begin nearer to the surface"
         )
+
+
+def _corners(reference: Reference, direction: Vec3, phase: Approach | Probe, ahead_m: float) -> Iterator[Vec3]:
+    """Return the corners of the space in which the reference may move during an approach or a probe; `ahead_m` is the distance of the
+    tip from the centre.
+    """
+    points = points_of(phase)
+    across_m = max((abs(right) for right, _ in points), default=0.0)
+    upwards_m = max((abs(up) for _, up in points), default=0.0)
+    if points and isinstance(phase, Approach):
+        across_m = max(across_m, ahead_m * math.sin(TURN_RAD))
+    right, up = axes(direction)
+    sides_m = (phase.distance_max_m,) if not points else (0.0, phase.distance_max_m)
+    for d, r, u in product(sides_m, (-across_m, across_m), (-upwards_m, upwards_m)):
+        x, y, z = (
+            p + d * n + r * a + u * b
+            for p, n, a, b in zip(reference.position_world_m, direction, right, up, strict=True)
+        )
+        yield (x, y, z)
 
 
 def _force(vehicle: Vehicle, reference: Reference, direction: Vec3, force_n: float) -> Iterator[str]:
@@ -89,14 +118,37 @@ def _force(vehicle: Vehicle, reference: Reference, direction: Vec3, force_n: flo
             f"tilts by {tilt_deg:.1f} deg to press with {force_n:g} N (limit {airframe.tilt_max_deg - TILT_RESERVE_DEG:g} deg: "
             f"airframe.tilt_max_deg less {TILT_RESERVE_DEG:g} deg); lower force_n"
         )
-    attitude = attitude_from_roll_pitch_yaw(*roll_pitch_from_force(thrust, reference.yaw_rad), reference.yaw_rad)
-    manipulator, arm_rad = manipulator_of(vehicle), reference.arm_rad
-    felt = quat_rotate(quat_conjugate(attitude), (-force_n * nx, -force_n * ny, -force_n * nz))
-    torques = manipulator.joint_torque_from_force(arm_rad, felt)
-    gravity = manipulator.gravity_torque_nm(arm_rad, attitude)
-    for joint, (t, g, limit_nm) in enumerate(zip(torques, gravity, vehicle.joint_torque_limits_nm, strict=True), 1):
-        if abs(g - t) > TORQUE_SHARE_MAX * limit_nm:
+
+
+def _torque(vehicle: Vehicle, reference: Reference, direction: Vec3, force_n: float, faces: bool) -> Iterator[str]:
+    """Check the torques that hold the arm against weight and force; if the vehicle turns to the surface, also on tilted surfaces."""
+    manipulator = manipulator_of(vehicle)
+    worst: dict[int, float] = {}
+    for tilt_rad in (-TURN_RAD, 0.0, TURN_RAD) if faces else (0.0,):
+        into = _raised(direction, tilt_rad)
+        nx, ny, nz = into
+        *inner, last = reference.arm_rad
+        arm_rad = (*inner, last + tool_turn_rad(vehicle, manipulator, reference.arm_rad, direction, into))
+        thrust = (force_n * nx, force_n * ny, force_n * nz + vehicle.airframe.mass_kg * GRAVITY_M_S2)
+        attitude = attitude_from_roll_pitch_yaw(*roll_pitch_from_force(thrust, reference.yaw_rad), reference.yaw_rad)
+        felt = quat_rotate(quat_conjugate(attitude), (-force_n * nx, -force_n * ny, -force_n * nz))
+        torques = manipulator.joint_torque_from_force(arm_rad, felt)
+        gravity = manipulator.gravity_torque_nm(arm_rad, attitude)
+        for joint, (t, g) in enumerate(zip(torques, gravity, strict=True), 1):
+            worst[joint] = max(worst.get(joint, 0.0), abs(g - t))
+    for (joint, needed_nm), limit_nm in zip(worst.items(), vehicle.joint_torque_limits_nm, strict=True):
+        if needed_nm > TORQUE_SHARE_MAX * limit_nm:
             yield (
-                f"needs {abs(g - t):.2f} N m of joint {joint} to press with {force_n:g} N (limit {TORQUE_SHARE_MAX * limit_nm:.2f} "
+                f"needs {needed_nm:.2f} N m of joint {joint} to press with {force_n:g} N (limit {TORQUE_SHARE_MAX * limit_nm:.2f} "
                 f"N m: {TORQUE_SHARE_MAX:g} of its torque); lower force_n, or hold the tip nearer to the shoulder's height"
             )
+
+
+def _raised(direction: Vec3, angle_rad: float) -> Vec3:
+    """Return a direction raised by an angle; a vertical one is returned as it is."""
+    x, y, z = direction
+    level = math.hypot(x, y)
+    if level < 1e-6 or angle_rad == 0.0:
+        return direction
+    elevation = math.atan2(z, level) + angle_rad
+    return (x / level * math.cos(elevation), y / level * math.cos(elevation), math.sin(elevation))

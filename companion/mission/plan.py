@@ -9,7 +9,7 @@ import math
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 
-from companion.config.mission import Approach, ArmMove, Detach, Land, Line, Mission, Path, Press, Takeoff
+from companion.config.mission import Approach, ArmMove, Detach, Land, Line, Mission, Path, Press, Probe, Takeoff
 from companion.config.vehicle import Vehicle
 from companion.mission.arm_motion import ArmLimits
 from companion.mission.contact import PRESS_RAMP_S, RELEASE_S, approach_s, travel_s
@@ -108,6 +108,8 @@ class Plan:
             elif isinstance(phase, Approach):
                 approach = phase
                 builder.t_s += approach_s(approach)
+            elif isinstance(phase, Probe):
+                builder.t_s += approach_s(phase)
             elif isinstance(phase, Press):
                 builder.t_s += PRESS_RAMP_S + phase.duration_s
             elif isinstance(phase, Detach):

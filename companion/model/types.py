@@ -249,10 +249,52 @@ class ContactMode(Enum):
     APPROACH = "approach"  # move along the direction until the surface is touched
     PRESS = "press"  # touched: hold the force
     LOST = "lost"  # the force has ended: wait at rest, then approach again
+    BACK = "back"  # a point was touched: move back from the surface
+    SHIFT = "shift"  # move in front of the next point, or turn to the surface
     LEAVE = "leave"  # release the force, then move back
+    RETURN = "return"  # move back to the plan
 
     # An enum's own hash is a Python function.
     __hash__ = object.__hash__
+
+
+class ContactShift(Record, frozen=True, kw_only=True):
+    """Straight move of the reference from rest to rest across the direction of an approach, in which yaw and last joint turn as well.
+    Everything is relative to the plan.
+    """
+
+    from_m: Vec3 = (0.0, 0.0, 0.0)
+    to_m: Vec3 = (0.0, 0.0, 0.0)
+    from_yaw_rad: float = 0.0
+    to_yaw_rad: float = 0.0
+    from_tool_rad: float = 0.0
+    """Turn of the last joint."""
+    to_tool_rad: float = 0.0
+    length_m: float = 0.0
+    """Length of the way; a turn counts as 1 m per rad if that is longer."""
+    way_m: float = 0.0
+    """Way that is done, its rate and its acceleration."""
+    rate_m_s: float = 0.0
+    acceleration_m_s2: float = 0.0
+
+
+class TouchedPoint(Record, frozen=True):
+    """A point of a surface that the tool has touched."""
+
+    t_s: float
+    tip_world_m: Vec3
+    """Mean measured position of the tip's centre."""
+    force_n: float
+    """Mean measured force."""
+
+
+class FoundSurface(Record, frozen=True):
+    """Plane through the touched points."""
+
+    point_world_m: Vec3
+    """Centre of the touched points, on the surface."""
+    normal_world: Vec3
+    """Unit vector out of the surface, towards the vehicle."""
 
 
 class ContactState(Record, frozen=True, kw_only=True):
@@ -296,6 +338,17 @@ class ContactState(Record, frozen=True, kw_only=True):
     """Push minus the force that the vehicle's motion shows, low-passed: what the vehicle pushes against nothing."""
     disagreed_s: float = 0.0
     """Time for which one of the two has been beyond `safety.contact_disagreement_n`."""
+    shift: ContactShift = ContactShift()
+    points: tuple[TouchedPoint, ...] = ()
+    """Points touched so far by a `probe`, or by an approach that turns to the surface."""
+    samples: int = 0
+    """Number of samples of the point that is touched now, their mean position and their mean force."""
+    mean_tip_m: Vec3 = (0.0, 0.0, 0.0)
+    mean_force_n: float = 0.0
+    surface: FoundSurface | None = None
+    """Surface through the touched points; None before the last of them."""
+    free_m: float = 0.0
+    """Offset up to which the way is known to be free."""
 
 
 class Reference(Record, frozen=True, kw_only=True):

@@ -73,7 +73,7 @@ PAYLOAD_LEFT = Notice(
 TOUCHED = Notice("touched", _INFO, _NOMINAL, "the tool touched the surface that the mission approaches")
 CONTACT_INTERRUPTED = Notice(
     "contact_interrupted", _WARNING, _WARN,
-    "no force for 0.5 s while pressing: the vehicle waits 0.5 s and approaches the surface again",
+    "no force for 1 s while pressing: the vehicle waits 0.5 s and approaches the surface again",
 )  # fmt: skip
 CONTACT_LOST = Notice(
     "contact_lost", _WARNING, _WARN,
@@ -93,12 +93,13 @@ CONTACT_BOUNCE = Notice(
 )  # fmt: skip
 CONTACT_SLIPPED = Notice(
     "contact_slipped", _WARNING, _WARN,
-    "the yaw error exceeded 5 deg while approaching or pressing, because the tool slips along the surface: the vehicle moves back, "
-    "and the mission goes on as aborted",
+    "the yaw error exceeded 5 deg while approaching or pressing (15 deg while light touches find the surface's normal), because the "
+    "tool slips along the surface: the vehicle moves back, and the mission goes on as aborted",
 )  # fmt: skip
 SURFACE_MISSING = Notice(
     "surface_missing", _WARNING, _WARN,
-    "nothing was touched within `distance_max_m`: the vehicle moves back, and the mission goes on as aborted",
+    "nothing was touched within `distance_max_m`, or the touched points lie on a plane tilted by more than 30 deg: the vehicle moves "
+    "back, and the mission goes on as aborted",
 )  # fmt: skip
 TOUCHDOWN = Notice("touchdown", _INFO, _NOMINAL, "the vehicle is on the ground")
 NO_TOUCHDOWN = Notice("no_touchdown", _CRITICAL, _PX4_LANDS, "no touchdown 5 s after the plan's end: PX4 lands")

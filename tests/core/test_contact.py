@@ -33,6 +33,7 @@ def press(
     command: tuple[float, OperatorCommand] | None = None,
     approach_m_s: float = 0.03,
     force_max_n: float = 12.0,
+    face_m: float | None = None,
 ) -> tuple[FastFlight, FastResult]:
     """Fly the mission press in the ideal world.
 
@@ -41,10 +42,12 @@ def press(
         command: time after the first touch, s, and the operator's command then.
         approach_m_s: speed of the approach.
         force_max_n: `safety.contact_force_max_n`.
+        face_m: `face_m` of the approach.
     """
     overrides = [
         f"world.surfaces={json.dumps([WALL | (wall or {})])}",
         f"mission.phases[3].speed_m_s={approach_m_s}",
+        f"mission.phases[3].face_m={json.dumps(face_m)}",
         f"vehicle.safety.contact_force_max_n={force_max_n}",
     ]
     flight = FastFlight(load_sitl(PRESS, world="ideal", overrides=overrides))
@@ -75,10 +78,10 @@ def force_n(result: FastResult) -> np.ndarray[Any, Any]:
 
 @pytest.fixture(scope="module")
 def pressed() -> tuple[FastFlight, FastResult]:
-    return press({"tilt_error_deg": [8.0, -6.0], "place_error_m": -0.03})
+    return press({"tilt_error_deg": [12.0, -6.0], "place_error_m": -0.03, "friction": 0.12}, face_m=0.2)
 
 
-def test_the_force_is_held_on_a_tilted_wall_that_is_not_where_the_mission_expects_it(
+def test_the_force_is_held_on_a_slippery_tilted_wall_that_is_not_where_the_mission_expects_it(
     pressed: tuple[FastFlight, FastResult],
 ) -> None:
     flight, result = pressed
@@ -96,7 +99,7 @@ def test_after_the_contact_nothing_presses_and_the_vehicle_is_back_on_its_plan(
 ) -> None:
     _, result = pressed
     last = max(k for k, o in enumerate(result.outputs) if o.contact is not None)
-    assert result.outputs[last].contact.mode is ContactMode.LEAVE  # type: ignore[union-attr]
+    assert result.outputs[last].contact.mode is ContactMode.RETURN  # type: ignore[union-attr]
     after = result.outputs[last + 1].reference
     assert after is not None and after.push_world_n is None
     assert after.position_world_m == pytest.approx((0.6, 0.0, 1.1), abs=1e-3)
@@ -123,7 +126,9 @@ def test_the_summary_has_the_contact_and_a_replay_is_identical(pressed: tuple[Fa
     assert 0.0 < found["rms_error_n"] < 0.75 and found["overshoot_n"] < 2.5 and found["path_rms_m"] < 0.02
     assert flight.plant.world.surfaces is not None
     off_m = flight.plant.world.surfaces.placed[0].local_m(tuple(found["surface"]["point_m"]))[2]
-    assert off_m == pytest.approx(0.015, abs=0.005)  # the ball's radius
+    assert off_m == pytest.approx(0.0, abs=0.005)
+    normal = flight.plant.world.surfaces.placed[0].normal
+    assert np.degrees(np.arccos(np.dot(found["surface"]["normal"], normal))) < 1.0
     core = FlightCore(flight.config.flight)
     assert all(core.step(i) == o for i, o in zip(result.inputs, result.outputs, strict=True))
 
@@ -147,7 +152,7 @@ def test_report_and_ground_station_show_the_force_and_the_report_the_true_one(
     force = contact_force(log)
     assert force is not None and contact_path(log) is not None
     bands = {text.get_text() for text in force.legends[0].get_texts()}
-    assert bands == {"weigh", "approach", "press", "leave"}
+    assert bands == {"weigh", "shift", "approach", "press", "back", "leave", "return"}
     on_the_ground = dataclasses.replace(log, outputs=log.outputs[:50], inputs=log.inputs[:50], sent=log.sent[:50])
     assert contact_force(on_the_ground) is None and contact_path(on_the_ground) is None
     assert contact_lines({"contact": contact_summary(on_the_ground)}) == []
@@ -161,7 +166,8 @@ def test_a_missing_surface_ends_in_a_retreat_and_an_aborted_mission() -> None:
 
 @pytest.mark.parametrize("t_s", [9.0, 22.0])
 def test_a_force_sensor_that_dies_during_approach_or_press_leads_away_from_the_wall(t_s: float) -> None:
-    config = load_sitl("press", world="wall", overrides=[f"world.faults=[{{kind: force_loss, t_s: {t_s}}}]"])
+    faults = f"world.faults=[{{kind: force_loss, t_s: {t_s}}}]"
+    config = load_sitl("press", world="wall", overrides=[faults, "mission.phases[3].face_m=null"])
     flight = FastFlight(config)
     result = flight.run(90.0)
     surfaces = flight.plant.world.surfaces
@@ -172,7 +178,7 @@ def test_a_force_sensor_that_dies_during_approach_or_press_leads_away_from_the_w
 
 def test_a_force_sensor_whose_zero_shifts_during_the_approach_neither_pushes_into_the_wall_nor_stays_at_it() -> None:
     faults = "world.faults=[{kind: force_bias, t_s: 12.0, size: 3.0}]"
-    flight = FastFlight(load_sitl("press", world="wall", overrides=[faults]))
+    flight = FastFlight(load_sitl("press", world="wall", overrides=[faults, "mission.phases[3].face_m=null"]))
     result = flight.run(90.0)
     surfaces = flight.plant.world.surfaces
     assert "contact_lost" in events(result)

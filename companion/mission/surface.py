@@ -1,0 +1,117 @@
+"""The plane through touched points: where to touch a surface, and its place and normal from the touches. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+from companion.config.mission import Approach, Phase, Probe
+from companion.config.vehicle import Vehicle
+from companion.control.manipulator import Manipulator
+from companion.model.types import FoundSurface, Joints, Vec2, Vec3
+
+TILT_MAX_RAD = math.radians(30.0)
+"""Largest angle between a surface's normal and the direction of the approach. Beyond it a touch is taken for a false one."""
+LIMIT_MARGIN_DEG = 5.0
+"""Distance of the turned tool from the limits of its joint."""
+_STEP_RAD = 0.001
+_LEVEL = 0.5
+"""Horizontal part of a direction from which it has an azimuth to which the vehicle can turn."""
+
+
+def axes(direction_world: Vec3) -> tuple[Vec3, Vec3]:
+    """Return the unit vectors right and up of a surface, world frame, as seen from a vehicle that looks in this direction.
+
+    Up is vertical as far as the surface allows; of a floor it is the world's x.
+    """
+    nx, ny, nz = direction_world
+    level = math.hypot(nx, ny)
+    right = (ny / level, -nx / level, 0.0) if level > 1e-6 else (0.0, -1.0, 0.0)
+    rx, ry, rz = right
+    return right, (ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx)
+
+
+def points_of(phase: Phase | None) -> tuple[Vec2, ...]:
+    """Return the points that a phase touches to find the surface, right and up of the way straight ahead, m."""
+    if isinstance(phase, Probe):
+        across = [phase.spacing_m * (k - 0.5 * (phase.columns - 1)) for k in range(phase.columns)]
+        rows = [phase.spacing_m * (k - 0.5 * (phase.rows - 1)) for k in range(phase.rows)]
+        # Row by row upwards, every other row from right to left.
+        return tuple((x, y) for k, y in enumerate(rows) for x in (across if k % 2 == 0 else reversed(across)))
+    if isinstance(phase, Approach) and phase.face_m is not None:
+        half, low = 0.5 * phase.face_m, phase.face_m / math.sqrt(12.0)
+        return ((-half, -low), (half, -low), (0.0, 2.0 * low))
+    return ()
+
+
+def farthest_step_m(points: Sequence[Vec2]) -> float:
+    """Return the largest distance between consecutive points."""
+    return max((math.dist(a, b) for a, b in pairwise(points)), default=0.0)
+
+
+def plane(tips_m: Sequence[Vec3], direction_world: Vec3, radius_m: float) -> FoundSurface | None:
+    """Return the plane through the touched points by least squares, or None if it is steeper than `TILT_MAX_RAD`.
+
+    Args:
+        tips_m: positions of the tip's centre, three or more that do not lie on a line, world frame.
+        direction_world: direction of the approaches, along which the errors are taken.
+        radius_m: radius of the tip.
+    """
+    count = len(tips_m)
+    cx, cy, cz = (sum(tip[k] for tip in tips_m) / count for k in range(3))
+    right, up = axes(direction_world)
+    rr = ru = uu = rd = ud = 0.0
+    for x, y, z in tips_m:
+        off = (x - cx, y - cy, z - cz)
+        r, u, d = _dot(off, right), _dot(off, up), _dot(off, direction_world)
+        rr, ru, uu, rd, ud = rr + r * r, ru + r * u, uu + u * u, rd + r * d, ud + u * d
+    scale = rr * uu - ru * ru
+    if scale <= 0.0:
+        return None
+    b, c = (uu * rd - ru * ud) / scale, (rr * ud - ru * rd) / scale
+    length = math.sqrt(1.0 + b * b + c * c)
+    if length * math.cos(TILT_MAX_RAD) > 1.0:
+        return None
+    into = [(n - b * r - c * u) / length for n, r, u in zip(direction_world, right, up, strict=True)]
+    nx, ny, nz = into
+    return FoundSurface(
+        point_world_m=(cx + radius_m * nx, cy + radius_m * ny, cz + radius_m * nz), normal_world=(-nx, -ny, -nz)
+    )
+
+
+def turn_to(surface: FoundSurface, yaw_rad: float) -> float:
+    """Return the yaw at which the vehicle looks at the surface; the present one if the surface is too nearly horizontal."""
+    x, y, _ = surface.normal_world
+    return math.atan2(-y, -x) if math.hypot(x, y) > _LEVEL else yaw_rad
+
+
+def tool_turn_rad(
+    vehicle: Vehicle, manipulator: Manipulator, arm_rad: Joints, direction_world: Vec3, into_world: Vec3
+) -> float:
+    """Return the turn of the last joint by which the tool keeps its angle to the force when that acts along `into_world` instead of
+    `direction_world`; 0 if this joint cannot raise and lower the tool.
+
+    A force across the tool is a torque at the sensor, which reads part of it as a force (cross-talk).
+    """
+    step = (*arm_rad[:-1], arm_rad[-1] + _STEP_RAD)
+    slope = (_elevation_rad(manipulator, step) - _elevation_rad(manipulator, arm_rad)) / _STEP_RAD
+    if abs(slope) < _LEVEL:
+        return 0.0
+    turn_rad = (math.asin(into_world[2]) - math.asin(direction_world[2])) / slope
+    low, high = vehicle.arm.joints[-1].angle_deg
+    least, most = math.radians(low + LIMIT_MARGIN_DEG), math.radians(high - LIMIT_MARGIN_DEG)
+    return min(most, max(least, arm_rad[-1] + turn_rad)) - arm_rad[-1]
+
+
+def _elevation_rad(manipulator: Manipulator, arm_rad: Joints) -> float:
+    """Return the angle of the line from the last joint to the tip above the body's horizontal plane."""
+    x, y, z = (
+        tip - joint
+        for tip, joint in zip(manipulator.net_body_m(arm_rad), manipulator.joints_body_m(arm_rad)[-1], strict=True)
+    )
+    return math.atan2(z, math.hypot(x, y))
+
+
+def _dot(a: Vec3, b: Vec3) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
