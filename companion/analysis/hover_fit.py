@@ -1,5 +1,8 @@
-"""Fits the hover thrust (without payload) to the steady parts of a flight log: least squares on the force balance of
-`companion.control.hover_thrust`, thrust = h . load, with a slope over the battery voltage if that changed enough.
+"""Fits the hover thrust (without payload) to the steady parts of a flight log, on the force balance of
+`companion.control.hover_thrust`: thrust = h . load, with a slope over the battery voltage if that changed enough.
+
+The load comes from the accelerometer. Least squares would divide h by 1 + the variance of its noise: by 1.2 with strong vibration. The
+fit therefore balances sums over time, in which the noise cancels (instrumental variables: 1 and the voltage).
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ import numpy as np
 
 from companion.analysis.log import Array, FlightLog
 from companion.control.hover_thrust import Balance
-from companion.control.sensing import acceleration_world_m_s2
+from companion.control.sensing import MeanAcceleration
 from companion.model.types import PhaseKind
 
 FIT_MIN_S = 2.0
@@ -73,13 +76,14 @@ def fit_hover_thrust(log: FlightLog) -> HoverFit:
             f"{log.path}: {used_s:.1f} s of steady flight, expected {FIT_MIN_S:g} s or more; hover for a few seconds"
         )
     pieces = np.floor(np.cumsum(dt_s) / PIECE_S)
-    values, errors = _least_squares(dt_s, load[:, None], thrust, pieces)
+    ones = np.ones((len(load), 1))
+    values, errors = _fit(dt_s, load[:, None], ones, thrust, pieces)
     mean_v = span_v = slope = None
     if np.isfinite(voltage_v).all():
         mean_v, span_v = float(np.average(voltage_v, weights=dt_s)), float(np.ptp(voltage_v))
         if span_v >= SLOPE_MIN_V:
-            columns = np.stack([load, load * (voltage_v - mean_v)], axis=1)
-            values, errors = _least_squares(dt_s, columns, thrust, pieces)
+            instruments = np.stack([np.ones(len(load)), voltage_v - mean_v], axis=1)
+            values, errors = _fit(dt_s, instruments * load[:, None], instruments, thrust, pieces)
             slope = VoltageSlope(float(values[1]), float(errors[1]))
     learnt = [o.control.hover_thrust for o in log.outputs if o.control is not None]
     return HoverFit(
@@ -105,6 +109,7 @@ def _calm(log: FlightLog) -> Array:
         raise HoverFitError(f"{log.path}: no vehicle.airframe.mass_kg in its configuration; expected a flight log")
     balance = Balance(mass_kg)
     rows: list[tuple[float, float, float, float]] = []
+    acceleration = MeanAcceleration()
     sent: float | None = None
     before_s: float | None = None
     carrying = False
@@ -114,7 +119,7 @@ def _calm(log: FlightLog) -> Array:
         carrying = carrying or any(event.id == "catch" for event in o.events)
         if sent is not None and i.vehicle is not None and o.control is not None:
             force = o.control.force_measured_world_n or o.control.force_ext_world_n
-            now = balance.step(dt_s, sent, acceleration_world_m_s2(i.vehicle), force, i.vehicle.attitude_wxyz)
+            now = balance.step(dt_s, sent, acceleration.update(i.vehicle), force, i.vehicle.attitude_wxyz)
             blind = i.force is None or i.t_s - i.force.stamp_s > force_timeout_s
             if now is not None and o.phase_kind is PhaseKind.FLIGHT and not (carrying and blind):
                 voltage_v = i.status.battery_voltage_v if i.status is not None else None
@@ -123,9 +128,9 @@ def _calm(log: FlightLog) -> Array:
     return np.array(rows, dtype=np.float64).reshape(len(rows), 4)
 
 
-def _least_squares(dt_s: Array, columns: Array, thrust: Array, pieces: Array) -> tuple[Array, Array]:
+def _fit(dt_s: Array, columns: Array, instruments: Array, thrust: Array, pieces: Array) -> tuple[Array, Array]:
     """Return the fitted values, weighted by time, and their cluster-robust standard errors with the pieces as clusters."""
-    weighted = columns * dt_s[:, None]
+    weighted = instruments * dt_s[:, None]
     inverse = np.linalg.inv(weighted.T @ columns)
     values: Array = inverse @ (weighted.T @ thrust)
     residual = thrust - columns @ values
@@ -133,5 +138,5 @@ def _least_squares(dt_s: Array, columns: Array, thrust: Array, pieces: Array) ->
     scores = np.zeros((int(index.max()) + 1, columns.shape[1]))
     np.add.at(scores, index, weighted * residual[:, None])
     freedom = len(scores) / max(1, len(scores) - columns.shape[1])
-    errors: Array = np.sqrt(freedom * np.diag(inverse @ (scores.T @ scores) @ inverse))
+    errors: Array = np.sqrt(freedom * np.diag(inverse @ (scores.T @ scores) @ inverse.T))
     return values, errors

@@ -38,6 +38,7 @@ _WITH_MODULES = (
         "faults",
         "tune",
         "hover",
+        "identify",
         "install",
         "arm",
         "px4",

@@ -171,3 +171,18 @@ def _inverse(matrix: list[list[float]]) -> list[list[float]] | None:
                 factor = rows[i][k]
                 rows[i] = [a - factor * b for a, b in zip(rows[i], rows[k], strict=True)]
     return [row[size:] for row in rows]
+
+
+def thrust_share(signal: float, factor: float) -> float:
+    """Return the fraction of full thrust at a motor signal of 0 to 1; `factor` is defined like THR_MDL_FAC."""
+    return signal * (factor * signal + 1.0 - factor)
+
+
+def motor_signal(command: float, factor: float) -> float:
+    """Return the motor signal (0 to 1) for a normalised thrust command (0 to 1). `factor` is THR_MDL_FAC: PX4 assumes that thrust is
+    factor * signal^2 + (1 - factor) * signal (FunctionMotors::updateValues).
+    """
+    if factor <= 0.0 or command <= 0.0:
+        return command
+    half = (1.0 - factor) / (2.0 * factor)
+    return math.sqrt(half * half + command / factor) - half

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from companion.model.frames import quat_multiply
+from companion.model.rotors import motor_signal
 from companion.model.types import Quat, Vec3
-from sitl.autopilot.cascade import Cascade, CascadeGains, motor_signal
+from sitl.autopilot.cascade import Cascade, CascadeGains
 from sitl.autopilot.commander import Command, Commander, Notice, Result, Severity
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.land_detector import LandDetector

@@ -27,16 +27,6 @@ class CascadeGains:
     d_cutoff_hz: float = 30.0
 
 
-def motor_signal(command: float, factor: float) -> float:
-    """Return the motor signal (0 to 1) for a normalised thrust command (0 to 1). `factor` is THR_MDL_FAC: PX4 assumes that thrust is
-    factor * signal^2 + (1 - factor) * signal (FunctionMotors::updateValues).
-    """
-    if factor <= 0.0 or command <= 0.0:
-        return command
-    half = (1.0 - factor) / (2.0 * factor)
-    return math.sqrt(half * half + command / factor) - half
-
-
 class Cascade:
     """PX4's multicopter attitude P loop, rate PID loop and mixer.
 

@@ -14,6 +14,7 @@ from companion.model.algebra import cross
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_rotate
 from companion.model.types import Joints, Quat, Vec2, Vec3
+from companion.sitl_config.effects.rotors import BODY_DRAG_N_PER_M_S
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.air import Air
 from sitl.world.effects.battery import BatteryPack
@@ -28,7 +29,6 @@ from sitl.world.payload import Payload
 from sitl.world.surfaces import Surfaces
 
 PHYSICS_DT_S: Final = 0.002
-DRAG_N_PER_M_S: Final = 0.25
 FALL_M_S: Final = 2.5
 """Speed of impact on the floor at which the legs break: the speed after a fall from 0.3 m. PX4 descends at 0.7 m/s at most."""
 _EFFECT_STEPS: Final = round(EFFECT_PERIOD_S / PHYSICS_DT_S)
@@ -311,7 +311,7 @@ class World:
             v = self.v
             wx, wy, wz = wx - v[0], wy - v[1], wz - v[2]
             hx, hy, hz = self._rotors.drag_n(sum(thrust_n), (wx, wy, wz), self.q)
-            force_n = (DRAG_N_PER_M_S * wx + hx, DRAG_N_PER_M_S * wy + hy, DRAG_N_PER_M_S * wz + hz)
+            force_n = (BODY_DRAG_N_PER_M_S * wx + hx, BODY_DRAG_N_PER_M_S * wy + hy, BODY_DRAG_N_PER_M_S * wz + hz)
         if self.snag is not None:
             x, y, z = force_n
             px, py, pz = self._snag_pull_n(*self.snag)

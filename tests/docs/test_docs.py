@@ -37,7 +37,7 @@ LOG, LAW = ROOT / "docs/log.md", ROOT / "docs/control-law.md"
 MADE_LATER = {
     "flight.mcap", "flight.log", "flight.pid", "guardian.log", "guardian.pid", "summary.json", "report.html", "config.json",
     "sitl_config.json", "sitl.log", "world.json", "preflight.json", "mine.yaml", "my_vehicle.yaml", "flights/",
-    "compare.json", "compare.html", "LAW_PRESET.yaml",
+    "compare.json", "compare.html", "LAW_PRESET.yaml", "identified_world.yaml", "identified.json",
 }  # fmt: skip
 EXAMPLE = ROOT / "examples/law"
 """The folder that the reader of docs/own-law.md makes."""

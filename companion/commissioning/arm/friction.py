@@ -177,14 +177,44 @@ def fit_joint(samples: Sequence[Sample], vehicle: Vehicle, joint: int) -> JointF
     rows, currents, chains = _binned(samples, vehicle, joint)
     if len(currents) < BINS_MIN:
         return None
+    sigmas = (math.inf, math.inf, math.inf, math.radians(LEVEL_DEG))
+    robust = robust_fit(rows, currents, chains, sigmas, vehicle.arm.torque_constants_nm_a[joint])
+    return _as_joint_fit(robust.theta, robust.covariance, rows, robust.scatter_a)
+
+
+@dataclass(frozen=True, slots=True)
+class RobustFit:
+    """Robust regression of a joint's current."""
+
+    theta: _Array
+    """Factor of each column; the first is 1/K, the others are divided by K."""
+    covariance: _Array
+    """Covariance of the factors, inflated for correlated residuals."""
+    scatter_a: float
+
+
+def robust_fit(
+    rows: _Array, currents: _Array, chains: list[int], sigmas: Sequence[float], constant_nm_a: float
+) -> RobustFit:
+    """Regress the currents on the rows, whose first column is the load.
+
+    Args:
+        rows: one row for each bin.
+        currents: mean current of each bin, A.
+        chains: bins with the same number follow each other without a gap.
+        sigmas: standard deviation of the prior of each factor times K, about 0; infinite for none.
+        constant_nm_a: the vehicle file's torque constant, for the scale of the priors.
+    """
     # Repeated, because the weights and that of the prior depend on the scatter of the currents.
-    scatter, theta, covariance, weights = 0.01, np.zeros(4), np.eye(4), np.ones(len(currents))
+    known = [index for index, sigma in enumerate(sigmas) if math.isfinite(sigma)]
+    columns = rows.shape[1]
+    scatter, theta, covariance, weights = 0.01, np.zeros(columns), np.eye(columns), np.ones(len(currents))
     for _ in range(8):
-        prior = np.array(
-            [[0.0, 0.0, 0.0, scatter / math.radians(LEVEL_DEG) * vehicle.arm.torque_constants_nm_a[joint]]]
-        )
+        prior = np.zeros((len(known), columns))
+        for row, index in enumerate(known):
+            prior[row, index] = scatter / sigmas[index] * constant_nm_a
         root = np.sqrt(weights)
-        design, wanted = np.vstack([rows * root[:, None], prior]), np.append(currents * root, 0.0)
+        design, wanted = np.vstack([rows * root[:, None], prior]), np.append(currents * root, np.zeros(len(known)))
         inverse = np.linalg.pinv(design.T @ design)
         theta = inverse @ design.T @ wanted
         residual = currents - rows @ theta
@@ -193,7 +223,7 @@ def fit_joint(samples: Sequence[Sample], vehicle: Vehicle, joint: int) -> JointF
         freedom = max(1.0, (len(currents) - 3) * float(np.mean(weights == 1.0)) ** 2)
         scatter = max(1e-4, math.sqrt(float(clipped @ clipped) / freedom))
         covariance = scatter**2 * _inflation(clipped, chains) * inverse
-    return _as_joint_fit(theta, covariance, rows, scatter)
+    return RobustFit(theta, covariance, scatter)
 
 
 def _huber(residual: _Array) -> _Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import cycle, islice
-from typing import Annotated
+from typing import Annotated, Final
 
 from pydantic import Field
 
@@ -12,6 +12,8 @@ from companion.config.base import Fraction, Model, NonNegative, Positive, Relati
 from companion.config.document import Document
 from companion.model.rotors import ROTORS_MAX
 
+BODY_DRAG_N_PER_M_S: Final = 0.25
+"""Drag of the body over its airspeed in every world, in addition to that of the rotors."""
 RotorErrors = Annotated[tuple[RelativeError, ...], Field(min_length=1, max_length=ROTORS_MAX)]
 
 

@@ -11,21 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from companion.model.rotors import RotorLayout
+from companion.model.rotors import RotorLayout, motor_signal, thrust_share
 from companion.model.types import Vec3
 from companion.sitl_config.effects.rotors import Rotors as RotorsConfig
 from companion.sitl_config.effects.rotors import of_rotors
-from sitl.autopilot.cascade import motor_signal
 
 Thrusts = tuple[float, ...]
 """Thrust of each rotor in N, in PX4's order."""
 LOWEST_RADII = 0.5
 """Height in rotor radii below which the ground effect is held constant; the formula is valid only above it."""
-
-
-def curve(signal: float, factor: float) -> float:
-    """Return the fraction of full thrust at a motor signal of 0 to 1; `factor` is defined like THR_MDL_FAC."""
-    return signal * (factor * signal + 1.0 - factor)
 
 
 class LinearRotors:
@@ -110,7 +104,7 @@ class Rotors:
             thr_mdl_fac: PX4's THR_MDL_FAC.
         """
         signals = (motor_signal(each_n / (gain * full_n), self._factor) for gain in self._gain)
-        return sum(curve(signal, thr_mdl_fac) for signal in signals) / len(self._gain)
+        return sum(thrust_share(signal, thr_mdl_fac) for signal in signals) / len(self._gain)
 
     def ground_effect(self, height_m: float) -> float:
         """Return the factor by which the ground effect multiplies the thrust of all rotors at a height above the floor."""

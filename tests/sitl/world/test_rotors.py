@@ -7,13 +7,12 @@ from typing import Any
 
 import pytest
 
-from companion.model.rotors import standard_layout
+from companion.model.rotors import motor_signal, standard_layout
 from companion.model.types import Vec4
 from companion.sitl_config.effects.rotors import Rotors as RotorsConfig
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.backend import stub_of
-from sitl.autopilot.cascade import motor_signal
 from sitl.fast.loop import FastFlight
 from sitl.px4.parameters import parameters
 from sitl.world.effects.rotors import LOWEST_RADII, Rotors

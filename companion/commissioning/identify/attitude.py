@@ -1,0 +1,166 @@
+"""Response of PX4's attitude loop, and the delay of motion capture against PX4's attitude."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from companion.commissioning.identify.quantity import SIGMAS_95, Quantity, combined
+from companion.commissioning.identify.response import Array, Fit, Piece, Prior, Spectrum, fit_response, long_run
+from companion.commissioning.identify.samples import Flight
+from companion.model.frames import quat_conjugate, quat_multiply
+from companion.model.types import Quat, Vec3
+
+AXES = ("roll", "pitch")
+_FREQUENCY_LN = Prior(math.log(11.0), 0.6)
+_DAMPING_LN = Prior(math.log(0.75), 0.3)
+_DELAY = Prior(0.025, 0.02)
+_CUTOFF_HZ = 12.0
+_LAG_SHARE, _BANDWIDTH_SHARE = 0.05, 0.07
+"""Standard errors, relative, from describing PX4's cascade by a second-order response."""
+_MOVED_MIN_RAD = math.radians(0.3)
+"""Smallest standard deviation of the setpoint that excites the loop."""
+_LAG_SIGMA_MAX_S = 0.02
+_SLOW_S = 0.4
+"""Averaging time that separates the slow difference between motion capture and PX4: tilt, hidden markers."""
+_RATE_OVER = 4
+_DELAY_SIGMA_S = 0.0015
+"""Standard error from the unknown age of PX4's attitude."""
+_SERVER_SIGMA_S = 0.0005
+_DELAY_SIGMA_MAX_S = 0.005
+_RATE_MIN_RAD_S = math.radians(0.5)
+
+
+def loop(flight: Flight, axis: int) -> tuple[Quantity, Quantity]:
+    """Return lag and bandwidth of the attitude loop about body x (0) or y (1)."""
+    name = AXES[axis]
+    lag_key, lag_title = f"{name}_lag_s", f"{name}: lag of the attitude loop"
+    band_key, band_title = f"{name}_bandwidth_hz", f"{name}: bandwidth (-3 dB)"
+    pieces = []
+    for begin, end in flight.airborne:
+        grid_s = flight.grid(begin, end)
+        setpoint = flight.on_grid(grid_s, flight.t_s, flight.attitude_setpoint_rad[:, axis])
+        attitude = flight.on_grid(grid_s, flight.attitude_stamp_s, flight.attitude_rad[:, axis])
+        pieces.append(Piece(setpoint, attitude))
+    moved = float(np.std(np.concatenate([piece.input - piece.input.mean() for piece in pieces])))
+    if moved < _MOVED_MIN_RAD:
+        how = f"the setpoint moved by {math.degrees(moved):.2f} deg (standard deviation); fly a circuit"
+        return (
+            Quantity(lag_key, lag_title, "ms", 0, how, scale=1e3),
+            Quantity(band_key, band_title, "Hz", 2, how),
+        )
+    fit = fit_response(
+        pieces,
+        _transfer,
+        [np.array([math.log(wn), math.log(damping), 0.03]) for wn in (7.0, 14.0) for damping in (0.6, 1.0)],
+        [_FREQUENCY_LN, _DAMPING_LN, _DELAY],
+        (np.array([math.log(2.0), math.log(0.3), 0.0]), np.array([math.log(60.0), math.log(3.0), 0.15])),
+        _CUTOFF_HZ,
+        order=10,
+    )
+    return _lag(fit, lag_key, lag_title), _bandwidth(fit, band_key, band_title)
+
+
+def _transfer(p: Array, s: Spectrum) -> Spectrum:
+    """Return a second-order response after a delay; the parameters are ln(frequency), ln(damping) and the delay."""
+    square = math.exp(2.0 * p[0])
+    response = square / (s * s + 2.0 * math.exp(p[1] + p[0]) * s + square)
+    return np.asarray(np.exp(-p[2] * s) * response, dtype=np.complex128)
+
+
+def _lag(fit: Fit, key: str, title: str) -> Quantity:
+    value, sigma = fit.of(lambda p: p[2] + 2.0 * math.exp(p[1]) / math.exp(p[0]))
+    sigma = combined(sigma, _LAG_SHARE * value)
+    if sigma > _LAG_SIGMA_MAX_S:
+        how = f"known only to ± {1e3 * SIGMAS_95 * sigma:.0f} ms; fly a circuit"
+        return Quantity(key, title, "ms", 0, how, scale=1e3)
+    frequency, damping, delay_s = math.exp(fit.parameters[0]), math.exp(fit.parameters[1]), fit.parameters[2]
+    how = f"setpoint to attitude: second order with {frequency:.1f} rad/s, damping {damping:.2f}, after {1e3 * delay_s:.0f} ms"
+    return Quantity(key, title, "ms", 0, how, value, sigma, "lab about 165 ms", 1e3)
+
+
+def _bandwidth(fit: Fit, key: str, title: str) -> Quantity:
+    value, sigma = fit.of(lambda p: bandwidth_hz(math.exp(p[0]), math.exp(p[1])))
+    sigma = combined(sigma, _BANDWIDTH_SHARE * value)
+    if sigma > 0.15 * value:
+        how = f"known only to ± {SIGMAS_95 * sigma:.1f} Hz; fly a circuit with faster turns"
+        return Quantity(key, title, "Hz", 2, how)
+    return Quantity(key, title, "Hz", 2, "of the same response", value, sigma)
+
+
+def bandwidth_hz(frequency_rad_s: float, damping: float) -> float:
+    """Return the frequency at which a second-order response has fallen to 1 / sqrt(2)."""
+    k = 1.0 - 2.0 * damping * damping
+    return frequency_rad_s * math.sqrt(k + math.sqrt(k * k + 1.0)) / (2.0 * math.pi)
+
+
+def mocap_delay(flight: Flight) -> Quantity:
+    """Return the delay from exposure to the arrival of a pose, against PX4's attitude, which the gyroscopes keep current.
+
+    `companion latency` measures the same more precisely by taps, which move the vehicle faster than any flight. Here the difference
+    between both attitudes is regressed on the body's rate: a late pose lags by rate times delay.
+    """
+    key, title = "mocap_delay_s", "delay of motion capture"
+    stamps, differences, rates = list[float](), list[Vec3](), list[Array]()
+    number = None
+    for begin, end in flight.airborne:
+        attitude_s, attitude = flight.attitude_stamp_s[begin:end], np.unwrap(flight.attitude_rad[begin:end], axis=0)
+        # Not the gyroscopes' rate, whose vibration would make the delay too small.
+        rate_rad_s = _rate(attitude_s, attitude)
+        for (i, _, _), stamp_s, rate in zip(flight.rows(begin, end), attitude_s, rate_rad_s, strict=True):
+            pose, vehicle = i.mocap, i.vehicle
+            if pose is None or vehicle is None or not pose.tracking_valid or pose.frame_number == number:
+                continue
+            number = pose.frame_number
+            roll, pitch, _ = _small_angle(vehicle.attitude_wxyz, pose.attitude_wxyz)
+            # The pose is compared with the attitude at the time of its own arrival.
+            ahead_s = stamp_s - pose.stamp_s
+            stamps.append(pose.stamp_s)
+            rates.append(rate[:2])
+            differences.append((roll + ahead_s * rate[0], pitch + ahead_s * rate[1], 0.0))
+    if len(stamps) < 400:
+        how = "PX4 got its poses from another program, or motion capture was lost; fly with motion capture"
+        return Quantity(key, title, "ms", 1, how, scale=1e3)
+    width = max(3, round(_SLOW_S / float(np.median(np.diff(stamps)))))
+    y, x = _without_mean(np.array(differences)[:, :2], width), _without_mean(np.array(rates), width)
+    rate_rms = float(np.sqrt(np.mean(x**2)))
+    scores = []
+    power = float(np.sum(x * x))
+    delay_s = -float(np.sum(x * y)) / power
+    for axis in range(2):
+        scores.append(x[:, axis] * (y[:, axis] + delay_s * x[:, axis]))
+    variance = sum(float(long_run(score[:, None], width)[0, 0]) for score in scores) / power**2
+    sigma = combined(math.sqrt(max(0.0, variance)), _DELAY_SIGMA_S)
+    if sigma > _DELAY_SIGMA_MAX_S or rate_rms < _RATE_MIN_RAD_S:
+        how = f"the attitude moved by {math.degrees(rate_rms):.1f} deg/s (RMS); companion latency measures it by taps"
+        return Quantity(key, title, "ms", 1, how, scale=1e3)
+    seen = f"lag of the poses behind PX4's attitude, {1e3 * delay_s:.1f} ± {1e3 * SIGMAS_95 * sigma:.1f} ms"
+    latencies = [i.mocap.latency_s for i in flight.log.inputs if i.mocap is not None and i.mocap.latency_s is not None]
+    if not latencies:
+        return Quantity(key, title, "ms", 1, seen, delay_s, sigma, "lab 5 ms", 1e3)
+    middle_s = float(np.median(latencies))
+    spread_s = 1.4826 * float(np.median(np.abs(np.array(latencies) - middle_s)))
+    how = f"the server's stamps, without the network; {seen}"
+    return Quantity(key, title, "ms", 1, how, middle_s, combined(spread_s, _SERVER_SIGMA_S), "lab 5 ms", 1e3)
+
+
+def _rate(t_s: Array, attitude_rad: Array) -> Array:
+    """Return the rates of roll, pitch and yaw, rad/s, from differences over `_RATE_OVER` ticks to both sides."""
+    ahead = np.minimum(np.arange(len(t_s)) + _RATE_OVER, len(t_s) - 1)
+    behind = np.maximum(np.arange(len(t_s)) - _RATE_OVER, 0)
+    since_s = np.maximum(t_s[ahead] - t_s[behind], 1e-3)
+    return np.asarray((attitude_rad[ahead] - attitude_rad[behind]) / since_s[:, None], dtype=np.float64)
+
+
+def _small_angle(a: Quat, b: Quat) -> tuple[float, float, float]:
+    """Return the rotation from attitude a to attitude b, which is small, in a's axes, rad."""
+    w, x, y, z = quat_multiply(quat_conjugate(a), b)
+    k = 2.0 if w >= 0.0 else -2.0
+    return k * x, k * y, k * z
+
+
+def _without_mean(values: Array, width: int) -> Array:
+    kernel = np.ones(width) / width
+    mean = np.stack([np.convolve(values[:, axis], kernel, mode="same") for axis in range(values.shape[1])], axis=1)
+    return np.asarray((values - mean)[width:-width], dtype=np.float64)
