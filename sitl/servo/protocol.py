@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 
+from fastcrc.crc16 import umts as crc16
+
 HEADER = b"\xff\xff\xfd\x00"
 BROADCAST_ID = 0xFE
 MAX_ID = 252
@@ -51,26 +53,6 @@ class StatusError(IntEnum):
 
 ALERT = 0x80
 """Bit 7 of the error byte: register 70 is not zero."""
-
-
-def _crc_table() -> tuple[int, ...]:
-    table = []
-    for byte in range(256):
-        crc = byte << 8
-        for _ in range(8):
-            crc = ((crc << 1) ^ 0x8005 if crc & 0x8000 else crc << 1) & 0xFFFF
-        table.append(crc)
-    return tuple(table)
-
-
-_CRC_TABLE = _crc_table()
-
-
-def crc16(data: bytes | bytearray, crc: int = 0) -> int:
-    """Return the CRC-16 of `data` (polynomial 0x8005, most significant bit first), continued from `crc`."""
-    for byte in data:
-        crc = ((crc << 8) & 0xFFFF) ^ _CRC_TABLE[(crc >> 8) ^ byte]
-    return crc
 
 
 def stuff(body: bytes) -> bytes:
