@@ -100,7 +100,7 @@ BAD_MISSION = [
         "type: takeoff ",
         "type: takeof ",
         [
-            f'{CATCH}:29:11: phases[0].type: expected one of approach, arm, detach, hold, land, line, path, press, takeoff, got "takeof" '
+            f'{CATCH}:29:11: phases[0].type: expected one of approach, arm, detach, hold, land, line, path, press, probe, takeoff, got "takeof" '
             "(did you mean takeoff?)"
         ],
     ),
