@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,8 @@ from companion.model.types import ContactMode, ContactState, Vec3
 
 SETTLED_S = 1.5
 """Time after the end of the force's ramp from which the force counts as steady."""
+PROBE = "probe.csv"
+"""Name of the file with the touched points in the folder of a flight."""
 PLANE_M = 0.05
 """Extent of the touched points, in both directions, from which the surface's normal is fitted to them."""
 
@@ -99,6 +103,31 @@ def contact_lines(summary: dict[str, Any]) -> list[tuple[str, str]]:
     if contact["path_rms_m"] is not None:
         text += f", tip within {1e3 * contact['path_rms_m']:.0f} mm (RMS) of its path"
     return [*lines, ("surface", text)]
+
+
+def write_probe(log: FlightLog, path: Path) -> None:
+    """Write the points at which a flight has touched surfaces to find them as CSV, a line for each; no file without such points.
+
+    The point lies on the surface; `residual_mm` is its distance from the plane through the points, positive outside the surface, and
+    empty if no plane was found.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    contacts = {o.contact.points[0]: o.contact for o in log.outputs if o.contact is not None and o.contact.points}
+    if not contacts:
+        return
+    radius_m = _radius_m(log)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(("t_s", "x_m", "y_m", "z_m", "force_n", "residual_mm"))
+        for contact in contacts.values():
+            found = contact.surface
+            normal = -np.array(contact.direction_world) if found is None else np.array(found.normal_world)
+            for point in contact.points:
+                at = np.array(point.tip_world_m) - radius_m * normal
+                off = "" if found is None else f"{1e3 * float((at - found.point_world_m) @ normal):.2f}"
+                rows.writerow((f"{point.t_s:.3f}", *(f"{x:.4f}" for x in at), f"{point.force_n:.2f}", off))
 
 
 def presses(state: ContactState) -> bool:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from companion import DISTRIBUTION
-from companion.analysis.contact import contact_lines
+from companion.analysis.contact import PROBE, contact_lines, write_probe
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.summary import summarise, write_summary
 from companion.campaigns.runner import to_json
@@ -167,6 +167,7 @@ def _one(path: Path, arguments: argparse.Namespace) -> int:
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_summary(flight.summary, out / "summary.json")
+        write_probe(flight.log, out / PROBE)
         report = report_of(flight.log, flight.summary, out)
     except OSError as error:
         raise _unwritable(out, error) from None

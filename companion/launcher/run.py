@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
-from companion.analysis.contact import contact_lines
+from companion.analysis.contact import PROBE, contact_lines, write_probe
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.summary import empty_summary, summarise, write_summary
 from companion.launcher.launcher import FlightResult, Launcher, Sitl, landing_signals
@@ -91,6 +91,8 @@ def _summary(config: SitlConfig, result: FlightResult, out: Path) -> tuple[Fligh
     summary["events"] += [event for event in result.events if event["id"] not in logged]
     summary["events"] += result.guardian_events
     write_summary(summary, out / "summary.json")
+    if log is not None:
+        write_probe(log, out / PROBE)
     return log, summary
 
 

@@ -107,7 +107,7 @@ BAD_MISSION = [
     (
         "type: takeoff               # 0.0 s\n    height_m: 1.0",
         "height_m: 1.0",
-        [f"{CATCH}:29:5: phases[0].type: missing; expected one of approach, arm, detach, hold, land, line, path, press, takeoff"],
+        [f"{CATCH}:29:5: phases[0].type: missing; expected one of approach, arm, detach, hold, land, line, path, press, probe, takeoff"],
     ),
     ("  - type: land                  # 18.0 s\n    speed_m_s: 0.35\n", "", [f"{CATCH}:51:11: phases[5].type: the last phase must be of type land"]),
     (

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from companion.analysis.contact import contact_lines, contact_summary
+from companion.analysis.contact import PROBE, contact_lines, contact_summary, write_probe
 from companion.analysis.contact_plots import contact_force, contact_path
 from companion.analysis.log import FlightLog
 from companion.core.flight_core import FlightCore
@@ -236,3 +237,22 @@ def test_a_force_that_is_too_high_leads_away_from_the_wall() -> None:
 def test_the_check_refuses_what_cannot_press(changes: dict[str, object], text: str) -> None:
     config = load_sitl(PRESS, overrides=[f"{key}={json.dumps(value)}" for key, value in changes.items()])
     assert any(text in problem for problem in check_mission(config.mission, config.vehicle))
+
+
+def test_a_probe_finds_the_surface_and_writes_its_points(tmp_path: Path) -> None:
+    wall = WALL | {"tilt_error_deg": [9.0, -7.0], "place_error_m": 0.03, "friction": 0.15}
+    grid = ["mission.phases[3].rows=2", "mission.phases[3].columns=2"]
+    flight = FastFlight(load_sitl("probe", world="ideal", overrides=[f"world.surfaces={json.dumps([wall])}", *grid]))
+    result = flight.run(120.0)
+    assert result.outputs[-1].outcome is Outcome.COMPLETED and events(result).count("touched") == 4
+    log: FlightLog = row_of(flight.config.flight, result, None)[1]
+    summary = contact_summary(log)
+    assert summary is not None and flight.plant.world.surfaces is not None
+    placed, found = flight.plant.world.surfaces.placed[0], summary["surface"]
+    assert abs(placed.local_m(tuple(found["point_m"]))[2]) < 0.003
+    assert np.degrees(np.arccos(np.dot(found["normal"], placed.normal))) < 0.7
+    write_probe(log, tmp_path / PROBE)
+    head, *points = (tmp_path / PROBE).read_text().splitlines()
+    assert head == "t_s,x_m,y_m,z_m,force_n,residual_mm" and len(points) == 4
+    x, y, z, _, residual_mm = map(float, points[2].split(",")[1:])
+    assert abs(placed.local_m((x, y, z))[2]) < 0.004 and abs(residual_mm) < 3.0
