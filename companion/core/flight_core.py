@@ -24,7 +24,7 @@ from companion.model import flight_stage as seq
 from companion.model.best_pose import pose_used_s
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.flight_stage import Stage
-from companion.model.types import ControlLog, Event, Inputs, Outputs, PhaseKind, Reference
+from companion.model.types import ControlLog, Event, Inputs, Outputs, PhaseKind, Reference, Vec3
 from companion.safety import notices
 from companion.safety.gate import ARM_FRESH_S, Gate, Refusal
 from companion.safety.governor import Governor
@@ -40,7 +40,7 @@ _DT_MAX_S: Final = 0.05
 _PLAN: Final = Stage.PLAN
 _SPOOL: Final = Stage.SPOOL
 _TOUCHDOWN: Final = Stage.TOUCHDOWN
-_NO_ERROR: Final = (0.0, 0.0, 0.0)
+_NO_ERROR: Vec3 = (0.0, 0.0, 0.0)
 
 
 class FlightCore:
