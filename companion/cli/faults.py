@@ -9,7 +9,7 @@ from typing import Any
 
 from companion.analysis.table import for_terminal
 from companion.campaigns.faults.campaign import Faults, kinds_list, kinds_table
-from companion.campaigns.faults.variants import WIRES, planned
+from companion.campaigns.faults.variants import WIRES, planned, touches
 from companion.cli.campaign import add_options, checked, common, fly, names, wide_console
 from companion.cli.options import MISSION_OR_DEFAULT_HELP, add_seed
 from companion.config.document import ConfigError
@@ -17,7 +17,10 @@ from companion.config.explain import nearest
 from companion.config.shipped import DEFAULT_MISSION
 from companion.model.exit_codes import EXIT_OK
 from companion.runtime.console import print_error
-from companion.sitl_config.faults import KINDS, PHASES, absent_part
+from companion.sitl_config.faults import CONTACT_PHASES, KINDS, PHASES, absent_part
+from companion.sitl_config.loader import COMMAND_LINE_WORLD
+
+CONTACT_MISSION, CONTACT_WORLD = "press", "wall"
 
 
 def add_parser(commands: Any) -> None:
@@ -36,8 +39,9 @@ def add_parser(commands: Any) -> None:
     kinds = _known(tuple(KINDS), "kind of fault")
     parser.add_argument("--kinds", type=kinds, default=(), metavar="KIND,...", help="default: all; see --list")
     parser.add_argument(
-        "--phases", type=_known(PHASES, "phase"), default=(), metavar="PHASE,...",
-        help=f"phases from {', '.join(PHASES)}; default: all",
+        "--phases", type=_known((*PHASES, *CONTACT_PHASES), "phase"), default=(), metavar="PHASE,...",
+        help=f"phases from {', '.join(PHASES)}; default: all of these. Or from {', '.join(CONTACT_PHASES)}, flown with the mission "
+        f"{CONTACT_MISSION} in the world {CONTACT_WORLD} unless others are given",
     )  # fmt: skip
     parser.add_argument(
         "--wires",
@@ -79,6 +83,18 @@ def _campaign(arguments: argparse.Namespace) -> Faults:
     Raises:
         ConfigError: one line per problem; also if there is no fault to fly.
     """
+    if touches(arguments.phases):
+        if not set(arguments.phases) <= set(CONTACT_PHASES):
+            raise ConfigError(
+                [
+                    f"companion faults: --phases: {', '.join(CONTACT_PHASES)} need a mission with a contact, got other phases as well; "
+                    "fly two campaigns"
+                ]
+            )
+        if arguments.mission == DEFAULT_MISSION:
+            arguments.mission = CONTACT_MISSION
+        if arguments.world == COMMAND_LINE_WORLD:
+            arguments.world = CONTACT_WORLD
     flights = planned(arguments.kinds, arguments.phases, wires=arguments.wires)
     if not flights:
         where = " with --wires" if arguments.wires else ""

@@ -131,6 +131,10 @@ class VehicleControl:
         self._arm_target_rad = towards(now, self.fold_rad, FOLD_RATE_RAD_S * dt_s)
         return Command(attitude=None, arm_torque_nm=self._hold(i))
 
+    def hold_arm(self, i: Inputs) -> Command:
+        """Return the command that keeps the arm where it was in flight, without an attitude setpoint."""
+        return Command(attitude=None, arm_torque_nm=self._hold(i))
+
     def _hold(self, i: Inputs) -> Joints | None:
         if i.arm is None or i.vehicle is None:
             return None

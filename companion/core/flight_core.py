@@ -252,13 +252,21 @@ class FlightCore:
         if stage is Stage.STAND_DOWN and self._state.armed_by_others:
             return msgspec.structs.replace(self._control.wait(i), attitude=None)
         if stage is Stage.AUTOPILOT_LAND:
-            folding = self._control.fold(i, dt_s)
+            # While PX4 lands, the tool keeps the rotors away from a surface.
+            folding = self._control.hold_arm(i) if self._is_tool_a_bumper(i) else self._control.fold(i, dt_s)
             return (
                 msgspec.structs.replace(folding, attitude=self._control.level(i))
                 if self._state.zero_thrust
                 else folding
             )
         return self._control.wait(i)
+
+    def _is_tool_a_bumper(self, i: Inputs) -> bool:
+        """Return whether the tool may touch a surface and does not touch the floor before the landing gear."""
+        if self._state.contact is None or i.arm is None:
+            return False
+        z_m = self._parameters.manipulator.net_body_m(i.arm.angle_rad)[2]
+        return z_m - self._vehicle.tip_radius_m > -self._vehicle.airframe.ground_clearance_m
 
     def _watch_for_catch(self, t_s: float, log: ControlLog, events: list[Event]) -> None:
         caught_s, start_s = self._control.catch_s(t_s, log), self._state.mission_start_s

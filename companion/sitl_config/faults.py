@@ -46,6 +46,9 @@ FaultKind = Literal[
     "payload_double",
     "payload_dropped",
     "payload_heavy",
+    "surface_gone",
+    "surface_slippery",
+    "tool_broken",
     "disk_full",
     "clock_step",
     "stall_loop",
@@ -56,8 +59,10 @@ FaultKind = Literal[
     "kill_guardian",
     "pilot_takeover",
 ]
-FlightPhase = Literal["ground", "takeoff", "line", "catch", "return", "landing"]
-PHASES: tuple[FlightPhase, ...] = get_args(FlightPhase)
+FlightPhase = Literal["ground", "takeoff", "line", "catch", "return", "landing", "touch", "press", "detach"]
+CONTACT_PHASES: tuple[FlightPhase, ...] = ("touch", "press", "detach")
+"""Phases of a mission that presses on a surface."""
+PHASES: tuple[FlightPhase, ...] = tuple(phase for phase in get_args(FlightPhase) if phase not in CONTACT_PHASES)
 IN_FLIGHT: tuple[FlightPhase, ...] = PHASES[1:]
 
 
@@ -95,6 +100,7 @@ _PULLED = (
 )  # fmt: skip
 _WEAK = ("thrust_saturated", "tracking_warn", "tracking_hold", "tracking_error", "sinks_too_fast", "tilt", "crashed")
 _GUARDIAN = ("guardian_took_over",)
+_CONTACT_ENDS = ("contact_disagrees", "contact_lost", "contact_interrupted", "contact_slipped", "surface_missing")
 
 KINDS: dict[FaultKind, Kind] = {
     "mocap_loss": Kind("no frame leaves the motion-capture computer", named_by=_MOCAP_GONE),
@@ -172,14 +178,14 @@ KINDS: dict[FaultKind, Kind] = {
         default=0.3,
         named_by=_ARM_GONE,
     ),
-    "force_loss": Kind("the force sensor stops sending", named_by=("force_lost",)),
-    "force_stuck": Kind("the force sensor repeats its last reading", named_by=("force_stuck",)),
+    "force_loss": Kind("the force sensor stops sending", named_by=("force_lost", "contact_lost")),
+    "force_stuck": Kind("the force sensor repeats its last reading", named_by=("force_stuck", "contact_lost")),
     "force_bias": Kind(
         what="the force sensor's zero shifts",
         size="shift of each axis",
         unit="N",
         default=4.0,
-        named_by=("force_drift", "force_overload", "tether_snagged", "tether_taut", "catch"),
+        named_by=("force_drift", "force_overload", "tether_snagged", "tether_taut", "catch", *_CONTACT_ENDS),
         signed=True,
     ),
     "motor_weak": Kind(
@@ -193,11 +199,11 @@ KINDS: dict[FaultKind, Kind] = {
         named_by=("battery_voltage", *_WEAK),
     ),
     "gust": Kind(
-        what="a wind blows away from the tether's anchor",
+        what="a wind blows away from the tether's anchor, or into the world's first surface",
         size="speed",
         unit="m/s",
         default=6.0,
-        named_by=(*_WEAK, "too_fast", "geofence_near", "tether_short"),
+        named_by=(*_WEAK, *_CONTACT_ENDS, "contact_force_high", "too_fast", "geofence_near", "tether_short"),
     ),
     "tether_taut": Kind(
         what="the tether jams: its free length cannot grow",
@@ -239,6 +245,15 @@ KINDS: dict[FaultKind, Kind] = {
         named_by=("catch", "servo_overload", *_WEAK),
         phases=("catch",),
     ),
+    "surface_gone": Kind("the surfaces give way at once", named_by=_CONTACT_ENDS, phases=CONTACT_PHASES),
+    "surface_slippery": Kind(
+        what="the friction of the surfaces changes",
+        size="coefficient of friction",
+        default=0.05,
+        named_by=_CONTACT_ENDS,
+        phases=CONTACT_PHASES,
+    ),
+    "tool_broken": Kind("the rod or brush breaks off", named_by=_CONTACT_ENDS, phases=CONTACT_PHASES),
     "disk_full": Kind("the log can no longer be written", named_by=("recorder_drops",), process=True),
     "clock_step": Kind(
         what="the clock of the motion-capture computer jumps",
@@ -279,6 +294,8 @@ def absent_part(kind: FaultKind, vehicle: Vehicle) -> str | None:
         return "arm"
     if kind.startswith("payload_") and not vehicle.has_net:
         return "tool (a net)"
+    if kind == "tool_broken" and (vehicle.tool is None or vehicle.has_net):
+        return "tool (a rod or a brush)"
     return None
 
 
@@ -288,10 +305,11 @@ class Fault(Model):
     kind: FaultKind
     t_s: NonNegative | None = None
     """Time from the event in `after` to the start of the fault. If it is absent, `phase` determines the start."""
-    after: Literal["start", "arming", "catch"] = "arming"
-    """Event from which `t_s` counts: the start of the world, arming or the catch."""
+    after: Literal["start", "arming", "catch", "touch"] = "arming"
+    """Event from which `t_s` counts: the start of the world, arming, the catch or the first touch of a surface."""
     phase: FlightPhase | None = None
-    """Alternative to `t_s`: the fault starts in the middle of this part of the mission, or just after the catch."""
+    """Alternative to `t_s`: the fault starts in the middle of this part of the mission, or just after the catch. `touch`, `press`
+    and `detach` are parts of a contact with a surface and count from its first touch."""
     duration_s: Positive | None = None
     """Duration. If it is absent, the fault is permanent."""
     size: float | None = Field(default=None)

@@ -90,6 +90,8 @@ def _faults_of_absent_parts(world: World, vehicle: Vehicle) -> Iterator[str]:
     """Yield one message for each fault that acts on a part or a servo which the vehicle does not have."""
     servos = len(vehicle.arm.joints)
     for number, fault in enumerate(world.faults):
+        if fault.kind.startswith("surface_") and not world.surfaces:
+            yield f"world.faults[{number}].kind: {fault.kind} needs world.surfaces, but the world has none; try --world wall"
         key = absent_part(fault.kind, vehicle)
         if key is not None:
             yield (

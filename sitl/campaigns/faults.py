@@ -5,6 +5,7 @@ A flight is {kind, size, duration_s, phase}: the fields of `companion.campaigns.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from companion.campaigns.faults.judge import FaultFlight, Point, row_of, ticks_of
@@ -59,7 +60,7 @@ def record_of(flown: Flown) -> FaultFlight:
             caught=False,
             error=flown.error,
         )
-    tether, layout = fast.config.vehicle.tether, result.layout
+    tether, layout, touches = fast.config.vehicle.tether, result.layout, bool(fast.config.world.surfaces)
     assert layout is not None
 
     def point(snapshot: Snapshot) -> Point:
@@ -72,6 +73,7 @@ def record_of(flown: Flown) -> FaultFlight:
             tilt_rad=tilt_rad(attitude),
             slack_m=slack_m,
             tension_n=abs(layout.tension_n(snapshot.sensors)),
+            contact_n=math.hypot(*layout.contact(snapshot.sensors)[1]) if touches else 0.0,
         )
 
     # A flight process that stalls leaves snapshots between its ticks.

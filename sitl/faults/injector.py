@@ -24,6 +24,7 @@ from sitl.autopilot.modes import NavState
 from sitl.servo.drive import COUNTS_PER_TURN, ServoDrive
 from sitl.world.model import SECOND, SECOND_CATCH
 from sitl.world.payload import Ball
+from sitl.world.surfaces import Surfaces
 from sitl.world.world import World
 
 CELL_FULL_V: Final = 4.15
@@ -117,7 +118,11 @@ class Faults:
             armed_t_s: world time of arming, or None.
         """
         self._now_s = t_s
-        origins = {"start": 0.0, "arming": armed_t_s, "catch": self._world.payload.caught_t_s}
+        surfaces = self._world.surfaces
+        touched_s = surfaces.touched_s if surfaces is not None else None
+        origins = {
+            "start": 0.0, "arming": armed_t_s, "catch": self._world.payload.caught_t_s, "touch": touched_s,
+        }  # fmt: skip
         for index, fault in enumerate(self._faults):
             origin_s = origins[fault.after]
             assert fault.t_s is not None
@@ -177,6 +182,14 @@ class Faults:
                 world.payload.throw(self._second)
             case "payload_dropped" if on:
                 world.payload.drop()
+            case "surface_gone" if on:
+                for number in range(len(self._surfaces.placed)):
+                    self._surfaces.give_way(number)
+            case "surface_slippery":
+                for number, placed in enumerate(self._surfaces.placed):
+                    self._surfaces.set_friction(number, size if on else placed.config.friction)
+            case "tool_broken" if on:
+                self._surfaces.break_tool()
             case "servo_overload" if on:
                 self._shut_down_servo(fault.servo - 1, OVERLOAD)
             case "servo_hot":
@@ -207,6 +220,12 @@ class Faults:
             case _:
                 pass
 
+    @property
+    def _surfaces(self) -> Surfaces:
+        surfaces = self._world.surfaces
+        assert surfaces is not None, "refused when the configuration is loaded"
+        return surfaces
+
     def _set_rotor_share(self) -> None:
         weak, sag = self.active.get("motor_weak"), self.active.get("battery_sag")
         self.sag_v = sag.magnitude if sag is not None else 0.0
@@ -216,7 +235,11 @@ class Faults:
         self._world.rotor_share = None if min(share) == 1.0 else share
 
     def _set_gust(self, speed_m_s: float) -> None:
-        """Add wind away from the tether's anchor, or without a tether away from the world's origin."""
+        """Add wind into the first surface; without one away from the tether's anchor, or without a tether from the world's origin."""
+        if self._world.surfaces is not None:
+            (nx, ny, nz), (wx, wy, wz) = self._world.surfaces.placed[0].normal, self._wind_m_s
+            self._world.wind_m_s = (wx - speed_m_s * nx, wy - speed_m_s * ny, wz - speed_m_s * nz)
+            return
         ax, ay = self._tether.anchor_world_m[0:2] if self._tether is not None else (0.0, 0.0)
         x, y = self._world.q[0] - ax, self._world.q[1] - ay
         away_m = math.hypot(x, y) or 1.0
@@ -298,6 +321,8 @@ class Sample:
     slack_m: float | None
     """Slack of the tether, computed with its present length; None without a tether."""
     tension_n: float
+    contact_n: float
+    """Force of a surface on the tip."""
 
 
 def sample(world: World, tether: Tether | None) -> Sample:
@@ -312,4 +337,5 @@ def sample(world: World, tether: Tether | None) -> Sample:
         tilt_rad=tilt_rad((attitude[0], attitude[1], attitude[2], attitude[3])),
         slack_m=slack_m,
         tension_n=world.layout.tension_n(world.sensors()),
+        contact_n=math.hypot(*world.layout.contact(world.sensors())[1]) if world.surfaces is not None else 0.0,
     )

@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from companion.config.mission import Press
 from companion.mission.plan import Plan
 from companion.mission.segments import Segment
 from companion.model.flight_stage import SPOOL_S
 from companion.model.types import PhaseKind
-from companion.sitl_config.faults import Fault, FaultKind, FlightPhase
+from companion.sitl_config.faults import CONTACT_PHASES, Fault, FaultKind, FlightPhase
 from companion.sitl_config.loader import SitlConfig
 
 AFTER_CATCH_S = 0.1
 """Time from the catch to a fault in phase "catch"."""
 REBOOT_ON_GROUND_S = 1.3
 """World time of a PX4 reboot in phase "ground": after PX4's first boot."""
+INTO_DETACH_S = 0.3
+"""Time from the end of the press to a fault in phase "detach"."""
 _ALONG_M = 0.3
 _EARLY_IN_LINE, _MIDDLE = 0.35, 0.5
 _FROM_START: frozenset[FaultKind] = frozenset({"payload_missed", "payload_heavy"})
@@ -48,10 +51,27 @@ def _timed(fault: Fault, config: SitlConfig) -> Fault:
         return fault.model_copy(update={"after": "start", "t_s": t_s, "phase": None})
     if fault.phase is None:
         return fault
+    if fault.phase in CONTACT_PHASES:
+        t_s = round(_after_touch_s(fault.phase, config), 3)
+        return fault.model_copy(update={"after": "touch", "t_s": t_s, "phase": None})
     if fault.phase == "catch" and config.world.payload_kg > 0:
         return fault.model_copy(update={"after": "catch", "t_s": AFTER_CATCH_S, "phase": None})
     t_s = round(SPOOL_S + _plan_time_s(fault.phase, config), 3)
     return fault.model_copy(update={"after": "arming", "t_s": t_s, "phase": None})
+
+
+def _after_touch_s(phase: FlightPhase, config: SitlConfig) -> float:
+    """Return the time since the first touch: at once, in the middle of the press, or just after it."""
+    phases = config.mission.phases
+    pressing_s = [
+        segment.end_s - segment.start_s
+        for segment in Plan.build(config.mission, config.vehicle).segments
+        if segment.index >= 0 and isinstance(phases[segment.index], Press)
+    ]
+    if not pressing_s:
+        text = f"world.faults: mission '{config.mission.name}' has no phase '{phase}'; give t_s instead of the phase"
+        raise FaultError(text)
+    return {"touch": 0.0, "press": _MIDDLE * pressing_s[0]}.get(phase, pressing_s[0] + INTO_DETACH_S)
 
 
 def _plan_time_s(phase: FlightPhase, config: SitlConfig) -> float:

@@ -33,6 +33,7 @@ _DAMPED_KG = 1.0
 _WATCH_STEPS = 5
 """Physics steps between two measurements of the rotors' distance, and between two samples of the contact force."""
 _RIM_POINTS = 36
+_NO_MASS_KG = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +139,8 @@ class Surfaces:
         """Whether each surface has given way."""
         self.touches = 0
         """Number of touches of any surface by the tip."""
+        self.touched_s: float | None = None
+        """World time of the first touch; None before it."""
         self.force_max_n = 0.0
         """Largest contact force."""
         self._forces_n: list[Vec3] = []
@@ -169,6 +172,18 @@ class Surfaces:
         self.gone[number] = True
         self._model.geom_pos[self._geoms[number]] = (0.0, 0.0, -100.0)
 
+    def break_tool(self) -> None:
+        """Remove the rod or brush: its mass, and its tip, which touches the surfaces."""
+        model = self._model
+        tip = model.geom("tip").id
+        model.geom_pos[tip] = (0.0, 0.0, -100.0)
+        model.geom_sameframe[tip] = (
+            mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        )  # or MuJoCo takes the body's place for the geom's
+        rod = model.body("net").id
+        model.body_mass[rod] = _NO_MASS_KG
+        model.body_inertia[rod] *= 0.0
+
     def step(self, world: World) -> None:
         """Watch the contact and the rotors."""
         tip_m, force_n = world.layout.contact(world.sensors())
@@ -176,6 +191,7 @@ class Surfaces:
         if size_n > 0.0:
             if world.t_s - self._last_touch_s > APART_S:
                 self.touches += 1
+                self.touched_s = world.t_s if self.touched_s is None else self.touched_s
                 world.report("touched")
             self._last_touch_s = world.t_s
             self.force_max_n = max(self.force_max_n, size_n)

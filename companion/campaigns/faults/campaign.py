@@ -147,6 +147,8 @@ def flights_table(rows: Sequence[Row], *, details: bool = False) -> Table:
         value("slack m", "min_slack_m", ".2f"),
         value("drift m", "drift_m", ".2f"),
     ]
+    if any(row["contact_n"] is not None for row in rows):
+        columns.append(value("force N", "contact_n", ".1f"))
     if details:
         columns.append(
             Column(

@@ -19,7 +19,7 @@ from companion.sitl_config.faults import KINDS, FaultKind, FlightPhase
 
 COLUMNS = (
     "fault", "phase", "size", "unit", "duration_s", "outcome", "detected_s", "event", "reacted_s", "action", "worst_tilt_deg",
-    "min_height_m", "min_slack_m", "drift_m", "caught", "problems", "events", "error",
+    "min_height_m", "min_slack_m", "drift_m", "contact_n", "caught", "problems", "events", "error",
 )  # fmt: skip
 GOOD = ("completed", "landed")
 TAUT_N = 0.5
@@ -30,6 +30,8 @@ OUTWARD_M = 0.15
 HARD_M_S = 1.8
 """Sink rate at the floor above which a landing counts as a crash."""
 NEAR_FLOOR_M = 0.1
+CONTACT_MEAN_S = 0.1
+"""Time over which the contact force is averaged, as long as the supervisor's rule must hold."""
 _PULLS_BY_ITSELF: frozenset[FaultKind] = frozenset({"tether_taut", "tether_snag"})
 
 
@@ -44,6 +46,8 @@ class Point:
     slack_m: float | None
     """Slack of the tether with its configured length; None without a tether."""
     tension_n: float
+    contact_n: float = 0.0
+    """Force of a surface on the tip."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +125,7 @@ def row_of(variant: Variant, phase: FlightPhase, flown: FaultFlight, vehicle: Ve
         "min_height_m": _min_height_m(flown, course),
         "min_slack_m": min((point.slack_m for point in course if point.slack_m is not None), default=None),
         "drift_m": _drift_m(flown, course, abort) if outcome != "refused" else None,
+        "contact_n": _contact_n(course),
         "caught": flown.caught,
         "problems": [],
         "events": list(dict.fromkeys(event.id for event in since)),
@@ -183,6 +188,21 @@ def _drift_m(flown: FaultFlight, course: Sequence[Point], abort: Event | None) -
     return worst
 
 
+def _contact_n(course: Sequence[Point]) -> float | None:
+    """Return the largest mean of the contact force over `CONTACT_MEAN_S`; None without a contact."""
+    if not any(point.contact_n for point in course):
+        return None
+    largest_n, first, impulse_ns = 0.0, 0, 0.0
+    spans_s = [0.0, *(b.t_s - a.t_s for a, b in itertools.pairwise(course))]
+    for last, point in enumerate(course):
+        impulse_ns += point.contact_n * spans_s[last]
+        while point.t_s - course[first].t_s > CONTACT_MEAN_S:
+            first += 1
+            impulse_ns -= course[first].contact_n * spans_s[first]
+        largest_n = max(largest_n, impulse_ns / CONTACT_MEAN_S)
+    return largest_n
+
+
 def _problems(
     row: Row, variant: Variant, phase: FlightPhase, course: Sequence[Point], abort: Event | None, vehicle: Vehicle
 ) -> list[str]:
@@ -198,6 +218,9 @@ def _problems(
         found.append("pulled its tether taut by its own motion")
     elif variant.kind == "tether_taut" and abort is not None and _outward_m(course, abort) > OUTWARD_M:
         found.append("moved outward on a taut tether")
+    force_max_n = vehicle.safety.contact_force_max_n
+    if (row["contact_n"] or 0.0) > force_max_n:
+        found.append(f"pressed with {row['contact_n']:.1f} N (limit {force_max_n:g} N)")
     if any(_outside(point.position_world_m, vehicle) for point in course):
         found.append("left the geofence")
     return found

@@ -144,9 +144,14 @@ def flown(folder: Path, config: FlightConfig) -> FaultFlight:
     offset_s = _offset_s(log.inputs if log is not None else (), world["mocap_frames"], begun_s or 0.0)
     course = [
         Point(
-            t_s=t_s + offset_s, position_world_m=(x, y, z), tilt_rad=tilt_rad, slack_m=slack_m, tension_n=abs(tension_n)
+            t_s=t_s + offset_s,
+            position_world_m=(x, y, z),
+            tilt_rad=tilt_rad,
+            slack_m=slack_m,
+            tension_n=abs(tension_n),
+            contact_n=contact_n,
         )
-        for t_s, (x, y, z), tilt_rad, slack_m, tension_n in world["course"]
+        for t_s, (x, y, z), tilt_rad, slack_m, tension_n, contact_n in world["course"]
     ]
     low_m = config.vehicle.airframe.ground_clearance_m + HEIGHT_MARGIN_M
     landed = bool(course) and course[-1].position_world_m[2] < low_m and not world["armed"]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from companion.sitl_config.faults import KINDS, PHASES, FaultKind, FlightPhase
+from companion.sitl_config.faults import CONTACT_PHASES, KINDS, PHASES, FaultKind, FlightPhase
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +126,28 @@ WIRES: tuple[tuple[Variant, FlightPhase], ...] = (
 """Faults of `--wires`, flown over the real protocols."""
 
 
+CONTACT: tuple[Variant, ...] = (
+    *_durations("mocap_loss", None),
+    *_durations("link_loss", None),
+    *_durations("force_loss", None),
+    *_durations("force_stuck", None),
+    *_sizes("force_bias", 3.0, -3.0),
+    *_sizes("gust", 3.0, duration_s=2.0),
+    *_durations("surface_gone", None),
+    *_sizes("surface_slippery", 0.05),
+    *_durations("tool_broken", None),
+    *_durations("kill_flight", None),
+)
+"""Faults of a campaign in each phase of a contact with a surface."""
+
+CONTACT_WIRES: tuple[tuple[Variant, FlightPhase], ...] = ((Variant("kill_flight"), "press"),)
+
+
+def touches(phases: Sequence[str]) -> bool:
+    """Return whether one of these phases is part of a contact with a surface."""
+    return any(phase in CONTACT_PHASES for phase in phases)
+
+
 def planned(kinds: Sequence[str], phases: Sequence[str], *, wires: bool = False) -> list[tuple[Variant, FlightPhase]]:
     """Return the faults to fly, in the order of the table.
 
@@ -133,9 +155,11 @@ def planned(kinds: Sequence[str], phases: Sequence[str], *, wires: bool = False)
         kinds: requested kinds; empty for all.
         phases: requested phases; empty for all. If kinds and phases are both requested, each kind is flown in each phase, even in
             one that campaigns normally leave out.
-        wires: whether to choose from `WIRES`.
+        wires: whether to choose from `WIRES`, or from `CONTACT_WIRES`.
     """
-    if wires:
+    if touches(phases):
+        everything = list(CONTACT_WIRES) if wires else [(v, phase) for v in CONTACT for phase in CONTACT_PHASES]
+    elif wires:
         everything = list(WIRES)
     else:
         asked = bool(kinds and phases)
