@@ -9,7 +9,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # All targets run the source, also after make compile.
 export PYTHONPATH := $(CURDIR)
 
-.PHONY: install lock audit fly compile test lint explore debian bench docs clean
+.PHONY: install lock audit fly press compile test lint explore debian bench docs clean
 
 install: $(STAMP)
 
@@ -39,6 +39,9 @@ audit:
 
 fly: install
 	@$(BIN)/companion fly configs/missions/catch.yaml --sitl
+
+press: install
+	@$(BIN)/companion fly configs/missions/press.yaml --sitl --world wall
 
 # Builds a wheel with compiled modules in build/compiled and installs it: .venv/bin/companion computes the same faster.
 compile: install

@@ -119,10 +119,13 @@ class Faults:
         """
         self._now_s = t_s
         surfaces = self._world.surfaces
-        touched_s = surfaces.touched_s if surfaces is not None else None
         origins = {
-            "start": 0.0, "arming": armed_t_s, "catch": self._world.payload.caught_t_s, "touch": touched_s,
-        }  # fmt: skip
+            "start": 0.0,
+            "arming": armed_t_s,
+            "catch": self._world.payload.caught_t_s,
+            "touch": surfaces.touched_s if surfaces is not None else None,
+            "press": surfaces.pressed_s if surfaces is not None else None,
+        }
         for index, fault in enumerate(self._faults):
             origin_s = origins[fault.after]
             assert fault.t_s is not None

@@ -52,16 +52,16 @@ def _timed(fault: Fault, config: SitlConfig) -> Fault:
     if fault.phase is None:
         return fault
     if fault.phase in CONTACT_PHASES:
-        t_s = round(_after_touch_s(fault.phase, config), 3)
-        return fault.model_copy(update={"after": "touch", "t_s": t_s, "phase": None})
+        t_s = round(_into_press_s(fault.phase, config), 3)
+        return fault.model_copy(update={"after": "press" if t_s else "touch", "t_s": t_s, "phase": None})
     if fault.phase == "catch" and config.world.payload_kg > 0:
         return fault.model_copy(update={"after": "catch", "t_s": AFTER_CATCH_S, "phase": None})
     t_s = round(SPOOL_S + _plan_time_s(fault.phase, config), 3)
     return fault.model_copy(update={"after": "arming", "t_s": t_s, "phase": None})
 
 
-def _after_touch_s(phase: FlightPhase, config: SitlConfig) -> float:
-    """Return the time since the first touch: at once, in the middle of the press, or just after it."""
+def _into_press_s(phase: FlightPhase, config: SitlConfig) -> float:
+    """Return the time since the press began: in its middle, or just after it; 0 for the first touch, which may come earlier."""
     phases = config.mission.phases
     pressing_s = [
         segment.end_s - segment.start_s

@@ -28,6 +28,7 @@ _CREEP_NS_M = 1e4
 """Friction force that is not enough to slide, divided by the speed with which the tip creeps. A large value lifts a sliding tip."""
 APART_S = 0.05
 """Shortest time without contact after which a contact is a new touch."""
+PRESSED_S, SAME_S = 2.5, 0.5
 _DAMPED_KG = 1.0
 """Mass to which `damping_ratio` refers."""
 _WATCH_STEPS = 5
@@ -141,6 +142,9 @@ class Surfaces:
         """Number of touches of any surface by the tip."""
         self.touched_s: float | None = None
         """World time of the first touch; None before it."""
+        self.pressed_s: float | None = None
+        """World time at which the first touch that lasted for `PRESSED_S` began; None before. Interruptions of up to `SAME_S` count."""
+        self._run_begin_s = -math.inf
         self.force_max_n = 0.0
         """Largest contact force."""
         self._forces_n: list[Vec3] = []
@@ -193,6 +197,10 @@ class Surfaces:
                 self.touches += 1
                 self.touched_s = world.t_s if self.touched_s is None else self.touched_s
                 world.report("touched")
+            if world.t_s - self._last_touch_s > SAME_S:
+                self._run_begin_s = world.t_s
+            if self.pressed_s is None and world.t_s - self._run_begin_s > PRESSED_S:
+                self.pressed_s = self._run_begin_s
             self._last_touch_s = world.t_s
             self.force_max_n = max(self.force_max_n, size_n)
             number = self.touched(tip_m)

@@ -98,6 +98,6 @@ def fault_row(flight: dict[str, Any], **changes: Any) -> Row:
     return {
         "fault": flight["kind"], "phase": flight["phase"], "size": flight["size"], "unit": "s", "duration_s": flight["duration_s"],
         "outcome": "landed", "detected_s": 0.12, "event": "mocap_lost", "reacted_s": 0.12, "action": "autopilot_land",
-        "worst_tilt_deg": 5.7, "min_height_m": 1.0, "min_slack_m": 1.2, "drift_m": 0.25, "caught": True, "problems": [],
-        "events": ["mocap_lost"], "error": None, **changes,
+        "worst_tilt_deg": 5.7, "min_height_m": 1.0, "min_slack_m": 1.2, "drift_m": 0.25, "contact_n": None, "caught": True,
+        "problems": [], "events": ["mocap_lost"], "error": None, **changes,
     }  # fmt: skip

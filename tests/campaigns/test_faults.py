@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any, get_args
@@ -11,7 +12,7 @@ import pytest
 from companion.campaigns.faults.judge import FaultFlight, Point, Tick, good, row_of
 from companion.campaigns.faults.sitl_flights import _offset_s
 from companion.campaigns.faults.sitl_flights import flown as flown_over_wires
-from companion.campaigns.faults.variants import VARIANTS, WIRES, Variant, planned
+from companion.campaigns.faults.variants import CONTACT, VARIANTS, WIRES, Variant, planned
 from companion.cli.main import main
 from companion.launcher.launcher import FlightResult
 from companion.launcher.run import _summary
@@ -27,8 +28,9 @@ from companion.model.types import (
     Severity,
     Vec3,
 )
+from companion.safety.notices import NOTICES
 from companion.safety.rules import RULES
-from companion.sitl_config.faults import IN_FLIGHT, KINDS, PHASES, FaultKind
+from companion.sitl_config.faults import CONTACT_PHASES, IN_FLIGHT, KINDS, PHASES, FaultKind
 from companion.sitl_config.loader import load_sitl
 from tests.campaigns.made_up import fault_row
 from tests.support import CATCH
@@ -183,7 +185,7 @@ def test_what_is_reported_after_the_landing_is_no_answer() -> None:
 def test_the_table_of_kinds_is_the_literal_and_names_events_that_exist() -> None:
     assert tuple(KINDS) == get_args(FaultKind)
     known = {rule.id for rule in RULES} | {"guardian_took_over", "offboard_refused", "arming_refused"}
-    known |= {"inputs_missing", "vision_not_fused", "gate", "catch"}
+    known |= {notice.id for notice in NOTICES}
     assert {name for kind in KINDS.values() for name in kind.named_by} - known == set()
 
 
@@ -191,9 +193,9 @@ def test_the_campaign_is_as_large_as_it_should_be() -> None:
     everywhere = [variant for variant in VARIANTS if set(IN_FLIGHT) <= set(variant.phases)]
     assert len(everywhere) >= 45
     assert len(set(VARIANTS)) == len(VARIANTS)
-    assert {variant.kind for variant in VARIANTS} == set(KINDS)
+    assert {variant.kind for variant in (*VARIANTS, *CONTACT)} == set(KINDS)
     assert len(WIRES) >= 15
-    for variant in VARIANTS:
+    for variant in (*VARIANTS, *CONTACT):
         assert (variant.size is not None) == (KINDS[variant.kind].size is not None), variant
 
 
@@ -203,6 +205,24 @@ def test_what_is_named_is_flown() -> None:
     assert planned(["autopilot_reboot"], []) == [(Variant("autopilot_reboot", 2.0), "ground")]
     assert planned(["autopilot_reboot"], ["line"]) == [(Variant("autopilot_reboot", 2.0), "line")]
     assert {phase for _, phase in planned([], [])} == set(PHASES)
+    assert len(planned([], CONTACT_PHASES)) == len(CONTACT) * len(CONTACT_PHASES)
+    assert planned([], ["press"], wires=True) == [(Variant("kill_flight"), "press")]
+
+
+def test_phases_of_a_contact_are_not_mixed_with_others(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["faults", "--phases", "line,press"]) == EXIT_BAD_INPUT
+    assert "fly two campaigns" in capsys.readouterr().err
+
+
+def test_a_force_above_the_limit_for_0_1_s_is_a_problem_and_a_spike_is_not() -> None:
+    made, limit_n = flight(), VEHICLE.safety.contact_force_max_n
+    for lasting_s, problems in ((0.03, []), (0.2, [f"pressed with {2.0 * limit_n:.1f} N (limit {limit_n:g} N)"])):
+        course = [
+            dataclasses.replace(p, contact_n=2.0 * limit_n if 12.0 <= p.t_s < 12.0 + lasting_s else 0.0)
+            for p in made.course
+        ]
+        row = row_of(LOST, "press", dataclasses.replace(made, course=course), VEHICLE)
+        assert row["problems"] == problems
 
 
 def test_the_page_of_the_docs_shows_the_outcome_of_each_phase() -> None:

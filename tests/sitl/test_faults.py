@@ -105,9 +105,11 @@ def test_a_fault_that_means_nothing_is_refused(
     assert told in capsys.readouterr().err
 
 
-def test_a_fault_of_a_servo_that_the_arm_does_not_have_is_refused() -> None:
+def test_a_fault_of_a_part_that_vehicle_or_world_do_not_have_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"world\.faults\[0\]\.servo: .* has 2 servos, got servo 3"):
         with_faults({"kind": "servo_loss", "t_s": 1.0, "servo": 3})
+    with pytest.raises(ConfigError, match=r"surface_gone needs world\.surfaces, but the world has none"):
+        with_faults({"kind": "surface_gone", "t_s": 1.0})
 
 
 def test_faults_that_are_over_leave_the_world_as_it_was() -> None:
@@ -140,6 +142,9 @@ _FOR_GOOD = (
     "payload_dropped",
     "payload_heavy",
     "pilot_takeover",
+    "surface_gone",
+    "surface_slippery",
+    "tool_broken",
 )
 
 
