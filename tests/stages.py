@@ -69,7 +69,7 @@ STAGES = (
     Stage(
         "computing",
         (
-            *(*_PYTEST, "-p", "tests.low_priority", "-n", "2", "--dist", "worksteal", "-o", "timeout=600"),
+            *(*_PYTEST, "-p", "tests.low_priority", "-n", "2", "--dist", "loadfile", "-o", "timeout=600"),
             *("-m", "not flight and not waits"),
         ),
         tests=True,
