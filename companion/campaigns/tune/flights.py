@@ -99,7 +99,7 @@ class Flights(AbstractContextManager["Flights"]):
     def _open(self, path: Path, settings: dict[str, Any]) -> None:
         """Read what was flown before, or begin a new file. A line that was cut short by the end of the program is dropped."""
         wanted = json.loads(json.dumps(settings))
-        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
         read = [data for line in lines if (data := _parsed(line)) is not None]
         if not read:
             path.write_text(json.dumps(wanted) + "\n", encoding="utf-8")
@@ -113,7 +113,7 @@ class Flights(AbstractContextManager["Flights"]):
                         f"is {_short(wanted.get(key))}; choose another folder"
                     ]
                 )
-        self._known = {line["flight"]: line["row"] for line in known}
+        self._known = {line["flight"]: line["row"] for line in known if "row" in line}
         path.write_text("".join(json.dumps(line) + "\n" for line in read), encoding="utf-8")
 
 

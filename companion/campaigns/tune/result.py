@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -150,7 +151,7 @@ class Result:
 
     def fly_line(self, file: Path) -> str:
         """Return the command that flies the gains of a file."""
-        return f"{self.fly} --controller {file}"
+        return f"{self.fly} --controller {shlex.quote(str(file))}"
 
 
 def flown(row: Row) -> bool:

@@ -136,19 +136,20 @@ def run(tune: Tune, out: Path, console: Console | None) -> int:
         with flights:
             search.run(space.start_point)
             judged = _judge(search, space, held_out, flights)
+        result = Result(tune.settings(), tune.command, tune.fly, space, search, training, held_out, judged)
+        publish(result, out, console)
+    except BrokenPipeError:
+        raise  # standard output has closed, which is no failure
+    except OSError as error:
+        print_error(f"companion tune: {error.filename or out}: cannot be written: {error.strerror}")
+        return EXIT_LOST
     except Interrupted:
-        _explain(out, "interrupted")
+        print_error(f"companion tune: interrupted; the same command with --out {out} goes on from there")
         return EXIT_ABORTED
     except CampaignError as error:
         print_error(f"companion tune: {error}")
         return EXIT_BAD_INPUT if error.bad_input else EXIT_LOST
-    result = Result(tune.settings(), tune.command, tune.fly, space, search, training, held_out, judged)
-    publish(result, out, console)
     return EXIT_OK if result.better else EXIT_REFUSED
-
-
-def _explain(out: Path, why: str) -> None:
-    print_error(f"companion tune: {why}; the same command with --out {out} goes on from there")
 
 
 def _flights(settings: Sequence[ControllerConfig], draws: Draws, numbers: Sequence[int]) -> list[Message]:
