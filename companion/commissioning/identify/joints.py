@@ -25,7 +25,7 @@ _RATE_MIN_RAD_S = 0.12
 """Slower motion may stand still within the backlash."""
 _ACCELERATED = 5
 """Samples at both ends of a bin whose mean rates give its acceleration."""
-_SIGMAS = (math.inf, 0.15, 0.05, math.radians(2.0), 0.4, 0.06, 0.05)
+_SIGMAS = (math.inf, 0.15, 0.05, math.radians(2.0), 0.4, 0.06, 0.05, 0.3)
 """Priors about 0: dry friction in N m, viscous friction in N m s, angle of gravity in rad, friction over load, a constant torque in N m
 such as that of the downwash, and in m the lever of a payload that hangs beside the centre of the net.
 """
@@ -78,7 +78,7 @@ def _joint(
     fit = robust_fit(rows, currents, chains, _SIGMAS, constant_nm_a)
     k = 1.0 / float(fit.theta[0])
     speed, load = float(np.mean(np.abs(rows[:, 2]))), float(np.mean(np.abs(rows[:, 0])))
-    at = np.array([0.0, 1.0, speed, 0.0, load, 0.0, 0.0])
+    at = np.array([0.0, 1.0, speed, 0.0, load, 0.0, 0.0, load * speed])
     friction = k * float(at @ fit.theta)
     slope = k * at
     slope[0] -= k * friction
@@ -168,9 +168,10 @@ def _bins(parts: list[_Motion], joint: int) -> tuple[Array, Array, list[int]]:
                     way * abs(load),
                     1.0,
                     float(part.pull_n[span].mean()),
+                    abs(load) * float(rate.mean()),
                 ]
             )
             currents.append(float(part.current_a[span, joint].mean()))
             chains.append(chain)
             at += width
-    return np.array(rows).reshape(-1, 7), np.array(currents), chains
+    return np.array(rows).reshape(-1, 8), np.array(currents), chains

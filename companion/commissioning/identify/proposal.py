@@ -105,7 +105,8 @@ def _world(found: Identification, lab: Mapping[str, Any]) -> _Found:
             rotors["thrust_error"] = ([_normal(round(error, 3), 0.01)] * count, remark)
     if lag.value is not None:
         up, down = _ends(lab, "lag_up_s"), _ends(lab, "lag_down_s")
-        usual = 0.25 * (sum(up) + sum(down))
+        # Rotors that speed up faster than they slow down follow small changes with the harmonic mean.
+        usual = statistics.harmonic_mean([sum(up) / 2.0, sum(down) / 2.0])
         low, high = (max(0.01, end - _REACTION_S) / usual for end in lag.interval)
         for key, (least, most) in (("lag_up_s", up), ("lag_down_s", down)):
             middle = 0.5 * (least + most)

@@ -90,7 +90,7 @@ def thrust_lag(flight: Flight, hover: float | None) -> Quantity:
         how = f"the thrust moved too little: known only to ± {1e3 * 1.96 * sigma:.0f} ms; fly climbs and descents, such as circuit"
         return Quantity(key, title, "ms", 0, how, scale=1e3)
     how = f"thrust setpoint to vertical specific force, below {_CUTOFF_HZ:g} Hz"
-    return Quantity(key, title, "ms", 0, how, value, sigma, "lab 50 to 80 ms", 1e3)
+    return Quantity(key, title, "ms", 0, how, value, sigma, "lab 54 to 76 ms", 1e3)
 
 
 def drag(flight: Flight) -> Quantity:
