@@ -37,10 +37,10 @@ from sitl.world.effects.rotors import Rotors
 
 Array = npt.NDArray[np.float64]
 ROLL_PITCH_HZ = np.array([0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0])
-THRUST_HZ = np.array([0.5])
-"""So low that the phase is that of delay plus time constant."""
+THRUST_HZ = np.array([0.75, 1.5, 2.25])
+"""Slower, the ground effect and the drag turn the phase; faster, the phase is no longer that of a delay."""
 _AMPLITUDES_RAD = np.radians([3.0, 1.5, 1.0, *[0.8] * 7])
-_THRUST_AMPLITUDE = 0.015
+_THRUST_AMPLITUDE = 0.008
 _BEGIN_S, _PERIOD_S, _PERIODS = 8.0, 4.0, 3
 _HEIGHT_M = 1.0
 _QUIET = (
@@ -144,7 +144,7 @@ def responses(seed: int) -> dict[str, float]:
         truth[f"{name}_bandwidth_hz"] = float(
             np.interp(math.sqrt(0.5), size[[after, after - 1]], ROLL_PITCH_HZ[[after, after - 1]])
         )
-    truth["thrust_lag_s"] = float(-np.angle(thrust[0, 0]) / (2.0 * np.pi * THRUST_HZ[0]))
+    truth["thrust_lag_s"] = float(np.median(-np.angle(thrust[:, 0]) / (2.0 * np.pi * THRUST_HZ)))
     return truth
 
 
