@@ -126,7 +126,7 @@ def write_probe(log: FlightLog, path: Path) -> None:
             normal = -np.array(contact.direction_world) if found is None else np.array(found.normal_world)
             for point in contact.points:
                 at = np.array(point.tip_world_m) - radius_m * normal
-                off = "" if found is None else f"{1e3 * float((at - found.point_world_m) @ normal):.2f}"
+                off = "" if found is None else f"{1e3 * float((at - found.point_world_m) @ normal):z.2f}"
                 rows.writerow((f"{point.t_s:.3f}", *(f"{x:.4f}" for x in at), f"{point.force_n:.2f}", off))
 
 
