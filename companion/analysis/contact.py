@@ -31,7 +31,8 @@ def contact_summary(log: FlightLog) -> dict[str, Any] | None:
     `overshoot_n` from the first touch on. `path_rms_m` is the distance of the tip, across that direction, from the path on which the
     reference would lead it; for a press that is a point. `surface` is the plane through the points touched by a probe, or by an
     approach that turns to the surface. Without those it is the mean point that was touched while the force was steady, and the normal
-    of the touched points or, if they lie too close together, the direction of the approach reversed.
+    of the touched points or, if they lie too close together, the direction of the approach reversed. Its
+    `points` are those by which it was found.
     """
     states = [outputs.contact for outputs in log.outputs]
     last = next((state for state in reversed(states) if state is not None), None)
@@ -45,10 +46,14 @@ def contact_summary(log: FlightLog) -> dict[str, Any] | None:
         "wanted_n": None, "mean_n": None, "rms_error_n": None, "overshoot_n": None, "touches": touches, "path_rms_m": None,
         "surface": None,
     }  # fmt: skip
-    if (
-        found := next((state.surface for state in reversed(states) if state is not None and state.surface), None)
-    ) is not None:
-        row["surface"] = {"point_m": list(found.point_world_m), "normal": list(found.normal_world)}
+    finder = next((state for state in reversed(states) if state is not None and state.surface is not None), None)
+    found = None if finder is None else finder.surface
+    if finder is not None and found is not None:
+        row["surface"] = {
+            "point_m": list(found.point_world_m),
+            "normal": list(found.normal_world),
+            "points": len(finder.points),
+        }
     if not pressing.any():
         return row
     most = float(wanted[pressing].max())
@@ -69,6 +74,7 @@ def contact_summary(log: FlightLog) -> dict[str, Any] | None:
             row["surface"] = {
                 "point_m": (tip.mean(axis=0) - _radius_m(log) * normal).tolist(),
                 "normal": normal.tolist(),
+                "points": 0,
             }
     return row
 
@@ -78,6 +84,24 @@ def true_force_n(summary: dict[str, Any]) -> float | None:
     surface = (summary.get("contact") or {}).get("surface")
     force_n = ((summary.get("world") or {}).get("contact") or {}).get("force_held_world_n")
     return None if surface is None or force_n is None else float(np.dot(force_n, surface["normal"]))
+
+
+def surface_error(summary: dict[str, Any]) -> tuple[float, float] | None:
+    """Return by how much the found surface is beside the nearest true one, m, and the angle between the normals, deg; None if no
+    surface was found by points, or if the true ones are unknown.
+    """
+    surface = (summary.get("contact") or {}).get("surface")
+    true = ((summary.get("world") or {}).get("contact") or {}).get("surfaces")
+    if not surface or not surface["points"] or not true:
+        return None
+    errors = [
+        (
+            abs(float(np.dot(np.subtract(surface["point_m"], one["point_m"]), one["normal"]))),
+            float(np.degrees(np.arccos(np.clip(np.dot(surface["normal"], one["normal"]), -1.0, 1.0)))),
+        )
+        for one in true
+    ]
+    return min(errors)
 
 
 def contact_lines(summary: dict[str, Any]) -> list[tuple[str, str]]:
@@ -92,15 +116,19 @@ def contact_lines(summary: dict[str, Any]) -> list[tuple[str, str]]:
             f", {contact['wanted_n']:.2f} N wanted, {contact['mean_n']:.2f} N measured (RMS error {contact['rms_error_n']:.2f} N, "
             f"overshoot {contact['overshoot_n']:.1f} N)"
         )
-    true_n, surface = true_force_n(summary), contact["surface"]
-    if true_n is not None:
-        text += f"; true: {true_n:.2f} N (known to the simulated world only)"
-    lines = [("contact", text)]
+        if (true_n := true_force_n(summary)) is not None:
+            text += f"; true: {true_n:.2f} N (known to the simulated world only)"
+    lines, surface = [("contact", text)], contact["surface"]
     if surface is None:
         return lines
     x, y, z = surface["point_m"]
     text = f"touched at [{x:.3f}, {y:.3f}, {z:.3f}] m"
-    if contact["path_rms_m"] is not None:
+    if surface["points"]:
+        x, y, z = surface["normal"]
+        text = f"found by {surface['points']} points{text.removeprefix('touched')}, normal [{x:.3f}, {y:.3f}, {z:.3f}]"
+        if (off := surface_error(summary)) is not None:
+            text += f"; {1e3 * off[0]:.1f} mm and {off[1]:.1f} deg off (known to the simulated world only)"
+    elif contact["path_rms_m"] is not None:
         text += f", tip within {1e3 * contact['path_rms_m']:.0f} mm (RMS) of its path"
     return [*lines, ("surface", text)]
 

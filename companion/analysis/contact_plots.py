@@ -15,17 +15,20 @@ from companion.analysis.plot_style import CATCH, DASHED, INK, REFERENCE, SERIES,
 from companion.analysis.time_axes import legend, line
 from companion.model.types import ContactMode, ControlLog, Vec3
 
+_LEAVE, _MOVE = ("leave", "#f8eed8"), ("move", "#f1e9f7")
 _BANDS = {
     ContactMode.WEIGH: ("weigh", "#eceff2"),
     ContactMode.APPROACH: ("approach", "#dcebf9"),
     ContactMode.PRESS: ("press", "#dff3e6"),
     ContactMode.LOST: ("contact lost", "#fbdfe3"),
-    ContactMode.BACK: ("back", "#f3efe6"),
-    ContactMode.SHIFT: ("shift", "#f1e9f7"),
-    ContactMode.LEAVE: ("leave", "#f8eed8"),
-    ContactMode.RETURN: ("return", "#f4f4f4"),
+    ContactMode.BACK: _LEAVE,
+    ContactMode.LEAVE: _LEAVE,
+    ContactMode.SHIFT: _MOVE,
+    ContactMode.RETURN: _MOVE,
 }
 """Name and colour of what the flight does about the surface."""
+_EXACT = 3
+"""Number of points through which a plane always fits."""
 _MEAN_S = 0.1
 """Time over which the force in the plane and the position of the tip are averaged: noise would hide them."""
 _AROUND_S = 1.0
@@ -67,7 +70,7 @@ def contact_force(log: FlightLog) -> Figure | None:
         ax.margins(y=0.12)
         legend(ax, columns=3)
         _shade(ax, t, modes)
-    shown = [_BANDS[mode] for mode in _BANDS if mode in modes]
+    shown = list(dict.fromkeys(_BANDS[mode] for mode in _BANDS if mode in modes))
     patches = [Patch(facecolor=colour, edgecolor="#aab4bd", lw=0.6) for _, colour in shown]
     figure_legend(figure, "Force on the tool", patches, [name for name, _ in shown], len(shown))
     return figure
@@ -104,6 +107,43 @@ def contact_path(log: FlightLog) -> Figure | None:
     ax.set_ylabel(f"up [{unit}]")
     legend(ax, columns=2)
     figure.suptitle("Contact in the plane of the surface", fontsize=13, fontweight="bold", color=INK)
+    return figure
+
+
+def found_surface(log: FlightLog) -> Figure | None:
+    """Draw the points by which a probe found the surface, and how far each is from the plane through them."""
+    last = next(
+        (o.contact for o in reversed(log.outputs) if o.contact is not None and o.contact.surface is not None), None
+    )
+    if last is None or last.surface is None or len(last.points) <= _EXACT:
+        return None
+    normal = np.array(last.surface.normal_world)
+    right, up = surface_axes(-normal)
+    tips = np.array([point.tip_world_m for point in last.points])
+    off = tips - tips.mean(axis=0)
+    x, y, beyond_mm = off @ right, off @ up, 1e3 * (off @ normal)
+    figure = new_figure(4.6)
+    ax = figure.subplots()
+    dress(ax)
+    most = max(1.0, float(np.abs(beyond_mm).max()))
+    ax.plot(x, y, color=SOFT, lw=0.8, zorder=2)
+    dots = ax.scatter(
+        x, y, c=beyond_mm, s=90, cmap="coolwarm", vmin=-most, vmax=most, edgecolors=INK, linewidths=0.6, zorder=3
+    )
+    for number, (px, py, mm) in enumerate(zip(x, y, beyond_mm, strict=True), 1):
+        ax.annotate(
+            f"{number}: {mm:+.1f} mm", (px, py), xytext=(8, 6), textcoords="offset points", fontsize=8.5, color=INK
+        )
+    figure.colorbar(dots, ax=ax, label="out of the plane through the points [mm]", shrink=0.85)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.margins(0.2)
+    ax.set_xlabel("right [m]")
+    ax.set_ylabel("up [m]")
+    rms_mm = float(np.sqrt(np.mean(beyond_mm**2)))
+    ax.set_title(
+        f"{len(tips)} points, {rms_mm:.1f} mm RMS from the plane through them", loc="left", fontsize=10, color=INK
+    )
+    figure.suptitle("Found surface", fontsize=13, fontweight="bold", color=INK)
     return figure
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from companion.analysis import metrics
-from companion.analysis.contact_plots import contact_force, contact_path, has_contact
+from companion.analysis.contact_plots import contact_force, contact_path, found_surface, has_contact
 from companion.analysis.log import Array, FlightLog
 from companion.analysis.plot_style import (
     CATCH,
@@ -70,7 +70,13 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
             contact_force,
         ),
         (
-            "surface",
+            "found_surface",
+            "Found surface",
+            "Centre of the tip at each touched point, as seen from the vehicle, in the order of the touches.",
+            found_surface,
+        ),
+        (
+            "contact_path",
             "Contact in the plane of the surface",
             "Centre of the tip while it touches, as seen from the vehicle, and the path on which the reference would lead it.",
             contact_path,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.analysis.animation import movie_of, player_html
-from companion.analysis.contact import true_force_n
+from companion.analysis.contact import surface_error, true_force_n
 from companion.analysis.log import FlightLog
 from companion.analysis.page import Page, Picture, Section, write_page
 from companion.analysis.plots import write_plots
@@ -130,7 +130,8 @@ def _contact(summary: dict[str, Any]) -> list[Table]:
     contact = summary.get("contact")
     if contact is None:
         return []
-    true_n, surface = true_force_n(summary), contact["surface"]
+    surface = contact["surface"]
+    true_n = None if contact["mean_n"] is None else true_force_n(summary)
     rows = [
         ("force wanted", _number(contact["wanted_n"], 2, " N")),
         ("force measured", _number(contact["mean_n"], 2, " N")),
@@ -141,8 +142,16 @@ def _contact(summary: dict[str, Any]) -> list[Table]:
         ("tip from its path, RMS", _number(contact["path_rms_m"], 4, " m")),
     ]
     if surface is not None:
-        rows.append(("surface touched at", ", ".join(f"{value:z.3f}" for value in surface["point_m"]) + " m"))
+        rows.append(("surface touched at", _vector(surface["point_m"]) + " m"))
+        if surface["points"]:
+            rows.append((f"normal by {surface['points']} points", _vector(surface["normal"])))
+        if (off := surface_error(summary)) is not None:
+            rows.append(("found surface off (simulation)", f"{1e3 * off[0]:.1f} mm, {off[1]:.1f} deg"))
     return [_pairs("Contact", rows)]
+
+
+def _vector(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:z.3f}" for value in values)
 
 
 def _pairs(title: str, rows: Sequence[tuple[str, ...]], *heads: str) -> Table:

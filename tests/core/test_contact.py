@@ -13,7 +13,7 @@ import pytest
 from msgspec.structs import replace
 
 from companion.analysis.contact import PROBE, contact_lines, contact_summary, write_probe
-from companion.analysis.contact_plots import contact_force, contact_path
+from companion.analysis.contact_plots import contact_force, contact_path, found_surface
 from companion.analysis.log import FlightLog
 from companion.core.flight_core import FlightCore
 from companion.ground.telemetry.scene import scene_of
@@ -143,7 +143,7 @@ def test_report_and_ground_station_show_the_force_and_the_report_the_true_one(
     about, surface = contact_lines(
         {"contact": contact_summary(log), "world": {"contact": flight.plant.world.surfaces.report()}}
     )
-    assert about[1].startswith("1 touch, 5.00 N wanted") and surface[1].startswith("touched at [1.5")
+    assert about[1].startswith("1 touch, 5.00 N wanted") and surface[1].startswith("found by 3 points at [1.5")
     true_n = float(about[1].partition("true: ")[2].split()[0])
     assert true_n == pytest.approx(5.0, abs=0.25)
     streams, _ = replay(log.rows(), flight.config.flight, "s", 0.0, rate_hz=2.0)
@@ -153,7 +153,14 @@ def test_report_and_ground_station_show_the_force_and_the_report_the_true_one(
     force = contact_force(log)
     assert force is not None and contact_path(log) is not None
     bands = {text.get_text() for text in force.legends[0].get_texts()}
-    assert bands == {"weigh", "shift", "approach", "press", "back", "leave", "return"}
+    assert bands == {"weigh", "approach", "press", "leave", "move"}
+    assert found_surface(log) is None  # a plane fits any three points
+    last = max(k for k, o in enumerate(log.outputs) if o.contact is not None)
+    contact = log.outputs[last].contact
+    assert contact is not None
+    probed = replace(log.outputs[last], contact=replace(contact, points=3 * contact.points))
+    seen = found_surface(dataclasses.replace(log, outputs=(*log.outputs[:last], probed), inputs=log.inputs[: last + 1]))
+    assert seen is not None and seen.axes[0].get_title(loc="left").startswith("9 points, 0.0 mm RMS")
     on_the_ground = dataclasses.replace(log, outputs=log.outputs[:50], inputs=log.inputs[:50], sent=log.sent[:50])
     assert contact_force(on_the_ground) is None and contact_path(on_the_ground) is None
     assert contact_lines({"contact": contact_summary(on_the_ground)}) == []
