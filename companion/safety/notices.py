@@ -77,15 +77,14 @@ CONTACT_INTERRUPTED = Notice(
 )  # fmt: skip
 CONTACT_LOST = Notice(
     "contact_lost", _WARNING, _WARN,
-    "the surface was not found again within 0.1 m of where it was touched, the force is not measured any more, more than "
-    "`contact_disagreement_n` of the push acts against nothing for 0.1 s, or the vehicle is 0.08 m ahead of its reference: "
-    "the vehicle moves back, and the mission goes on as aborted",
+    "the surface was not found again within 0.1 m of where it was touched, the force is not measured any more, three quarters of "
+    "`contact_disagreement_n` of the push act against nothing for 0.1 s, or the vehicle is 0.08 m ahead of its reference: the vehicle "
+    "moves back, and the mission goes on as aborted",
 )  # fmt: skip
 CONTACT_DISAGREES = Notice(
     "contact_disagrees", _WARNING, _WARN,
-    "for 0.1 s the measured contact force differs by more than `contact_disagreement_n` from the force that thrust, tilt and "
-    "acceleration show, or the vehicle is 0.08 m behind its reference although no touch was measured: the vehicle moves back, and the "
-    "mission goes on as aborted",
+    "for 0.1 s the contact force that thrust, tilt and acceleration show exceeds the measured one by `contact_disagreement_n`, or the "
+    "vehicle is 0.08 m behind its reference although no touch was measured: the vehicle moves back, and the mission goes on as aborted",
 )  # fmt: skip
 CONTACT_BOUNCE = Notice(
     "contact_bounce", _WARNING, _WARN,
