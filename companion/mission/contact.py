@@ -376,4 +376,6 @@ def released(contact: ContactState, dt_s: float) -> ContactState:
 
 def entered(contact: ContactState, t_s: float, mode: ContactMode, *, failed: bool = False) -> ContactState:
     """Return the state at the beginning of a mode."""
-    return replace(contact, mode=mode, since_s=t_s, beyond_s=0.0, wanted_n=0.0, failed=contact.failed or failed)
+    return replace(
+        contact, mode=mode, since_s=t_s, beyond_s=0.0, wanted_n=0.0, correction_n=0.0, failed=contact.failed or failed
+    )

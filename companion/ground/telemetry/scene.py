@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from companion.config.arm_chain import chain_of
 from companion.config.loader import FlightConfig
-from companion.config.mission import Approach
+from companion.config.mission import Approach, Probe
 from companion.ground.protocol.messages import VERSION, Scene
 from companion.mission.segments import phase_name
 from companion.model.arm_skeleton import skeleton_of
@@ -53,7 +53,7 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
         mission_s=mission_s,
         path_world_m=thinned(path_world_m),
         phases=tuple(map(phase_name, config.mission.phases)),
-        has_contact=any(isinstance(phase, Approach) for phase in config.mission.phases) or None,
+        has_contact=any(isinstance(phase, Approach | Probe) for phase in config.mission.phases) or None,
     )
 
 
