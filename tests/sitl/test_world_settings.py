@@ -163,7 +163,9 @@ OF_DEVICES = (
     *("faults.size bus_noise", "faults.size clock_step", "faults.size autopilot_reboot"),
 )
 """How settings begin that are tried on the wires: those of the devices, and some that show that `Plant` and `Faults` get theirs."""
-SENT = [pair for pair in PAIRS if pair.setting.startswith(OF_DEVICES) and pair.acts < 2]
+SENT = [
+    pair for pair in PAIRS if pair.setting.startswith(OF_DEVICES) and pair.acts < 2 and "surfaces" not in pair.usual
+]
 """Both loops give the world's settings as a whole to one `Plant` and one `Faults`: what these do is seen in the fast loop."""
 
 

@@ -16,7 +16,7 @@ from pydantic.fields import FieldInfo
 
 from companion.config.base import Model
 from companion.sitl_config.effects.mocap import Mocap
-from companion.sitl_config.faults import KINDS, Fault
+from companion.sitl_config.faults import CONTACT_PHASES, KINDS, Fault
 from companion.sitl_config.surfaces import Surface
 from companion.sitl_config.world import Push, Servo, World
 
@@ -126,12 +126,14 @@ def fault_pairs() -> Iterator[Pair]:
         after = "catch" if kind.startswith("payload_") else "arming" if kind in IN_THE_AIR else "start"
         acts = ("start", "arming", "catch").index(after)
         fault = {"kind": kind, "t_s": 0.1, "after": after}
+        world = {"surfaces": [EXAMPLES[Surface]]} if about.phases == CONTACT_PHASES else {}
         if kind not in ("payload_missed", "payload_heavy"):  # those act from the start, whatever t_s says
             with_it = BESIDE.get(kind, _NEVER)
-            yield Pair(f"faults.kind {kind}", {"faults": [with_it]}, {"faults": [with_it, fault]}, acts)
+            usual, changed = {**world, "faults": [with_it]}, {**world, "faults": [with_it, fault]}
+            yield Pair(f"faults.kind {kind}", usual, changed, acts)
         if about.default is not None and kind != "pilot_takeover":
             other = {**fault, "size": SIZES.get(kind, 0.5 * about.default)}
-            yield Pair(f"faults.size {kind}", {"faults": [fault]}, {"faults": [other]}, acts)
+            yield Pair(f"faults.size {kind}", {**world, "faults": [fault]}, {**world, "faults": [other]}, acts)
 
 
 def _acts(setting: str) -> int:
