@@ -25,6 +25,12 @@ from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight, FastResult
 
 PRESS = "configs/missions/press.yaml"
+SHORT = (
+    "mission.start.position_m=[0.2,0.0]",
+    "mission.phases[4].duration_s=5.0",
+    "mission.phases[6].to_m=[0.2,0.0,1.1]",
+)
+"""The mission with less of a way to the wall and back."""
 WALL = {"point_m": [1.5, 0.0, 1.09], "normal": [-1.0, 0.0, 0.0], "stiffness_n_m": 1e4, "friction": 0.5}
 
 
@@ -36,7 +42,7 @@ def press(
     force_max_n: float = 12.0,
     face_m: float | None = None,
 ) -> tuple[FastFlight, FastResult]:
-    """Fly the mission press in the ideal world.
+    """Fly a short mission press in the ideal world.
 
     Args:
         wall: keys of the wall that differ from `WALL`.
@@ -46,6 +52,7 @@ def press(
         face_m: `face_m` of the approach.
     """
     overrides = [
+        *SHORT,
         f"world.surfaces={json.dumps([WALL | (wall or {})])}",
         f"mission.phases[3].speed_m_s={approach_m_s}",
         f"mission.phases[3].face_m={json.dumps(face_m)}",
