@@ -1,0 +1,108 @@
+"""A press on drawn walls in the laboratory, fast loop: `python -m benchmarks.press [--draws 200] [--first-seed 5001]`.
+
+Each seed draws a laboratory, and a wall of 1e3 to 1e5 N/m with a friction of 0.1 to 0.8, tilted by up to 15 deg about both axes and
+up to 5 cm from where the mission expects it. Prints a line for each flight and a summary: the steady error of the true and of the
+measured force along the wall's normal from 1.5 s after the wanted force is reached, the largest force, the normal and the place that
+were found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import random
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.model.types import ContactMode, Outcome
+from companion.sitl_config.loader import load_sitl
+from sitl.fast.loop import FastFlight
+
+MISSION = "configs/missions/press.yaml"
+SETTLE_TICKS = 300
+"""Ticks at the wanted force that do not count as steady."""
+
+
+@dataclass(frozen=True, slots=True)
+class Press:
+    """What one flight shows; errors in percent of the wanted force, NaN without a steady press."""
+
+    seed: int
+    completed: bool
+    crashed: bool
+    true_error: float
+    measured_error: float
+    largest_true_n: float
+    """While pressing with the rise of the force."""
+    largest_measured_n: float
+    rotor_distance_m: float
+    normal_error_deg: float
+    place_error_mm: float
+
+
+def flown(seed: int) -> Press:
+    """Fly the mission on the wall of a seed."""
+    draw = random.Random(seed)
+    stiffness_n_m, friction = 10.0 ** draw.uniform(3.0, 5.0), draw.uniform(0.1, 0.8)
+    tilt_deg, place_m = [draw.uniform(-15.0, 15.0), draw.uniform(-15.0, 15.0)], draw.uniform(-0.05, 0.05)
+    wall = {"point_m": [1.5, 0.0, 1.09], "normal": [-1.0, 0.0, 0.0], "stiffness_n_m": stiffness_n_m}
+    wall |= {"friction": friction, "tilt_error_deg": tilt_deg, "place_error_m": place_m}
+    sets = [f"world.surfaces={json.dumps([wall])}", f"world.seed={seed}"]
+    flight = FastFlight(load_sitl(MISSION, world="lab", overrides=sets))
+    result = flight.run(300.0)
+    surfaces, layout = flight.plant.world.surfaces, result.layout
+    assert surfaces is not None and layout is not None
+    placed = surfaces.placed[0]
+    contacts = [outputs.contact for outputs in result.outputs]
+    true_n = np.array([layout.contact(snapshot.sensors)[1] for snapshot in result.snapshots]) @ np.array(placed.normal)
+    measured_n = np.array([math.nan if c is None else c.force_n for c in contacts])
+    wanted_n = np.array([0.0 if c is None or c.mode is not ContactMode.PRESS else c.wanted_n for c in contacts])
+    pressing = wanted_n > wanted_n[-1]
+    steady = np.flatnonzero(wanted_n == 5.0)[SETTLE_TICKS:]
+    found = next((c.surface for c in reversed(contacts) if c is not None and c.surface is not None), None)
+    return Press(
+        seed=seed,
+        completed=result.outputs[-1].outcome is Outcome.COMPLETED,
+        crashed=result.crashed,
+        true_error=_error(true_n[steady]),
+        measured_error=_error(measured_n[steady]),
+        largest_true_n=float(true_n[pressing].max(initial=0.0)),
+        largest_measured_n=float(measured_n[pressing].max(initial=0.0)),
+        rotor_distance_m=surfaces.rotor_distance_min_m,
+        normal_error_deg=math.nan
+        if found is None
+        else math.degrees(math.acos(min(1.0, float(np.dot(found.normal_world, placed.normal))))),
+        place_error_mm=math.nan if found is None else 1e3 * abs(placed.local_m(found.point_world_m)[2]),
+    )
+
+
+def _error(force_n: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+    return 100.0 * abs(float(force_n.mean()) / 5.0 - 1.0) if len(force_n) else math.nan
+
+
+def main() -> None:
+    """Fly and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draws", type=int, default=200)
+    parser.add_argument("--first-seed", type=int, default=5001)
+    arguments = parser.parse_args()
+    presses = []
+    for seed in range(arguments.first_seed, arguments.first_seed + arguments.draws):
+        presses.append(flown(seed))
+        print(presses[-1], flush=True)
+    completed = [press for press in presses if press.completed]
+    print(f"{len(completed)} of {len(presses)} completed, {sum(press.crashed for press in presses)} crashed")
+    print(f"nearest rotor {min(press.rotor_distance_m for press in presses):.2f} m")
+    for name in (
+        *("true_error", "measured_error", "largest_true_n", "largest_measured_n"),
+        *("normal_error_deg", "place_error_mm"),
+    ):
+        values = [getattr(press, name) for press in completed]
+        low, high, most = np.nanpercentile(values, (50, 95, 100))
+        print(f"{name}: p50 {low:.2f}, p95 {high:.2f}, largest {most:.2f}")
+
+
+if __name__ == "__main__":
+    main()
