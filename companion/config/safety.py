@@ -108,8 +108,8 @@ class Safety(Model):
     contact_force_max_n: Positive = 12.0
     """Largest force against the direction of an approach; above it, the vehicle moves back from the surface and holds."""
     contact_disagreement_n: Positive = 4.0
-    """Largest force against the direction of an approach that the vehicle's motion shows in excess of the measured one, and by a
-    third more than the largest push against nothing. With a healthy sensor, gusts in simulated laboratories reached 3.1 N."""
+    """Largest force against the direction of an approach that the vehicle's motion shows in excess of the measured one, and
+    largest push against nothing. With a healthy sensor, gusts in simulated laboratories reached 3.1 N."""
     climb_max_m_s: Positive = 1.5
     sink_max_m_s: Positive = 1.5
     geofence_tolerance_m: NonNegative = 0.10

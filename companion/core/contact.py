@@ -154,7 +154,6 @@ def _contradiction(t: Transition, contact: ContactState) -> tuple[Notice, str] |
     elif contact.disagreed_s < c.DISAGREEMENT_S:
         return None
     elif contact.disagreement_n <= limit_n:
-        limit_n *= c.UNOPPOSED_SHARE
         text = f"{contact.unopposed_n:.1f} N of the push act against nothing (limit {limit_n:g} N)"
         return notices.CONTACT_LOST, text
     else:

@@ -59,8 +59,6 @@ ASTRAY_M = 0.08
 """Position error along the direction from which the vehicle leaves: something blocks it that the force sensor does not measure, or it
 pushes against nothing. In simulated laboratories with a healthy sensor the error stayed below 0.03 m.
 """
-UNOPPOSED_SHARE = 0.75
-"""Largest push against nothing, as a fraction of `safety.contact_disagreement_n`."""
 DISAGREEMENT_S = 0.1
 """Time constant of the comparison of the measured force with the one that the vehicle's motion shows, and the time for which they must
 disagree.
@@ -239,8 +237,9 @@ def measured(
     shown_n = contact.force_n + unlike_n - mean_n
     disagreement_n += dt_s / DISAGREEMENT_S * (unlike_n - mean_n - disagreement_n)
     unopposed_n += dt_s / DISAGREEMENT_S * (contact.push_n - shown_n - unopposed_n)
-    # A gust towards the surface acts like a push against nothing, but the sensor then measures more than the push.
-    pushes = contact.push_n > max(0.0, contact.force_n) and unopposed_n > UNOPPOSED_SHARE * disagreement_max_n
+    # A gust towards the surface acts like a push against nothing; a push below the limit cannot exceed it, and with a gust the
+    # sensor measures more than the push.
+    pushes = contact.push_n > max(disagreement_max_n, contact.force_n) and unopposed_n > disagreement_max_n
     holds = disagreement_n > disagreement_max_n or pushes
     return replace(
         contact,

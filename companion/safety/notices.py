@@ -77,7 +77,7 @@ CONTACT_INTERRUPTED = Notice(
 )  # fmt: skip
 CONTACT_LOST = Notice(
     "contact_lost", _WARNING, _WARN,
-    "the surface was not found again within 0.1 m of where it was touched, the force is not measured any more, three quarters of "
+    "the surface was not found again within 0.1 m of where it was touched, the force is not measured any more, "
     "`contact_disagreement_n` of the push act against nothing for 0.1 s, or the vehicle is 0.08 m ahead of its reference: the vehicle "
     "moves back, and the mission goes on as aborted",
 )  # fmt: skip
