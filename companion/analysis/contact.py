@@ -29,10 +29,11 @@ def contact_summary(log: FlightLog) -> dict[str, Any] | None:
 
     Force is that along the direction of the approach, as measured in flight: `mean_n` and `rms_error_n` while it is steady,
     `overshoot_n` from the first touch on. `path_rms_m` is the distance of the tip, across that direction, from the path on which the
-    reference would lead it; for a press that is a point. `surface` is the plane through the points touched by a probe, or by an
-    approach that turns to the surface. Without those it is the mean point that was touched while the force was steady, and the normal
-    of the touched points or, if they lie too close together, the direction of the approach reversed. Its
-    `points` are those by which it was found.
+    reference would lead it. For a press that path is a point, and the distance is that from the tip's mean place: a constant
+    distance between tip and reference is not in it. `surface` is the plane through the points touched by a probe, or by an approach
+    that turns to the surface. Without those it is the mean point that was touched while the force was steady, and the normal of the
+    touched points or, if they lie too close together, the direction of the approach reversed. Its `points` are those by which it was
+    found.
     """
     states = [outputs.contact for outputs in log.outputs]
     last = next((state for state in reversed(states) if state is not None), None)

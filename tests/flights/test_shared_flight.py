@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.flight, pytest.mark.xdist_group("the shared flight")]
 
 @dataclass(frozen=True)
 class Flown:
-    """The flight when it is over."""
+    """The one flight of this file, after it has ended."""
 
     sandbox: Sandbox
     ended: Ended
