@@ -131,7 +131,7 @@ class NetFt:
         """The counter overflows in the stream."""
         self.status = 0
         self.broken = b""
-        """Bytes sent in place of the next record."""
+        """Bytes sent in place of the records."""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run)
 
@@ -158,7 +158,6 @@ class NetFt:
                 counts = (1_500_000, -250_000, 10_000 * (self.sequence % 7), 2000, -3000, 0)
                 record = struct.pack(">3I6i", self.sequence, 0, self.status, *counts)
                 self._socket.sendto(self.broken or record, peer)
-                self.broken = b""
 
 
 def ati(port: int) -> ForceDevice:
