@@ -9,12 +9,24 @@ from companion.guardian.heartbeat import Heartbeat
 from companion.mission.contact import way_back_m
 from companion.model.best_pose import best_pose, pose_used_s
 from companion.model.flight_stage import PILOT_FLIES
-from companion.model.types import AutopilotRequest, AutopilotStatus, Inputs, LinkIdentity, Outputs, PhaseKind
+from companion.model.types import (
+    AutopilotRequest,
+    AutopilotStatus,
+    ContactMode,
+    ContactState,
+    Inputs,
+    LinkIdentity,
+    Outputs,
+    PhaseKind,
+    Vec3,
+)
 from companion.safety.rules import MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS, PILOT_TOOK_OVER
 
 _IN_THE_AIR = frozenset({PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING})
 _REFUSALS = frozenset({MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS})
 """Events after which PX4 lands because motion capture is rejected."""
+_FLOWN_SHARE = 0.1
+"""Share of the way back from a surface that may be left when it counts as flown."""
 
 
 class Heartbeats:
@@ -35,6 +47,8 @@ class Heartbeats:
         """
         self._pose_stamp_s = float("-inf")
         self._position_world_m = (0.0, 0.0, 0.0)
+        self._left: tuple[Vec3, Vec3] | None = None
+        """Way back from a surface, and where it begins, while a landing or a retract that has replaced the mission may still fly it."""
 
     def of(self, inputs: Inputs, outputs: Outputs) -> Heartbeat:
         """Return the heartbeat of a tick; call it in every tick."""
@@ -64,8 +78,25 @@ class Heartbeats:
             pose_stamp_s=self._pose_stamp_s,
             position_world_m=self._position_world_m,
             peer=link.peer,
-            back_world_m=None if outputs.contact is None else way_back_m(outputs.contact),
+            back_world_m=self._back_world_m(outputs.contact),
         )
+
+    def _back_world_m(self, contact: ContactState | None) -> Vec3 | None:
+        """Return the way back from the surface that the tool may touch; None if it touches none."""
+        if contact is not None:
+            way = way_back_m(contact)
+            self._left = None if contact.mode is ContactMode.RETURN else (way, self._position_world_m)
+            return way
+        if self._left is None:
+            return None
+        way, begin = self._left
+        moved = (now - then for now, then in zip(self._position_world_m, begin, strict=True))
+        share = 1.0 - sum(w * m for w, m in zip(way, moved, strict=True)) / sum(w * w for w in way)
+        if share <= _FLOWN_SHARE:
+            self._left = None
+            return None
+        x, y, z = way
+        return (share * x, share * y, share * z)
 
 
 class FlightGuard:

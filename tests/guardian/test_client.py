@@ -15,9 +15,12 @@ from companion.flight.heartbeat import FlightGuard, Heartbeats
 from companion.guardian import heartbeat
 from companion.guardian.client import SILENT_S, GuardianClient
 from companion.io.protocols import DeviceError
+from companion.mission import contact
 from companion.model.types import (
     AutopilotRequest,
     AutopilotStatus,
+    ContactMode,
+    ContactState,
     Event,
     FlightMode,
     Inputs,
@@ -226,3 +229,21 @@ def test_motion_capture_is_refused_from_the_landing_for_it_until_it_is_trusted_a
         False,
         True,
     ]
+
+
+def test_the_way_back_from_a_surface_stays_until_a_landing_has_flown_it(waiting: Outputs) -> None:
+    heartbeats = Heartbeats(LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0)
+    touching = contact.entered(contact.begun(4.0, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0)), 4.5, ContactMode.PRESS)
+    returning = contact.entered(touching, 4.6, ContactMode.RETURN)
+
+    def back_m(state: ContactState | None, x_m: float) -> float | None:
+        now = inputs(armed=True)
+        assert now.mocap is not None
+        pose = msgspec.structs.replace(now.mocap, position_world_m=(x_m, 0.0, 1.0))
+        outputs = msgspec.structs.replace(waiting, contact=state)
+        way = heartbeats.of(msgspec.structs.replace(now, mocap=pose), outputs).back_world_m
+        return None if way is None else way[0]
+
+    assert back_m(touching, 1.0) == -0.2  # LAND replaces the mission in the next tick
+    assert [back_m(None, x_m) for x_m in (1.0, 0.875, 0.81, 0.9)] == [-0.2, pytest.approx(-0.075), None, None]
+    assert back_m(returning, 1.0) == -0.2 and back_m(None, 1.0) is None  # a contact that ended in the air
