@@ -43,6 +43,7 @@ PREFLIGHT = "vehicle.safety.preflight_s"
 PATIENT: dict[str, object] = {
     PREFLIGHT: 1.0,
     "vehicle.safety.arm_timeout_s": 0.4,
+    "vehicle.safety.arm_read_failures_max": 60,
     "vehicle.safety.mocap_timeout_s": 0.3,
     "vehicle.safety.vehicle_timeout_s": 0.5,
     "vehicle.safety.link_lag_max_s": 0.25,

@@ -92,7 +92,7 @@ STILL = Check("arm.still", "arm at rest", "moves less than 3 deg", "motion of th
 READS = Check(
     "arm.reads",
     "bus cycles without an answer",
-    "at most 0.1 %; refused above 10 %",
+    "at most 0.1 %; refused above 10 %, if that is more than `safety.arm_read_failures_max`",
     "`safety.arm_read_failures_max` of them in a row end the flight",
 )
 USB = Check(
@@ -140,7 +140,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     if o.arm:
         yield from _states(o.arm, vehicle, temperatures_unknown=stated is not None)
     if o.arm_reads is not None:
-        yield _reads(*o.arm_reads)
+        yield _reads(*o.arm_reads, vehicle.safety.arm_read_failures_max)
     if o.machine is not None and stated is None:
         yield usb_latency(USB, o.machine.arm_latency_ms)
 
@@ -276,13 +276,14 @@ def _angles(last: ArmState, vehicle: Vehicle) -> Row:
     return ANGLES.bad(read, wanted, "move the arm by hand, or correct zero_count and sign of the joint")
 
 
-def _reads(cycles: int, missed: int) -> Row:
+def _reads(cycles: int, missed: int, warned_of: int) -> Row:
     share = missed / max(1, cycles)
     read, wanted = f"{missed} of {cycles}", f"{MISSED_GOOD:.1%}"
     if cycles and share <= MISSED_GOOD:
         return READS.good(read, wanted)
     fix = "check for a loose cable, a bad ground or interference on the servo bus"
-    return (READS.doubtful if cycles and share <= MISSED_MAX else READS.bad)(read, wanted, fix)
+    few = share <= MISSED_MAX or missed <= warned_of
+    return (READS.doubtful if cycles and few else READS.bad)(read, wanted, fix)
 
 
 def usb_latency(check: Check, latency_ms: int | None) -> Row:

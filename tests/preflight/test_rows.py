@@ -195,6 +195,8 @@ CASES = {
         {"arm": (*r.arm(angle_rad=(math.radians(160), r.ARM_RAD[1]))[:9], *r.arm()[9:])},
     ),
     "loose cable": Case("arm.reads", "20 of 1000", "loose cable", {"arm_reads": (1000, 20)}, WARN),
+    "few cycles": Case("arm.reads", "5 of 20", "loose cable", {"arm_reads": (20, 5)}, WARN),
+    "bad bus": Case("arm.reads", "200 of 1000", "loose cable", {"arm_reads": (1000, 200)}),
     "dead bus": Case("arm.reads", "0 of 0", "loose cable", {"arm_reads": (0, 0)}),
     "arm's latency timer": Case("arm.usb_latency", "16 ms", "udev", {"machine": r.machine(arm_latency_ms=16)}, WARN),
     "no force sensor": Case("force.device", "expected it", "", failure("force")),
