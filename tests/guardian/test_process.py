@@ -247,7 +247,7 @@ def test_it_is_not_ready_without_a_body_of_its_own(tmp_path: Path) -> None:
 
 
 def test_in_the_air_it_is_no_worse_than_a_flight_process_that_sees_nothing_either(tmp_path: Path) -> None:
-    with Rig(tmp_path, timeout_s=0.5) as rig:
+    with Rig(tmp_path) as rig:
         rig.beat_until_ready()
         rig.cameras.tracked = False
 

@@ -65,6 +65,7 @@ class Px4Peer:
         self.received: list[Any] = []
         self._marks = 0
         self._changed = threading.Condition()
+        """Its lock is held while a message is recorded and answered, and while one is sent: by this thread or by the test."""
         self._stop = threading.Event()
         self._out = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         self._in = mavlink.MAVLink(None)
@@ -118,7 +119,8 @@ class Px4Peer:
             return len(self.received)
 
     def say(self, message: Any) -> None:
-        self._socket.sendto(message.pack(self._out), self.remote)
+        with self._changed:
+            self._socket.sendto(message.pack(self._out), self.remote)
 
     def _run(self) -> None:
         beat_s = stream_s = 0.0
@@ -140,12 +142,12 @@ class Px4Peer:
                     self._changed.notify_all()
                 continue
             for message in self._in.parse_buffer(datagram) or []:
-                self._take(message)
+                with self._changed:
+                    self._take(message)
 
     def _take(self, message: Any) -> None:
-        with self._changed:
-            self.received.append(message)
-            self._changed.notify_all()
+        self.received.append(message)
+        self._changed.notify_all()
         if message.get_type() == "COMMAND_LONG":
             self._answer(message)
         elif message.get_type() == "PARAM_REQUEST_READ" and message.param_id in self.deaf_to:
@@ -173,8 +175,9 @@ class Px4Peer:
 
     def finish(self, result: int) -> None:
         """Answer every command that is in progress for good."""
-        while self.working_on:
-            self._say_ack(self.working_on.pop(), result)
+        with self._changed:
+            while self.working_on:
+                self._say_ack(self.working_on.pop(), result)
 
     def _say_ack(self, command: Any, result: int) -> None:
         self.say(
@@ -199,8 +202,9 @@ class Px4Peer:
             self._say_param(message.param_id)
 
     def _say_slow(self) -> None:
-        for command in list(self.working_on):
-            self._say_ack(command, mavlink.MAV_RESULT_IN_PROGRESS)
+        with self._changed:
+            for command in self.working_on:
+                self._say_ack(command, mavlink.MAV_RESULT_IN_PROGRESS)
         self.say(
             mavlink.MAVLink_heartbeat_message(
                 mavlink.MAV_TYPE_QUADROTOR, self.autopilot, self.base_mode, self.custom_mode, self.system_status, 3

@@ -10,21 +10,19 @@ from typing import Any, Self
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from tests.io.px4_peer import free_udp_port
-
 
 class GroundPeer:
     """Listens on a free port of loopback and records everything; answers whoever spoke last, as QGroundControl does."""
 
     def __init__(self, beating: bool = True) -> None:
-        self.port = free_udp_port()
-        self.address = f"udpout://127.0.0.1:{self.port}"
         self.beating = beating
         self._heard: list[tuple[Any, int, int]] = []
         self._changed = threading.Condition()
         self._stop = threading.Event()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(("127.0.0.1", self.port))
+        self._socket.bind(("127.0.0.1", 0))
+        self.port = int(self._socket.getsockname()[1])
+        self.address = f"udpout://127.0.0.1:{self.port}"
         self._socket.settimeout(0.01)
         self._partner: Any = None
         self._thread = threading.Thread(target=self._run, name="ground-peer")
