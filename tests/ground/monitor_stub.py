@@ -145,6 +145,8 @@ class MonitorStub:
         self._heard: list[Message] = []
         self._change = threading.Condition()
         self._sockets: list[web.WebSocketResponse] = []
+        self._greeted = asyncio.Lock()
+        """A page that has the greeting gets every message after it."""
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="monitor stub")
         self._runner: web.AppRunner | None = None
@@ -175,10 +177,10 @@ class MonitorStub:
         self._do(self._stop())
 
     def hang_up(self) -> None:
-        """Close all connections and forget the received messages."""
-        self._do(self._hang_up())
+        """Forget the received messages and close all connections."""
         with self._change:
-            self._heard.clear()
+            self._heard.clear()  # first: a page that connects anew may speak at once
+        self._do(self._hang_up())
 
     def send(self, *messages: Message) -> None:
         """Send messages to all connected pages."""
@@ -225,16 +227,18 @@ class MonitorStub:
             self._runner = None
 
     async def _send(self, messages: Iterable[Message]) -> None:
-        for message in messages:
-            for socket in self._sockets:
-                await socket.send_json(message)
+        async with self._greeted:
+            for message in messages:
+                for socket in [socket for socket in self._sockets if not socket.closed]:
+                    await socket.send_json(message)
 
     async def _viewer(self, request: web.Request) -> web.WebSocketResponse:
         socket = web.WebSocketResponse()
         await socket.prepare(request)
-        for message in self.greeting:
-            await socket.send_json(message)
-        self._sockets.append(socket)
+        async with self._greeted:
+            for message in self.greeting:
+                await socket.send_json(message)
+            self._sockets.append(socket)
         try:
             async for received in socket:
                 if received.type is WSMsgType.TEXT:
