@@ -28,6 +28,7 @@ from companion.io.protocols import DeviceError
 from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
 from companion.runtime.clock import flight_clock
 from companion.runtime.event_loop import run
+from tests.flights.test_guardian import hooked
 from tests.support import CATCH, DEADLINE_S, HOVER, Ended, Sandbox, World, read_summary, sandbox_in, set_options
 
 SHARED = pytest.mark.xdist_group("the world that refuses")
@@ -326,11 +327,29 @@ def test_refuses_when_px4_fuses_no_motion_capture(sandbox: Sandbox, fresh_world:
 
 
 @pytest.mark.flight
-def test_refuses_when_px4_does_not_arm_and_passes_its_answer_on(sandbox: Sandbox, tmp_path: Path) -> None:
+def test_refuses_when_px4_does_not_arm_and_passes_its_answer_on(tmp_path: Path) -> None:
+    """A flight process that asks PX4 for two seconds, not for ten."""
+    hooks = tmp_path / "hooks"
+    hooks.mkdir()
+    (hooks / "sitecustomize.py").write_text(_IMPATIENT, encoding="utf-8")
     refuses = ("world.faults=[{kind: arming_refused, phase: ground}]",)
-    with sandbox_in(tmp_path / "world") as around, World(around, CATCH, refuses) as world:
+    with (
+        sandbox_in(tmp_path / "sandbox", hooked(hooks)) as sandbox,
+        sandbox_in(tmp_path / "world") as around,
+        World(around, CATCH, refuses) as world,
+    ):
         ended = refused(sandbox, world, *world.addresses(), events=True)
     assert_one_line(ended, r"^PX4 did not arm; PX4 reported: ARM refused: temporarily rejected")
+
+
+_IMPATIENT = """
+import sys
+
+if "companion.flight.main" in sys.orig_argv:
+    from companion.model import flight_stage
+
+    flight_stage.ARM_TIMEOUT_S = 2.0
+"""
 
 
 @SHARED

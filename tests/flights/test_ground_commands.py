@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -33,10 +31,10 @@ from companion.ground.protocol.messages import (
     vehicle_of,
 )
 from companion.ground.protocol.proof import ack_proven, stream_proven
-from companion.model.exit_codes import EXIT_ABORTED
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK
 from companion.model.types import OperatorCommand, Outcome, SafetyAction
 from tests.broker import loopback_broker
-from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, sandbox_in, set_options
+from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, run_here, sandbox_in, set_options
 
 HIGH_AND_LONG = {
     "mission.phases[0].height_m": 1.0,
@@ -176,13 +174,8 @@ def test_started_held_let_go_on_and_landed_from_the_ground(sandbox: Sandbox, tmp
         lines = [m.data.decode(errors="replace") for _, _, m in make_reader(file).iter_messages(topics=["/log"])]
     assert any(f"hold of {operator}: holding" in line for line in lines)
 
-    replayed = subprocess.run(
-        [sys.executable, "-m", "companion", "replay", str(out / "flight.mcap")],
-        capture_output=True,
-        text=True,
-        timeout=DEADLINE_S,
-    )
-    assert replayed.returncode == 0, replayed.stdout + replayed.stderr
+    replayed = run_here("replay", out / "flight.mcap")
+    assert replayed.code == EXIT_OK, replayed.out + replayed.err
 
 
 @pytest.mark.flight

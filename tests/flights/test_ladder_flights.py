@@ -25,7 +25,7 @@ from companion.model.types import (
 )
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
-from tests.support import SHORT_CATCH, tether_of
+from tests.support import HOVER, LOW_HOVER, SHORT_CATCH, tether_of
 
 replace = msgspec.structs.replace
 Change = Callable[[Inputs], Inputs]
@@ -200,6 +200,20 @@ def test_a_pilot_who_takes_over_from_px4s_landing_is_left_alone() -> None:
     after = [o for o in result.outputs if o.t_s >= 9.5]
     assert any(event.text == "a pilot took over" for o in after for event in o.events)
     assert all(o.attitude is None and o.request is AutopilotRequest.NONE for o in after)
+
+
+def test_a_pilot_who_takes_over_after_touch_down_is_not_disarmed() -> None:
+    """PX4's land detector takes its time, and in the middle of that the pilot switches to Hold: FORCE_DISARM left all the same."""
+    slow = "world.px4_params={LNDMC_TRIG_TIME: 5.0}"
+    taken = "world.faults=[{kind: pilot_takeover, t_s: 8.5, size: 3.0}]"
+    low = [f"{key}={value}" for key, value in LOW_HOVER.items()]
+    result = FastFlight(load_sitl(HOVER, overrides=[*low, slow, taken])).run(limit_s=14.0)
+    assert event_ids(result) == ["takeoff", "touchdown", "pilot_took_over"]
+    assert result.armed and not {o.request for o in result.outputs} & {
+        AutopilotRequest.DISARM,
+        AutopilotRequest.FORCE_DISARM,
+    }
+    assert not result.crashed
 
 
 # -- broken inputs ---------------------------------------------------------------------------------------------------

@@ -75,11 +75,6 @@ def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
         yield sandbox
 
 
-@pytest.fixture(params=[pytest.param("stub", marks=STUB), pytest.param("px4", marks=REAL)])
-def autopilot(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
 def faults(*kinds: str, on_stub: str | None) -> pytest.MarkDecorator:
     """Every fault on the real PX4; on the stub one or none of them, since its guardian is the same in every test."""
     cases = [pytest.param("px4", kind, marks=REAL) for kind in kinds]
@@ -218,6 +213,7 @@ def test_a_dead_link_is_landed_by_px4_itself(sandbox: Sandbox, autopilot: str) -
     assert not world["armed"]
 
 
+@pytest.mark.parametrize("autopilot", [pytest.param("px4", marks=REAL)])  # the stub's: test_tipped_over.py
 def test_a_rotor_lost_in_the_air_is_a_flip_and_the_others_are_stopped(sandbox: Sandbox, autopilot: str) -> None:
     """LAND comes first and does not help: PX4 refuses a plain DISARM in the air, and its rotors went on in the wreck."""
     fault = "world.faults=[{kind: motor_weak, size: 1.0, t_s: 7.0}]"
@@ -240,6 +236,7 @@ def test_a_rotor_lost_in_the_air_is_a_flip_and_the_others_are_stopped(sandbox: S
     assert AutopilotRequest.DISARM not in {o.request for o in log.outputs}
 
 
+@pytest.mark.parametrize("autopilot", [pytest.param("px4", marks=REAL)])  # the stub's: test_ladder_flights.py
 def test_a_pilot_who_takes_over_after_touch_down_is_not_disarmed(sandbox: Sandbox, autopilot: str) -> None:
     """PX4's land detector takes its time, and in the middle of that the pilot switches to Hold: FORCE_DISARM left all the same."""
     slow = ("--set", "world.px4_params={LNDMC_TRIG_TIME: 5.0}")

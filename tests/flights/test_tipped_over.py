@@ -1,4 +1,4 @@
-"""A vehicle that tips over on the floor with its rotors turning, in the fast closed loop: by the flight process and by the guardian."""
+"""A vehicle that tips over, on the floor or in the air: its rotors are stopped. In the fast closed loop."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import math
 import pytest
 
 from companion.model.frames import euler_zyx_from_quat, tilt_rad
-from companion.model.types import Outcome
+from companion.model.types import AutopilotRequest, Outcome
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.world.handling import Wrench
+from sitl.world.world import World
 from tests.support import HOVER, LOW_HOVER
 
 LIES_AT_RAD = math.radians(50.0)
@@ -64,3 +65,20 @@ def test_tipped_over_on_the_floor_its_rotors_are_stopped_by_the_guardian() -> No
     assert result.guardian_landed is True
     assert "tipped over on the floor: FORCE_DISARM is requested at once" in [e.text for e in result.guardian_events]
     assert flight.stopped_s - flight.begun_s < STOPPED_WITHIN_S
+
+
+def test_flipped_in_the_air_by_a_lost_rotor_the_others_are_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """LAND comes first and does not help: PX4 refuses a plain DISARM in the air, and its rotors went on in the wreck."""
+    monkeypatch.setattr(World, "_watch_crash", lambda _: None)  # the fast loop ends with the world's word
+    # High enough to turn over before it is down.
+    high = ("mission.phases[0].height_m=1.6", "mission.phases[0].duration_s=5.0")
+    flight = FastFlight(load_sitl(HOVER, overrides=[*high, "world.faults=[{kind: motor_weak, size: 1.0, t_s: 7.0}]"]))
+    result = flight.run()
+    at_s = {event.id: outputs.t_s for outputs in result.outputs for event in outputs.events}
+    assert at_s["tilt"] < at_s["crashed"]
+    assert result.outputs[-1].outcome is Outcome.CRASHED
+    stopped_s = next(
+        i.t_s for i in result.inputs if i.t_s > at_s["crashed"] and i.status is not None and not i.status.armed
+    )
+    assert stopped_s - at_s["crashed"] < STOPPED_WITHIN_S
+    assert AutopilotRequest.DISARM not in {outputs.request for outputs in result.outputs}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import time
@@ -22,11 +23,19 @@ from companion.analysis.log import FlightLog
 from companion.launcher.sitl_process import SitlProcess
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_REFUSED
 from companion.sitl_config.loader import load_sitl
+from tests.runtime.test_cores import CORES, affinities
 from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, sandbox_in, set_options, wait_until
 
 FLY = ("fly", HOVER, "--sitl", "--out", "out", "--set", "mission.phases[1].duration_s=1.0")
 IN_FLIGHT = "  hold\n"
 """Printed when the vehicle has reached its height."""
+PROCESSES = {
+    "flight": "companion.flight.main",
+    "guardian": "companion.guardian",
+    "recorder": "companion.recorder.main",
+    "world": "sitl",
+    "launcher": "companion",
+}
 
 
 @pytest.fixture
@@ -118,8 +127,13 @@ def test_killed_while_a_device_is_being_opened(sandbox: Sandbox) -> None:
 
 @pytest.mark.flight
 def test_given_up_before_arming(sandbox: Sandbox) -> None:
-    with sandbox.start(*FLY) as running:
+    """With a core of its own, if there are several: the flight alone runs on it, and the terminal says what it got."""
+    own, rest = (CORES[-1:], CORES[:-1]) if len(CORES) > 1 else ([], CORES)
+    options = set_options(**{"vehicle.computer.cpus": own, "vehicle.computer.lock_memory": False})
+    with sandbox.start(*FLY, *options) as running:
         running.wait_for("  wait\n")  # it weighs the net for a second
+        memory = Path(f"/proc/{sandbox.pid_of(PROCESSES['flight'])}/status").read_text(errors="replace")
+        found = {name: affinities(sandbox.pid_of(module)) for name, module in PROCESSES.items()}
         running.signal(signal.SIGINT)
         running.wait_for("landing commanded")
         running.signal(signal.SIGINT)
@@ -133,6 +147,12 @@ def test_given_up_before_arming(sandbox: Sandbox) -> None:
     log = FlightLog.read(sandbox.cwd / "out/flight.mcap")
     assert log.closed
     assert not any(inputs.status is not None and inputs.status.armed for inputs in log.inputs)
+
+    assert re.search(r"^VmLck:\s+0 kB$", memory, re.MULTILINE), memory
+    assert found == {name: {frozenset(own if own and name == "flight" else rest)} for name in PROCESSES}
+    told = re.search(r"real time +(.*)", ended.out)
+    assert told is not None and f"CPUs {','.join(map(str, own or rest))};" in told[1], ended.out
+    assert sorted(os.sched_getaffinity(0)) == CORES
 
 
 @pytest.mark.flight

@@ -33,8 +33,8 @@ from tests.support import CATCH, DEADLINE_S, Sandbox, World, sandbox_in
 
 pytestmark = [pytest.mark.flight, pytest.mark.xdist_group("the world with a hand")]
 
-FIRST_ROUND_S = 30.0
-"""The first test must be ready by then, on a busy computer too."""
+FIRST_ROUND_S = 8.0
+"""A test that is ready later waits on the floor for the next round, 24 s after the first."""
 
 
 @pytest.fixture(scope="module")
@@ -88,8 +88,12 @@ async def said(console: Console, words: str) -> None:
 
 
 def test_a_whole_round_passes_and_is_kept(config: SitlConfig, tmp_path: Path) -> None:
-    console, path = terminal(), tmp_path / "state" / "hand-tests.json"
-    rows = asyncio.run(over_wires(config, console, path))
+    path = tmp_path / "state" / "hand-tests.json"
+    while True:
+        console = terminal()
+        rows = asyncio.run(over_wires(config, console, path))
+        if "repeat" not in text_of(console):
+            break  # this process was held up for 0.3 s; the world's hand goes on without being asked, and repeats the round alone
     assert all(row.ok for row in rows), [row.line() for row in rows if not row.ok]
     assert [row.id for row in rows] == [*(check.id for check in hand_test_evaluation.CHECKS), "hand.record"]
     for words in ("1/4", "2/4", "lift it straight up", "3/4", "forward", "4/4", "to the left", "put it back"):
