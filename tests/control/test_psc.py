@@ -44,7 +44,8 @@ def controller(config: SitlConfig) -> PscController:
 
 @cache
 def flown(*overrides: str) -> FastResult:
-    return FastFlight(configured(*overrides)).run()
+    """The mission to the end of `stabilise`, 4.5 s after the catch."""
+    return FastFlight(configured(*overrides)).run(until_mission_s=11.0)
 
 
 REFERENCE = Reference(
@@ -147,7 +148,7 @@ def test_no_estimate_without_its_switch() -> None:
 
 @pytest.mark.parametrize("payload_kg", [0.1, 0.3])
 def test_the_mass_estimate_converges_after_the_catch(payload_kg: float) -> None:
-    """Within 20 %, from thrust and IMU alone, with their noise; from 2 s after the catch to the landing."""
+    """Within 20 %, from thrust and IMU alone, with their noise; from 2 s after the catch on."""
     result = flown(f"world.payload_kg={payload_kg}")
     catch_s = next(event.t_s for outputs in result.outputs for event in outputs.events if event.id == "catch")
     flight = [o for o in result.outputs if o.phase_kind is PhaseKind.FLIGHT]
@@ -169,10 +170,9 @@ def test_the_estimate_is_in_the_log_and_comes_out_of_a_replay_bit_for_bit(tmp_pa
 
 
 @pytest.mark.parametrize(("payload_kg", "limit_m"), [(0.1, 0.02), (0.3, 0.03)])
-def test_it_catches_the_payload_and_comes_home(payload_kg: float, limit_m: float) -> None:
+def test_it_catches_the_payload_and_carries_it(payload_kg: float, limit_m: float) -> None:
     result = flown(f"world.payload_kg={payload_kg}")
-    assert result.outputs[-1].outcome is Outcome.COMPLETED
-    assert event_ids(result) == ["takeoff", "catch", "touchdown"]
+    assert event_ids(result) == ["takeoff", "catch"]
     assert error_after_catch_m(result) <= limit_m
 
 

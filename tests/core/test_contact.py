@@ -57,6 +57,7 @@ def press(
         f"mission.phases[3].speed_m_s={approach_m_s}",
         f"mission.phases[3].face_m={json.dumps(face_m)}",
         f"vehicle.safety.contact_force_max_n={force_max_n}",
+        "vehicle.safety.hold_max_s=9.0",
     ]
     flight = FastFlight(load_sitl(PRESS, world="ideal", overrides=overrides))
     if command is not None:
@@ -202,7 +203,7 @@ def test_a_force_sensor_whose_zero_shifts_during_the_approach_neither_pushes_int
 
 
 def test_without_a_force_sensor_gusts_feign_no_touch_and_the_force_is_held() -> None:
-    sets = ["world.seed=318", "vehicle.force_source=observer", "mission.phases[4].duration_s=4.0"]
+    sets = ["world.seed=318", "vehicle.force_source=observer", "mission.phases[3].face_m=null", *SHORT[1:2]]
     result = FastFlight(load_sitl(PRESS, world="wall", overrides=sets)).run(90.0)
     assert result.outputs[-1].outcome is Outcome.COMPLETED and not result.crashed
     true_n = force_n(result)

@@ -39,7 +39,7 @@ def failed(rows: list[Row]) -> dict[str, str]:
     return {row.id: row.fix for row in rows if not row.ok}
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_sound_set_up_passes_whatever_the_noise(seed: int) -> None:
     rows = watched(f"seed={seed}")
     assert not failed(rows), [row.line() for row in rows if not row.ok]

@@ -319,9 +319,8 @@ def event_ids(result: FastResult) -> list[str]:
     ],
 )
 def test_an_ordinary_flight_raises_no_alarm(overrides: tuple[str, ...]) -> None:
-    result = FastFlight(config(*overrides)).run()
-    assert result.outputs[-1].outcome is Outcome.COMPLETED
-    assert event_ids(result) == ["takeoff", "catch", "touchdown"]
+    result = FastFlight(config(*overrides)).run(until_mission_s=11.0)
+    assert event_ids(result) == ["takeoff", "catch"]
     assert all(o.action is SafetyAction.NOMINAL and not o.limited_by and o.mocap_trusted for o in result.outputs)
     states = [o.tether for o in result.outputs if o.tether is not None and o.phase_kind is PhaseKind.FLIGHT]
     assert len(states) > 1000

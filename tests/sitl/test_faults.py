@@ -274,7 +274,7 @@ def test_a_catch_in_a_drawn_world_is_no_drag() -> None:
             CATCH, overrides=[f"world.{key}={json.dumps(value)}" for key, value in knobs.items()], world="robustness"
         )
     )
-    result = flight.run()
+    result = flight.run(until_mission_s=11.0)
     assert result.caught
     assert "mocap_dragged" not in {event.id for outputs in result.outputs for event in outputs.events}
 
