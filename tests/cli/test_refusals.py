@@ -1,8 +1,8 @@
 """Devices that are not there or not as they must be, on the hardware path: `companion fly` without --sitl against a simulated
 world that runs on its own. Each time: exit 3, one clear line, never armed, nothing left, and everything free for the next attempt.
 
-Each device has a whole `fly` (the force sensor's comes before the flight at the end); of the rest the line is read where a flight opens
-its devices, in this process.
+Each device has a whole `fly` (the force sensor's comes before the refused start at the end); of the rest the line is read where a
+flight opens its devices, in this process.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from pymavlink import mavutil
 from companion.config.loader import load_flight
 from companion.io.devices import open_devices
 from companion.io.protocols import DeviceError
-from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_REFUSED
 from companion.runtime.clock import flight_clock
 from companion.runtime.event_loop import run
 from tests.flights.test_guardian import hooked
-from tests.support import CATCH, DEADLINE_S, HOVER, Ended, Sandbox, World, read_summary, sandbox_in, set_options
+from tests.support import CATCH, DEADLINE_S, Ended, Sandbox, World, read_summary, sandbox_in, set_options
 
 SHARED = pytest.mark.xdist_group("the world that refuses")
 """Tests that share one world run in one process."""
@@ -193,19 +193,6 @@ def test_names(world: World, case: str) -> None:
     assert re.search(wrong.line, line), (wrong.line, line)
 
 
-@pytest.mark.flight
-def test_refuses_a_start_other_than_the_missions(sandbox: Sandbox, fresh_world: World) -> None:
-    """The arm and the vehicle both stand elsewhere: one line for each, and no other."""
-    start = {"mission.start.arm_deg": [150.0, 140.0], "mission.start.position_m": [-0.5, 0.0]}
-    ended = refused(sandbox, fresh_world, *fresh_world.addresses(), *set_options(**start))
-    assert len(ended.err_lines) == 2, ended.err
-    for pattern in (
-        r"^arm at the start: \(165, 140\) deg, wanted \(150, 140\) ± 10 deg; move the arm there by hand",
-        r"^start position in the motion-capture axes: \(-1\.0\d, -?0\.0\d\) m, 0\.50 m away, wanted \(-0\.5, 0\) m, .*; carry the",
-    ):
-        assert [line for line in ended.err_lines if re.search(pattern, line)], (pattern, ended.err)
-
-
 def assert_one_line(ended: Ended, pattern: str) -> None:
     assert len(ended.err_lines) == 1, ended.err
     assert re.search(pattern, ended.err_lines[0]), (pattern, ended.err)
@@ -354,18 +341,18 @@ if "companion.flight.main" in sys.orig_argv:
 
 @SHARED
 @pytest.mark.flight
-def test_after_refusals_the_same_world_flies_though_its_terminal_goes_away(
+def test_refuses_a_start_other_than_the_missions_though_it_refused_before(
     sandbox: Sandbox, world: World, tmp_path: Path
 ) -> None:
-    last = WRONG["force port that is not there"]
+    """The force sensor's port is wrong first. Then the arm and the vehicle both stand elsewhere: one line for each, and no other."""
+    wrong = WRONG["force port that is not there"]
     with sandbox_in(tmp_path / "refused") as its:
-        assert_one_line(refused(its, world, *world.addresses(**last.but)), last.line)
-    with sandbox.start("fly", HOVER, "--out", "out", *world.addresses()) as running:
-        running.wait_for("  wait\n")
-        running.close_output()
-        ended = running.end()
-    sandbox.assert_nobody_left()
-    assert (ended.code, ended.err) == (EXIT_OK, ""), ended
-    assert read_summary(sandbox.cwd / "out")["outcome"] == "completed"
-    world.wait_for(lambda message: message["type"] == "at_rest" and not message["at_rest"])
-    assert (world.armings, world.crashes) == (1, 0)
+        assert_one_line(refused(its, world, *world.addresses(**wrong.but)), wrong.line)
+    start = {"mission.start.arm_deg": [150.0, 140.0], "mission.start.position_m": [-0.5, 0.0]}
+    ended = refused(sandbox, world, *world.addresses(), *set_options(**start))
+    assert len(ended.err_lines) == 2, ended.err
+    for pattern in (
+        r"^arm at the start: \(165, 140\) deg, wanted \(150, 140\) ± 10 deg; move the arm there by hand",
+        r"^start position in the motion-capture axes: \(-1\.0\d, -?0\.0\d\) m, 0\.50 m away, wanted \(-0\.5, 0\) m, .*; carry the",
+    ):
+        assert [line for line in ended.err_lines if re.search(pattern, line)], (pattern, ended.err)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import signal
 from pathlib import Path
 
 import pytest
@@ -15,7 +14,7 @@ from companion.config.loader import load_vehicle
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.runtime.clock import flight_clock
 from sitl.force_torque import ForceTorqueServer
-from tests.commissioning.test_mocap_wires import VEHICLE, bad, changes, document, sandbox, vehicle, wait_for_error
+from tests.commissioning.test_mocap_wires import VEHICLE, bad, changes, document, sandbox, vehicle
 from tests.support import Sandbox, World, run_here, tool_of
 
 pytestmark = pytest.mark.waits
@@ -105,17 +104,6 @@ def test_bad_input_opens_nothing(options: tuple[str, ...]) -> None:
     ended = run_here("ft", *options, "--vehicle", VEHICLE)
     assert ended.code == EXIT_BAD_INPUT
     assert len(ended.err_lines) == 1
-
-
-def test_ctrl_c_ends_the_check(sandbox: Sandbox) -> None:
-    with World(sandbox) as world:
-        running = sandbox.start("ft", "check", "--weight", 1, "--vehicle", VEHICLE, *world.addresses())
-        with running:
-            wait_for_error(running, "empty and untouched")
-            running.signal(signal.SIGINT)
-            ended = running.end()
-    assert ended.code == EXIT_ABORTED
-    assert ended.err_lines[-1] == "companion ft: interrupted"
 
 
 def test_no_sample_from_before_the_sensors_zero_was_set_or_cleared_is_used() -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
-from tests.commissioning.test_mocap_wires import VEHICLE, bad, document, sandbox, wait_for_error
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from tests.commissioning.test_mocap_wires import VEHICLE, bad, document, sandbox
 from tests.support import Ended, Sandbox, World, run_here
 
 pytestmark = pytest.mark.waits
@@ -90,14 +89,3 @@ def test_bad_input_opens_nothing(options: tuple[str, ...]) -> None:
     ended = run_here("latency", "--vehicle", VEHICLE, *options)
     assert ended.code == EXIT_BAD_INPUT
     assert len(ended.err_lines) == 1
-
-
-def test_ctrl_c_gives_up(sandbox: Sandbox) -> None:
-    with World(sandbox) as world:
-        running = sandbox.start("latency", "--vehicle", VEHICLE, *world.addresses())
-        with running:
-            wait_for_error(running, "hold the vehicle up")
-            running.signal(signal.SIGINT)
-            ended = running.end()
-    assert (ended.code, ended.out) == (EXIT_ABORTED, "")
-    assert ended.err_lines[-1] == "companion latency: interrupted"

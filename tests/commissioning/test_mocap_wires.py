@@ -5,16 +5,14 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import signal
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
-from tests.support import CATCH, DEADLINE_S, ROOT, Ended, Running, Sandbox, World, run_here, sandbox_in, set_options
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from tests.support import CATCH, ROOT, Ended, Sandbox, World, run_here, sandbox_in, set_options
 
 pytestmark = pytest.mark.waits
 
@@ -44,13 +42,6 @@ def addresses(world: World, *left_out: str) -> list[str]:
     }
     flat = {f"vehicle.devices.{name}.{key}": value for name, one in keys.items() for key, value in one.items()}
     return set_options(**flat)
-
-
-def wait_for_error(running: Running, text: str) -> None:
-    """Until standard error has shown it: there people are reported what to do."""
-    deadline_s = time.monotonic() + DEADLINE_S
-    while text not in running._text("err"):
-        assert running._pump(deadline_s), (text, running._text("out"), running._text("err"))
 
 
 def document(ended: Ended) -> dict[str, Any]:
@@ -148,29 +139,6 @@ def test_bad_input_opens_nothing(options: tuple[str, ...]) -> None:
     ended = run_here("mocap", "check", *(() if "--vehicle" in options else ("--vehicle", VEHICLE)), *options)
     assert ended.code == EXIT_BAD_INPUT
     assert len(ended.err_lines) == 1
-
-
-def test_ctrl_c_gives_up_and_leaves_nothing(sandbox: Sandbox) -> None:
-    with World(sandbox) as world:
-        running = sandbox.start("mocap", "check", "--seconds", 300, "--vehicle", VEHICLE, *addresses(world))
-        with running:
-            wait_for_error(running, "watching")
-            running.signal(signal.SIGINT)
-            ended = running.end()
-    assert ended.code == EXIT_ABORTED
-    assert ended.out == ""
-    assert ended.err_lines[-1] == "companion mocap: interrupted"
-
-
-def test_ctrl_c_ends_the_hand_test(sandbox: Sandbox, vehicle: Path) -> None:
-    with World(sandbox) as world:
-        running = sandbox.start("mocap", "align", CATCH, "--json", "--vehicle", vehicle, *addresses(world))
-        with running:
-            wait_for_error(running, "1/4")
-            running.signal(signal.SIGINT)
-            ended = running.end()
-    assert (ended.code, ended.out) == (EXIT_ABORTED, "")
-    assert "cancelled; nothing was changed" in ended.err
 
 
 def test_a_y_up_stream_is_found_and_written(sandbox: Sandbox, vehicle: Path) -> None:

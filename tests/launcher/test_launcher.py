@@ -83,35 +83,23 @@ def motive_that_never_answers() -> Iterator[tuple[socket.socket, list[str]]]:
     ids=["SIGTERM", "SIGINT in the background, where shells ignore it"],
 )
 def test_given_up_while_a_device_is_being_opened(sandbox: Sandbox, number: signal.Signals, background: bool) -> None:
+    """The numbers of flight and guardian are there for as long as they live: one that is left behind may belong to another process."""
+    numbers = [sandbox.cwd / "out/flight.pid", sandbox.cwd / "out/guardian.pid"]
     with (
         motive_that_never_answers() as (motive, options),
         sandbox.start("fly", HOVER, "--out", "out", *options, background=background) as running,
     ):
         assert motive.recv(100)  # the flight process speaks to it
+        wait_until(lambda: all(path.exists() for path in numbers), lambda: "no process numbers")
+        found = [sandbox.pid_of(PROCESSES["flight"]), sandbox.pid_of(PROCESSES["guardian"])]
+        assert found == [int(path.read_text()) for path in numbers]
         running.signal(number)
         ended = running.end()
     sandbox.assert_nobody_left()
     assert (ended.code, ended.err) == (EXIT_ABORTED, "")
     assert read_summary(sandbox.cwd / "out")["outcome"] == "aborted"
     assert not (sandbox.cwd / "out/flight.mcap").exists()
-
-
-@pytest.mark.waits
-def test_the_numbers_of_flight_and_guardian_are_there_for_as_long_as_they_live(sandbox: Sandbox) -> None:
-    """A process id that is left behind may belong to another process when it is used."""
-    numbers = [sandbox.cwd / "out/flight.pid", sandbox.cwd / "out/guardian.pid"]
-    with (
-        motive_that_never_answers() as (motive, options),
-        sandbox.start("fly", HOVER, "--out", "out", *options) as running,
-    ):
-        assert motive.recv(100)
-        wait_until(lambda: all(number.exists() for number in numbers), lambda: "no process numbers")
-        assert [sandbox.pid_of("companion.flight.main"), sandbox.pid_of("companion.guardian")] == [
-            int(number.read_text()) for number in numbers
-        ]
-        running.signal(signal.SIGINT)
-        running.end()
-    assert not any(number.exists() for number in numbers)
+    assert not any(path.exists() for path in numbers)
 
 
 @pytest.mark.waits
