@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from companion.analysis import plots
 from companion.analysis.log import FlightLog
 from companion.analysis.metrics import catch_index
 from companion.analysis.report import write_report
@@ -78,7 +79,8 @@ def test_the_summary_says_that_it_is_thinned_out_and_grades_nearly_the_same(whol
     json.dumps(of_some, allow_nan=False)
 
 
-def test_the_report_says_so_too(thin: FlightLog, tmp_path: Path) -> None:
+def test_the_report_says_so_too(thin: FlightLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plots, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
     summary = summarise(thin, outcome="completed", controller="adaptive", preset="recommended")
     assert f"one in {thin.stride} (long flight)" in write_report(thin, summary, tmp_path).read_text()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from functools import cache
 from pathlib import Path
 from typing import get_args
 
@@ -22,6 +23,11 @@ FOLDERS = {"missions": "mission", "vehicles": "vehicle", "controllers": "control
 FILES = [(path, kind) for folder, kind in FOLDERS.items() for path in sorted((CONFIGS / folder).glob("*.yaml"))]
 
 
+@cache
+def validator(kind: str) -> jsonschema.Draft202012Validator:
+    return jsonschema.Draft202012Validator(json.loads(schema_json(kind)))
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_committed_schema_is_up_to_date(kind: str) -> None:
     committed = (CONFIGS / "schema" / f"{kind}.schema.json").read_text(encoding="utf-8")
@@ -32,7 +38,7 @@ def test_committed_schema_is_up_to_date(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_schema_is_a_schema(kind: str) -> None:
-    jsonschema.Draft202012Validator.check_schema(json.loads(schema_json(kind)))
+    jsonschema.Draft202012Validator.check_schema(validator(kind).schema)
 
 
 def test_there_are_files_of_every_kind() -> None:
@@ -41,14 +47,14 @@ def test_there_are_files_of_every_kind() -> None:
 
 @pytest.mark.parametrize(("path", "kind"), FILES, ids=[path.name for path, _ in FILES])
 def test_committed_file_fits_its_schema_and_names_it(path: Path, kind: str) -> None:
-    jsonschema.Draft202012Validator(json.loads(schema_json(kind))).validate(read_document(path).data)
+    validator(kind).validate(read_document(path).data)
     header = re.match(r"# yaml-language-server: \$schema=(\S+)\n", path.read_text(encoding="utf-8"))
     assert header is not None
     assert (path.parent / header[1]).resolve() == (CONFIGS / "schema" / f"{kind}.schema.json").resolve()
 
 
 def test_schema_refuses_what_the_model_refuses() -> None:
-    schema = jsonschema.Draft202012Validator(json.loads(schema_json("mission")))
+    schema = validator("mission")
     document = read_document(CONFIGS / "missions" / "hover.yaml").data
     phases = document["phases"]
     assert isinstance(phases, list)

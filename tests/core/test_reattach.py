@@ -168,7 +168,7 @@ def flown(died_s: float, back_s: float, change: Change = lambda i: i) -> tuple[F
     return flight, flight.run()
 
 
-@pytest.mark.parametrize(("died_s", "gone_s"), [(5.0, 8.0), (9.4, 0.1), (9.4, 2.5), (20.0, 1.0)])
+@pytest.mark.parametrize(("died_s", "gone_s"), [(5.0, 8.0), (9.4, 0.1), (9.4, 2.5)])
 def test_started_again_in_the_air_it_lands_what_still_flies(died_s: float, gone_s: float) -> None:
     """PX4 has been without motion capture: after 4.5 s it descends blindly and never finds that it stands."""
     flight, result = flown(died_s, died_s + gone_s)

