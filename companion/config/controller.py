@@ -150,6 +150,19 @@ class LawConfig(ControllerConfig):
         return self
 
 
+class OnlineConfig(Model):
+    """Slow optimisation of the target impedance in flight: one scale of Phi and Lambda on x, y and z (docs/tune.md)."""
+
+    bound: Annotated[float, Field(gt=1, le=2)] = 1.5
+    """The scale stays within 1 / bound and bound."""
+    rate_1_s: Annotated[float, Field(gt=0, le=0.1)] = 0.03
+    """Largest rate at which the logarithm of the scale rises. It falls up to ten times as fast."""
+    shake_rad_s: Annotated[float, Field(ge=2, le=10)] = 5.0
+    """Angular frequency at which the position error is neither slow, which raises the scale, nor shaking, which lowers it."""
+    keep: bool = False
+    """Whether the scale is kept for the landing. If not, the landing begins by returning to the mission's gains."""
+
+
 class AdaptiveConfig(LawConfig):
     """Adaptive impedance control (paper, tab:control_parameters).
 
@@ -216,6 +229,8 @@ class AdaptiveConfig(LawConfig):
     arm_inertia_nominal: bool = False
     """Whether the arm's nominal inertia and Coriolis torque are fed forward in place of M_d. The vehicle and the coupling remain
     unmodelled."""
+    online: OnlineConfig | None = None
+    """Optimisation of the target impedance in flight; null disables it."""
 
     @model_validator(mode="after")
     def _conditions(self) -> Self:

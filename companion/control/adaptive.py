@@ -21,6 +21,7 @@ from companion.control.common import Actuation, DesiredForce, ForceFilter, base_
 from companion.control.compensation import FRICTION_RATE_RAD_S, Compensation
 from companion.control.impedance import Impedance
 from companion.control.load_adaptation import LoadAdaptation
+from companion.control.online import OnlineImpedance
 from companion.control.scaled_gains import for_vehicle
 from companion.control.types import PlantState, Wrench
 from companion.control.zero_order_hold import HoldTable
@@ -98,13 +99,19 @@ class AdaptiveController:
         gains = list(
             zip(impedance.inertia, impedance.phi, fitted(config.lambda_gain, rows), robust, impedance.d, strict=True)
         )
-        self._base_gains = gains[:3]
+        self._base_gains = self._mission_gains = gains[:3]
         """M_d, Phi, Lambda, S^2 times `robust_scale`, and D of x, y and z."""
         self._joint_gains = [(joint, 6 + joint, *row) for joint, row in enumerate(gains[6:])]
         """Number of each joint and its row, then as in `_base_gains`."""
         self._base_phi, self._base_weights = (*impedance.phi[:3], impedance.phi[5]), weights[:3]
         self._joint_weights = [(joint, row, phi, weights[row]) for joint, row, _, phi, *_ in self._joint_gains]
         """Number of each joint, its row, Phi and S^2."""
+        self.online = (
+            None
+            if config.online is None
+            else OnlineImpedance(config.online, impedance.inertia[:3], config.lambda_gain[:3], impedance.phi[:3])
+        )
+        """Optimisation of the target impedance in flight; None if it is off."""
         self._varpi = config.boundary_layer
         self._acceleration_cap = config.acceleration_cap
         self._acceleration_cutoff_rad_s = 2.0 * math.pi * config.acceleration_lowpass_hz
@@ -147,6 +154,12 @@ class AdaptiveController:
         load.advance(dt_s, s, learn)
         gamma = impedance.advance(dt_s, e_tau)
         self._desired.advance(dt_s, force)
+        online, scale = self.online, None
+        if online is not None:
+            scale = online.scale
+            rate = state.angular_rate_body_rad_s
+            if online.step(dt_s, error, error_rate, rate, force, sent.any_clipped, state.tuning):
+                self._scale_gains(online.scale)
         log = ControlLog(
             error=error,
             error_rate=error_rate,
@@ -164,10 +177,17 @@ class AdaptiveController:
             load_estimate_n=load.force_n if load.on else None,
             moment_estimate_kg_m=load.moments_kg_m if load.on else None,
             friction_estimate_nm=load.friction_nm if load.on else None,
+            impedance_scale=scale,
         )
         return Wrench(
             attitude_wxyz=sent.attitude_wxyz, collective_n=sent.collective_n, arm_torque_nm=sent.arm_torque_nm, log=log
         )
+
+    def _scale_gains(self, k: float) -> None:
+        """Set Phi and Lambda of x, y and z to k times those of the mission."""
+        self._base_gains = [(m, k * phi, k * lam, weight, d) for m, phi, lam, weight, d in self._mission_gains]
+        (_, p0, *_), (_, p1, *_), (_, p2, *_) = self._base_gains
+        self._base_phi = (p0, p1, p2, self._base_phi[3])
 
     def _sliding(
         self, dt_s: float, state: PlantState, reference: Reference, yaw_rad: float

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import Protocol
 
 from companion.model.codec import Record
 from companion.model.types import ControlLog, Joints, Quat, Reference, Vec3
+
+
+class Tuning(Enum):
+    """What the state of the flight permits the online optimisation of a law to do."""
+
+    FREEZE = "freeze"
+    RUN = "run"
+    UNDO = "undo"  # return to the mission's gains
+
+    # An enum's own hash is a Python function.
+    __hash__ = object.__hash__
 
 
 class PlantState(Record, frozen=True, kw_only=True):
@@ -25,6 +37,8 @@ class PlantState(Record, frozen=True, kw_only=True):
     """Whether only the rotors carry the vehicle. While the ground or a surface may carry a part of it, a law's integrators do not
     change.
     """
+    tuning: Tuning = Tuning.FREEZE
+    """What a law that optimises its gains in flight may do."""
 
 
 class Wrench(Record, frozen=True, kw_only=True):

@@ -14,8 +14,9 @@ from companion.control.arm_model import manipulator_of
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.force_observer import ForceObserver
 from companion.control.hover_thrust import HoverThrust, off_the_ground
+from companion.control.online import OnlineImpedance
 from companion.control.sensing import CatchDetector, ForceSensing, MeanAcceleration, ObservedCatchDetector
-from companion.control.types import Controller, Law, PlantState
+from companion.control.types import Controller, Law, PlantState, Tuning
 from companion.model.codec import Record
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_from_euler_zyx, quat_rotate
@@ -76,6 +77,10 @@ class VehicleControl:
         """State in the last tick in which the law ran."""
         self._law: Law = law_class(config.controller.law)(config.controller, vehicle, hover_thrust)
         self._controller: Controller = self._law
+        self.online: OnlineImpedance | None = getattr(self._law, "online", None)
+        """Optimisation of the law's target impedance; None if it is off or the law has none."""
+        self.tuning = Tuning.FREEZE
+        """What this optimisation may do in this tick."""
         self.fold_rad: Joints = tuple(map(math.radians, vehicle.fold_arm_deg))
         self._arm_target_rad: Joints | None = None
         self.tracking_error_m: float | None = None
@@ -164,6 +169,7 @@ class VehicleControl:
             arm_rate_rad_s=arm.velocity_rad_s if arm is not None else reference.arm_rate_rad_s,
             force_ext_world_n=_used(force, pressing) if self._observer is None else None,
             airborne=airborne,
+            tuning=self.tuning,
         )
         carries = self._catch.carries(i.t_s)
         if self._hover_adapts:

@@ -12,6 +12,7 @@ import msgspec
 
 from companion.config.loader import FlightConfig
 from companion.config.vehicle import OBSERVER
+from companion.control.types import Tuning
 from companion.control.vehicle_control import Command, VehicleControl
 from companion.core.contact import force_on_tool_n
 from companion.core.flight_state import Observation, Request, Tare
@@ -24,7 +25,7 @@ from companion.model import flight_stage as seq
 from companion.model.best_pose import pose_used_s
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.flight_stage import Stage
-from companion.model.types import ControlLog, Event, Inputs, Outputs, PhaseKind, Reference, Vec3
+from companion.model.types import ControlLog, Event, Inputs, Outputs, PhaseKind, Reference, SafetyAction, Vec3
 from companion.safety import notices
 from companion.safety.gate import ARM_FRESH_S, Gate, Refusal
 from companion.safety.governor import Governor
@@ -36,6 +37,8 @@ from companion.safety.tether import TetherWatch
 
 _DT_MIN_S: Final = 0.001
 _DT_MAX_S: Final = 0.05
+_POSE_AGE_MAX_S: Final = 0.1
+"""Age of the last trusted pose beyond which the target impedance is not optimised."""
 # Looking up members of an enum costs time in every tick.
 _PLAN: Final = Stage.PLAN
 _SPOOL: Final = Stage.SPOOL
@@ -92,6 +95,9 @@ class FlightCore:
         events = list(request.events)
         if command.log is not None and kind is PhaseKind.FLIGHT and state.contact is None:
             self._watch_for_catch(t_s, command.log, events)
+        online = self._control.online
+        if online is not None and (report := online.take_report()):
+            events.append(event_of(notices.IMPEDANCE_SCALED, t_s, report))
         arm, vehicle = i.arm, i.vehicle
         verdict = self._gate.check(
             command.attitude,
@@ -244,7 +250,22 @@ class FlightCore:
             governed = self._governor.constrain(dt_s, reference, self._situation.tether)
             reference, self._limited_by = governed.reference, governed.limited_by
         self._reference = reference
+        if self._control.online is not None:
+            self._control.tuning = self._tuning(i.t_s)
         return reference, self._control.fly(i, dt_s, reference, state.vertical_scale(i.t_s))
+
+    def _tuning(self, t_s: float) -> Tuning:
+        """Return what an optimisation of the target impedance may do: it runs only while nothing else happens, and the mission's
+        gains return for an undisturbed landing.
+        """
+        state, kind = self._state, self._state.phase(t_s)[1]
+        if state.supervisor.action is not SafetyAction.NOMINAL:
+            return Tuning.FREEZE
+        if kind is PhaseKind.LANDING:
+            return Tuning.UNDO
+        disturbed = state.contact is not None or self._limited_by or not self._monitors.mocap_trusted
+        stale = t_s - self._pose_s > _POSE_AGE_MAX_S
+        return Tuning.RUN if kind is PhaseKind.FLIGHT and not disturbed and not stale else Tuning.FREEZE
 
     def _without_reference(self, stage: Stage, dt_s: float, i: Inputs) -> Command:
         if stage in (Stage.WAIT, Stage.READY, Stage.DONE):

@@ -418,6 +418,8 @@ class ControlLog(Record, frozen=True, kw_only=True):
     them."""
     friction_estimate_nm: Joints | None = None
     """Adapted friction of each joint; None if the law does not adapt it."""
+    impedance_scale: float | None = None
+    """Factor on Phi and Lambda of x, y and z by the optimisation in flight; None if it is off."""
     force_observed_world_n: Vec3 | None = None
     """Estimate of the momentum observer, also while the law does not use it; None if `force_source` is not `observer`."""
     force_measured_world_n: Vec3 | None = None

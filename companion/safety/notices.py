@@ -70,6 +70,10 @@ PAYLOAD_LEFT = Notice(
     "payload_left", _INFO, _NOMINAL,
     "no pull on the net for 0.5 s without free fall: the net is empty and ready for the next catch",
 )  # fmt: skip
+IMPEDANCE_SCALED = Notice(
+    "impedance_scaled", _INFO, _NOMINAL,
+    "the optimisation in flight (`controller.online`) has changed the target impedance by 5 % or more, or undone its changes",
+)  # fmt: skip
 TOUCHED = Notice("touched", _INFO, _NOMINAL, "the tool touched the surface that the mission approaches")
 CONTACT_INTERRUPTED = Notice(
     "contact_interrupted", _WARNING, _WARN,
@@ -124,7 +128,7 @@ NO_ROOM_TO_STAY = Notice(
 
 NOTICES: tuple[Notice, ...] = (
     INPUTS_MISSING, VISION_NOT_FUSED, ESTIMATE_UNSTEADY, START_REFUSED, OFFBOARD_REFUSED, ARMING_REFUSED, NOT_READY,
-    START_DECLINED, CALLED_OFF, RESUME_REFUSED, TAKEOFF, CATCH, PAYLOAD_LEFT, TOUCHED, CONTACT_INTERRUPTED, CONTACT_LOST,
+    START_DECLINED, CALLED_OFF, RESUME_REFUSED, TAKEOFF, CATCH, PAYLOAD_LEFT, IMPEDANCE_SCALED, TOUCHED, CONTACT_INTERRUPTED, CONTACT_LOST,
     CONTACT_DISAGREES, CONTACT_BOUNCE, CONTACT_SLIPPED, SURFACE_MISSING, TOUCHDOWN, NO_TOUCHDOWN, DISARM_REFUSED,
     AUTOPILOT_LANDING, GATE, HOLD_EXPIRED, RETRACT_EXPIRED, RETRACT_DONE, NO_ROOM_TO_STAY,
 )  # fmt: skip
