@@ -163,7 +163,7 @@ class OnlineImpedance:
         """Change the logarithm of the scale within the bounds and what the tank holds; return whether it has changed."""
         before = self._log_scale
         after = max(-self._most, min(self._most, before + change))
-        if not after != before:
+        if after == before:
             return False
         if after > before:
             x, y, z = self._stiffness_n_m

@@ -169,7 +169,7 @@ class VehicleControl:
             arm_rate_rad_s=arm.velocity_rad_s if arm is not None else reference.arm_rate_rad_s,
             force_ext_world_n=_used(force, pressing) if self._observer is None else None,
             airborne=airborne,
-            tuning=self.tuning,
+            tuning=self.tuning if airborne else Tuning.FREEZE,
         )
         carries = self._catch.carries(i.t_s)
         if self._hover_adapts:
