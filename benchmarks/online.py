@@ -40,21 +40,14 @@ class Flight:
     """Of the scale."""
 
 
-def scaled(controller: AdaptiveConfig, k: float, online: dict[str, Any] | None) -> AdaptiveConfig:
-    """Return the gains with Phi and Lambda of x, y and z times k."""
-    phi, lambda_gain = (
-        tuple([k * gain if row < 3 else gain for row, gain in enumerate(gains)])
-        for gains in (controller.phi, controller.lambda_gain)
-    )
-    return controller.with_gains({"phi": phi, "lambda_gain": lambda_gain, "online": online})
-
-
 def flown(seed: int, k: float, online: dict[str, Any] | None, repeat: int, sets: Sequence[str]) -> Flight:
     """Fly the course in the laboratory of a seed."""
     overrides = [f"world.seed={seed}", f"mission.repeat={repeat}", "world.payload_kg=0", *sets]
     config = load_sitl("configs/missions/circuit.yaml", preset="recommended", overrides=overrides, world="lab")
-    assert isinstance(config.controller, AdaptiveConfig)
-    fast = FastFlight(config.model_copy(update={"controller": scaled(config.controller, k, online)}))
+    controller = config.controller
+    assert isinstance(controller, AdaptiveConfig)
+    controller = controller.with_impedance_scale(k).with_gains({"online": online})
+    fast = FastFlight(config.model_copy(update={"controller": controller}))
     result = fast.run(40.0 + 15.0 * repeat)
     laps: dict[str, list[tuple[float, float]]] = {}
     scales = [1.0]

@@ -18,6 +18,8 @@ PAIRS_FINGERPRINT = "1e7b00d5cd62de28"
 """Fingerprint of the records of versions up to 0.2.0, which differ only in that every arm has two joints."""
 NO_CONTACT_FINGERPRINT = "9b601c4b6d344318"
 """Fingerprint of the records before there were contact phases, which differ only in the fields of the contact."""
+NO_ONLINE_FINGERPRINT = "d9237ed1d1bff80d"
+"""Fingerprint of the records before a law could optimise its gains in flight, which differ only in `ControlLog.impedance_scale`."""
 
 
 class Core(Protocol):
@@ -93,7 +95,8 @@ def check_replayable(log: FlightLog) -> str:
         raise LogError(
             f"{log.path}: was recorded by {found}, but this is companion {__version__}; replay it with the version that recorded it"
         )
-    if about.get("records") not in {fingerprint(Inputs, Outputs, Sent), PAIRS_FINGERPRINT, NO_CONTACT_FINGERPRINT}:
+    older = (PAIRS_FINGERPRINT, NO_CONTACT_FINGERPRINT, NO_ONLINE_FINGERPRINT)
+    if about.get("records") not in (fingerprint(Inputs, Outputs, Sent), *older):
         raise LogError(
             f"{log.path}: the fields of its records differ from those of this version; it was written by "
             f"{writer(log.metadata)}; replay it with that version"

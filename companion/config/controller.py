@@ -256,6 +256,14 @@ class AdaptiveConfig(LawConfig):
         rows = zip(self.damping_kd, self.inertia_md, self.phi, strict=True)
         return tuple([k_d - m_d * phi for k_d, m_d, phi in rows])
 
+    def with_impedance_scale(self, k: float) -> Self:
+        """Return the settings with Phi and Lambda of x, y and z times k, as `online` scales them in flight."""
+        scaled = {
+            key: tuple([six_digits(k * gain) if row < 3 else gain for row, gain in enumerate(getattr(self, key))])
+            for key in ("phi", "lambda_gain")
+        }
+        return self.with_gains({**scaled, "damping_d": self.damping_d})
+
     def with_gains(self, gains: Mapping[str, Any]) -> Self:
         """Return the settings with other values of some keys; `damping_d` is D.
 

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from companion.config.arm_chain import chain_of
-from companion.config.controller import ControllerConfig, LawConfig, fitted
+from companion.config.controller import ControllerConfig, LawConfig, Machine, fitted, law_class
 from companion.config.vehicle import Vehicle
+from companion.config.yaml_text import flow_text
 from companion.control.arm_model.chain_dynamics import ChainDynamics
 from companion.model.arm_chain import ArmChain
 from companion.model.types import Joints
@@ -76,6 +78,30 @@ def for_vehicle(vehicle: Vehicle, config: C) -> C:
         value = getattr(config, key)
         changes[key] = tuple([rows[0] * part for part in value]) if isinstance(value, tuple) else rows[0] * value
     return config.model_copy(update={**changes, "scale": scale})
+
+
+def written_for(settings: ControllerConfig, vehicle: Vehicle) -> ControllerConfig:
+    """Return the gains that fly on the vehicle as gains that were found for it, so that on another one they follow its inertia."""
+    if not isinstance(settings, LawConfig) or not hasattr(law_class(settings.law), "for_vehicle"):
+        return settings
+    joints = joint_inertia_kg_m2(vehicle) or (settings.found_for.joint_inertia_kg_m2 if settings.found_for else (1.0,))
+    machine = Machine(mass_kg=vehicle.airframe.mass_kg, joint_inertia_kg_m2=joints)
+    return settings.model_copy(update={"found_for": machine, "scale": None})
+
+
+def controller_yaml(settings: ControllerConfig, preset: str, remarks: Sequence[str]) -> str:
+    """Return the text of a controller file.
+
+    Args:
+        settings: law and gains.
+        preset: name of the gains.
+        remarks: comments above them, one for each line.
+    """
+    data = settings.model_dump(mode="json", exclude_defaults=True)
+    head = {"schema_version": 1, "law": data["law"], "preset": preset}
+    body = {key: value for key, value in data.items() if key not in head}
+    lines = [*(f"# {remark}" for remark in remarks), *(f"{key}: {flow_text(value)}" for key, value in head.items())]
+    return "\n".join([*lines, "", *(f"{key}: {flow_text(value)}" for key, value in body.items())]) + "\n"
 
 
 def scale_text(config: ControllerConfig) -> str:

@@ -265,7 +265,7 @@ class FlightCore:
             return Tuning.UNDO
         disturbed = state.contact is not None or self._limited_by or not self._monitors.mocap_trusted
         stale = t_s - self._pose_s > _POSE_AGE_MAX_S
-        return Tuning.RUN if kind is PhaseKind.FLIGHT and not disturbed and not stale else Tuning.FREEZE
+        return Tuning.FREEZE if disturbed or stale else Tuning.RUN
 
     def _without_reference(self, stage: Stage, dt_s: float, i: Inputs) -> Command:
         if stage in (Stage.WAIT, Stage.READY, Stage.DONE):

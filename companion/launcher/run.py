@@ -9,6 +9,7 @@ from rich.console import Console
 
 from companion.analysis.contact import PROBE, contact_lines, write_probe
 from companion.analysis.log import FlightLog, LogError
+from companion.analysis.proposal import PROPOSAL, write_proposal
 from companion.analysis.summary import empty_summary, summarise, write_summary
 from companion.launcher.launcher import FlightResult, Launcher, Sitl, landing_signals
 from companion.model.types import Outcome
@@ -60,6 +61,9 @@ def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Con
         except OSError as error:
             print_error(f"{out}: the report cannot be written: {error.strerror}")
     print_result(console, summary, out, page, contact_lines(summary))
+    if (out / PROPOSAL).exists():
+        text = f"gains as optimised in flight: {out / PROPOSAL}; fly them with --controller {out / PROPOSAL}"
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
     return result.exit_code
 
 
@@ -93,6 +97,7 @@ def _summary(config: SitlConfig, result: FlightResult, out: Path) -> tuple[Fligh
     write_summary(summary, out / "summary.json")
     if log is not None:
         write_probe(log, out / PROBE)
+        write_proposal(log, out / PROPOSAL)
     return log, summary
 
 

@@ -16,7 +16,7 @@ from companion.analysis.table import Column, Table, for_terminal, number, table
 from companion.campaigns.cost import TERMS, cost_of, flight_cost, terms_of
 from companion.campaigns.runner import counted, to_json
 from companion.campaigns.tune.result import Gain, HeldOut, Result, completed, flown
-from companion.config.yaml_text import flow_text
+from companion.control.scaled_gains import controller_yaml as controller_file
 from companion.runtime.console import print_error
 
 CONTROLLER_FILE, RESULT_FILE, PAGE_FILE = "controller.yaml", "result.json", "page.html"
@@ -133,7 +133,6 @@ def controller_yaml(result: Result) -> str:
     """Return the found gains as a controller file with their provenance."""
     s, (before, after) = result.settings, result.judged.costs()
     settings = result.space.settings(result.search.best.point)
-    data = settings.model_dump(mode="json", exclude_defaults=True)
     version = s["versions"].get("git") or s["versions"]["companion"]
     remarks = [
         f"Found by `{result.command}`",
@@ -144,7 +143,4 @@ def controller_yaml(result: Result) -> str:
         f"Cost of whole missions in {result.held_out.text}, held out: {before:.4f} before, {after:.4f} after;",
         f"completed {completed(result.judged.before)} before, {completed(result.judged.after)} after.",
     ]
-    head = {"schema_version": 1, "law": data["law"], "preset": f"{data['preset']}_tuned"}
-    body = {key: value for key, value in data.items() if key not in head}
-    lines = [*(f"# {remark}" for remark in remarks), *(f"{key}: {flow_text(value)}" for key, value in head.items())]
-    return "\n".join([*lines, "", *(f"{key}: {flow_text(value)}" for key, value in body.items())]) + "\n"
+    return controller_file(settings, f"{settings.preset}_tuned", remarks)

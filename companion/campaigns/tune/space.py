@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from companion.config.controller import ControllerConfig, LawConfig, Machine, fitted, law_class, six_digits
+from companion.config.controller import ControllerConfig, LawConfig, fitted, six_digits
 from companion.config.tuned_gain import EACH, TunedGain
 from companion.config.vehicle import Vehicle
-from companion.control.scaled_gains import joint_inertia_kg_m2
+from companion.control.scaled_gains import joint_inertia_kg_m2, written_for
 
 Point = tuple[float, ...]
 """Coordinates from 0 (lower bound) to 1 (upper bound), on a logarithmic scale."""
@@ -83,15 +83,6 @@ class Space:
         """Return the first value of each axis at a point."""
         settings = self.settings(point)
         return [_values(axis.gain, settings)[0] for axis in self.axes]
-
-
-def written_for(settings: ControllerConfig, vehicle: Vehicle) -> ControllerConfig:
-    """Return the gains that fly on the vehicle as gains that were found for it, so that on another one they follow its inertia."""
-    if not isinstance(settings, LawConfig) or not hasattr(law_class(settings.law), "for_vehicle"):
-        return settings
-    joints = joint_inertia_kg_m2(vehicle) or (settings.found_for.joint_inertia_kg_m2 if settings.found_for else (1.0,))
-    machine = Machine(mass_kg=vehicle.airframe.mass_kg, joint_inertia_kg_m2=joints)
-    return settings.model_copy(update={"found_for": machine, "scale": None})
 
 
 def _axis(gain: TunedGain, start: ControllerConfig, vehicle: Vehicle) -> Axis | None:
