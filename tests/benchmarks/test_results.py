@@ -146,7 +146,7 @@ def test_the_committed_page_has_these_tables() -> None:
 
 def test_one_phase_of_a_log_is_read(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
-    record_flight(path)
+    record_flight(path, rate_hz=50.0)
     log = FlightLog.read(path)
     name = max({outputs.phase for outputs in log.outputs}, key=lambda phase: sum(o.phase == phase for o in log.outputs))
     begin_s = next(outputs.t_s for outputs in log.outputs if outputs.phase == name)

@@ -112,7 +112,7 @@ def test_minutes_are_cut_at_sixty_seconds() -> None:
 
 def test_the_log_is_read_tick_by_tick(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
-    record_flight(path)
+    record_flight(path, end_s=5.0)
     log = FlightLog.read(path)
     ticks = ticks_of_log(path)
     assert ticks.ticks == len(log.sent)
