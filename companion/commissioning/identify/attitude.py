@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 
 import numpy as np
@@ -13,12 +14,25 @@ from companion.model.frames import quat_conjugate, quat_multiply
 from companion.model.types import Quat, Vec3
 
 AXES = ("roll", "pitch")
-_FREQUENCY_LN = Prior(math.log(11.0), 0.6)
-_DAMPING_LN = Prior(math.log(0.75), 0.3)
-_DELAY = Prior(0.025, 0.02)
-_CUTOFF_HZ = 12.0
-_LAG_SHARE, _BANDWIDTH_SHARE = 0.05, 0.07
-"""Standard errors, relative, from describing PX4's cascade by a second-order response."""
+_ANGLE_GAIN_LN = Prior(math.log(6.5), 0.15)
+"""Gain of the angle loop, 1/s (MC_ROLL_P, MC_PITCH_P)."""
+_RATE_GAIN_LN = Prior(math.log(30.0), 0.4)
+"""Gain of the rate loop: angular acceleration over rate error, 1/s."""
+_ROTOR_LAG_LN = Prior(math.log(0.05), 0.25)
+_DELAY = Prior(0.012, 0.008)
+_INTEGRAL_1_S, _DERIVATIVE_S = 4.0 / 3.0, 0.02
+"""Integral and derivative gains of PX4's rate loop over its proportional gain (defaults of MC_ROLLRATE_* and MC_PITCHRATE_*)."""
+_DERIVATIVE_HZ = 30.0
+_MEASURED_S = 0.005
+"""Time from the gyroscope to the motor signal."""
+_CUTOFF_HZ = 8.0
+_SLOW_HZ = 1.0
+"""Below it, the attitude also follows the arm's motion and gusts, which the position loop answers with setpoints."""
+_LAG_SHARE = 0.05
+_BANDWIDTH_SHARE = 0.09
+"""Standard errors, relative, that no fit of one flight shows. The bandwidth follows the arm: folded and unfolded, it differs by 20 %
+about roll and 10 % about pitch (docs/identify.md), and a flight shows one mean of it.
+"""
 _MOVED_MIN_RAD = math.radians(0.3)
 """Smallest standard deviation of the setpoint that excites the loop."""
 _LAG_SIGMA_MAX_S = 0.02
@@ -53,46 +67,68 @@ def loop(flight: Flight, axis: int) -> tuple[Quantity, Quantity]:
     fit = fit_response(
         pieces,
         _transfer,
-        [np.array([math.log(wn), math.log(damping), 0.03]) for wn in (7.0, 14.0) for damping in (0.6, 1.0)],
-        [_FREQUENCY_LN, _DAMPING_LN, _DELAY],
-        (np.array([math.log(2.0), math.log(0.3), 0.0]), np.array([math.log(60.0), math.log(3.0), 0.15])),
-        _CUTOFF_HZ,
-        order=10,
+        [np.array([prior.mean for prior in _PRIORS])],
+        _PRIORS,
+        (np.append(np.log([2.0, 5.0, 0.01]), 0.0), np.append(np.log([20.0, 200.0, 0.2]), 0.1)),
+        cutoff_hz=_CUTOFF_HZ,
+        slow_hz=_SLOW_HZ,
+        order=8,
     )
     return _lag(fit, lag_key, lag_title), _bandwidth(fit, band_key, band_title)
 
 
+_PRIORS = (_ANGLE_GAIN_LN, _RATE_GAIN_LN, _ROTOR_LAG_LN, _DELAY)
+
+
 def _transfer(p: Array, s: Spectrum) -> Spectrum:
-    """Return a second-order response after a delay; the parameters are ln(frequency), ln(damping) and the delay."""
-    square = math.exp(2.0 * p[0])
-    response = square / (s * s + 2.0 * math.exp(p[1] + p[0]) * s + square)
-    return np.asarray(np.exp(-p[2] * s) * response, dtype=np.complex128)
+    """Return the response of PX4's cascade: angle gain, rate loop (PID, derivative of the measured rate) and rotors, after a delay.
+
+    The parameters are the logarithms of both gains and of the rotors' lag, and the delay.
+    """
+    angle_1_s, rate_1_s, lag_s = np.exp(p[:3])
+    rotors = rate_1_s * np.exp(-_MEASURED_S * s) / (1.0 + lag_s * s)
+    forward = (s + _INTEGRAL_1_S) * rotors
+    damping = _DERIVATIVE_S * s * s / (1.0 + s / (2.0 * math.pi * _DERIVATIVE_HZ)) * rotors
+    rate = forward / (s * s + forward + damping)
+    return np.asarray(np.exp(-p[3] * s) * angle_1_s * rate / (s + angle_1_s * rate), dtype=np.complex128)
+
+
+def lag_s(p: Array) -> float:
+    """Return the lag of the response to slow setpoints."""
+    hertz = 0.25
+    response = _transfer(p, np.array([2j * math.pi * hertz]))[0]
+    return -cmath.phase(complex(response)) / (2.0 * math.pi * hertz)
+
+
+def bandwidth_hz(p: Array) -> float:
+    """Return the frequency at which the response has fallen to 1 / sqrt(2)."""
+    hertz = np.linspace(0.3, 10.0, 500)
+    size = np.abs(_transfer(p, 2j * math.pi * hertz))
+    low = int(np.argmax(size < math.sqrt(0.5)))
+    return float(np.interp(math.sqrt(0.5), size[[low, low - 1]], hertz[[low, low - 1]]))
 
 
 def _lag(fit: Fit, key: str, title: str) -> Quantity:
-    value, sigma = fit.of(lambda p: p[2] + 2.0 * math.exp(p[1]) / math.exp(p[0]))
+    value, sigma = fit.of(lag_s)
     sigma = combined(sigma, _LAG_SHARE * value)
     if sigma > _LAG_SIGMA_MAX_S:
         how = f"known only to ± {1e3 * SIGMAS_95 * sigma:.0f} ms; fly a circuit"
         return Quantity(key, title, "ms", 0, how, scale=1e3)
-    frequency, damping, delay_s = math.exp(fit.parameters[0]), math.exp(fit.parameters[1]), fit.parameters[2]
-    how = f"setpoint to attitude: second order with {frequency:.1f} rad/s, damping {damping:.2f}, after {1e3 * delay_s:.0f} ms"
+    angle_1_s, rate_1_s, rotors_s = np.exp(fit.parameters[:3])
+    how = (
+        f"setpoint to attitude: PX4's cascade with gains {angle_1_s:.1f} 1/s (angle) and {rate_1_s:.0f} 1/s (rate), "
+        f"rotors {1e3 * rotors_s:.0f} ms, after {1e3 * fit.parameters[3]:.0f} ms"
+    )
     return Quantity(key, title, "ms", 0, how, value, sigma, "lab about 165 ms", 1e3)
 
 
 def _bandwidth(fit: Fit, key: str, title: str) -> Quantity:
-    value, sigma = fit.of(lambda p: bandwidth_hz(math.exp(p[0]), math.exp(p[1])))
+    value, sigma = fit.of(bandwidth_hz)
     sigma = combined(sigma, _BANDWIDTH_SHARE * value)
     if sigma > 0.15 * value:
         how = f"known only to ± {SIGMAS_95 * sigma:.1f} Hz; fly a circuit with faster turns"
         return Quantity(key, title, "Hz", 2, how)
-    return Quantity(key, title, "Hz", 2, "of the same response", value, sigma)
-
-
-def bandwidth_hz(frequency_rad_s: float, damping: float) -> float:
-    """Return the frequency at which a second-order response has fallen to 1 / sqrt(2)."""
-    k = 1.0 - 2.0 * damping * damping
-    return frequency_rad_s * math.sqrt(k + math.sqrt(k * k + 1.0)) / (2.0 * math.pi)
+    return Quantity(key, title, "Hz", 2, "of the same response, mean over the arm's poses in this flight", value, sigma)
 
 
 def mocap_delay(flight: Flight) -> Quantity:

@@ -67,7 +67,7 @@ class Fit:
 class _Low:
     """A piece below the cutoff frequency, at a lower rate."""
 
-    def __init__(self, piece: Piece, cutoff_hz: float) -> None:
+    def __init__(self, piece: Piece, cutoff_hz: float, slow_hz: float) -> None:
         every = max(1, int(1.0 / (3.0 * cutoff_hz * STEP_S)))
         edge = math.ceil(_EDGE_S / (every * STEP_S))
         count = len(piece.input)
@@ -81,9 +81,10 @@ class _Low:
         self._input = self._spectrum(piece.input - self._begin)
         self._output_begin = float(piece.output[0])
         self.output = self._values(self._spectrum(piece.output - self._output_begin)) + self._output_begin
-        line = np.linspace(-1.0, 1.0, len(self.output))
-        self.slow = np.stack([np.ones(len(line)), line], axis=1)
-        """Columns of an offset and a drift."""
+        half_turns = np.pi * (np.arange(len(self.output)) + 0.5) / len(self.output)
+        cosines = np.arange(1 + int(2.0 * slow_hz * every * STEP_S * len(self.output)))
+        self.slow = np.column_stack([half_turns, np.cos(np.outer(half_turns, cosines))])
+        """Columns of a drift, an offset and the cosines up to `slow_hz`."""
 
     def response(self, transfer: Spectrum) -> Array:
         """Return the response to the input."""
@@ -104,24 +105,27 @@ def fit_response(
     priors: Sequence[Prior],
     bounds: tuple[Array, Array],
     cutoff_hz: float,
+    slow_hz: float,
     order: int,
     gain: Prior | None = None,
 ) -> Fit:
     """Fit the parameters of a response.
 
     Args:
-        pieces: parts of the flight. Each has its own offset and drift of the output.
+        pieces: parts of the flight.
         transfer: the model.
         starts: first guesses; the best result counts, because the cost may have several minima.
         priors: one for each parameter.
         bounds: lower and upper bounds of the parameters.
         cutoff_hz: frequency up to which the response is compared.
+        slow_hz: frequency below which each piece has a disturbance of its own, which is fitted, too: the position loop answers slow
+            disturbances with setpoints, and these would pass for their cause.
         order: order of the autoregressive model of the residuals.
         gain: prior of a factor of the response, which each piece has for itself; None if the factor is 1.
     """
     from scipy.optimize import least_squares  # the import takes half a second
 
-    low = [_Low(piece, cutoff_hz) for piece in pieces]
+    low = [_Low(piece, cutoff_hz, slow_hz) for piece in pieces]
     white = np.ones(1)
     noise = float(np.std(np.concatenate([one.output - one.output.mean() for one in low])))
 

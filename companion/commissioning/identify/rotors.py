@@ -27,8 +27,12 @@ THR_MDL_FAC says.
 """
 _CUTOFF_HZ = 6.0
 """Above it, vibration that the law feeds back hides the response."""
-_LAG_SIGMA_S = 0.006
-"""Standard error from describing rotors that speed up faster than they slow down by one time constant."""
+_SLOW_HZ = 0.5
+"""Below it, the ground effect, the drag and the payload change the specific force, too."""
+_LAG_SIGMA_S = 0.008
+"""Standard error from describing rotors that speed up faster than they slow down by one time constant, and from the vibration that the
+accelerometer brings into the thrust setpoint.
+"""
 _LAG_SIGMA_MAX_S = 0.025
 _THRUST_MOVED = 0.003
 """Smallest standard deviation of the thrust setpoint that excites the rotors."""
@@ -80,7 +84,8 @@ def thrust_lag(flight: Flight, hover: float | None) -> Quantity:
         [np.array([math.log(lag_s), delay_s]) for lag_s in (0.02, 0.06, 0.12) for delay_s in (0.008, 0.03)],
         [_LAG_LN, _DELAY],
         (np.array([math.log(0.005), 0.0]), np.array([math.log(0.5), 0.1])),
-        _CUTOFF_HZ,
+        cutoff_hz=_CUTOFF_HZ,
+        slow_hz=_SLOW_HZ,
         order=6,
         gain=Prior(_SLOPE.mean * gain, _SLOPE.sigma * gain),
     )
