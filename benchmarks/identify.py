@@ -2,7 +2,8 @@
 
 Every laboratory is flown in the fast loop; the identification sees the flight's log only. The truth is read from the world, or measured
 in it: for the responses, the same world without noise, gusts and arm effects is excited with sines, and its true motion is compared
-with the setpoints; for the bandwidth with the arm folded and unfolded, and the mean of both responses counts. Prints how often each 95 % interval holds the truth, and how wide it is.
+with the setpoints; for the bandwidth with the arm folded and unfolded, and the mean of both responses counts. Prints how often each
+95 % interval holds the truth, and how wide it is.
 """
 
 from __future__ import annotations

@@ -130,6 +130,7 @@ def test_a_crash_counts_as_worse_than_every_other_flight() -> None:
     assert group.spread("rms.post.e_p_m") == Spread(0.3, None, 5)
     assert group.spread("rms.pre.e_p_m") == Spread(0.01, 0.01, 5), "it crashed after the catch"
     assert group.jsonable()["completed"] == 3
+    assert group.jsonable()["cost_m"] == group.cost > 0.0
     assert group.jsonable()["p95"]["rms"]["post"]["e_p_m"] is None
     (all_crashed,) = aggregate([row(1, None), row(2, None)])
     assert all_crashed.spread("rms.post.e_p_m") is None

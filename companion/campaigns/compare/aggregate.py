@@ -108,6 +108,7 @@ class Group:
             "flights": len(self.rows),
             "completed": sum(row["outcome"] == COMPLETED for row in self.rows),
             "failures": self.failures,
+            "cost_m": self.cost,
             "p50": _nested({name: None if spread is None else spread.p50 for name, spread in spreads.items()}),
             "p95": _nested({name: None if spread is None else spread.p95 for name, spread in spreads.items()}),
             "printed": of

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from companion.campaigns.tune.search import Evaluation, Search, rungs_of
 from companion.campaigns.tune.space import Space
 from companion.model.types import Outcome
 
+BOOTSTRAPS = 2000
 NEAR_BOUND = 0.03
 """Distance from a bound, as a share of the logarithmic range, below which a gain is marked."""
 
@@ -32,6 +34,21 @@ class HeldOut:
     def costs(self) -> tuple[float, float]:
         """Return the cost of the start and that of the found gains."""
         return cost_of([*map(flight_cost, self.before)]), cost_of([*map(flight_cost, self.after)])
+
+    def change_95(self) -> tuple[float, float]:
+        """Return the 95 % interval of the relative change of the cost.
+
+        It is the paired bootstrap's over the laboratories: start and found gains have flown in the same ones.
+        """
+        pairs = [(flight_cost(old), flight_cost(new)) for old, new in zip(self.before, self.after, strict=True)]
+        draw = random.Random(0)
+        changes = []
+        for _ in range(BOOTSTRAPS):
+            before, after = zip(*draw.choices(pairs, k=len(pairs)), strict=True)
+            changes.append(cost_of(after) / cost_of(before) - 1.0)
+        changes.sort()
+        tail = round(0.025 * BOOTSTRAPS)
+        return changes[tail], changes[-1 - tail]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +82,13 @@ class Result:
 
     @cached_property
     def better(self) -> bool:
-        """Whether the found gains cost less in the held-out laboratories."""
-        before, after = self.judged.costs()
-        return self.search.best is not self.search.start and after < before
+        """Whether the found gains surely cost less than the start in laboratories like the held-out ones."""
+        return self.search.best is not self.search.start and self.change_95[1] < 0.0
+
+    @cached_property
+    def change_95(self) -> tuple[float, float]:
+        """The 95 % interval of the relative change of the cost in the held-out laboratories."""
+        return self.judged.change_95()
 
     @cached_property
     def gains(self) -> list[Gain]:
@@ -99,11 +120,12 @@ class Result:
         if self.search.best is self.search.start:
             return "no candidate costs less than the start in the laboratories of the search; no controller file was written"
         before, after = self.judged.costs()
-        share = f"{abs(after / before - 1.0):.0%} {'less' if after < before else 'more'}"
+        low, high = self.change_95
+        share = f"{after / before - 1.0:+.0%}, 95 % interval {low:+.0%} to {high:+.0%}"
         text = f"cost in {self.held_out.count} held-out laboratories: {before:.4f} before, {after:.4f} after ({share})"
         if self.better:
             return text
-        return f"{text}; the gains are not better, so no controller file was written"
+        return f"{text}; the gains are not surely better, so no controller file was written"
 
     def data(self, file: Path | None) -> dict[str, Any]:
         """Return the result as plain data."""
@@ -121,6 +143,7 @@ class Result:
             "held_out": {
                 "cost_before": before,
                 "cost_after": after,
+                "change_95": list(self.change_95),
                 "completed_before": completed(self.judged.before),
                 "completed_after": completed(self.judged.after),
                 "better_flights": sum(new < old for old, new in pairs),
