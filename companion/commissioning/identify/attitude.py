@@ -103,7 +103,7 @@ def lag_s(p: Array) -> float:
 def bandwidth_hz(p: Array) -> float:
     """Return the frequency at which the response has fallen to 1 / sqrt(2)."""
     hertz = np.linspace(0.3, 10.0, 500)
-    size = np.abs(_transfer(p, 2j * math.pi * hertz))
+    size = np.abs(_transfer(p, np.asarray(2j * math.pi * hertz, dtype=np.complex128)))
     low = int(np.argmax(size < math.sqrt(0.5)))
     return float(np.interp(math.sqrt(0.5), size[[low, low - 1]], hertz[[low, low - 1]]))
 
