@@ -16,8 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.model.types import ContactMode, Outcome
+from companion.analysis.contact import contact_summary
+from companion.model.types import ContactMode, Outcome, Severity
 from companion.sitl_config.loader import load_sitl
+from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight
 
 MISSION = "configs/missions/press.yaml"
@@ -37,6 +39,11 @@ class Press:
     largest_true_n: float
     """While pressing with the rise of the force."""
     largest_measured_n: float
+    largest_in_flight_n: float
+    """True force, light touches included."""
+    beside_mm: float
+    """RMS distance of the pressing tip from its reference, across the press."""
+    events: str
     rotor_distance_m: float
     normal_error_deg: float
     place_error_mm: float
@@ -61,6 +68,7 @@ def flown(seed: int) -> Press:
     wanted_n = np.array([0.0 if c is None or c.mode is not ContactMode.PRESS else c.wanted_n for c in contacts])
     pressing = wanted_n > wanted_n[-1]
     steady = np.flatnonzero(wanted_n == 5.0)[SETTLE_TICKS:]
+    beside_m = (contact_summary(row_of(flight.config.flight, result, None)[1]) or {}).get("path_rms_m")
     found = next((c.surface for c in reversed(contacts) if c is not None and c.surface is not None), None)
     return Press(
         seed=seed,
@@ -70,6 +78,9 @@ def flown(seed: int) -> Press:
         measured_error=_error(measured_n[steady]),
         largest_true_n=float(true_n[pressing].max(initial=0.0)),
         largest_measured_n=float(measured_n[pressing].max(initial=0.0)),
+        largest_in_flight_n=surfaces.force_max_n,
+        beside_mm=math.nan if beside_m is None else 1e3 * beside_m,
+        events=" ".join(e.id for o in result.outputs for e in o.events if e.severity is not Severity.INFO),
         rotor_distance_m=surfaces.rotor_distance_min_m,
         normal_error_deg=math.nan
         if found is None
@@ -97,7 +108,7 @@ def main() -> None:
     print(f"nearest rotor {min(press.rotor_distance_m for press in presses):.2f} m")
     for name in (
         *("true_error", "measured_error", "largest_true_n", "largest_measured_n"),
-        *("normal_error_deg", "place_error_mm"),
+        *("largest_in_flight_n", "beside_mm", "normal_error_deg", "place_error_mm"),
     ):
         values = [getattr(press, name) for press in completed]
         low, high, most = np.nanpercentile(values, (50, 95, 100))

@@ -15,6 +15,7 @@ from companion.model.arm_skeleton import ArmSkeleton, logged_skeleton
 from companion.model.best_pose import best_pose
 from companion.model.frames import quat_rotate
 from companion.model.types import ContactMode, ContactState, Vec3
+from companion.safety import notices
 
 SETTLED_S = 1.5
 """Time after the end of the force's ramp from which the force counts as steady."""
@@ -29,17 +30,16 @@ def contact_summary(log: FlightLog) -> dict[str, Any] | None:
 
     Force is that along the direction of the approach, as measured in flight: `mean_n` and `rms_error_n` while it is steady,
     `overshoot_n` from the first touch on. `path_rms_m` is the distance of the tip, across that direction, from the path on which the
-    reference would lead it. For a press that path is a point, and the distance is that from the tip's mean place: a constant
-    distance between tip and reference is not in it. `surface` is the plane through the points touched by a probe, or by an approach
-    that turns to the surface. Without those it is the mean point that was touched while the force was steady, and the normal of the
-    touched points or, if they lie too close together, the direction of the approach reversed. Its `points` are those by which it was
-    found.
+    reference would lead it; for a press that path is a point. `surface` is the plane through the points touched by a probe, or by an
+    approach that turns to the surface. Without those it is the mean point that was touched while the force was steady, and the normal
+    of the touched points or, if they lie too close together, the direction of the approach reversed. Its `points` are those by which
+    it was found.
     """
     states = [outputs.contact for outputs in log.outputs]
     last = next((state for state in reversed(states) if state is not None), None)
     if last is None:
         return None
-    touches = max((state.touches for state in states if state is not None), default=0)
+    touches = sum(event.id == notices.TOUCHED.id for outputs in log.outputs for event in outputs.events)
     pressing = np.array([state is not None and presses(state) for state in states], dtype=np.bool_)
     force = np.array([np.nan if state is None else state.force_n for state in states])
     wanted = np.array([0.0 if state is None else state.wanted_n for state in states])
@@ -68,7 +68,6 @@ def contact_summary(log: FlightLog) -> dict[str, Any] | None:
         tip, planned, direction, _ = tips
         off = tip - planned
         off -= np.outer(off @ direction, direction)
-        off -= off.mean(axis=0) if float(np.ptp(planned, axis=0).max()) < PLANE_M else 0.0
         row["path_rms_m"] = float(np.sqrt(np.mean(np.sum(off * off, axis=1))))
         if found is None:
             normal = _normal(tip, direction)
@@ -85,6 +84,12 @@ def true_force_n(summary: dict[str, Any]) -> float | None:
     surface = (summary.get("contact") or {}).get("surface")
     force_n = ((summary.get("world") or {}).get("contact") or {}).get("force_held_world_n")
     return None if surface is None or force_n is None else float(np.dot(force_n, surface["normal"]))
+
+
+def rotor_distance_m(summary: dict[str, Any]) -> float | None:
+    """Return the smallest distance of a rotor's disk from a surface, m, as the simulated world reports it; None if it is unknown."""
+    distance_m: float | None = ((summary.get("world") or {}).get("contact") or {}).get("rotor_distance_min_m")
+    return distance_m
 
 
 def surface_error(summary: dict[str, Any]) -> tuple[float, float] | None:
@@ -110,16 +115,25 @@ def contact_lines(summary: dict[str, Any]) -> list[tuple[str, str]]:
     contact = summary.get("contact")
     if contact is None:
         return []
-    touches = "touch" if contact["touches"] == 1 else "touches"
-    text = f"{contact['touches']} {touches}"
+    surface = contact["surface"]
+    text = "1 touch" if contact["touches"] == 1 else f"{contact['touches']} touches"
+    if surface is not None and surface["points"]:
+        text += f", {surface['points']} of them to find the surface"
+    lines = [("contact", text)]
     if contact["mean_n"] is not None:
-        text += (
-            f", {contact['wanted_n']:.2f} N wanted, {contact['mean_n']:.2f} N measured (RMS error {contact['rms_error_n']:.2f} N, "
+        text = (
+            f"{contact['wanted_n']:.2f} N wanted, {contact['mean_n']:.2f} N measured (RMS error {contact['rms_error_n']:.2f} N, "
             f"overshoot {contact['overshoot_n']:.1f} N)"
         )
+        lines.append(("force", text))
         if (true_n := true_force_n(summary)) is not None:
-            text += f"; true: {true_n:.2f} N (known to the simulated world only)"
-    lines, surface = [("contact", text)], contact["surface"]
+            lines.append(("true force", f"{true_n:.2f} N (known to the simulated world only)"))
+    if (distance_m := rotor_distance_m(summary)) is not None:
+        lines.append(
+            ("rotors", f"{distance_m:.2f} m from a surface at the nearest (known to the simulated world only)")
+        )
+    if contact["path_rms_m"] is not None:
+        lines.append(("tip", f"{1e3 * contact['path_rms_m']:.0f} mm (RMS) from its path, across the press"))
     if surface is None:
         return lines
     x, y, z = surface["point_m"]
@@ -129,8 +143,6 @@ def contact_lines(summary: dict[str, Any]) -> list[tuple[str, str]]:
         text = f"found by {surface['points']} points{text.removeprefix('touched')}, normal [{x:.3f}, {y:.3f}, {z:.3f}]"
         if (off := surface_error(summary)) is not None:
             text += f"; {1e3 * off[0]:.1f} mm and {off[1]:.1f} deg off (known to the simulated world only)"
-    elif contact["path_rms_m"] is not None:
-        text += f", tip within {1e3 * contact['path_rms_m']:.0f} mm (RMS) of its path"
     return [*lines, ("surface", text)]
 
 

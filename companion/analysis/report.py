@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.analysis.animation import movie_of, player_html
-from companion.analysis.contact import surface_error, true_force_n
+from companion.analysis.contact import rotor_distance_m, surface_error, true_force_n
 from companion.analysis.log import FlightLog
 from companion.analysis.page import Page, Picture, Section, write_page
 from companion.analysis.plots import write_plots
@@ -22,7 +22,8 @@ def write_report(log: FlightLog, summary: dict[str, Any], out_dir: Path) -> Path
     """Write the plots as PNG and report.html into `out_dir`; return the path of report.html."""
     plots = [Picture(plot.path, plot.title, plot.caption) for plot in write_plots(log, out_dir)]
     config, movie = effective_config(log, summary), movie_of(log, summary)
-    payload_kg = summary["payload_kg"]
+    catches = summary["catch_t_s"] is not None or (log.config.get("mission") or {}).get("catch") is not None
+    payload_kg = summary["payload_kg"] if catches else None
     about = (
         _start(log),
         (log.config.get("vehicle") or {}).get("name", ""),
@@ -44,7 +45,7 @@ def write_report(log: FlightLog, summary: dict[str, Any], out_dir: Path) -> Path
         str((log.config.get("mission") or {}).get("name", "flight")),
         " · ".join(text for text in about if text),
         [
-            Section("", cards=_results(summary, log.stride)),
+            Section("", cards=_results(summary, log.stride, catches)),
             *([Section("Plots", pictures=plots)] if plots else []),
             Section("Events", "" if summary["events"] else "None.", [_events(summary["events"])]),
             Section("Record", tables=[_pairs("", versions)], folded=folded),
@@ -72,10 +73,11 @@ def _why_ended(summary: dict[str, Any]) -> str:
     return ""
 
 
-def _results(summary: dict[str, Any], stride: int) -> list[Table]:
+def _results(summary: dict[str, Any], stride: int, catches: bool) -> list[Table]:
+    parts = {"pre": "in flight"} if summary["catch_t_s"] is None else {"pre": "before catch", "post": "after catch"}
     loop, latency, recorder, stages = (summary[key] for key in ("loop", "latency_ms", "recorder", "stages_ms"))
     rms = [
-        (name, *(_number(summary["rms"][part][key], digits) for part in ("pre", "post")))
+        (name, *(_number(summary["rms"][part][key], digits) for part in parts))
         for name, key, digits in (
             ("position ‖e_p‖ [m]", "e_p_m", 4),
             ("attitude ‖e_q‖ [deg]", "e_q_deg", 2),
@@ -83,12 +85,15 @@ def _results(summary: dict[str, Any], stride: int) -> list[Table]:
         )
     ]
     flight = [
-        ("catch at", _number(summary["catch_t_s"], 2, " s")),
         ("final height error", _number(summary["final_e_z_m"], 3, " m")),
-        ("impedance error, position", _number(summary["impedance_error"]["position_n"], 2, " N")),
-        ("impedance error, arm", _number(summary["impedance_error"]["arm_nm"], 3, " N m")),
         ("minimum tether slack", _number(summary["tether"]["min_slack_m"], 2, " m")),
     ]
+    if catches:
+        flight[:0] = [
+            ("catch at", _number(summary["catch_t_s"], 2, " s")),
+            ("impedance error, position", _number(summary["impedance_error"]["position_n"], 2, " N")),
+            ("impedance error, arm", _number(summary["impedance_error"]["arm_nm"], 3, " N m")),
+        ]
     if summary.get("catch_confirmed") is False:
         flight.insert(1, ("catch confirmed", "no, the flight ended too soon after the impact"))
     if (observed := summary.get("force_observer_error_n")) is not None:
@@ -117,7 +122,7 @@ def _results(summary: dict[str, Any], stride: int) -> list[Table]:
     if recorder.get("error"):
         processes.append(("recorder", recorder["error"]))
     return [
-        _pairs("RMS error", rms, "before catch", "after catch"),
+        _pairs("RMS error", rms, *parts.values()),
         _pairs("Flight", flight),
         *_contact(summary),
         _pairs("Timing [ms]", timing, "p50", "p99", "max"),
@@ -147,6 +152,8 @@ def _contact(summary: dict[str, Any]) -> list[Table]:
             rows.append((f"normal by {surface['points']} points", _vector(surface["normal"])))
         if (off := surface_error(summary)) is not None:
             rows.append(("found surface off (simulation)", f"{1e3 * off[0]:.1f} mm, {off[1]:.1f} deg"))
+    if (distance_m := rotor_distance_m(summary)) is not None:
+        rows.append(("nearest rotor (simulation)", f"{distance_m:.2f} m"))
     return [_pairs("Contact", rows)]
 
 

@@ -121,8 +121,11 @@ def effective_config(log: FlightLog, summary: dict[str, Any]) -> dict[str, Any]:
     world = summary.get("world")
     if not log.config or not world:
         return log.config
-    # The drawn values are in the configuration, too.
-    return {**log.config, "world": {key: value for key, value in world.items() if key != "drawn"}}
+    # The drawn values are in the configuration, too; the contact is what happened.
+    return {
+        **log.config,
+        "world": {key: value for key, value in world.items() if key not in ("drawn", "contact")},
+    }
 
 
 def world_text(world: dict[str, Any] | None) -> str:

@@ -41,7 +41,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--phases", type=_known((*PHASES, *CONTACT_PHASES), "phase"), default=(), metavar="PHASE,...",
         help=f"phases from {', '.join(PHASES)}; default: all of these. Or from {', '.join(CONTACT_PHASES)}, flown with the mission "
-        f"{CONTACT_MISSION} in the world {CONTACT_WORLD} unless others are given",
+        f"{CONTACT_MISSION} in the world {CONTACT_WORLD} unless others are given; the default for kinds that need a surface",
     )  # fmt: skip
     parser.add_argument(
         "--wires",
@@ -83,6 +83,16 @@ def _campaign(arguments: argparse.Namespace) -> Faults:
     Raises:
         ConfigError: one line per problem; also if there is no fault to fly.
     """
+    touching = [kind for kind in arguments.kinds if KINDS[kind].phases == CONTACT_PHASES]
+    if touching and not arguments.phases:
+        if len(touching) < len(arguments.kinds):
+            raise ConfigError(
+                [
+                    f"companion faults: --kinds: {', '.join(touching)} need a mission with a contact, got other kinds as well; choose "
+                    f"--phases {','.join(CONTACT_PHASES)}, or fly two campaigns"
+                ]
+            )
+        arguments.phases = CONTACT_PHASES
     if touches(arguments.phases):
         if not set(arguments.phases) <= set(CONTACT_PHASES):
             raise ConfigError(

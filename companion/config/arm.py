@@ -254,7 +254,7 @@ TOOL_KEYS = {
     "rod": ("mass_kg", "length_m", "tip_radius_m"),
     "brush": ("mass_kg", "length_m", "tip_radius_m", "stiffness_n_m"),
 }
-"""Keys of each kind of tool, in addition to those of the sensor."""
+"""Keys of each kind of tool, in addition to those of the sensor. A rod may have `stiffness_n_m` as well."""
 
 
 class Tool(Model):
@@ -277,7 +277,7 @@ class Tool(Model):
     tip_radius_m: Positive | None = None
     """Radius of the ball or brush. Rods and brushes only."""
     stiffness_n_m: Positive | None = None
-    """Stiffness of the bristles. Brushes only."""
+    """Stiffness of the bristles, or of a rod's ball; a rod without it has a hard ball, which hits a hard surface harder."""
     sensor_rpy_deg: Vector3 = (0.0, 0.0, 0.0)
     """Attitude of the sensor frame in the tip's frame (x outwards; for rods, the frame of the last link): roll, pitch, yaw (ZYX)."""
 
@@ -285,7 +285,7 @@ class Tool(Model):
     def _keys_of_kind(self) -> Self:
         own, problems = TOOL_KEYS[self.kind], list[tuple[Location, str]]()
         for key in dict.fromkeys(key for keys in TOOL_KEYS.values() for key in keys):
-            if (getattr(self, key) is None) == (key in own):
+            if (self.kind, key) != ("rod", "stiffness_n_m") and (getattr(self, key) is None) == (key in own):
                 text = (
                     f"missing; a {self.kind} has it"
                     if key in own

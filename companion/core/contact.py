@@ -85,10 +85,14 @@ def advance_contact(t: Transition) -> None:
         _stay_in(t, engaged)
         contact = probing.touching(t, contact, approach)
     elif isinstance(phase, Detach):
+        _warn_if_beside(t, contact)
         contact = c.entered(contact, t_s, _LEAVE)
         t.change(contact_segment=segment)
     elif isinstance(phase, Press):
+        rises = contact.wanted_n < phase.force_n
         contact = c.pressed(contact, t_s, dt_s, approach.touch_n, phase.force_n)
+        if rises and contact.wanted_n >= phase.force_n:
+            _warn_if_beside(t, contact)
         contact = c.timed(contact, dt_s, not c.touches(contact, approach.touch_n))
         t.change(contact_segment=segment)
         if contact.beyond_s >= c.LOST_S:
@@ -98,6 +102,12 @@ def advance_contact(t: Transition) -> None:
 
 def _turn_max_rad(contact: ContactState, approach: Approach | Probe) -> float:
     return c.TURNED_LIGHTLY_RAD if probing.seeks_points(contact, approach) else c.TURNED_RAD
+
+
+def _warn_if_beside(t: Transition, contact: ContactState) -> None:
+    if (off_m := probing.beside_m(t, contact)) > c.BESIDE_M:
+        text = f"the tool presses {100 * off_m:.0f} cm beside the point of the mission (limit {100 * c.BESIDE_M:g} cm)"
+        t.report(notices.CONTACT_BESIDE, text)
 
 
 def _left(contact: ContactState, t_s: float, dt_s: float, speed_m_s: float) -> ContactState:

@@ -94,6 +94,21 @@ def shifting(t: Transition, contact: ContactState, phase: Approach | Probe) -> C
     return c.entered(contact, t.i.t_s, mode)
 
 
+def beside_m(t: Transition, contact: ContactState) -> float:
+    """Return the distance of the tip from its reference, across the direction of the press, m; 0 if it is unknown."""
+    tip, course = _tip_world_m(t), t.state.course
+    if tip is None or course is None:
+        return 0.0
+    reference = c.along(course.reference(t.i.t_s), contact)
+    x, y, z = t.parameters.manipulator.net_body_m(reference.arm_rad)
+    cos, sin = math.cos(reference.yaw_rad), math.sin(reference.yaw_rad)
+    level = (cos * x - sin * y, sin * x + cos * y, z)
+    tilted, at = contact.tilting_n, reference.position_world_m
+    dx, dy, dz = (p - q - a + tilted * s for p, q, a, s in zip(tip, at, level, contact.tip_per_n_m, strict=True))
+    along_m = c.along_m(contact, (dx, dy, dz))
+    return math.sqrt(max(0.0, dx * dx + dy * dy + dz * dz - along_m * along_m))
+
+
 def steep(contact: ContactState) -> str:
     """Return why the touched points are refused."""
     most_deg = math.degrees(TILT_MAX_RAD)

@@ -60,7 +60,7 @@ def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Con
             print_error(f"report cancelled; write it with: companion report {out / 'flight.mcap'}")
         except OSError as error:
             print_error(f"{out}: the report cannot be written: {error.strerror}")
-    print_result(console, summary, out, page, contact_lines(summary))
+    print_result(console, summary, out, page, contact_lines(summary), catches=config.mission.catch is not None)
     if (out / PROPOSAL).exists():
         text = f"gains as optimised in flight: {out / PROPOSAL}; fly them with --controller {out / PROPOSAL}"
         console.print(text, highlight=False, markup=False, soft_wrap=True)
@@ -90,6 +90,7 @@ def _summary(config: SitlConfig, result: FlightResult, out: Path) -> tuple[Fligh
         "name": config.laboratory.name,
         "drawn": config.laboratory.drawn(config.world),
         **knobs,
+        "contact": result.world.get("contact"),
     }
     logged = {event["id"] for event in summary["events"]}
     summary["events"] += [event for event in result.events if event["id"] not in logged]

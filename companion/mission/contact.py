@@ -59,6 +59,8 @@ ASTRAY_M = 0.08
 """Position error along the direction from which the vehicle leaves: something blocks it that the force sensor does not measure, or it
 pushes against nothing. In simulated laboratories with a healthy sensor the error stayed below 0.03 m.
 """
+BESIDE_M = 0.05
+"""Distance of the pressing tip from its reference, across the press, from which a warning is reported."""
 DISAGREEMENT_S = 0.1
 """Time constant of the comparison of the measured force with the one that the vehicle's motion shows, and the time for which they must
 disagree.

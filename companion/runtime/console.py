@@ -195,14 +195,31 @@ class FlightDisplay:
 
 
 def print_result(
-    console: Console, summary: dict[str, Any], out: Path, report: Path | None, contact: Sequence[tuple[str, str]] = ()
+    console: Console,
+    summary: dict[str, Any],
+    out: Path,
+    report: Path | None,
+    contact: Sequence[tuple[str, str]] = (),
+    *,
+    catches: bool = True,
 ) -> None:
-    """Print the result table and the paths of the flight's files; `contact` holds names and texts of facts about a contact."""
+    """Print the result table and the paths of the flight's files.
+
+    Args:
+        console: where to print.
+        summary: the flight's summary.
+        out: folder of the flight.
+        report: the flight's report, if it was written.
+        contact: names and texts of facts about a contact.
+        catches: whether the mission catches a payload.
+    """
+    catch = summary.get("catch_t_s")
     outcome = summary["outcome"]
     table = Table(title=None, show_header=True, header_style="bold", box=None, pad_edge=False)
     table.add_column("")
-    table.add_column("before the catch", justify="right")
-    table.add_column("after the catch", justify="right")
+    parts = ("pre",) if catch is None else ("pre", "post")
+    for head in ("in flight",) if catch is None else ("before the catch", "after the catch"):
+        table.add_column(head, justify="right")
     rms = summary["rms"]
 
     def cell(part: str, key: str, unit: str, scale: float = 1.0, digits: int = 3) -> str:
@@ -215,7 +232,7 @@ def print_result(
         ("attitude error, RMS", "e_q_deg", "deg", 2),
         ("arm error, RMS", "e_alpha_deg", "deg", 2),
     ):
-        table.add_row(label, cell("pre", key, unit, digits=digits), cell("post", key, unit, digits=digits))
+        table.add_row(label, *(cell(part, key, unit, digits=digits) for part in parts))
     facts = Table.grid(padding=(0, 2))
     style = _OUTCOME_STYLE.get(outcome, "bold red")
     facts.add_row("outcome", f"[{style}]{outcome}[/]")
@@ -223,15 +240,16 @@ def print_result(
     world = summary.get("world")
     if world is not None:
         facts.add_row("world", f"{world['name']}, seed {world['seed']}")
-    if summary.get("payload_kg") is not None:
+    catches = catches or catch is not None
+    if catches and summary.get("payload_kg") is not None:
         facts.add_row("payload", f"{summary['payload_kg']:g} kg (known to the simulated world only)")
-    catch = summary.get("catch_t_s")
     doubt = (
         ""
         if summary.get("catch_confirmed") is not False
         else ", not confirmed: the flight ended too soon after the impact"
     )
-    facts.add_row("catch", "none" if catch is None else f"t = {catch:.2f} s{doubt}")
+    if catches:
+        facts.add_row("catch", "none" if catch is None else f"t = {catch:.2f} s{doubt}")
     for name, text in contact:
         facts.add_row(name, escape(text))
     loop = summary.get("loop") or {}

@@ -94,6 +94,11 @@ CONTACT_BOUNCE = Notice(
     "contact_bounce", _WARNING, _WARN,
     "the surface was touched three times in one contact: the vehicle moves back, and the mission goes on as aborted",
 )  # fmt: skip
+CONTACT_BESIDE = Notice(
+    "contact_beside", _WARNING, _WARN,
+    "the tool touched more than 5 cm beside the point of the mission, or slipped there: judged when the force is reached and when it "
+    "ends; the mission goes on",
+)  # fmt: skip
 CONTACT_SLIPPED = Notice(
     "contact_slipped", _WARNING, _WARN,
     "the yaw error exceeded 5 deg while approaching or pressing (15 deg while light touches find the surface's normal), because the "
@@ -129,6 +134,7 @@ NO_ROOM_TO_STAY = Notice(
 NOTICES: tuple[Notice, ...] = (
     INPUTS_MISSING, VISION_NOT_FUSED, ESTIMATE_UNSTEADY, START_REFUSED, OFFBOARD_REFUSED, ARMING_REFUSED, NOT_READY,
     START_DECLINED, CALLED_OFF, RESUME_REFUSED, TAKEOFF, CATCH, PAYLOAD_LEFT, IMPEDANCE_SCALED, TOUCHED, CONTACT_INTERRUPTED,
-    CONTACT_LOST, CONTACT_DISAGREES, CONTACT_BOUNCE, CONTACT_SLIPPED, SURFACE_MISSING, TOUCHDOWN, NO_TOUCHDOWN, DISARM_REFUSED,
+    CONTACT_LOST, CONTACT_DISAGREES, CONTACT_BOUNCE, CONTACT_BESIDE, CONTACT_SLIPPED, SURFACE_MISSING, TOUCHDOWN, NO_TOUCHDOWN,
+    DISARM_REFUSED,
     AUTOPILOT_LANDING, GATE, HOLD_EXPIRED, RETRACT_EXPIRED, RETRACT_DONE, NO_ROOM_TO_STAY,
 )  # fmt: skip

@@ -128,10 +128,12 @@ class Surfaces:
         tip = model.body("tip").id
         self._inverse_kg = float(model.body_invweight0[tip, 0])
         tool = vehicle.tool
-        brush = tool.stiffness_n_m if tool is not None else None
+        tip_n_m = tool.stiffness_n_m if tool is not None else None
         for number, surface in enumerate(config.surfaces):
             own = surface.stiffness_n_m
-            self._set_contact(number, own if brush is None else own * brush / (own + brush), surface.damping_ratio)
+            self._set_contact(
+                number, own if tip_n_m is None else own * tip_n_m / (own + tip_n_m), surface.damping_ratio
+            )
         layout = vehicle.airframe.rotor_layout
         angles = np.linspace(0.0, 2.0 * math.pi, _RIM_POINTS, endpoint=False)
         rim = vehicle.airframe.disk_radius_m * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)

@@ -221,6 +221,8 @@ CASES = "mission: a.yaml\ncontroller: adaptive\npreset: paper\ncases: []\n"
         (("faults", "--phases", "lunch"), r"there is no phase 'lunch'"),
         (("faults", "--set", "world.faults=[]"), r"the campaign sets this key; use --kinds and --phases"),
         (("faults", "--wires", "--kinds", "gust"), r"no fault to fly with --wires: kind gust, phase any"),
+        (("faults", "--wires", "--kinds", "tool_broken"), r"kind tool_broken, phase touch or press or detach"),
+        (("faults", "--kinds", "gust,tool_broken"), r"tool_broken need a mission with a contact, got other kinds"),
         (("robustness", "--case", "heavy"), r"--case needs --cases FILE"),
         (("robustness", "--cases", "nowhere.yaml"), r"nowhere\.yaml: no such file"),
         (("robustness", "--cases", "empty.yaml"), r"empty\.yaml: cases: expected at least one case"),

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from companion.analysis.contact import rotor_distance_m
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK
 from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight
@@ -94,13 +95,16 @@ def test_the_fast_loop_says_what_the_wires_say(the_catch: Flown) -> None:
 
 def test_a_lost_arm_lands_it(tmp_path_factory: pytest.TempPathFactory) -> None:
     with sandbox_in(tmp_path_factory.mktemp("arm")) as sandbox:
-        fault = set_options(**{"world.faults": [{"kind": "servo_loss", "t_s": HOVERS_S}]})
-        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *fault)
+        far = [{"point_m": [50.0, 0.0, 1.0], "normal": [-1.0, 0.0, 0.0]}]
+        fault = {"world.faults": [{"kind": "servo_loss", "t_s": HOVERS_S}], "world.surfaces": far}
+        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *set_options(**fault))
         sandbox.assert_nobody_left()
         summary = read_summary(sandbox.cwd / "out")
     assert ended.code == EXIT_ABORTED, ended
     assert summary["outcome"] == "aborted"
     assert {"takeoff", "arm_lost", "touchdown"} <= {event["id"] for event in summary["events"]}
+    distance_m = rotor_distance_m(summary)
+    assert distance_m is not None and 50.0 < distance_m < 51.0
 
 
 def test_another_program_feeds_px4_and_its_end_is_found(tmp_path_factory: pytest.TempPathFactory) -> None:

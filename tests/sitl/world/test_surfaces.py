@@ -20,7 +20,10 @@ from sitl.world.handling import Wrench
 from sitl.world.surfaces import Placed, Surfaces
 from sitl.world.world import PHYSICS_DT_S, World
 
-ROD = load_vehicle("configs/vehicles/tarot650_2r_rod.yaml")
+SHIPPED = load_vehicle("configs/vehicles/tarot650_2r_rod.yaml")
+assert SHIPPED.tool is not None
+ROD = SHIPPED.model_copy(update={"tool": SHIPPED.tool.model_copy(update={"stiffness_n_m": None})})
+"""With a hard ball: the surface's stiffness alone counts."""
 PRESS = tuple(map(math.radians, ROD.poses_deg["press"]))
 TIP_M = manipulator_of(ROD).net_body_m(PRESS)
 MU = 0.4
@@ -66,11 +69,11 @@ def test_the_tip_sinks_in_by_force_over_stiffness_and_rests(stiffness_n_m: float
     assert surfaces(world).touches == 1
 
 
-@pytest.mark.parametrize("stiffness_n_m", [1e3, 1e5])
-def test_a_brush_yields_in_addition_to_the_surface(stiffness_n_m: float) -> None:
+@pytest.mark.parametrize(("kind", "stiffness_n_m"), [("brush", 1e3), ("rod", 1e5)])
+def test_a_tip_yields_in_addition_to_the_surface(kind: str, stiffness_n_m: float) -> None:
     assert ROD.tool is not None
-    brush = ROD.tool.model_copy(update={"kind": "brush", "stiffness_n_m": 1000.0})
-    world = in_front(vehicle=ROD.model_copy(update={"tool": brush}), stiffness_n_m=stiffness_n_m, damping_ratio=1.0)
+    soft = ROD.tool.model_copy(update={"kind": kind, "stiffness_n_m": 1000.0})
+    world = in_front(vehicle=ROD.model_copy(update={"tool": soft}), stiffness_n_m=stiffness_n_m, damping_ratio=1.0)
     pushed(world, (5.0, 0.0, 0.0), 4.0)
     depth_m = ROD.tip_radius_m - surfaces(world).placed[0].local_m(contact(world)[0])[2]
     assert depth_m == pytest.approx(5.0 / 1000.0 + 5.0 / stiffness_n_m, rel=0.05)
@@ -90,6 +93,17 @@ def test_an_impact_adds_no_energy(stiffness_n_m: float, damping_ratio: float) ->
     assert surfaces(world).force_max_n > 2.0
     assert max(energy_j) <= energy_j[0] * (1.0 + 1e-3)
     assert energy_j[-1] < energy_j[0]
+
+
+def test_the_soft_ball_of_the_rod_makes_the_touch_of_a_hard_wall_a_third_as_hard() -> None:
+    hardest_n = []
+    for vehicle in (ROD, SHIPPED):
+        world = in_front(0.002, vehicle, stiffness_n_m=1e5)
+        world.data.qvel[0] = 0.05
+        for _ in range(300):
+            world.step((0.0,) * 4, (0.0, 0.0), False, drag=False)
+        hardest_n.append(surfaces(world).force_max_n)
+    assert 3.0 < hardest_n[1] < hardest_n[0] / 3.0
 
 
 @pytest.mark.parametrize("stiffness_n_m", [1e3, 1e5])
