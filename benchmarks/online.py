@@ -90,6 +90,8 @@ def main() -> None:
         print(f"{flight.seed} {flight.outcome}: {laps} scale {flight.lowest:.2f} to {flight.highest:.2f}", flush=True)
     print(", ".join(f"{count} {name}" for name, count in Counter(flight.outcome for flight in flights).items()))
     whole = [flight for flight in flights if flight.outcome == "completed"]
+    if not whole:
+        return
     for name, values in (
         ("e_p of the first repetition, mm", [flight.laps_mm[0] for flight in whole]),
         ("e_p of the last repetition, mm", [flight.laps_mm[-1] for flight in whole]),
