@@ -33,15 +33,20 @@ def test_a_datagram_that_waited_is_as_old_as_it_is(monkeypatch: pytest.MonkeyPat
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(20.0)
         stamp_arrivals(receiver)
-        before_s = clock()
-        sender.sendto(b"1", receiver.getsockname())
-        sent_s = clock()
-        time.sleep(0.05)  # the reader is busy
-        data, notes, _, _ = receiver.recvmsg(100, STAMP_ROOM_BYTES)
-        assert data == b"1"
-        if not notes:
-            pytest.skip("no stamps here: an emulated kernel")
-        assert before_s - 0.001 < arrived_s(notes, clock) < sent_s + 0.045
+        for _ in range(100):
+            before_s = clock()
+            sender.sendto(b"1", receiver.getsockname())
+            sent_s = clock()
+            time.sleep(0.05)  # the reader is busy
+            data, notes, _, _ = receiver.recvmsg(100, STAMP_ROOM_BYTES)
+            assert data == b"1"
+            if not notes:
+                pytest.skip("no stamps here: an emulated kernel")
+            arrival_s = arrived_s(notes, clock)
+            assert arrival_s > before_s - 0.001
+            if arrival_s < sent_s + 0.045:
+                return
+        pytest.fail("stamped when it was read")  # the kernel begins to stamp arrivals some time after it was asked
 
 
 def test_without_a_stamp_it_has_just_arrived() -> None:
