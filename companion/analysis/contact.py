@@ -30,10 +30,11 @@ def contact_summary(log: FlightLog) -> dict[str, Any] | None:
 
     Force is that along the direction of the approach, as measured in flight: `mean_n` and `rms_error_n` while it is steady,
     `overshoot_n` from the first touch on. `path_rms_m` is the distance of the tip, across that direction, from the path on which the
-    reference would lead it; for a press that path is a point. `surface` is the plane through the points touched by a probe, or by an
-    approach that turns to the surface. Without those it is the mean point that was touched while the force was steady, and the normal
-    of the touched points or, if they lie too close together, the direction of the approach reversed. Its `points` are those by which
-    it was found.
+    reference would lead it; for a press that path is a point. During a slide the reference moves, and its path begins where the tip
+    is; force and path are then those of the slides alone, and `slid_m` is the length of the reference's way. `surface` is the plane
+    through the points touched by a probe, or by an approach that turns to the surface. Without those it is the mean point that was
+    touched while the force was steady, and the normal of the touched points or, if they lie too close together, the direction of the
+    approach reversed. Its `points` are those by which it was found.
     """
     states = [outputs.contact for outputs in log.outputs]
     last = next((state for state in reversed(states) if state is not None), None)
@@ -45,7 +46,7 @@ def contact_summary(log: FlightLog) -> dict[str, Any] | None:
     wanted = np.array([0.0 if state is None else state.wanted_n for state in states])
     row: dict[str, Any] = {
         "wanted_n": None, "mean_n": None, "rms_error_n": None, "overshoot_n": None, "touches": touches, "path_rms_m": None,
-        "surface": None,
+        "slid_m": None, "surface": None,
     }  # fmt: skip
     finder = next((state for state in reversed(states) if state is not None and state.surface is not None), None)
     found = None if finder is None else finder.surface
@@ -59,7 +60,8 @@ def contact_summary(log: FlightLog) -> dict[str, Any] | None:
         return row
     most = float(wanted[pressing].max())
     row.update(wanted_n=most, overshoot_n=max(0.0, float(force[pressing].max()) - most))
-    steady = _steady(log.columns.t_s, pressing, wanted)
+    sliding = np.array([state is not None and state.mode is ContactMode.SLIDE for state in states], dtype=np.bool_)
+    steady = sliding if sliding.any() else _steady(log.columns.t_s, pressing, wanted)
     if not steady.any():
         return row
     row.update(mean_n=float(force[steady].mean()), rms_error_n=float(np.sqrt(np.mean((force - wanted)[steady] ** 2))))
@@ -69,6 +71,8 @@ def contact_summary(log: FlightLog) -> dict[str, Any] | None:
         off = tip - planned
         off -= np.outer(off @ direction, direction)
         row["path_rms_m"] = float(np.sqrt(np.mean(np.sum(off * off, axis=1))))
+        if sliding.any():
+            row["slid_m"] = float(np.sum(np.linalg.norm(np.diff(planned, axis=0), axis=1)))
         if found is None:
             normal = _normal(tip, direction)
             row["surface"] = {
@@ -126,6 +130,8 @@ def contact_lines(summary: dict[str, Any]) -> list[tuple[str, str]]:
             f"overshoot {contact['overshoot_n']:.1f} N)"
         )
         lines.append(("force", text))
+        if contact.get("slid_m") is not None:
+            lines.append(("slide", f"{contact['slid_m']:.2f} m along the surface"))
         if (true_n := true_force_n(summary)) is not None:
             lines.append(("true force", f"{true_n:.2f} N (known to the simulated world only)"))
     if (distance_m := rotor_distance_m(summary)) is not None:
@@ -133,7 +139,7 @@ def contact_lines(summary: dict[str, Any]) -> list[tuple[str, str]]:
             ("rotors", f"{distance_m:.2f} m from a surface at the nearest (known to the simulated world only)")
         )
     if contact["path_rms_m"] is not None:
-        lines.append(("tip", f"{1e3 * contact['path_rms_m']:.0f} mm (RMS) from its path, across the press"))
+        lines.append(("tip", f"{1e3 * contact['path_rms_m']:.0f} mm (RMS) from its path on the surface"))
     if surface is None:
         return lines
     x, y, z = surface["point_m"]
@@ -173,6 +179,8 @@ def write_probe(log: FlightLog, path: Path) -> None:
 
 def presses(state: ContactState) -> bool:
     """Return whether the vehicle presses: the light touches by which a surface is found do not count."""
+    if state.mode is ContactMode.SLIDE:
+        return True
     return state.mode is ContactMode.PRESS and (state.surface is not None or state.shift.length_m == 0.0)
 
 
@@ -218,7 +226,7 @@ def tips_m(log: FlightLog, used: Any) -> tuple[Array, Array, Array, Array] | Non
         cos, sin = np.cos(0.5 * reference.yaw_rad), np.sin(0.5 * reference.yaw_rad)
         measured.append(np.add(at.position_world_m, quat_rotate(at.attitude_wxyz, tip)))
         ahead = np.add(reference.position_world_m, quat_rotate((float(cos), 0.0, 0.0, float(sin)), level))
-        planned.append(ahead - contact.tilting_n * np.array(contact.tip_per_n_m))
+        planned.append(ahead - contact.tilting_n * np.array(contact.tip_per_n_m) + contact.beside_m)
         ticks.append(k)
         direction = contact.direction_world
     return (np.array(measured), np.array(planned), np.array(direction), np.array(ticks)) if measured else None

@@ -20,6 +20,7 @@ _BANDS = {
     ContactMode.WEIGH: ("weigh", "#eceff2"),
     ContactMode.APPROACH: ("approach", "#dcebf9"),
     ContactMode.PRESS: ("press", "#dff3e6"),
+    ContactMode.SLIDE: ("slide", "#cfe9f0"),
     ContactMode.LOST: ("contact lost", "#fbdfe3"),
     ContactMode.BACK: _LEAVE,
     ContactMode.LEAVE: _LEAVE,

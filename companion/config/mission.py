@@ -104,6 +104,7 @@ class Land(Model):
     speed_m_s: Annotated[float, Field(ge=0.05, le=1.0)]
 
 
+SLIDE_MIN_M = 0.01
 ContactForce = Annotated[float, Field(gt=0, le=50)]
 ContactSpeed = Annotated[float, Field(ge=0.02, le=0.2)]
 
@@ -128,7 +129,7 @@ class _Contact(Model):
 
 
 class Approach(_Contact):
-    """Move in one direction until the tool touches a surface; the arm keeps its pose. A press must follow."""
+    """Move in one direction until the tool touches a surface; the arm keeps its pose. A press or a slide must follow."""
 
     type: Literal["approach"]
     face_m: Annotated[float, Field(ge=0.1, le=0.5)] | None = None
@@ -157,6 +158,28 @@ class Press(Model):
     duration_s: Duration
 
 
+class Slide(Model):
+    """Move the tip straight along the surface while the force along its normal is held."""
+
+    type: Literal["slide"]
+    name: Name | None = None
+    force_n: ContactForce
+    """Force along the direction of the approach."""
+    by_m: Vector2
+    """Way to the right and up in the surface, as seen from the vehicle, from where the tip is."""
+    speed_m_s: ContactSpeed
+    friction_max: Annotated[float, Field(ge=0, le=2)] = 0.8
+    """Largest coefficient of friction that the surface may have. It limits the force along the surface, for which the check looks for
+    reserves of the joints and of the rotors' yaw torque.
+    """
+
+    @model_validator(mode="after")
+    def _goes_somewhere(self) -> Self:
+        if math.hypot(*self.by_m) < SLIDE_MIN_M:
+            refuse("slide", [(("by_m",), f"is shorter than {SLIDE_MIN_M:g} m")])
+        return self
+
+
 class Detach(Model):
     """Release the force and move back to where the approach began."""
 
@@ -166,9 +189,11 @@ class Detach(Model):
 
 
 Phase = Annotated[
-    Takeoff | Hold | Line | Path | ArmMove | Approach | Press | Detach | Probe | Land, Field(discriminator="type")
+    Takeoff | Hold | Line | Path | ArmMove | Approach | Press | Slide | Detach | Probe | Land,
+    Field(discriminator="type"),
 ]
-_TOUCHING = ("approach", "press")
+_PRESSING = ("press", "slide")
+_TOUCHING = ("approach", *_PRESSING)
 """Phases during which, or at whose end, the tool touches a surface."""
 
 
@@ -282,15 +307,15 @@ class Mission(Model):
         before = ""
         for index, phase in enumerate(self.phases):
             at = ("phases", index, "type")
-            if isinstance(phase, Press):
+            if isinstance(phase, Press | Slide):
                 if before not in _TOUCHING:
-                    problems.append((at, "a press must follow an approach or a press"))
+                    problems.append((at, f"a {phase.type} must follow an approach, a press or a slide"))
             elif isinstance(phase, Detach):
-                if before != "press":
-                    problems.append((at, "a detach must follow a press"))
+                if before not in _PRESSING:
+                    problems.append((at, "a detach must follow a press or a slide"))
             elif before == "approach":
-                problems.append((at, f"a press must follow the approach, not a {phase.type}"))
-            elif before == "press":
+                problems.append((at, f"a press or a slide must follow the approach, not a {phase.type}"))
+            elif before in _PRESSING:
                 problems.append(
                     (at, f"a detach must come before this {phase.type}: the tool still touches the surface")
                 )
@@ -337,6 +362,7 @@ __all__ = [
     "Phase",
     "Press",
     "Probe",
+    "Slide",
     "Start",
     "Takeoff",
 ]

@@ -74,6 +74,8 @@ class Compensation:
             y += my * lead_s * jerk[1]
         if (push := reference.push_world_n) is not None:
             x, y, z = x + push[0], y + push[1], z + push[2]
+        if (slide := reference.slide_world_n) is not None:
+            x, y, z = x + slide[0], y + slide[1], z + slide[2]
         return (x, y, z)
 
     def joint_torque_nm(self, torque_nm: Joints, wanted_rate_rad_s: Joints) -> Joints:

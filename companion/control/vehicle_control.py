@@ -16,6 +16,7 @@ from companion.control.force_observer import ForceObserver
 from companion.control.hover_thrust import HoverThrust, off_the_ground
 from companion.control.online import OnlineImpedance
 from companion.control.sensing import CatchDetector, ForceSensing, MeanAcceleration, ObservedCatchDetector
+from companion.control.slide import Slide
 from companion.control.types import Controller, Law, PlantState, Tuning
 from companion.model.codec import Record
 from companion.model.constants import GRAVITY_M_S2
@@ -58,6 +59,7 @@ class VehicleControl:
         self._force_timeout_s = vehicle.safety.force_timeout_s
         self._arm_hold = ArmHold(vehicle)
         self._sensing = ForceSensing(vehicle.tool, manipulator_of(vehicle))
+        self._slide = Slide(vehicle)
         self._acceleration = MeanAcceleration()
         self._observer = ForceObserver(vehicle) if vehicle.force_source == OBSERVER else None
         self._catch = CatchDetector() if self._observer is None else ObservedCatchDetector()
@@ -189,12 +191,18 @@ class VehicleControl:
             raise ValueError("the control law's thrust or tracking error is not finite")
         self._thrust_sent = thrust if thrust < 1.0 else 1.0
         torque, log = (wrench.arm_torque_nm or ()) if arm is not None else None, wrench.log
+        attitude = wrench.attitude_wxyz
+        if pressing is None:
+            self._slide.end()
+        elif torque is not None:
+            torque = self._slide.torque_nm(dt_s, torque, state, reference.slide_world_n)
+            attitude = self._slide.attitude(dt_s, attitude, state, _across(force, pressing))
         if self._observer is not None:
             observed = self._observer.force_n
             log = msgspec.structs.replace(log, force_observed_world_n=observed, force_measured_world_n=force)
         elif pressing is not None:
             log = msgspec.structs.replace(log, force_measured_world_n=force)
-        return Command(AttitudeSetpoint(wrench.attitude_wxyz, self._thrust_sent), torque, log)
+        return Command(AttitudeSetpoint(attitude, self._thrust_sent), torque, log)
 
     def _observe(
         self, observer: ForceObserver, dt_s: float, i: Inputs, state: PlantState, carries: bool, off_the_floor: bool
@@ -252,3 +260,10 @@ def _used(force: Vec3 | None, direction: Vec3 | None) -> Vec3 | None:
     (fx, fy, fz), (nx, ny, nz) = force, direction
     along = fx * nx + fy * ny + fz * nz
     return (along * nx, along * ny, along * nz)
+
+
+def _across(force: Vec3 | None, direction: Vec3) -> Vec3 | None:
+    """Return the part of a force across a direction."""
+    if force is None or (along := _used(force, direction)) is None:
+        return None
+    return (force[0] - along[0], force[1] - along[1], force[2] - along[2])

@@ -11,9 +11,9 @@ import math
 
 from msgspec.structs import replace
 
-from companion.config.mission import Approach, Detach, Phase, Press, Probe
+from companion.config.mission import Approach, Detach, Phase, Press, Probe, Slide
 from companion.config.vehicle import OBSERVER
-from companion.core import probing
+from companion.core import probing, sliding
 from companion.core.transition import Transition
 from companion.mission import contact as c
 from companion.mission.segments import Segment
@@ -23,9 +23,10 @@ from companion.safety.notices import Notice
 
 _BEFORE_END_S = 1e-6
 _WEIGH, _APPROACH, _PRESS = ContactMode.WEIGH, ContactMode.APPROACH, ContactMode.PRESS
+_SLIDE = ContactMode.SLIDE
 _LOST, _BACK, _SHIFT = ContactMode.LOST, ContactMode.BACK, ContactMode.SHIFT
 _LEAVE, _RETURN = ContactMode.LEAVE, ContactMode.RETURN
-_MEASURING = (_APPROACH, _PRESS, _LOST)
+_MEASURING = (_APPROACH, _PRESS, _SLIDE, _LOST)
 
 
 def advance_contact(t: Transition) -> None:
@@ -37,7 +38,7 @@ def advance_contact(t: Transition) -> None:
     if contact is None:
         if isinstance(phase, Approach | Probe) and not t.state.contact_over:
             t.change(contact=probing.begun(t, phase), contact_segment=segment)
-        elif isinstance(phase, Approach | Press | Detach | Probe):
+        elif isinstance(phase, Approach | Press | Slide | Detach | Probe):
             t.change(course=course.moved_to(segment.end_s, t_s))
         elif t.state.contact_over:
             t.change(contact_over=False)
@@ -46,6 +47,8 @@ def advance_contact(t: Transition) -> None:
     limit_n = t.parameters.vehicle.safety.contact_disagreement_n
     weigh_s = c.WEIGH_OBSERVED_S if _observes(t) else c.WEIGH_S
     contact = c.measured(contact, dt_s, t.o.force_world_n, t.o.disturbance_world_n, limit_n, weigh_s)
+    if not (isinstance(phase, Slide) and (contact.mode is _PRESS or contact.mode is _SLIDE)):
+        contact = sliding.released(contact, dt_s)
     approach = _approach(t, segment)
     engaged = t.state.contact_segment
     assert engaged is not None
@@ -76,7 +79,7 @@ def advance_contact(t: Transition) -> None:
         back = probing.moving_back(t, contact, approach)
         contact = back or _failed(t, contact, notices.SURFACE_MISSING, probing.steep(contact))
     elif contact.mode is _LOST:
-        contact = c.released(contact, dt_s)
+        contact = c.released(c.shifted(contact, dt_s, 0.0), dt_s)
         if t_s - contact.since_s >= c.WAIT_S:
             contact = c.entered(contact, t_s, _APPROACH)
             if probing.seeks_points(contact, approach):
@@ -88,16 +91,36 @@ def advance_contact(t: Transition) -> None:
         _warn_if_beside(t, contact)
         contact = c.entered(contact, t_s, _LEAVE)
         t.change(contact_segment=segment)
-    elif isinstance(phase, Press):
-        rises = contact.wanted_n < phase.force_n
-        contact = c.pressed(contact, t_s, dt_s, approach.touch_n, phase.force_n)
-        if rises and contact.wanted_n >= phase.force_n:
-            _warn_if_beside(t, contact)
+    elif isinstance(phase, Press | Slide):
+        if isinstance(phase, Press):
+            rises = contact.wanted_n < phase.force_n
+            contact = c.pressed(contact, t_s, dt_s, approach.touch_n, phase.force_n)
+            if rises and contact.wanted_n >= phase.force_n:
+                _warn_if_beside(t, contact)
+        else:
+            contact = _slid(t, sliding.begun(contact, phase) if segment != engaged else contact, phase, segment)
         contact = c.timed(contact, dt_s, not c.touches(contact, approach.touch_n))
         t.change(contact_segment=segment)
         if contact.beyond_s >= c.LOST_S:
             contact = _lost(t, contact)
     t.change(contact=contact)
+
+
+def _slid(t: Transition, contact: ContactState, phase: Slide, segment: Segment) -> ContactState:
+    """Return the state after one tick of a slide, whose end the plan's time awaits."""
+    course, t_s = t.state.course, t.i.t_s
+    assert course is not None
+    contact = sliding.slid(t, contact, phase, _approach(t, segment))
+    if contact.stuck_s >= sliding.STUCK_S:
+        text = (
+            f"the tip is {contact.lag_m:.3f} m behind its reference (limit {sliding.STUCK_M:g} m); leaving the surface"
+        )
+        return _failed(t, contact, notices.CONTACT_STUCK, text)
+    if contact.mode is _SLIDE and c.is_shifted(contact):
+        t.change(course=course.moved_to(segment.end_s, t_s))
+        return replace(contact, mode=_PRESS)
+    _stay_in(t, segment)
+    return contact
 
 
 def _turn_max_rad(contact: ContactState, approach: Approach | Probe) -> float:

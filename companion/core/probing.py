@@ -30,7 +30,7 @@ def begun(t: Transition, phase: Approach | Probe) -> ContactState:
     nx, ny, nz = phase.direction
     length = math.hypot(nx, ny, nz)
     direction = (nx / length, ny / length, nz / length)
-    return c.begun(t.i.t_s, direction, _shift_per_n(t, direction, _ahead_m(t)))
+    return c.begun(t.i.t_s, direction, _shift_per_n(t, direction, ahead_m(t)))
 
 
 def weighed(t: Transition, contact: ContactState, phase: Approach | Probe) -> ContactState:
@@ -48,7 +48,7 @@ def touching(t: Transition, contact: ContactState, phase: Approach | Probe) -> C
     contact = c.timed(contact, dt_s, not felt)
     if contact.beyond_s >= c.LOST_S:  # gusts have feigned a touch
         return c.entered(replace(contact, samples=0), t_s, ContactMode.LOST)
-    tip = _tip_world_m(t)
+    tip = tip_world_m(t)
     if t_s - contact.since_s < c.TOUCH_SETTLE_S or not felt or tip is None:
         return contact
     contact = c.averaged(contact, tip)
@@ -134,7 +134,7 @@ def _towards_surface(t: Transition, contact: ContactState, surface: FoundSurface
     into = (-mx, -my, -mz)
     turn_rad = turn_to(surface, reference.yaw_rad) - reference.yaw_rad
     tool_rad = tool_turn_rad(t.parameters.vehicle, t.parameters.manipulator, reference.arm_rad, n, into)
-    before, after = _ahead_m(t), _ahead_m(t, turn_rad, tool_rad)
+    before, after = ahead_m(t), ahead_m(t, turn_rad, tool_rad)
     start = [p + tip for p, tip in zip(reference.position_world_m, before, strict=True)]
     gap = sum((q - s) * k for q, s, k in zip(surface.point_world_m, start, into, strict=True))
     way_m = gap / sum(a * b for a, b in zip(n, into, strict=True))
@@ -156,7 +156,7 @@ def _shift_per_n(t: Transition, direction: Vec3, ahead_m: Vec3) -> Vec3:
     return c.tip_per_n_m(direction, ahead_m, t.parameters.vehicle.airframe.mass_kg * GRAVITY_M_S2)
 
 
-def _ahead_m(t: Transition, turn_rad: float = 0.0, tool_rad: float = 0.0) -> Vec3:
+def ahead_m(t: Transition, turn_rad: float = 0.0, tool_rad: float = 0.0) -> Vec3:
     """Return the tip relative to the body's origin in the plan's reference, turned by these angles, world frame, with the vehicle
     level.
     """
@@ -168,7 +168,7 @@ def _ahead_m(t: Transition, turn_rad: float = 0.0, tool_rad: float = 0.0) -> Vec
     return (cos * x - sin * y, sin * x + cos * y, z)
 
 
-def _tip_world_m(t: Transition) -> Vec3 | None:
+def tip_world_m(t: Transition) -> Vec3 | None:
     """Return the measured position of the tip's centre, world frame; None if it is unknown."""
     pose, arm = best_pose(t.i), t.i.arm
     if pose is None or not pose.tracking_valid or arm is None:

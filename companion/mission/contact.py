@@ -145,6 +145,7 @@ def along(reference: Reference, contact: ContactState) -> Reference:
         rate = (push - tilting) / TILT_S
         x, y, z = x + tilting * sx, y + tilting * sy, z + tilting * sz
         vx, vy, vz = vx + rate * sx, vy + rate * sy, vz + rate * sz
+    slide = contact.slide_world_n if contact.slide_world_n != _NO_FORCE else None
     yaw, yaw_rate, shift = reference.yaw_rad, reference.yaw_rate_rad_s, contact.shift
     arm, arm_rate, arm_acceleration = reference.arm_rad, reference.arm_rate_rad_s, reference.arm_acceleration_rad_s2
     if shift.length_m > 0.0:
@@ -171,6 +172,7 @@ def along(reference: Reference, contact: ContactState) -> Reference:
         arm_rate_rad_s=arm_rate,
         arm_acceleration_rad_s2=arm_acceleration,
         push_world_n=(push * nx, push * ny, push * nz) if contact.touches else None,
+        slide_world_n=slide,
     )
 
 

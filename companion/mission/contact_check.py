@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from itertools import product
 
-from companion.config.mission import Approach, Mission, Press, Probe
+from companion.config.mission import Approach, Limits, Mission, Press, Probe, Slide
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.control.thrust import attitude_from_roll_pitch_yaw, roll_pitch_from_force
@@ -15,7 +15,7 @@ from companion.mission.segments import Segment
 from companion.mission.surface import axes, points_of, tool_turn_rad
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_conjugate, quat_rotate
-from companion.model.types import Reference, Vec3
+from companion.model.types import Reference, Vec2, Vec3
 from companion.safety.governor import SafeSet
 
 TURN_RAD = math.radians(15.0)
@@ -24,9 +24,13 @@ AHEAD_M = 0.05
 """Smallest distance by which the tool must reach beyond the rotors."""
 TRACKING_M = 0.05
 """Distance from the limits of room and tether at the end of an approach, which is slow."""
+FLOOR_M = 0.1
+"""Smallest height above standing height at the end of a slide."""
 TILT_RESERVE_DEG = 5.0
 TORQUE_SHARE_MAX = 0.85
 """Largest fraction of a joint's torque limit that gravity and the contact force may need. At the limit the arm gives way."""
+YAW_SHARE = 0.4
+"""Fraction of the rotors' largest yaw torque at hover that the friction of a slide may need."""
 FORCE_SHARE_MAX = 0.6
 """Largest wanted force as a fraction of `safety.contact_force_max_n`: an overshoot of 50 % passes."""
 
@@ -35,6 +39,8 @@ def contact_problems(mission: Mission, vehicle: Vehicle, plan: Plan) -> Iterator
     """Return each segment that cannot be flown, with the reason and the advice."""
     direction: Vec3 = (0.0, 0.0, 0.0)
     faces = False
+    approach: Approach | Probe | None = None
+    slid_m: Vec2 = (0.0, 0.0)
     for segment in plan.segments:
         if segment.repetition > 1:
             continue
@@ -44,6 +50,7 @@ def contact_problems(mission: Mission, vehicle: Vehicle, plan: Plan) -> Iterator
             x, y, z = phase.direction
             direction = (x / length, y / length, z / length)
             faces = isinstance(phase, Approach) and phase.face_m is not None
+            approach, slid_m = phase, (0.0, 0.0)
             yield from (
                 (segment, text) for text in _approach(vehicle, plan.reference(segment.start_s), direction, phase)
             )
@@ -51,6 +58,27 @@ def contact_problems(mission: Mission, vehicle: Vehicle, plan: Plan) -> Iterator
             reference = plan.reference(segment.start_s)
             yield from ((segment, text) for text in _force(vehicle, reference, direction, phase.force_n))
             yield from ((segment, text) for text in _torque(vehicle, reference, direction, phase.force_n, faces))
+        elif isinstance(phase, Slide):
+            assert approach is not None, "the mission file is checked: an approach comes first"
+            reference = plan.reference(segment.start_s)
+            slid_m = (slid_m[0] + phase.by_m[0], slid_m[1] + phase.by_m[1])
+            yield from ((segment, text) for text in _force(vehicle, reference, direction, phase.force_n))
+            yield from ((segment, text) for text in _slide(vehicle, mission.limits, reference, direction, phase, faces))
+            low_m = (
+                reference.position_world_m[2] + slid_m[1] * axes(direction)[1][2] - vehicle.airframe.ground_clearance_m
+            )
+            if low_m < FLOOR_M:
+                yield (
+                    segment,
+                    f"ends {low_m:.2f} m above standing height (minimum {FLOOR_M:g} m); shorten by_m or begin higher",
+                )
+            far, beyond_m = _farthest(vehicle, reference, direction, approach, slid_m)
+            if beyond_m > 0.0:
+                yield (
+                    segment,
+                    f"may move to ({far[0]:.2f}, {far[1]:.2f}, {far[2]:.2f}) m, {beyond_m:.2f} m beyond what room and tether allow "
+                    f"with a margin of {TRACKING_M:g} m; shorten by_m or begin elsewhere",
+                )
 
 
 def _approach(vehicle: Vehicle, reference: Reference, direction: Vec3, phase: Approach | Probe) -> Iterator[str]:
@@ -69,18 +97,54 @@ def _approach(vehicle: Vehicle, reference: Reference, direction: Vec3, phase: Ap
             f"approaches with the tip {ahead_m:.2f} m beyond the rotors (minimum {AHEAD_M:g} m); stretch the arm in the direction of "
             "the approach, or turn the vehicle"
         )
-    safe = SafeSet(vehicle)
-    far, beyond_m = max(
-        (
-            (at, max(safe.breach_walls_m(at), safe.breach_tether_m(at)) + TRACKING_M)
-            for at in _corners(reference, direction, phase, math.hypot(x, y))
-        ),
-        key=lambda found: found[1],
-    )
+    far, beyond_m = _farthest(vehicle, reference, direction, phase)
     if beyond_m > 0.0:
         yield (
             f"may move to ({far[0]:.2f}, {far[1]:.2f}, {far[2]:.2f}) m if it touches nothing, {beyond_m:.2f} m beyond what room and "
             f"tether allow with a margin of {TRACKING_M:g} m; lower distance_max_m or begin nearer to the surface"
+        )
+
+
+def _farthest(
+    vehicle: Vehicle, reference: Reference, direction: Vec3, phase: Approach | Probe, slid_m: Vec2 = (0.0, 0.0)
+) -> tuple[Vec3, float]:
+    """Return the place that is farthest beyond room and tether, and by how much with the margin, m; `slid_m` is the way of the slides
+    since the touch, right and up.
+    """
+    safe, (right, up) = SafeSet(vehicle), axes(direction)
+    x, y, _ = manipulator_of(vehicle).net_body_m(reference.arm_rad)
+    shift = [slid_m[0] * a + slid_m[1] * b for a, b in zip(right, up, strict=True)]
+    found = []
+    for px, py, pz in _corners(reference, direction, phase, math.hypot(x, y)):
+        at = (px + shift[0], py + shift[1], pz + shift[2])
+        found.append((at, max(safe.breach_walls_m(at), safe.breach_tether_m(at)) + TRACKING_M))
+    return max(found, key=lambda place: place[1])
+
+
+def _slide(
+    vehicle: Vehicle, limits: Limits, reference: Reference, direction: Vec3, phase: Slide, faces: bool
+) -> Iterator[str]:
+    """Check what the largest friction needs: joints, thrust, and the rotors' yaw torque."""
+    (right, up), length_m, airframe = axes(direction), math.hypot(*phase.by_m), vehicle.airframe
+    way = [(phase.by_m[0] * a + phase.by_m[1] * b) / length_m for a, b in zip(right, up, strict=True)]
+    most_n, weight_n = phase.friction_max * phase.force_n, airframe.mass_kg * GRAVITY_M_S2
+    friction = (-most_n * way[0], -most_n * way[1], -most_n * way[2])
+    yield from _torque(vehicle, reference, direction, phase.force_n, faces, friction)
+    most_share = limits.thrust_share_max * airframe.thrust_max_n
+    if weight_n - friction[2] > most_share:
+        yield (
+            f"needs {weight_n - friction[2]:.1f} N of thrust to slide (limit {most_share:.1f} N: limits.thrust_share_max); lower "
+            "force_n or friction_max"
+        )
+    x, y, _ = manipulator_of(vehicle).net_body_m(reference.arm_rad)
+    needed_nm = math.hypot(x, y) * math.hypot(friction[0], friction[1])
+    yaw_nm = YAW_SHARE * airframe.yaw_torque_per_thrust_m * weight_n
+    if needed_nm > yaw_nm:
+        least = phase.friction_max * yaw_nm / needed_nm
+        yield (
+            f"needs {needed_nm:.2f} N m of yaw torque to slide sideways with friction up to {phase.friction_max:g} (limit {yaw_nm:.2f} "
+            f"N m: {YAW_SHARE:g} of what the rotors have at hover); slide up or down, or if the surface is slippery, set friction_max "
+            f"to at most {least:.2f}"
         )
 
 
@@ -120,8 +184,17 @@ def _force(vehicle: Vehicle, reference: Reference, direction: Vec3, force_n: flo
         )
 
 
-def _torque(vehicle: Vehicle, reference: Reference, direction: Vec3, force_n: float, faces: bool) -> Iterator[str]:
-    """Check the torques that hold the arm against weight and force; if the vehicle turns to the surface, also on tilted surfaces."""
+def _torque(
+    vehicle: Vehicle,
+    reference: Reference,
+    direction: Vec3,
+    force_n: float,
+    faces: bool,
+    friction: Vec3 = (0.0, 0.0, 0.0),
+) -> Iterator[str]:
+    """Check the torques that hold the arm against weight, force and friction; if the vehicle turns to the surface, also on tilted
+    surfaces.
+    """
     manipulator = manipulator_of(vehicle)
     worst: dict[int, float] = {}
     for tilt_rad in (-TURN_RAD, 0.0, TURN_RAD) if faces else (0.0,):
@@ -131,16 +204,19 @@ def _torque(vehicle: Vehicle, reference: Reference, direction: Vec3, force_n: fl
         arm_rad = (*inner, last + tool_turn_rad(vehicle, manipulator, reference.arm_rad, direction, into))
         thrust = (force_n * nx, force_n * ny, force_n * nz + vehicle.airframe.mass_kg * GRAVITY_M_S2)
         attitude = attitude_from_roll_pitch_yaw(*roll_pitch_from_force(thrust, reference.yaw_rad), reference.yaw_rad)
-        felt = quat_rotate(quat_conjugate(attitude), (-force_n * nx, -force_n * ny, -force_n * nz))
+        fx, fy, fz = friction
+        felt = quat_rotate(quat_conjugate(attitude), (fx - force_n * nx, fy - force_n * ny, fz - force_n * nz))
         torques = manipulator.joint_torque_from_force(arm_rad, felt)
         gravity = manipulator.gravity_torque_nm(arm_rad, attitude)
         for joint, (t, g) in enumerate(zip(torques, gravity, strict=True), 1):
             worst[joint] = max(worst.get(joint, 0.0), abs(g - t))
     for (joint, needed_nm), limit_nm in zip(worst.items(), vehicle.joint_torque_limits_nm, strict=True):
         if needed_nm > TORQUE_SHARE_MAX * limit_nm:
+            rubs = f" against {math.hypot(*friction):.1f} N of friction" if any(friction) else ""
+            advice = "slide downwards" if friction[2] < 0.0 else "hold the tip nearer to the shoulder's height"
             yield (
-                f"needs {needed_nm:.2f} N m of joint {joint} to press with {force_n:g} N (limit {TORQUE_SHARE_MAX * limit_nm:.2f} "
-                f"N m: {TORQUE_SHARE_MAX:g} of its torque); lower force_n, or hold the tip nearer to the shoulder's height"
+                f"needs {needed_nm:.2f} N m of joint {joint} to press with {force_n:g} N{rubs} (limit "
+                f"{TORQUE_SHARE_MAX * limit_nm:.2f} N m: {TORQUE_SHARE_MAX:g} of its torque); lower force_n, or {advice}"
             )
 
 

@@ -9,7 +9,7 @@ import math
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 
-from companion.config.mission import Approach, ArmMove, Detach, Land, Line, Mission, Path, Press, Probe, Takeoff
+from companion.config.mission import Approach, ArmMove, Detach, Land, Line, Mission, Path, Press, Probe, Slide, Takeoff
 from companion.config.vehicle import Vehicle
 from companion.mission.arm_motion import ArmLimits
 from companion.mission.contact import PRESS_RAMP_S, RELEASE_S, approach_s, travel_s
@@ -112,6 +112,8 @@ class Plan:
                 builder.t_s += approach_s(phase)
             elif isinstance(phase, Press):
                 builder.t_s += PRESS_RAMP_S + phase.duration_s
+            elif isinstance(phase, Slide):
+                builder.t_s += PRESS_RAMP_S + travel_s(math.hypot(*phase.by_m), phase.speed_m_s)
             elif isinstance(phase, Detach):
                 assert approach is not None, "the mission file is checked: an approach comes first"
                 builder.t_s += RELEASE_S + travel_s(approach.distance_max_m, phase.speed_m_s)

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from companion.config.mission import ArmMove, Line, Mission, Path, Phase, Press
+from companion.config.mission import ArmMove, Line, Mission, Path, Phase, Press, Slide
 from companion.model.types import PhaseKind
 
 
@@ -107,4 +107,6 @@ def phase_name(phase: Phase) -> str:
         return f"arm to ({', '.join(f'{value:g}' for value in phase.arm_deg)}) deg"
     if isinstance(phase, Press):
         return f"press with {phase.force_n:g} N"
+    if isinstance(phase, Slide):
+        return f"slide by ({', '.join(f'{value:g}' for value in phase.by_m)}) m with {phase.force_n:g} N"
     return _PLAIN_NAMES.get(phase.type, phase.type)

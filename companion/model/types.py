@@ -248,6 +248,7 @@ class ContactMode(Enum):
     WEIGH = "weigh"  # at rest before the approach: average the force that is there without contact
     APPROACH = "approach"  # move along the direction until the surface is touched
     PRESS = "press"  # touched: hold the force
+    SLIDE = "slide"  # move the tip along the surface while the force is held
     LOST = "lost"  # the force has ended: wait at rest, then approach again
     BACK = "back"  # a point was touched: move back from the surface
     SHIFT = "shift"  # move in front of the next point, or turn to the surface
@@ -349,6 +350,16 @@ class ContactState(Record, frozen=True, kw_only=True):
     """Surface through the touched points; None before the last of them."""
     free_m: float = 0.0
     """Offset up to which the way is known to be free."""
+    beside_m: Vec3 = (0.0, 0.0, 0.0)
+    """Place of the tip minus that of its reference when a slide begins: its path begins where the tip is."""
+    lag_m: float = 0.0
+    """Distance of the tip behind its reference along a slide."""
+    lag_integral_n: float = 0.0
+    """Integral part of the force along a slide."""
+    slide_world_n: Vec3 = (0.0, 0.0, 0.0)
+    """Force along the surface that moves the tip against friction."""
+    stuck_s: float = 0.0
+    """Time for which the tip has been too far behind its reference."""
 
 
 class Reference(Record, frozen=True, kw_only=True):
@@ -366,6 +377,8 @@ class Reference(Record, frozen=True, kw_only=True):
     """Reference jerk, used by laws whose acceleration feed-forward has a lead."""
     push_world_n: Vec3 | None = None
     """Force that the vehicle is to exert on a surface, world frame; None without contact."""
+    slide_world_n: Vec3 | None = None
+    """Force that vehicle and arm are to exert along a surface, world frame; None unless the tip slides."""
 
 
 class AttitudeSetpoint(Record, frozen=True):

@@ -181,6 +181,7 @@ class Governor:
             arm_acceleration_rad_s2=reference.arm_acceleration_rad_s2,
             jerk_world_m_s3=(0.0, 0.0, 0.0),
             push_world_n=reference.push_world_n,
+            slide_world_n=reference.slide_world_n,
         )
         return Governed(constrained, reasons)
 

@@ -104,6 +104,11 @@ CONTACT_SLIPPED = Notice(
     "the yaw error exceeded 5 deg while approaching or pressing (15 deg while light touches find the surface's normal), because the "
     "tool slips along the surface: the vehicle moves back, and the mission goes on as aborted",
 )  # fmt: skip
+CONTACT_STUCK = Notice(
+    "contact_stuck", _WARNING, _WARN,
+    "for 0.5 s the tip of a slide is 0.05 m behind its reference or ahead of it, because the tool is caught on the surface or friction "
+    "exceeds `friction_max`: the vehicle moves back, and the mission goes on as aborted",
+)  # fmt: skip
 SURFACE_MISSING = Notice(
     "surface_missing", _WARNING, _WARN,
     "nothing was touched within `distance_max_m`, or the touched points lie on a plane tilted by more than 30 deg: the vehicle moves "
@@ -134,7 +139,7 @@ NO_ROOM_TO_STAY = Notice(
 NOTICES: tuple[Notice, ...] = (
     INPUTS_MISSING, VISION_NOT_FUSED, ESTIMATE_UNSTEADY, START_REFUSED, OFFBOARD_REFUSED, ARMING_REFUSED, NOT_READY,
     START_DECLINED, CALLED_OFF, RESUME_REFUSED, TAKEOFF, CATCH, PAYLOAD_LEFT, IMPEDANCE_SCALED, TOUCHED, CONTACT_INTERRUPTED,
-    CONTACT_LOST, CONTACT_DISAGREES, CONTACT_BOUNCE, CONTACT_BESIDE, CONTACT_SLIPPED, SURFACE_MISSING, TOUCHDOWN, NO_TOUCHDOWN,
-    DISARM_REFUSED,
+    CONTACT_LOST, CONTACT_DISAGREES, CONTACT_BOUNCE, CONTACT_BESIDE, CONTACT_SLIPPED, CONTACT_STUCK, SURFACE_MISSING, TOUCHDOWN,
+    NO_TOUCHDOWN, DISARM_REFUSED,
     AUTOPILOT_LANDING, GATE, HOLD_EXPIRED, RETRACT_EXPIRED, RETRACT_DONE, NO_ROOM_TO_STAY,
 )  # fmt: skip

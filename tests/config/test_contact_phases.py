@@ -12,6 +12,7 @@ from companion.config.mission import Mission
 
 APPROACH = {"type": "approach", "direction": [1.0, 0.0, 0.0], "distance_max_m": 0.3, "speed_m_s": 0.04}
 PRESS = {"type": "press", "force_n": 5.0, "duration_s": 5.0}
+SLIDE = {"type": "slide", "force_n": 3.0, "by_m": [0.0, -0.5], "speed_m_s": 0.05}
 DETACH = {"type": "detach", "speed_m_s": 0.1}
 HOLD = {"type": "hold", "duration_s": 1.0}
 
@@ -40,7 +41,7 @@ def mission(*phases: dict[str, Any]) -> Mission:
     )
 
 
-@pytest.mark.parametrize("phases", [(APPROACH, PRESS, DETACH), (APPROACH, PRESS, PRESS, DETACH, HOLD)])
+@pytest.mark.parametrize("phases", [(APPROACH, PRESS, DETACH), (APPROACH, PRESS, SLIDE, SLIDE, PRESS, DETACH, HOLD)])
 def test_a_contact_that_is_left_is_accepted(phases: tuple[dict[str, Any], ...]) -> None:
     assert len(mission(*phases).phases) == len(phases) + 2
 
@@ -49,9 +50,12 @@ def test_a_contact_that_is_left_is_accepted(phases: tuple[dict[str, Any], ...]) 
     ("phases", "text"),
     [
         ((PRESS,), "a press must follow an approach"),
+        ((SLIDE,), "a slide must follow an approach"),
+        (({**SLIDE, "by_m": [0.0, 0.0]},), "is shorter than"),
         ((DETACH,), "a detach must follow a press"),
         ((APPROACH, DETACH), "a detach must follow a press"),
-        ((APPROACH, HOLD), "a press must follow the approach, not a hold"),
+        ((APPROACH, HOLD), "a press or a slide must follow the approach, not a hold"),
+        ((APPROACH, SLIDE, HOLD), "a detach must come before this hold"),
         ((APPROACH, PRESS, HOLD, DETACH), "a detach must come before this hold"),
         ((APPROACH, PRESS), "a detach must come before this land"),
         (({**APPROACH, "direction": [0.0, 0.0, 0.0]}, PRESS, DETACH), "has no length"),

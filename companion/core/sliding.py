@@ -1,0 +1,111 @@
+"""Moves the tip along the surface: a phase `slide`. Pure.
+
+The reference moves straight, once the force is reached, and the tip's path begins where the tip is. Against friction, the weak springs
+of base and arm would leave the tip far behind: a force along the way, in proportion to the tip's lag and to its integral, acts on base
+and arm (`slide_world_n`). It is limited by the largest friction that the mission allows, and ends with the slide.
+"""
+
+from __future__ import annotations
+
+import math
+
+from msgspec.structs import replace
+
+from companion.config.mission import Approach, Probe, Slide
+from companion.core.probing import ahead_m, tip_world_m
+from companion.core.transition import Transition
+from companion.mission import contact as c
+from companion.mission.surface import axes
+from companion.model.types import ContactMode, ContactState, Vec3
+
+LAG_N_M, LAG_N_MS = 30.0, 40.0
+"""Force along the way per lag of the tip, and its rate. With twice as much, the tip sticks and slips."""
+BEYOND_FRICTION_N = 0.5
+"""Largest force along the way beyond the largest friction."""
+STUCK_M, STUCK_S = 0.05, 0.5
+"""Lag of the tip from which it is stuck, and for how long."""
+RELEASE_N_S = 3.0
+"""Rate at which the force along the way ends after a slide."""
+_ENDED: Vec3 = (0.0, 0.0, 0.0)
+
+
+def begun(contact: ContactState, phase: Slide) -> ContactState:
+    """Return the state with the way of a slide planned; the tip stays until the force is reached."""
+    (r, u), (right, up) = phase.by_m, axes(contact.direction_world)
+    rest = c.shift_to(contact, contact.shift.to_m, contact.shift.to_yaw_rad, contact.shift.to_tool_rad).from_m
+    x, y, z = (p + r * a + u * b for p, a, b in zip(rest, right, up, strict=True))
+    shift = c.shift_to(contact, (x, y, z), contact.shift.to_yaw_rad, contact.shift.to_tool_rad)
+    return replace(contact, shift=shift, mode=ContactMode.PRESS, lag_m=0.0, lag_integral_n=0.0, stuck_s=0.0)
+
+
+def slid(t: Transition, contact: ContactState, phase: Slide, approach: Approach | Probe) -> ContactState:
+    """Return the state after one tick of a slide."""
+    dt_s = t.o.dt_s
+    contact = c.pressed(contact, t.i.t_s, dt_s, approach.touch_n, phase.force_n)
+    slides = contact.mode is ContactMode.SLIDE
+    if not slides and contact.wanted_n != phase.force_n:
+        return contact
+    felt = c.touches(contact, approach.touch_n)
+    if slides:
+        contact = c.shifted(contact, dt_s, phase.speed_m_s if felt else 0.0)
+    beside_m = _beside_m(t, contact)
+    if beside_m is None:
+        return contact
+    if not felt:  # nothing rubs: the force would move the tip away
+        return replace(contact, lag_integral_n=0.0, slide_world_n=_ENDED)
+    most_n = phase.friction_max * phase.force_n + BEYOND_FRICTION_N
+    if not slides:
+        contact = replace(contact, mode=ContactMode.SLIDE, since_s=t.i.t_s, beside_m=beside_m)
+    lag_m = _along(contact, contact.beside_m) - _along(contact, beside_m)
+    integral_n = min(most_n, max(-most_n, contact.lag_integral_n + LAG_N_MS * dt_s * lag_m))
+    contact = replace(
+        contact,
+        lag_m=lag_m,
+        lag_integral_n=integral_n,
+        stuck_s=contact.stuck_s + dt_s if abs(lag_m) > STUCK_M else 0.0,
+    )
+    return _driven(contact, min(most_n, max(-most_n, integral_n + LAG_N_M * lag_m)))
+
+
+def _driven(contact: ContactState, force_n: float) -> ContactState:
+    x, y, z = way(contact)
+    return replace(contact, slide_world_n=(force_n * x, force_n * y, force_n * z))
+
+
+def _along(contact: ContactState, vector: Vec3) -> float:
+    (nx, ny, nz), (x, y, z) = way(contact), vector
+    return nx * x + ny * y + nz * z
+
+
+def released(contact: ContactState, dt_s: float) -> ContactState:
+    """Return the state with less force along the surface, because the tip does not slide."""
+    if contact.slide_world_n == _ENDED:
+        return contact
+    x, y, z = contact.slide_world_n
+    size_n = math.hypot(x, y, z)
+    k = max(0.0, 1.0 - RELEASE_N_S * dt_s / size_n)
+    return replace(contact, slide_world_n=(k * x, k * y, k * z) if k > 0.0 else _ENDED)
+
+
+def way(contact: ContactState) -> Vec3:
+    """Return the direction of a slide, a unit vector."""
+    (fx, fy, fz), (tx, ty, tz), length_m = contact.shift.from_m, contact.shift.to_m, contact.shift.length_m
+    return ((tx - fx) / length_m, (ty - fy) / length_m, (tz - fz) / length_m)
+
+
+def _beside_m(t: Transition, contact: ContactState) -> Vec3 | None:
+    """Return the place of the tip minus that of its reference; None if it is unknown."""
+    tip, course, shift = tip_world_m(t), t.state.course, contact.shift
+    if tip is None or course is None:
+        return None
+    (px, py, pz), (ax, ay, az) = (
+        course.reference(t.i.t_s).position_world_m,
+        ahead_m(t, shift.to_yaw_rad, shift.to_tool_rad),
+    )
+    (fx, fy, fz), (tx, ty, tz), share = shift.from_m, shift.to_m, shift.way_m / shift.length_m
+    x, y, z = tip
+    return (
+        x - px - ax - fx - share * (tx - fx),
+        y - py - ay - fy - share * (ty - fy),
+        z - pz - az - fz - share * (tz - fz),
+    )

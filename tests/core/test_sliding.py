@@ -1,0 +1,72 @@
+"""A slide along a surface in the fast loop: force and path, a tool that is caught, and what the check refuses."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.analysis.contact import contact_lines, contact_summary
+from companion.core.flight_core import FlightCore
+from companion.mission.check import check_mission
+from companion.model.types import ContactMode, Outcome
+from companion.sitl_config.loader import load_sitl
+from sitl.campaigns.flights import row_of
+from sitl.fast.loop import FastFlight, FastResult
+
+SLIDE = "configs/missions/slide.yaml"
+
+
+def slide(friction: float) -> tuple[FastFlight, FastResult]:
+    """Fly a short slide in the ideal world, with little of a way to the wall and back."""
+    wall = {"point_m": [1.5, 0.0, 1.09], "normal": [-1.0, 0.0, 0.0], "stiffness_n_m": 1e4, "friction": friction}
+    overrides = [
+        f"world.surfaces={json.dumps([wall])}",
+        "mission.start.position_m=[0.2,0.0]",
+        "mission.phases[3]={type: approach, direction: [1.0, 0.0, 0.0], distance_max_m: 0.35, speed_m_s: 0.05}",
+        "mission.phases[4].by_m=[0.0,-0.3]",
+        "mission.phases[6].to_m=[0.2,0.0,1.35]",
+    ]
+    flight = FastFlight(load_sitl(SLIDE, world="ideal", overrides=overrides))
+    return flight, flight.run(90.0)
+
+
+def test_the_tip_follows_its_path_while_the_force_is_held() -> None:
+    flight, result = slide(0.5)
+    assert result.outputs[-1].outcome is Outcome.COMPLETED and not result.crashed and result.layout is not None
+    assert {e.id for o in result.outputs for e in o.events} == {"takeoff", "touched", "touchdown"}
+    sliding = np.array([o.contact is not None and o.contact.mode is ContactMode.SLIDE for o in result.outputs])
+    tips, forces = zip(*(result.layout.contact(s.sensors) for s in result.snapshots), strict=True)
+    tip, force_n = np.array(tips)[sliding], -np.array(forces)[sliding, 0]
+    assert tip[-1][2] - tip[0][2] == pytest.approx(-0.3, abs=0.02) and np.ptp(tip[:, 1]) < 0.01
+    assert np.sqrt(np.mean((force_n - 3.0) ** 2)) < 0.45
+    log = row_of(flight.config.flight, result, None)[1]
+    summary = contact_summary(log)
+    assert summary is not None and summary["path_rms_m"] < 0.012
+    assert "; slid by 0.30 m, tip within " in contact_lines({"contact": summary})[0][1]
+    core = FlightCore(flight.config.flight)
+    assert all(core.step(i) == o for i, o in zip(result.inputs, result.outputs, strict=True))
+
+
+def test_a_tool_that_is_caught_leads_away_from_the_wall() -> None:
+    _, result = slide(2.0)
+    assert "contact_stuck" in [e.id for o in result.outputs for e in o.events]
+    assert result.outputs[-1].outcome is Outcome.ABORTED and not result.crashed
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"by_m": [0.3, 0.0]}, "set friction_max to at most 0.1"),
+        ({"by_m": [0.0, 0.3]}, "of friction (limit 2.12 N m: 0.85 of its torque); lower force_n, or slide downwards"),
+        ({"by_m": [0.0, -1.0]}, "above standing height"),
+        ({"by_m": [-2.0, 0.0], "friction_max": 0.0}, "shorten by_m"),
+    ],
+)
+def test_the_check_refuses_what_cannot_slide(changes: dict[str, Any], text: str) -> None:
+    config = load_sitl(
+        SLIDE, overrides=[f"mission.phases[4].{key}={json.dumps(value)}" for key, value in changes.items()]
+    )
+    assert any(text in problem for problem in check_mission(config.mission, config.vehicle))
