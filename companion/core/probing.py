@@ -96,7 +96,7 @@ def shifting(t: Transition, contact: ContactState, phase: Approach | Probe) -> C
 
 def beside_m(t: Transition, contact: ContactState) -> float:
     """Return the distance of the tip from its reference, across the direction of the press, m; 0 if it is unknown."""
-    tip, course = _tip_world_m(t), t.state.course
+    tip, course = tip_world_m(t), t.state.course
     if tip is None or course is None:
         return 0.0
     reference = c.along(course.reference(t.i.t_s), contact)
