@@ -20,6 +20,8 @@ NO_CONTACT_FINGERPRINT = "9b601c4b6d344318"
 """Fingerprint of the records before there were contact phases, which differ only in the fields of the contact."""
 NO_ONLINE_FINGERPRINT = "d9237ed1d1bff80d"
 """Fingerprint of the records before a law could optimise its gains in flight, which differ only in `ControlLog.impedance_scale`."""
+NO_SLIDE_FINGERPRINT = "d2306038621d169b"
+"""Fingerprint of the records before a tip could slide, which differ only in the fields of the contact and `Reference.slide_world_n`."""
 
 
 class Core(Protocol):
@@ -95,7 +97,7 @@ def check_replayable(log: FlightLog) -> str:
         raise LogError(
             f"{log.path}: was recorded by {found}, but this is companion {__version__}; replay it with the version that recorded it"
         )
-    older = (PAIRS_FINGERPRINT, NO_CONTACT_FINGERPRINT, NO_ONLINE_FINGERPRINT)
+    older = (PAIRS_FINGERPRINT, NO_CONTACT_FINGERPRINT, NO_ONLINE_FINGERPRINT, NO_SLIDE_FINGERPRINT)
     if about.get("records") not in (fingerprint(Inputs, Outputs, Sent), *older):
         raise LogError(
             f"{log.path}: the fields of its records differ from those of this version; it was written by "
