@@ -311,6 +311,7 @@ class Launcher:
                 heard_s = now_s
                 flight_open = self._receive(channel)
             elif flight_open and process.poll() is not None:
+                self._receive(channel)  # its last messages may have come after `select`
                 flight_open = False
             elif flight_open and self._flying and not guardian.took_over and now_s - heard_s > FLIGHT_SILENT_TIMEOUT_S:
                 text = f"flight: the flight process sent nothing for {FLIGHT_SILENT_TIMEOUT_S:g} s and was killed"

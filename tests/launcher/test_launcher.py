@@ -14,14 +14,17 @@ import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from pymavlink import mavutil
 
 from companion.analysis.log import FlightLog
+from companion.launcher.launcher import Launcher
 from companion.launcher.sitl_process import SitlProcess
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_REFUSED
+from companion.runtime import ipc
 from companion.sitl_config.loader import load_sitl
 from tests.runtime.test_cores import CORES, affinities
 from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, sandbox_in, set_options, wait_until
@@ -217,6 +220,24 @@ def test_process_that_cannot_start_is_named_in_one_line(tmp_path: Path, package:
         summary = read_summary(sandbox.cwd / "out")
     assert (ended.code, ended.err) == (EXIT_REFUSED, f"{line}\n")
     assert summary["outcome"] == "refused"
+
+
+def test_a_flight_process_that_ends_while_the_launcher_is_busy_is_heard_to_its_last_word(tmp_path: Path) -> None:
+    """Its refusal may come after `select` has returned without it, and before the launcher asks whether the process has ended."""
+    heard: list[dict[str, Any]] = []
+    launcher = Launcher(load_sitl(HOVER), tmp_path, sitl=False, on_message=heard.append)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setblocking(False)
+
+    def ends() -> int:
+        ipc.send(theirs, {"type": "refused", "lines": ["because"]})
+        return EXIT_REFUSED
+
+    guardian: Any = SimpleNamespace(open=False, channel=None, receive=tuple, took_over=False, hangs=bool)
+    process: Any = SimpleNamespace(poll=ends)
+    with ours, theirs:
+        launcher._watch(process, ours, guardian, None)
+    assert [message["lines"] for message in heard] == [["because"]]
 
 
 @pytest.mark.waits
