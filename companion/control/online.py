@@ -27,7 +27,7 @@ BLOW_N = 1.0
 """Difference of the measured force from its mean over `BLOW_TIME_S` that counts as a blow, such as a catch."""
 BLOW_TIME_S = 0.5
 DT_MAX_S = 0.02
-"""A longer step means missing ticks."""
+"""Longest time between two ticks with which the optimisation goes on; a longer one means that ticks are missing."""
 RATE_LOWPASS_RAD_S = 20.0
 """Of the tilting rate: gyroscopes measure the rotors' vibration, too."""
 TANK_SHARE, TANK_MAX_J = 0.5, 0.05

@@ -24,6 +24,8 @@ SOFTEN_S = 0.3
 """Time constant with which that stiffness ends after the slide."""
 ATTITUDE_P, RATE_P, INTEGRATOR_S = 6.5, 0.15, 0.75
 """PX4's defaults of MC_PITCH_P and MC_PITCHRATE_P, and MC_PITCHRATE_P over MC_PITCHRATE_I."""
+TURN_MAX_RAD = math.radians(10.0)
+"""Largest turn of the setpoint, per axis: a wrong reading of the force sensor must not tilt the vehicle further."""
 OPPOSED_SHARE = 0.4
 """Fraction of the friction's moment that the setpoint opposes. With twice as much, the tip starts to swing."""
 
@@ -88,7 +90,10 @@ class Slide:
         hx, hy = self._held_nm
         k = 1.0 - math.exp(-dt_s / INTEGRATOR_S)
         self._held_nm = hx, hy = hx + k * (mx - hx), hy + k * (my - hy)
-        turn = quat_from_euler_zyx(-self._rad_per_nm * (mx - hx), -self._rad_per_nm * (my - hy), 0.0)
+        turn_x, turn_y = self._rad_per_nm * (hx - mx), self._rad_per_nm * (hy - my)
+        turn_x = min(max(turn_x, -TURN_MAX_RAD), TURN_MAX_RAD)
+        turn_y = min(max(turn_y, -TURN_MAX_RAD), TURN_MAX_RAD)
+        turn = quat_from_euler_zyx(turn_x, turn_y, 0.0)
         return quat_multiply(attitude_wxyz, turn)
 
     def end(self) -> None:

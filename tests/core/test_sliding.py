@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from companion.analysis.contact import contact_lines, contact_summary
+from companion.control import slide as control
+from companion.control.types import PlantState
 from companion.core.flight_core import FlightCore
 from companion.mission.check import check_mission
+from companion.model.frames import euler_zyx_from_quat
 from companion.model.types import ContactMode, Outcome
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
@@ -54,6 +57,25 @@ def test_a_tool_that_is_caught_leads_away_from_the_wall() -> None:
     _, result = slide(2.0)
     assert "contact_stuck" in [e.id for o in result.outputs for e in o.events]
     assert result.outputs[-1].outcome is Outcome.ABORTED and not result.crashed
+
+
+def test_a_wrong_reading_of_the_force_turns_the_setpoint_by_a_bounded_angle() -> None:
+    vehicle = load_sitl(SLIDE).vehicle
+    level = (1.0, 0.0, 0.0, 0.0)
+    rest = (0.0, 0.0, 0.0)
+    state = PlantState(
+        position_world_m=rest,
+        velocity_world_m_s=rest,
+        acceleration_world_m_s2=rest,
+        attitude_wxyz=level,
+        angular_rate_body_rad_s=rest,
+        arm_rad=(1.1, 1.4),
+        arm_rate_rad_s=(0.0, 0.0),
+    )
+    slide = control.Slide(vehicle)
+    slide.torque_nm(0.005, (0.0, 0.0), state, (0.0, 0.0, -1.0))
+    turned = slide.attitude(0.005, level, state, (0.0, 0.0, 200.0))
+    assert max(map(abs, euler_zyx_from_quat(turned))) == pytest.approx(control.TURN_MAX_RAD)
 
 
 @pytest.mark.parametrize(

@@ -141,8 +141,8 @@ def test_given_up_before_arming(sandbox: Sandbox) -> None:
 
     assert re.search(r"^VmLck:\s+0 kB$", memory, re.MULTILINE), memory
     assert found == {name: {frozenset(own if own and name == "flight" else rest)} for name in PROCESSES}
-    told = re.search(r"real time +(.*)", ended.out)
-    assert told is not None and f"CPUs {','.join(map(str, own or rest))};" in told[1], ended.out
+    printed = re.search(r"real time +(.*)", ended.out)
+    assert printed is not None and f"CPUs {','.join(map(str, own or rest))};" in printed[1], ended.out
     assert sorted(os.sched_getaffinity(0)) == CORES
 
 
