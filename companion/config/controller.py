@@ -153,7 +153,7 @@ class LawConfig(ControllerConfig):
 class OnlineConfig(Model):
     """Slow optimisation of the target impedance in flight: one scale of Phi and Lambda on x, y and z (docs/tune.md)."""
 
-    bound: Annotated[float, Field(gt=1, le=2)] = 1.5
+    bound: Annotated[float, Field(gt=1, le=2)] = 2.0
     """The scale stays within 1 / bound and bound."""
     rate_1_s: Annotated[float, Field(gt=0, le=0.1)] = 0.03
     """Largest rate at which the logarithm of the scale rises. It falls up to ten times as fast."""

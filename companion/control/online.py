@@ -36,6 +36,10 @@ SHAKES, FALL_FACTOR = -0.5, 10.0
 """Direction below which the vehicle shakes in earnest (three times the error), and how much faster the scale falls then: before the
 supervisor has to act. Softer gains release energy, so that no tank limits this.
 """
+ERROR_MAX_M2 = 0.06**2
+"""Mean square of the position error above which a larger one does not stiffen any more: a gust or a wrong sensor can make the error as
+large as it likes, but the scale rises only while the vehicle shakes by less than that.
+"""
 UNDO_RATE_1_S = 0.3
 REPORTED = 0.05
 """Change of the logarithm of the scale that is reported."""
@@ -145,8 +149,9 @@ class OnlineImpedance:
         """Set the slope of the next window: 1 if the error is slow only, -1 if the vehicle shakes only, times the rates."""
         error_m2, shaking_m2 = self._error_m2_s / self._window_s, self._shaking_m2_s / self._window_s
         self._window_s = self._error_m2_s = self._shaking_m2_s = 0.0
-        whole = error_m2 + shaking_m2
-        direction = (error_m2 - shaking_m2) / whole if whole > 0.0 else 0.0
+        known_m2 = min(error_m2, ERROR_MAX_M2)
+        whole = known_m2 + shaking_m2
+        direction = (known_m2 - shaking_m2) / whole if whole > 0.0 else 0.0
         if self._clipped:
             direction, self._clipped = min(direction, 0.0), False
         self._slope_1_s = self._rate_1_s * direction * (1.0 if direction > SHAKES else FALL_FACTOR)
