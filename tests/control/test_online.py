@@ -97,6 +97,14 @@ def test_it_softens_fast_while_the_vehicle_shakes_saturated_or_not() -> None:
     assert it.scale == pytest.approx(1.0 / 1.4)
 
 
+def test_no_error_however_large_stiffens_a_vehicle_that_shakes() -> None:
+    it = online()
+    for k in range(800):
+        it.step(DT_S, row(2.0), row(0.5), (2.0 * math.sin(7.0 * k * DT_S), 0.0, 0.0), ZERO, False, Tuning.RUN)
+        assert it.scale <= 1.0
+    assert it.scale < 1.0
+
+
 def test_a_blow_missing_ticks_and_a_disturbed_flight_freeze_it() -> None:
     it = online()
     scale = moved(it, 5.0)
