@@ -195,7 +195,7 @@ class VehicleControl:
         if pressing is None:
             self._slide.end()
         elif torque is not None:
-            torque = self._slide.torque_nm(dt_s, torque, state, reference.slide_world_n)
+            torque = self._slide.torque_nm(dt_s, torque, state, reference.slide_world_n, pressing, force)
             attitude = self._slide.attitude(dt_s, attitude, state, _across(force, pressing))
         if self._observer is not None:
             observed = self._observer.force_n

@@ -145,7 +145,13 @@ def along(reference: Reference, contact: ContactState) -> Reference:
         rate = (push - tilting) / TILT_S
         x, y, z = x + tilting * sx, y + tilting * sy, z + tilting * sz
         vx, vy, vz = vx + rate * sx, vy + rate * sy, vz + rate * sz
-    slide = contact.slide_world_n if contact.slide_world_n != _NO_FORCE else None
+    slide = None
+    if (
+        contact.slide_world_n != _NO_FORCE
+    ):  # the arm needs the wanted force as well; together both remain the base's force
+        (sx, sy, sz), wanted = contact.slide_world_n, contact.wanted_n
+        slide = (sx + wanted * nx, sy + wanted * ny, sz + wanted * nz)
+        push -= wanted
     yaw, yaw_rate, shift = reference.yaw_rad, reference.yaw_rate_rad_s, contact.shift
     arm, arm_rate, arm_acceleration = reference.arm_rad, reference.arm_rate_rad_s, reference.arm_acceleration_rad_s2
     if shift.length_m > 0.0:

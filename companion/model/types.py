@@ -376,9 +376,10 @@ class Reference(Record, frozen=True, kw_only=True):
     jerk_world_m_s3: Vec3
     """Reference jerk, used by laws whose acceleration feed-forward has a lead."""
     push_world_n: Vec3 | None = None
-    """Force that the vehicle is to exert on a surface, world frame; None without contact."""
+    """Force that the vehicle is to exert on a surface, world frame, but for that of `slide_world_n`; None without contact."""
     slide_world_n: Vec3 | None = None
-    """Force that vehicle and arm are to exert along a surface, world frame; None unless the tip slides."""
+    """Force that vehicle and arm are to exert with a tip that slides, world frame: along the surface against friction, and the wanted
+    force across it; None unless the tip slides."""
 
 
 class AttitudeSetpoint(Record, frozen=True):

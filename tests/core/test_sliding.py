@@ -7,14 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from companion.analysis.contact import contact_lines, contact_summary
 from companion.control import slide as control
+from companion.control.arm_model import manipulator_of
 from companion.control.types import PlantState
 from companion.core.flight_core import FlightCore
 from companion.mission.check import check_mission
 from companion.model.frames import euler_zyx_from_quat
-from companion.model.types import ContactMode, Outcome
+from companion.model.types import ContactMode, Joints, Outcome
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight, FastResult
@@ -60,22 +62,46 @@ def test_a_tool_that_is_caught_leads_away_from_the_wall() -> None:
 
 
 def test_a_wrong_reading_of_the_force_turns_the_setpoint_by_a_bounded_angle() -> None:
-    vehicle = load_sitl(SLIDE).vehicle
-    level = (1.0, 0.0, 0.0, 0.0)
+    vehicle, state = load_sitl(SLIDE).vehicle, at_rest()
+    level = state.attitude_wxyz
+    slide = control.Slide(vehicle)
+    slide.torque_nm(0.005, (0.0, 0.0), state, (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), None)
+    turned = slide.attitude(0.005, level, state, (0.0, 0.0, 200.0))
+    assert max(map(abs, euler_zyx_from_quat(turned))) == pytest.approx(control.TURN_MAX_RAD)
+
+
+def test_the_arm_yields_across_the_surface_and_answers_the_force_error_by_a_bounded_force() -> None:
+    vehicle, state = load_sitl(SLIDE).vehicle, at_rest()
+    into, slide = (1.0, 0.0, 0.0), control.Slide(vehicle)
+    jacobian = np.array(manipulator_of(vehicle).jacobian_body_m(state.arm_rad))[[0, 2]]
+
+    def tip_force(arm: Joints, reading_n: float) -> Any:
+        moved = replace(state, arm_rad=arm)
+        torque = slide.torque_nm(0.005, (0.0, 0.0), moved, (3.0, 0.0, 0.0), into, (-reading_n, 0.0, 0.0))
+        return np.linalg.solve(jacobian.T, torque)
+
+    assert np.abs(tip_force(state.arm_rad, 3.0)).max() < 1e-9
+    across, along = (np.linalg.solve(jacobian, step) for step in ([0.005, 0.0], [0.0, 0.005]))
+    a, b = state.arm_rad
+    assert np.abs(tip_force((a + across[0], b + across[1]), 3.0)).max() < 0.05
+    assert tip_force((a + along[0], b + along[1]), 3.0)[1] < -0.1
+    for _ in range(200):
+        force = tip_force(state.arm_rad, 200.0)
+    assert force[0] == pytest.approx(-control.FORCE_MAX_N, rel=1e-3) and abs(force[1]) < 1e-9
+
+
+def at_rest() -> PlantState:
+    """Return the state of a level vehicle at rest whose arm is stretched."""
     rest = (0.0, 0.0, 0.0)
-    state = PlantState(
+    return PlantState(
         position_world_m=rest,
         velocity_world_m_s=rest,
         acceleration_world_m_s2=rest,
-        attitude_wxyz=level,
+        attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
         angular_rate_body_rad_s=rest,
         arm_rad=(1.1, 1.4),
         arm_rate_rad_s=(0.0, 0.0),
     )
-    slide = control.Slide(vehicle)
-    slide.torque_nm(0.005, (0.0, 0.0), state, (0.0, 0.0, -1.0))
-    turned = slide.attitude(0.005, level, state, (0.0, 0.0, 200.0))
-    assert max(map(abs, euler_zyx_from_quat(turned))) == pytest.approx(control.TURN_MAX_RAD)
 
 
 @pytest.mark.parametrize(
