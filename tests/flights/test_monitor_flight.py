@@ -16,7 +16,7 @@ from playwright.sync_api import sync_playwright
 from companion.model.exit_codes import EXIT_ABORTED
 from tests.broker import loopback_broker
 from tests.browser import ARGUMENTS, chromium
-from tests.support import DEADLINE_S, SHORT_CATCH, Sandbox, read_summary, sandbox_in, set_options
+from tests.support import CATCH, DEADLINE_S, Sandbox, read_summary, sandbox_in, set_options
 
 SLACK = "[data-figure='tether']"
 
@@ -83,7 +83,7 @@ def test_the_catch_is_watched_held_and_landed_from_the_page(tmp_path: Path) -> N
         page_at(address) as page,
     ):
         to_broker = set_options(**{"vehicle.ground.mqtt.url": broker.url})
-        with sandbox.start("fly", SHORT_CATCH, "--sitl", "--out", "out", *to_broker) as flight:
+        with sandbox.start("fly", CATCH, "--sitl", "--out", "out", *to_broker) as flight:
             until_text(page, "#word", "FLYING")
             first_m = float(page.inner_text(SLACK).split()[0])
             until_text(page, "#event-list", "payload caught")

@@ -35,10 +35,10 @@ def wanted(extras: bool) -> set[str]:
     return names - {DISTRIBUTION}
 
 
-@pytest.mark.parametrize(("what", "extras"), [("flight", False), ("all", True), ("pip", None)])
+@pytest.mark.parametrize(("what", "extras"), [("flight", False), ("all", True), ("uv", None)])
 def test_every_package_is_pinned_with_hashes(what: str, extras: bool | None) -> None:
     lock = locked(what)
-    assert ({"pip"} if extras is None else wanted(extras)) <= set(lock)
+    assert ({"uv"} if extras is None else wanted(extras)) <= set(lock)
     for name, (version, hashes) in lock.items():
         assert re.search(r"--hash=sha256:[0-9a-f]{64}", hashes), f"{name}=={version} has no hash: make lock"
 
