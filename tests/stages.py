@@ -7,6 +7,7 @@ lowest priority (`tests.low_priority`). The last line counts tests; each check (
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import shlex
@@ -201,7 +202,8 @@ def run_all(stages: Sequence[Stage]) -> int:
         except KeyboardInterrupt:
             interrupted = True
             for running in beside:  # in sessions of their own, which Ctrl-C does not reach
-                os.killpg(running.process.pid, signal.SIGINT)
+                with contextlib.suppress(ProcessLookupError):  # it has ended
+                    os.killpg(running.process.pid, signal.SIGINT)
                 running.process.wait()
             print("\ninterrupted; the stages below had ended")
     print(summary(results), flush=True)
