@@ -20,7 +20,7 @@ from companion.runtime.console import print_error
 from companion.sitl_config.faults import CONTACT_PHASES, KINDS, PHASES, absent_part
 from companion.sitl_config.loader import COMMAND_LINE_WORLD
 
-CONTACT_MISSION, CONTACT_WORLD = "press", "wall"
+CONTACT_MISSION, SLIDING_MISSION, CONTACT_WORLD = "press", "slide", "wall"
 
 
 def add_parser(commands: Any) -> None:
@@ -41,7 +41,8 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--phases", type=_known((*PHASES, *CONTACT_PHASES), "phase"), default=(), metavar="PHASE,...",
         help=f"phases from {', '.join(PHASES)}; default: all of these. Or from {', '.join(CONTACT_PHASES)}, flown with the mission "
-        f"{CONTACT_MISSION} in the world {CONTACT_WORLD} unless others are given; the default for kinds that need a surface",
+        f"{CONTACT_MISSION} (slide: {SLIDING_MISSION}) in the world {CONTACT_WORLD} unless others are given; the default for kinds "
+        "that need a surface",
     )  # fmt: skip
     parser.add_argument(
         "--wires",
@@ -92,7 +93,7 @@ def _campaign(arguments: argparse.Namespace) -> Faults:
                     f"--phases {','.join(CONTACT_PHASES)}, or fly two campaigns"
                 ]
             )
-        arguments.phases = CONTACT_PHASES
+        arguments.phases = tuple(phase for phase in CONTACT_PHASES if phase != "slide")
     if touches(arguments.phases):
         if not set(arguments.phases) <= set(CONTACT_PHASES):
             raise ConfigError(
@@ -102,7 +103,7 @@ def _campaign(arguments: argparse.Namespace) -> Faults:
                 ]
             )
         if arguments.mission == DEFAULT_MISSION:
-            arguments.mission = CONTACT_MISSION
+            arguments.mission = SLIDING_MISSION if "slide" in arguments.phases else CONTACT_MISSION
         if arguments.world == COMMAND_LINE_WORLD:
             arguments.world = CONTACT_WORLD
     flights = planned(arguments.kinds, arguments.phases, wires=arguments.wires)

@@ -51,7 +51,7 @@ class Slide:
         self._manipulator, self._torque_max_nm = manipulator_of(vehicle), vehicle.joint_torque_limits_nm
         airframe = vehicle.airframe
         arms_m = [abs(x) for x, _, _ in airframe.rotor_layout.positions_body_m]
-        torque_max_nm = 0.5 * airframe.thrust_max_n * sum(arms_m) / len(arms_m)
+        torque_max_nm = 0.5 * airframe.thrust_max_n * sum(arms_m, 0.0) / len(arms_m)
         self._rad_per_nm = OPPOSED_SHARE / (ATTITUDE_P * RATE_P * torque_max_nm)
         self._stiff_rad: Joints | None = None
         """Joint angles to which the stiff arm returns; None if nothing slides."""
@@ -116,7 +116,7 @@ class Slide:
         """Return the motion of the joints, a unit vector, that moves the tip along the normal only: J' (J J')^-1 n."""
         jacobian = self._manipulator.jacobian_body_m(arm_rad)
         (xx, xy, xz), (_, yy, yz), (_, _, zz) = (
-            [sum([u * v for u, v in zip(one, other, strict=True)]) for other in jacobian] for one in jacobian
+            [sum([u * v for u, v in zip(one, other, strict=True)], 0.0) for other in jacobian] for one in jacobian
         )
         a, b, c = (xx + _DAMPED_M2, xy, xz), (xy, yy + _DAMPED_M2, yz), (xz, yz, zz + _DAMPED_M2)
         x, y, z = mat_vec((cross(b, c), cross(c, a), cross(a, b)), normal_body)

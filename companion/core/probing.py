@@ -14,6 +14,7 @@ from companion.config.mission import Approach, Phase, Probe
 from companion.core.transition import Transition
 from companion.mission import contact as c
 from companion.mission.surface import TILT_MAX_RAD, axes, plane, points_of, tool_turn_rad, turn_to
+from companion.model.algebra import dot
 from companion.model.best_pose import best_pose
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_rotate
@@ -135,9 +136,8 @@ def _towards_surface(t: Transition, contact: ContactState, surface: FoundSurface
     turn_rad = turn_to(surface, reference.yaw_rad) - reference.yaw_rad
     tool_rad = tool_turn_rad(t.parameters.vehicle, t.parameters.manipulator, reference.arm_rad, n, into)
     before, after = ahead_m(t), ahead_m(t, turn_rad, tool_rad)
-    start = [p + tip for p, tip in zip(reference.position_world_m, before, strict=True)]
-    gap = sum((q - s) * k for q, s, k in zip(surface.point_world_m, start, into, strict=True))
-    way_m = gap / sum(a * b for a, b in zip(n, into, strict=True))
+    (qx, qy, qz), (px, py, pz), (bx, by, bz) = surface.point_world_m, reference.position_world_m, before
+    way_m = dot((qx - (px + bx), qy - (py + by), qz - (pz + bz)), into) / dot(n, into)
     x, y, z = (way_m * (a - b) + old - new for a, b, old, new in zip(n, into, before, after, strict=True))
     return c.entered(
         replace(

@@ -59,7 +59,7 @@ def plane(tips_m: Sequence[Vec3], direction_world: Vec3, radius_m: float) -> Fou
         radius_m: radius of the tip.
     """
     count = len(tips_m)
-    cx, cy, cz = (sum(tip[k] for tip in tips_m) / count for k in range(3))
+    cx, cy, cz = (sum([tip[k] for tip in tips_m], 0.0) / count for k in range(3))
     right, up = axes(direction_world)
     rr = ru = uu = rd = ud = 0.0
     for x, y, z in tips_m:

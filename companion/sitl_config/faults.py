@@ -59,9 +59,9 @@ FaultKind = Literal[
     "kill_guardian",
     "pilot_takeover",
 ]
-FlightPhase = Literal["ground", "takeoff", "line", "catch", "return", "landing", "touch", "press", "detach"]
-CONTACT_PHASES: tuple[FlightPhase, ...] = ("touch", "press", "detach")
-"""Phases of a mission that presses on a surface."""
+FlightPhase = Literal["ground", "takeoff", "line", "catch", "return", "landing", "touch", "press", "slide", "detach"]
+CONTACT_PHASES: tuple[FlightPhase, ...] = ("touch", "press", "slide", "detach")
+"""Phases of a mission that presses on a surface or slides along it."""
 PHASES: tuple[FlightPhase, ...] = tuple(phase for phase in get_args(FlightPhase) if phase not in CONTACT_PHASES)
 IN_FLIGHT: tuple[FlightPhase, ...] = PHASES[1:]
 
@@ -309,8 +309,8 @@ class Fault(Model):
     """Event from which `t_s` counts: the start of the world, arming, the catch, the first touch of a surface, or the beginning of the
     first one that lasts for 2.5 s."""
     phase: FlightPhase | None = None
-    """Alternative to `t_s`: the fault starts in the middle of this part of the mission, or just after the catch. `touch`, `press`
-    and `detach` are parts of a contact with a surface."""
+    """Alternative to `t_s`: the fault starts in the middle of this part of the mission, or just after the catch. `touch`, `press`,
+    `slide` and `detach` are parts of a contact with a surface."""
     duration_s: Positive | None = None
     """Duration. If it is absent, the fault is permanent."""
     size: float | None = Field(default=None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from companion.config.mission import Press
+from companion.config.mission import Press, Slide
 from companion.mission.plan import Plan
 from companion.mission.segments import Segment
 from companion.model.flight_stage import SPOOL_S
@@ -18,7 +18,7 @@ AFTER_CATCH_S = 0.1
 REBOOT_ON_GROUND_S = 1.3
 """World time of a PX4 reboot in phase "ground": after PX4's first boot."""
 INTO_DETACH_S = 0.3
-"""Time from the end of the press to a fault in phase "detach"."""
+"""Time from the end of the press or slide to a fault in phase "detach"."""
 _ALONG_M = 0.3
 _EARLY_IN_LINE, _MIDDLE = 0.35, 0.5
 _FROM_START: frozenset[FaultKind] = frozenset({"payload_missed", "payload_heavy"})
@@ -61,17 +61,18 @@ def _timed(fault: Fault, config: SitlConfig) -> Fault:
 
 
 def _into_press_s(phase: FlightPhase, config: SitlConfig) -> float:
-    """Return the time since the press began: in its middle, or just after it; 0 for the first touch, which may come earlier."""
-    phases = config.mission.phases
+    """Return the time since press or slide began: in its middle, or just after it; 0 for the first touch, which may come earlier."""
+    phases, kinds = config.mission.phases, {"press": (Press,), "slide": (Slide,)}.get(phase, (Press, Slide))
     pressing_s = [
         segment.end_s - segment.start_s
         for segment in Plan.build(config.mission, config.vehicle).segments
-        if segment.index >= 0 and isinstance(phases[segment.index], Press)
+        if segment.index >= 0 and isinstance(phases[segment.index], kinds)
     ]
     if not pressing_s:
         text = f"world.faults: mission '{config.mission.name}' has no phase '{phase}'; give t_s instead of the phase"
         raise FaultError(text)
-    return {"touch": 0.0, "press": _MIDDLE * pressing_s[0]}.get(phase, pressing_s[0] + INTO_DETACH_S)
+    middle_s = _MIDDLE * pressing_s[0]
+    return {"touch": 0.0, "press": middle_s, "slide": middle_s}.get(phase, pressing_s[0] + INTO_DETACH_S)
 
 
 def _plan_time_s(phase: FlightPhase, config: SitlConfig) -> float:

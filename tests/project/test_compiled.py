@@ -21,7 +21,7 @@ from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 mission, law, preset, world, vehicle, *overrides = sys.argv[1:]
 config = load_sitl(mission, vehicle or None, law, preset, overrides, world=world)
-result = FastFlight(config).run()
+result = FastFlight(config).run(300.0)
 flown = repr((result.inputs, result.outputs, result.snapshots, result.after))
 print(COMPILED, len(result.outputs), result.outputs[-1].outcome.value, hashlib.sha256(flown.encode()).hexdigest())
 """
@@ -33,6 +33,9 @@ FLIGHTS = [
     ("circuit", "adaptive", "recommended", "lab", ""),
     ("hover", "adaptive", "recommended", "lab", "tarot650_4r"),
     ("hover", "adaptive", "recommended", "lab", "hexa_2r"),
+    ("press", "adaptive", "recommended", "wall", ""),
+    ("slide", "adaptive", "recommended", "wall", "", "mission.phases[4].by_m=[0.0,-0.2]"),
+    ("probe", "adaptive", "recommended", "wall", "", "mission.phases[3].rows=2", "mission.phases[3].columns=2"),
 ]
 ROBUSTNESS = ("robustness", str(CATCH), "--draws", "4", "--seed", "5", "--jobs", "1", "--json")
 
