@@ -15,7 +15,7 @@ from tests.support import ROOT
 
 FILE = Path(__file__).with_name("robustness.yaml")
 KEPT: Cases = read_cases(FILE)
-FLOWN = 4
+FLOWN = 2
 """The worst of them; `companion robustness --cases tests/regressions/robustness.yaml` flies all."""
 
 
