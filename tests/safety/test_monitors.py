@@ -584,9 +584,14 @@ def test_every_threshold_of_the_table_is_one_that_runs(rule: Rule) -> None:
         if fault is not FAULTS[rule.id]:
             inputs = after_a_moment(fault.change)
 
-        def times_s(vehicle: Vehicle, fault: Fault = fault, inputs: list[Inputs] = inputs) -> list[float]:
-            return [event.t_s for event in watched(vehicle, inputs, fault.situation()) if event.id == rule.id]
+        def reported(vehicle: Vehicle, inputs: list[Inputs], fault: Fault = fault) -> int | None:
+            """Return the number of the tick in which the rule's event is first reported."""
+            monitors, situation = Monitors(vehicle), fault.situation()
+            return next(
+                (k for k, i in enumerate(inputs) if any(e.id == rule.id for e in monitors.check(i, situation))), None
+            )
 
-        expected = times_s(machine)
-        assert expected
-        assert any(times_s(scaled(key, factor, machine)) != expected for factor in (1e-3, 1e3, -1e3)), key
+        expected = reported(machine, inputs)
+        assert expected is not None
+        until = inputs[: expected + 1]
+        assert any(reported(scaled(key, factor, machine), until) != expected for factor in (1e-3, 1e3, -1e3)), key
