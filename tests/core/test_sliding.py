@@ -29,10 +29,10 @@ def slide(friction: float) -> tuple[FastFlight, FastResult]:
     wall = {"point_m": [1.5, 0.0, 1.09], "normal": [-1.0, 0.0, 0.0], "stiffness_n_m": 1e4, "friction": friction}
     overrides = [
         f"world.surfaces={json.dumps([wall])}",
-        "mission.start.position_m=[0.2,0.0]",
+        "mission.start.position_m=[0.4,0.0]",
         "mission.phases[3]={type: approach, direction: [1.0, 0.0, 0.0], distance_max_m: 0.35, speed_m_s: 0.05}",
         "mission.phases[4].by_m=[0.0,-0.3]",
-        "mission.phases[6].to_m=[0.2,0.0,1.35]",
+        "mission.phases[6].to_m=[0.5,0.0,1.35]",
     ]
     flight = FastFlight(load_sitl(SLIDE, world="ideal", overrides=overrides))
     return flight, flight.run(90.0)

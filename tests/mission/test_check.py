@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from pathlib import Path
 from typing import Any
 
@@ -56,13 +57,16 @@ def test_0_2_m_s_or_more_off_the_fastest_accepted_plan_no_monitor_stops_it(
 ) -> None:
     """Outward, at every instant of a line that ends near the wall or the tether's end; one that takes 0.1 s less is refused."""
     limits = ("mission.limits.speed_max_m_s=1.6", "mission.limits.acceleration_max_m_s2=2", *where)
-    for tenths in range(40, 80):
+
+    def line(tenths: int) -> tuple[FlightConfig, list[str]]:
         line = f"mission.phases[1]={{type: line, to_m: [1.5, 0, 1.0], duration_s: {tenths / 10}}}"
         config = load(*limits, line, mission="hover")
-        found = check_mission(config.mission, config.vehicle)
-        if not found:
-            break
-        assert all(f"could not stop within the {end}" in problem for problem in found)
+        return config, check_mission(config.mission, config.vehicle)
+
+    tenths = 40 + bisect_left(range(40, 80), True, key=lambda tenths: not line(tenths)[1])
+    config, found = line(tenths)
+    refused = line(tenths - 1)[1]
+    assert not found and refused and all(f"could not stop within the {end}" in problem for problem in refused)
     vehicle, start = config.vehicle, config.mission.start
     plan = Plan.build(config.mission, vehicle, (*start.position_m, vehicle.airframe.ground_clearance_m), 0.0)
     tracker, watch = FlightTracker(vehicle), TetherWatch(vehicle, tether_of(vehicle))

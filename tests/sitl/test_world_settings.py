@@ -44,6 +44,8 @@ UNTIL_S = EARLY_S, _, _ = 0.15, 1.3, 6.1
 A pair flies until its first difference. Shorter flights are tried first, unless other pairs share the usual world.
 """
 SHARED = {world for world, pairs_of_it in Counter(json.dumps(pair.usual) for pair in PAIRS).items() if pairs_of_it > 3}
+EARLY = {"air", "battery", "compliance", "imu", "machine", "mocap", "push", "rotors"}
+"""Parts of shared worlds that act before the catch."""
 UNTIL_STEPS = (130, 400, END_STEPS)
 """The same on the wires, in steps of the physics."""
 
@@ -120,7 +122,9 @@ def devices_differ(pair: Pair, end: int) -> bool:
 
 def tried(pair: Pair, limits: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return the limits to try in turn until the pair differs."""
-    return limits[-1:] if json.dumps(pair.usual) in SHARED else limits[pair.acts :]
+    if json.dumps(pair.usual) not in SHARED:
+        return limits[pair.acts :]
+    return limits[1:] if pair.usual.keys() & EARLY else limits[-1:]
 
 
 def field(pair: Pair) -> str:
