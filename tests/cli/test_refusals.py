@@ -1,8 +1,8 @@
 """Devices that are not there or not as they must be, on the hardware path: `companion fly` without --sitl against a simulated
 world that runs on its own. Each time: exit 3, one clear line, never armed, nothing left, and everything free for the next attempt.
 
-Each device has a whole `fly` (the force sensor's comes before the refused start at the end); of the rest the line is read where a
-flight opens its devices, in this process.
+The autopilot and the force sensor (before the refused start at the end) each have a whole `fly`; of the rest the line is read where
+a flight opens its devices, in this process.
 """
 
 from __future__ import annotations
@@ -10,17 +10,14 @@ from __future__ import annotations
 import os
 import re
 import socket
-import struct
 import tty
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import serial
-from pymavlink import mavutil
 
 from companion.config.loader import load_flight
 from companion.io.devices import open_devices
@@ -28,8 +25,7 @@ from companion.io.protocols import DeviceError
 from companion.model.exit_codes import EXIT_REFUSED
 from companion.runtime.clock import flight_clock
 from companion.runtime.event_loop import run
-from tests.flights.test_guardian import hooked
-from tests.support import CATCH, DEADLINE_S, Ended, Sandbox, World, read_summary, sandbox_in, set_options
+from tests.support import CATCH, Ended, Sandbox, World, read_summary, sandbox_in, set_options
 
 SHARED = pytest.mark.xdist_group("the world that refuses")
 """Tests that share one world run in one process."""
@@ -39,13 +35,6 @@ QUICK = {"discovery_timeout_s": 1.0}
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     with sandbox_in(tmp_path_factory.mktemp("world")) as sandbox, World(sandbox) as world:
-        yield world
-
-
-@pytest.fixture
-def fresh_world(tmp_path: Path) -> Iterator[World]:
-    """A world for one test: once the servos have held the arm and let it go, it hangs, until somebody folds it by hand."""
-    with sandbox_in(tmp_path / "world") as sandbox, World(sandbox) as world:
         yield world
 
 
@@ -148,18 +137,6 @@ WRONG = {
 }
 
 
-FLOWN = ("arm baud rate", "mocap body never seen")
-
-
-@SHARED
-@pytest.mark.waits
-@pytest.mark.parametrize("case", FLOWN)
-def test_refuses(sandbox: Sandbox, world: World, case: str) -> None:
-    wrong = WRONG[case]
-    ended = refused(sandbox, world, *world.addresses(**wrong.but), *set_options(**wrong.also))
-    assert_one_line(ended, wrong.line)
-
-
 def line_at_opening(world: World, *options: str) -> str:
     """The line of the device at which a flight with these options ends. Nothing is armed."""
     config = load_flight(CATCH, overrides=[word for word in options if word != "--set"], hardware=True)
@@ -186,7 +163,7 @@ def refused_at_opening(world: World, *options: str) -> str:
 
 @SHARED
 @pytest.mark.waits
-@pytest.mark.parametrize("case", sorted(WRONG.keys() - set(FLOWN)))
+@pytest.mark.parametrize("case", WRONG)
 def test_names(world: World, case: str) -> None:
     wrong = WRONG[case]
     line = refused_at_opening(world, *world.addresses(**wrong.but), *set_options(**wrong.also))
@@ -266,77 +243,6 @@ def test_names_a_silent_mocap_server(world: World) -> None:
     assert re.search(
         rf"^mocap 127\.0\.0\.1:{port}: no answer to the NatNet connect request within .*; is Motive running", line
     )
-
-
-@contextmanager
-def px4_param(world: World, name: str, value: float) -> Iterator[None]:
-    """One parameter of the world's PX4 changed over MAVLink, and set back afterwards."""
-    before = exchange_param(world, name, lambda mav: mav.param_request_read_send(1, 1, name.encode(), -1))
-    kind = before.param_type
-    set_param(world, name, value if kind == mavutil.mavlink.MAV_PARAM_TYPE_REAL32 else as_float_bits(int(value)), kind)
-    try:
-        yield
-    finally:
-        set_param(world, name, before.param_value, kind)
-
-
-def set_param(world: World, name: str, wire_value: float, kind: int) -> None:
-    answer = exchange_param(world, name, lambda mav: mav.param_set_send(1, 1, name.encode(), wire_value, kind))
-    assert answer.param_value == pytest.approx(wire_value)
-
-
-def exchange_param(world: World, name: str, ask: Callable[[Any], None]) -> Any:
-    """One question about a parameter, and the PARAM_VALUE that answers it."""
-    address = world.devices["autopilot"]["address"].removeprefix("udpout://")
-    with closing(mavutil.mavlink_connection(f"udpout:{address}", source_system=255)) as ground:
-        ask(ground.mav)
-        while True:
-            answer = ground.recv_match(type="PARAM_VALUE", blocking=True, timeout=DEADLINE_S)
-            assert answer is not None, f"no answer about {name}"
-            if answer.param_id == name:
-                return answer
-
-
-def as_float_bits(value: int) -> float:
-    """PX4 carries an INT32 in the bytes of the message's float."""
-    return float(struct.unpack("<f", struct.pack("<i", value))[0])
-
-
-@pytest.mark.waits
-def test_refuses_when_px4_fuses_no_motion_capture(sandbox: Sandbox, fresh_world: World) -> None:
-    with px4_param(fresh_world, "EKF2_EV_CTRL", 0):
-        ended = refused(sandbox, fresh_world, *fresh_world.addresses())
-    for pattern in (
-        r"^EKF2_EV_CTRL: 0, wanted 11 or 15; set EKF2_EV_CTRL to 11 \(companion px4 params --write\)$",
-        r"^EKF2 fuses motion capture: the estimator reports no valid .*, wanted fused for 1 s; check EKF2_EV_CTRL = 11",
-    ):
-        assert [line for line in ended.err_lines if re.search(pattern, line)], (pattern, ended.err)
-
-
-@pytest.mark.flight
-def test_refuses_when_px4_does_not_arm_and_passes_its_answer_on(tmp_path: Path) -> None:
-    """A flight process that asks PX4 for two seconds, not for ten."""
-    hooks = tmp_path / "hooks"
-    hooks.mkdir()
-    (hooks / "sitecustomize.py").write_text(_IMPATIENT, encoding="utf-8")
-    refuses = ("world.faults=[{kind: arming_refused, phase: ground}]",)
-    with (
-        sandbox_in(tmp_path / "sandbox", hooked(hooks)) as sandbox,
-        sandbox_in(tmp_path / "world") as around,
-        World(around, CATCH, refuses) as world,
-    ):
-        ended = refused(sandbox, world, *world.addresses(), events=True)
-    assert_one_line(ended, r"^PX4 did not arm; PX4 reported: ARM refused: temporarily rejected")
-
-
-_IMPATIENT = """
-import sys
-
-if "companion.flight.main" in sys.orig_argv:
-    from companion.model import flight_stage
-
-    flight_stage.ARM_TIMEOUT_S = 2.0
-"""
 
 
 @SHARED

@@ -57,24 +57,6 @@ def test_more_latency_is_found_and_written(sandbox: Sandbox) -> None:
     assert found["written_ms"] == pytest.approx(found["parameter"]["EKF2_EV_DELAY"], abs=1e-4)
 
 
-def test_30_ms_more_are_found_and_too_many_to_be_written(sandbox: Sandbox) -> None:
-    ended = measured(sandbox, "world.mocap_latency_s=0.035", options=("--write", "--yes", *FEWEST))
-    found = document(ended)
-    near(found, 36.0)
-    assert set(bad(found)) == {"latency.delay", "latency.long"}
-    assert found["written_ms"] is None
-    assert "EKF2_EV_DELAY is not written" in ended.err
-
-
-def test_weak_taps_are_refused(sandbox: Sandbox) -> None:
-    ended = measured(sandbox, "world.hand_tap_n=3", options=("--seconds", 5))
-    found = document(ended)
-    assert ended.code == EXIT_REFUSED
-    assert set(bad(found)) == {"latency.taps"}
-    assert found["ev_delay_ms"] is None
-    assert "tap harder" in bad(found)["latency.taps"]
-
-
 def test_without_px4_it_says_so(sandbox: Sandbox) -> None:
     with World(sandbox) as world:
         address = {"address": "udpin://127.0.0.1:0"}

@@ -117,7 +117,7 @@ def test_the_catch(sandbox: Sandbox, autopilot: str) -> None:
     assert summary["rms"]["post"]["e_q_deg"] < E_Q_MAX_DEG
 
 
-@faults("kill_flight", "stop_flight", on_stub="kill_flight")
+@faults("kill_flight", "stop_flight", on_stub=None)
 def test_the_guardian_lands_after_the_catch(sandbox: Sandbox, autopilot: str, kind: str) -> None:
     fault = f"world.faults=[{{kind: {kind}, after: catch, t_s: 0.1}}]"
     ended = sandbox.run("fly", SHORT_CATCH, f"--sitl={autopilot}", "--out", "out", "--set", fault)

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from companion.analysis.log import FlightLog
-from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST
 from companion.model.types import AutopilotRequest
 from tests.support import HOVER, Running, Sandbox, World, read_summary, sandbox_in, set_options, wait_until
 
@@ -100,10 +100,8 @@ def test_started_again_in_the_air_without_the_arm_it_lands_what_it_finds(sandbox
 
 
 @pytest.mark.flight
-def test_hung_beside_a_hung_guardian_px4_lands_it_and_the_next_companion_judges_it_as_any_other_start(
-    sandbox: Sandbox,
-) -> None:
-    """The launcher kills both and reports it. The vehicle stands disarmed, its arm limp, and not where the next mission begins."""
+def test_hung_beside_a_hung_guardian_px4_lands_it(sandbox: Sandbox) -> None:
+    """The launcher kills both and reports it."""
     with World(sandbox, HOVER, ["world.payload_kg=0"]) as world:
         with sandbox.start("fly", HOVER, "--out", "first", *world.addresses()) as first:
             first.wait_for(IN_FLIGHT)
@@ -116,9 +114,6 @@ def test_hung_beside_a_hung_guardian_px4_lands_it_and_the_next_companion_judges_
         assert read_summary(sandbox.cwd / "first")["outcome"] == "lost"
         wait_until(lambda: at_rest(world), lambda: str(world.messages[-3:]))
         assert not world.crashes
-        elsewhere = set_options(**{"mission.start.position_m": [0.6, 0.0]})
-        ended = sandbox.run("fly", HOVER, "--out", "second", *elsewhere, *world.addresses())
-        assert ended.code == EXIT_REFUSED, (ended.out, ended.err)
         assert world.armings == 1
     sandbox.assert_nobody_left()
 

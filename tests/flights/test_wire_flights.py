@@ -23,6 +23,8 @@ pytestmark = pytest.mark.flight
 THE_CATCH = pytest.mark.xdist_group("the catch over wires")
 """Tests that look at one flight run in one process."""
 PAYLOAD_KG = 0.2
+LANDS_S = 0.5
+"""From the lost arm to the lost poses: the landing is under way, and above the floor."""
 
 
 @dataclass(frozen=True)
@@ -94,30 +96,21 @@ def test_the_fast_loop_says_what_the_wires_say(the_catch: Flown) -> None:
     assert 0.7 < over_wires_m / row["rms"]["post"]["e_p_m"] < 4.0
 
 
-def test_a_lost_arm_lands_it(tmp_path_factory: pytest.TempPathFactory) -> None:
-    with sandbox_in(tmp_path_factory.mktemp("arm")) as sandbox:
-        far = [{"point_m": [50.0, 0.0, 1.0], "normal": [-1.0, 0.0, 0.0]}]
-        fault = {"world.faults": [{"kind": "servo_loss", "t_s": HOVERS_S}], "world.surfaces": far}
-        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *set_options(**fault))
-        sandbox.assert_nobody_left()
-        summary = read_summary(sandbox.cwd / "out")
-    assert ended.code == EXIT_ABORTED, ended
-    assert summary["outcome"] == "aborted"
-    assert {"takeoff", "arm_lost", "touchdown"} <= {event["id"] for event in summary["events"]}
-    distance_m = rotor_distance_m(summary)
-    assert distance_m is not None and 50.0 < distance_m < 51.0
-
-
-def test_another_program_feeds_px4_and_its_end_is_found(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """The simulated world sends the poses to PX4 on a link of its own; the companion has the report of PX4's estimator alone."""
+def test_a_lost_arm_lands_it_and_another_programs_end_is_found(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The simulated world sends the poses to PX4 on a link of its own; the companion has the report of PX4's estimator alone. The
+    arm's servo falls silent in the hover, and the other program during the landing.
+    """
     with sandbox_in(tmp_path_factory.mktemp("external")) as sandbox:
-        loss = [{"kind": "mocap_loss", "t_s": HOVERS_S}]
-        options = set_options(**{"vehicle.devices.mocap.type": "external", "world.faults": loss})
-        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *options)
+        faults = [{"kind": "servo_loss", "t_s": HOVERS_S}, {"kind": "mocap_loss", "t_s": HOVERS_S + LANDS_S}]
+        far = [{"point_m": [50.0, 0.0, 1.0], "normal": [-1.0, 0.0, 0.0]}]
+        options = {"vehicle.devices.mocap.type": "external", "world.faults": faults, "world.surfaces": far}
+        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *set_options(**options))
         sandbox.assert_nobody_left()
         summary = read_summary(sandbox.cwd / "out")
     assert ended.code == EXIT_ABORTED, ended
     assert summary["outcome"] == "aborted"  # and not lost: PX4 landed and is disarmed, whoever noticed the floor first
-    wanted = ["takeoff", "vision_lost"]
+    wanted = ["takeoff", "arm_lost", "vision_lost"]
     assert [event["id"] for event in summary["events"] if event["id"] in wanted] == wanted
     assert summary["latency_ms"]["mocap_to_setpoint"]["p99"] is None
+    distance_m = rotor_distance_m(summary)
+    assert distance_m is not None and 50.0 < distance_m < 51.0

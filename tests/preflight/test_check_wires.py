@@ -62,34 +62,37 @@ def test_a_sound_world_may_fly_and_every_row_is_reported(sandbox: Sandbox) -> No
 
 @pytest.mark.flight
 def test_a_wrong_setting_refuses_the_check_and_the_flight(sandbox: Sandbox, tmp_path: Path) -> None:
-    """Wrong joint angle, force bias and one parameter of PX4, in the world alone: the companion believes its files."""
+    """Wrong joint angle, force bias and two parameters of PX4, in the world alone: the companion believes its files."""
     wrong = (
         "mission.start.arm_deg=[140, 120]",
         "world.force_bias_n=[30, 0, 0]",
-        "world.px4_params={COM_OBL_RC_ACT: 0}",
+        "world.px4_params={COM_OBL_RC_ACT: 0, EKF2_EV_CTRL: 0}",
     )
-    expected = {"mission.arm", "force.tare", "px4.param.COM_OBL_RC_ACT"}
+    expected = {"mission.arm", "force.tare", "px4.param.COM_OBL_RC_ACT", "px4.param.EKF2_EV_CTRL", "px4.vision"}
     with sandbox_in(tmp_path / "world") as around, World(around, CATCH, wrong) as world:
         shown = sandbox.run("check", CATCH, *world.addresses())
         assert (shown.code, shown.err) == (EXIT_REFUSED, ""), shown
-        assert "3 of " in shown.out and "the vehicle may not fly." in shown.out
+        assert "the vehicle may not fly." in shown.out
         assert "-> set COM_OBL_RC_ACT to 4" in shown.out
 
         flown = sandbox.run("fly", CATCH, "--out", "out", *world.addresses())
         assert flown.code == EXIT_REFUSED, flown
         assert (world.armings, world.crashes) == (0, 0)
     sandbox.assert_nobody_left()
-    assert len(flown.err_lines) == len(expected), flown.err
     for start in (
         "arm at the start: (140, 120) deg, wanted (165, 140)",
         "force sensor tare: (",
         "COM_OBL_RC_ACT: 0, wanted 4; set",
+        "EKF2_EV_CTRL: 0, wanted 11 or 15; set EKF2_EV_CTRL to 11 (companion px4 params --write)",
+        "EKF2 fuses motion capture: the estimator reports no valid ",
     ):
         assert [line for line in flown.err_lines if line.startswith(start)], (start, flown.err)
     summary = read_summary(sandbox.cwd / "out")
     assert (summary["outcome"], summary["events"]) == ("refused", [])
     rows = rows_in((sandbox.cwd / "out/preflight.json").read_text(encoding="utf-8"))
-    assert refusing(rows) == expected
+    assert expected <= refusing(rows) and len(flown.err_lines) == len(refusing(rows)), flown.err
+    follows = refusing(rows) - expected
+    assert all(name.startswith(("px4.", "frames.")) for name in follows), f"not of an estimate without poses: {follows}"
     assert "(140, 120) deg" in rows["mission.arm"]["read"]
     assert rows["force.tare"]["read"].startswith("(30.0, ")
     assert rows["px4.param.COM_OBL_RC_ACT"]["fix"].startswith("set COM_OBL_RC_ACT to 4")
