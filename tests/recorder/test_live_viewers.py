@@ -9,12 +9,15 @@ from __future__ import annotations
 import asyncio
 import base64
 import contextlib
+import fcntl
 import functools
 import itertools
 import json
 import select
 import socket
 import struct
+import sys
+import termios
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +31,7 @@ from companion.recorder.client import RecorderProcess
 from tests.recorder.flights import Row, config_json, offer, started, tethered
 from tests.recorder.protobuf_wire import Descriptors
 from tests.recorder.viewers import view
-from tests.support import DEADLINE_S
+from tests.support import DEADLINE_S, wait_until
 
 RECORDS = {"/inputs", "/outputs", "/sent"}
 SHOWN = {*RECORDS, "/tf", "/tf_arm", "/pose", "/reference", "/scene", "/scene_path", "/scene_static"}
@@ -92,10 +95,15 @@ def recorder_for_viewers(path: Path, port: int) -> Iterator[RecorderProcess]:
 
 
 def write_lines(recorder: RecorderProcess, numbers: range) -> None:
-    """Write lines of 64 kB that begin with their number."""
+    """Write lines of 64 kB that begin with their number; return when the recorder has read them."""
     for number in numbers:
         select.select([], [recorder.client], [], DEADLINE_S)
         assert recorder.client.text(1.0, Severity.INFO, "test", f"{number} " + 64_000 * "x")
+
+    def unread() -> int:
+        return int.from_bytes(fcntl.ioctl(recorder.client, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
+
+    wait_until(lambda: unread() == 0, lambda: f"{unread()} bytes that the recorder has not read")
 
 
 def small_buffer(address: aiohttp.AddrInfoType) -> socket.socket:
