@@ -86,11 +86,6 @@ def test_the_start_is_what_flies_and_a_found_file_flies_unchanged_on_its_vehicle
     )
 
 
-@pytest.mark.parametrize("law", ["csc", "psc"])
-def test_the_gains_among_the_examples_fly_the_shipped_vehicle(law: str) -> None:
-    assert load_flight(CATCH, None, str(HEXA.parent / f"{law}.yaml")).controller.law == law
-
-
 def test_campaigns_fly_a_file_of_gains(monkeypatch: pytest.MonkeyPatch) -> None:
     file = str(ROOT / "configs/controllers/csc_tuned.yaml")
     monkeypatch.setattr("companion.campaigns.compare.plots.write_pictures", lambda *_: [])
