@@ -49,6 +49,14 @@ ARRESTED_SHARE = 0.5
 """Fraction of the fastest descent. PX4 controls its estimated speed, so an estimate that slows down to less than this was stopped by
 the floor.
 """
+IMPACT_M_S: Final = 0.2
+"""An estimated descent that slows down by this much within `IMPACT_WITHIN_S` hit something: a quarter of the weight was lifted off.
+PX4 brakes more gradually.
+"""
+IMPACT_WITHIN_S: Final = 0.08
+IMPACT_KEPT_M_S: Final = 0.1
+"""After an impact in the air PX4 descends as before, within this."""
+IMPACT_HOLD_S: Final = 0.6
 DRIFT_M_S2 = 0.5
 """Without motion capture the estimated height may be off by half of this times the square of the time."""
 STANDING_S = 3.0
@@ -76,27 +84,40 @@ class Arrest:
     """Evidence of touchdown for an estimate that drifts: according to that estimate, PX4's descent stopped and did not resume.
 
     Dead reckoning from an accelerometer with an error of 0.2 m/s^2 is wrong by 0.4 m/s and 0.4 m after 2 s, so speed and height do
-    not show rest, but the change of speed at the floor does.
+    not show rest, but the change of speed at the floor does. PX4 believes that a vehicle with such an error descends at
+    MPC_LAND_SPEED; it touches down more slowly, and its estimate loses less than half of its speed. Then the impact counts.
     """
 
     descends_since_s: float | None = None
     fastest_m_s: float = 0.0
     """Fastest descent that lasted for `DESCENT_HOLD_S`, limited to `DESCENT_COUNTED_M_S`; 0 before the first."""
     arrested_since_s: float | None = None
+    recent: tuple[tuple[float, float], ...] = ()
+    """Stamps and estimated vertical speeds of the last `IMPACT_WITHIN_S`; a change across a longer gap is no impact."""
+    impact: tuple[float, float] | None = None
+    """Time of an impact after which the descent has not resumed, and the vertical speed before it."""
 
-    def update(self, t_s: float, up_m_s: float) -> Arrest:
-        """Return the evidence after one more tick of PX4's descent; `up_m_s` is its estimated vertical speed."""
+    def update(self, t_s: float, stamp_s: float, up_m_s: float) -> Arrest:
+        """Return the evidence after one more tick of PX4's descent; `up_m_s` is its estimated vertical speed, stamped `stamp_s`."""
         descends = up_m_s < -max(DESCENT_M_S, ARRESTED_SHARE * self.fastest_m_s)
         since_s = (t_s if self.descends_since_s is None else self.descends_since_s) if descends else None
         lasting = since_s is not None and t_s - since_s >= DESCENT_HOLD_S
         fastest_m_s = max(self.fastest_m_s, min(-up_m_s, DESCENT_COUNTED_M_S)) if lasting else self.fastest_m_s
         arrested = fastest_m_s > 0.0 and up_m_s > -ARRESTED_SHARE * fastest_m_s
         arrested_since_s = (t_s if self.arrested_since_s is None else self.arrested_since_s) if arrested else None
-        return Arrest(since_s, fastest_m_s, arrested_since_s)
+        recent = (*(seen for seen in self.recent if stamp_s - seen[0] <= IMPACT_WITHIN_S), (stamp_s, up_m_s))
+        before_m_s = max(-DESCENT_COUNTED_M_S, min(speed for _, speed in recent))
+        impact = self.impact
+        if impact is not None and up_m_s < impact[1] + IMPACT_KEPT_M_S:
+            impact = None
+        elif impact is None and fastest_m_s > 0.0 and before_m_s < -DESCENT_M_S and up_m_s - before_m_s >= IMPACT_M_S:
+            impact = (t_s, before_m_s)
+        return Arrest(since_s, fastest_m_s, arrested_since_s, recent, impact)
 
     def stands(self, t_s: float) -> bool:
         """Return whether the descent has been arrested for long enough."""
-        return self.arrested_since_s is not None and t_s - self.arrested_since_s >= HEIGHT_HOLD_S
+        arrested = self.arrested_since_s is not None and t_s - self.arrested_since_s >= HEIGHT_HOLD_S
+        return arrested or (self.impact is not None and t_s - self.impact[0] >= IMPACT_HOLD_S)
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,7 +258,7 @@ class AutopilotLanding:
         if vehicle is None or not fresh or since_s is None or t_s - pose_s > ESTIMATE_TRUSTED_S:
             return replace(now, height=replace(self.height, since_s=None), arrest=Arrest()), False
         height_m, up_m_s = vehicle.position_world_m[2], vehicle.velocity_world_m_s[2]
-        arrest = self.arrest.update(t_s, up_m_s) if pose is None else Arrest()
+        arrest = self.arrest.update(t_s, vehicle.position_stamp_s, up_m_s) if pose is None else Arrest()
         now = replace(now, arrest=arrest)
         if not begun:
             return replace(now, height=replace(self.height, since_s=None)), False

@@ -65,6 +65,8 @@ class MocapTracker:
         self._jump_rad = math.radians(s.mocap_jump_deg)
         self._jump_cos_half = math.cos(0.5 * self._jump_rad)
         self._frame_awake_s = -math.inf
+        self._tracked: MocapPose | None = None
+        """The newest frame in which the body was tracked."""
         self._trusted_pose: MocapPose | None = None
         self._trusted_awake_s = -math.inf
         self._same_since_s: float | None = None
@@ -102,7 +104,7 @@ class MocapTracker:
         self.trusted = True
         """Whether poses are trusted: the newest one is plausible, and they are not frozen, dragged or from two servers."""
         self.repeats = False
-        """Whether the newest pose equals the previous one bit for bit, which no measurement does in the air."""
+        """Whether the newest pose equals the last tracked one bit for bit, which no measurement does in the air."""
 
     def update(self, i: Inputs, situation: Situation, awake_s: float, moving: bool) -> None:
         """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle is moving."""
@@ -168,17 +170,17 @@ class MocapTracker:
         # The gap was reported as a loss; a rate across it does not describe this stream.
         if gone_s > self._s.mocap_timeout_s:
             self._window_awake_s = self.rate_hz = None
-        self.repeats = (
-            before is not None
-            and pose.position_world_m == before.position_world_m
-            and pose.attitude_wxyz == before.attitude_wxyz
-        )
-        if before is None or pose.position_world_m != before.position_world_m or not pose.tracking_valid:
-            self._same_since_s, self._moved = None, False
-        elif self._same_since_s is None and pose.attitude_wxyz == before.attitude_wxyz:
-            self._same_since_s, self._moved = awake_s, False
+        # A frame in which the body is not tracked does not end a freeze: only another pose does.
+        tracked = self._tracked
+        same = tracked is not None and pose.position_world_m == tracked.position_world_m
+        self.repeats = same and tracked is not None and pose.attitude_wxyz == tracked.attitude_wxyz
         if not pose.tracking_valid:
             return
+        self._tracked = pose
+        if not same:
+            self._same_since_s, self._moved = None, False
+        elif self._same_since_s is None and self.repeats:
+            self._same_since_s, self._moved = awake_s, False
         self.plausible = (
             accepted is None or vehicle is None or gone_s > FORGET_S or self._follows(accepted, pose, vehicle)
         )

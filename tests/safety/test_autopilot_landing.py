@@ -17,7 +17,7 @@ from companion.model.types import (
     OperatorCommand,
     VehicleState,
 )
-from companion.safety.autopilot_landing import TIMEOUT_S, AutopilotLanding, LandingStep
+from companion.safety.autopilot_landing import IMPACT_HOLD_S, TIMEOUT_S, AutopilotLanding, LandingStep
 from companion.safety.touchdown import HEIGHT_HOLD_S, HEIGHT_MARGIN_M
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -143,12 +143,24 @@ def test_a_descent_that_the_floor_stops_is_a_touchdown_although_the_estimate_dri
     assert found_s == pytest.approx(2.0 + HEIGHT_HOLD_S, abs=0.02)
 
 
+@pytest.mark.parametrize("drift_m_s2", [-0.1, 0.0, 0.05])
+def test_an_impact_after_which_the_descent_does_not_resume_is_a_touchdown(drift_m_s2: float) -> None:
+    """The vehicle touches the floor at 0.25 m/s, and the estimate goes on from 0.6 to 0.35 m/s: more than half."""
+
+    def up_m_s(t_s: float) -> float:
+        return -0.35 + drift_m_s2 * (t_s - 2.0) if t_s >= 2.0 else -0.6 if t_s > 0.8 else 0.0
+
+    found_s = blind_landing(up_m_s, 0.8)
+    assert found_s == pytest.approx(2.0 + IMPACT_HOLD_S, abs=0.02)
+
+
 @pytest.mark.parametrize(
     "up_m_s",
     [
         lambda t_s: 0.0,  # it brakes, and has not begun to descend
         lambda t_s: -0.7,
-        lambda t_s: -0.7 if t_s < 1.5 else -0.4,  # PX4 descends more slowly near the floor
+        lambda t_s: -0.7 + min(0.3, max(0.0, t_s - 1.5)),  # PX4 descends more slowly near the floor
+        lambda t_s: -0.7 + (t_s > 1.5) * 0.3 * math.exp(4.0 * (1.5 - t_s)),  # a bump, and PX4 descends as before
         lambda t_s: -0.7 if t_s < 1.5 or t_s > 1.7 else 0.0,  # a gust
         lambda t_s: -1.8 if t_s < 1.0 else -0.6,  # it falls when the landing begins, and PX4 brakes it
     ],
@@ -162,6 +174,15 @@ def test_a_descent_that_ends_higher_than_the_estimate_can_have_drifted_is_no_tou
         blind_landing(lambda t_s: -0.7 if 0.5 < t_s < 1.0 else 0.0, 2.0 + CLEARANCE_M + HEIGHT_MARGIN_M + 0.25 * 16)
         is None
     )
+
+
+def test_a_slower_descent_after_a_gap_in_px4s_positions_is_no_impact() -> None:
+    landing = Landing(pilot=False)
+    for k in range(1, 800):
+        t_s = k * 0.005
+        stamp_s = 1.5 if 1.5 < t_s < 1.75 else t_s
+        sink_m_s = 0.65 if stamp_s <= 1.5 else 0.4
+        assert not landing.step(seen(t_s, 0.8, sink_m_s=sink_m_s, mocap=False, position_s=stamp_s)).zero_thrust
 
 
 def test_sinking_is_no_touchdown() -> None:

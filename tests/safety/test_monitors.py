@@ -550,6 +550,19 @@ def test_in_the_air_a_repeated_pose_is_not_passed_on_at_once() -> None:
     assert monitors.mocap_trusted, "on the ground a pose may well repeat"
 
 
+def test_a_frame_without_the_body_does_not_end_a_freeze() -> None:
+    """Otherwise the frozen pose is trusted again for `mocap_frozen_s`, and a landing by PX4 takes it for a new one."""
+    monitors, same = Monitors(VEHICLE), frozen_values("mocap", "position_world_m", "attitude_wxyz")
+    told = watched(VEHICLE, (same(healthy(k)) for k in range(60)), flying(), monitors)
+    assert [event.id for event in told] == ["mocap_frozen"]
+    monitors.check(put("mocap", tracking_valid=False)(same(healthy(60))), flying())
+    for k in range(61, 80):
+        monitors.check(same(healthy(k)), flying())
+        assert monitors.trusted is not None and monitors.trusted.mocap is None
+    monitors.check(healthy(80), flying())
+    assert monitors.trusted is not None and monitors.trusted.mocap is not None, "the pose moves again"
+
+
 def scaled(key: str, factor: float, machine: Vehicle = VEHICLE) -> Vehicle:
     """The vehicle with one threshold multiplied."""
     section, _, name = ("safety." + key if "." not in key else key).rpartition(".")
