@@ -26,6 +26,8 @@ BUILD = WHEELS / "files"
 WORK = ROOT / "build" / "mypyc"
 """Folder for the generated C code, the object files and mypy's cache."""
 PACKAGES = ("companion", "sitl")
+SETTINGS = "companion/config/files"
+"""A link to configs/, which the wheel contains as files."""
 # Without companion/io/dynamixel/registers.py: it extends a class of the servos' SDK, which crashes a compiled process.
 COMPILED = (
     "companion/core/*.py",
@@ -68,7 +70,7 @@ between the modules, which lie in one library, and with fast reads of records' f
 
 def sources() -> list[Path]:
     """Return the paths of all files of the packages, relative to the root of the repository."""
-    found = (path for package in PACKAGES for path in (ROOT / package).rglob("*"))
+    found = (path for folder in (*PACKAGES, SETTINGS) for path in (ROOT / folder).rglob("*"))
     return [path.relative_to(ROOT) for path in found if path.is_file() and path.parent.name != "__pycache__"]
 
 

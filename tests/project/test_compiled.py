@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.support import CATCH, ROOT
-from tools.compiled import BUILD, INTERPRETED, is_current, modules
+from tools.compiled import BUILD, INTERPRETED, is_current, modules, sources
 
 FLIGHT = """
 import hashlib, sys
@@ -85,6 +85,7 @@ print(ServoPort("/dev/none").is_open, ForceTorqueServer().silent)
 def test_the_list_of_modules_names_only_files_that_exist() -> None:
     assert set(modules()) >= {"companion/core/flight_core.py", "sitl/fast/loop.py", "sitl/world/effects/net.py"}
     assert all((ROOT / name).exists() for name in INTERPRETED)
+    assert Path("companion/config/files/controllers/psc_tuned.yaml") in sources(), "settings, which the wheel contains"
 
 
 def test_no_tuple_of_floats_is_final() -> None:
