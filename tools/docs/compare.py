@@ -185,8 +185,6 @@ def _estimated(c: LawConfig) -> str:
 
 def _with_source(table: str, groups: Sequence[Group]) -> str:
     """Return the table followed by the seeds, commands and commits of its flights."""
-    if not groups:
-        return "Not flown."
     rows = [row for group in groups for row in group.rows]
     seeds = sorted({row["seed"] for row in rows})
     errors = ", ".join(f"{100 * error:g} %" for error in sorted({group.model_error for group in groups}))
@@ -245,7 +243,7 @@ def _against_print(group: Group, part: str) -> str:
 
 
 def tables(files: Sequence[Results]) -> dict[str, str]:
-    """Return every table by name, each with the commands and commits from which its figures come."""
+    """Return the tables by name, each with the commands and commits from which its figures come; none without a flight."""
     groups = by_payload(aggregate(merged(files)))
     whole = [group for group in groups if not is_ablation(group.preset)]
     first = [group for group in whole if group.model_error == min(one.model_error for one in groups)]
@@ -264,15 +262,15 @@ def tables(files: Sequence[Results]) -> dict[str, str]:
         if group.label.startswith("/".join(ABLATED) + LESS)
         and (group.payload_kg, group.model_error) == (ABLATION_KG, first[0].model_error)
     ]
-    return {
-        "published": _with_source(laws_markdown(published), published),
-        "extras": _with_source(laws_markdown(extras), extras),
-        "differences": differences_markdown(first),
-        "model error": _with_source(model_error_markdown(by_error), by_error),
-        "adaptation": _with_source(adaptation_markdown(paired), paired),
-        "ablation": _with_source(ablation_markdown(ablated), ablated),
-        "told": knowledge_markdown(),
+    made: dict[str, tuple[Callable[[Sequence[Group]], str], Sequence[Group]]] = {
+        "published": (laws_markdown, published),
+        "extras": (laws_markdown, extras),
+        "model error": (model_error_markdown, by_error),
+        "adaptation": (adaptation_markdown, paired),
+        "ablation": (ablation_markdown, ablated),
     }
+    flown = {name: _with_source(table(of), of) for name, (table, of) in made.items() if of}
+    return {**flown, "differences": differences_markdown(first), "told": knowledge_markdown()}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -289,8 +287,8 @@ def main(argv: list[str] | None = None) -> int:
         print(f"{', '.join(map(str, arguments.results))}: {reason}", file=sys.stderr)
         return 2
     for name, _, _, figure in distributions(aggregate(rows)):
-        if name in PICTURES:
-            table, alt = PICTURES[name]
+        table, alt = PICTURES.get(name, ("", ""))
+        if table in found:
             picture = Path("pictures") / f"compare_{name}.svg"
             found[table] += f"\n\n![{alt}]({picture})"
             (arguments.page.parent / picture).parent.mkdir(exist_ok=True)

@@ -53,7 +53,7 @@ def flown_by(results: Mapping[str, Any]) -> str:
     """
     commit = results["versions"].get("git", "unknown")
     dirty = " with changes" if commit.endswith("-dirty") else ""
-    command = re.sub(r" --out \S+", "", results["settings"]["command"])
+    command = re.sub(r" --(out|jobs) \S+", "", results["settings"]["command"])
     return f"\nFlown by `{command}` at commit {commit.removesuffix('-dirty')[:10]}{dirty}."
 
 
