@@ -1,5 +1,9 @@
 """A press on drawn walls in the laboratory, fast loop: `python -m benchmarks.press [--draws 200] [--first-seed 5001]`.
 
+With `--mission probe` the walls are probed instead; then only the normal and the place that were found say something.
+With `--datum` each laboratory first probes a wall whose place is known, and the rigid body's pivot is moved by what it was found too far, as
+in Motive.
+
 Each seed draws a laboratory, and a wall of 1e3 to 1e5 N/m with a friction of 0.1 to 0.8, tilted by up to 15 deg about both axes and
 up to 5 cm from where the mission expects it. Prints a line for each flight and a summary: the steady error of the true and of the
 measured force along the wall's normal from 1.5 s after the wanted force is reached, the largest force, the normal and the place that
@@ -22,7 +26,7 @@ from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight
 
-MISSION = "configs/missions/press.yaml"
+PROBE = "configs/missions/probe.yaml"
 SETTLE_TICKS = 300
 """Ticks at the wanted force that do not count as steady."""
 
@@ -49,15 +53,17 @@ class Press:
     place_error_mm: float
 
 
-def flown(seed: int) -> Press:
-    """Fly the mission on the wall of a seed."""
+def flown(seed: int, mission: str = "press", datum: bool = False) -> Press:
+    """Fly a mission (`press`, `probe`) on the wall of a seed; with a datum, after a probe of a wall whose place is known."""
     draw = random.Random(seed)
     stiffness_n_m, friction = 10.0 ** draw.uniform(3.0, 5.0), draw.uniform(0.1, 0.8)
     tilt_deg, place_m = [draw.uniform(-15.0, 15.0), draw.uniform(-15.0, 15.0)], draw.uniform(-0.05, 0.05)
     wall = {"point_m": [1.5, 0.0, 1.09], "normal": [-1.0, 0.0, 0.0], "stiffness_n_m": stiffness_n_m}
     wall |= {"friction": friction, "tilt_error_deg": tilt_deg, "place_error_m": place_m}
     sets = [f"world.surfaces={json.dumps([wall])}", f"world.seed={seed}"]
-    flight = FastFlight(load_sitl(MISSION, world="lab", overrides=sets))
+    if datum:
+        sets.append(f"world.mocap.pivot_offset_m={json.dumps(_moved_pivot_m(seed))}")
+    flight = FastFlight(load_sitl(f"configs/missions/{mission}.yaml", world="lab", overrides=sets))
     result = flight.run(300.0)
     surfaces, layout = flight.plant.world.surfaces, result.layout
     assert surfaces is not None and layout is not None
@@ -89,6 +95,17 @@ def flown(seed: int) -> Press:
     )
 
 
+def _moved_pivot_m(seed: int) -> list[float]:
+    """Return the pivot of the seed's laboratory, moved by the distance by which a probe finds a wall at x = 1.5 m too far."""
+    wall = {"point_m": [1.5, 0.0, 1.09], "normal": [-1.0, 0.0, 0.0]}
+    config = load_sitl(PROBE, world="lab", overrides=[f"world.surfaces={json.dumps([wall])}", f"world.seed={seed}"])
+    found = next(
+        o.contact.surface for o in reversed(FastFlight(config).run(300.0).outputs) if o.contact and o.contact.surface
+    )
+    x_m, y_m, z_m = config.world.mocap.pivot_offset_m
+    return [x_m - (found.point_world_m[0] - 1.5), y_m, z_m]
+
+
 def _error(force_n: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
     return 100.0 * abs(float(force_n.mean()) / 5.0 - 1.0) if len(force_n) else math.nan
 
@@ -98,10 +115,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--first-seed", type=int, default=5001)
+    parser.add_argument("--mission", choices=["press", "probe"], default="press")
+    parser.add_argument("--datum", action="store_true")
     arguments = parser.parse_args()
     presses = []
     for seed in range(arguments.first_seed, arguments.first_seed + arguments.draws):
-        presses.append(flown(seed))
+        presses.append(flown(seed, arguments.mission, arguments.datum))
         print(presses[-1], flush=True)
     completed = [press for press in presses if press.completed]
     print(f"{len(completed)} of {len(presses)} completed, {sum(press.crashed for press in presses)} crashed")
