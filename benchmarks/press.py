@@ -1,8 +1,8 @@
 """A press on drawn walls in the laboratory, fast loop: `python -m benchmarks.press [--draws 200] [--first-seed 5001]`.
 
 With `--mission probe` the walls are probed instead; then only the normal and the place that were found say something.
-With `--datum` each laboratory first probes a wall whose place is known, and the rigid body's pivot is moved by what it was found too far, as
-in Motive.
+With `--datum` each laboratory first probes a wall whose place is known, and the rigid body's pivot is moved by what it was found too
+far, as in Motive.
 
 Each seed draws a laboratory, and a wall of 1e3 to 1e5 N/m with a friction of 0.1 to 0.8, tilted by up to 15 deg about both axes and
 up to 5 cm from where the mission expects it. Prints a line for each flight and a summary: the steady error of the true and of the
