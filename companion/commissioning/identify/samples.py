@@ -82,10 +82,6 @@ class Flight:
         log = self.log
         return list(zip(log.inputs[begin:end], log.outputs[begin:end], log.sent[begin:end], strict=True))
 
-    def is_after_catch(self, tick: int) -> bool:
-        """Return whether the tick is after a catch."""
-        return self.catch is not None and tick >= self.catch
-
     @cached_property
     def t_s(self) -> Array:
         """Flight clock of each tick."""
