@@ -1,167 +1,128 @@
-"""People on the ground command a flight over a real broker: START, HOLD, RESUME, LAND, signed with this user's own key."""
+"""The ground commands a flight over everything that is real: browser, monitor, `companion command`, mosquitto, and a flight."""
 
 from __future__ import annotations
 
-import asyncio
 import os
+import re
 import signal
-import time
-from collections.abc import Callable, Iterator
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-import aiomqtt
 import pytest
 from mcap.reader import make_reader
+from playwright.sync_api import sync_playwright
 
 from companion.analysis.log import FlightLog
-from companion.config.ground import topic_name
-from companion.config.loader import load_flight
-from companion.ground.protocol.commands import make_command
-from companion.ground.protocol.flight_clock import FlightClock
-from companion.ground.protocol.keys import load_operators
-from companion.ground.protocol.messages import (
-    Ack,
-    CommandName,
-    Presence,
-    State,
-    Stream,
-    Topic,
-    decode,
-    encode,
-    vehicle_of,
-)
-from companion.ground.protocol.proof import ack_proven, stream_proven
-from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK
-from companion.model.types import OperatorCommand, Outcome, SafetyAction
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
+from companion.model.types import OperatorCommand
 from tests.broker import loopback_broker
-from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, run_here, sandbox_in, set_options
+from tests.browser import ARGUMENTS, chromium
+from tests.support import CATCH, DEADLINE_S, HOVER, Sandbox, read_summary, run_here, sandbox_in, set_options
 
-HIGH_AND_LONG = {
-    "mission.phases[0].height_m": 1.0,
-    "mission.phases[0].duration_s": 3.0,
-    "mission.phases[1].duration_s": 60.0,
-}
-"""Room to be held in, and time for all that is commanded, on a loaded machine."""
+SLACK = "[data-figure='tether']"
+ROOM = {"mission.phases[3].duration_s": 20.0}
+"""Time over the place after the catch for all that is commanded there, on a loaded machine."""
 
 
-class Station:
-    """A ground station of a few lines: what the vehicle says, and commands to it."""
-
-    def __init__(self, client: aiomqtt.Client, vehicle: str, operator: str, key: bytes) -> None:
-        self._client = client
-        self._vehicle = vehicle
-        self._operator, self._key = operator, key
-        self._clock = FlightClock()
-        self._session: str | None = None
-        self.state: State | None = None
-        self.stream: Stream | None = None
-        self.acks: dict[str, Ack] = {}
-
-    async def until(self, condition: Callable[[], bool], what: str) -> None:
-        """Listen until it holds."""
-        try:
-            async with asyncio.timeout(DEADLINE_S):
-                while not condition():
-                    self._take(await anext(self._client.messages))
-        except TimeoutError:
-            raise AssertionError(f"{what}: did not come; last: {self.state}, {self.stream}, {self.acks}") from None
-
-    async def command(self, name: CommandName) -> Ack:
-        """Command, and wait for the answer."""
-        t_ms = self._clock.now_ms(time.monotonic())
-        assert t_ms is not None and self._session is not None and self.stream is not None
-        hold = (self.stream.hold or 0) if name is CommandName.RESUME else 0
-        command = make_command(name, self._vehicle, self._session, self._operator, self._key, t_ms, hold)
-        await self._client.publish(Topic.COMMAND.of(self._vehicle), encode(command), qos=1)
-        await self.until(lambda: command.nonce in self.acks, f"an answer to {name.value}")
-        return self.acks[command.nonce]
-
-    def _take(self, message: aiomqtt.Message) -> None:
-        named = vehicle_of(message.topic.value)
-        assert named is not None and isinstance(message.payload, bytes)
-        match named[1]:
-            case Topic.STATE:
-                self.state = decode(State, message.payload)
-            case Topic.STREAM:
-                self.stream = decode(Stream, message.payload)
-                assert stream_proven(self.stream, self._vehicle, self._key)
-                self._session = self.stream.session
-                self._clock.add(self.stream.t_s, time.monotonic())
-            case Topic.ACK:
-                ack = decode(Ack, message.payload)
-                assert ack_proven(ack, self._vehicle, self._key)
-                self.acks[ack.nonce] = ack
+@contextmanager
+def monitor(sandbox: Sandbox, broker: str) -> Iterator[str]:
+    """`companion monitor`; yields the address that it prints, token and all."""
+    command = [sys.executable, "-m", "companion", "monitor", "--broker", broker, "--port", "0"]
+    environment = {**sandbox.environment, "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen(command, cwd=sandbox.cwd, env=environment, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        for line in process.stdout:
+            if found := re.search(r"http://\S+", line):
+                yield found[0]
+                break
+        else:
+            raise AssertionError("the monitor printed no address")
+    finally:
+        process.terminate()
+        process.wait(DEADLINE_S)
+        process.stdout.close()
 
 
-@pytest.fixture
-def sandbox(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Sandbox]:
-    """The flight and this process are of one user, whose keys nobody has made yet."""
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
-    with sandbox_in(tmp_path) as sandbox:
-        yield sandbox
+@contextmanager
+def page_at(address: str) -> Iterator[Any]:
+    """The page in a browser; what the browser complains about fails the test."""
+    complaints: list[str] = []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium(), args=list(ARGUMENTS))
+        page = browser.new_page(viewport={"width": 1440, "height": 900})
+        page.set_default_timeout(DEADLINE_S * 1e3)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.goto(address)
+        yield page
+        browser.close()
+    assert complaints == []
 
 
-async def commanded(station: Station) -> None:
-    """START, HOLD, RESUME, LAND; what is answered is what the vehicle does."""
-
-    def stream() -> Stream:
-        assert station.stream is not None
-        return station.stream
-
-    await station.until(lambda: station.stream is not None and stream().waits_for_start, "waiting for start")
-    await station.until(lambda: station.state is not None and station.state.commands, "that commands are heard")
-    assert not stream().armed
-    ack = await station.command(CommandName.RESUME)
-    assert (ack.accepted, ack.text) == (False, "nothing to resume: on the ground")
-    ack = await station.command(CommandName.START)
-    assert (ack.accepted, ack.text) == (True, "taking off")
-    await station.until(lambda: stream().phase == "hold", "the hover")
-    ack = await station.command(CommandName.HOLD)
-    assert (ack.accepted, ack.text, ack.action) == (True, "holding", SafetyAction.HOLD.value)
-    await station.until(lambda: stream().action == SafetyAction.HOLD.value, "the hold")
-    held = stream().progress
-    ack = await station.command(CommandName.RESUME)
-    assert (ack.accepted, ack.text) == (True, "continuing")
-    await station.until(lambda: stream().action == "nominal" and stream().progress > held + 0.01, "continuing")
-    ack = await station.command(CommandName.LAND)
-    assert (ack.accepted, ack.text) == (True, "landing")
-    await station.until(lambda: station.state is not None and station.state.presence is Presence.ENDED, "the end")
+def until_text(page: Any, selector: str, text: str) -> None:
+    page.wait_for_function(
+        "([s, t]) => document.querySelector(s)?.textContent.includes(t)", arg=[selector, text], polling=50
+    )
 
 
+def answer(page: Any, command: str) -> str:
+    """What the vehicle said to it."""
+    page.wait_for_function(
+        "c => !['wait', undefined].includes(document.querySelector(`#answers [data-for=${c}]`)?.dataset.state)",
+        arg=command,
+        polling=50,
+    )
+    found: str = page.inner_text(f"#answers [data-for={command}]")
+    return found
+
+
+@pytest.mark.alone
 @pytest.mark.flight
-def test_started_held_let_go_on_and_landed_from_the_ground(sandbox: Sandbox, tmp_path: Path) -> None:
-    operators = load_operators()
-    [operator] = operators.names
-    ground = load_flight(HOVER).vehicle
-    vehicle = topic_name(ground.ground.topic, ground.name)
-    with loopback_broker(tmp_path) as broker:
-        options = set_options(**{"vehicle.ground.mqtt.url": broker.url, **HIGH_AND_LONG})
-
-        async def on_the_ground() -> None:
-            async with aiomqtt.Client("127.0.0.1", broker.port, protocol=aiomqtt.ProtocolVersion.V5) as client:
-                for topic in (Topic.STATE, Topic.STREAM, Topic.ACK):
-                    await client.subscribe(topic.of(vehicle), qos=1)
-                await commanded(Station(client, vehicle, operator, operators.key(operator)))
-
-        with sandbox.start("fly", HOVER, "--sitl", "--wait-for-start", "--out", "out", *options) as flying:
-            asyncio.run(on_the_ground())
-            ended = flying.end()
-    sandbox.assert_nobody_left()
-    assert ended.code == EXIT_ABORTED, ended.out + ended.err
+def test_the_catch_is_started_watched_held_let_go_on_and_landed_from_the_ground(tmp_path: Path) -> None:
+    with (
+        loopback_broker(tmp_path) as broker,
+        sandbox_in(tmp_path / "sandbox") as sandbox,
+        monitor(sandbox, broker.url) as address,
+        page_at(address) as page,
+    ):
+        options = set_options(**{"vehicle.ground.mqtt.url": broker.url, **ROOM})
+        with sandbox.start("fly", CATCH, "--sitl", "--wait-for-start", "--out", "out", *options) as flight:
+            flight.wait_for("take off with: companion command start")
+            refused = sandbox.run("command", "resume", "--broker", broker.url)
+            assert refused.code == EXIT_REFUSED and "nothing to resume: on the ground" in refused.err, refused
+            started = sandbox.run("command", "start", "--broker", broker.url)
+            assert started.code == EXIT_OK and "taking off" in started.out, started
+            until_text(page, "#word", "FLYING")
+            first_m = float(page.inner_text(SLACK).split()[0])
+            until_text(page, "#event-list", "payload caught")
+            assert 0.0 < float(page.inner_text(SLACK).split()[0]) != first_m, "the slack on the page is not live"
+            page.click("[data-command=hold]")
+            assert "holding" in answer(page, "hold")
+            until_text(page, "#word", "HOLDING")
+            let_go = sandbox.run("command", "resume", "--broker", broker.url)
+            assert let_go.code == EXIT_OK and "continuing" in let_go.out, let_go
+            until_text(page, "#word", "FLYING")
+            page.click("[data-command=land]")
+            assert "landing" in answer(page, "land")
+            until_text(page, "#word", "LANDING")
+            ended = flight.end()
+            until_text(page, "#word", "ENDED")
+    assert ended.code == EXIT_ABORTED, ended
     assert ended.err == ""
     for line in (
         f"connected to {broker.url}",
-        "take off with: companion command start",
-        f"{operator} commanded start: taking off",
-        f"{operator} commanded resume: nothing to resume: on the ground",
-        f"{operator} commanded land: landing",
+        "commanded start: taking off",
+        "commanded resume: nothing to resume: on the ground",
+        "commanded land: landing",
     ):
         assert ended.out.count(line) == 1, (line, ended.out)
-
     out = sandbox.cwd / "out"
     summary = read_summary(out)
-    assert summary["outcome"] == Outcome.ABORTED.value
-    wanted = ["operator_start", "takeoff", "operator_hold", "operator_resume", "operator_land", "touchdown"]
+    wanted = ["operator_start", "takeoff", "catch", "operator_hold", "operator_resume", "operator_land", "touchdown"]
     assert [event["id"] for event in summary["events"] if event["id"] in wanted] == wanted
     assert summary["recorder"]["dropped"] == 0
     log = FlightLog.read(out / "flight.mcap")
@@ -172,16 +133,15 @@ def test_started_held_let_go_on_and_landed_from_the_ground(sandbox: Sandbox, tmp
     ]
     with (out / "flight.mcap").open("rb") as file:
         lines = [m.data.decode(errors="replace") for _, _, m in make_reader(file).iter_messages(topics=["/log"])]
-    assert any(f"hold of {operator}: holding" in line for line in lines)
-
+    assert any(re.search(r"hold of \S+: holding", line) for line in lines)
     replayed = run_here("replay", out / "flight.mcap")
     assert replayed.code == EXIT_OK, replayed.out + replayed.err
 
 
 @pytest.mark.flight
-def test_without_its_recorder_it_still_stands_down_on_ctrl_c(sandbox: Sandbox, tmp_path: Path) -> None:
+def test_without_its_recorder_it_still_stands_down_on_ctrl_c(tmp_path: Path) -> None:
     """Waiting for its start, the recorder is killed: no commands any more, told once; Ctrl-C ends it as ever."""
-    with loopback_broker(tmp_path) as broker:
+    with loopback_broker(tmp_path) as broker, sandbox_in(tmp_path / "sandbox") as sandbox:
         options = set_options(**{"vehicle.ground.mqtt.url": broker.url})
         with sandbox.start("fly", HOVER, "--sitl", "--wait-for-start", "--out", "out", *options) as flying:
             flying.wait_for("take off with: companion command start")
@@ -191,6 +151,6 @@ def test_without_its_recorder_it_still_stands_down_on_ctrl_c(sandbox: Sandbox, t
             flying.wait_for("no telemetry, no commands")
             flying.signal(signal.SIGINT)
             ended = flying.end()
-    sandbox.assert_nobody_left()
+        sandbox.assert_nobody_left()
     assert ended.code == EXIT_ABORTED, ended.out + ended.err
     assert ended.out.count("no telemetry, no commands") == 1

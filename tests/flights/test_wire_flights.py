@@ -42,7 +42,7 @@ class Flown:
 @pytest.fixture(scope="module")
 def the_catch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
     """A catch of `PAYLOAD_KG` with the preflight and the report of `make fly`; once for everybody who only looks at it. The mission of
-    `make fly` is flown by test_monitor_flight.py.
+    `make fly` is flown by test_ground_commands.py.
     """
     options = set_options(**{"world.payload_kg": PAYLOAD_KG, "vehicle.safety.preflight_s": 5.0})
     with sandbox_in(tmp_path_factory.mktemp("catch")) as sandbox:
