@@ -78,7 +78,7 @@ class Rig:
             ended = self.sandbox.run("arm", *words, "--json", *self.options())
         else:
             ended = self.run(*words, "--json")
-        assert ended.out.count("\n") == 1, ended
+        assert ended.out.count("\n") == 1, ended.err
         document: dict[str, Any] = json.loads(ended.out)
         assert document["schema_version"] == 1 and document["ok"] == (ended.code == EXIT_OK)
         return ended.code, document

@@ -119,14 +119,13 @@ class ServoTalk:
         return PingAnswers(servos, self._port.came_bytes - before != PING_BYTES * len(servos))
 
     def answers(self, servo_id: int) -> bool:
-        """Return whether this servo answers a ping.
+        """Return whether this servo answers a ping, which is repeated if a packet was lost or corrupted.
 
         Raises:
             DeviceError: the port is gone.
         """
         with self._named(f"ping of servo {servo_id}"):
-            _, result, _ = self._protocol.ping(self._port, servo_id)
-        return bool(result == COMM_SUCCESS)
+            return any(self._protocol.ping(self._port, servo_id)[1] == COMM_SUCCESS for _ in range(_ATTEMPTS))
 
     def read(self, servo_id: int, register: Register) -> int:
         """Return a register's value. The request is repeated if a packet was lost or corrupted.
