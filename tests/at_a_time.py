@@ -8,6 +8,7 @@ are met by fewer.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from pathlib import Path
@@ -16,6 +17,8 @@ from companion.runtime.realtime import FLIGHT_PRIORITY
 
 AT_A_TIME = {"waiting": (2, 3), "flights": (1, 2)}
 """By stage: without and with real-time priority, on two cores or more."""
+_SESSION, _USER, _SYSTEM, _NICE = 3, 11, 12, 16
+"""Fields of /proc/PID/stat after the name (proc_pid_stat(5))."""
 
 
 def real_time() -> bool:
@@ -52,3 +55,21 @@ def core_is_taken(within_s: float = 0.5, times: int = 4) -> bool:
         if (os.cpu_count() or 1) - idle < 0.5:
             return False
     return True
+
+
+def is_taken_within(session: int, above: int, within_s: float = 0.5) -> bool:
+    """Measure whether programs of a session that have a niceness above a limit use more than a quarter of a core together."""
+
+    def used_ticks() -> dict[str, int]:
+        used = {}
+        for path in Path("/proc").glob("[0-9]*/stat"):
+            with contextlib.suppress(OSError):  # it has ended
+                words = path.read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
+                if int(words[_SESSION]) == session and int(words[_NICE]) > above:
+                    used[path.parent.name] = int(words[_USER]) + int(words[_SYSTEM])
+        return used
+
+    before, begun_s = used_ticks(), time.monotonic()
+    time.sleep(within_s)
+    used = sum(ticks - before.get(pid, ticks) for pid, ticks in used_ticks().items())
+    return used / os.sysconf("SC_CLK_TCK") > 0.25 * (time.monotonic() - begun_s)

@@ -2,8 +2,7 @@
 
 To be started in a session of its own. Linux shares the processors among sessions first (sched_autogroup) and among the processes of a
 session second: a niceness alone counts in its session only. So a foreign program gets a whole core before a session of the lowest
-priority gets anything, even if its niceness is 19. Where that is so (`EQUAL`), the command's session has the priority of any other, and
-each worker of pytest (`-p tests.low_priority`) a session of its own.
+priority gets anything, even if its niceness is 19. Where that is so, `PLACE` says what is done instead.
 """
 
 from __future__ import annotations
@@ -18,13 +17,20 @@ from pathlib import Path
 import pytest
 
 LOWEST = 19
-EQUAL = "COMPANION_TESTS_EQUAL_SESSIONS"
+LOW = 10
+PLACE = "COMPANION_TESTS_PLACE"
 """Environment variable: set if a foreign program takes a core, and what has to be in time has real-time priority."""
+EQUAL = "equal"
+"""A value of `PLACE`: the session of the command, and one of each worker of pytest (`-p tests.low_priority`), has the priority of any
+other.
+"""
+OURS = "ours"
+"""A value of `PLACE`: the foreign program runs in our session with a niceness above `LOW`, and the command there with `LOW`."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Give a worker its own session, if sessions are equal."""
-    if EQUAL in os.environ and hasattr(config, "workerinput"):
+    if os.environ.get(PLACE) == EQUAL and hasattr(config, "workerinput"):
         os.setsid()
 
 
@@ -41,8 +47,8 @@ def pytest_collection(session: pytest.Session) -> Iterator[None]:
 
 
 if __name__ == "__main__":
-    os.nice(LOWEST)
-    if EQUAL not in os.environ:
+    os.nice(LOW if os.environ.get(PLACE) == OURS else LOWEST)
+    if PLACE not in os.environ:
         with contextlib.suppress(OSError):  # a kernel without groups of sessions, where niceness counts everywhere
             Path("/proc/self/autogroup").write_text(str(LOWEST), encoding="ascii")
     os.execvp(sys.argv[1], sys.argv[1:])

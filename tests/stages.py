@@ -20,9 +20,10 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from tests.at_a_time import AT_A_TIME, at_a_time, core_is_taken, real_time
-from tests.low_priority import EQUAL
+from tests.at_a_time import AT_A_TIME, at_a_time, core_is_taken, is_taken_within, real_time
+from tests.low_priority import EQUAL, LOW, OURS, PLACE
 from tests.marked import TESTS, files_of
 
 _BIN = Path(sys.executable).parent
@@ -117,12 +118,9 @@ def start(stage: Stage, folder: Path, *, beside: bool = False) -> Running:
         return Running(stage, subprocess.Popen(command), begun_s, own)
     with (own / _OUTPUT).open("wb") as output:
         command = (sys.executable, "-m", "tests.low_priority", *command)
-        return Running(
-            stage,
-            subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, start_new_session=True),
-            begun_s,
-            own,
-        )
+        apart: dict[str, Any] = {"process_group": 0} if os.environ.get(PLACE) == OURS else {"start_new_session": True}
+        process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, **apart)
+        return Running(stage, process, begun_s, own)
 
 
 def finish(running: Running) -> Result:
@@ -201,7 +199,7 @@ def run_all(stages: Sequence[Stage]) -> int:
                 del beside[0]
         except KeyboardInterrupt:
             interrupted = True
-            for running in beside:  # in sessions of their own, which Ctrl-C does not reach
+            for running in beside:  # in process groups of their own, which Ctrl-C does not reach
                 with contextlib.suppress(ProcessLookupError):  # it has ended
                     os.killpg(running.process.pid, signal.SIGINT)
                 running.process.wait()
@@ -221,7 +219,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if unknown:
         parser.error(f"no stage {unknown[0]!r}; there are {', '.join(names)}")
     if real_time() and core_is_taken():
-        os.environ[EQUAL] = "1"
+        os.environ[PLACE] = OURS if is_taken_within(os.getsid(0), above=LOW) else EQUAL
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored if a shell started us in the background
     return run_all([stage for stage in STAGES if stage.name in wanted])
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.low_priority import EQUAL
+from tests.at_a_time import is_taken_within
+from tests.low_priority import EQUAL, LOW, OURS, PLACE
 from tests.stages import Stage, run_all
 from tests.support import DEADLINE_S, ROOT, wait_until
 
@@ -68,11 +69,17 @@ def test_all_green_is_exit_0(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr().out.splitlines()[-1] == "1 passed, 0 failed, 0 skipped"
 
 
-def test_a_stage_runs_beside_the_next_ones_in_a_session_of_its_own(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("ours", [False, True])
+def test_a_stage_runs_beside_the_next_ones(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *, ours: bool
 ) -> None:
-    """With the lowest priority in it, and among sessions where the kernel has groups of them; its output comes whole."""
-    monkeypatch.delenv(EQUAL, raising=False)
+    """In a session of its own, with the lowest priority in it, and among sessions where the kernel has groups of them; in our session
+    beside a foreign program of ours that has even less. Its output comes whole.
+    """
+    if ours:
+        monkeypatch.setenv(PLACE, OURS)
+    else:
+        monkeypatch.delenv(PLACE, raising=False)
     met = tmp_path / "met"
     waits = f"import os, pathlib, time\nwhile not pathlib.Path({str(met)!r}).exists(): time.sleep(0.01)\n"
     waits += "print(os.getsid(0) == os.getpid(), os.nice(0))\n"
@@ -83,7 +90,9 @@ def test_a_stage_runs_beside_the_next_ones_in_a_session_of_its_own(
     ]
     assert run_all(stages) == 0
     out = capfd.readouterr().out
-    assert f"=== computing:\nTrue {min(19, os.nice(0) + 19)}\n19\n" in out
+    group = Path("/proc/self/autogroup")
+    among = group.read_text(encoding="ascii").split()[-1] if ours and group.exists() else "19"
+    assert f"=== computing:\n{not ours} {min(19, os.nice(0) + (LOW if ours else 19))}\n{among}\n" in out
     assert out.index("=== types") < out.index("=== computing:\n")
 
 
@@ -112,13 +121,22 @@ def test_tests_of_a_group_share_one_worker(tmp_path: Path) -> None:
 def test_workers_have_sessions_of_their_own_where_these_share_the_processors(tmp_path: Path, *, equal: bool) -> None:
     path = tmp_path / "test_session.py"
     path.write_text("import os\ndef test_session():\n    open('session', 'w').write(f'{os.getsid(0)} {os.getpid()}')\n")
-    own = {key: value for key, value in os.environ.items() if key != EQUAL}
-    environment = {**own, "PYTHONPATH": str(ROOT), **({EQUAL: "1"} if equal else {})}
+    own = {key: value for key, value in os.environ.items() if key != PLACE}
+    environment = {**own, "PYTHONPATH": str(ROOT), **({PLACE: EQUAL} if equal else {})}
     command = (*pytest_of(path), "-p", "tests.low_priority", "-n", "1")
     with subprocess.Popen(command, cwd=tmp_path, env=environment, start_new_session=True) as process:
         assert process.wait() == 0
     session, worker = (tmp_path / "session").read_text(encoding="utf-8").split()
     assert int(session) == (int(worker) if equal else process.pid)
+
+
+def test_a_program_that_takes_a_core_is_found_in_its_session() -> None:
+    with subprocess.Popen((sys.executable, "-c", "while True: pass"), start_new_session=True) as foreign:
+        try:
+            wait_until(lambda: is_taken_within(foreign.pid, above=-21), lambda: "it used less than a quarter of a core")
+            assert not is_taken_within(foreign.pid, above=19)
+        finally:
+            foreign.kill()
 
 
 @pytest.mark.parametrize("beside", [False, True])
