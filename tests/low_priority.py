@@ -25,7 +25,10 @@ EQUAL = "equal"
 other.
 """
 OURS = "ours"
-"""A value of `PLACE`: the foreign program runs in our session with a niceness above `LOW`, and the command there with `LOW`."""
+"""A value of `PLACE`: the foreign program runs in our session with a niceness above `LOW`, and the command there with `LOW`. What waits
+and flies gets a session of its own then: where programs of three priorities share one, those of niceness 0 wait up to two seconds for
+a core (Linux 6.18).
+"""
 
 
 def pytest_configure(config: pytest.Config) -> None:

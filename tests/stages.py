@@ -114,11 +114,12 @@ def start(stage: Stage, folder: Path, *, beside: bool = False) -> Running:
         together = ("-n", str(at_a_time(stage.name))) if stage.name in AT_A_TIME else ()
         command += (*together, "-p", "tests.tally", "--tally", str(own / _TALLY), "--durations=10")
     begun_s = time.monotonic()
+    ours = os.environ.get(PLACE) == OURS
     if not beside:
-        return Running(stage, subprocess.Popen(command), begun_s, own)
+        return Running(stage, subprocess.Popen(command, start_new_session=ours and not stage.beside), begun_s, own)
     with (own / _OUTPUT).open("wb") as output:
         command = (sys.executable, "-m", "tests.low_priority", *command)
-        apart: dict[str, Any] = {"process_group": 0} if os.environ.get(PLACE) == OURS else {"start_new_session": True}
+        apart: dict[str, Any] = {"process_group": 0} if ours else {"start_new_session": True}
         process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, **apart)
         return Running(stage, process, begun_s, own)
 
@@ -151,6 +152,8 @@ def _wait(process: subprocess.Popen[bytes]) -> int:
     try:
         return process.wait()
     except KeyboardInterrupt:
+        with contextlib.suppress(ProcessLookupError):  # it leads no group, and Ctrl-C reached it
+            os.killpg(process.pid, signal.SIGINT)
         process.wait()
         raise
 

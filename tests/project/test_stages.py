@@ -74,21 +74,23 @@ def test_a_stage_runs_beside_the_next_ones(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *, ours: bool
 ) -> None:
     """In a session of its own, with the lowest priority in it, and among sessions where the kernel has groups of them; in our session
-    beside a foreign program of ours that has even less. Its output comes whole.
+    beside a foreign program of ours that has even less, and then what has to be in time has its own. Its output comes whole.
     """
     if ours:
         monkeypatch.setenv(PLACE, OURS)
     else:
         monkeypatch.delenv(PLACE, raising=False)
     met = tmp_path / "met"
+    meets = f"import os, pathlib; pathlib.Path({str(met)!r}).write_text(str(os.getsid(0) == os.getpid()))"
     waits = f"import os, pathlib, time\nwhile not pathlib.Path({str(met)!r}).exists(): time.sleep(0.01)\n"
     waits += "print(os.getsid(0) == os.getpid(), os.nice(0))\n"
     waits += "path = pathlib.Path('/proc/self/autogroup'); print(path.read_text().split()[-1] if path.exists() else 19)"
     stages = [
         Stage("computing", (sys.executable, "-c", waits), tests=False, beside=True),
-        Stage("types", (sys.executable, "-c", f"import pathlib; pathlib.Path({str(met)!r}).touch()"), tests=False),
+        Stage("types", (sys.executable, "-c", meets), tests=False),
     ]
     assert run_all(stages) == 0
+    assert met.read_text(encoding="utf-8") == str(ours)
     out = capfd.readouterr().out
     group = Path("/proc/self/autogroup")
     among = group.read_text(encoding="ascii").split()[-1] if ours and group.exists() else "19"
@@ -139,8 +141,8 @@ def test_a_program_that_takes_a_core_is_found_in_its_session() -> None:
             foreign.kill()
 
 
-@pytest.mark.parametrize("beside", [False, True])
-def test_ctrl_c_lets_the_stage_end_in_order(tmp_path: Path, *, beside: bool) -> None:
+@pytest.mark.parametrize(("beside", "place"), [(False, None), (True, None), (False, OURS), (True, OURS)])
+def test_ctrl_c_lets_the_stage_end_in_order(tmp_path: Path, *, beside: bool, place: str | None) -> None:
     """The stage takes two seconds to end."""
     begun, ended = tmp_path / "begun", tmp_path / "ended"
     slow = "import pathlib, signal, sys, time\ntry:\n    pathlib.Path(sys.argv[1]).touch(); signal.pause()\nfinally:\n"
@@ -148,7 +150,12 @@ def test_ctrl_c_lets_the_stage_end_in_order(tmp_path: Path, *, beside: bool) -> 
     stage = f"Stage('computing', (sys.executable, '-c', {slow!r}, {str(begun)!r}, {str(ended)!r}), tests=False, beside={beside})"
     other = "Stage('types', (sys.executable, '-c', 'import signal; signal.pause()'), tests=False)"
     code = f"import signal, sys; from tests.stages import *; sys.exit(run_all([{stage}, {other}]))"
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, start_new_session=True) as process:
+    environment = {
+        **{key: value for key, value in os.environ.items() if key != PLACE},
+        **({PLACE: place} if place else {}),
+    }
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, start_new_session=True) as process:
         assert process.stdout is not None
         wait_until(begun.exists, lambda: "the stage has not begun")
         os.killpg(process.pid, signal.SIGINT)
