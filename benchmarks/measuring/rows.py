@@ -118,7 +118,7 @@ def sections(parts: Mapping[str, Figures]) -> list[Section]:
             _row("the law alone, us", "raw MuJoCo", median("core", "law_us"), raw),
             _row("the law with adaptive loads, us", "without them", median("core", "law_us"), median("core", "law_without_loads_us")),
             _row("a tick of the fast closed loop, plant and all, us", "raw MuJoCo", median("core", "tick_us"), raw),
-            _row("FlightCore.step in the flight, us", "the fast closed loop", microseconds("hover", "core_ms"),
+            _row("inputs and FlightCore.step in the flight, us", "the fast closed loop", microseconds("hover", "core_ms"),
                  microseconds("core", "core_ms"), Target(80.0, ("p50",), ratio=False)),
             *(
                 _row("FlightCore.step, compiled build, us", "plain Python", microseconds("compiled", "core_ms"),

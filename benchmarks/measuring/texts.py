@@ -45,7 +45,7 @@ CORE = _paragraphs("""
 The core's whole tick (mission, governor, controller, supervisor, gate) on the recorded inputs of the catch mission, flown in the
 fast closed loop; wall time of each step. Raw MuJoCo: `mj_step` of the same model, as many steps as in one tick, in batches; CPU
 time, median of repeats, as for the law and the whole tick. In flight the core runs once in 5 ms, after other code that uses the
-caches.
+caches, and its row includes collecting the inputs from the drivers.
 """)
 
 PI = _paragraphs("""

@@ -223,7 +223,7 @@ def force_overload(f: ForceTracker, force_max_n: float) -> Values | None:
     if f.force is None:
         return None
     x, y, z = f.force.force_sensor_n
-    return (x, y, z) if f.force.overload or x * x + y * y + z * z > force_max_n**2 else None
+    return (x, y, z) if f.force.overload or x * x + y * y + z * z > force_max_n * force_max_n else None
 
 
 def force_stuck(f: ForceTracker, _: None) -> Values | None:
@@ -234,4 +234,4 @@ def force_stuck(f: ForceTracker, _: None) -> Values | None:
 def force_drift(f: ForceTracker, drift_n: float) -> Values | None:
     """Fires if the mean force on an empty net exceeds the threshold."""
     x, y, z = f.mean_n
-    return (x, y, z, drift_n) if x * x + y * y + z * z > drift_n**2 else None
+    return (x, y, z, drift_n) if x * x + y * y + z * z > drift_n * drift_n else None

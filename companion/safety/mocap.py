@@ -213,7 +213,8 @@ class MocapTracker:
             px, py, pz = vehicle.position_world_m
             allowed_m = min(self._s.mocap_jump_m + DRIFT_M_S * dt_s, self._s.estimate_disagreement_m)
             reference = vehicle.attitude_wxyz
-        off_m2 = (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2
+        dx, dy, dz = x - px, y - py, z - pz
+        off_m2 = dx * dx + dy * dy + dz * dz
         cos_half = abs(_dot(pose.attitude_wxyz, reference))
         if off_m2 <= allowed_m * allowed_m and cos_half >= self._jump_cos_half:
             return True
@@ -296,7 +297,9 @@ def estimate_disagrees(m: MocapTracker, disagreement_m: float) -> Values | None:
     """Fires if PX4's position and the pose are further apart than the threshold."""
     if m.compared is None:
         return None
-    apart_m = math.dist(m.compared[1].position_world_m, m.compared[0].position_world_m)
+    (x, y, z), (px, py, pz) = m.compared[1].position_world_m, m.compared[0].position_world_m
+    dx, dy, dz = x - px, y - py, z - pz
+    apart_m = math.sqrt(dx * dx + dy * dy + dz * dz)
     return (apart_m, disagreement_m) if apart_m > disagreement_m else None
 
 

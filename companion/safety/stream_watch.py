@@ -44,7 +44,10 @@ class StreamWatch:
             if behind < _HALF:
                 self._back_s.append(t_s)
             self._newest = number
-            self._recent = {n: c for n, c in self._recent.items() if (number - n) & _MASK <= REORDERED_MAX}
+            if behind == _MASK:  # the next number: only the oldest frame leaves
+                self._recent.pop((number - REORDERED_MAX - 1) & _MASK, None)
+            else:
+                self._recent = {n: c for n, c in self._recent.items() if (number - n) & _MASK <= REORDERED_MAX}
             self._recent[number] = content
         elif self._recent.setdefault(number, content) != content:
             self._back_s.append(t_s)
