@@ -1,8 +1,8 @@
 """A press on drawn walls in the laboratory, fast loop: `python -m benchmarks.press [--draws 200] [--first-seed 5001]`.
 
 With `--mission probe` the walls are probed instead; then only the normal and the place that were found say something.
-With `--datum` each laboratory first probes a wall whose place is known, and the rigid body's pivot is moved by what it was found too
-far, as in Motive.
+With `--datum` each laboratory first probes a wall whose place is known, from two headings and leaned, and the rigid body's pivot is
+moved, as in Motive, by what the wall was found too far.
 
 Each seed draws a laboratory, and a wall of 1e3 to 1e5 N/m with a friction of 0.1 to 0.8, tilted by up to 15 deg about both axes and
 up to 5 cm from where the mission expects it. Prints a line for each flight and a summary: the steady error of the true and of the
@@ -21,12 +21,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.analysis.contact import contact_summary
+from companion.commissioning.mocap.pivot import Probed, tip_off_m
 from companion.model.types import ContactMode, Outcome, Severity
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight
 
 PROBE = "configs/missions/probe.yaml"
+DATUM_DEG = ((15.0, 0.0), (-15.0, 0.0), (0.0, 15.0))
+"""Yaw of the vehicle and lean of the wall in the three probes of a datum."""
 SETTLE_TICKS = 300
 """Ticks at the wanted force that do not count as steady."""
 
@@ -96,14 +99,19 @@ def flown(seed: int, mission: str = "press", datum: bool = False) -> Press:
 
 
 def _moved_pivot_m(seed: int) -> list[float]:
-    """Return the pivot of the seed's laboratory, moved by the distance by which a probe finds a wall at x = 1.5 m too far."""
-    wall = {"point_m": [1.5, 0.0, 1.09], "normal": [-1.0, 0.0, 0.0]}
-    config = load_sitl(PROBE, world="lab", overrides=[f"world.surfaces={json.dumps([wall])}", f"world.seed={seed}"])
-    found = next(
-        o.contact.surface for o in reversed(FastFlight(config).run(300.0).outputs) if o.contact and o.contact.surface
-    )
-    x_m, y_m, z_m = config.world.mocap.pivot_offset_m
-    return [x_m - (found.point_world_m[0] - 1.5), y_m, z_m]
+    """Return the pivot of the seed's laboratory, moved as `companion mocap pivot` says after three probes of a known wall."""
+    probes = []
+    for yaw_deg, lean_deg in DATUM_DEG:
+        wall = {"point_m": [1.5, 0.0, 1.09], "normal": [-1.0, 0.0, 0.0], "tilt_error_deg": [0.0, lean_deg]}
+        sets = [f"world.surfaces={json.dumps([wall])}", f"world.seed={seed}", f"mission.start.yaw_deg={yaw_deg}"]
+        flight = FastFlight(load_sitl(PROBE, world="lab", overrides=sets))
+        outputs = reversed(flight.run(300.0).outputs)
+        found = next(o.contact.surface for o in outputs if o.contact and o.contact.surface)
+        assert flight.plant.world.surfaces is not None
+        placed = flight.plant.world.surfaces.placed[0]
+        probes.append(Probed(placed.normal, math.radians(yaw_deg), placed.local_m(found.point_world_m)[2]))
+    pivot_m = flight.config.world.mocap.pivot_offset_m
+    return [at - off for at, off in zip(pivot_m, tip_off_m(probes), strict=True)]
 
 
 def _error(force_n: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:

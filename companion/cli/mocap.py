@@ -1,7 +1,9 @@
-"""`companion mocap check|align`: check the motion-capture stream and find its axes."""
+"""`companion mocap check|align|pivot`: check the motion-capture stream, find its axes and the error of the pivot."""
 
 from __future__ import annotations
 
+import argparse
+import math
 from typing import Any
 
 from companion.commissioning.tool import add_tool, number
@@ -12,7 +14,7 @@ _TOOLS = "companion.commissioning.mocap.tools"
 
 def add_parser(commands: Any) -> None:
     """Add `mocap` to the sub-parsers of `companion`."""
-    mocap = commands.add_parser("mocap", help="motion capture: check the stream, find its axes")
+    mocap = commands.add_parser("mocap", help="motion capture: check the stream, find its axes and the pivot")
     parts = mocap.add_subparsers(dest="part", required=True, metavar="PART")
     check = add_tool(
         parts, "check", _TOOLS,
@@ -38,3 +40,28 @@ def add_parser(commands: Any) -> None:
         default=DEFAULT_MISSION,
         help=f"mission whose start defines the yaw (default: {DEFAULT_MISSION})",
     )
+    pivot = add_tool(
+        parts, "pivot", _TOOLS,
+        help="how far the rigid body's pivot is off, from probes of a surface whose place is known",
+        description="Compare probed surfaces with where they are, and print how to move the pivot. Three flights of a mission "
+        "like probe: nose to the left, nose to the right, surface leaned. Exit 0: the pivot is right; 3: it is not.",
+        write="", yes=False,
+    )  # fmt: skip
+    pivot.add_argument("flights", nargs="+", metavar="FLIGHT", help="folder of a flight that probed the surface")
+    pivot.add_argument(
+        "--plane", action="append", required=True, type=_plane, metavar="X,Y,Z,NX,NY,NZ",
+        help="a point of the surface, m, and its normal out of it, world frame; once, or once for each flight",
+    )  # fmt: skip
+
+
+def _plane(text: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    try:
+        x, y, z, nx, ny, nz = (float(word) for word in text.split(","))
+    except ValueError:
+        x = y = z = nx = ny = nz = math.nan
+    length = math.hypot(nx, ny, nz)
+    if not (math.isfinite(x + y + z + length) and length > 0.0):
+        raise argparse.ArgumentTypeError(
+            f"expected six numbers X,Y,Z,NX,NY,NZ, a normal that is not zero, got '{text}'"
+        )
+    return (x, y, z), (nx / length, ny / length, nz / length)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Final
 
 from companion.config.mission import Approach, Phase, Probe
 from companion.config.vehicle import Vehicle
@@ -15,6 +16,10 @@ TILT_MAX_RAD = math.radians(30.0)
 """Largest angle between a surface's normal and the direction of the approach. Beyond it a touch is taken for a false one."""
 LIMIT_MARGIN_DEG = 5.0
 """Distance of the turned tool from the limits of its joint."""
+OUTLIER: Final = 5.0
+OUTLIER_POINTS_MIN: Final = 6
+ERROR_MIN_M: Final = 0.001
+"""Error that a touched point has at least."""
 _STEP_RAD = 0.001
 _LEVEL = 0.5
 """Horizontal part of a direction from which it has an azimuth to which the vehicle can turn."""
@@ -53,23 +58,27 @@ def farthest_step_m(points: Sequence[Vec2]) -> float:
 def plane(tips_m: Sequence[Vec3], direction_world: Vec3, radius_m: float) -> FoundSurface | None:
     """Return the plane through the touched points by least squares, or None if it is steeper than `TILT_MAX_RAD`.
 
+    A gust can feign a touch in front of the surface. Of six points or more, one is left out if it lies in front of
+    the plane through the others by more than `OUTLIER` standard errors.
+
     Args:
         tips_m: positions of the tip's centre, three or more that do not lie on a line, world frame.
         direction_world: direction of the approaches, along which the errors are taken.
         radius_m: radius of the tip.
     """
-    count = len(tips_m)
-    cx, cy, cz = (sum([tip[k] for tip in tips_m], 0.0) / count for k in range(3))
     right, up = axes(direction_world)
-    rr = ru = uu = rd = ud = 0.0
-    for x, y, z in tips_m:
-        off = (x - cx, y - cy, z - cz)
-        r, u, d = _dot(off, right), _dot(off, up), _dot(off, direction_world)
-        rr, ru, uu, rd, ud = rr + r * r, ru + r * u, uu + u * u, rd + r * d, ud + u * d
-    scale = rr * uu - ru * ru
-    if scale <= 0.0:
+    points = [(_dot(tip, right), _dot(tip, up), _dot(tip, direction_world)) for tip in tips_m]
+    fit = _fit(points)
+    while len(points) >= OUTLIER_POINTS_MIN:
+        share, k = max((_outlying(points, k), k) for k in range(len(points)))
+        if share <= OUTLIER:
+            break
+        del points[k]
+        fit = _fit(points)
+    if fit is None:
         return None
-    b, c = (uu * rd - ru * ud) / scale, (rr * ud - ru * rd) / scale
+    r, u, d, b, c = fit
+    cx, cy, cz = (r * e + u * f + d * g for e, f, g in zip(right, up, direction_world, strict=True))
     length = math.sqrt(1.0 + b * b + c * c)
     if length * math.cos(TILT_MAX_RAD) > 1.0:
         return None
@@ -78,6 +87,38 @@ def plane(tips_m: Sequence[Vec3], direction_world: Vec3, radius_m: float) -> Fou
     return FoundSurface(
         point_world_m=(cx + radius_m * nx, cy + radius_m * ny, cz + radius_m * nz), normal_world=(-nx, -ny, -nz)
     )
+
+
+def _fit(points: Sequence[Vec3]) -> tuple[float, float, float, float, float] | None:
+    """Return the centre (r, u, d) of the points and the slopes b and c of the plane d + b r + c u through it by least squares; None if
+    the points lie on a line.
+    """
+    count = len(points)
+    cr, cu, cd = (sum([point[k] for point in points], 0.0) / count for k in range(3))
+    rr = ru = uu = rd = ud = 0.0
+    for r, u, d in points:
+        r, u, d = r - cr, u - cu, d - cd
+        rr, ru, uu, rd, ud = rr + r * r, ru + r * u, uu + u * u, rd + r * d, ud + u * d
+    scale = rr * uu - ru * ru
+    if scale <= 0.0:
+        return None
+    return cr, cu, cd, (uu * rd - ru * ud) / scale, (rr * ud - ru * rd) / scale
+
+
+def _outlying(points: Sequence[Vec3], k: int) -> float:
+    """Return how far the point `k` lies in front of the plane through the others, in standard errors; 0 if those lie on a line."""
+    others = [point for index, point in enumerate(points) if index != k]
+    fit = _fit(others)
+    if fit is None:
+        return 0.0
+    squares = sum([_behind_m(point, fit) ** 2 for point in others], 0.0)
+    error_m = max(ERROR_MIN_M, math.sqrt(squares / (len(others) - 3)))
+    return -_behind_m(points[k], fit) / error_m
+
+
+def _behind_m(point: Vec3, fit: tuple[float, float, float, float, float]) -> float:
+    r, u, d, b, c = fit
+    return point[2] - d - b * (point[0] - r) - c * (point[1] - u)
 
 
 def turn_to(surface: FoundSurface, yaw_rad: float) -> float:

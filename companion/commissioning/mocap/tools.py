@@ -1,4 +1,4 @@
-"""`companion mocap check` checks the motion-capture stream; `companion mocap align` finds its axes."""
+"""`companion mocap check` checks the motion-capture stream, `align` finds its axes, and `pivot` how far the pivot is off."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 
 from companion.commissioning.mocap import align as mocap_align
 from companion.commissioning.mocap import judge as mocap_judge
+from companion.commissioning.mocap import pivot as mocap_pivot
 from companion.commissioning.mocap.judge import FrameSeen, Watched
 from companion.commissioning.mocap.watch import discover, path_to, watcher
 from companion.commissioning.tool import SENSORS, Cancelled, Report, Session, Tool
@@ -179,4 +180,5 @@ def judge_axes(carried: Carried, vehicle: Vehicle) -> Report:
 TOOLS: Final[Mapping[str, Tool[Any]]] = {
     "check": Tool("mocap check", SENSORS, watch, judge),
     "align": Tool("mocap align", SENSORS, guide_hand_test, judge_axes),
+    "pivot": Tool("mocap pivot", SENSORS, mocap_pivot.read, mocap_pivot.judge),
 }
