@@ -1,6 +1,7 @@
 """A press on drawn walls in the laboratory, fast loop: `python -m benchmarks.press [--draws 200] [--first-seed 5001]`.
 
-With `--mission probe` the walls are probed instead; then only the normal and the place that were found say something.
+With `--mission probe` the walls are probed instead; then only the normal and the place that were found say something. With `--mission
+slide` the tip slides along them; both errors are then RMS over the slide.
 With `--datum` each laboratory first probes a wall whose place is known, from two headings and leaned, and the rigid body's pivot is
 moved, as in Motive, by what the wall was found too far.
 
@@ -21,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.analysis.contact import contact_summary
+from companion.analysis.log import Array
 from companion.commissioning.mocap.pivot import Probed, tip_off_m
 from companion.model.types import ContactMode, Outcome, Severity
 from companion.sitl_config.loader import load_sitl
@@ -30,6 +32,7 @@ from sitl.fast.loop import FastFlight
 PROBE = "configs/missions/probe.yaml"
 DATUM_DEG = ((15.0, 0.0), (-15.0, 0.0), (0.0, 15.0))
 """Yaw of the vehicle and lean of the wall in the three probes of a datum."""
+_PRESSING = (ContactMode.PRESS, ContactMode.SLIDE)
 SETTLE_TICKS = 300
 """Ticks at the wanted force that do not count as steady."""
 
@@ -49,7 +52,7 @@ class Press:
     largest_in_flight_n: float
     """True force, light touches included."""
     beside_mm: float
-    """RMS distance of the pressing tip from its reference, across the press."""
+    """RMS distance of the pressing or sliding tip from its reference, across the press."""
     events: str
     rotor_distance_m: float
     normal_error_deg: float
@@ -57,7 +60,7 @@ class Press:
 
 
 def flown(seed: int, mission: str = "press", datum: bool = False) -> Press:
-    """Fly a mission (`press`, `probe`) on the wall of a seed; with a datum, after a probe of a wall whose place is known."""
+    """Fly a mission (`press`, `probe`, `slide`) on the wall of a seed; with a datum, after a probe of a wall whose place is known."""
     draw = random.Random(seed)
     stiffness_n_m, friction = 10.0 ** draw.uniform(3.0, 5.0), draw.uniform(0.1, 0.8)
     tilt_deg, place_m = [draw.uniform(-15.0, 15.0), draw.uniform(-15.0, 15.0)], draw.uniform(-0.05, 0.05)
@@ -74,17 +77,21 @@ def flown(seed: int, mission: str = "press", datum: bool = False) -> Press:
     contacts = [outputs.contact for outputs in result.outputs]
     true_n = np.array([layout.contact(snapshot.sensors)[1] for snapshot in result.snapshots]) @ np.array(placed.normal)
     measured_n = np.array([math.nan if c is None else c.force_n for c in contacts])
-    wanted_n = np.array([0.0 if c is None or c.mode is not ContactMode.PRESS else c.wanted_n for c in contacts])
+    wanted_n = np.array([0.0 if c is None or c.mode not in _PRESSING else c.wanted_n for c in contacts])
     pressing = wanted_n > wanted_n[-1]
-    steady = np.flatnonzero(wanted_n == 5.0)[SETTLE_TICKS:]
+    most_n = float(wanted_n.max())
+    steady = np.flatnonzero(wanted_n == most_n)[SETTLE_TICKS:]
+    sliding = np.flatnonzero([c is not None and c.mode is ContactMode.SLIDE for c in contacts])
     beside_m = (contact_summary(row_of(flight.config.flight, result, None)[1]) or {}).get("path_rms_m")
     found = next((c.surface for c in reversed(contacts) if c is not None and c.surface is not None), None)
     return Press(
         seed=seed,
         completed=result.outputs[-1].outcome is Outcome.COMPLETED,
         crashed=result.crashed,
-        true_error=_error(true_n[steady]),
-        measured_error=_error(measured_n[steady]),
+        true_error=_rms(true_n[sliding], wanted_n[sliding]) if len(sliding) else _error(true_n[steady], most_n),
+        measured_error=_rms(measured_n[sliding], wanted_n[sliding])
+        if len(sliding)
+        else _error(measured_n[steady], most_n),
         largest_true_n=float(true_n[pressing].max(initial=0.0)),
         largest_measured_n=float(measured_n[pressing].max(initial=0.0)),
         largest_in_flight_n=surfaces.force_max_n,
@@ -114,8 +121,14 @@ def _moved_pivot_m(seed: int) -> list[float]:
     return [at - off for at, off in zip(pivot_m, tip_off_m(probes), strict=True)]
 
 
-def _error(force_n: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
-    return 100.0 * abs(float(force_n.mean()) / 5.0 - 1.0) if len(force_n) else math.nan
+def _error(force_n: Array, wanted_n: float) -> float:
+    """Return the error of the mean force, %."""
+    return 100.0 * abs(float(force_n.mean()) / wanted_n - 1.0) if len(force_n) else math.nan
+
+
+def _rms(force_n: Array, wanted_n: Array) -> float:
+    """Return the RMS error of the force, %."""
+    return 100.0 * float(np.sqrt(np.mean((force_n / wanted_n - 1.0) ** 2)))
 
 
 def main() -> None:
@@ -123,7 +136,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--first-seed", type=int, default=5001)
-    parser.add_argument("--mission", choices=["press", "probe"], default="press")
+    parser.add_argument("--mission", choices=["press", "probe", "slide"], default="press")
     parser.add_argument("--datum", action="store_true")
     arguments = parser.parse_args()
     presses = []
