@@ -136,7 +136,7 @@ def plan(found: Scan, arm: Arm, device: ArmDevice, joint: int | None = None) -> 
     )
 
 
-def carry_out(port: str, plans: Sequence[ServoPlan], report: Callable[[str], None] = lambda _: None) -> None:
+def carry_out(port: str, plans: Sequence[ServoPlan], report: Callable[[str], None]) -> None:
     """Write the planned settings to one servo after the other.
 
     Args:

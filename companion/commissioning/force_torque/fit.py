@@ -12,6 +12,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.vehicle import Vehicle
@@ -170,26 +173,24 @@ class Drift:
 
 def drift(samples: Sequence[ForceSample]) -> list[Drift]:
     """Fit a straight line to each axis x, y, z of at least four samples."""
-    return [_drift([(s.stamp_s, s.force_sensor_n[axis]) for s in samples]) for axis in range(3)]
+    stamps_s = np.array([sample.stamp_s for sample in samples])
+    return [_drift(stamps_s, np.array(values)) for values in zip(*(s.force_sensor_n for s in samples), strict=True)]
 
 
-def _drift(points: Sequence[tuple[float, float]]) -> Drift:
-    start_s = points[0][0]
-    width_s = min(1.0, (points[-1][0] - start_s) / 4)
-    blocks: dict[int, list[tuple[float, float]]] = {}
-    for t_s, value in points:
-        blocks.setdefault(int((t_s - start_s) / width_s), []).append((t_s - start_s, value))
-    means = [
-        (len(block), sum(t for t, _ in block) / len(block), sum(v for _, v in block) / len(block))
-        for block in blocks.values()
-    ]
-    mean_t, mean = sum(n * t for n, t, _ in means) / len(points), sum(n * v for n, _, v in means) / len(points)
-    spread = sum(n * (t - mean_t) ** 2 for n, t, _ in means)
-    slope = sum(n * (t - mean_t) * (v - mean) for n, t, v in means) / spread
-    rest = sum(n * (v - mean - slope * (t - mean_t)) ** 2 for n, t, v in means) / max(1, len(means) - 2)
-    off = [value - mean - slope * (t_s - start_s - mean_t) for t_s, value in points]
-    noise = math.sqrt(sum(value * value for value in off) / len(off))
-    return Drift(mean, noise, 60.0 * slope, 60.0 * math.sqrt(rest / spread))
+def _drift(stamps_s: NDArray[np.float64], values: NDArray[np.float64]) -> Drift:
+    t_s = stamps_s - stamps_s[0]
+    block = (t_s / min(1.0, t_s[-1] / 4)).astype(int)
+    counts = np.bincount(block)
+    filled, counts = counts > 0, counts[counts > 0]
+    mean_s, means = (np.bincount(block, one)[filled] / counts for one in (t_s, values))
+    line, covariance = np.polyfit(mean_s, means, 1, w=np.sqrt(counts), cov="unscaled")
+    scatter = counts @ (means - np.polyval(line, mean_s)) ** 2 / max(1, len(counts) - 2)
+    return Drift(
+        mean_n=float(values.mean()),
+        noise_n=float(np.std(values - np.polyval(line, t_s))),
+        per_minute_n=60.0 * float(line[0]),
+        standard_error_n=60.0 * math.sqrt(scatter * covariance[0, 0]),
+    )
 
 
 def _degrees(q: Quat) -> Vec3:

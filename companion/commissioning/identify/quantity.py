@@ -20,7 +20,7 @@ class Quantity:
     unit: str
     digits: int
     """Decimal places in the text."""
-    how: str
+    how: str = ""
     """How it was found, or what the flight lacked and which flight would show it; one line."""
     value: float | None = None
     """None if this flight does not show the quantity."""
