@@ -43,6 +43,12 @@ class Check:
         """Return the row of `good` if `ok` is True, else that of `bad`."""
         return self.good(read, wanted) if ok else self.bad(read, wanted, fix)
 
+    def graded(self, ok: bool, tolerable: bool, read: str, wanted: str, fix: str) -> Row:
+        """Return the row of `good` if `ok` is True, else that of `doubtful` if `tolerable` is True, else that of `bad`."""
+        if ok:
+            return self.good(read, wanted)
+        return self.doubtful(read, wanted, fix) if tolerable else self.bad(read, wanted, fix)
+
     def _row(self, ok: bool, read: str, wanted: str, fix: str, level: Level) -> Row:
         plain = without_negative_zero
         return Row(
