@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import matplotlib
 import numpy as np
@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
+_T = TypeVar("_T")
 DPI = 150
 WIDTH_IN = 9.0
 INK = "#22303c"
@@ -42,6 +43,23 @@ def write_svg(figure: Figure, path: Path) -> None:
     """Write the figure as SVG; the same data always gives the same bytes."""
     with matplotlib.rc_context({"svg.hashsalt": "companion"}):
         FigureCanvasSVG(figure).print_svg(path, metadata={"Date": None, "Creator": None})
+
+
+def panels(axes: Any, items: Sequence[_T]) -> Iterator[tuple[Any, _T]]:
+    """Yield each item with the axes that show it, and hide the axes that are left over."""
+    for place, ax in enumerate(axes.flat):
+        if place < len(items):
+            yield ax, items[place]
+        else:
+            ax.set_visible(False)
+
+
+def label_lowest(axes: Any, count: int, label: str) -> None:
+    """Label the x axis of the lowest used panel of each column, if the grid of shared axes holds `count` panels."""
+    columns = axes.shape[1]
+    for ax in list(axes.flat)[max(0, count - columns) : count]:
+        ax.tick_params(labelbottom=True)
+        ax.set_xlabel(label)
 
 
 def dress(ax: Any) -> None:

@@ -245,7 +245,7 @@ def _write(campaign: Campaign, flown: Flown, table: dict[str, Any], out: Path) -
     try:
         pictures = campaign.draw(flown.messages, out)
     except ImportError:
-        print_error(f"companion {campaign.name}: plots need matplotlib: pip install '{DISTRIBUTION}[analysis]'")
+        print_error(no_plots(campaign.name))
         pictures = []
     page = campaign.page(rows, pictures)
     record = {
@@ -260,6 +260,11 @@ def _write(campaign: Campaign, flown: Flown, table: dict[str, Any], out: Path) -
     # This file is written last: if it exists, all the others exist.
     whole = {**table, "settings": settings, "versions": used, "notes": flown.notes, "wall_s": wall_s}
     (out / f"{campaign.name}.json").write_text(to_json(whole), encoding="utf-8")
+
+
+def no_plots(command: str) -> str:
+    """Return the message of a command that leaves out the plots because matplotlib is not installed."""
+    return f"companion {command}: plots need matplotlib: pip install '{DISTRIBUTION}[analysis]'"
 
 
 def outcomes(rows: Iterable[Row]) -> dict[str, int]:

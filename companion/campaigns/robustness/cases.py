@@ -123,8 +123,8 @@ def fly_command(
     preset: str,
     name: str,
     world: Mapping[str, Any],
-    sets: Sequence[str] = (),
-    vehicle: str | None = None,
+    sets: Sequence[str],
+    vehicle: str | None,
 ) -> str:
     """Return the `companion fly --sitl` command that flies the same world.
 

@@ -10,11 +10,10 @@ from typing import Any
 
 from rich.console import Console
 
-from companion import DISTRIBUTION
 from companion.analysis.page import Page, Picture, Section, write_page
 from companion.analysis.table import Column, Table, for_terminal, number, table
 from companion.campaigns.cost import TERMS, cost_of, flight_cost, terms_of
-from companion.campaigns.runner import counted, to_json
+from companion.campaigns.runner import counted, no_plots, to_json
 from companion.campaigns.tune.result import Gain, HeldOut, Result, completed, flown
 from companion.control.scaled_gains import controller_yaml as controller_file
 from companion.runtime.console import print_error
@@ -79,7 +78,7 @@ def publish(result: Result, out: Path, console: Console | None) -> None:
 
         pictures = write_pictures(result, out)
     except ImportError:
-        print_error(f"companion tune: plots need matplotlib: pip install '{DISTRIBUTION}[analysis]'")
+        print_error(no_plots("tune"))
         pictures = []
     write_page(page(result, pictures), out / PAGE_FILE)
     data = result.data(file)
