@@ -15,7 +15,7 @@ from companion.analysis.log import Array, FlightLog
 from companion.control.sensing import CatchDetector, ObservedCatchDetector
 from companion.model.arm_skeleton import logged_skeleton
 from companion.model.best_pose import best_pose
-from companion.model.frames import quat_rotate
+from companion.model.frames import quat_conjugate, quat_rotate
 from companion.model.types import PhaseKind
 
 Mask = npt.NDArray[np.bool_]
@@ -201,12 +201,9 @@ def _joint_torque_error_nm(log: FlightLog, used: Mask, period_s: float) -> Array
     for n, sample in enumerate(force):
         passing[n] = sample - lasting
         lasting = lasting + k * passing[n]
-    quats = log.column(lambda i, o, s: i.vehicle.attitude_wxyz if i.vehicle else None, 4)[used]
-    w, x, y, z = quats.T
-    body_x = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
-    body_y = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1)
-    body_z = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
-    force_body = np.stack([(passing * axis).sum(axis=1) for axis in (body_x, body_y, body_z)], axis=1)
+    quats = log.column(lambda i, o, s: i.vehicle.attitude_wxyz if i.vehicle else None, 4)[used].tolist()
+    turned = zip(quats, passing.tolist(), strict=True)
+    force_body = np.array([quat_rotate(quat_conjugate(q), tuple(one)) for q, one in turned]).reshape(-1, 3)
     points, axes = pose(skeleton, log.columns.arm_rad[used])
     torques = [(np.cross(axes[:, j], points[:, -1] - points[:, j]) * force_body).sum(axis=1) for j in range(joints)]
     return np.stack(torques, axis=1) if torques else np.zeros((len(force_body), 0))

@@ -6,7 +6,6 @@ Needs matplotlib (extra `analysis`). The flight process never imports this modul
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,8 @@ from matplotlib.figure import Figure
 
 from companion.analysis import metrics
 from companion.analysis.contact_plots import contact_force, contact_path, found_surface, has_contact
-from companion.analysis.log import Array, FlightLog
+from companion.analysis.log import FlightLog
+from companion.analysis.page import Picture
 from companion.analysis.plot_style import (
     CATCH,
     DASHED,
@@ -34,16 +34,7 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import tilt_rad
 
 
-@dataclass(frozen=True, slots=True)
-class Plot:
-    """A plot that was written."""
-
-    path: Path
-    title: str
-    caption: str
-
-
-def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
+def write_plots(log: FlightLog, out_dir: Path) -> list[Picture]:
     """Write every plot for which the log has data, as PNG into `out_dir`."""
     if not log.inputs:
         return []
@@ -95,13 +86,13 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
             _timing,
         ),
     )
-    written: list[Plot] = []
+    written: list[Picture] = []
     for name, title, caption, make in makers:
         figure = make(log)
         if figure is not None:
             path = out_dir / f"{name}.png"
             write_png(figure, path)
-            written.append(Plot(path, title, caption))
+            written.append(Picture(path, title, caption))
     return written
 
 
@@ -109,18 +100,17 @@ def _tracking(log: FlightLog) -> Figure | None:
     joints = log.joint_count
     title = "Tracking errors and arm" if joints else "Tracking errors"
     figure, axes, t = stack(log, title, (1.0, 1.0, *((1.25,) if joints else ())), 6.8 if joints else 4.8)
-    line(axes[0], t, _norm(metrics.position_error_m(log)), r"$\|e_p\|$", SERIES[0])
+    e_p_m = np.linalg.norm(metrics.position_error_m(log), axis=1)
+    e_q_deg = np.degrees(np.linalg.norm(metrics.attitude_error_rad(log), axis=1))
+    line(axes[0], t, e_p_m, r"$\|e_p\|$", SERIES[0])
     line(axes[0], t, log.column(lambda i, o, s: o.mocap_innovation_m or None), "motion capture against IMU", SERIES[1])
     legend(axes[0], columns=2)
-    line(axes[1], t, np.degrees(_norm(metrics.attitude_error_rad(log))), r"$\|e_q\|$", SERIES[0])
+    line(axes[1], t, e_q_deg, r"$\|e_q\|$", SERIES[0])
     axes[0].set_ylabel("position error [m]")
     axes[1].set_ylabel("attitude error [deg]")
     pre, post = metrics.flight_masks(log)
     # The take-off's transient would hide the flight itself.
-    for ax, values in (
-        (axes[0], _norm(metrics.position_error_m(log))),
-        (axes[1], np.degrees(_norm(metrics.attitude_error_rad(log)))),
-    ):
+    for ax, values in ((axes[0], e_p_m), (axes[1], e_q_deg)):
         seen = values[(pre | post) & np.isfinite(values)]
         if len(seen):
             ax.set_ylim(0.0, 1.15 * max(float(seen.max()), 1e-3))
@@ -297,8 +287,3 @@ def _timing(log: FlightLog) -> Figure | None:
     panes["late"].set_ylabel("ticks")
     figure.suptitle("Timing", fontsize=13, fontweight="bold", color=INK)
     return figure
-
-
-def _norm(rows: Array) -> Array:
-    out: Array = np.sqrt(np.sum(rows * rows, axis=1))
-    return out

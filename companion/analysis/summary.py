@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ def empty_summary(
         "payload_kg": payload_kg,
         "catch_t_s": None,
         "catch_confirmed": None,
-        "rms": {"pre": _rms(_NO_RMS), "post": _rms(_NO_RMS)},
+        "rms": {"pre": asdict(_NO_RMS), "post": asdict(_NO_RMS)},
         "impedance_error": {"position_n": None, "arm_nm": None},
         "final_e_z_m": None,
         "loop": {"rate_hz": None, "ticks": 0, "missed": 0, "lateness_ms": _spread(None)},
@@ -92,7 +93,7 @@ def summarise(
     summary.update(
         catch_t_s=None if caught is None else log.outputs[caught].mission_t_s,
         catch_confirmed=None if caught is None else metrics.unconfirmed_catch_index(log) is None,
-        rms={"pre": _rms(metrics.tracking_rms(log, pre)), "post": _rms(metrics.tracking_rms(log, post))},
+        rms={"pre": asdict(metrics.tracking_rms(log, pre)), "post": asdict(metrics.tracking_rms(log, post))},
         impedance_error={"position_n": position_n, "arm_nm": arm_nm},
         final_e_z_m=metrics.final_e_z_m(log),
         loop={
@@ -150,10 +151,6 @@ def write_summary(summary: dict[str, Any], path: Path) -> None:
         ValueError: a value is NaN or infinite.
     """
     path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _rms(rms: TrackingRms) -> dict[str, float | None]:
-    return {"e_p_m": rms.e_p_m, "e_q_deg": rms.e_q_deg, "e_alpha_deg": rms.e_alpha_deg}
 
 
 def _spread(spread: Percentiles | None) -> dict[str, float | None]:
