@@ -321,7 +321,7 @@ def _run(command: Command, report: Report) -> None:
                 encoding="utf-8",
                 errors="replace",
                 timeout=COMMAND_TIMEOUT_S,
-                env={**os.environ, "LC_ALL": "C", "RECORD_PATH": _TOOLS},
+                env={**os.environ, "LC_ALL": "C", "PATH": _TOOLS},
                 check=False,
             )
             if ended.returncode != 0:
