@@ -65,7 +65,6 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
     logged.
 
     Args:
-        log: log of the flight.
         summary: summary of the flight, with the payload's mass and the simulated world.
     """
     flying = np.flatnonzero([o.phase_kind in _FLYING for o in log.outputs])

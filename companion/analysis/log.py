@@ -60,7 +60,6 @@ class FlightLog:
         """Read a log.
 
         Args:
-            path: path of the file.
             ticks_max: keep about this many ticks, evenly spread (`stride`), and those with events; a tick takes about 8 kB of
                 memory. None keeps all, which a replay needs.
 

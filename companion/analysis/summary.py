@@ -67,9 +67,7 @@ def summarise(
     """Return the summary of one flight.
 
     Args:
-        log: the flight.
         outcome: completed, refused, aborted, crashed or lost, as determined by the launcher.
-        controller: control law.
         preset: name of the built-in or user's preset.
         payload_kg: true mass in SITL; None on hardware.
         recorder: the recorder's own report (samples, dropped, error); None to count from the log.

@@ -53,7 +53,6 @@ def plan(campaign: Campaign, console: Console | None) -> int:
     """Fly a sample spread evenly over the campaign and print the plan; no files are written.
 
     Args:
-        campaign: campaign to plan.
         console: where to print; None to print JSON instead.
 
     Returns:

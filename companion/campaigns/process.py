@@ -37,7 +37,6 @@ class CampaignProcess:
     """A running campaign in its own process group. As a context manager it ends the campaign and all of its workers.
 
     Args:
-        job: see `sitl.campaigns`.
         log: file for the campaign's standard error; deleted at the end if it is empty.
     """
 

@@ -152,7 +152,6 @@ def run(campaign: Campaign, out: Path, console: Console | None) -> int:
     """Fly the campaign, write its files into `out` and print its results.
 
     Args:
-        campaign: campaign to fly.
         out: an existing folder; stays empty if no flight ended.
         console: where to print the tables; None to print the rows and their summary as JSON instead.
 

@@ -28,7 +28,6 @@ def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | 
     """Add the options that all campaigns share.
 
     Args:
-        parser: parser of the command.
         one_law: whether the campaign flies a single control law; adds `--controller` and `--preset`.
         world: default of `--world`.
     """
@@ -129,7 +128,6 @@ def results_folder(arguments: argparse.Namespace, parent: str, result: str | Non
     """Yield the folder for the results: `--out`, or a new one under `parent`. Afterwards it is removed if nothing was written.
 
     Args:
-        arguments: parsed arguments.
         parent: folder of the new folder.
         result: as in `why_unusable`.
 
@@ -163,7 +161,6 @@ def why_unusable(folder: Path, result: str | None) -> str | None:
     """Create the folder if it does not exist. Return why results cannot be written into it, or None if they can.
 
     Args:
-        folder: folder for the results.
         result: name of the file by which earlier results are recognised; None to accept them.
     """
     try:

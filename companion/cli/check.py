@@ -66,13 +66,7 @@ Plans = Callable[[FlightConfig], list[str]]
 
 
 def run(arguments: argparse.Namespace, config: SitlConfig, problems: Plans) -> int:
-    """Run the command and return the exit code.
-
-    Args:
-        arguments: parsed arguments.
-        config: configuration loaded from them.
-        problems: returns the reasons why a mission cannot be flown.
-    """
+    """Run the command and return the exit code."""
     found = problems(config)
     if arguments.plan_only:
         return _plan_only(arguments, config, found)

@@ -112,11 +112,6 @@ def stream_rows(
     """Return the rows of a sensor that was recorded at rest.
 
     Args:
-        stream: counters of the stream.
-        samples: samples in order of time.
-        duration_s: duration of the observation.
-        vehicle: limits, and the tool whose weight the tare accounts for.
-        device: expected rate and range of the sensor.
         pose: attitude of the body and joint angles, rad; None if unknown, which omits the row on the tare.
     """
     if stream.lost is not None:

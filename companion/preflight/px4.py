@@ -37,7 +37,6 @@ def rows(firmware: str | None, params: Mapping[str, Value], vehicle: Vehicle) ->
     Args:
         firmware: text returned by `MavsdkAutopilot.firmware`; None to return no row on the firmware.
         params: PX4's parameters by name; parameters that PX4 does not have are absent.
-        vehicle: limits, room, thrust and the link's address.
     """
     found = [] if firmware is None else [firmware_row(firmware)]
     if not params:

@@ -199,7 +199,6 @@ def flights_table(rows: Sequence[Row], cases: Sequence[Case] = ()) -> Table:
     """Return a table with one line per flight: its result and the drawn values.
 
     Args:
-        rows: rows of the flights.
         cases: the cases that were flown, with the same names as their rows; empty for draws.
     """
 

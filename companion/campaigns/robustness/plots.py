@@ -22,13 +22,7 @@ BARS = 10
 
 
 def write_distribution(rows: Sequence[Row], title: str, path: Path) -> bool:
-    """Draw the plot; return False if no flight caught its payload and was completed.
-
-    Args:
-        rows: rows of all flights.
-        title: title of the plot.
-        path: PNG file.
-    """
+    """Draw the plot; return False if no flight caught its payload and was completed."""
     flown = graded(rows)
     if not flown:
         return False

@@ -65,8 +65,6 @@ def publish(result: Result, out: Path, console: Console | None) -> None:
     """Write the files of a result into a folder and print it.
 
     Args:
-        result: what to write.
-        out: an existing folder.
         console: where to print; None to print JSON instead.
     """
     file = out / CONTROLLER_FILE if result.better else None

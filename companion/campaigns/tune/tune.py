@@ -113,7 +113,6 @@ def run(tune: Tune, out: Path, console: Console | None) -> int:
     """Search, judge, write the results into `out` and print them; return the exit code.
 
     Args:
-        tune: what to search.
         out: an existing folder; if it has the flights of the same search, that search goes on.
         console: where to print; None to print JSON instead.
 

@@ -85,8 +85,6 @@ def fit_weight(empty_n: Vec3, loaded_n: Vec3, down_tip: Vec3, weight_kg: float, 
         empty_n: mean reading with the net empty, sensor frame.
         loaded_n: mean reading with the weight on the net, sensor frame.
         down_tip: gravity's direction in the frame of the arm's tip.
-        weight_kg: mass of the weight.
-        sensor_rpy_deg: the vehicle file's mounting.
     """
     mounted = _mounting(sensor_rpy_deg)
     measured = (loaded_n[0] - empty_n[0], loaded_n[1] - empty_n[1], loaded_n[2] - empty_n[2])

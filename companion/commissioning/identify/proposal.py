@@ -59,12 +59,7 @@ def _mean(quantities: list[Quantity]) -> float:
 
 
 def world_text(found: Identification, name: str) -> str:
-    """Return a world file: the laboratory with what was identified in place of its draws.
-
-    Args:
-        found: what the flight shows.
-        name: the log's name, for the comment.
-    """
+    """Return a world file: the laboratory with what was identified in place of its draws."""
     lab: dict[str, Any] = read_document(shipped_file("worlds", BASE)).data
     lines = [
         "# yaml-language-server: $schema=../schema/world.schema.json",

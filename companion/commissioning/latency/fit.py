@@ -108,7 +108,6 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
     """Measure the delay from one tap.
 
     Args:
-        tap: a tap that was found in `imu`.
         imu: samples in order of time.
         poses: poses in order of arrival.
         noise: noise of motion capture per axis, one sigma, m and rad (`mocap_noise`).

@@ -48,7 +48,6 @@ def alignment(result: HandResult, up_axis: str, start_yaw_rad: float) -> Alignme
     """Find the axes from a finished test.
 
     Args:
-        result: result of the test.
         up_axis: `devices.mocap.up_axis` during the test.
         start_yaw_rad: true yaw of the nose during the forward motion: the mission's start yaw.
     """

@@ -30,13 +30,7 @@ _ANSWERS_S: Final = 1.0
 
 
 def watcher(device: MocapDevice, clock: Clock, on_frame: Callable[[FrameSeen], None]) -> NatNetMocap:
-    """Return an unopened motion-capture driver that reports every rigid body of every frame and requires none.
-
-    Args:
-        device: addresses, transport, version.
-        clock: the flight clock.
-        on_frame: called with every frame in order of arrival.
-    """
+    """Return an unopened motion-capture driver that reports every rigid body of every frame and requires none."""
 
     def show(frame: Frame, datagram: bytes, arrived_s: float) -> None:
         bodies = (driver.client.other_body(datagram, number) for number in frame.body_ids)
@@ -60,7 +54,6 @@ async def discover(interface: str, command_port: int) -> dict[str, ServerInfo]:
 
     Args:
         interface: address of this computer in that segment; 0.0.0.0 for all segments.
-        command_port: NatNet's command port, 1510 unless changed in Motive.
     """
     found: dict[str, ServerInfo] = {}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:

@@ -86,8 +86,6 @@ class CommandSender:
     """Sends commands of one operator to any known vehicle.
 
     Args:
-        link: connection to the broker.
-        tracker: session and clock of each vehicle.
         signer: the operator, or why there is none.
     """
 
@@ -119,8 +117,6 @@ class CommandSender:
         or a new flight, ends the attempts.
 
         Args:
-            vehicle: name of the vehicle.
-            command: command to send.
             notify: called when an attempt is sent, and when one fails.
             hold: number of the hold that a RESUME ends, as the operator saw it; None for the hold of the newest message.
 

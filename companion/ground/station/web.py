@@ -81,7 +81,6 @@ class Monitor:
     """The web server.
 
     Args:
-        serving: address and TLS settings.
         hub: distributes messages to viewers; None for a replay.
         commands: sends commands; None for a replay.
         replay_logs: the logs of a replay.

@@ -68,7 +68,6 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
     """Return one row per property that the test measures.
 
     Args:
-        result: result of a finished test.
         up_axis: devices.mocap.up_axis, "y" or "z".
     """
     lift, forward, turn = result.lift, result.forward, result.turn
