@@ -32,15 +32,6 @@ yielded to.
 
 
 @dataclass(frozen=True, slots=True)
-class Percentiles:
-    """Percentiles of durations, ms."""
-
-    p50_ms: float
-    p99_ms: float
-    max_ms: float
-
-
-@dataclass(frozen=True, slots=True)
 class TrackingRms:
     """RMS of the error norms; None where nothing was measured."""
 
@@ -244,18 +235,12 @@ def missed_deadlines(log: FlightLog) -> int:
     return int((log.timing.lateness_s > log.timing.period_s).sum())
 
 
-def lateness(log: FlightLog) -> Percentiles | None:
-    """Return the delay of the ticks' starts after their deadlines."""
-    return percentiles(log.timing.lateness_s)
-
-
-def percentiles(durations_s: Array) -> Percentiles | None:
-    """Return p50, p99 and maximum in ms; None if there are no values."""
+def percentiles(durations_s: Array) -> dict[str, float | None]:
+    """Return `p50`, `p99` and `max` of durations in ms; each is None if there are no values."""
     known = durations_s[np.isfinite(durations_s)]
     if not len(known):
-        return None
-    p50, p99 = np.percentile(known, [50, 99])
-    return Percentiles(float(p50) * 1e3, float(p99) * 1e3, float(known.max()) * 1e3)
+        return {"p50": None, "p99": None, "max": None}
+    return {name: float(np.percentile(known, q)) * 1e3 for name, q in (("p50", 50), ("p99", 99), ("max", 100))}
 
 
 def slack_m(log: FlightLog) -> Array:

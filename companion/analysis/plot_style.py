@@ -76,6 +76,24 @@ def dress(ax: Any) -> None:
         label.set_size(9.5)
 
 
+def path_panes(figure: Figure) -> list[tuple[Any, int]]:
+    """Return the axes for a path seen from above (y over x) and from the side (z over x), and for each the index of its height."""
+    axes = figure.subplots(2, 1, sharex=True)
+    for ax, name, title in zip(axes, "yz", ("From above", "From the side"), strict=True):
+        dress(ax)
+        ax.set_ylabel(f"{name} [m]")
+        ax.set_title(title, loc="left", fontsize=10, color=INK)
+    axes[1].set_xlabel("x [m]")
+    return [(axes[0], 1), (axes[1], 2)]
+
+
+def scale_path(ax: Any, *values: Any) -> None:
+    """Scale the height of a pane to the values. It shows 0.6 m or more, so that noise of millimetres does not look large."""
+    low, high = np.nanmin(values), np.nanmax(values)
+    middle, half = (low + high) / 2, max(0.3, 0.62 * (high - low))
+    ax.set_ylim(middle - half, middle + half)
+
+
 def figure_legend(figure: Figure, title: str, handles: Sequence[Any], names: Sequence[str], columns: int) -> None:
     """Write the title and the legend above the axes; a `$` in a name is shown literally."""
     figure.legend(

@@ -25,6 +25,8 @@ from companion.analysis.plot_style import (
     SERIES_DARK,
     dress,
     new_figure,
+    path_panes,
+    scale_path,
     write_png,
 )
 from companion.analysis.time_axes import legend, line, stack
@@ -222,23 +224,15 @@ def _path(log: FlightLog) -> Figure | None:
     if not np.isfinite(flown).any():
         return None
     figure = new_figure(5.2)
-    axes = figure.subplots(2, 1, sharex=True)
+    panes = path_panes(figure)
     caught = metrics.catch_index(log)
-    for ax, row, name in ((axes[0], 1, "y"), (axes[1], 2, "z")):
-        dress(ax)
+    for ax, row in panes:
         ax.plot(wanted[:, 0], wanted[:, row], color=REFERENCE, lw=1.2, ls=DASHED, label="reference", zorder=3.5)
         ax.plot(flown[:, 0], flown[:, row], color=SERIES[0], lw=1.5, label="flown", zorder=3)
         if caught is not None:
             ax.plot(*flown[caught, [0, row]], "o", ms=7, mfc="white", mec=CATCH, mew=1.8, label="catch", zorder=4)
-        ax.set_ylabel(f"{name} [m]")
-        # A straight path gets margins, so that noise of millimetres does not look large.
-        low, high = np.nanmin([flown[:, row], wanted[:, row]]), np.nanmax([flown[:, row], wanted[:, row]])
-        middle, half = (low + high) / 2, max(0.3, 0.62 * (high - low))
-        ax.set_ylim(middle - half, middle + half)
-    axes[0].set_title("From above", loc="left", fontsize=10, color=INK)
-    axes[1].set_title("From the side", loc="left", fontsize=10, color=INK)
-    axes[1].set_xlabel("x [m]")
-    legend(axes[0], columns=3)
+        scale_path(ax, flown[:, row], wanted[:, row])
+    legend(panes[0][0], columns=3)
     figure.suptitle("Path", fontsize=13, fontweight="bold", color=INK)
     return figure
 
@@ -274,14 +268,15 @@ def _timing(log: FlightLog) -> Figure | None:
         ax.set_title(title, fontsize=10, color=INK)
         ax.set_xlabel("[ms]")
         spread = metrics.percentiles(values_s)
-        if spread is None:
+        p50_ms, p99_ms, max_ms = spread["p50"], spread["p99"], spread["max"]
+        if p50_ms is None or p99_ms is None:
             ax.text(0.5, 0.5, "not measured", ha="center", va="center", color=REFERENCE, transform=ax.transAxes)
             continue
-        end_ms = max(1.3 * spread.p99_ms, 0.1)
+        end_ms = max(1.3 * p99_ms, 0.1)
         ax.hist(np.minimum(1e3 * values_s, end_ms), bins=40, range=(0.0, end_ms), color=SERIES[0], alpha=0.85)
-        for value_ms, label, dash in ((spread.p50_ms, "p50", "-"), (spread.p99_ms, "p99", "--")):
+        for value_ms, label, dash in ((p50_ms, "p50", "-"), (p99_ms, "p99", "--")):
             ax.axvline(value_ms, color=CATCH, lw=1.2, ls=dash, label=f"{label} {value_ms:.2f} ms")
-        ax.plot([], [], " ", label=f"max {spread.max_ms:.2f} ms")
+        ax.plot([], [], " ", label=f"max {max_ms:.2f} ms")
         ax.set_ylim(top=1.45 * ax.get_ylim()[1])  # room for the legend
         legend(ax)
     panes["late"].set_ylabel("ticks")

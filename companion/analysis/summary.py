@@ -8,14 +8,17 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from companion.analysis import metrics
 from companion.analysis.contact import contact_summary
 from companion.analysis.log import FlightLog
-from companion.analysis.metrics import Percentiles, TrackingRms
+from companion.analysis.metrics import TrackingRms, percentiles
 
 STAGES = ("wait_for_joints", "core", "send", "whole", "bus_read", "bus_cycle")
 """Keys of `stages_ms`; the key NAME holds the percentiles of the field `NAME_s` of `companion.analysis.timing.Timing`."""
 _NO_RMS = TrackingRms(None, None, None)
+_NO_TIMES = percentiles(np.empty(0))
 
 
 def empty_summary(
@@ -38,9 +41,9 @@ def empty_summary(
         "rms": {"pre": asdict(_NO_RMS), "post": asdict(_NO_RMS)},
         "impedance_error": {"position_n": None, "arm_nm": None},
         "final_e_z_m": None,
-        "loop": {"rate_hz": None, "ticks": 0, "missed": 0, "lateness_ms": _spread(None)},
-        "latency_ms": {"mocap_to_setpoint": _spread(None), "joint_read_to_write": _spread(None)},
-        "stages_ms": {stage: _spread(None) for stage in STAGES},
+        "loop": {"rate_hz": None, "ticks": 0, "missed": 0, "lateness_ms": _NO_TIMES},
+        "latency_ms": {"mocap_to_setpoint": _NO_TIMES, "joint_read_to_write": _NO_TIMES},
+        "stages_ms": dict.fromkeys(STAGES, _NO_TIMES),
         "recorder": {
             "samples": recorder.get("samples", 0),
             "dropped": recorder.get("dropped", 0),
@@ -98,13 +101,13 @@ def summarise(
             "rate_hz": metrics.loop_rate_hz(log),
             "ticks": timing.last_tick - timing.first_tick + 1,
             "missed": metrics.missed_deadlines(log),
-            "lateness_ms": _spread(metrics.lateness(log)),
+            "lateness_ms": percentiles(timing.lateness_s),
         },
         latency_ms={
-            "mocap_to_setpoint": _spread(metrics.percentiles(timing.mocap_to_setpoint_s)),
-            "joint_read_to_write": _spread(metrics.percentiles(timing.joint_read_to_write_s)),
+            "mocap_to_setpoint": percentiles(timing.mocap_to_setpoint_s),
+            "joint_read_to_write": percentiles(timing.joint_read_to_write_s),
         },
-        stages_ms={stage: _spread(metrics.percentiles(getattr(timing, f"{stage}_s"))) for stage in STAGES},
+        stages_ms={stage: percentiles(getattr(timing, f"{stage}_s")) for stage in STAGES},
         events=_events(log),
         tether={"min_slack_m": metrics.min_slack_m(log)},
         contact=contact_summary(log),
@@ -149,12 +152,6 @@ def write_summary(summary: dict[str, Any], path: Path) -> None:
         ValueError: a value is NaN or infinite.
     """
     path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _spread(spread: Percentiles | None) -> dict[str, float | None]:
-    if spread is None:
-        return {"p50": None, "p99": None, "max": None}
-    return {"p50": spread.p50_ms, "p99": spread.p99_ms, "max": spread.max_ms}
 
 
 def _events(log: FlightLog) -> list[dict[str, Any]]:
