@@ -15,6 +15,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST
+
 STALL_TIMEOUT_S = 300.0
 """Time without a result after which a campaign is treated as hung; a flight takes seconds."""
 STOP_TIMEOUT_S = 3.0
@@ -31,6 +33,11 @@ class CampaignError(Exception):
         super().__init__(text)
         self.bad_input = bad_input
         """Whether the user's input is the cause; if so, nothing was flown."""
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of the command."""
+        return EXIT_BAD_INPUT if self.bad_input else EXIT_LOST
 
 
 class CampaignProcess:

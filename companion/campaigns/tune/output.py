@@ -13,7 +13,7 @@ from rich.console import Console
 from companion.analysis.page import Page, Picture, Section, write_page
 from companion.analysis.table import Column, Table, for_terminal, number, table
 from companion.campaigns.cost import TERMS, cost_of, flight_cost, terms_of
-from companion.campaigns.runner import counted, no_plots, to_json
+from companion.campaigns.runner import counted, no_plots, print_lines, to_json
 from companion.campaigns.tune.result import Gain, HeldOut, Result, completed, flown
 from companion.control.scaled_gains import controller_yaml as controller_file
 from companion.runtime.console import print_error
@@ -91,16 +91,14 @@ def publish(result: Result, out: Path, console: Console | None) -> None:
         sys.stdout.flush()
         return
     show(result, console, file)
-    console.print(f"report  {out / PAGE_FILE}", highlight=False, markup=False, soft_wrap=True)
+    print_lines(console, f"report  {out / PAGE_FILE}")
 
 
 def show(result: Result, console: Console, file: Path | None) -> None:
     """Print gains, costs, and the line that flies the gains."""
     for shown in (gains_table(result.gains), costs_table(result.judged)):
         console.print(for_terminal(shown), highlight=False)
-    lines = [result.verdict, *([] if file is None else [f"to fly it:  {result.fly_line(file)}"])]
-    for line in lines:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    print_lines(console, result.verdict, *([] if file is None else [f"to fly it:  {result.fly_line(file)}"]))
 
 
 def page(result: Result, pictures: Sequence[Picture]) -> Page:
