@@ -119,7 +119,7 @@ class Document:
                 del origins[known]
             origins[location] = origin
 
-    def refuse(self, location: Location, text: str, rank: int = RANK_VALUE) -> None:
+    def report(self, location: Location, text: str, rank: int = RANK_VALUE) -> None:
         """Add a problem with the value at a location."""
         self.problems.append(Problem(rank, self.origin(location), f"{key_path(location)}: {text}"))
 

@@ -191,14 +191,14 @@ def _read_urdf(document: Document) -> None:
         return  # not given, or not text: the check of the vehicle reports it
     origin = document.origin(location)
     if document.find(("arm", "links")) is not None:
-        document.refuse(location, "expected urdf or links, got both")
+        document.report(location, "expected urdf or links, got both")
         return
     folder = Path(document.source).parent if origin.line else Path()
     try:
         arm = read_urdf(Path(os.path.normpath(folder / name)), base, tip)
     except ConfigError as error:
         for line in error.lines:
-            document.refuse(location, line)
+            document.report(location, line)
         return
     for key, value in arm.items():
         document.replace(("arm", key), value, origin)
@@ -231,11 +231,11 @@ def _place_arm(document: Document, vehicle: Vehicle | None) -> None:
                 else:
                     text = f'the mission moves the arm to "{given}", but the vehicle has no arm; choose a mission without arm '
                     text += "motion, such as hover, or a vehicle with an arm"
-                document.refuse(place, text)
+                document.report(place, text)
             document.replace(place, list(poses_deg.get(given, ())), document.origin(place))
         elif isinstance(given, list) and vehicle is not None and len(given) != len(vehicle.arm.joints):
             text = f"expected {len(vehicle.arm.joints)} joint angles, as many as the vehicle has, got {len(given)}"
-            document.refuse(place, text)
+            document.report(place, text)
 
 
 def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:
@@ -277,11 +277,11 @@ def _check_controller(document: Document, overrides: list[Override], lines: list
         return _validated(LAWS[law], document, lines)
     expected = f"expected one of {', '.join(LAWS)}"
     if law is None:
-        document.refuse(("law",), f"missing; {expected}", RANK_MISSING)
+        document.report(("law",), f"missing; {expected}", RANK_MISSING)
     else:
         close = nearest(str(law), list(LAWS))
         hint = f" (did you mean {close}?)" if close else ""
-        document.refuse(("law",), f"{expected}, got {json.dumps(law)}{hint}")
+        document.report(("law",), f"{expected}, got {json.dumps(law)}{hint}")
     lines += problem_lines(document.problems)
     return None
 
