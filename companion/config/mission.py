@@ -169,8 +169,8 @@ class Slide(Model):
     """Way to the right and up in the surface, as seen from the vehicle, from where the tip is."""
     speed_m_s: ContactSpeed
     friction_max: Annotated[float, Field(ge=0, le=2)] = 0.8
-    """Largest coefficient of friction that the surface may have. It limits the force along the surface, for which the check looks for
-    reserves of the joints and of the rotors' yaw torque.
+    """Largest coefficient of friction that the surface may have. From it follows the largest force along the surface; the check of the
+    mission refuses a slide for which the joints or the rotors' yaw torque have too little reserve.
     """
 
     @model_validator(mode="after")

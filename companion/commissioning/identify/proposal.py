@@ -82,7 +82,7 @@ def world_text(found: Identification, name: str) -> str:
 
 
 _Found = dict[str, dict[str, tuple[Any, str]]]
-"""Value and remark by section and key of a world; a key of the world itself is a section with that one key."""
+"""Values of a world file, each with its remark, by section and key. A key outside of all sections has a section of its own name."""
 
 
 def _world(found: Identification, lab: Mapping[str, Any]) -> _Found:

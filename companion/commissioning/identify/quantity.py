@@ -25,7 +25,7 @@ class Quantity:
     value: float | None = None
     """None if this flight does not show the quantity."""
     sigma: float = 0.0
-    """Standard error: that of the fit, with correlated residuals, and that of what the method assumes."""
+    """Standard error, which combines the error of the fit (with correlated residuals) and that of the method's assumptions."""
     now: str = ""
     """What the vehicle file or the laboratory has now; empty if neither has such a key."""
     scale: float = 1.0
