@@ -20,7 +20,7 @@ from companion.model.observations import Observations
 from companion.model.types import MocapPose, Quat, Vec3, VehicleState
 from companion.preflight.axes import IDENTITY, MIRRORINGS, ROTATIONS, Y_UP, AxisMap
 from companion.preflight.checks import Check
-from companion.preflight.hand_test.motion import angle_rad, mean_attitude, mean_vector, norm, turned_rad
+from companion.preflight.hand_test.motion import angle_rad, mean_attitude, mean_vector, turned_rad
 
 HAND_TEST = Check(
     "frames.hand_test",
@@ -285,7 +285,7 @@ def _rest(poses: list[MocapPose], states: tuple[VehicleState, ...]) -> Row:
     moved_deg = math.degrees(
         turned_rad(mean_attitude([p.attitude_wxyz for p in first]), mean_attitude([p.attitude_wxyz for p in last]))
     )
-    rate_deg_s = math.degrees(norm(mean_vector([state.angular_rate_body_rad_s for state in states])))
+    rate_deg_s = math.degrees(math.hypot(*mean_vector([state.angular_rate_body_rad_s for state in states])))
     read = (
         f"moved by {1e3 * moved_m:.1f} mm and {moved_deg:.1f} deg during the observation, gyro {rate_deg_s:.1f} deg/s"
     )
@@ -311,7 +311,7 @@ def _noise(poses: list[MocapPose], at: Pose) -> Iterator[Row]:
 
 
 def _accelerometer(force_m_s2: Vec3) -> Row:
-    size = norm(force_m_s2)
+    size = math.hypot(*force_m_s2)
     read, wanted = f"{size:.2f} m/s2", f"{GRAVITY_M_S2:g} ± {GRAVITY_TOLERANCE_M_S2:g} m/s2"
     right = abs(size - GRAVITY_M_S2) <= GRAVITY_TOLERANCE_M_S2
     return ACCELEROMETER.row(right, read, wanted, "calibrate PX4's accelerometer")

@@ -25,7 +25,7 @@ from companion.model.frames import euler_zyx_from_quat, quat_conjugate, quat_fro
 from companion.model.types import ForceSample, Joints, Quat, Vec3
 from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
 from companion.preflight.checks import Check
-from companion.preflight.hand_test.motion import angle_rad, norm
+from companion.preflight.hand_test.motion import angle_rad
 
 STUCK = Check("ft.stuck", "force sensor alive", why="a stuck sensor reports plausible values and measures nothing")
 WEIGHT = Check("ft.weight", "known weight", why="scale and direction remain unknown")
@@ -93,7 +93,7 @@ def fit_weight(empty_n: Vec3, loaded_n: Vec3, down_tip: Vec3, weight_kg: float, 
     best = min(ROTATIONS, key=off_deg.__getitem__)
     if off_deg[IDENTITY] <= off_deg[best] + 1.0:
         best = IDENTITY
-    measured_n, expected_n = norm(measured), GRAVITY_M_S2 * weight_kg
+    measured_n, expected_n = math.hypot(*measured), GRAVITY_M_S2 * weight_kg
     return WeightFit(
         expected_n=expected_n,
         measured_n=measured_n,

@@ -14,7 +14,7 @@ from companion.model.frames import quat_rotate
 from companion.model.types import Vec3
 from companion.preflight.axes import ALL, IDENTITY, Y_UP, AxisMap
 from companion.preflight.checks import Check
-from companion.preflight.hand_test.motion import Motion, angle_rad, norm
+from companion.preflight.hand_test.motion import Motion, angle_rad
 from companion.preflight.hand_test.steps import HandResult
 
 _ASTRAY = "the controller would push in the wrong directions"
@@ -80,7 +80,7 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
     slant_deg = math.degrees(angle_rad(forward.response, forward.felt_m))
     felt_deg, seen_deg = (math.degrees(value) for value in (turn.felt_turn_rad[2], turn.seen_turn_rad[2]))
     axis_deg = math.degrees(angle_rad(turn.seen_turn_rad, turn.felt_turn_rad))
-    scales = (norm(lift.response), norm(forward.response))
+    scales = (math.hypot(*lift.response), math.hypot(*forward.response))
 
     far = "calibrate the motion-capture volume again (wand length), or the accelerometer if it reads wrong at rest"
     return [
@@ -212,7 +212,7 @@ def _explain(result: HandResult, up_axis: str) -> str:
 def _way(v: Vec3) -> str:
     """Return a displacement as text, such as "0.29 m forward"."""
     words = (("forward", "back"), ("left", "right"), ("up", "down"))
-    size = norm(v)
+    size = math.hypot(*v)
     parts = [
         f"{abs(part):.2f} m {pair[part < 0.0]}"
         for part, pair in zip(v, words, strict=True)
