@@ -160,7 +160,7 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
         if tool.device is None:
             print_error(error)
             return EXIT_REFUSED
-        report = Report([tool.device.bad(str(error), "", "")], tool.no_data)
+        report = Report([tool.device.bad(str(error))], tool.no_data)
     except Cancelled as end:
         print_error(f"companion {tool.name}: {end}")
         return EXIT_ABORTED

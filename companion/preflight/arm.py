@@ -128,7 +128,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         return
     failure = o.failures.get("arm")
     if failure is not None:
-        yield DEVICE.bad(failure, "", "")
+        yield DEVICE.bad(failure)
         return
     stated = o.arm_statement
     if stated is not None:

@@ -31,11 +31,11 @@ class Check:
         """Return a row that passes."""
         return self._row(True, read, wanted, "", self._level)
 
-    def bad(self, read: str, wanted: str, fix: str) -> Row:
+    def bad(self, read: str, wanted: str = "", fix: str = "") -> Row:
         """Return a row that fails and forbids take-off, or only warns the operator if `warns` is set."""
         return self._row(False, read, wanted, fix, self._level)
 
-    def doubtful(self, read: str, wanted: str, fix: str) -> Row:
+    def doubtful(self, read: str, wanted: str = "", fix: str = "") -> Row:
         """Return a row that warns; the operator decides."""
         return self._row(False, read, wanted, fix, Level.WARN)
 

@@ -93,7 +93,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     """Return the rows of PX4's telemetry."""
     failure = o.failures.get("autopilot")
     if failure is not None:
-        yield DEVICE.bad(failure, "", "")
+        yield DEVICE.bad(failure)
         return
     yield DEVICE.good(f"answers on {vehicle.devices.autopilot.address}")
     yield _heartbeat(o, vehicle)

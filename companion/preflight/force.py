@@ -89,11 +89,8 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         yield DEVICE.doubtful("none; a catch, a lost payload and a force on the empty net are not detected", "", fix)
         return
     failure, stream = o.failures.get("force"), o.force_stream
-    if failure is not None:
-        yield DEVICE.bad(failure, "", "")
-        return
-    if stream is None:
-        yield DEVICE.bad("not checked", "", "")
+    if failure is not None or stream is None:
+        yield DEVICE.bad(failure or "not checked")
         return
     pose = (o.vehicle[-1].attitude_wxyz, o.arm[-1].angle_rad) if o.vehicle and o.arm else None
     yield from stream_rows(stream, o.force, o.duration_s, vehicle, vehicle.devices.force, pose)

@@ -84,14 +84,11 @@ CLOCK_GOOD, WANDER_GOOD_S = 0.01, 0.020
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     """Return the rows of motion capture."""
     if vehicle.devices.mocap.external:
-        yield DEVICE.doubtful(NOT_CHECKED, "", "")
+        yield DEVICE.doubtful(NOT_CHECKED)
         return
     failure, stream = o.failures.get("mocap"), o.mocap_stream
-    if failure is not None:
-        yield DEVICE.bad(failure, "", "")
-        return
-    if stream is None:
-        yield DEVICE.bad("not checked", "", "")
+    if failure is not None or stream is None:
+        yield DEVICE.bad(failure or "not checked")
         return
     yield DEVICE.good(stream.application or "answers")
     yield _rate(o, stream, vehicle)
