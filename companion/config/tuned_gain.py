@@ -33,7 +33,7 @@ class TunedGain:
     scaled_as: str = ""
     """If `key` is a property: the key whose scaling with the vehicle the gain follows. Empty for `key` itself."""
     only_with: str = ""
-    """Key without whose value (0) the gain has no effect, so that it is not searched; empty for none."""
+    """Key of another setting; if that is 0, the gain has no effect and is not searched. Empty if there is no such setting."""
 
     @property
     def place(self) -> slice:

@@ -42,7 +42,7 @@ DIRECTION_MAX_DEG: Final = 8.0
 EXPLAINED_MAX_DEG: Final = 20.0
 """Largest remaining angle at which a rotation by multiples of 90 deg is accepted as the cause of a wrong direction."""
 APART_MIN_DEG: Final = 12.0
-"""Smallest difference between the remaining angles of the best and the second-best rotation at which the mounting counts as certain."""
+"""Smallest difference between the angle errors of the best and the second-best rotation with which the mounting counts as certain."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,8 @@ _SIGMAS = (math.inf, 0.15, 0.05, math.radians(2.0), 0.4, 0.06, 0.05, 0.3)
 such as that of the downwash, and in m the lever of a payload that hangs beside the centre of the net.
 """
 _CONSTANT_SHARE = 0.11
-"""Standard error, relative, that no flight shows: masses and centres of mass of the vehicle file, downwash on the arm."""
+"""Relative standard error due to causes that cannot be seen in a flight: errors of the vehicle file's masses and centres of mass, and
+downwash on the arm."""
 _FRICTION_SHARE, _FRICTION_SIGMA_NM = 0.08, 0.012
 _CONSTANT_SIGMA_MAX = 0.17
 _FRICTION_SIGMA_MAX_NM = 0.06
