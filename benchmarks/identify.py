@@ -61,7 +61,7 @@ _WITHOUT_NOISE = ("payload_kg", "mocap_noise_m", "mocap_noise_deg", "gyro_noise_
 
 @dataclass(frozen=True)
 class Flown:
-    """One laboratory: what was found, and the truth by the same keys."""
+    """One laboratory: what was identified, and the truth by the same keys."""
 
     seed: int
     found: Identification

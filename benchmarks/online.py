@@ -45,11 +45,12 @@ class Flight:
     laps_mm: tuple[float, ...]
     """RMS ||e_p|| of each repetition."""
     shaking_rad_s: tuple[float, ...]
-    """RMS of the tilting rate, likewise."""
+    """RMS of the rate of roll and pitch in each repetition."""
     lowest: float
+    """Smallest scale of the impedance."""
     highest: float
     last: float
-    """Of the scale."""
+    """Scale at the end."""
 
 
 def configured(seed: int, k: float, online: dict[str, Any] | None, repeat: int, sets: Sequence[str]) -> SitlConfig:

@@ -18,6 +18,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -141,7 +142,7 @@ def _modes_of(folder: Path) -> str:
     except LogError:
         return ""
     flown = [status.mode.name for status in statuses if status is not None and status.armed]
-    return ", ".join(mode for i, mode in enumerate(flown) if i == 0 or mode != flown[i - 1])
+    return ", ".join(mode for mode, _ in groupby(flown))
 
 
 def _after_fault_of_the_stub(witness: dict[str, Any]) -> dict[str, Any]:
@@ -160,12 +161,16 @@ def _after_fault_of_the_stub(witness: dict[str, Any]) -> dict[str, Any]:
 Cell = Callable[[Sequence[Row]], str]
 
 
+def _count(rows: Sequence[Row]) -> str:
+    return f"{sum(row.as_it_must for row in rows)} of {len(rows)}"
+
+
 def _spread_of(key: str, digits: int, scale: float = 1.0) -> Cell:
     return lambda rows: _spread([getattr(row, key) for row in rows], scale, digits)
 
 
 FLIGHT_COLUMNS: dict[str, Cell] = {
-    "ended as it must": lambda rows: _count(rows),
+    "ended as it must": _count,
     "e_p before the catch, mm": _spread_of("e_p_before_m", 1, 1e3),
     "after it, mm": _spread_of("e_p_m", 1, 1e3),
     "e_q, deg": _spread_of("e_q_deg", 2),
@@ -175,7 +180,7 @@ FLIGHT_COLUMNS: dict[str, Cell] = {
     "modes": lambda rows: " / ".join(sorted({row.modes for row in rows})),
 }
 FAULT_COLUMNS: dict[str, Cell] = {
-    "ended as it must": lambda rows: _count(rows),
+    "ended as it must": _count,
     "last setpoint, s": _spread_of("last_setpoint_s", 3),
     "longest gap in vision, s": _spread_of("vision_gap_s", 3),
     "next mode": lambda rows: " / ".join(sorted({row.mode or "-" for row in rows})),
@@ -201,10 +206,6 @@ def markdown(rows: Sequence[Row]) -> str:
                     cells = (case.name, autopilot, *(cell(some) for cell in columns.values()))
                     lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
-
-
-def _count(rows: Sequence[Row]) -> str:
-    return f"{sum(row.as_it_must for row in rows)} of {len(rows)}"
 
 
 def _spread(values: Sequence[float | None], scale: float, digits: int) -> str:

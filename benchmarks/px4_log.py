@@ -10,6 +10,7 @@ import math
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -130,8 +131,7 @@ class Px4Log:
 
     def modes(self) -> str:
         """Return the modes in order, such as `OFFBOARD, LAND`."""
-        flown = [change.mode for change in self.changes if change.armed]
-        return ", ".join(mode for i, mode in enumerate(flown) if i == 0 or mode != flown[i - 1])
+        return ", ".join(mode for mode, _ in groupby(change.mode for change in self.changes if change.armed))
 
 
 def newest(flight: Path) -> Path:

@@ -65,7 +65,6 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
     logged.
 
     Args:
-        log: log of the flight.
         summary: summary of the flight, with the payload's mass and the simulated world.
     """
     flying = np.flatnonzero([o.phase_kind in _FLYING for o in log.outputs])
@@ -195,15 +194,9 @@ def _throw_velocity_m_s(log: FlightLog, summary: dict[str, Any]) -> Array | None
 
 def _labels(log: FlightLog, k: int, mission_s: float, speed: float) -> list[Shape]:
     at = np.array([[16.0, 24.0]])
-    pace = (
-        "real time"
-        if abs(speed - 1) < 0.05
-        else "¼ speed"
-        if speed < 1
-        else f"{speed:.1f}× speed"
-        if speed < 1.95
-        else f"{speed:.0f}× speed"
-    )
+    pace = "¼ speed" if speed < 1 else f"{speed:.{1 if speed < 1.95 else 0}f}× speed"
+    if abs(speed - 1) < 0.05:
+        pace = "real time"
     return [
         Shape(at, INK, 18.0, text=log.outputs[k].phase, align="left"),
         Shape(at + np.array([0.0, 24.0]), _SOFT, 14.0, text=f"t = {mission_s:.2f} s", align="left"),
@@ -214,14 +207,15 @@ def _labels(log: FlightLog, k: int, mission_s: float, speed: float) -> list[Shap
 def _plots(log: FlightLog, mission_s: Array, ticks: slice, caught: int | None) -> tuple[list[Shape], list[Shape]]:
     """Return the axes and the curves of position error and arm error, or attitude error without an arm."""
     scaled = np.array([o.phase_kind in (PhaseKind.TAKEOFF, PhaseKind.FLIGHT) for o in log.outputs])
-    arm = np.degrees(_norm(log.columns.arm_rad - log.columns.arm_reference_rad))
+    arm = np.degrees(np.linalg.norm(metrics.arm_error_rad(log), axis=1))
     axes: list[Shape] = [Shape(np.array([[_SPLIT_PX, 0.0], [_SPLIT_PX, HEIGHT]]), _GRID, 1.0)]
     curves: list[Shape] = []
     t_s = mission_s[ticks]
-    attitude = np.degrees(_norm(metrics.attitude_error_rad(log)))
+    attitude = np.degrees(np.linalg.norm(metrics.attitude_error_rad(log), axis=1))
+    position_cm = 100.0 * np.linalg.norm(metrics.position_error_m(log), axis=1)
     below = ("arm error [deg]", arm, LINK) if log.joint_count else ("attitude error [deg]", attitude, LINK)
     for (top, bottom), name, values, colour in (
-        (_PLOTS_Y[0], "position error [cm]", 100.0 * _norm(metrics.position_error_m(log)), FRONT),
+        (_PLOTS_Y[0], "position error [cm]", position_cm, FRONT),
         (_PLOTS_Y[1], *below),
     ):
         seen = values[scaled & np.isfinite(values)]
@@ -257,11 +251,6 @@ def _round_up(value: float) -> float:
     """Round up to 1, 2, 3, 4, 6, 8 or 10 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(max(value, 1e-6)))
     return next(step * power for step in (1, 2, 3, 4, 6, 8, 10) if step * power >= value)
-
-
-def _norm(rows: Array) -> Array:
-    out: Array = np.sqrt(np.sum(rows * rows, axis=1))
-    return out
 
 
 # Output

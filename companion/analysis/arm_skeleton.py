@@ -15,7 +15,6 @@ def pose(arm: ArmSkeleton, arm_rad: Array) -> tuple[Array, Array]:
     """Return the arm at the given angles.
 
     Args:
-        arm: joints and links.
         arm_rad: joint angles, shape (N, joints).
 
     Returns:

@@ -60,7 +60,6 @@ class FlightLog:
         """Read a log.
 
         Args:
-            path: path of the file.
             ticks_max: keep about this many ticks, evenly spread (`stride`), and those with events; a tick takes about 8 kB of
                 memory. None keeps all, which a replay needs.
 
@@ -95,14 +94,11 @@ class FlightLog:
             raise LogError(f"{path}: an MCAP file, but not a flight log: it has no 'companion' metadata record")
         if not rows.whole():
             raise LogError(f"{path}: damaged: /inputs, /outputs and /sent hold different ticks")
-        inputs = tuple(row[0] for row in rows.kept)
-        outputs = tuple(row[1] for row in rows.kept)
-        sent = tuple(row[2] for row in rows.kept)
         return FlightLog(
             path=path,
-            inputs=inputs,
-            outputs=outputs,
-            sent=sent,
+            inputs=tuple(row[0] for row in rows.kept),
+            outputs=tuple(row[1] for row in rows.kept),
+            sent=tuple(row[2] for row in rows.kept),
             metadata=metadata,
             closed=closed,
             stride=rows.stride,

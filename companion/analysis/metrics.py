@@ -15,7 +15,7 @@ from companion.analysis.log import Array, FlightLog
 from companion.control.sensing import CatchDetector, ObservedCatchDetector
 from companion.model.arm_skeleton import logged_skeleton
 from companion.model.best_pose import best_pose
-from companion.model.frames import quat_rotate
+from companion.model.frames import quat_conjugate, quat_rotate
 from companion.model.types import PhaseKind
 
 Mask = npt.NDArray[np.bool_]
@@ -29,15 +29,6 @@ DESIRED_FORCE_TIME_S = 0.5
 """Time constant with which the desired force F_d follows the measured force, so that a lasting load is carried rather than
 yielded to.
 """
-
-
-@dataclass(frozen=True, slots=True)
-class Percentiles:
-    """Percentiles of durations, ms."""
-
-    p50_ms: float
-    p99_ms: float
-    max_ms: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,12 +192,9 @@ def _joint_torque_error_nm(log: FlightLog, used: Mask, period_s: float) -> Array
     for n, sample in enumerate(force):
         passing[n] = sample - lasting
         lasting = lasting + k * passing[n]
-    quats = log.column(lambda i, o, s: i.vehicle.attitude_wxyz if i.vehicle else None, 4)[used]
-    w, x, y, z = quats.T
-    body_x = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
-    body_y = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1)
-    body_z = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
-    force_body = np.stack([(passing * axis).sum(axis=1) for axis in (body_x, body_y, body_z)], axis=1)
+    quats = log.column(lambda i, o, s: i.vehicle.attitude_wxyz if i.vehicle else None, 4)[used].tolist()
+    turned = zip(quats, passing.tolist(), strict=True)
+    force_body = np.array([quat_rotate(quat_conjugate(q), tuple(one)) for q, one in turned]).reshape(-1, 3)
     points, axes = pose(skeleton, log.columns.arm_rad[used])
     torques = [(np.cross(axes[:, j], points[:, -1] - points[:, j]) * force_body).sum(axis=1) for j in range(joints)]
     return np.stack(torques, axis=1) if torques else np.zeros((len(force_body), 0))
@@ -247,18 +235,12 @@ def missed_deadlines(log: FlightLog) -> int:
     return int((log.timing.lateness_s > log.timing.period_s).sum())
 
 
-def lateness(log: FlightLog) -> Percentiles | None:
-    """Return the delay of the ticks' starts after their deadlines."""
-    return percentiles(log.timing.lateness_s)
-
-
-def percentiles(durations_s: Array) -> Percentiles | None:
-    """Return p50, p99 and maximum in ms; None if there are no values."""
+def percentiles(durations_s: Array) -> dict[str, float | None]:
+    """Return `p50`, `p99` and `max` of durations in ms; each is None if there are no values."""
     known = durations_s[np.isfinite(durations_s)]
     if not len(known):
-        return None
-    p50, p99 = np.percentile(known, [50, 99])
-    return Percentiles(float(p50) * 1e3, float(p99) * 1e3, float(known.max()) * 1e3)
+        return {"p50": None, "p99": None, "max": None}
+    return {name: float(np.percentile(known, q)) * 1e3 for name, q in (("p50", 50), ("p99", 99), ("max", 100))}
 
 
 def slack_m(log: FlightLog) -> Array:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import matplotlib
 import numpy as np
@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
+_T = TypeVar("_T")
 DPI = 150
 WIDTH_IN = 9.0
 INK = "#22303c"
@@ -44,6 +45,23 @@ def write_svg(figure: Figure, path: Path) -> None:
         FigureCanvasSVG(figure).print_svg(path, metadata={"Date": None, "Creator": None})
 
 
+def panels(axes: Any, items: Sequence[_T]) -> Iterator[tuple[Any, _T]]:
+    """Yield each item with the axes that show it, and hide the axes that are left over."""
+    for place, ax in enumerate(axes.flat):
+        if place < len(items):
+            yield ax, items[place]
+        else:
+            ax.set_visible(False)
+
+
+def label_lowest(axes: Any, count: int, label: str) -> None:
+    """Label the x axis of the lowest used panel of each column, if the grid of shared axes holds `count` panels."""
+    columns = axes.shape[1]
+    for ax in list(axes.flat)[max(0, count - columns) : count]:
+        ax.tick_params(labelbottom=True)
+        ax.set_xlabel(label)
+
+
 def dress(ax: Any) -> None:
     """Draw the grid behind the data, only the left and lower axes, and small labels."""
     ax.grid(True, color="#e6eaee", lw=0.7)
@@ -56,6 +74,24 @@ def dress(ax: Any) -> None:
     for label in (ax.xaxis.label, ax.yaxis.label):
         label.set_color(INK)
         label.set_size(9.5)
+
+
+def path_panes(figure: Figure) -> list[tuple[Any, int]]:
+    """Return the axes for a path seen from above (y over x) and from the side (z over x), and for each the index of its height."""
+    axes = figure.subplots(2, 1, sharex=True)
+    for ax, name, title in zip(axes, "yz", ("From above", "From the side"), strict=True):
+        dress(ax)
+        ax.set_ylabel(f"{name} [m]")
+        ax.set_title(title, loc="left", fontsize=10, color=INK)
+    axes[1].set_xlabel("x [m]")
+    return [(axes[0], 1), (axes[1], 2)]
+
+
+def scale_path(ax: Any, *values: Any) -> None:
+    """Scale the height of a pane to the values. It shows 0.6 m or more, so that noise of millimetres does not look large."""
+    low, high = np.nanmin(values), np.nanmax(values)
+    middle, half = (low + high) / 2, max(0.3, 0.62 * (high - low))
+    ax.set_ylim(middle - half, middle + half)
 
 
 def figure_legend(figure: Figure, title: str, handles: Sequence[Any], names: Sequence[str], columns: int) -> None:

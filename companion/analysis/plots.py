@@ -6,7 +6,6 @@ Needs matplotlib (extra `analysis`). The flight process never imports this modul
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,8 @@ from matplotlib.figure import Figure
 
 from companion.analysis import metrics
 from companion.analysis.contact_plots import contact_force, contact_path, found_surface, has_contact
-from companion.analysis.log import Array, FlightLog
+from companion.analysis.log import FlightLog
+from companion.analysis.page import Picture
 from companion.analysis.plot_style import (
     CATCH,
     DASHED,
@@ -25,6 +25,8 @@ from companion.analysis.plot_style import (
     SERIES_DARK,
     dress,
     new_figure,
+    path_panes,
+    scale_path,
     write_png,
 )
 from companion.analysis.time_axes import legend, line, stack
@@ -34,16 +36,7 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import tilt_rad
 
 
-@dataclass(frozen=True, slots=True)
-class Plot:
-    """A plot that was written."""
-
-    path: Path
-    title: str
-    caption: str
-
-
-def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
+def write_plots(log: FlightLog, out_dir: Path) -> list[Picture]:
     """Write every plot for which the log has data, as PNG into `out_dir`."""
     if not log.inputs:
         return []
@@ -95,13 +88,13 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Plot]:
             _timing,
         ),
     )
-    written: list[Plot] = []
+    written: list[Picture] = []
     for name, title, caption, make in makers:
         figure = make(log)
         if figure is not None:
             path = out_dir / f"{name}.png"
             write_png(figure, path)
-            written.append(Plot(path, title, caption))
+            written.append(Picture(path, title, caption))
     return written
 
 
@@ -109,18 +102,17 @@ def _tracking(log: FlightLog) -> Figure | None:
     joints = log.joint_count
     title = "Tracking errors and arm" if joints else "Tracking errors"
     figure, axes, t = stack(log, title, (1.0, 1.0, *((1.25,) if joints else ())), 6.8 if joints else 4.8)
-    line(axes[0], t, _norm(metrics.position_error_m(log)), r"$\|e_p\|$", SERIES[0])
+    e_p_m = np.linalg.norm(metrics.position_error_m(log), axis=1)
+    e_q_deg = np.degrees(np.linalg.norm(metrics.attitude_error_rad(log), axis=1))
+    line(axes[0], t, e_p_m, r"$\|e_p\|$", SERIES[0])
     line(axes[0], t, log.column(lambda i, o, s: o.mocap_innovation_m or None), "motion capture against IMU", SERIES[1])
     legend(axes[0], columns=2)
-    line(axes[1], t, np.degrees(_norm(metrics.attitude_error_rad(log))), r"$\|e_q\|$", SERIES[0])
+    line(axes[1], t, e_q_deg, r"$\|e_q\|$", SERIES[0])
     axes[0].set_ylabel("position error [m]")
     axes[1].set_ylabel("attitude error [deg]")
     pre, post = metrics.flight_masks(log)
     # The take-off's transient would hide the flight itself.
-    for ax, values in (
-        (axes[0], _norm(metrics.position_error_m(log))),
-        (axes[1], np.degrees(_norm(metrics.attitude_error_rad(log)))),
-    ):
+    for ax, values in ((axes[0], e_p_m), (axes[1], e_q_deg)):
         seen = values[(pre | post) & np.isfinite(values)]
         if len(seen):
             ax.set_ylim(0.0, 1.15 * max(float(seen.max()), 1e-3))
@@ -232,23 +224,15 @@ def _path(log: FlightLog) -> Figure | None:
     if not np.isfinite(flown).any():
         return None
     figure = new_figure(5.2)
-    axes = figure.subplots(2, 1, sharex=True)
+    panes = path_panes(figure)
     caught = metrics.catch_index(log)
-    for ax, row, name in ((axes[0], 1, "y"), (axes[1], 2, "z")):
-        dress(ax)
+    for ax, row in panes:
         ax.plot(wanted[:, 0], wanted[:, row], color=REFERENCE, lw=1.2, ls=DASHED, label="reference", zorder=3.5)
         ax.plot(flown[:, 0], flown[:, row], color=SERIES[0], lw=1.5, label="flown", zorder=3)
         if caught is not None:
             ax.plot(*flown[caught, [0, row]], "o", ms=7, mfc="white", mec=CATCH, mew=1.8, label="catch", zorder=4)
-        ax.set_ylabel(f"{name} [m]")
-        # A straight path gets margins, so that noise of millimetres does not look large.
-        low, high = np.nanmin([flown[:, row], wanted[:, row]]), np.nanmax([flown[:, row], wanted[:, row]])
-        middle, half = (low + high) / 2, max(0.3, 0.62 * (high - low))
-        ax.set_ylim(middle - half, middle + half)
-    axes[0].set_title("From above", loc="left", fontsize=10, color=INK)
-    axes[1].set_title("From the side", loc="left", fontsize=10, color=INK)
-    axes[1].set_xlabel("x [m]")
-    legend(axes[0], columns=3)
+        scale_path(ax, flown[:, row], wanted[:, row])
+    legend(panes[0][0], columns=3)
     figure.suptitle("Path", fontsize=13, fontweight="bold", color=INK)
     return figure
 
@@ -284,21 +268,17 @@ def _timing(log: FlightLog) -> Figure | None:
         ax.set_title(title, fontsize=10, color=INK)
         ax.set_xlabel("[ms]")
         spread = metrics.percentiles(values_s)
-        if spread is None:
+        p50_ms, p99_ms, max_ms = spread["p50"], spread["p99"], spread["max"]
+        if p50_ms is None or p99_ms is None:
             ax.text(0.5, 0.5, "not measured", ha="center", va="center", color=REFERENCE, transform=ax.transAxes)
             continue
-        end_ms = max(1.3 * spread.p99_ms, 0.1)
+        end_ms = max(1.3 * p99_ms, 0.1)
         ax.hist(np.minimum(1e3 * values_s, end_ms), bins=40, range=(0.0, end_ms), color=SERIES[0], alpha=0.85)
-        for value_ms, label, dash in ((spread.p50_ms, "p50", "-"), (spread.p99_ms, "p99", "--")):
+        for value_ms, label, dash in ((p50_ms, "p50", "-"), (p99_ms, "p99", "--")):
             ax.axvline(value_ms, color=CATCH, lw=1.2, ls=dash, label=f"{label} {value_ms:.2f} ms")
-        ax.plot([], [], " ", label=f"max {spread.max_ms:.2f} ms")
+        ax.plot([], [], " ", label=f"max {max_ms:.2f} ms")
         ax.set_ylim(top=1.45 * ax.get_ylim()[1])  # room for the legend
         legend(ax)
     panes["late"].set_ylabel("ticks")
     figure.suptitle("Timing", fontsize=13, fontweight="bold", color=INK)
     return figure
-
-
-def _norm(rows: Array) -> Array:
-    out: Array = np.sqrt(np.sum(rows * rows, axis=1))
-    return out

@@ -11,7 +11,7 @@ from typing import Any
 from companion.analysis.animation import movie_of, player_html
 from companion.analysis.contact import rotor_distance_m, surface_error, true_force_n
 from companion.analysis.log import FlightLog
-from companion.analysis.page import Page, Picture, Section, write_page
+from companion.analysis.page import Page, Section, write_page
 from companion.analysis.plots import write_plots
 from companion.analysis.summary import effective_config, world_text
 from companion.analysis.table import Cell, Column, Table, table
@@ -20,7 +20,7 @@ from companion.model.types import Outcome, SafetyAction
 
 def write_report(log: FlightLog, summary: dict[str, Any], out_dir: Path) -> Path:
     """Write the plots as PNG and report.html into `out_dir`; return the path of report.html."""
-    plots = [Picture(plot.path, plot.title, plot.caption) for plot in write_plots(log, out_dir)]
+    plots = write_plots(log, out_dir)
     config, movie = effective_config(log, summary), movie_of(log, summary)
     catches = summary["catch_t_s"] is not None or (log.config.get("mission") or {}).get("catch") is not None
     payload_kg = summary["payload_kg"] if catches else None

@@ -68,7 +68,6 @@ class Camera:
             target_m: world point in the middle of the frame.
             yaw_rad: horizontal direction of view, measured from world x.
             pitch_rad: angle of the view below the horizon.
-            distance_m: distance from the eye to the target.
             size_px: width and height of the frame; its height covers `VIEW_M` at the target.
         """
         cy, sy, cp, sp = math.cos(yaw_rad), math.sin(yaw_rad), math.cos(pitch_rad), math.sin(pitch_rad)

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from companion.analysis import metrics
 from companion.analysis.contact import contact_summary
 from companion.analysis.log import FlightLog
-from companion.analysis.metrics import Percentiles, TrackingRms
+from companion.analysis.metrics import TrackingRms, percentiles
 
 STAGES = ("wait_for_joints", "core", "send", "whole", "bus_read", "bus_cycle")
 """Keys of `stages_ms`; the key NAME holds the percentiles of the field `NAME_s` of `companion.analysis.timing.Timing`."""
 _NO_RMS = TrackingRms(None, None, None)
+_NO_TIMES = percentiles(np.empty(0))
 
 
 def empty_summary(
@@ -34,12 +38,12 @@ def empty_summary(
         "payload_kg": payload_kg,
         "catch_t_s": None,
         "catch_confirmed": None,
-        "rms": {"pre": _rms(_NO_RMS), "post": _rms(_NO_RMS)},
+        "rms": {"pre": asdict(_NO_RMS), "post": asdict(_NO_RMS)},
         "impedance_error": {"position_n": None, "arm_nm": None},
         "final_e_z_m": None,
-        "loop": {"rate_hz": None, "ticks": 0, "missed": 0, "lateness_ms": _spread(None)},
-        "latency_ms": {"mocap_to_setpoint": _spread(None), "joint_read_to_write": _spread(None)},
-        "stages_ms": {stage: _spread(None) for stage in STAGES},
+        "loop": {"rate_hz": None, "ticks": 0, "missed": 0, "lateness_ms": _NO_TIMES},
+        "latency_ms": {"mocap_to_setpoint": _NO_TIMES, "joint_read_to_write": _NO_TIMES},
+        "stages_ms": dict.fromkeys(STAGES, _NO_TIMES),
         "recorder": {
             "samples": recorder.get("samples", 0),
             "dropped": recorder.get("dropped", 0),
@@ -66,9 +70,7 @@ def summarise(
     """Return the summary of one flight.
 
     Args:
-        log: the flight.
         outcome: completed, refused, aborted, crashed or lost, as determined by the launcher.
-        controller: control law.
         preset: name of the built-in or user's preset.
         payload_kg: true mass in SITL; None on hardware.
         recorder: the recorder's own report (samples, dropped, error); None to count from the log.
@@ -92,20 +94,20 @@ def summarise(
     summary.update(
         catch_t_s=None if caught is None else log.outputs[caught].mission_t_s,
         catch_confirmed=None if caught is None else metrics.unconfirmed_catch_index(log) is None,
-        rms={"pre": _rms(metrics.tracking_rms(log, pre)), "post": _rms(metrics.tracking_rms(log, post))},
+        rms={"pre": asdict(metrics.tracking_rms(log, pre)), "post": asdict(metrics.tracking_rms(log, post))},
         impedance_error={"position_n": position_n, "arm_nm": arm_nm},
         final_e_z_m=metrics.final_e_z_m(log),
         loop={
             "rate_hz": metrics.loop_rate_hz(log),
             "ticks": timing.last_tick - timing.first_tick + 1,
             "missed": metrics.missed_deadlines(log),
-            "lateness_ms": _spread(metrics.lateness(log)),
+            "lateness_ms": percentiles(timing.lateness_s),
         },
         latency_ms={
-            "mocap_to_setpoint": _spread(metrics.percentiles(timing.mocap_to_setpoint_s)),
-            "joint_read_to_write": _spread(metrics.percentiles(timing.joint_read_to_write_s)),
+            "mocap_to_setpoint": percentiles(timing.mocap_to_setpoint_s),
+            "joint_read_to_write": percentiles(timing.joint_read_to_write_s),
         },
-        stages_ms={stage: _spread(metrics.percentiles(getattr(timing, f"{stage}_s"))) for stage in STAGES},
+        stages_ms={stage: percentiles(getattr(timing, f"{stage}_s")) for stage in STAGES},
         events=_events(log),
         tether={"min_slack_m": metrics.min_slack_m(log)},
         contact=contact_summary(log),
@@ -150,16 +152,6 @@ def write_summary(summary: dict[str, Any], path: Path) -> None:
         ValueError: a value is NaN or infinite.
     """
     path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _rms(rms: TrackingRms) -> dict[str, float | None]:
-    return {"e_p_m": rms.e_p_m, "e_q_deg": rms.e_q_deg, "e_alpha_deg": rms.e_alpha_deg}
-
-
-def _spread(spread: Percentiles | None) -> dict[str, float | None]:
-    if spread is None:
-        return {"p50": None, "p99": None, "max": None}
-    return {"p50": spread.p50_ms, "p99": spread.p99_ms, "max": spread.max_ms}
 
 
 def _events(log: FlightLog) -> list[dict[str, Any]]:

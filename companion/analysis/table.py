@@ -84,9 +84,6 @@ def table(
     """Return a table of items.
 
     Args:
-        columns: columns of the table.
-        items: items, one per row.
-        title: title above the table.
         kind: returns the kind of an item's row, a key of `STYLES` or empty.
         group: returns the group of an item; a rule separates neighbouring groups.
         folded: see `Table.folded`.

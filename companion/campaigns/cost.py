@@ -40,11 +40,14 @@ TERMS = (
     ),
     Term("torque_activity_nm", 0.5, "m/(N m)", "RMS change of the joint torques from tick to tick"),
 )
-COMPLETED_MAX, MISSED, ABORTED, LOST = 1.0, 0.3, 1.0, 2.0
-"""Largest cost of a completed flight, what a missed payload adds, and the costs of a flight that was aborted, and of one that crashed,
-was lost or ended by an error."""
+COMPLETED_MAX = 1.0
+"""Largest cost of a completed flight, before `MISSED` is added."""
+MISSED = 0.3
+"""Additional cost of a flight that missed its payload."""
+ABORTED, LOST = 1.0, 2.0
+"""Cost of an aborted flight; cost of a flight that crashed, was lost or ended by an error."""
 WORST_SHARE, WORST_WEIGHT = 0.25, 0.5
-"""Share of the flights that count as the worst, and the weight of their mean."""
+"""Fraction of the flights that count as the worst, and the weight of their mean."""
 
 
 def terms_of(row: Row) -> dict[str, float]:

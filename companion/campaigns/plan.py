@@ -12,7 +12,7 @@ from statistics import mean, stdev
 from rich.console import Console
 
 from companion.campaigns.process import Message
-from companion.campaigns.runner import Campaign, fly, to_json
+from companion.campaigns.runner import Campaign, fly, print_lines, to_json
 from companion.model.exit_codes import EXIT_LOST, EXIT_OK
 from companion.runtime.console import print_error
 
@@ -53,7 +53,6 @@ def plan(campaign: Campaign, console: Console | None) -> int:
     """Fly a sample spread evenly over the campaign and print the plan; no files are written.
 
     Args:
-        campaign: campaign to plan.
         console: where to print; None to print JSON instead.
 
     Returns:
@@ -77,8 +76,9 @@ def plan(campaign: Campaign, console: Console | None) -> int:
 
 
 def _show(found: Plan, scheduler: str | None, console: Console) -> None:
-    where = "on this computer" if scheduler is None else f"on the workers of {scheduler}"
-    lines = [
+    where = where_flown(scheduler)
+    print_lines(
+        console,
         f"processor time of a flight: {found.cpu_s:.2f} s, standard error {found.cpu_error_s:.2f} s "
         f"({found.sample} of {found.flights} flights flown {where})",
         f"{found.flights} flights, {found.at_once} at a time {where}: {duration_text(found.duration_s(found.at_once))}",
@@ -87,9 +87,12 @@ def _show(found: Plan, scheduler: str | None, console: Console) -> None:
             f"{duration_text(found.duration_s(workers))}"
             for workers in WORKERS
         ),
-    ]
-    for line in lines:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    )
+
+
+def where_flown(scheduler: str | None) -> str:
+    """Return where a campaign flies, as text."""
+    return "on this computer" if scheduler is None else f"on the workers of {scheduler}"
 
 
 def duration_text(seconds: float) -> str:

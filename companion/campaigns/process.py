@@ -15,6 +15,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST
+
 STALL_TIMEOUT_S = 300.0
 """Time without a result after which a campaign is treated as hung; a flight takes seconds."""
 STOP_TIMEOUT_S = 3.0
@@ -32,12 +34,16 @@ class CampaignError(Exception):
         self.bad_input = bad_input
         """Whether the user's input is the cause; if so, nothing was flown."""
 
+    @property
+    def exit_code(self) -> int:
+        """Exit code of the command."""
+        return EXIT_BAD_INPUT if self.bad_input else EXIT_LOST
+
 
 class CampaignProcess:
     """A running campaign in its own process group. As a context manager it ends the campaign and all of its workers.
 
     Args:
-        job: see `sitl.campaigns`.
         log: file for the campaign's standard error; deleted at the end if it is empty.
     """
 

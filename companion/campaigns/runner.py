@@ -152,7 +152,6 @@ def run(campaign: Campaign, out: Path, console: Console | None) -> int:
     """Fly the campaign, write its files into `out` and print its results.
 
     Args:
-        campaign: campaign to fly.
         out: an existing folder; stays empty if no flight ended.
         console: where to print the tables; None to print the rows and their summary as JSON instead.
 
@@ -183,7 +182,7 @@ def fly(campaign: Campaign, out: Path) -> Flown:
                 bar.update(task, advance=1, description=_progress(campaign, message, bad))
         except CampaignError as error:
             notes.append(str(error))
-            code = EXIT_BAD_INPUT if error.bad_input else EXIT_LOST
+            code = error.exit_code
     if len(results) < whole and code != EXIT_BAD_INPUT:
         if not notes:
             notes.append("interrupted")
@@ -236,7 +235,7 @@ def _publish(campaign: Campaign, flown: Flown, out: Path, console: Console | Non
         return
     campaign.show(flown.rows, console)
     page = out / f"{campaign.name}.html"
-    console.print(f"\nreport  {page}", highlight=False, markup=False, soft_wrap=True)
+    print_lines(console, f"\nreport  {page}")
 
 
 def _write(campaign: Campaign, flown: Flown, table: dict[str, Any], out: Path) -> None:
@@ -245,7 +244,7 @@ def _write(campaign: Campaign, flown: Flown, table: dict[str, Any], out: Path) -
     try:
         pictures = campaign.draw(flown.messages, out)
     except ImportError:
-        print_error(f"companion {campaign.name}: plots need matplotlib: pip install '{DISTRIBUTION}[analysis]'")
+        print_error(no_plots(campaign.name))
         pictures = []
     page = campaign.page(rows, pictures)
     record = {
@@ -260,6 +259,17 @@ def _write(campaign: Campaign, flown: Flown, table: dict[str, Any], out: Path) -
     # This file is written last: if it exists, all the others exist.
     whole = {**table, "settings": settings, "versions": used, "notes": flown.notes, "wall_s": wall_s}
     (out / f"{campaign.name}.json").write_text(to_json(whole), encoding="utf-8")
+
+
+def no_plots(command: str) -> str:
+    """Return the message of a command that leaves out the plots because matplotlib is not installed."""
+    return f"companion {command}: plots need matplotlib: pip install '{DISTRIBUTION}[analysis]'"
+
+
+def print_lines(console: Console, *lines: str) -> None:
+    """Print lines as they are: without markup, highlights and line breaks, so that paths and commands can be copied."""
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def outcomes(rows: Iterable[Row]) -> dict[str, int]:

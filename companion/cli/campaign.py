@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import datetime
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from rich.console import Console
 
 from companion.campaigns.plan import SAMPLE, plan
 from companion.campaigns.runner import Campaign, run
-from companion.cli.options import add_law, add_world
+from companion.cli.options import add_law, add_world, time_stamp
 from companion.config.document import ConfigError
 from companion.mission.check import check_mission
 from companion.runtime.console import terminal_console
@@ -29,7 +28,6 @@ def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | 
     """Add the options that all campaigns share.
 
     Args:
-        parser: parser of the command.
         one_law: whether the campaign flies a single control law; adds `--controller` and `--preset`.
         world: default of `--world`.
     """
@@ -121,16 +119,30 @@ def fly(campaign: Campaign, arguments: argparse.Namespace, parent: str) -> int:
     console = None if arguments.json else wide_console(CAMPAIGN_WIDTH)
     if getattr(arguments, "plan", False):
         return plan(campaign, console)
-    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    folder = Path(arguments.out) if arguments.out is not None else Path(parent) / stamp
-    empty_name = "expected the name of a folder, got an empty one" if arguments.out == "" else None
-    problem = empty_name or why_unusable(folder, f"{campaign.name}.json")
-    if problem is not None:
-        raise ConfigError([f"companion {campaign.name}: --out {folder}: {problem}"])
-    try:
+    with results_folder(arguments, parent, f"{campaign.name}.json") as folder:
         return run(campaign, folder, console)
+
+
+@contextlib.contextmanager
+def results_folder(arguments: argparse.Namespace, parent: str, result: str | None) -> Iterator[Path]:
+    """Yield the folder for the results: `--out`, or a new one under `parent`. Afterwards it is removed if nothing was written.
+
+    Args:
+        parent: folder of the new folder.
+        result: as in `why_unusable`.
+
+    Raises:
+        ConfigError: the folder cannot be used.
+    """
+    folder = Path(arguments.out) if arguments.out is not None else Path(parent) / time_stamp()
+    empty_name = "expected the name of a folder, got an empty one" if arguments.out == "" else None
+    problem = empty_name or why_unusable(folder, result)
+    if problem is not None:
+        raise ConfigError([f"companion {arguments.command}: --out {folder}: {problem}"])
+    try:
+        yield folder
     finally:
-        # Removes empty folders only: those of a campaign in which no flight ended.
+        # Removes empty folders only.
         with contextlib.suppress(OSError):
             folder.rmdir()
             if arguments.out is None:
@@ -149,7 +161,6 @@ def why_unusable(folder: Path, result: str | None) -> str | None:
     """Create the folder if it does not exist. Return why results cannot be written into it, or None if they can.
 
     Args:
-        folder: folder for the results.
         result: name of the file by which earlier results are recognised; None to accept them.
     """
     try:

@@ -11,7 +11,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -66,33 +65,15 @@ _STYLES = {"ok": "green", "WARN": "yellow", "FAIL": "bold red"}
 Plans = Callable[[FlightConfig], list[str]]
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
-    """The command's arguments."""
-
-    config: SitlConfig
-    mission: str
-    sitl: str | None
-    hand: bool
-    json: bool
-
-
 def run(arguments: argparse.Namespace, config: SitlConfig, problems: Plans) -> int:
-    """Run the command and return the exit code.
-
-    Args:
-        arguments: parsed arguments.
-        config: configuration loaded from them.
-        problems: returns the reasons why a mission cannot be flown.
-    """
+    """Run the command and return the exit code."""
     found = problems(config)
     if arguments.plan_only:
         return _plan_only(arguments, config, found)
-    task = Task(config=config, mission=arguments.mission, sitl=arguments.sitl, hand=arguments.hand, json=arguments.json)
     people = console_on(sys.stderr)
     scratch = Path(tempfile.mkdtemp(prefix="companion-check-"))
     try:
-        rows = _rows(task, tuple(found), scratch, people)
+        rows = _rows(arguments, config, tuple(found), scratch, people)
     except LaunchError as error:  # it names a log, which is kept
         print_error(f"companion check: {error}")
         return EXIT_REFUSED
@@ -100,10 +81,10 @@ def run(arguments: argparse.Namespace, config: SitlConfig, problems: Plans) -> i
         shutil.rmtree(scratch, ignore_errors=True)
         raise
     shutil.rmtree(scratch, ignore_errors=True)
-    if task.json:
+    if arguments.json:
         print(json.dumps(preflight.as_json(rows)))
     else:
-        show(wide_console(), rows, task)
+        show(wide_console(), rows, config, simulated=arguments.sitl is not None)
     return EXIT_REFUSED if refusals(rows) else EXIT_OK
 
 
@@ -136,18 +117,20 @@ def _poses(vehicle: Vehicle) -> Iterator[str]:
         yield f"pose {name}, {angles} deg: the {tip} is {at}"
 
 
-def _rows(task: Task, plan: tuple[str, ...], scratch: Path, people: Console) -> list[Row]:
+def _rows(
+    arguments: argparse.Namespace, sitl_config: SitlConfig, plan: tuple[str, ...], scratch: Path, people: Console
+) -> list[Row]:
     """Return the rows of all checks.
 
     Raises:
         LaunchError: the simulated world could not be started.
     """
-    config = task.config.flight
+    config = sitl_config.flight
     with contextlib.ExitStack() as stack:
         line = stack.enter_context(_Line(people))
-        if task.sitl is not None:
+        if arguments.sitl is not None:
             line("starting the simulated world")
-            world = SitlProcess(task.config, scratch, px4=task.sitl == "px4")
+            world = SitlProcess(sitl_config, scratch, px4=arguments.sitl == "px4")
             stack.callback(world.stop)
             config = replace_device_settings(config, world.devices(line.world))
         line("recorder")
@@ -155,22 +138,25 @@ def _rows(task: Task, plan: tuple[str, ...], scratch: Path, people: Console) -> 
             start_s=0.0,
             duration_s=0.0,
             plan=plan,
-            left_out=tuple(figures_left_out(task.config.vehicle)),
+            left_out=tuple(figures_left_out(sitl_config.vehicle)),
             mission_s=None if plan else Plan.build(config.mission, config.vehicle).duration_s,
             recorder=_recorder(config, scratch),
         )
-        return run_until_interrupted(_look(task, config, known, line, people))
+        return run_until_interrupted(_look(arguments, config, known, line, people))
 
 
-async def _look(task: Task, config: FlightConfig, known: Observations, line: _Line, people: Console) -> list[Row]:
-    clock, sitl = flight_clock(), task.sitl is not None
+async def _look(
+    arguments: argparse.Namespace, config: FlightConfig, known: Observations, line: _Line, people: Console
+) -> list[Row]:
+    clock, sitl = flight_clock(), arguments.sitl is not None
     async with open_available(config, clock, lambda device: line(f"opening: {device}")) as devices:
         rows = await preflight.preflight(
             devices, config, clock, out=Path("flights"), progress=line, known=known, sitl=sitl
         )
-        if task.hand:
+        if arguments.hand:
             line.stop()
-            rows += await run_hand_test(devices, config, people, task.json, record=None if sitl else record_path())
+            record = None if sitl else record_path()
+            rows += await run_hand_test(devices, config, people, arguments.json, record=record)
         return rows
 
 
@@ -216,12 +202,12 @@ class _Line:
             self._status.stop()
 
 
-def show(console: Console, rows: list[Row], task: Task) -> None:
+def show(console: Console, rows: list[Row], config: SitlConfig, *, simulated: bool) -> None:
     """Print one table per device with a remedy below each failed row, then the verdict."""
-    where = " (SITL)" if task.sitl is not None else ""
+    where = " (SITL)" if simulated else ""
     build = ", compiled build" if COMPILED else ""
-    law = find(CONTROL_LAWS, task.config.controller.law)
-    title = f"{task.config.vehicle.name}{where}, mission '{task.config.mission.name}', {law}{build}"
+    law = find(CONTROL_LAWS, config.controller.law)
+    title = f"{config.vehicle.name}{where}, mission '{config.mission.name}', {law}{build}"
     console.print(Text(title, style="bold"))
     for prefix, heading in GROUPS.items():
         group = [row for row in rows if row.id.partition(".")[0] == prefix]
@@ -229,7 +215,8 @@ def show(console: Console, rows: list[Row], task: Task) -> None:
             continue
         console.print()
         console.print(_line(console, "", heading, "read", "wanted", header=True))
-        fine = [row for row in group if row.ok and row.id.startswith(PARAM_ID)]
+        params = [row for row in group if row.id.startswith(PARAM_ID)]
+        fine = [row for row in params if row.ok]
         for row in group:
             if row in fine:
                 continue
@@ -238,9 +225,7 @@ def show(console: Console, rows: list[Row], task: Task) -> None:
             if not row.ok:
                 console.print(_under(row))
         if fine:
-            all_of_them = (
-                "all" if len(fine) == len([row for row in group if row.id.startswith(PARAM_ID)]) else "the other"
-            )
+            all_of_them = "all" if fine == params else "the other"
             console.print(_line(console, "ok", "parameters", f"{all_of_them} {len(fine)} are correct", "docs/px4.md"))
     refused = refusals(rows)
     warned = [row for row in rows if not row.ok and row.level is Level.WARN]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import datetime
 import errno
 import importlib
 import os
@@ -16,7 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from companion import __version__
-from companion.cli.options import MISSION_HELP, MISSION_OR_DEFAULT_HELP, add_law, add_seed, add_world, preset_help
+from companion.cli.options import (
+    MISSION_HELP,
+    MISSION_OR_DEFAULT_HELP,
+    add_law,
+    add_seed,
+    add_world,
+    preset_help,
+    time_stamp,
+)
 from companion.cli.planning_progress import PlanningProgress
 from companion.cli.schema import schema_json
 from companion.config.document import ConfigError
@@ -32,24 +39,9 @@ from companion.runtime.subprocesses import use_default_signals
 from companion.sitl_config.loader import COMMAND_LINE_WORLD, DEFAULT_WORLD, SitlConfig, load_sitl
 
 _WITH_MODULES = (
-    *(
-        "compare",
-        "robustness",
-        "faults",
-        "tune",
-        "hover",
-        "identify",
-        "install",
-        "arm",
-        "px4",
-        "mocap",
-        "ft",
-        "latency",
-        "monitor",
-        "command",
-    ),
-    *("broker", "report", "init", "plugins"),
-)
+    "compare", "robustness", "faults", "tune", "hover", "identify", "install", "arm", "px4", "mocap", "ft", "latency", "monitor",
+    "command", "broker", "report", "init", "plugins",
+)  # fmt: skip
 """Commands whose parser is in `companion.cli.NAME`."""
 _ADDRESS = re.compile(r"[^/]*:\d+")
 """A word that is the value of the `--foxglove` before it."""
@@ -89,12 +81,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_REFUSED
     try:
         code: int = arguments.run(arguments)
-    except ConfigError as error:
-        for line in error.lines:
+    except (ConfigError, PluginError) as error:
+        for line in error.lines if isinstance(error, ConfigError) else (error,):
             print_error(line)
-        return EXIT_BAD_INPUT
-    except PluginError as error:
-        print_error(error)
         return EXIT_BAD_INPUT
     except BrokenPipeError:
         return EXIT_OK
@@ -276,8 +265,7 @@ def _fly(arguments: argparse.Namespace) -> int:
         for line in problems:
             print_error(line)
         return EXIT_BAD_INPUT
-    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    out = Path(arguments.out) if arguments.out else Path("flights") / f"{stamp}-{config.mission.name}"
+    out = Path(arguments.out) if arguments.out else Path("flights") / f"{time_stamp()}-{config.mission.name}"
     problem = why_unusable(out, "flight.mcap")
     if problem is not None:
         print_error(f"companion fly: --out {out}: {problem}")
@@ -326,8 +314,7 @@ def _sitl(arguments: argparse.Namespace) -> int:
     os.write(file, config.model_dump_json().encode())
     command = [sys.executable, "-P", "-m", "sitl", "--config", f"/proc/self/fd/{file}"]
     if arguments.px4:
-        stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-        command += ["--px4", str((Path("flights") / f"{stamp}-sitl" / "px4").resolve())]
+        command += ["--px4", str((Path("flights") / f"{time_stamp()}-sitl" / "px4").resolve())]
     os.execv(sys.executable, command)
 
 

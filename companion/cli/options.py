@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import datetime
 
 from companion.config.controller import PRESETS
 from companion.config.shipped import DEFAULT_MISSION, names
@@ -11,6 +12,11 @@ from companion.sitl_config.loader import COMMAND_LINE_WORLD, WORLDS
 
 MISSION_HELP = f"mission: a built-in name ({', '.join(names('missions'))}) or a file"
 MISSION_OR_DEFAULT_HELP = f"{MISSION_HELP} (default: {DEFAULT_MISSION})"
+
+
+def time_stamp() -> str:
+    """Return the local time as part of a file name, such as `20261125-093743`."""
+    return datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
 
 
 def add_law(parser: argparse.ArgumentParser) -> None:

@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from typing import Any
 
 from companion.config.base import Model
 from companion.config.controller import LAWS
-from companion.config.device_plugins import OptionsOf
+from companion.config.device_plugins import device_class
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
-from companion.plugins import ARMS, CONTROL_LAWS, FORCE_SENSORS, KINDS, MOCAP_SYSTEMS, PluginError, installed
-
-_SETTINGS: dict[str, Mapping[str, type[Model]]] = {
-    CONTROL_LAWS: LAWS,
-    MOCAP_SYSTEMS: OptionsOf(MOCAP_SYSTEMS),
-    FORCE_SENSORS: OptionsOf(FORCE_SENSORS),
-    ARMS: OptionsOf(ARMS),
-}
-"""Settings class of each plug-in, by group and name."""
+from companion.plugins import CONTROL_LAWS, KINDS, PluginError, installed
 
 
 def add_parser(commands: Any) -> None:
@@ -38,7 +29,7 @@ def run(_: argparse.Namespace) -> int:
     for group, kind in KINDS.items():
         for name, plugin in installed(group).items():
             try:
-                what = (_SETTINGS[group][name].__doc__ or "").strip().partition("\n")[0]
+                what = (_settings(group, name).__doc__ or "").strip().partition("\n")[0]
             except PluginError as error:
                 code, what = EXIT_BAD_INPUT, f"cannot be used: {error.reason}"
             rows.append((name, kind, plugin.distribution, plugin.version, what))
@@ -46,3 +37,13 @@ def run(_: argparse.Namespace) -> int:
     for row in rows:
         print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
     return code
+
+
+def _settings(group: str, name: str) -> type[Model]:
+    """Return the class of a plug-in's settings.
+
+    Raises:
+        PluginError: the plug-in cannot be used.
+    """
+    settings: type[Model] = LAWS[name] if group == CONTROL_LAWS else device_class(group, name).options
+    return settings

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import datetime
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
+from companion.cli.options import time_stamp
 from companion.config.devices import AutopilotDevice
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
@@ -102,8 +102,7 @@ async def _run(arguments: argparse.Namespace, wanted: dict[str, Value], device: 
                 f"autopilot {device.address}: expected a disarmed PX4, but it is armed; land and disarm before writing"
             )
             return EXIT_REFUSED
-        stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-        backup = arguments.backup or Path(f"px4_{stamp}.params")
+        backup = arguments.backup or Path(f"px4_{time_stamp()}.params")
         problem = _back_up(backup, comparison.differences, await autopilot.firmware(), source)
         if problem is not None:
             print_error(problem)

@@ -15,7 +15,7 @@ from companion import DISTRIBUTION
 from companion.analysis.contact import PROBE, contact_lines, write_probe
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.summary import summarise, write_summary
-from companion.campaigns.runner import to_json
+from companion.campaigns.runner import no_plots, to_json
 from companion.campaigns.side_by_side.comparison import FLIGHTS_MAX, Comparison, NotAlignable, compare, jsonable
 from companion.campaigns.side_by_side.flight import Flight, flight_of
 from companion.config.document import ConfigError
@@ -292,5 +292,5 @@ def _unwritable(out: Path, error: OSError) -> ConfigError:
 
 
 def _no_pictures() -> int:
-    print_error(f"companion report: plots need matplotlib: pip install '{DISTRIBUTION}[analysis]'")
+    print_error(no_plots("report"))
     return EXIT_REFUSED

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import datetime
 import shlex
-from pathlib import Path
 from typing import Any
 
 from companion.campaigns.tune.tune import Tune, plan, run
-from companion.cli.campaign import CAMPAIGN_WIDTH, add_options, checked, count, why_unusable, wide_console
+from companion.cli.campaign import CAMPAIGN_WIDTH, add_options, checked, count, results_folder, wide_console
 from companion.cli.options import MISSION_OR_DEFAULT_HELP
 from companion.config.document import ConfigError
 from companion.config.shipped import DEFAULT_MISSION
@@ -50,17 +47,8 @@ def run_command(arguments: argparse.Namespace) -> int:
     console = None if arguments.json else wide_console(CAMPAIGN_WIDTH)
     if arguments.plan:
         return plan(tune, console)
-    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    folder = Path(arguments.out) if arguments.out is not None else Path("tuning") / stamp
-    empty_name = "expected the name of a folder, got an empty one" if arguments.out == "" else None
-    problem = empty_name or why_unusable(folder, None)
-    if problem is not None:
-        raise ConfigError([f"companion tune: --out {folder}: {problem}"])
-    try:
+    with results_folder(arguments, "tuning", None) as folder:
         return run(tune, folder, console)
-    finally:
-        with contextlib.suppress(OSError):
-            folder.rmdir()
 
 
 def _tune(arguments: argparse.Namespace) -> Tune:

@@ -105,7 +105,6 @@ def propose(vehicle_path: str | Path, changes: Mapping[Location, Data]) -> Patch
     """Return the patch that sets values in the vehicle file. Nothing is written.
 
     Args:
-        vehicle_path: vehicle file.
         changes: new values by location, in the file's units: `{("arm", "joints", 0, "sign"): -1}`. Values that the file already has
             are left out; missing keys are added. Round the values first: they are written as given.
 

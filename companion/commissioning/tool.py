@@ -77,10 +77,6 @@ class Report:
 class Session:
     """One run of a tool.
 
-    Args:
-        arguments: the parsed options.
-        family: family of the tool.
-
     Raises:
         ConfigError: the vehicle file or an override is wrong.
     """
@@ -164,7 +160,7 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
         if tool.device is None:
             print_error(error)
             return EXIT_REFUSED
-        report = Report([tool.device.bad(str(error), "", "")], tool.no_data)
+        report = Report([tool.device.bad(str(error))], tool.no_data)
     except Cancelled as end:
         print_error(f"companion {tool.name}: {end}")
         return EXIT_ABORTED
@@ -209,7 +205,6 @@ def row_lines(rows: Sequence[Row], brief: Mapping[str, str]) -> list[str]:
     """Return the rows as lines: result, title, measured value, and the remedy if a row is not ok.
 
     Args:
-        rows: rows in the order of display.
         brief: see `Report.brief`.
     """
     lines, hidden, wrong = [], Counter[str](), set()
@@ -248,10 +243,8 @@ def add_tool(
     """Add a tool's parser with the options that all tools have.
 
     Args:
-        parts: sub-parsers of the command.
         name: name of the tool, its key in `TOOLS`.
         module: module of `TOOLS`; imported when the tool runs.
-        help: help text, one line.
         description: description with the exit codes.
         write: help of `--write`; empty if the tool has no such option.
         yes: whether the tool has `--yes`.

@@ -43,7 +43,7 @@ NonNegativeJoints = Annotated[
     BeforeValidator(_as_joints),
     OrElse({"type": "number"}),
 ]
-"""As `PositiveJoints`, or one number for all joints."""
+"""One value for each joint, as in `PositiveJoints`, or one number for all joints."""
 NonNegative3 = tuple[NonNegative, NonNegative, NonNegative]
 Positive4 = tuple[Positive, Positive, Positive, Positive]
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from pydantic import ValidationError
@@ -32,7 +32,6 @@ def device_class(group: str, name: str) -> Any:
 
     Args:
         group: group of entry points, such as `companion.plugins.FORCE_SENSORS`.
-        name: type of the device.
 
     Raises:
         PluginError: the device is not installed, cannot be imported or has no model for its options.
@@ -59,22 +58,3 @@ def problems(group: str, name: str, options: Mapping[str, Any]) -> list[tuple[Lo
     except ValidationError as error:
         return [(("options", *detail["loc"]), detail["msg"]) for detail in error.errors(include_url=False)]
     return []
-
-
-class OptionsOf(Mapping[str, type[Model]]):
-    """Model of the options of each installed device of a group. Access raises PluginError if the device cannot be used."""
-
-    def __init__(self, group: str) -> None:
-        self._group = group
-
-    def __getitem__(self, name: str) -> type[Model]:
-        if name not in plugins.installed(self._group):
-            raise KeyError(name)
-        options: type[Model] = device_class(self._group, name).options
-        return options
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(plugins.installed(self._group))
-
-    def __len__(self) -> int:
-        return len(plugins.installed(self._group))

@@ -119,6 +119,17 @@ class Document:
                 del origins[known]
             origins[location] = origin
 
+    def report(self, location: Location, text: str, rank: int = RANK_VALUE) -> None:
+        """Add a problem with the value at a location."""
+        self.problems.append(Problem(rank, self.origin(location), f"{key_path(location)}: {text}"))
+
+    def find(self, location: Location) -> Data:
+        """Return the value at a location; None if the location does not exist."""
+        try:
+            return self.get(location)
+        except (KeyError, IndexError):
+            return None
+
     def get(self, location: Location) -> Data:
         """Return the value at a location.
 

@@ -42,12 +42,7 @@ def schema_of(model: type[Model]) -> _Node:
 
 
 def validate(model: type[M], document: Document) -> M | None:
-    """Build a model from a document. If there are problems, append them to `document.problems` and return None.
-
-    Args:
-        model: the model to build.
-        document: the document after overrides.
-    """
+    """Build a model from a document. If there are problems, append them to `document.problems` and return None."""
     schema = schema_of(model)
     found = [
         # In JSON `true` equals the constant 1.
@@ -112,10 +107,10 @@ def _value_problem(
         expected = f"one of {', '.join(tags)}"
         if kind == "union_tag_not_found":
             return problem(RANK_MISSING, document.origin(at), at, f"missing; expected {expected}")
-        value = _get(document, at)
+        value = document.find(at)
         text = f"expected {expected}, got {_show(value)}{_did_you_mean(str(value), tags)}"
         return problem(RANK_VALUE, document.origin(at), at, text)
-    value = _get(document, at)
+    value = document.find(at)
     expected = describe(node, schema) if node is not None else str(detail["msg"])
     return problem(RANK_VALUE, document.origin(at), at, f"expected {expected}, got {_show(value)}{_hint(value, node)}")
 
@@ -194,7 +189,7 @@ def _unknown(at: Location, parent: _Node | None, document: Document) -> tuple[st
     close = nearest(key, known)
     if close is not None:
         return f"unknown key; did you mean {close}?", close
-    given = _get(document, at[:-1])
+    given = document.find(at[:-1])
     free = [name for name in known if not (isinstance(given, dict) and name in given)]
     return f"unknown key; known keys: {', '.join(free or known)}", None
 
@@ -247,13 +242,6 @@ def _show(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _get(document: Document, at: Location) -> Data:
-    try:
-        return document.get(at)
-    except (KeyError, IndexError):
-        return None
-
-
 def _resolve(node: _Node, schema: _Node) -> _Node:
     """Return the node with references followed and, for an optional value, the alternative that is not null."""
     while True:
@@ -299,8 +287,6 @@ def values(
 
     Args:
         node: schema node of the data; None for data that the schema does not know.
-        data: plain data.
-        at: location of the data.
         root: the whole schema; None if `node` is the whole schema.
     """
     root = root if root is not None else node or {}

@@ -22,7 +22,6 @@ from companion.config.document import (
     RANK_MISSING,
     RANK_VALUE,
     ConfigError,
-    Data,
     Document,
     Problem,
     key_path,
@@ -104,7 +103,7 @@ def load_flight(
     vehicle: Vehicle | None = None
     vehicle_file = _open_named(mission_file, ("vehicle",), vehicle_path, of_vehicle)
     if vehicle_file is not None:
-        vehicle = check_document(Vehicle, vehicle_file, "vehicle", parsed, of_vehicle)
+        vehicle = _check_vehicle(vehicle_file, parsed, of_vehicle)
         if hardware and vehicle is not None:
             of_vehicle += _open_to_every_network(vehicle, vehicle_file) + _unusable_devices(vehicle, vehicle_file)
     _place_arm(mission_file, vehicle)
@@ -152,7 +151,7 @@ def load_vehicle(path: str | Path, overrides: Sequence[str] = ()) -> Vehicle:
     """
     lines: list[str] = []
     document = read_document(named_file("vehicles", path, "--vehicle"))
-    vehicle = check_document(Vehicle, document, "vehicle", parse_overrides(overrides), lines)
+    vehicle = _check_vehicle(document, parse_overrides(overrides), lines)
     if vehicle is not None:
         lines += _unusable_devices(vehicle, document)
     if vehicle is None or lines:
@@ -174,38 +173,32 @@ def logged_flight(config_json: str) -> FlightConfig:
     return FlightConfig.model_validate_json(json.dumps(data))
 
 
-def check_document(
-    model: type[M], document: Document, section: Section, overrides: list[Override], lines: list[str]
-) -> M | None:
-    """Apply the overrides of a section to its document and validate it; append one message per problem to `lines`.
-
-    Returns:
-        The model, or None if the document has a problem.
-    """
-    _override(document, section, overrides, lines)
-    if section == "vehicle":
-        _move_keys(document)
-        if document.data.get("arm", NO_ARM) is None:
-            document.replace(("arm",), copy.deepcopy(NO_ARM), document.origin(("arm",)))
-        _read_urdf(document)
-    return _validated(model, document, lines)
+def _check_vehicle(document: Document, overrides: list[Override], lines: list[str]) -> Vehicle | None:
+    """Apply the overrides to a vehicle file and validate it; return None if it has problems."""
+    _override(document, "vehicle", overrides, lines)
+    _move_keys(document)
+    if document.data.get("arm", NO_ARM) is None:
+        document.replace(("arm",), copy.deepcopy(NO_ARM), document.origin(("arm",)))
+    _read_urdf(document)
+    return _validated(Vehicle, document, lines)
 
 
 def _read_urdf(document: Document) -> None:
     """Replace the name of a URDF file in a vehicle file by the file's links; the name stays, to be shown and logged."""
     location: Location = ("arm", "urdf")
-    name, base, tip = (_value(document, ("arm", key)) for key in ("urdf", "urdf_base", "urdf_tip"))
+    name, base, tip = (document.find(("arm", key)) for key in ("urdf", "urdf_base", "urdf_tip"))
     if not isinstance(name, str) or not isinstance(base, str | None) or not isinstance(tip, str | None):
         return  # not given, or not text: the check of the vehicle reports it
     origin = document.origin(location)
-    if _value(document, ("arm", "links")) is not None:
-        document.problems.append(Problem(RANK_VALUE, origin, "arm.urdf: expected urdf or links, got both"))
+    if document.find(("arm", "links")) is not None:
+        document.report(location, "expected urdf or links, got both")
         return
     folder = Path(document.source).parent if origin.line else Path()
     try:
         arm = read_urdf(Path(os.path.normpath(folder / name)), base, tip)
     except ConfigError as error:
-        document.problems += [Problem(RANK_VALUE, origin, f"arm.urdf: {line}") for line in error.lines]
+        for line in error.lines:
+            document.report(location, line)
         return
     for key, value in arm.items():
         document.replace(("arm", key), value, origin)
@@ -224,26 +217,25 @@ def _place_arm(document: Document, vehicle: Vehicle | None) -> None:
     """Replace the names of poses in a mission by the vehicle's joint angles, and check the number of angles; without a valid vehicle,
     a name is replaced by an empty pose.
     """
-    phases = _value(document, ("phases",))
+    phases = document.find(("phases",))
     places: list[Location] = [("start", "arm_deg")]
     places += [("phases", index, "arm_deg") for index in range(len(phases) if isinstance(phases, list) else 0)]
     for place in places:
-        given = _value(document, place)
+        given = document.find(place)
         if isinstance(given, str):
             poses_deg = vehicle.poses_deg if vehicle is not None else {given: ()}
             if given not in poses_deg:
-                text = f"{key_path(place)}: "
                 if vehicle is not None and vehicle.arm.joints:
-                    text += f'expected joint angles or a pose of the vehicle ({", ".join(poses_deg)}), got "{given}"; '
+                    text = f'expected joint angles or a pose of the vehicle ({", ".join(poses_deg)}), got "{given}"; '
                     text += "define it in arm.poses of the vehicle file"
                 else:
-                    text += f'the mission moves the arm to "{given}", but the vehicle has no arm; choose a mission without arm '
+                    text = f'the mission moves the arm to "{given}", but the vehicle has no arm; choose a mission without arm '
                     text += "motion, such as hover, or a vehicle with an arm"
-                document.problems.append(Problem(RANK_VALUE, document.origin(place), text))
+                document.report(place, text)
             document.replace(place, list(poses_deg.get(given, ())), document.origin(place))
         elif isinstance(given, list) and vehicle is not None and len(given) != len(vehicle.arm.joints):
-            text = f"{key_path(place)}: expected {len(vehicle.arm.joints)} joint angles, as many as the vehicle has, got {len(given)}"
-            document.problems.append(Problem(RANK_VALUE, document.origin(place), text))
+            text = f"expected {len(vehicle.arm.joints)} joint angles, as many as the vehicle has, got {len(given)}"
+            document.report(place, text)
 
 
 def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:
@@ -280,17 +272,16 @@ def _unusable_devices(vehicle: Vehicle, document: Document) -> list[str]:
 def _check_controller(document: Document, overrides: list[Override], lines: list[str]) -> ControllerConfig | None:
     """Apply the overrides to a controller file and validate it with the model of its law."""
     _override(document, "controller", overrides, lines)
-    law = _value(document, ("law",))
+    law = document.find(("law",))
     if isinstance(law, str) and law in LAWS:
         return _validated(LAWS[law], document, lines)
     expected = f"expected one of {', '.join(LAWS)}"
     if law is None:
-        document.problems.append(Problem(RANK_MISSING, document.origin(()), f"law: missing; {expected}"))
+        document.report(("law",), f"missing; {expected}", RANK_MISSING)
     else:
         close = nearest(str(law), list(LAWS))
         hint = f" (did you mean {close}?)" if close else ""
-        text = f"law: {expected}, got {json.dumps(law)}{hint}"
-        document.problems.append(Problem(RANK_VALUE, document.origin(("law",)), text))
+        document.report(("law",), f"{expected}, got {json.dumps(law)}{hint}")
     lines += problem_lines(document.problems)
     return None
 
@@ -316,7 +307,7 @@ def _open_named(
     try:
         if given is not None:
             return read_document(named_file("vehicles", given, "--vehicle"))
-        named = _value(mission_file, location)
+        named = mission_file.find(location)
         if not isinstance(named, str):
             return None  # missing or not text: the check of the mission reports it
         origin = mission_file.origin(location)
@@ -331,7 +322,7 @@ def _open_named(
 def _controller_choice(mission_file: Document) -> ControllerChoice | None:
     """Return the controller choice of an otherwise invalid mission, so that problems of the controller file are reported too."""
     try:
-        return ControllerChoice.model_validate(_value(mission_file, ("controller",)) or {})
+        return ControllerChoice.model_validate(mission_file.find(("controller",)) or {})
     except ValidationError:
         return None
 
@@ -369,10 +360,3 @@ def _open_controller(law: str | None, preset: str | None) -> Document:
     if preset not in PRESETS[law]:
         raise ConfigError([f"--preset {preset}: no such preset of '{law}'; available: {', '.join(PRESETS[law])}"])
     return read_document(near(preset_file(law, preset)))
-
-
-def _value(document: Document, location: Location) -> Data:
-    try:
-        return document.get(location)
-    except (KeyError, IndexError):
-        return None

@@ -169,8 +169,8 @@ class Slide(Model):
     """Way to the right and up in the surface, as seen from the vehicle, from where the tip is."""
     speed_m_s: ContactSpeed
     friction_max: Annotated[float, Field(ge=0, le=2)] = 0.8
-    """Largest coefficient of friction that the surface may have. It limits the force along the surface, for which the check looks for
-    reserves of the joints and of the rotors' yaw torque.
+    """Largest coefficient of friction that the surface may have. From it follows the largest force along the surface; the check of the
+    mission refuses a slide for which the joints or the rotors' yaw torque have too little reserve.
     """
 
     @model_validator(mode="after")
@@ -282,20 +282,11 @@ class Mission(Model):
         problems: list[tuple[Location, str]] = []
         last = len(self.phases) - 1
         for index, phase in enumerate(self.phases):
-            if (phase.type == "takeoff") != (index == 0):
-                text = (
-                    "the first phase must be of type takeoff"
-                    if index == 0
-                    else "only the first phase can be of type takeoff"
-                )
-                problems.append((("phases", index, "type"), text))
-            elif (phase.type == "land") != (index == last):
-                text = (
-                    "the last phase must be of type land"
-                    if index == last
-                    else "only the last phase can be of type land"
-                )
-                problems.append((("phases", index, "type"), text))
+            for kind, place, name in (("takeoff", 0, "first"), ("land", last, "last")):
+                if (phase.type == kind) != (index == place):
+                    must = f"the {name} phase must be" if index == place else f"only the {name} phase can be"
+                    problems.append((("phases", index, "type"), f"{must} of type {kind}"))
+                    break
         if self.repeat > 1 and last < 2:
             problems.append((("repeat",), "there is nothing between take-off and landing to repeat"))
         refuse("mission", problems)
@@ -345,24 +336,3 @@ class Mission(Model):
                     at_m = point_m
         refuse("mission", list(problems.items()))
         return self
-
-
-__all__ = [
-    "Approach",
-    "ArmMove",
-    "Catch",
-    "ControllerChoice",
-    "Detach",
-    "Hold",
-    "Land",
-    "Limits",
-    "Line",
-    "Mission",
-    "Path",
-    "Phase",
-    "Press",
-    "Probe",
-    "Slide",
-    "Start",
-    "Takeoff",
-]

@@ -35,7 +35,6 @@ def named_file(folder: str, given: str | Path, option: str) -> Path:
 
     Args:
         folder: folder of `FILES`.
-        given: name of a shipped file, or a path.
         option: command-line option through which it was given, for messages.
 
     Raises:

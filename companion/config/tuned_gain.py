@@ -31,9 +31,9 @@ class TunedGain:
     rows: Rows = EACH
     """Which values of a list."""
     scaled_as: str = ""
-    """Key that tells how the gain follows the vehicle, for a property; empty for `key` itself."""
+    """If `key` is a property: the key whose scaling with the vehicle the gain follows. Empty for `key` itself."""
     only_with: str = ""
-    """Key without whose value (0) the gain has no effect, so that it is not searched; empty for none."""
+    """Key of another setting; if that is 0, the gain has no effect and is not searched. Empty if there is no such setting."""
 
     @property
     def place(self) -> slice:
@@ -47,7 +47,7 @@ _COMPENSATION = (
     TunedGain("feedforward_lead_s", 0.01, 0.4),
     TunedGain("attitude_filter_rad_s", 15.0, 150.0),
 )
-"""Of the settings that the companion's own laws share."""
+"""Gains that all of the companion's own laws have."""
 ADAPTIVE = (
     TunedGain("inertia_md", 0.25, 1.5, XYZ),
     TunedGain("lambda_gain", 0.3, 10.0, XY),

@@ -189,7 +189,7 @@ def undo(root: Path, report: Report) -> bool:
                 raise InstallError(changed_by_others(path))
             back.append(path)
     if live:
-        if _service_active(SERVICE):
+        if _service_active():
             raise InstallError(
                 f"{SERVICE} is running; first run: systemctl stop companion (a flying vehicle lands first)"
             )
@@ -287,12 +287,12 @@ def _user_in_group(user: str) -> bool:
     return user in group.gr_mem or pwd.getpwnam(user).pw_gid == group.gr_gid
 
 
-def _service_active(unit: str) -> bool:
+def _service_active() -> bool:
     tool = shutil.which("systemctl", path=_TOOLS)
     if tool is None:
         return False
     ended = subprocess.run(
-        [tool, "is-active", unit],
+        [tool, "is-active", SERVICE],
         capture_output=True,
         encoding="utf-8",
         errors="replace",
@@ -321,7 +321,7 @@ def _run(command: Command, report: Report) -> None:
                 encoding="utf-8",
                 errors="replace",
                 timeout=COMMAND_TIMEOUT_S,
-                env={**os.environ, "LC_ALL": "C", "RECORD_PATH": _TOOLS},
+                env={**os.environ, "LC_ALL": "C", "PATH": _TOOLS},
                 check=False,
             )
             if ended.returncode != 0:

@@ -24,12 +24,7 @@ def _installed(package: str) -> bool:
 
 
 def missing_extra(arguments: argparse.Namespace, here: Callable[[str], bool] = _installed) -> str | None:
-    """Return one line if the command needs a package that is not installed, else None.
-
-    Args:
-        arguments: parsed arguments of the command.
-        here: returns whether a package can be imported.
-    """
+    """Return one line if the command needs a package that is not installed, else None."""
     what, needs = f"companion {arguments.command}", _NEEDS.get(arguments.command)
     if needs is None and getattr(arguments, "sitl", None):
         what, needs = f"{what} --sitl", _WORLD

@@ -14,7 +14,7 @@ from companion.runtime.files import write_whole
 
 
 class InstallError(Exception):
-    """The installation failed. The text is one line; changes were rolled back unless it says otherwise."""
+    """The installation failed. The text is one line; changes were rolled back unless the text states otherwise."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,7 +48,6 @@ def contention_message(waits: Sequence[ProcessWait], late_s: float) -> str | Non
     """Return one line for the operator if the computer is too busy, else None.
 
     Args:
-        waits: one entry per process.
         late_s: 99th percentile of the ticks' lateness, s; 0 before the first tick.
     """
     worst = max((wait.share for wait in waits), default=0.0)
@@ -80,7 +79,6 @@ class CpuContention:
     """Samples the scheduling delays of a flight's processes and evaluates them when an event occurs that lateness may have caused.
 
     Args:
-        pids: process ids keyed by process name.
         read: returns the waits of one process's threads.
     """
 

@@ -23,8 +23,6 @@ class GuardianProcess:
     """A running guardian, started after the flight process so that it can hold that process's pidfd.
 
     Args:
-        config_path: effective configuration.
-        out: folder of the flight.
         flight_pid: id of the flight process, a child that has not been reaped.
         heartbeats: the guardian's end of the socket to the flight process; closed here.
         shared: descriptors that the guardian keeps open for the simulated world.

@@ -97,14 +97,14 @@ class Launcher:
         config: checked configuration. With SITL, the addresses of the simulated devices replace its device addresses, and only
             the sitl process receives the configuration of the world.
         out: existing folder for all files of the flight.
-        sitl: False for hardware; True or "stub" for the simulated world with the PX4 stub; "px4" for a real PX4.
+        sitl: autopilot of the simulated world; None for hardware.
         on_message: called with every message of the flight process, for the display; messages of the world have "source": "sitl".
     """
 
-    def __init__(self, config: SitlConfig, out: Path, *, sitl: bool | Sitl, on_message: OnMessage) -> None:
+    def __init__(self, config: SitlConfig, out: Path, *, sitl: Sitl | None, on_message: OnMessage) -> None:
         self._config = config
         self._out = out
-        self._sitl_kind = sitl
+        self._sitl = sitl
         self._on_message = on_message
         self._stop_requested = False
         self._channel: socket.socket | None = None
@@ -140,8 +140,8 @@ class Launcher:
         keep_off(self._config.vehicle.computer.cpus)
         try:
             config = self._config.flight
-            if self._sitl_kind:
-                sitl = SitlProcess(self._config, self._out, px4=self._sitl_kind == "px4")
+            if self._sitl is not None:
+                sitl = SitlProcess(self._config, self._out, px4=self._sitl == "px4")
                 config = replace_device_settings(
                     config, sitl.devices(self._on_world_message, lambda: self._stop_requested)
                 )

@@ -36,7 +36,7 @@ def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Con
         else:
             display.on_message(message)
 
-    launcher = Launcher(config, out, sitl=sitl or False, on_message=on_message)
+    launcher = Launcher(config, out, sitl=sitl, on_message=on_message)
     # A second Ctrl-C after the end of a short flight must not lose the summary.
     with landing_signals(launcher.request_landing):
         with display:

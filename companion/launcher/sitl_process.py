@@ -27,13 +27,7 @@ SITL_TERMINATE_TIMEOUT_S = 10.0
 
 
 class SitlProcess:
-    """A running simulated world.
-
-    Args:
-        config: configuration of the flight and its world.
-        out: folder of the flight.
-        px4: whether to use a real PX4 instead of the stub.
-    """
+    """A running simulated world."""
 
     def __init__(self, config: SitlConfig, out: Path, *, px4: bool = False) -> None:
         self._px4 = px4

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from functools import reduce
+from operator import or_
 
 from companion.config.vehicle import Vehicle
 from companion.io.dynamixel.registers import cycle_bytes, cycle_s
@@ -126,7 +128,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         return
     failure = o.failures.get("arm")
     if failure is not None:
-        yield DEVICE.bad(failure, "", "")
+        yield DEVICE.bad(failure)
         return
     stated = o.arm_statement
     if stated is not None:
@@ -159,27 +161,14 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
     else:
         yield MODEL.good(read, wanted)
     yield firmware(FIRMWARE, [(kind, servo.firmware) for servo, kind in zip(servos, kinds, strict=True)])
-    modes = [servo.operating_mode for servo in servos]
-    yield _equal(
-        MODE,
-        modes,
-        MODE_CURRENT,
-        _mode,
-        "another program has changed it: close that program, then cycle the servos' power",
-    )
-    delays_us = [servo.return_delay_us for servo in servos]
-    yield _equal(
-        RETURN_DELAY,
-        delays_us,
-        0,
-        "{} us".format,
-        "another program has changed it: close that program, then start again",
-    )
-    watchdogs_ms = [servo.watchdog_ms for servo in servos]
-    wanted_ms = vehicle.arm_device.watchdog_ms
-    yield _equal(
-        WATCHDOG, watchdogs_ms, wanted_ms, "{} ms".format, "cycle the servos' power; check for a loose supply cable"
-    )
+    modes = [_mode(servo.operating_mode) for servo in servos]
+    fix = "another program has changed it: close that program, then cycle the servos' power"
+    yield _equal(MODE, modes, _mode(MODE_CURRENT), fix)
+    delays = [f"{servo.return_delay_us} us" for servo in servos]
+    yield _equal(RETURN_DELAY, delays, "0 us", "another program has changed it: close that program, then start again")
+    watchdogs = [f"{servo.watchdog_ms} ms" for servo in servos]
+    wanted = f"{vehicle.arm_device.watchdog_ms} ms"
+    yield _equal(WATCHDOG, watchdogs, wanted, "cycle the servos' power; check for a loose supply cable")
     yield _current_limit(servos, vehicle)
     yield supply(VOLTAGE, [(kind, servo.voltage_v) for servo, kind in zip(servos, kinds, strict=True)])
 
@@ -228,11 +217,9 @@ def _current_limit(servos: Sequence[ServoReport], vehicle: Vehicle) -> Row:
     needed = [math.floor(joint.torque_max_nm / nm + 1e-9) for joint, nm in zip(arm.joints, per_count_nm, strict=True)]
     read = _each([f"{limit} ({limit * nm:.2f} N m)" for limit, nm in zip(limits, per_count_nm, strict=True)])
     wanted = f"at least {_each(needed)}"
-    if all(limit >= need for limit, need in zip(limits, needed, strict=True)):
-        return CURRENT_LIMIT.good(read, wanted)
-    return CURRENT_LIMIT.bad(
-        read, wanted, "raise register 38 with DYNAMIXEL Wizard, or lower arm.joints[].torque_max_nm"
-    )
+    enough = all(limit >= need for limit, need in zip(limits, needed, strict=True))
+    fix = "raise register 38 with DYNAMIXEL Wizard, or lower arm.joints[].torque_max_nm"
+    return CURRENT_LIMIT.row(enough, read, wanted, fix)
 
 
 def _states(states: Sequence[ArmState], vehicle: Vehicle, *, temperatures_unknown: bool) -> Iterator[Row]:
@@ -243,16 +230,15 @@ def _states(states: Sequence[ArmState], vehicle: Vehicle, *, temperatures_unknow
         yield TEMPERATURE.doubtful(
             "not reported by every motor", wanted, "limit the motors' temperature by their own settings"
         )
-    elif hottest_c < safety.servo_warn_c:
-        yield TEMPERATURE.good(read, wanted)
     else:
-        row = TEMPERATURE.doubtful if hottest_c < safety.servo_max_c else TEMPERATURE.bad
-        yield row(read, wanted, "let the arm cool down; check for a jammed joint or a load on the arm")
-    errors = [_or(servo) for servo in zip(*(state.hardware_error for state in states), strict=True)]
+        cool, tolerable = hottest_c < safety.servo_warn_c, hottest_c < safety.servo_max_c
+        fix = "let the arm cool down; check for a jammed joint or a load on the arm"
+        yield TEMPERATURE.graded(cool, tolerable, read, wanted, fix)
+    errors = [reduce(or_, servo) for servo in zip(*(state.hardware_error for state in states), strict=True)]
     named = error_text(errors)
     if named:
         yield ERROR.bad(named, "none", "remove the cause, then cycle the servos' power")
-    elif _or(errors) & WATCHDOG_ERROR:
+    elif any(error & WATCHDOG_ERROR for error in errors):
         fix = "check for a loose cable or supply, and for a computer that stalls"
         yield ERROR.doubtful("a bus watchdog tripped", "none", fix)
     else:
@@ -260,10 +246,8 @@ def _states(states: Sequence[ArmState], vehicle: Vehicle, *, temperatures_unknow
     yield _angles(last, vehicle)
     moved_rad = max(max(angles) - min(angles) for angles in zip(*(state.angle_rad for state in states), strict=True))
     read, wanted = f"moves by {math.degrees(moved_rad):.1f} deg", f"{math.degrees(STILL_RAD):.0f} deg"
-    if moved_rad <= STILL_RAD:
-        yield STILL.good(read, wanted)
-    else:
-        yield STILL.bad(read, wanted, "fold the arm so that it rests on its own, and do not touch it")
+    fix = "fold the arm so that it rests on its own, and do not touch it"
+    yield STILL.row(moved_rad <= STILL_RAD, read, wanted, fix)
 
 
 def _angles(last: ArmState, vehicle: Vehicle) -> Row:
@@ -271,19 +255,16 @@ def _angles(last: ArmState, vehicle: Vehicle) -> Row:
     limits = [joint.angle_deg for joint in vehicle.arm.joints]
     read = f"({listed(degrees, '.0f')}) deg"
     wanted = " and ".join(f"{low:g} to {high:g} deg" for low, high in limits)
-    if all(low <= angle <= high for angle, (low, high) in zip(degrees, limits, strict=True)):
-        return ANGLES.good(read, wanted)
-    return ANGLES.bad(read, wanted, "move the arm by hand, or correct zero_count and sign of the joint")
+    within = all(low <= angle <= high for angle, (low, high) in zip(degrees, limits, strict=True))
+    return ANGLES.row(within, read, wanted, "move the arm by hand, or correct zero_count and sign of the joint")
 
 
 def _reads(cycles: int, missed: int, warned_of: int) -> Row:
     share = missed / max(1, cycles)
     read, wanted = f"{missed} of {cycles}", f"{MISSED_GOOD:.1%}"
-    if cycles and share <= MISSED_GOOD:
-        return READS.good(read, wanted)
     fix = "check for a loose cable, a bad ground or interference on the servo bus"
     few = share <= MISSED_MAX or missed <= warned_of
-    return (READS.doubtful if cycles and few else READS.bad)(read, wanted, fix)
+    return READS.graded(cycles > 0 and share <= MISSED_GOOD, cycles > 0 and few, read, wanted, fix)
 
 
 def usb_latency(check: Check, latency_ms: int | None) -> Row:
@@ -291,16 +272,12 @@ def usb_latency(check: Check, latency_ms: int | None) -> Row:
     wanted = f"{LATENCY_GOOD_MS} ms"
     if latency_ms is None:
         return check.good("not an FTDI adapter", wanted)
-    if latency_ms <= LATENCY_GOOD_MS:
-        return check.good(f"{latency_ms} ms", wanted)
     fix = "keep it at 1 ms with a udev rule (see docs/commissioning.md, step 2)"
-    return check.bad(f"{latency_ms} ms", wanted, fix)
+    return check.row(latency_ms <= LATENCY_GOOD_MS, f"{latency_ms} ms", wanted, fix)
 
 
-def _equal(check: Check, values: Sequence[int], wanted: int, text: Callable[[int], str], fix: str) -> Row:
-    read = _each([text(value) for value in values])
-    good = all(value == wanted for value in values)
-    return check.good(read, text(wanted)) if good else check.bad(read, text(wanted), fix)
+def _equal(check: Check, values: Sequence[str], wanted: str, fix: str) -> Row:
+    return check.row(set(values) == {wanted}, _each(values), wanted, fix)
 
 
 def _each(values: Sequence[object]) -> str:
@@ -310,10 +287,3 @@ def _each(values: Sequence[object]) -> str:
 
 def _mode(mode: int) -> str:
     return f"{mode} ({MODES.get(mode, 'unknown')})"
-
-
-def _or(errors: Iterable[int]) -> int:
-    found = 0
-    for error in errors:
-        found |= error
-    return found

@@ -31,17 +31,23 @@ class Check:
         """Return a row that passes."""
         return self._row(True, read, wanted, "", self._level)
 
-    def bad(self, read: str, wanted: str, fix: str) -> Row:
+    def bad(self, read: str, wanted: str = "", fix: str = "") -> Row:
         """Return a row that fails and forbids take-off, or only warns the operator if `warns` is set."""
         return self._row(False, read, wanted, fix, self._level)
 
-    def doubtful(self, read: str, wanted: str, fix: str) -> Row:
+    def doubtful(self, read: str, wanted: str = "", fix: str = "") -> Row:
         """Return a row that warns; the operator decides."""
         return self._row(False, read, wanted, fix, Level.WARN)
 
     def row(self, ok: bool, read: str, wanted: str, fix: str) -> Row:
         """Return the row of `good` if `ok` is True, else that of `bad`."""
         return self.good(read, wanted) if ok else self.bad(read, wanted, fix)
+
+    def graded(self, ok: bool, tolerable: bool, read: str, wanted: str, fix: str) -> Row:
+        """Return the row of `good` if `ok` is True, else that of `doubtful` if `tolerable` is True, else that of `bad`."""
+        if ok:
+            return self.good(read, wanted)
+        return self.doubtful(read, wanted, fix) if tolerable else self.bad(read, wanted, fix)
 
     def _row(self, ok: bool, read: str, wanted: str, fix: str, level: Level) -> Row:
         plain = without_negative_zero

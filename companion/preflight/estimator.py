@@ -93,7 +93,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     """Return the rows of PX4's telemetry."""
     failure = o.failures.get("autopilot")
     if failure is not None:
-        yield DEVICE.bad(failure, "", "")
+        yield DEVICE.bad(failure)
         return
     yield DEVICE.good(f"answers on {vehicle.devices.autopilot.address}")
     yield _heartbeat(o, vehicle)
@@ -121,9 +121,8 @@ def _heartbeat(o: Observations, vehicle: Vehicle) -> Row:
     if not o.status:
         return HEARTBEAT.bad("no heartbeat", wanted, "check link and baud rate")
     age_s = max(0.0, o.start_s + o.duration_s - o.status[-1].heartbeat_stamp_s)
-    if age_s > limit_s:
-        return HEARTBEAT.bad(f"none for {age_s:.1f} s", wanted, "check cable, baud rate and PX4's power")
-    return HEARTBEAT.good(f"{age_s:.1f} s old", wanted)
+    read = f"{age_s:.1f} s old" if age_s <= limit_s else f"none for {age_s:.1f} s"
+    return HEARTBEAT.row(age_s <= limit_s, read, wanted, "check cable, baud rate and PX4's power")
 
 
 def _disarmed(o: Observations) -> Row:
@@ -139,13 +138,11 @@ def _rates(o: Observations) -> Row:
     rates_hz = [count / o.duration_s for count in (counts.position, counts.attitude, counts.imu)]
     read = "position {:.0f}, attitude {:.0f}, IMU {:.0f} Hz".format(*rates_hz)
     wanted = f"{RATE_GOOD_HZ:g} Hz each"
-    if min(rates_hz) >= RATE_GOOD_HZ:
-        return RATES.good(read, wanted)
     if rates_hz[0] == 0.0:
         fix = "PX4 sends no position until it fuses motion capture: see the row 'EKF2 fuses motion capture'"
     else:
         fix = "make the link faster: 921600 baud, MAV_x_RATE 80000 or more, MAV_x_MODE onboard (docs/px4.md)"
-    return (RATES.doubtful if min(rates_hz) >= RATE_MIN_HZ else RATES.bad)(read, wanted, fix)
+    return RATES.graded(min(rates_hz) >= RATE_GOOD_HZ, min(rates_hz) >= RATE_MIN_HZ, read, wanted, fix)
 
 
 def _lag(o: Observations, vehicle: Vehicle) -> Row:
@@ -156,9 +153,8 @@ def _lag(o: Observations, vehicle: Vehicle) -> Row:
     late_s = offsets_s[int(0.99 * (len(offsets_s) - 1))] - offsets_s[0]
     limit_s = vehicle.safety.link_lag_max_s
     read, wanted = f"{late_s * 1e3:.0f} ms at the 99th percentile", f"{limit_s * 1e3:.0f} ms"
-    if late_s <= limit_s:
-        return LAG.good(read, wanted)
-    return LAG.bad(read, wanted, "reduce other traffic on the link and the load on this computer")
+    fix = "reduce other traffic on the link and the load on this computer"
+    return LAG.row(late_s <= limit_s, read, wanted, fix)
 
 
 def vision(o: Observations, external: bool = False) -> Row:
@@ -232,11 +228,9 @@ def agreement(o: Observations) -> Iterator[Row]:
     apart_m, yaw_rad = max(math.hypot(*d) for d in apart), max(abs(a) for a in turned_rad)
     read = f"{apart_m:.3f} m and {math.degrees(yaw_rad):.1f} deg of yaw apart"
     wanted = f"{FUSED_WITHIN_M:g} m, {math.degrees(FUSED_WITHIN_RAD):.0f} deg"
-    if apart_m <= FUSED_WITHIN_M and yaw_rad <= FUSED_WITHIN_RAD:
-        yield AGREES.good(read, wanted)
-    else:
-        fix = "check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3, and the body's axes in Motive; reboot PX4 after a change"
-        yield AGREES.bad(read, wanted, fix)
+    agree = apart_m <= FUSED_WITHIN_M and yaw_rad <= FUSED_WITHIN_RAD
+    fix = "check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3, and the body's axes in Motive; reboot PX4 after a change"
+    yield AGREES.row(agree, read, wanted, fix)
     yield _wander(apart, turned_rad)
 
 
@@ -251,11 +245,8 @@ def _wander(places_m: Sequence[Sequence[float]], yaws_rad: Sequence[float]) -> R
     wander_rad = max(yaws_rad) - min(yaws_rad)
     read = f"varies by {wander_m:.3f} m and {math.degrees(wander_rad):.1f} deg"
     wanted = f"{STEADY_M:g} m, {math.degrees(STEADY_RAD):.0f} deg"
-    if wander_m <= STEADY_M and wander_rad <= STEADY_RAD:
-        return STEADY.good(read, wanted)
-    return STEADY.bad(
-        read, wanted, "leave the vehicle at rest; if the estimate does not settle, reboot PX4 and calibrate its gyros"
-    )
+    fix = "leave the vehicle at rest; if the estimate does not settle, reboot PX4 and calibrate its gyros"
+    return STEADY.row(wander_m <= STEADY_M and wander_rad <= STEADY_RAD, read, wanted, fix)
 
 
 def _pairs(states: tuple[VehicleState, ...], poses: tuple[MocapPose, ...]) -> Iterator[tuple[VehicleState, MocapPose]]:
@@ -272,11 +263,8 @@ def _pairs(states: tuple[VehicleState, ...], poses: tuple[MocapPose, ...]) -> It
 
 def _battery(o: Observations, vehicle: Vehicle) -> Row:
     status, safety = o.status[-1], vehicle.safety
-    remaining, voltage_v, voltage_min_v = (
-        status.battery_remaining,
-        status.battery_voltage_v,
-        safety.battery_voltage_min_v,
-    )
+    remaining, voltage_v = status.battery_remaining, status.battery_voltage_v
+    voltage_min_v = safety.battery_voltage_min_v
     told = [f"{remaining:.0%}" if remaining is not None else "", f"{voltage_v:.1f} V" if voltage_v is not None else ""]
     read = ", ".join(text for text in told if text) or "PX4 reports neither charge nor voltage"
     wanted = f"{safety.battery_warn:.0%}" + (f", {voltage_min_v:g} V" if voltage_min_v is not None else "")
@@ -297,8 +285,6 @@ def _hover(hover: float, vehicle: Vehicle) -> Row:
     source = "airframe.hover_thrust" if own else HOVER_PARAM
     read = f"{source} = {hover:.3f}"
     wanted = f"about {expected:.3f} ({airframe.mass_kg:g} kg, maximum thrust {airframe.thrust_max_n:g} N)"
-    if abs(off) <= HOVER_GOOD:
-        return HOVER.good(read, wanted)
     fix = f"measure it (companion hover fit) and set {source}, or correct airframe.mass_kg and airframe.thrust_max_n"
     # The parameter's own row refuses a value in PX4 that is far off.
-    return (HOVER.bad if own and abs(off) > HOVER_MAX else HOVER.doubtful)(read, wanted, fix)
+    return HOVER.graded(abs(off) <= HOVER_GOOD, not own or abs(off) <= HOVER_MAX, read, wanted, fix)

@@ -89,11 +89,8 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         yield DEVICE.doubtful("none; a catch, a lost payload and a force on the empty net are not detected", "", fix)
         return
     failure, stream = o.failures.get("force"), o.force_stream
-    if failure is not None:
-        yield DEVICE.bad(failure, "", "")
-        return
-    if stream is None:
-        yield DEVICE.bad("not checked", "", "")
+    if failure is not None or stream is None:
+        yield DEVICE.bad(failure or "not checked")
         return
     pose = (o.vehicle[-1].attitude_wxyz, o.arm[-1].angle_rad) if o.vehicle and o.arm else None
     yield from stream_rows(stream, o.force, o.duration_s, vehicle, vehicle.devices.force, pose)
@@ -112,11 +109,6 @@ def stream_rows(
     """Return the rows of a sensor that was recorded at rest.
 
     Args:
-        stream: counters of the stream.
-        samples: samples in order of time.
-        duration_s: duration of the observation.
-        vehicle: limits, and the tool whose weight the tare accounts for.
-        device: expected rate and range of the sensor.
         pose: attitude of the body and joint angles, rad; None if unknown, which omits the row on the tare.
     """
     if stream.lost is not None:
@@ -143,33 +135,26 @@ def stream_rows(
 def _rate(rate_hz: float, device: ForceDevice) -> Row:
     expected_hz = device.rate_hz
     read, wanted = f"{rate_hz:.0f} Hz", f"{expected_hz} Hz"
-    if rate_hz >= RATE_GOOD * expected_hz:
-        return RATE.good(read, wanted)
     fix = "check cable and adapter; power-cycle the sensor"
-    return (RATE.doubtful if rate_hz >= RATE_MIN * expected_hz else RATE.bad)(read, wanted, fix)
+    return RATE.graded(rate_hz >= RATE_GOOD * expected_hz, rate_hz >= RATE_MIN * expected_hz, read, wanted, fix)
 
 
 def _noise(samples: Sequence[ForceSample]) -> Row:
     """Return the row on the differences between consecutive samples. Drift has its own row."""
-    squares = [0.0, 0.0, 0.0]
-    for before, now in itertools.pairwise(samples):
-        for axis in range(3):
-            squares[axis] += (now.force_sensor_n[axis] - before.force_sensor_n[axis]) ** 2
-    noise_n = math.sqrt(max(squares) / (2 * (len(samples) - 1)))
+    axes = zip(*(sample.force_sensor_n for sample in samples), strict=True)
+    squares = max(sum((now - before) ** 2 for before, now in itertools.pairwise(axis)) for axis in axes)
+    noise_n = math.sqrt(squares / (2 * (len(samples) - 1)))
     read, wanted = f"{noise_n:.2f} N (one sigma)", f"{NOISE_GOOD_N:g} N"
-    if noise_n <= NOISE_GOOD_N:
-        return NOISE.good(read, wanted)
     fix = "remove sources of vibration; ground the sensor; route its cable away from motors"
-    return (NOISE.doubtful if noise_n <= NOISE_MAX_N else NOISE.bad)(read, wanted, fix)
+    return NOISE.graded(noise_n <= NOISE_GOOD_N, noise_n <= NOISE_MAX_N, read, wanted, fix)
 
 
 def _overload(samples: Sequence[ForceSample], device: ForceDevice) -> Row:
     count = sum(sample.overload for sample in samples)
-    if not count:
-        return OVERLOAD.good("none", "none")
+    read = f"{count} of {len(samples)} samples" if count else "none"
     limit_n = device.force_max_n
     fix = f"remove the load; if there is none, the sensor or its mount is damaged (devices.force.force_max_n is {limit_n:g} N)"
-    return OVERLOAD.bad(f"{count} of {len(samples)} samples", "none", fix)
+    return OVERLOAD.row(not count, read, "none", fix)
 
 
 def _tare(bias_n: Vec3, tool: Tool, device: ForceDevice) -> Row:
@@ -178,13 +163,11 @@ def _tare(bias_n: Vec3, tool: Tool, device: ForceDevice) -> Row:
     kind, tool_kg = tool.kind, tool.beyond_sensor_kg
     read = f"({x:.1f}, {y:.1f}, {z:.1f}) N besides the {kind}'s {tool_kg:g} kg"
     wanted = f"{TARE_GOOD * full_n:g} N"
-    if size_n <= TARE_GOOD * full_n:
-        return TARE.good(read, wanted)
     fix = (
         f"free the {kind}; if it is free, correct tool.{tool.mass_key}, loosen the sensor's mount or set its bias with the vendor's "
         "tool"
     )
-    return (TARE.doubtful if size_n <= TARE_MAX * full_n else TARE.bad)(read, wanted, fix)
+    return TARE.graded(size_n <= TARE_GOOD * full_n, size_n <= TARE_MAX * full_n, read, wanted, fix)
 
 
 def tare_bias_n(samples: Sequence[ForceSample], vehicle: Vehicle, attitude: Quat, arm_rad: Joints) -> Vec3:
@@ -204,9 +187,8 @@ def _still(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
     drift_n = max(max(mean[axis] for mean in means) - min(mean[axis] for mean in means) for axis in range(3))
     limit_n = vehicle.safety.force_drift_n
     read, wanted = f"drifts by {drift_n:.2f} N", f"{limit_n:g} N"
-    if drift_n <= limit_n:
-        return STILL.good(read, wanted)
-    return STILL.bad(read, wanted, "do not touch the net; let the sensor warm up for a few minutes")
+    fix = "do not touch the net; let the sensor warm up for a few minutes"
+    return STILL.row(drift_n <= limit_n, read, wanted, fix)
 
 
 def mean_force_n(samples: Sequence[ForceSample]) -> Vec3:

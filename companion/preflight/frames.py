@@ -20,7 +20,7 @@ from companion.model.observations import Observations
 from companion.model.types import MocapPose, Quat, Vec3, VehicleState
 from companion.preflight.axes import IDENTITY, MIRRORINGS, ROTATIONS, Y_UP, AxisMap
 from companion.preflight.checks import Check
-from companion.preflight.hand_test.motion import angle_rad, mean_attitude, mean_vector, norm, turned_rad
+from companion.preflight.hand_test.motion import angle_rad, mean_attitude, mean_vector, turned_rad
 
 HAND_TEST = Check(
     "frames.hand_test",
@@ -171,42 +171,29 @@ def standing(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> Iterat
     yaw_off_deg = math.degrees(wrap_rad(yaw_from_quat(at.attitude) - wanted.yaw_rad))
 
     read, text = f"{tilt_deg:.1f} deg from the vertical", f"within {GRAVITY_MAX_DEG:g} deg"
-    if tilt_deg <= GRAVITY_MAX_DEG:
-        yield GRAVITY.good(read, text)
-    elif max(abs(high_m), away_m) <= wanted.tolerance_m:
-        yield GRAVITY.bad(read, text, fix or f"the rigid body's zero was set while it was tilted: {_RESET}")
-    else:
-        level = "calibration square level on the floor"
-        yield GRAVITY.bad(read, text, fix or f"set the ground plane again in Motive ({level}), then {_RESET}")
+    reset = f"set the ground plane again in Motive (calibration square level on the floor), then {_RESET}"
+    if max(abs(high_m), away_m) <= wanted.tolerance_m:
+        reset = f"the rigid body's zero was set while it was tilted: {_RESET}"
+    yield GRAVITY.row(tilt_deg <= GRAVITY_MAX_DEG, read, text, fix or reset)
 
     read, text = f"z = {z:.3f} m", f"{wz:.2f} ± {HEIGHT_GOOD_M:g} m (airframe.ground_clearance_m)"
     pivot = (
         "in Motive, set the rigid body's pivot to the body's origin and the ground plane to the floor, "
         "or correct airframe.ground_clearance_m"
     )
-    if abs(high_m) <= HEIGHT_GOOD_M:
-        yield HEIGHT.good(read, text)
-    elif abs(high_m) <= wanted.tolerance_m:
-        yield HEIGHT.doubtful(read, text, fix or pivot)
-    else:
-        yield HEIGHT.bad(read, text, fix or pivot)
+    yield HEIGHT.graded(abs(high_m) <= HEIGHT_GOOD_M, abs(high_m) <= wanted.tolerance_m, read, text, fix or pivot)
 
     read, text = f"({x:.2f}, {y:.2f}) m, {away_m:.2f} m away", f"({wx:g}, {wy:g}) m, within {wanted.tolerance_m:g} m"
-    if away_m <= wanted.tolerance_m:
-        yield PLACE.good(read, text)
-    else:
-        yield PLACE.bad(read, text, fix or "carry the vehicle there or change the mission's start.position_m")
+    carry = "carry the vehicle there or change the mission's start.position_m"
+    yield PLACE.row(away_m <= wanted.tolerance_m, read, text, fix or carry)
 
     read = f"{math.degrees(yaw_from_quat(at.attitude)):.0f} deg"
     text = f"{math.degrees(wanted.yaw_rad):g} ± {wanted.yaw_tolerance_deg:g} deg"
-    if abs(yaw_off_deg) <= wanted.yaw_tolerance_deg:
-        yield YAW.good(read, text)
-    else:
-        turned = (
-            f"if the nose really points {abs(yaw_off_deg):.0f} deg off, turn the vehicle or change the mission's start.yaw_deg; "
-            f"if not, the rigid body's zero is turned by {yaw_off_deg:+.0f} deg: {_RESET}"
-        )
-        yield YAW.bad(read, text, fix or turned)
+    turned = (
+        f"if the nose really points {abs(yaw_off_deg):.0f} deg off, turn the vehicle or change the mission's start.yaw_deg; "
+        f"if not, the rigid body's zero is turned by {yaw_off_deg:+.0f} deg: {_RESET}"
+    )
+    yield YAW.row(abs(yaw_off_deg) <= wanted.yaw_tolerance_deg, read, text, fix or turned)
 
 
 def explanation(at: Pose, force_m_s2: Vec3, wanted: Wanted, up_axis: str) -> str:
@@ -284,11 +271,8 @@ def _plane(axes: AxisMap) -> str:
 
 
 def _hand_test(passed: str, changed: str) -> Row:
-    if passed:
-        return HAND_TEST.good(passed, "passed with this set-up")
-    return HAND_TEST.bad(
-        changed or "never passed", "passed with this set-up", "run companion check --hand (one minute)"
-    )
+    read = passed or changed or "never passed"
+    return HAND_TEST.row(bool(passed), read, "passed with this set-up", "run companion check --hand (one minute)")
 
 
 def _rest(poses: list[MocapPose], states: tuple[VehicleState, ...]) -> Row:
@@ -301,7 +285,7 @@ def _rest(poses: list[MocapPose], states: tuple[VehicleState, ...]) -> Row:
     moved_deg = math.degrees(
         turned_rad(mean_attitude([p.attitude_wxyz for p in first]), mean_attitude([p.attitude_wxyz for p in last]))
     )
-    rate_deg_s = math.degrees(norm(mean_vector([state.angular_rate_body_rad_s for state in states])))
+    rate_deg_s = math.degrees(math.hypot(*mean_vector([state.angular_rate_body_rad_s for state in states])))
     read = (
         f"moved by {1e3 * moved_m:.1f} mm and {moved_deg:.1f} deg during the observation, gyro {rate_deg_s:.1f} deg/s"
     )
@@ -323,20 +307,14 @@ def _noise(poses: list[MocapPose], at: Pose) -> Iterator[Row]:
     ):
         noise, worst = math.sqrt(sum(value * value for value in away) / len(away)), max(away)
         read, wanted = f"{noise:.2g} {unit}, {worst:.2g} {unit} in the worst frame", f"{good:g} {unit}, {jump:g} {unit}"
-        if worst > jump or noise > most:
-            yield check.bad(read, wanted, fix)
-        elif noise > good:
-            yield check.doubtful(read, wanted, fix)
-        else:
-            yield check.good(read, wanted)
+        yield check.graded(worst <= jump and noise <= good, worst <= jump and noise <= most, read, wanted, fix)
 
 
 def _accelerometer(force_m_s2: Vec3) -> Row:
-    size = norm(force_m_s2)
+    size = math.hypot(*force_m_s2)
     read, wanted = f"{size:.2f} m/s2", f"{GRAVITY_M_S2:g} ± {GRAVITY_TOLERANCE_M_S2:g} m/s2"
-    if abs(size - GRAVITY_M_S2) <= GRAVITY_TOLERANCE_M_S2:
-        return ACCELEROMETER.good(read, wanted)
-    return ACCELEROMETER.bad(read, wanted, "calibrate PX4's accelerometer")
+    right = abs(size - GRAVITY_M_S2) <= GRAVITY_TOLERANCE_M_S2
+    return ACCELEROMETER.row(right, read, wanted, "calibrate PX4's accelerometer")
 
 
 def _px4(at: Pose, states: tuple[VehicleState, ...], vehicle: Vehicle) -> Iterator[Row]:
@@ -346,15 +324,10 @@ def _px4(at: Pose, states: tuple[VehicleState, ...], vehicle: Vehicle) -> Iterat
     estimate = mean_attitude([state.attitude_wxyz for state in states[len(states) // 2 :]])
     tilt_deg = math.degrees(angle_rad(quat_rotate(estimate, _UP), quat_rotate(at.attitude, _UP)))
     read, wanted = f"{tilt_deg:.1f} deg apart", f"within {TILT_MAX_DEG:g} deg"
-    if tilt_deg <= TILT_MAX_DEG:
-        yield PX4_TILT.good(read, wanted)
-    else:
-        fix = "see the row on gravity; if it passes, set PX4's level horizon (SENS_BOARD_X_OFF, SENS_BOARD_Y_OFF)"
-        yield PX4_TILT.bad(read, wanted, fix)
+    fix = "see the row on gravity; if it passes, set PX4's level horizon (SENS_BOARD_X_OFF, SENS_BOARD_Y_OFF)"
+    yield PX4_TILT.row(tilt_deg <= TILT_MAX_DEG, read, wanted, fix)
     yaw_deg = math.degrees(wrap_rad(yaw_from_quat(estimate) - yaw_from_quat(at.attitude)))
     most_deg = vehicle.safety.yaw_disagreement_deg
     read, wanted = f"{yaw_deg:+.1f} deg apart", f"within {most_deg:g} deg (safety.yaw_disagreement_deg)"
-    if abs(yaw_deg) <= most_deg:
-        yield PX4_YAW.good(read, wanted)
-    else:
-        yield PX4_YAW.bad(read, wanted, "set EKF2_EV_CTRL to 11 and EKF2_MAG_TYPE to 5: companion px4 params --diff")
+    fix = "set EKF2_EV_CTRL to 11 and EKF2_MAG_TYPE to 5: companion px4 params --diff"
+    yield PX4_YAW.row(abs(yaw_deg) <= most_deg, read, wanted, fix)

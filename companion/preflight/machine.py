@@ -67,24 +67,17 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         if machine.disk_free_bytes is not None:
             yield _disk(machine.disk_free_bytes, o.mission_s if o.mission_s is not None else DEFAULT_MISSION_S)
         others = sorted({governor for governor in machine.governors if governor != "performance"})
-        if others:
-            fix = "run sudo companion install --systemd; for this session only: cpupower frequency-set -g performance"
-            yield GOVERNOR.bad(", ".join(others), "performance", fix)
-        else:
-            yield GOVERNOR.good("performance" if machine.governors else "no governor is reported", "performance")
-        if machine.realtime is None:
-            yield REALTIME.bad(
-                "refused: the flight runs at normal priority", "SCHED_FIFO", _PERMIT.format("@dialout - rtprio 60")
-            )
-        else:
-            yield REALTIME.good(machine.realtime, "SCHED_FIFO")
+        read = ", ".join(others) or ("performance" if machine.governors else "no governor is reported")
+        fix = "run sudo companion install --systemd; for this session only: cpupower frequency-set -g performance"
+        yield GOVERNOR.row(not others, read, "performance", fix)
+        read = machine.realtime or "refused: the flight runs at normal priority"
+        fix = _PERMIT.format("@dialout - rtprio 60")
+        yield REALTIME.row(machine.realtime is not None, read, "SCHED_FIFO", fix)
         yield _memory_lock(machine, vehicle.computer)
         yield _cpus(machine, vehicle.computer)
     if o.recorder is not None:
-        if o.recorder:
-            yield RECORDER.bad(o.recorder, "the recorder opens a log", "remove the cause that this row names")
-        else:
-            yield RECORDER.good("opens a log", "the recorder opens a log")
+        fix = "remove the cause that this row names"
+        yield RECORDER.row(not o.recorder, o.recorder or "opens a log", "the recorder opens a log", fix)
 
 
 _PERMIT = (
@@ -96,11 +89,8 @@ _PERMIT = (
 def _memory_lock(machine: Machine, computer: Computer) -> Row:
     if not computer.lock_memory:
         return MEMORY_LOCK.good("computer.lock_memory is false: not requested")
-    if machine.memory_lock is None:
-        return MEMORY_LOCK.good("permitted", "RLIMIT_MEMLOCK unlimited")
-    return MEMORY_LOCK.bad(
-        machine.memory_lock, "RLIMIT_MEMLOCK unlimited", _PERMIT.format("@dialout - memlock unlimited")
-    )
+    refused, fix = machine.memory_lock, _PERMIT.format("@dialout - memlock unlimited")
+    return MEMORY_LOCK.row(refused is None, refused or "permitted", "RLIMIT_MEMLOCK unlimited", fix)
 
 
 def _cpus(machine: Machine, computer: Computer) -> Row:
@@ -121,7 +111,5 @@ def _disk(free_bytes: int, mission_s: float) -> Row:
     once = LOG_BYTES_PER_S * (mission_s + GROUND_S) + REPORT_BYTES
     twice = LOG_BYTES_PER_S * (2.0 * mission_s + GROUND_S) + REPORT_BYTES
     read, wanted = f"{free_bytes / 1e6:.0f} MB free", f"{twice / 1e6:.0f} MB for a mission of {mission_s:.0f} s"
-    if free_bytes >= twice:
-        return DISK.good(read, wanted)
     fix = "delete old flights, or choose another disk with --out"
-    return (DISK.doubtful if free_bytes >= once else DISK.bad)(read, wanted, fix)
+    return DISK.graded(free_bytes >= twice, free_bytes >= once, read, wanted, fix)

@@ -48,14 +48,10 @@ CHECKS = (VEHICLE, PLAN, ARM, ROOM)
 def rows(o: Observations, config: FlightConfig) -> Iterator[Row]:
     """Return the rows on plan, arm and position."""
     mission, vehicle = config.mission, config.vehicle
-    if o.left_out:
-        yield VEHICLE.bad(
-            f"left out: {'; '.join(o.left_out)}",
-            "all given",
-            "add them to the vehicle file, as they are on the machine",
-        )
-    elif o.left_out is not None:
-        yield VEHICLE.good("all given", "all given")
+    if o.left_out is not None:
+        read = f"left out: {'; '.join(o.left_out)}" if o.left_out else "all given"
+        fix = "add them to the vehicle file, as they are on the machine"
+        yield VEHICLE.row(not o.left_out, read, "all given", fix)
     if o.plan is not None:
         if o.plan:
             yield PLAN.bad(
@@ -76,9 +72,8 @@ def _arm(angle_rad: Joints, start: Start) -> Row:
     off_deg = max(abs(angle - wanted) for angle, wanted in zip(angle_deg, start.arm_deg, strict=True))
     read = f"({listed(angle_deg, '.0f')}) deg"
     wanted = f"({listed(start.arm_deg, 'g')}) ± {start.arm_tolerance_deg:g} deg"
-    if off_deg <= start.arm_tolerance_deg:
-        return ARM.good(read, wanted)
-    return ARM.bad(read, wanted, "move the arm there by hand, or change the mission's start.arm_deg")
+    fix = "move the arm there by hand, or change the mission's start.arm_deg"
+    return ARM.row(off_deg <= start.arm_tolerance_deg, read, wanted, fix)
 
 
 def _room(position: Vec3, room: Room, radius_m: float) -> Row:

@@ -5,6 +5,7 @@ functions.
 from __future__ import annotations
 
 import itertools
+import statistics
 from collections.abc import Iterator
 
 from companion.config.vehicle import Vehicle
@@ -83,14 +84,11 @@ CLOCK_GOOD, WANDER_GOOD_S = 0.01, 0.020
 def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     """Return the rows of motion capture."""
     if vehicle.devices.mocap.external:
-        yield DEVICE.doubtful(NOT_CHECKED, "", "")
+        yield DEVICE.doubtful(NOT_CHECKED)
         return
     failure, stream = o.failures.get("mocap"), o.mocap_stream
-    if failure is not None:
-        yield DEVICE.bad(failure, "", "")
-        return
-    if stream is None:
-        yield DEVICE.bad("not checked", "", "")
+    if failure is not None or stream is None:
+        yield DEVICE.bad(failure or "not checked")
         return
     yield DEVICE.good(stream.application or "answers")
     yield _rate(o, stream, vehicle)
@@ -109,19 +107,15 @@ def _rate(o: Observations, stream: MocapStream, vehicle: Vehicle) -> Row:
     rate_hz, expected_hz = stream.frames / o.duration_s, vehicle.devices.mocap.rate_hz
     least_hz = vehicle.safety.mocap_rate_min_hz
     read, wanted = f"{rate_hz:.0f} Hz", f"{expected_hz:g} Hz"
-    if rate_hz >= RATE_GOOD * expected_hz:
-        return RATE.good(read, wanted)
     fix = "set the camera rate in Motive or devices.mocap.rate_hz; check for a slow network or a busy computer"
-    return (RATE.doubtful if rate_hz >= least_hz else RATE.bad)(read, wanted, fix)
+    return RATE.graded(rate_hz >= RATE_GOOD * expected_hz, rate_hz >= least_hz, read, wanted, fix)
 
 
 def _jitter(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
     gap_s = max(b.stamp_s - a.stamp_s for a, b in itertools.pairwise(poses))
     read, wanted = f"longest gap {gap_s * 1e3:.0f} ms", f"{GAP_GOOD_S * 1e3:.0f} ms"
-    if gap_s <= max(GAP_GOOD_S, 2.5 / vehicle.devices.mocap.rate_hz):
-        return JITTER.good(read, wanted)
     fix = "use a cable, not Wi-Fi; disable power saving of the network card; see the rows on processor and real-time permission"
-    return JITTER.bad(read, wanted, fix)
+    return JITTER.row(gap_s <= max(GAP_GOOD_S, 2.5 / vehicle.devices.mocap.rate_hz), read, wanted, fix)
 
 
 def _latency(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
@@ -134,28 +128,22 @@ def _latency(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
         )
     high_s = latency_s[int(0.99 * (len(latency_s) - 1))]
     read = f"{latency_s[len(latency_s) // 2] * 1e3:.1f} ms, {high_s * 1e3:.1f} ms at the 99th percentile"
-    if high_s <= limit_s:
-        return LATENCY.good(read, wanted)
     fix = "lower Motive's load: fewer markers and bodies, no video, labelled markers off"
-    return (LATENCY.doubtful if high_s <= worst_s else LATENCY.bad)(read, wanted, fix)
+    return LATENCY.graded(high_s <= limit_s, high_s <= worst_s, read, wanted, fix)
 
 
 def _lost(stream: MocapStream) -> Row:
     share = stream.lost / max(1, stream.frames + stream.lost)
     read, wanted = f"{stream.lost} of {stream.frames + stream.lost} frames, {share:.1%}", f"{LOST_GOOD:.1%}"
-    if share <= LOST_GOOD:
-        return LOST.good(read, wanted)
     fix = "connect by cable on a separate network; on Wi-Fi, use unicast (devices.mocap.transport)"
-    return (LOST.doubtful if share <= LOST_MAX else LOST.bad)(read, wanted, fix)
+    return LOST.graded(share <= LOST_GOOD, share <= LOST_MAX, read, wanted, fix)
 
 
 def _tracked(poses: tuple[MocapPose, ...]) -> Row:
     share = sum(pose.tracking_valid for pose in poses) / len(poses)
     read = f"{share:.1%} of the frames"
-    if share == 1.0:
-        return TRACKED.good(read, "all")
     fix = "clean or move the markers, make sure that the cameras can see them, calibrate the volume"
-    return (TRACKED.doubtful if share >= TRACKED_MIN else TRACKED.bad)(read, "all", fix)
+    return TRACKED.graded(share == 1.0, share >= TRACKED_MIN, read, "all", fix)
 
 
 def _body(stream: MocapStream, vehicle: Vehicle) -> Row:
@@ -171,21 +159,18 @@ def _body(stream: MocapStream, vehicle: Vehicle) -> Row:
 def _error(poses: tuple[MocapPose, ...]) -> Row:
     mean_m = sum(pose.marker_error_m for pose in poses) / len(poses)
     read, wanted = f"{mean_m * 1e3:.1f} mm", f"{ERROR_GOOD_M * 1e3:.0f} mm"
-    if mean_m <= ERROR_GOOD_M:
-        return ERROR.good(read, wanted)
-    return ERROR.bad(read, wanted, "create the rigid body again in Motive; fasten its markers; calibrate the volume")
+    fix = "create the rigid body again in Motive; fasten its markers; calibrate the volume"
+    return ERROR.row(mean_m <= ERROR_GOOD_M, read, wanted, fix)
 
 
 def _clock(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
     """Return the row on a least-squares fit of arrival time over frame number: the slope is the server's frame period by the
     companion's clock, and the residual is jitter.
     """
-    count, first = len(poses), poses[0]
+    first = poses[0]
     n = [pose.frame_number - first.frame_number for pose in poses]
     t = [pose.stamp_s - first.stamp_s for pose in poses]
-    mean_n, mean_t = sum(n) / count, sum(t) / count
-    spread = sum((a - mean_n) ** 2 for a in n)
-    period_s = sum((a - mean_n) * (b - mean_t) for a, b in zip(n, t, strict=True)) / spread if spread else 0.0
+    period_s, first_s = statistics.linear_regression(n, t) if any(n) else (0.0, 0.0)
     expected_hz = vehicle.devices.mocap.rate_hz
     wanted = f"{1e3 / expected_hz:.3f} ms per frame, steady within {WANDER_GOOD_S * 1e3:.0f} ms"
     if not period_s > 0.0:
@@ -193,13 +178,12 @@ def _clock(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
             "the frame number does not advance", wanted, "Motive is paused or is playing a take: restart live streaming"
         )
     # Late frames are jitter; only the median of each tenth of the time is used here.
-    off_s = sorted(_medians([b - mean_t - period_s * (a - mean_n) for a, b in zip(n, t, strict=True)]))
+    off_s = sorted(_medians([b - first_s - period_s * a for a, b in zip(n, t, strict=True)]))
     wander_s = off_s[-1] - off_s[0]
     read = f"{period_s * 1e3:.3f} ms per frame, jitter {wander_s * 1e3:.1f} ms"
-    if abs(period_s * expected_hz - 1.0) <= CLOCK_GOOD and wander_s <= WANDER_GOOD_S:
-        return CLOCK.good(read, wanted)
+    steady = abs(period_s * expected_hz - 1.0) <= CLOCK_GOOD and wander_s <= WANDER_GOOD_S
     fix = "set devices.mocap.rate_hz to the camera rate; check for a server that stalls, or for clock steps by time synchronisation"
-    return CLOCK.bad(read, wanted, fix)
+    return CLOCK.row(steady, read, wanted, fix)
 
 
 def _medians(values: list[float]) -> list[float]:

@@ -77,13 +77,10 @@ async def observe(
 
     Args:
         devices: open devices; for a device that could not be opened, only the failure is reported.
-        config: the effective configuration.
-        clock: the flight clock.
         out: folder of the flight's files, for the free disk space.
         param_names: PX4's parameters to read.
         unsettled: called when the time is over, with the data of the last `preflight_s`; see
             `companion.preflight.evaluation.unsettled`.
-        progress: progress callback.
         known: facts that are not observed: plan, recorder, mission length, hand test.
     """
     watcher = _Watcher(devices, config, clock)

@@ -21,7 +21,8 @@ ROTORS = Check(
     "with another order of rotors or another spin direction, the vehicle flips or spins at take-off",
 )
 CHECKS = (ROTORS,)
-FIRMWARE_ID, UNREAD_ID = "px4.firmware", "px4.params"
+FIRMWARE_ID = "px4.firmware"
+UNREAD = Check("px4.params", "PX4 parameters", why="PX4's behaviour would be unknown")
 PARAM_ID = "px4.param."
 """Prefix of the id of a parameter's row; the parameter's name follows it."""
 
@@ -36,23 +37,11 @@ def rows(firmware: str | None, params: Mapping[str, Value], vehicle: Vehicle) ->
     Args:
         firmware: text returned by `MavsdkAutopilot.firmware`; None to return no row on the firmware.
         params: PX4's parameters by name; parameters that PX4 does not have are absent.
-        vehicle: limits, room, thrust and the link's address.
     """
     found = [] if firmware is None else [firmware_row(firmware)]
     if not params:
         if firmware is not None:
-            why = "PX4's behaviour would be unknown"
-            found.append(
-                Row(
-                    id=UNREAD_ID,
-                    title="PX4 parameters",
-                    ok=False,
-                    read="none could be read",
-                    wanted="",
-                    why=why,
-                    fix="check the link, then try again",
-                )
-            )
+            found.append(UNREAD.bad("none could be read", "", "check the link, then try again"))
         return found
     return [*found, *_param_rows(params, vehicle), *_rotor_rows(params, vehicle)]
 
@@ -97,33 +86,12 @@ def _param_rows(params: Mapping[str, Value], vehicle: Vehicle) -> Iterator[Row]:
             continue
         value = params.get(wanted.name)
         text = wanted.text(vehicle)
-        row_id = PARAM_ID + wanted.name
-        if value is None and wanted.only:
-            continue
-        if value is None:
+        check = Check(PARAM_ID + wanted.name, wanted.name, why=wanted.why, warns=wanted.level is Level.WARN)
+        if value is not None:
+            yield check.row(wanted.accepts(value, vehicle), text_of(value), text, fix_of(wanted))
+        elif not wanted.only:
             fix = "check the firmware: PX4 1.16 and 1.18 have this parameter"
-            yield Row(
-                id=row_id,
-                title=wanted.name,
-                ok=False,
-                read="PX4 does not have this parameter",
-                wanted=text,
-                why=wanted.why,
-                fix=fix,
-                level=Level.WARN,
-            )
-            continue
-        ok = wanted.accepts(value, vehicle)
-        yield Row(
-            id=row_id,
-            title=wanted.name,
-            ok=ok,
-            read=text_of(value),
-            wanted=text,
-            why=wanted.why,
-            fix="" if ok else fix_of(wanted),
-            level=wanted.level,
-        )
+            yield check.doubtful("PX4 does not have this parameter", text, fix)
 
 
 def _rotor_rows(params: Mapping[str, Value], vehicle: Vehicle) -> Iterator[Row]:

@@ -58,10 +58,8 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         "compare with a tape measure",
     )
     read, wanted = f"{tether.load_rating_n:g} N", f"{airframe.thrust_max_n:g} N (airframe.thrust_max_n)"
-    if tether.load_rating_n >= airframe.thrust_max_n:
-        yield STRENGTH.good(read, wanted)
-    else:
-        yield STRENGTH.bad(read, wanted, "use a stronger tether, and correct tether.load_rating_n")
+    fix = "use a stronger tether, and correct tether.load_rating_n"
+    yield STRENGTH.row(tether.load_rating_n >= airframe.thrust_max_n, read, wanted, fix)
     if vehicle.arm.joints:
         yield _arm(vehicle, tether)
     pose = last_pose(o, external=vehicle.devices.mocap.external)
@@ -71,11 +69,8 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     tied_m = [p + a for p, a in zip(pose.position_world_m, attachment, strict=True)]
     slack_m = tether.length_m - math.dist(tied_m, tether.anchor_world_m)
     read, wanted = f"{slack_m:.2f} m", f"{tether.margin_m:g} m or more"
-    if slack_m >= tether.margin_m:
-        yield SLACK.good(read, wanted)
-    else:
-        fix = "move the vehicle nearer to the anchor, or correct tether.length_m and tether.anchor_world_m"
-        yield SLACK.bad(read, wanted, fix)
+    fix = "move the vehicle nearer to the anchor, or correct tether.length_m and tether.anchor_world_m"
+    yield SLACK.row(slack_m >= tether.margin_m, read, wanted, fix)
 
 
 def _arm(vehicle: Vehicle, tether: Tether) -> Row:

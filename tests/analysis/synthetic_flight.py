@@ -6,12 +6,13 @@ import json
 import math
 import random
 import select
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from companion.analysis.log import FlightLog
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import (
     ArmState,
@@ -94,11 +95,9 @@ def reference_at(t_s: float) -> tuple[Vec3, Joints]:
     return (x, 0.0, 0.15 + 0.85 * up), arm
 
 
-def synthetic_flight(
-    seed: int = 1, end_s: float = LANDED_S, rate_hz: float = RATE_HZ
-) -> Iterator[tuple[Inputs, Outputs, Sent]]:
+def synthetic_flight(end_s: float = LANDED_S, rate_hz: float = RATE_HZ) -> Iterator[tuple[Inputs, Outputs, Sent]]:
     """Ticks up to `end_s` of the mission clock."""
-    noise = random.Random(seed)
+    noise = random.Random(1)
     period_s = 1.0 / rate_hz
     caught = False
     last_kind: PhaseKind | None = None
@@ -253,6 +252,19 @@ def synthetic_flight(
             current_sent_s=core_s + 2e-4,
         )
         yield inputs, outputs, sent
+
+
+def log_of_rows(
+    rows: Iterable[tuple[Inputs, Outputs, Sent]],
+    config: dict[str, Any] = CONFIG,
+    *,
+    path: str = "flight.mcap",
+    about: dict[str, str] | None = None,
+) -> FlightLog:
+    """Return ticks in memory as a closed log; `about` is its metadata record `companion`."""
+    inputs, outputs, sent = zip(*rows, strict=True)
+    metadata = {"companion": about or {}, "config": {"json": json.dumps(config)}}
+    return FlightLog(path=Path(path), inputs=inputs, outputs=outputs, sent=sent, metadata=metadata, closed=True)
 
 
 def record_flight(

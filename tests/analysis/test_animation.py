@@ -20,7 +20,7 @@ from companion.config.loader import load_vehicle
 from companion.control.arm_model import manipulator_of
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.types import Joints
-from tests.analysis.synthetic_flight import CATCH_S, CONFIG, synthetic_flight
+from tests.analysis.synthetic_flight import CATCH_S, CONFIG, log_of_rows, synthetic_flight
 from tests.ground.page_browser import chromium
 from tests.support import ROOT
 
@@ -29,18 +29,8 @@ SIMULATED = {"payload_kg": 0.2, "world": {"throw_velocity_m_s": [-2.0, 0.15, -1.
 
 
 def flown(phase: str | None = None) -> FlightLog:
-    rows = list(synthetic_flight(rate_hz=50.0))
-    outputs = tuple(o if phase is None else replace(o, phase=phase) for _, o, _ in rows)
-    config = {**CONFIG, "vehicle": json.loads(VEHICLE.model_dump_json())}
-    metadata = {"config": {"json": json.dumps(config)}}
-    return FlightLog(
-        path=Path("flight.mcap"),
-        inputs=tuple(r[0] for r in rows),
-        outputs=outputs,
-        sent=tuple(r[2] for r in rows),
-        metadata=metadata,
-        closed=True,
-    )
+    rows = ((i, replace(o, phase=phase or o.phase), s) for i, o, s in synthetic_flight(rate_hz=50.0))
+    return log_of_rows(rows, {**CONFIG, "vehicle": json.loads(VEHICLE.model_dump_json())})
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from companion.analysis.report import write_report
 from companion.analysis.summary import empty_summary, summarise, write_summary
 from companion.model.codec import differences
 from companion.model.types import Inputs, Outputs, PhaseKind, Sent
-from tests.analysis.synthetic_flight import CATCH_S, CONFIG, record_flight, synthetic_flight
+from tests.analysis.synthetic_flight import CATCH_S, CONFIG, log_of_rows, record_flight, synthetic_flight
 from tests.support import ROOT
 
 Row = tuple[Inputs, Outputs, Sent]
@@ -53,9 +53,7 @@ def flown() -> list[Row]:
 
 
 def made_of(rows: list[Row], config: dict[str, Any] | None = None) -> FlightLog:
-    metadata = {"companion": {"version_companion": "0.1.0"}, "config": {"json": json.dumps(config or CONFIG)}}
-    inputs, outputs, sent = zip(*rows, strict=True)
-    return FlightLog(path=Path("made.mcap"), inputs=inputs, outputs=outputs, sent=sent, metadata=metadata, closed=True)
+    return log_of_rows(rows, config or CONFIG, about={"version_companion": "0.1.0"})
 
 
 def changed(change: Callable[[Inputs, Outputs, Sent], Row]) -> FlightLog:

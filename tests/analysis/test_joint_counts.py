@@ -13,7 +13,7 @@ from companion.analysis.animation import movie_of
 from companion.analysis.log import FlightLog
 from companion.analysis.plots import write_plots
 from companion.analysis.summary import summarise
-from tests.analysis.synthetic_flight import CONFIG, synthetic_flight, with_joints
+from tests.analysis.synthetic_flight import CONFIG, log_of_rows, synthetic_flight, with_joints
 from tests.machines import vehicle_with_joints
 
 SIMULATED = {"payload_kg": 0.2, "world": {"throw_velocity_m_s": [0.0, -1.5, 0.5]}}
@@ -22,11 +22,7 @@ SIMULATED = {"payload_kg": 0.2, "world": {"throw_velocity_m_s": [0.0, -1.5, 0.5]
 def flight(count: int, rate_hz: float = 20.0) -> FlightLog:
     rows = [with_joints(row, count) for row in synthetic_flight(rate_hz=rate_hz)]
     vehicle = {**CONFIG["vehicle"], **json.loads(vehicle_with_joints(count).model_dump_json())}
-    inputs, outputs, sent = zip(*rows, strict=True)
-    metadata = {"config": {"json": json.dumps({**CONFIG, "vehicle": vehicle})}}
-    return FlightLog(
-        path=Path("flight.mcap"), inputs=inputs, outputs=outputs, sent=sent, metadata=metadata, closed=True
-    )
+    return log_of_rows(rows, {**CONFIG, "vehicle": vehicle})
 
 
 @pytest.mark.parametrize("count", [0, 1, 4])

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import pytest
 from msgspec.structs import replace
 
 from companion.analysis import metrics
 from companion.analysis.log import FlightLog
 from companion.model.types import Outputs, PhaseKind, Vec3
-from tests.analysis.synthetic_flight import CONFIG, synthetic_flight
+from tests.analysis.synthetic_flight import log_of_rows, synthetic_flight
 
 
 def flown(observed: Vec3 | None, measured: Vec3 | None) -> FlightLog:
@@ -28,15 +25,7 @@ def flown(observed: Vec3 | None, measured: Vec3 | None) -> FlightLog:
         )
         return replace(o, control=control)
 
-    rows = list(synthetic_flight(rate_hz=20.0))
-    return FlightLog(
-        path=Path("flight.mcap"),
-        inputs=tuple(i for i, _, _ in rows),
-        outputs=tuple(with_forces(o) for _, o, _ in rows),
-        sent=tuple(s for _, _, s in rows),
-        metadata={"config": {"json": json.dumps(CONFIG)}},
-        closed=True,
-    )
+    return log_of_rows((i, with_forces(o), s) for i, o, s in synthetic_flight(rate_hz=20.0))
 
 
 def test_the_error_of_the_observer_counts_in_flight_only() -> None:

@@ -106,24 +106,17 @@ def test_percentiles_are_samples() -> None:
 
 def test_bytes_on_the_wire_are_sent_one_after_the_other() -> None:
     spread = Latency(1.0, 1.0, 1.0)
-    assert BusCycles(
-        command_ms=spread,
-        cycle_ms=spread,
-        failed=0,
-        request_bytes=16,
-        answer_bytes=42,
-        write_bytes=20,
-        baud_bps=3_000_000,
-    ).wire_ms == pytest.approx(0.26)
-    assert BusCycles(
-        command_ms=spread,
-        cycle_ms=spread,
-        failed=0,
-        request_bytes=16,
-        answer_bytes=42,
-        write_bytes=20,
-        baud_bps=1_000_000,
-    ).wire_ms == pytest.approx(0.78)
+    for baud_bps, wire_ms in ((3_000_000, 0.26), (1_000_000, 0.78)):
+        cycles = BusCycles(
+            command_ms=spread,
+            cycle_ms=spread,
+            failed=0,
+            request_bytes=16,
+            answer_bytes=42,
+            write_bytes=20,
+            baud_bps=baud_bps,
+        )
+        assert cycles.wire_ms == pytest.approx(wire_ms)
 
 
 def test_a_ports_bytes_are_counted_both_ways() -> None:

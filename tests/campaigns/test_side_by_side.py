@@ -16,7 +16,6 @@ import pytest
 from msgspec.structs import replace
 
 from companion.analysis import plots
-from companion.analysis.log import FlightLog
 from companion.analysis.summary import summarise
 from companion.campaigns.side_by_side import plots as side_by_side_plots
 from companion.campaigns.side_by_side.comparison import FLIGHTS_MAX, Comparison, Figure, NotAlignable, compare, jsonable
@@ -28,7 +27,15 @@ from companion.cli.report import names_of
 from companion.launcher import run as flight_module
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.model.types import Event, Inputs, Outputs, SafetyAction, Sent, Severity
-from tests.analysis.synthetic_flight import CATCH_S, CONFIG, GROUND_S, LANDED_S, record_flight, synthetic_flight
+from tests.analysis.synthetic_flight import (
+    CATCH_S,
+    CONFIG,
+    GROUND_S,
+    LANDED_S,
+    log_of_rows,
+    record_flight,
+    synthetic_flight,
+)
 
 Row = tuple[Inputs, Outputs, Sent]
 ROWS = list(synthetic_flight(rate_hz=50.0))
@@ -46,24 +53,11 @@ def made(
     outcome: str = "completed",
     payload_kg: float | None = 0.2,
     digest: str | None = None,
-    stride: int = 1,
 ) -> Flight:
     """A flight of a comparison, from ticks in memory."""
     rows = [change(*row) for row in rows] if change is not None else rows
-    inputs, outputs, sent = zip(*rows, strict=True)
-    metadata = {
-        "companion": {**VERSIONS, "epoch_offset_ns": "1700000000000000000", **(about or {})},
-        "config": {"json": json.dumps(config)},
-    }
-    log = FlightLog(
-        path=Path(f"{letter}.mcap"),
-        inputs=inputs,
-        outputs=outputs,
-        sent=sent,
-        metadata=metadata,
-        closed=True,
-        stride=stride,
-    )
+    about = {**VERSIONS, "epoch_offset_ns": "1700000000000000000", **(about or {})}
+    log = log_of_rows(rows, config, path=f"{letter}.mcap", about=about)
     law = config["controller"]
     summary = summarise(log, outcome=outcome, controller=law["law"], preset=law["preset"], payload_kg=payload_kg)
     return flight_of(letter, f"flight {letter}", f"{letter}.mcap", digest or letter, log, summary)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -86,13 +87,8 @@ def test_a_log_that_never_hovered_and_a_file_that_is_no_log_are_refused_in_one_l
 ) -> None:
     log = flown[0]
     ground = sum(o.mission_t_s == 0.0 for o in log.outputs)
-    short = FlightLog(
-        path=log.path,
-        inputs=log.inputs[:ground],
-        outputs=log.outputs[:ground],
-        sent=log.sent[:ground],
-        metadata=log.metadata,
-        closed=True,
+    short = dataclasses.replace(
+        log, inputs=log.inputs[:ground], outputs=log.outputs[:ground], sent=log.sent[:ground], closed=True
     )
     text = tmp_path / "notes.txt"
     text.write_text("thirty characters and then some", encoding="utf-8")

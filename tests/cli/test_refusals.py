@@ -200,38 +200,32 @@ def test_names_a_busy_udp_port(world: World) -> None:
 
 @SHARED
 @pytest.mark.waits
-def test_names_an_arm_port_that_another_program_holds(world: World) -> None:
-    with serial.Serial(world.devices["arm"]["port"], 3000000, exclusive=True):
+@pytest.mark.parametrize(
+    ("device", "refusal"),
+    [
+        ("arm", r"^arm bus /dev/pts/\d+: port is busy; another program .*: close that one$"),
+        ("force", r"^force sensor /dev/pts/\d+: in use by another program; close it"),
+    ],
+)
+def test_names_a_port_that_another_program_holds(world: World, device: str, refusal: str) -> None:
+    with serial.Serial(world.devices[device]["port"], exclusive=True):
         line = line_at_opening(world, *world.addresses())
-    assert re.search(r"^arm bus /dev/pts/\d+: port is busy; another program .*: close that one$", line)
+    assert re.search(refusal, line)
 
 
 @SHARED
 @pytest.mark.waits
-def test_names_a_force_port_that_another_program_holds(world: World) -> None:
-    with serial.Serial(world.devices["force"]["port"], 115200, exclusive=True):
-        line = line_at_opening(world, *world.addresses())
-    assert re.search(r"^force sensor /dev/pts/\d+: in use by another program; close it", line)
-
-
-@SHARED
-@pytest.mark.waits
-def test_names_an_arm_bus_without_any_servo(world: World) -> None:
+@pytest.mark.parametrize(
+    ("device", "refusal"),
+    [
+        ("arm", r"^arm bus PORT: servo 1 \(joint 1\): does not answer .*; no servo answers at all; check its"),
+        ("force", "^force sensor PORT: no answer .* nothing was received; check the sensor's power and cable$"),
+    ],
+)
+def test_names_a_device_that_is_silent(world: World, device: str, refusal: str) -> None:
     with silent_pty() as port:
-        line = refused_at_opening(world, *world.addresses(arm={"port": port}))
-    assert re.search(
-        rf"^arm bus {port}: servo 1 \(joint 1\): does not answer .*; no servo answers at all; check its", line
-    )
-
-
-@SHARED
-@pytest.mark.waits
-def test_names_a_silent_force_sensor(world: World) -> None:
-    with silent_pty() as port:
-        line = refused_at_opening(world, *world.addresses(force={"port": port}))
-    assert re.search(
-        rf"^force sensor {port}: no answer .* nothing was received; check the sensor's power and cable$", line
-    )
+        line = refused_at_opening(world, *world.addresses(**{device: {"port": port}}))
+    assert re.search(refusal.replace("PORT", port), line)
 
 
 @SHARED

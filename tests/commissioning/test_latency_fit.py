@@ -25,6 +25,7 @@ from companion.preflight.hand_test.motion import ImuAt, PoseAt
 
 TAPS_AT_S = (2.0, 3.13, 4.21, 5.4, 6.52, 7.61)
 TAP_S = 0.024
+IMU_HZ = 226.0
 
 
 def vector(values: np.ndarray) -> Vec3:
@@ -35,7 +36,6 @@ def tapped(
     delay_s: float,
     *,
     strength_m_s2: float = 10.0,
-    imu_hz: float = 226.0,
     accel_noise: float = 0.15,
     mocap_noise_m: float = 0.0002,
     seed: int = 3,
@@ -58,7 +58,7 @@ def tapped(
     way = np.array([0.8, 0.0, 0.6])
     total = np.concatenate([[0.0], np.cumsum(a) * dt])
     imu = []
-    times = np.arange(0.05, 8.9, 1.0 / imu_hz)
+    times = np.arange(0.05, 8.9, 1.0 / IMU_HZ)
     for before, now in pairwise(times):
         mean = (total[int(now / dt)] - total[int(before / dt)]) / (int(now / dt) - int(before / dt)) / dt
         force = way * mean + np.array([0.0, 0.0, 9.81]) + rng.normal(0.0, accel_noise, 3)

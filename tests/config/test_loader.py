@@ -235,6 +235,8 @@ BAD_OVERRIDES = [
     ("world..a=1", "--set world..a: cannot read the key from column 6; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("[0]=1", "--set [0]: unknown section '0'; available: mission, vehicle, controller, world"),
     ("world.payload_kg=3", "--set world.payload_kg: expected a number from 0 to 2, got 3"),
+    ("world.payload_kg=.nan", "--set world.payload_kg: expected a number from 0 to 2, got .nan"),
+    ("world.payload_kg=.inf", "--set world.payload_kg: expected a number from 0 to 2, got .inf"),
     ("world.seed=1.5", "--set world.seed: expected a whole number >= 0, got 1.5"),
     ("world.faults=[{kind: mocap_los, t_s: 5}]", '--set world.faults: faults[0].kind: expected one of 43 names ("mocap_loss", "mocap_occluded", "mocap_jump", ...), got "mocap_los" (did you mean mocap_loss?)'),
     ("world.throw_velocity_m_s=[1, 2", "--set world.throw_velocity_m_s: not YAML: expected ',' or ']', but got '<stream end>' while parsing a flow sequence"),

@@ -127,8 +127,8 @@ def test_base_and_tip_may_be_named(tmp_path: Path) -> None:
     assert named.reach_m == pytest.approx(np.hypot(0.012, 0.05) + 0.16 + 0.14 + 0.055)
 
 
-def second_branch(kind: str) -> str:
-    extra = f'<link name="more"/><joint name="extra" type="{kind}"><parent link="turret"/><child link="more"/></joint>'
+def second_branch() -> str:
+    extra = '<link name="more"/><joint name="extra" type="revolute"><parent link="turret"/><child link="more"/></joint>'
     return TEXT.replace("</robot>", extra + "</robot>")
 
 
@@ -178,7 +178,7 @@ DAMAGED = {
         r'32: link "turret": the inertia is that of 0.19 kg at a distance of 23.\d+ m; .*is the file in mm',
     ),
     "mm": (edited('xyz="0.16 0 0"', 'xyz="160 0 0"'), r"56: the origin is 160 m away; .*millimetres"),
-    "two branches": (second_branch("revolute"), r'\d+: joint "extra" starts a second branch beside joint "shoulder"'),
+    "two branches": (second_branch(), r'\d+: joint "extra" starts a second branch beside joint "shoulder"'),
     "loop": (fixed_joint("net", "upper_arm"), r'\d+: joint "back" closes a loop: link "upper_arm" is already the child of'),
     "loop with base": (fixed_joint("net", "body"), r"\d+: expected one link that .*, got none \(the joints form a loop\)"),
     "two bases": (edited("</robot>", '<link name="alone"/></robot>'), r"\d+: expected one link that .*, got 2 \(body, alone\)"),

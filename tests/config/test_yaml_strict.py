@@ -89,25 +89,19 @@ def test_every_duplicate_is_reported(tmp_path: Path) -> None:
     assert [str(problem.origin) for problem in read_document(path, "f.yaml").problems] == ["f.yaml:2:1", "f.yaml:5:3"]
 
 
-def test_missing_file() -> None:
-    with pytest.raises(ConfigError, match=r"^no/such\.yaml: no such file$"):
-        read_document("no/such.yaml")
-
-
-def test_directory(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"is a directory, expected a YAML file$"):
-        read_document(tmp_path)
-
-
-def test_path_with_a_nul_byte() -> None:
-    with pytest.raises(ConfigError, match="not readable"):
-        read_document("a\0b")
-
-
-def test_path_through_a_file(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "refusal"),
+    [
+        ("none.yaml", r"none\.yaml: no such file$"),
+        ("", "is a directory, expected a YAML file$"),
+        ("a\0b", "not readable"),
+        ("file/x.yaml", "not readable: Not a directory$"),
+    ],
+)
+def test_what_is_no_file_is_refused(tmp_path: Path, name: str, refusal: str) -> None:
     (tmp_path / "file").write_text("a: 1")
-    with pytest.raises(ConfigError, match=r"not readable: Not a directory$"):
-        read_document(tmp_path / "file" / "x.yaml")
+    with pytest.raises(ConfigError, match=refusal):
+        read_document(tmp_path / name)
 
 
 def test_not_utf_8(tmp_path: Path) -> None:

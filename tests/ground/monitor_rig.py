@@ -55,7 +55,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 @contextlib.asynccontextmanager
 async def monitor_at(
-    url: str, signer: Signer | str = SIGNER, *, serving: ServerSettings | None = None, only: str | None = None
+    url: str, signer: Signer | str = SIGNER, *, serving: ServerSettings | None = None
 ) -> AsyncIterator[Monitor]:
     """Run a monitor of a broker on a free port."""
     served: list[Monitor] = []
@@ -66,7 +66,7 @@ async def monitor_at(
         listening.set()
 
     serving = serving or ServerSettings("127.0.0.1", 0)
-    work = asyncio.ensure_future(serve_live(serving, broker_access(url, None, None), signer, only, on_listening))
+    work = asyncio.ensure_future(serve_live(serving, broker_access(url, None, None), signer, None, on_listening))
     try:
         ready = asyncio.ensure_future(listening.wait())
         await asyncio.wait([work, ready], return_when=asyncio.FIRST_COMPLETED)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
 from pathlib import Path
 
 import aiomqtt
@@ -15,18 +14,12 @@ from companion.ground.protocol.keys import Operator, load_operators, operators_t
 from companion.ground.protocol.messages import Presence, Topic
 from companion.ground.station.command_sender import ATTEMPTS
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
-from tests.broker import Broker, free_port, loopback_broker
+from tests.broker import Broker, free_port
 from tests.ground.monitor_rig import ANNA, OPERATORS, played
 from tests.ground.vehicle import played_vehicle
 from tests.support import Ended, sandbox_in
 
 pytestmark = pytest.mark.waits
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    with loopback_broker(tmp_path) as broker:
-        yield broker
 
 
 @pytest.fixture

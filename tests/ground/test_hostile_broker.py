@@ -7,7 +7,6 @@ import io
 import json
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import aiomqtt
@@ -38,7 +37,7 @@ from companion.ground.station.vehicles import LIVE_S, VEHICLES_MAX, VehicleTrack
 from companion.ground.telemetry.scene import scene_of
 from companion.model.codec import to_jsonable
 from companion.runtime.tasks import until_first
-from tests.broker import Broker, loopback_broker
+from tests.broker import Broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, played, until
 from tests.ground.vehicle import ack_of, flight, played_vehicle, state_of
 
@@ -256,12 +255,6 @@ def test_random_bytes_are_counted(payload: bytes, topic: str) -> None:
     watch = VehicleTracker(signer=SIGNER)
     assert watch.receive(topic, payload, False, 50.0) is None
     assert watch.rejected == 1
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    with loopback_broker(tmp_path) as broker:
-        yield broker
 
 
 @played

@@ -32,12 +32,6 @@ pytestmark = pytest.mark.waits
 
 
 @pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    with loopback_broker(tmp_path) as broker:
-        yield broker
-
-
-@pytest.fixture
 def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
     with sandbox_in(tmp_path / "sandbox", {"XDG_CONFIG_HOME": str(tmp_path / "config")}) as sandbox:
         yield sandbox

@@ -34,10 +34,10 @@ from companion.model.types import (
     SafetyAction,
     Sent,
     Severity,
-    TetherState,
     VehicleState,
 )
 from tests.analysis.synthetic_flight import synthetic_flight
+from tests.safety.healthy import SLOW
 from tests.support import CATCH, position_error_m
 from tools.docs.telemetry import schema_of
 
@@ -257,20 +257,8 @@ def test_the_longest_events_fit_into_a_message() -> None:
 
 
 def tether(**values: Any) -> dict[str, Any]:
-    state = TetherState(
-        range_m=2.0,
-        slack_m=1.0,
-        stop_slack_m=0.9,
-        elevation_rad=0.1,
-        clearance_m=0.5,
-        turns=0.0,
-        pull_n=0.0,
-        taut=False,
-        snagged=False,
-        separated=False,
-        vehicle_turns=0.0,
-    )
-    return {"outputs__tether": msgspec.structs.replace(state, **values)}
+    usual = {"slack_m": 1.0, "stop_slack_m": 0.9, "clearance_m": 0.5}
+    return {"outputs__tether": msgspec.structs.replace(SLOW, **{**usual, **values})}
 
 
 def old(device: str, limit_s: float) -> Callable[[float], dict[str, Any]]:

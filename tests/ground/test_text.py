@@ -13,7 +13,7 @@ import subprocess
 import sys
 import termios
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from companion.ground.station.station import Station
 from companion.ground.station.text_monitor import _Screen
 from companion.ground.station.text_view import STALE_S, Notice, StationStatus, render, stale, status_line, status_word
 from companion.ground.station.vehicles import Vehicle, VehicleTracker
-from tests.broker import Broker, loopback_broker
+from tests.broker import Broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, played
 from tests.ground.vehicle import flight, played_vehicle, state_of
 from tests.support import ROOT
@@ -37,12 +37,6 @@ from tests.support import ROOT
 pytestmark = pytest.mark.waits
 
 AROUND = StationStatus("connected to mqtt://127.0.0.1:1883", True, "anna", None)
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    with loopback_broker(tmp_path) as broker:
-        yield broker
 
 
 def known(presence: Presence = Presence.FLYING, heard_s: float = 0.0, event: str = "caught", **values: Any) -> Vehicle:

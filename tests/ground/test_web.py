@@ -36,12 +36,6 @@ from tests.ground.vehicle import flight, played_vehicle
 pytestmark = pytest.mark.waits
 
 
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    with loopback_broker(tmp_path) as broker:
-        yield broker
-
-
 @played
 async def test_a_viewer_receives_hello_and_the_known_state_and_then_live_data(broker: Broker) -> None:
     async with played_vehicle(broker.port, OPERATORS), monitor_at(broker.url) as monitor, viewer_of(monitor) as viewer:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
 from pathlib import Path
 
 import aiomqtt
@@ -21,12 +20,6 @@ from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, on_pag
 from tests.ground.vehicle import PlayedVehicle, played_vehicle
 
 pytestmark = pytest.mark.waits
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    with loopback_broker(tmp_path) as broker:
-        yield broker
 
 
 @pytest.mark.parametrize("command", list(CommandName))

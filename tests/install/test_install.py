@@ -14,8 +14,9 @@ import pytest
 
 from companion.cli.main import main
 from companion.install import apply
+from companion.install.plan import Command
 from companion.install.record import RECORD_PATH
-from companion.install.state import PathState, write_state
+from companion.install.state import InstallError, PathState, write_state
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.support import ROOT
 
@@ -332,3 +333,11 @@ def test_a_mission_that_the_service_could_not_read_is_refused(root: Path, capsys
     (root / "etc/companion/missions").chmod(0o700)
     assert install(root) == EXIT_BAD_INPUT
     assert "chmod o+rX" in capsys.readouterr().err
+
+
+def test_commands_run_with_a_fixed_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Root's tools do not come from the PATH of the user who called sudo."""
+    monkeypatch.setenv("PATH", "/tmp/others")
+    command = Command(("sh", "-c", "echo $PATH >&2; exit 1"), "shows its path", needed=True)
+    with pytest.raises(InstallError, match=r": /usr/sbin:/sbin:/usr/bin:/bin$"):
+        apply._run(command, lambda _: None)

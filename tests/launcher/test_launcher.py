@@ -225,7 +225,7 @@ def test_process_that_cannot_start_is_named_in_one_line(tmp_path: Path, package:
 def test_a_flight_process_that_ends_while_the_launcher_is_busy_is_heard_to_its_last_word(tmp_path: Path) -> None:
     """Its refusal may come after `select` has returned without it, and before the launcher asks whether the process has ended."""
     heard: list[dict[str, Any]] = []
-    launcher = Launcher(load_sitl(HOVER), tmp_path, sitl=False, on_message=heard.append)
+    launcher = Launcher(load_sitl(HOVER), tmp_path, sitl=None, on_message=heard.append)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setblocking(False)
 

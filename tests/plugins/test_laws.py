@@ -14,7 +14,7 @@ from rich.console import Console
 from companion import DISTRIBUTION, __version__
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.replay import check_replayable
-from companion.cli.check import Task, show
+from companion.cli.check import show
 from companion.cli.main import main
 from companion.cli.schema import schema_json
 from companion.config.loader import load_flight, logged_flight
@@ -73,7 +73,7 @@ def test_it_is_listed_with_its_distribution(capsys: pytest.CaptureFixture[str]) 
 @pytest.mark.usefixtures("site")
 def test_a_check_names_it_with_its_distribution() -> None:
     out, config = io.StringIO(), load_sitl("hover", controller_law="lift")
-    show(Console(file=out, width=200), [], Task(config=config, mission="hover", sitl=None, hand=False, json=False))
+    show(Console(file=out, width=200), [], config, simulated=False)
     assert out.getvalue().startswith("tarot650-2r, mission 'hover', control law 'lift' (lab-a 1.0)")
 
 

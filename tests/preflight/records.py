@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from typing import Any
+
+from msgspec.structs import replace
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.model.estimator import EstimatorReport
@@ -53,89 +56,77 @@ def wave(index: int, size: float) -> float:
 
 
 def vehicle(count: int = 620) -> tuple[VehicleState, ...]:
-    states = []
-    for i in range(count):
-        t_s = START_S + (i + 1) * SPAN_S / count
-        position, attitude = (
-            (-1.0 + wave(i, 0.002), wave(i + 3, 0.002), 0.30),
-            quat_from_euler_zyx(0.0, 0.0, wave(i, 0.002)),
+    return tuple(
+        VehicleState(
+            position_stamp_s=(t_s := START_S + (i + 1) * SPAN_S / count),
+            attitude_stamp_s=t_s,
+            imu_stamp_s=t_s,
+            position_world_m=(-1.0 + wave(i, 0.002), wave(i + 3, 0.002), 0.30),
+            velocity_world_m_s=(0.0, 0.0, 0.0),
+            attitude_wxyz=quat_from_euler_zyx(0.0, 0.0, wave(i, 0.002)),
+            angular_rate_body_rad_s=(0.0, 0.0, wave(i, 0.01)),
+            specific_force_body_m_s2=(wave(i, 0.05), wave(i + 1, 0.05), 9.81 + wave(i + 2, 0.05)),
+            boot_s=t_s + 40.0,
         )
-        force = (wave(i, 0.05), wave(i + 1, 0.05), 9.81 + wave(i + 2, 0.05))
-        states.append(
-            VehicleState(
-                position_stamp_s=t_s,
-                attitude_stamp_s=t_s,
-                imu_stamp_s=t_s,
-                position_world_m=position,
-                velocity_world_m_s=(0.0, 0.0, 0.0),
-                attitude_wxyz=attitude,
-                angular_rate_body_rad_s=(0.0, 0.0, wave(i, 0.01)),
-                specific_force_body_m_s2=force,
-                boot_s=t_s + 40.0,
-            )
+        for i in range(count)
+    )
+
+
+def estimator(**changes: Any) -> tuple[EstimatorReport, ...]:
+    sound = EstimatorReport(
+        stamp_s=START_S,
+        flags=FLAGS,
+        velocity_ratio=0.0,
+        position_horizontal_ratio=0.02,
+        position_vertical_ratio=0.01,
+        position_horizontal_accuracy_m=0.004,
+        position_vertical_accuracy_m=0.005,
+    )
+    return tuple(replace(sound, stamp_s=START_S + 0.2 * i, **changes) for i in range(1, 26))
+
+
+def mocap(count: int = 1000, **changes: Any) -> tuple[MocapPose, ...]:
+    poses = (
+        MocapPose(
+            stamp_s=START_S + (i + 1) * SPAN_S / count + wave(i, 0.0005),
+            latency_s=0.006,
+            frame_number=5000 + i,
+            position_world_m=(-1.0 + wave(i, 0.0004), wave(i + 5, 0.0004), 0.30),
+            attitude_wxyz=quat_from_euler_zyx(0.0, 0.0, wave(i + 2, 0.001)),
+            tracking_valid=True,
+            marker_error_m=0.0003,
         )
-    return tuple(states)
+        for i in range(count)
+    )
+    return tuple(replace(pose, **changes) for pose in poses)
 
 
-def estimator(**changes: float) -> tuple[EstimatorReport, ...]:
-    values = {
-        "flags": FLAGS,
-        "velocity_ratio": 0.0,
-        "position_horizontal_ratio": 0.02,
-        "position_vertical_ratio": 0.01,
-        "position_horizontal_accuracy_m": 0.004,
-        "position_vertical_accuracy_m": 0.005,
-        **changes,
-    }
-    return tuple(EstimatorReport(stamp_s=START_S + 0.2 * i, **values) for i in range(1, 26))  # type: ignore[arg-type]
+def arm(**changes: Any) -> tuple[ArmState, ...]:
+    sound = ArmState(
+        stamp_s=START_S,
+        angle_rad=ARM_RAD,
+        velocity_rad_s=(0.0, 0.0),
+        torque_nm=(0.0, 0.0),
+        hardware_error=(0, 0),
+        temperature_c=(31.0, 33.0),
+        read_failures=0,
+    )
+    return tuple(replace(sound, **{"stamp_s": START_S + (i + 1) * SPAN_S / 700, **changes}) for i in range(700))
 
 
-def mocap(count: int = 1000, **changes: object) -> tuple[MocapPose, ...]:
-    poses = []
-    for i in range(count):
-        values: dict[str, object] = {
-            "stamp_s": START_S + (i + 1) * SPAN_S / count + wave(i, 0.0005),
-            "latency_s": 0.006,
-            "frame_number": 5000 + i,
-            "position_world_m": (-1.0 + wave(i, 0.0004), wave(i + 5, 0.0004), 0.30),
-            "attitude_wxyz": quat_from_euler_zyx(0.0, 0.0, wave(i + 2, 0.001)),
-            "tracking_valid": True,
-            "marker_error_m": 0.0003,
-            **changes,
-        }
-        poses.append(MocapPose(**values))  # type: ignore[arg-type]
-    return tuple(poses)
-
-
-def arm(**changes: object) -> tuple[ArmState, ...]:
-    states = []
-    for i in range(700):
-        values: dict[str, object] = {
-            "stamp_s": START_S + (i + 1) * SPAN_S / 700,
-            "angle_rad": ARM_RAD,
-            "velocity_rad_s": (0.0, 0.0),
-            "torque_nm": (0.0, 0.0),
-            "hardware_error": (0, 0),
-            "temperature_c": (31.0, 33.0),
-            "read_failures": 0,
-            **changes,
-        }
-        states.append(ArmState(**values))  # type: ignore[arg-type]
-    return tuple(states)
-
-
-def servos(**changes: object) -> tuple[ServoReport, ...]:
-    """Two; the changes are the second one's."""
-    values: dict[str, object] = {
-        "model": 1030,
-        "firmware": 48,
-        "operating_mode": 0,
-        "return_delay_us": 0,
-        "current_limit_counts": 1193,
-        "watchdog_ms": 100,
-        "voltage_v": 12.1,
-    }
-    return ServoReport(servo_id=1, **values), ServoReport(servo_id=2, **{**values, **changes})  # type: ignore[arg-type]
+def servos(**changes: Any) -> tuple[ServoReport, ...]:
+    """Two servos, the second one with changes."""
+    sound = ServoReport(
+        servo_id=1,
+        model=1030,
+        firmware=48,
+        operating_mode=0,
+        return_delay_us=0,
+        current_limit_counts=1193,
+        watchdog_ms=100,
+        voltage_v=12.1,
+    )
+    return sound, replace(sound, servo_id=2, **changes)
 
 
 def force(
@@ -152,36 +143,33 @@ def force(
     )
 
 
-def status(**changes: object) -> tuple[AutopilotStatus, ...]:
-    values: dict[str, object] = {
-        "heartbeat_stamp_s": START_S + SPAN_S - 0.4,
-        "armed": False,
-        "mode": FlightMode.HOLD,
-        "landed": LandedState.ON_GROUND,
-        "battery_voltage_v": 16.2,
-        "battery_remaining": 0.97,
-        **changes,
-    }
-    return (AutopilotStatus(**values),)  # type: ignore[arg-type]
+def status(**changes: Any) -> tuple[AutopilotStatus, ...]:
+    sound = AutopilotStatus(
+        heartbeat_stamp_s=START_S + SPAN_S - 0.4,
+        armed=False,
+        mode=FlightMode.HOLD,
+        landed=LandedState.ON_GROUND,
+        battery_voltage_v=16.2,
+        battery_remaining=0.97,
+    )
+    return (replace(sound, **changes),)
 
 
-def machine(**changes: object) -> Machine:
-    values: dict[str, object] = {
-        "disk_free_bytes": 10**10,
-        "governors": ("performance",) * 4,
-        "realtime": "SCHED_FIFO 50",
-        "memory_lock": None,
-        "cpus": (0, 1, 2, 3),
-        "arm_latency_ms": 1,
-        "force_latency_ms": None,
-        **changes,
-    }
-    return Machine(**values)  # type: ignore[arg-type]
+def machine(**changes: Any) -> Machine:
+    sound = Machine(
+        disk_free_bytes=10**10,
+        governors=("performance",) * 4,
+        realtime="SCHED_FIFO 50",
+        memory_lock=None,
+        cpus=(0, 1, 2, 3),
+        arm_latency_ms=1,
+        force_latency_ms=None,
+    )
+    return replace(sound, **changes)
 
 
-def stream(**changes: object) -> MocapStream:
-    values: dict[str, object] = {"frames": 1000, "lost": 0, "application": "Motive 3.1, NatNet 4.1", **changes}
-    return MocapStream(**values)  # type: ignore[arg-type]
+def stream(**changes: Any) -> MocapStream:
+    return replace(MocapStream(frames=1000, lost=0, application="Motive 3.1, NatNet 4.1"), **changes)
 
 
 @cache

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from companion.campaigns.compare.grid import ADAPTATION_OFF, is_ablation
@@ -111,8 +111,7 @@ class Group:
             "cost_m": self.cost,
             "p50": _nested({name: None if spread is None else spread.p50 for name, spread in spreads.items()}),
             "p95": _nested({name: None if spread is None else spread.p95 for name, spread in spreads.items()}),
-            "printed": of
-            and {"controller": of.title, "pre": of.pre.jsonable(), "post": of.post and of.post.jsonable()},
+            "printed": of and {"controller": of.title, "pre": asdict(of.pre), "post": of.post and asdict(of.post)},
         }
 
 

@@ -73,7 +73,6 @@ def variants_of(
     with all of its presets if it has none of them.
 
     Args:
-        available: presets of each law.
         controllers: requested laws; empty for all.
         presets: requested presets; empty for all.
         ablation: whether to add variants of `ABLATED`, each with one part removed.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 SOURCE = "paper.tex, RMS_table"
 
@@ -15,10 +15,6 @@ class Printed:
     """RMS of ||e_p||."""
     e_q_deg: float
     """RMS of ||e_q||. The table states no unit; the plots in the same section use degrees."""
-
-    def jsonable(self) -> dict[str, float]:
-        """Return the results by key."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from itertools import product, zip_longest
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +26,11 @@ from companion.analysis.plot_style import (
     SOFT,
     dress,
     figure_legend,
+    label_lowest,
     mark_catch,
     mark_end,
     new_figure,
+    panels,
     write_png,
 )
 from companion.campaigns.compare.aggregate import COMPLETED, Group, Pairs, adaptation_pairs
@@ -223,14 +225,13 @@ def _against_model_error(groups: Sequence[Group]) -> Figure:
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     every = [value for group in groups for value in _finite(group, "post")]
     low, high = 0.8 * min(every), 1.3 * max(every)
-    for ax, label in zip_longest(axes.flat, labels):
-        if label is None:
-            ax.set_visible(False)
-            continue
+    for ax, label in panels(axes, labels):
         dress(ax)
         ax.set_title(label, loc="left", fontsize=9, color=INK)
         for payload_kg, colour, marker in zip(payloads, COLOURS, "os^Dv*P", strict=False):
-            line = sorted((g for g in groups if (g.label, g.payload_kg) == (label, payload_kg)), key=_model_error)
+            line = sorted(
+                (g for g in groups if (g.label, g.payload_kg) == (label, payload_kg)), key=lambda g: g.model_error
+            )
             spreads = [group.spread("rms.post.e_p_m") for group in line]
             p50, p95 = (_array([getattr(s, key) if s is not None else None for s in spreads]) for key in ("p50", "p95"))
             share = [100 * group.model_error for group in line]
@@ -241,32 +242,22 @@ def _against_model_error(groups: Sequence[Group]) -> Figure:
     axes[0, 0].set_xticks(sorted({100 * group.model_error for group in groups}))
     for ax in axes[:, 0]:
         ax.set_ylabel(r"RMS $\|e_p\|$ [m]")
-    for place, ax in enumerate(axes.flat):
-        if place < len(labels) <= place + columns:
-            ax.tick_params(labelbottom=True)
-            ax.set_xlabel("model error [%]")
+    label_lowest(axes, len(labels), "model error [%]")
     handles, names = axes[0, 0].get_legend_handles_labels()
     figure_legend(figure, "After the catch: p50, and band up to p95", handles, names, columns=4)
     return figure
 
 
-def _model_error(group: Group) -> float:
-    return group.model_error
-
-
 def _paired(pairs: Sequence[Pairs]) -> Figure:
-    panels = list(dict.fromkeys((one.controller, one.preset, one.model_error) for one in pairs))
+    shown = list(dict.fromkeys((one.controller, one.preset, one.model_error) for one in pairs))
     payloads = sorted({one.payload_kg for one in pairs})
-    columns = min(3, len(panels))
-    rows = math.ceil(len(panels) / columns)
+    columns = min(3, len(shown))
+    rows = math.ceil(len(shown) / columns)
     figure = new_figure(1.0 + 3.6 * rows)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     every = [value for one in pairs for pair in one.off_on for value in pair if math.isfinite(value)]
     low, high = 0.8 * min(every), 1.4 * max(every)
-    for ax, panel in zip_longest(axes.flat, panels):
-        if panel is None:
-            ax.set_visible(False)
-            continue
+    for ax, panel in panels(axes, shown):
         dress(ax)
         controller, preset, model_error = panel
         ax.set_title(f"{controller}/{preset}, model error {model_error:.0%}", loc="left", fontsize=9, color=INK)
@@ -288,10 +279,7 @@ def _paired(pairs: Sequence[Pairs]) -> Figure:
     _log_metres(axes[0, 0], "x", "y")
     for ax in axes[:, 0]:
         ax.set_ylabel(r"adaptation on, RMS $\|e_p\|$ [m]")
-    for place, ax in enumerate(axes.flat):
-        if place < len(panels) <= place + columns:
-            ax.tick_params(labelbottom=True)
-            ax.set_xlabel(r"adaptation off, RMS $\|e_p\|$ [m]")
+    label_lowest(axes, len(shown), r"adaptation off, RMS $\|e_p\|$ [m]")
     figure.suptitle(
         "After the catch, adaptation off and on", x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK
     )

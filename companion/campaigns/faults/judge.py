@@ -88,14 +88,7 @@ class FaultFlight:
 
 
 def row_of(variant: Variant, phase: FlightPhase, flown: FaultFlight, vehicle: Vehicle) -> Row:
-    """Return the row of a flight.
-
-    Args:
-        variant: the fault.
-        phase: phase in which the fault was injected.
-        flown: the flight.
-        vehicle: vehicle file with the limits.
-    """
+    """Return the row of a flight."""
     begun_s = flown.begun_s
     outcome = "landed" if flown.outcome == "aborted" and flown.landed else flown.outcome
     impact_m_s = _impact_m_s(flown.course, vehicle.airframe.ground_clearance_m)

@@ -42,11 +42,9 @@ class WireFlights:
     """Flies with `companion fly --sitl`, `jobs` flights at a time.
 
     Args:
-        flights: the faults.
         options: arguments of `companion fly` that all flights share, the mission first.
         config: effective configuration, for the evaluation.
         out: folder in which every flight gets a folder of its own.
-        jobs: number of simultaneous flights.
     """
 
     def __init__(

@@ -155,7 +155,6 @@ def planned(kinds: Sequence[str], phases: Sequence[str], *, wires: bool = False)
         kinds: requested kinds; empty for all.
         phases: requested phases; empty for all. If kinds and phases are both requested, each kind is flown in each phase, even in
             one that campaigns normally leave out.
-        wires: whether to choose from `WIRES`, or from `CONTACT_WIRES`.
     """
     if touches(phases):
         everything = list(CONTACT_WIRES) if wires else [(v, phase) for v in CONTACT for phase in CONTACT_PHASES]

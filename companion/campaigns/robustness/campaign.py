@@ -14,7 +14,7 @@ from companion.analysis.table import Cell, Column, Table, for_terminal, number, 
 from companion.campaigns.process import Message
 from companion.campaigns.robustness.cases import Case, Cases, as_cases, fly_command, worse_than, write_cases
 from companion.campaigns.robustness.draws import DRAWN, DRIVERS, SAFE, drivers, influence, thirds, worst
-from companion.campaigns.runner import Campaign, Row, counted, outcomes
+from companion.campaigns.runner import Campaign, Row, counted, outcomes, print_lines
 from companion.model.types import Outcome
 
 
@@ -124,9 +124,7 @@ class Robustness(Campaign):
         keys = hardest if self.cases else {key: hardest[key] for key in DRAWN}
         world = self.configs[0].laboratory.name
         line = fly_command(self.mission, law, preset, world, keys, self.overrides, self.vehicle)
-        console.print(
-            f"to fly the worst world with companion fly:\n{line}", highlight=False, markup=False, soft_wrap=True
-        )
+        print_lines(console, f"to fly the worst world with companion fly:\n{line}")
 
     def good(self, rows: Sequence[Row]) -> bool:
         """Return whether every flight ended safely."""
@@ -199,7 +197,6 @@ def flights_table(rows: Sequence[Row], cases: Sequence[Case] = ()) -> Table:
     """Return a table with one line per flight: its result and the drawn values.
 
     Args:
-        rows: rows of the flights.
         cases: the cases that were flown, with the same names as their rows; empty for draws.
     """
 

@@ -103,8 +103,6 @@ def write_cases(cases: Cases, path: Path, remark: str) -> None:
     """Write a file that `read_cases` reads.
 
     Args:
-        cases: cases to write.
-        path: YAML file.
         remark: comment lines at the head of the file.
     """
     lines = [f"# {line}".rstrip() for line in remark.splitlines()]
@@ -123,20 +121,10 @@ def fly_command(
     preset: str,
     name: str,
     world: Mapping[str, Any],
-    sets: Sequence[str] = (),
-    vehicle: str | None = None,
+    sets: Sequence[str],
+    vehicle: str | None,
 ) -> str:
-    """Return the `companion fly --sitl` command that flies the same world.
-
-    Args:
-        mission: mission file.
-        controller: name of the control law.
-        preset: name of the preset.
-        name: name of a built-in world, or a world file.
-        world: keys of the world to set.
-        sets: further overrides.
-        vehicle: vehicle file; None for the mission's.
-    """
+    """Return the `companion fly --sitl` command that flies the same world."""
     words = ["companion", "fly", mission, "--sitl"]
     words += [] if vehicle is None else ["--vehicle", vehicle]
     words += ["--controller", controller, "--preset", preset, "--world", name]

@@ -6,13 +6,12 @@ Needs matplotlib (extra `analysis`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from companion.analysis.plot_style import CATCH, COLOURS, INK, SOFT, dress, figure_legend, new_figure, write_png
+from companion.analysis.plot_style import CATCH, COLOURS, INK, SOFT, dress, figure_legend, new_figure, panels, write_png
 from companion.campaigns.robustness.draws import DRIVERS, drivers, graded, influence, sensor_of
 from companion.campaigns.runner import Row
 
@@ -23,13 +22,7 @@ BARS = 10
 
 
 def write_distribution(rows: Sequence[Row], title: str, path: Path) -> bool:
-    """Draw the plot; return False if no flight caught its payload and was completed.
-
-    Args:
-        rows: rows of all flights.
-        title: title of the plot.
-        path: PNG file.
-    """
+    """Draw the plot; return False if no flight caught its payload and was completed."""
     flown = graded(rows)
     if not flown:
         return False
@@ -40,10 +33,7 @@ def write_distribution(rows: Sequence[Row], title: str, path: Path) -> bool:
     _histogram(axes[0, 0], error_mm, sensors)
     drawn = {key: np.array([drivers(row["world"])[key] for row in flown], dtype=np.float64) for key in _AGAINST}
     known = [key for key, values in drawn.items() if np.isfinite(values).any()]
-    for ax, key in zip_longest((axes[0, 1], axes[0, 2], axes[1, 0], axes[1, 1]), known[:4]):
-        if key is None:
-            ax.set_visible(False)
-            continue
+    for ax, key in panels(axes.ravel()[1:5], known[:4]):
         _scatter(ax, drawn[key], error_mm, sensors)
         ax.set_xlabel(DRIVERS[key])
         ax.set_ylabel(r"RMS $\|e_p\|$ [mm]")

@@ -44,27 +44,9 @@ class Course:
 
 def course_of(log: FlightLog) -> Course:
     """Return the time series of a log."""
-    if not log.inputs:
-        none, three = np.empty(0), np.empty((0, 3))
-        mask = np.empty(0, dtype=np.bool_)
-        return Course(
-            t_s=none,
-            flying=mask,
-            graded=mask,
-            e_p_m=none,
-            e_q_deg=none,
-            e_alpha_deg=none,
-            thrust_percent=none,
-            rho=none,
-            slack_m=none,
-            flown_world_m=three,
-            reference_world_m=three,
-            lateness_s=none,
-            catch=None,
-            takeoff_s=None,
-        )
     c = log.columns
     pre, post = metrics.flight_masks(log)
+    e_alpha_deg = np.degrees(np.linalg.norm(metrics.arm_error_rad(log), axis=1))
     rho = log.column(lambda i, o, s: o.control.rho if o.control else None)
     under_way = np.flatnonzero(c.mission_t_s > 0.0)
     takeoff_s = float(c.t_s[under_way[0]] - c.mission_t_s[under_way[0]]) if len(under_way) else None
@@ -72,9 +54,9 @@ def course_of(log: FlightLog) -> Course:
         t_s=c.t_s,
         flying=np.array([o.phase_kind in _FLYING for o in log.outputs], dtype=np.bool_),
         graded=pre | post,
-        e_p_m=_norm(metrics.position_error_m(log)),
-        e_q_deg=np.degrees(_norm(metrics.attitude_error_rad(log))),
-        e_alpha_deg=np.degrees(_norm(metrics.arm_error_rad(log))) if log.joint_count else np.full(len(rho), np.nan),
+        e_p_m=np.linalg.norm(metrics.position_error_m(log), axis=1),
+        e_q_deg=np.degrees(np.linalg.norm(metrics.attitude_error_rad(log), axis=1)),
+        e_alpha_deg=e_alpha_deg if log.joint_count else np.full(len(rho), np.nan),
         thrust_percent=100.0 * log.column(lambda i, o, s: o.attitude.thrust if o.attitude else None),
         rho=rho if np.nan_to_num(rho).any() else np.full(len(rho), np.nan),
         slack_m=metrics.slack_m(log),
@@ -84,11 +66,6 @@ def course_of(log: FlightLog) -> Course:
         catch=metrics.catch_index(log),
         takeoff_s=takeoff_s,
     )
-
-
-def _norm(rows: Array) -> Array:
-    out: Array = np.sqrt(np.sum(rows * rows, axis=1))
-    return out
 
 
 @dataclass(frozen=True)

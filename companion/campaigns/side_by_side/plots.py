@@ -25,6 +25,8 @@ from companion.analysis.plot_style import (
     mark_catch,
     mark_end,
     new_figure,
+    path_panes,
+    scale_path,
     write_png,
 )
 from companion.analysis.table import Line
@@ -240,9 +242,7 @@ def _path(comparison: Comparison) -> Figure | None:
     if not flights:
         return None
     figure = new_figure(5.6 + 0.2 * ((len(comparison.flights) + 1) // 2))
-    axes = figure.subplots(2, 1, sharex=True)
-    for ax, row, name in ((axes[0], 1, "y"), (axes[1], 2, "z")):
-        dress(ax)
+    for ax, row in path_panes(figure):
         seen: list[Array] = []
         for n, flight in enumerate(comparison.flights):
             course, colour = flight.course, LINES[n].colour
@@ -255,15 +255,7 @@ def _path(comparison: Comparison) -> Figure | None:
             if not flight.completed:
                 mark_end(ax, flown[:, 0], flown[:, row], colour)
             seen += [flown[:, row], wanted[:, row]]
-        every = np.concatenate(seen)
-        every = every[np.isfinite(every)]
-        # At least 0.6 m of height: millimetres of noise on a straight path must not look large.
-        middle, half = (every.min() + every.max()) / 2, max(0.3, 0.62 * float(np.ptp(every)))
-        ax.set_ylim(middle - half, middle + half)
-        ax.set_ylabel(f"{name} [m]")
-    axes[0].set_title("From above", loc="left", fontsize=10, color=INK)
-    axes[1].set_title("From the side", loc="left", fontsize=10, color=INK)
-    axes[1].set_xlabel("x [m]")
+        scale_path(ax, np.concatenate(seen))
     _title(figure, comparison, "Path")
     return figure
 

@@ -69,7 +69,10 @@ def settings_of(configs: Sequence[dict[str, Any]]) -> tuple[list[Setting], list[
     The section `world` of a flight on hardware is meaningless and left out.
     """
     in_world = [simulated(config) for config in configs]
-    flat = [_flat(config if real else _without_world(config)) for config, real in zip(configs, in_world, strict=True)]
+    flat = [
+        _flat(config if simulation else {name: part for name, part in config.items() if name != "world"})
+        for config, simulation in zip(configs, in_world, strict=True)
+    ]
     keys = list(dict.fromkeys(key for one in flat for key in one))
     settings: list[Setting] = []
     addresses: list[Setting] = []
@@ -207,10 +210,6 @@ def _rank(section: str) -> int:
 def _part(tree: dict[str, Any], name: str) -> dict[str, Any]:
     part = tree.get(name)
     return part if isinstance(part, dict) else {}
-
-
-def _without_world(config: dict[str, Any]) -> dict[str, Any]:
-    return {name: part for name, part in config.items() if name != "world"}
 
 
 def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:

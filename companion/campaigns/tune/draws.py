@@ -50,7 +50,6 @@ class Draws:
         """Return a flight of `sitl.campaigns.tune`.
 
         Args:
-            settings: settings of the control law, as plain data.
             number: number of the draw, from 0.
         """
         rng = np.random.default_rng(self.first + number)
@@ -80,11 +79,7 @@ def draws_of(
     """Return the laboratories of the search, whose flights end some seconds after the catch, and the held-out ones.
 
     Args:
-        mission: mission to fly.
-        vehicle: vehicle to fly.
-        overrides: `--set` options of the user.
         seed: seed of the search, 1 or more.
-        training: number of laboratories of the search.
         held_out: number of held-out laboratories.
     """
     plan = Plan.build(mission, vehicle)

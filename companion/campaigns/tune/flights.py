@@ -26,7 +26,6 @@ class Flights(AbstractContextManager["Flights"]):
     """Flights of one search. A flight that the file has already is not flown again.
 
     Args:
-        job: see `sitl.campaigns`, without its flights.
         folder: folder of results; None to keep nothing.
         settings: what the result of a flight depends on, besides the flight.
         total: number of flights of the whole search, for the progress bar.
@@ -62,7 +61,6 @@ class Flights(AbstractContextManager["Flights"]):
 
         Args:
             flights: flights in the format of `sitl.campaigns.tune`.
-            about: text for the progress bar.
 
         Raises:
             CampaignError: the flights cannot be flown.

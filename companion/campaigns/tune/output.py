@@ -10,11 +10,10 @@ from typing import Any
 
 from rich.console import Console
 
-from companion import DISTRIBUTION
 from companion.analysis.page import Page, Picture, Section, write_page
 from companion.analysis.table import Column, Table, for_terminal, number, table
 from companion.campaigns.cost import TERMS, cost_of, flight_cost, terms_of
-from companion.campaigns.runner import counted, to_json
+from companion.campaigns.runner import counted, no_plots, print_lines, to_json
 from companion.campaigns.tune.result import Gain, HeldOut, Result, completed, flown
 from companion.control.scaled_gains import controller_yaml as controller_file
 from companion.runtime.console import print_error
@@ -66,8 +65,6 @@ def publish(result: Result, out: Path, console: Console | None) -> None:
     """Write the files of a result into a folder and print it.
 
     Args:
-        result: what to write.
-        out: an existing folder.
         console: where to print; None to print JSON instead.
     """
     file = out / CONTROLLER_FILE if result.better else None
@@ -79,7 +76,7 @@ def publish(result: Result, out: Path, console: Console | None) -> None:
 
         pictures = write_pictures(result, out)
     except ImportError:
-        print_error(f"companion tune: plots need matplotlib: pip install '{DISTRIBUTION}[analysis]'")
+        print_error(no_plots("tune"))
         pictures = []
     write_page(page(result, pictures), out / PAGE_FILE)
     data = result.data(file)
@@ -94,16 +91,14 @@ def publish(result: Result, out: Path, console: Console | None) -> None:
         sys.stdout.flush()
         return
     show(result, console, file)
-    console.print(f"report  {out / PAGE_FILE}", highlight=False, markup=False, soft_wrap=True)
+    print_lines(console, f"report  {out / PAGE_FILE}")
 
 
 def show(result: Result, console: Console, file: Path | None) -> None:
     """Print gains, costs, and the line that flies the gains."""
     for shown in (gains_table(result.gains), costs_table(result.judged)):
         console.print(for_terminal(shown), highlight=False)
-    lines = [result.verdict, *([] if file is None else [f"to fly it:  {result.fly_line(file)}"])]
-    for line in lines:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    print_lines(console, result.verdict, *([] if file is None else [f"to fly it:  {result.fly_line(file)}"]))
 
 
 def page(result: Result, pictures: Sequence[Picture]) -> Page:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from itertools import accumulate, zip_longest
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from companion.analysis.page import Picture
-from companion.analysis.plot_style import CATCH, COLOURS, INK, SOFT, dress, figure_legend, new_figure, write_png
+from companion.analysis.plot_style import CATCH, COLOURS, INK, SOFT, dress, figure_legend, new_figure, panels, write_png
 from companion.campaigns.tune.result import Result, first_costs
 
 _COLUMNS = 4
@@ -63,10 +63,7 @@ def _draw_gains(result: Result, first: Any, path: Path) -> None:
     figure = new_figure(0.8 + 1.7 * lines)
     values = np.array([space.values(one.point) for one in evaluations])
     colours = np.linspace(0.85, 0.15, len(evaluations))
-    for ax, column in zip_longest(figure.subplots(lines, _COLUMNS, squeeze=False).flat, range(len(space.axes))):
-        if column is None:
-            ax.set_visible(False)
-            continue
+    for ax, column in panels(figure.subplots(lines, _COLUMNS, squeeze=False), range(len(space.axes))):
         gain = result.gains[column]
         ax.scatter(values[:, column], first, s=7, c=colours, cmap="Blues_r", vmin=0.0, vmax=1.0, lw=0)
         ax.axvline(gain.start, color=INK, lw=1.0, ls=(0, (4, 2)))

@@ -188,6 +188,6 @@ def completed(rows: Sequence[Row]) -> int:
 
 
 def first_costs(evaluations: Sequence[Evaluation], draws: int) -> list[float]:
-    """Return the cost of each candidate in the first laboratories, which all have flown."""
+    """Return the cost of each candidate in the first laboratories, in which every candidate was flown."""
     first = rungs_of(draws)[0]
     return [cost_of(one.costs[:first]) for one in evaluations]

@@ -76,11 +76,7 @@ class Search:
     """One search.
 
     Args:
-        start: point of the start.
-        draws: number of laboratories.
         budget: number of candidates to evaluate, the start included.
-        seed: seed of CMA-ES.
-        evaluate: flies candidates.
     """
 
     def __init__(self, start: Point, draws: int, budget: int, seed: int, evaluate: Evaluate) -> None:

@@ -45,8 +45,8 @@ class Axis:
 class Space:
     """The gains of a law that are searched for one machine.
 
-    The start is one of the points, and gains that are searched together keep the ratios that they have there. What the start switches
-    off by a value of 0 stays off.
+    A point of the space has one coordinate for each axis, and the start is a point of it. The gains of one axis keep the ratios that
+    they have at the start. A gain that is 0 at the start stays 0.
     """
 
     start: ControllerConfig

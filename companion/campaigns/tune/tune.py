@@ -17,9 +17,9 @@ from typing import Any
 from rich.console import Console
 
 from companion.campaigns.cost import flight_cost
-from companion.campaigns.plan import WORKERS, duration_text
+from companion.campaigns.plan import WORKERS, duration_text, where_flown
 from companion.campaigns.process import CampaignError, Message
-from companion.campaigns.runner import Row, to_json, versions
+from companion.campaigns.runner import Row, print_lines, to_json, versions
 from companion.campaigns.tune.draws import Draws, draws_of
 from companion.campaigns.tune.flights import Flights, Interrupted
 from companion.campaigns.tune.output import publish
@@ -28,7 +28,7 @@ from companion.campaigns.tune.search import Evaluation, Search, batches_of
 from companion.campaigns.tune.space import Point, Space
 from companion.config.controller import ControllerConfig
 from companion.config.document import ConfigError
-from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from companion.plugins import CONTROL_LAWS, find
 from companion.runtime.console import print_error
 from companion.sitl_config.loader import SitlConfig
@@ -113,7 +113,6 @@ def run(tune: Tune, out: Path, console: Console | None) -> int:
     """Search, judge, write the results into `out` and print them; return the exit code.
 
     Args:
-        tune: what to search.
         out: an existing folder; if it has the flights of the same search, that search goes on.
         console: where to print; None to print JSON instead.
 
@@ -148,7 +147,7 @@ def run(tune: Tune, out: Path, console: Console | None) -> int:
         return EXIT_ABORTED
     except CampaignError as error:
         print_error(f"companion tune: {error}")
-        return EXIT_BAD_INPUT if error.bad_input else EXIT_LOST
+        return error.exit_code
     return EXIT_OK if result.better else EXIT_REFUSED
 
 
@@ -164,19 +163,6 @@ def _judge(search: Search, space: Space, draws: Draws, flights: Flights) -> Held
         return flights.fly(_flights([space.settings(one.point)], draws, range(draws.count)), about)
 
     return HeldOut(rows_of(search.start, "held out, before"), rows_of(search.best, "held out, after"))
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """Measured cost of some flights of the start, and the duration of the whole search computed from it."""
-
-    batches: tuple[tuple[int, float], ...]
-    """Number of flights of each batch, and the processor time of one of them, s."""
-    at_once: int
-
-    def duration_s(self, at_once: int) -> float:
-        """Return the duration with this number of simultaneous flights, each on a free core."""
-        return sum(-(-flights // at_once) * cpu_s for flights, cpu_s in self.batches)
 
 
 def plan(tune: Tune, console: Console | None) -> int:
@@ -197,22 +183,23 @@ def plan(tune: Tune, console: Console | None) -> int:
             return EXIT_ABORTED
         except CampaignError as error:
             print_error(f"companion tune: {error}")
-            return EXIT_BAD_INPUT if error.bad_input else EXIT_LOST
-    searched = batches_of(tune.budget, len(space.axes), training.count)
-    found = Plan((*((flown, cpu_s[0]) for flown in searched), (2 * held_out.count, cpu_s[1])), at_once)
-    count = sum(flown for flown, _ in found.batches)
-    seconds = {workers: found.duration_s(workers) for workers in (found.at_once, *WORKERS)}
+            return error.exit_code
+    batches = [(flown, cpu_s[0]) for flown in batches_of(tune.budget, len(space.axes), training.count)]
+    batches.append((2 * held_out.count, cpu_s[1]))
+    count = sum(flown for flown, _ in batches)
+    # A batch ends with its last flight; each flight has a core of its own.
+    seconds = {
+        workers: sum(-(-flown // workers) * each_s for flown, each_s in batches) for workers in (at_once, *WORKERS)
+    }
     if console is None:
-        data = {"flights": count, "cpu_s": cpu_s[0], "whole_mission_cpu_s": cpu_s[1], "at_once": found.at_once}
-        sys.stdout.write(to_json({**data, "duration_s": seconds[found.at_once], "durations_s": seconds}))
+        data = {"flights": count, "cpu_s": cpu_s[0], "whole_mission_cpu_s": cpu_s[1], "at_once": at_once}
+        sys.stdout.write(to_json({**data, "duration_s": seconds[at_once], "durations_s": seconds}))
         return EXIT_OK
-    where = "on this computer" if tune.scheduler is None else f"on the workers of {tune.scheduler}"
-    lines = [
+    print_lines(
+        console,
         f"processor time of a flight: {cpu_s[0]:.2f} s in the search, {cpu_s[1]:.2f} s of a whole mission",
-        f"{count} flights of {tune.budget} candidates, {found.at_once} at a time {where}: "
-        f"{duration_text(seconds[found.at_once])}",
+        f"{count} flights of {tune.budget} candidates, {at_once} at a time {where_flown(tune.scheduler)}: "
+        f"{duration_text(seconds[at_once])}",
         *(f"on {workers} Dask workers, one core each: {duration_text(seconds[workers])}" for workers in WORKERS),
-    ]
-    for line in lines:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    )
     return EXIT_OK

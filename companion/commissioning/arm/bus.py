@@ -67,11 +67,7 @@ class PingAnswers:
 
 
 class ServoTalk:
-    """Communication on one port. Not thread-safe. A KeyboardInterrupt in any method leaves no servo under torque.
-
-    Args:
-        port: serial device.
-    """
+    """Communication on one port. Not thread-safe. A KeyboardInterrupt in any method leaves no servo under torque."""
 
     def __init__(self, port: str) -> None:
         self._name = port
@@ -145,9 +141,6 @@ class ServoTalk:
         """Write a register and read it back. The request is repeated if a packet was lost or corrupted.
 
         Args:
-            servo_id: id of the servo.
-            register: register to write.
-            value: new value.
             read_back: False for id and baud rate, because the servo then answers at another id or rate.
 
         Raises:

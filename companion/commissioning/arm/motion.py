@@ -65,12 +65,7 @@ class Moved:
 
 
 class Motion:
-    """Controls all joints, of which one moves at a time.
-
-    Args:
-        vehicle: arm, tool and limits.
-        state: current state of the arm.
-    """
+    """Controls all joints, of which one moves at a time."""
 
     def __init__(self, vehicle: Vehicle, state: ArmState) -> None:
         self._vehicle = vehicle
@@ -97,7 +92,6 @@ class Motion:
         """Start moving a joint; the others stay at their references.
 
         Args:
-            joint: index of the joint.
             goal_rad: goal, clipped to the joint limits minus the margin; a joint beyond them may only return.
             speed_rad_s: speed, limited to `SPEED_MAX_DEG_S`.
         """
@@ -129,7 +123,6 @@ class Motion:
         """Compute one control step.
 
         Args:
-            state: newest state of the arm.
             dt_s: time since the last step; a late step moves the reference by at most 20 ms.
         """
         dt_s = min(dt_s, 0.02)

@@ -80,8 +80,6 @@ def scan(
 
     Args:
         device: port, and the baud rate that is tried first.
-        progress: called with the baud rate that is being tried.
-        sysfs: folder in which the kernel exposes latency timers.
         only: the one baud rate to try; None for all.
 
     Raises:

@@ -121,12 +121,6 @@ class Setting(NamedTuple):
 def settings(servo: FoundServo, index: int, arm: Arm, device: ArmDevice) -> list[Setting]:
     """Return every setting that the companion needs, in the order of writing: id and baud rate come last because they change the
     address.
-
-    Args:
-        servo: found servo with its registers.
-        index: index of the servo's joint.
-        arm: provides the joints and their torque constants.
-        device: provides the bus's baud rate.
     """
     joint = arm.joints[index]
     kind = joint.kind

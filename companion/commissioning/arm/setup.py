@@ -93,8 +93,6 @@ def plan(found: Scan, arm: Arm, device: ArmDevice, joint: int | None = None) -> 
 
     Args:
         found: a scan of all baud rates.
-        arm: joints of the vehicle file.
-        device: baud rate of the vehicle file.
         joint: index of the joint to which the one connected servo belongs regardless of its id; None to assign by id.
     """
     alone = one_at_a_time(arm)
@@ -136,11 +134,10 @@ def plan(found: Scan, arm: Arm, device: ArmDevice, joint: int | None = None) -> 
     )
 
 
-def carry_out(port: str, plans: Sequence[ServoPlan], report: Callable[[str], None] = lambda _: None) -> None:
+def carry_out(port: str, plans: Sequence[ServoPlan], report: Callable[[str], None]) -> None:
     """Write the planned settings to one servo after the other.
 
     Args:
-        port: serial device.
         plans: plans from one scan.
         report: called with a line for each value that is written.
 

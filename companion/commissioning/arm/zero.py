@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from companion.commissioning.arm.poses import SWING_MIN_DEG, Step, steps_of
@@ -173,16 +173,16 @@ class ZeroGuide:
         if twice is not None:
             servo_id = self._arm.joints[twice].servo_id
             text = f"servo {servo_id} turned in two steps, and another one in none: turn the joints one after the other, as requested"
-            return _failed(view, text)
+            return replace(view, held=0.0, failed=text)
         joints = tuple(
             self._joint(joint, servo, [held[servo] for held in self._held]) for joint, servo in enumerate(movers)
         )
         for joint, found in enumerate(joints):
             if found.spread_deg is not None and found.spread_deg > DISAGREE_DEG:
                 text = f"joint {joint + 1}: the poses disagree by {found.spread_deg:.1f} deg"
-                return _failed(view, f"{text}; hold the arm more precisely, and check for a slipping horn")
-        result = ZeroResult(joints, movers != list(range(len(movers))))
-        return ZeroView(step=None, number=view.number, moved_deg=moved, held=1.0, notice="", result=result)
+                text += "; hold the arm more precisely, and check for a slipping horn"
+                return replace(view, held=0.0, failed=text)
+        return replace(view, result=ZeroResult(joints, movers != list(range(len(movers)))))
 
     def _joint(self, joint: int, servo: int, counts: Sequence[int]) -> ZeroJoint:
         # In the steps after its own, a joint is only roughly held.
@@ -198,12 +198,6 @@ class ZeroGuide:
             zero %= COUNTS_PER_TURN
         spread = (max(zeros) - min(zeros)) * _DEG_PER_COUNT if len(zeros) > 1 else None
         return ZeroJoint(self._arm.joints[servo].servo_id, sign, zero, spread)
-
-
-def _failed(view: ZeroView, text: str) -> ZeroView:
-    return ZeroView(
-        step=None, number=view.number, moved_deg=view.moved_deg, held=0.0, notice="", result=None, failed=text
-    )
 
 
 def _mover(before: Counts, after: Counts) -> int:

@@ -12,6 +12,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.vehicle import Vehicle
@@ -22,7 +25,7 @@ from companion.model.frames import euler_zyx_from_quat, quat_conjugate, quat_fro
 from companion.model.types import ForceSample, Joints, Quat, Vec3
 from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
 from companion.preflight.checks import Check
-from companion.preflight.hand_test.motion import angle_rad, norm
+from companion.preflight.hand_test.motion import angle_rad
 
 STUCK = Check("ft.stuck", "force sensor alive", why="a stuck sensor reports plausible values and measures nothing")
 WEIGHT = Check("ft.weight", "known weight", why="scale and direction remain unknown")
@@ -39,7 +42,7 @@ DIRECTION_MAX_DEG: Final = 8.0
 EXPLAINED_MAX_DEG: Final = 20.0
 """Largest remaining angle at which a rotation by multiples of 90 deg is accepted as the cause of a wrong direction."""
 APART_MIN_DEG: Final = 12.0
-"""Smallest difference between the remaining angles of the best and the second-best rotation at which the mounting counts as certain."""
+"""Smallest difference between the angle errors of the best and the second-best rotation with which the mounting counts as certain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +85,6 @@ def fit_weight(empty_n: Vec3, loaded_n: Vec3, down_tip: Vec3, weight_kg: float, 
         empty_n: mean reading with the net empty, sensor frame.
         loaded_n: mean reading with the weight on the net, sensor frame.
         down_tip: gravity's direction in the frame of the arm's tip.
-        weight_kg: mass of the weight.
-        sensor_rpy_deg: the vehicle file's mounting.
     """
     mounted = _mounting(sensor_rpy_deg)
     measured = (loaded_n[0] - empty_n[0], loaded_n[1] - empty_n[1], loaded_n[2] - empty_n[2])
@@ -92,7 +93,7 @@ def fit_weight(empty_n: Vec3, loaded_n: Vec3, down_tip: Vec3, weight_kg: float, 
     best = min(ROTATIONS, key=off_deg.__getitem__)
     if off_deg[IDENTITY] <= off_deg[best] + 1.0:
         best = IDENTITY
-    measured_n, expected_n = norm(measured), GRAVITY_M_S2 * weight_kg
+    measured_n, expected_n = math.hypot(*measured), GRAVITY_M_S2 * weight_kg
     return WeightFit(
         expected_n=expected_n,
         measured_n=measured_n,
@@ -170,26 +171,24 @@ class Drift:
 
 def drift(samples: Sequence[ForceSample]) -> list[Drift]:
     """Fit a straight line to each axis x, y, z of at least four samples."""
-    return [_drift([(s.stamp_s, s.force_sensor_n[axis]) for s in samples]) for axis in range(3)]
+    stamps_s = np.array([sample.stamp_s for sample in samples])
+    return [_drift(stamps_s, np.array(values)) for values in zip(*(s.force_sensor_n for s in samples), strict=True)]
 
 
-def _drift(points: Sequence[tuple[float, float]]) -> Drift:
-    start_s = points[0][0]
-    width_s = min(1.0, (points[-1][0] - start_s) / 4)
-    blocks: dict[int, list[tuple[float, float]]] = {}
-    for t_s, value in points:
-        blocks.setdefault(int((t_s - start_s) / width_s), []).append((t_s - start_s, value))
-    means = [
-        (len(block), sum(t for t, _ in block) / len(block), sum(v for _, v in block) / len(block))
-        for block in blocks.values()
-    ]
-    mean_t, mean = sum(n * t for n, t, _ in means) / len(points), sum(n * v for n, _, v in means) / len(points)
-    spread = sum(n * (t - mean_t) ** 2 for n, t, _ in means)
-    slope = sum(n * (t - mean_t) * (v - mean) for n, t, v in means) / spread
-    rest = sum(n * (v - mean - slope * (t - mean_t)) ** 2 for n, t, v in means) / max(1, len(means) - 2)
-    off = [value - mean - slope * (t_s - start_s - mean_t) for t_s, value in points]
-    noise = math.sqrt(sum(value * value for value in off) / len(off))
-    return Drift(mean, noise, 60.0 * slope, 60.0 * math.sqrt(rest / spread))
+def _drift(stamps_s: NDArray[np.float64], values: NDArray[np.float64]) -> Drift:
+    t_s = stamps_s - stamps_s[0]
+    block = (t_s / min(1.0, t_s[-1] / 4)).astype(int)
+    counts = np.bincount(block)
+    filled, counts = counts > 0, counts[counts > 0]
+    mean_s, means = (np.bincount(block, one)[filled] / counts for one in (t_s, values))
+    line, covariance = np.polyfit(mean_s, means, 1, w=np.sqrt(counts), cov="unscaled")
+    scatter = counts @ (means - np.polyval(line, mean_s)) ** 2 / max(1, len(counts) - 2)
+    return Drift(
+        mean_n=float(values.mean()),
+        noise_n=float(np.std(values - np.polyval(line, t_s))),
+        per_minute_n=60.0 * float(line[0]),
+        standard_error_n=60.0 * math.sqrt(scatter * covariance[0, 0]),
+    )
 
 
 def _degrees(q: Quat) -> Vec3:

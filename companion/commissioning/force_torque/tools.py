@@ -119,7 +119,7 @@ def judge(seen: Watched, vehicle: Vehicle) -> Report:
     }
     data = {"rest": rest, "weight": None}
     if seen.problem:
-        return Report([*rows, preflight.DEVICE.bad(seen.problem, "", "")], data)
+        return Report([*rows, preflight.DEVICE.bad(seen.problem)], data)
     if seen.weight_kg is None:
         return Report(
             rows, data, advice=["to check scale and direction with a known weight: companion ft check --weight KG"]
@@ -163,7 +163,7 @@ def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
 
 @dataclass(frozen=True, slots=True)
 class Tared:
-    """Measurement with an empty net, and after the sensor's own zero was set."""
+    """Samples with an empty net, before and after the sensor's own zero was set."""
 
     samples: Sequence[ForceSample]
     first: Sequence[ForceSample]

@@ -132,16 +132,14 @@ async def arm_angles(
         await arm.__aexit__(None, None, None)
 
 
-async def until_loaded(
-    sensor: SampleStream, empty_n: Vec3, weight_n: float, timeout_s: float = WEIGHT_TIMEOUT_S
-) -> bool:
-    """Wait until a weight hangs steadily on the net. Return False at the timeout.
+async def until_loaded(sensor: SampleStream, empty_n: Vec3, weight_n: float) -> bool:
+    """Wait until a weight hangs steadily on the net. Return False after `WEIGHT_TIMEOUT_S`.
 
     Raises:
         DeviceError: the sensor stopped sending.
     """
     loop = asyncio.get_running_loop()
-    deadline_s = loop.time() + timeout_s
+    deadline_s = loop.time() + WEIGHT_TIMEOUT_S
     least_n = max(_CHANGE_MIN_N, _CHANGE_SHARE * weight_n)
     steady: list[Vec3] = []
     while loop.time() < deadline_s:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cmath
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -49,8 +50,8 @@ _RATE_MIN_RAD_S = math.radians(0.5)
 def loop(flight: Flight, axis: int) -> tuple[Quantity, Quantity]:
     """Return lag and bandwidth of the attitude loop about body x (0) or y (1)."""
     name = AXES[axis]
-    lag_key, lag_title = f"{name}_lag_s", f"{name}: lag of the attitude loop"
-    band_key, band_title = f"{name}_bandwidth_hz", f"{name}: bandwidth (-3 dB)"
+    lag = Quantity(f"{name}_lag_s", f"{name}: lag of the attitude loop", "ms", 0, scale=1e3)
+    bandwidth = Quantity(f"{name}_bandwidth_hz", f"{name}: bandwidth (-3 dB)", "Hz", 2)
     pieces = []
     for begin, end in flight.airborne:
         grid_s = flight.grid(begin, end)
@@ -60,10 +61,7 @@ def loop(flight: Flight, axis: int) -> tuple[Quantity, Quantity]:
     moved = float(np.std(np.concatenate([piece.input - piece.input.mean() for piece in pieces])))
     if moved < _MOVED_MIN_RAD:
         how = f"the setpoint moved by {math.degrees(moved):.2f} deg (standard deviation); fly a circuit"
-        return (
-            Quantity(lag_key, lag_title, "ms", 0, how, scale=1e3),
-            Quantity(band_key, band_title, "Hz", 2, how),
-        )
+        return replace(lag, how=how), replace(bandwidth, how=how)
     fit = fit_response(
         pieces,
         _transfer,
@@ -74,7 +72,7 @@ def loop(flight: Flight, axis: int) -> tuple[Quantity, Quantity]:
         slow_hz=_SLOW_HZ,
         order=8,
     )
-    return _lag(fit, lag_key, lag_title), _bandwidth(fit, band_key, band_title)
+    return _lag(fit, lag), _bandwidth(fit, bandwidth)
 
 
 _PRIORS = (_ANGLE_GAIN_LN, _RATE_GAIN_LN, _ROTOR_LAG_LN, _DELAY)
@@ -108,27 +106,26 @@ def bandwidth_hz(p: Array) -> float:
     return float(np.interp(math.sqrt(0.5), size[[low, low - 1]], hertz[[low, low - 1]]))
 
 
-def _lag(fit: Fit, key: str, title: str) -> Quantity:
+def _lag(fit: Fit, lag: Quantity) -> Quantity:
     value, sigma = fit.of(lag_s)
     sigma = combined(sigma, _LAG_SHARE * value)
     if sigma > _LAG_SIGMA_MAX_S:
-        how = f"known only to ± {1e3 * SIGMAS_95 * sigma:.0f} ms; fly a circuit"
-        return Quantity(key, title, "ms", 0, how, scale=1e3)
+        return replace(lag, how=f"known only to ± {1e3 * SIGMAS_95 * sigma:.0f} ms; fly a circuit")
     angle_1_s, rate_1_s, rotors_s = np.exp(fit.parameters[:3])
     how = (
         f"setpoint to attitude: PX4's cascade with gains {angle_1_s:.1f} 1/s (angle) and {rate_1_s:.0f} 1/s (rate), "
         f"rotors {1e3 * rotors_s:.0f} ms, after {1e3 * fit.parameters[3]:.0f} ms"
     )
-    return Quantity(key, title, "ms", 0, how, value, sigma, "lab about 165 ms", 1e3)
+    return replace(lag, how=how, value=value, sigma=sigma, now="lab about 165 ms")
 
 
-def _bandwidth(fit: Fit, key: str, title: str) -> Quantity:
+def _bandwidth(fit: Fit, bandwidth: Quantity) -> Quantity:
     value, sigma = fit.of(bandwidth_hz)
     sigma = combined(sigma, _BANDWIDTH_SHARE * value)
     if sigma > 0.15 * value:
-        how = f"known only to ± {SIGMAS_95 * sigma:.1f} Hz; fly a circuit with faster turns"
-        return Quantity(key, title, "Hz", 2, how)
-    return Quantity(key, title, "Hz", 2, "of the same response, mean over the arm's poses in this flight", value, sigma)
+        return replace(bandwidth, how=f"known only to ± {SIGMAS_95 * sigma:.1f} Hz; fly a circuit with faster turns")
+    how = "of the same response, mean over the arm's poses in this flight"
+    return replace(bandwidth, how=how, value=value, sigma=sigma)
 
 
 def mocap_delay(flight: Flight) -> Quantity:
@@ -137,7 +134,7 @@ def mocap_delay(flight: Flight) -> Quantity:
     `companion latency` measures the same more precisely by taps, which move the vehicle faster than any flight. Here the difference
     between both attitudes is regressed on the body's rate: a late pose lags by rate times delay.
     """
-    key, title = "mocap_delay_s", "delay of motion capture"
+    delay = Quantity("mocap_delay_s", "delay of motion capture", "ms", 1, scale=1e3)
     stamps, differences, rates = list[float](), list[Vec3](), list[Array]()
     number = None
     for begin, end in flight.airborne:
@@ -157,28 +154,25 @@ def mocap_delay(flight: Flight) -> Quantity:
             differences.append((roll + ahead_s * rate[0], pitch + ahead_s * rate[1], 0.0))
     if len(stamps) < 400:
         how = "PX4 got its poses from another program, or motion capture was lost; fly with motion capture"
-        return Quantity(key, title, "ms", 1, how, scale=1e3)
+        return replace(delay, how=how)
     width = max(3, round(_SLOW_S / float(np.median(np.diff(stamps)))))
     y, x = _without_mean(np.array(differences)[:, :2], width), _without_mean(np.array(rates), width)
     rate_rms = float(np.sqrt(np.mean(x**2)))
-    scores = []
     power = float(np.sum(x * x))
     delay_s = -float(np.sum(x * y)) / power
-    for axis in range(2):
-        scores.append(x[:, axis] * (y[:, axis] + delay_s * x[:, axis]))
-    variance = sum(float(long_run(score[:, None], width)[0, 0]) for score in scores) / power**2
+    variance = float(np.trace(long_run(x * (y + delay_s * x), width))) / power**2
     sigma = combined(math.sqrt(max(0.0, variance)), _DELAY_SIGMA_S)
     if sigma > _DELAY_SIGMA_MAX_S or rate_rms < _RATE_MIN_RAD_S:
         how = f"the attitude moved by {math.degrees(rate_rms):.1f} deg/s (RMS); companion latency measures it by taps"
-        return Quantity(key, title, "ms", 1, how, scale=1e3)
+        return replace(delay, how=how)
     seen = f"lag of the poses behind PX4's attitude, {1e3 * delay_s:.1f} ± {1e3 * SIGMAS_95 * sigma:.1f} ms"
     latencies = [i.mocap.latency_s for i in flight.log.inputs if i.mocap is not None and i.mocap.latency_s is not None]
     if not latencies:
-        return Quantity(key, title, "ms", 1, seen, delay_s, sigma, "lab 5 ms", 1e3)
+        return replace(delay, how=seen, value=delay_s, sigma=sigma, now="lab 5 ms")
     middle_s = float(np.median(latencies))
     spread_s = 1.4826 * float(np.median(np.abs(np.array(latencies) - middle_s)))
     how = f"the server's stamps, without the network; {seen}"
-    return Quantity(key, title, "ms", 1, how, middle_s, combined(spread_s, _SERVER_SIGMA_S), "lab 5 ms", 1e3)
+    return replace(delay, how=how, value=middle_s, sigma=combined(spread_s, _SERVER_SIGMA_S), now="lab 5 ms")
 
 
 def _rate(t_s: Array, attitude_rad: Array) -> Array:

@@ -8,6 +8,7 @@ without it, the torque constant would come out too low.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +31,8 @@ _SIGMAS = (math.inf, 0.15, 0.05, math.radians(2.0), 0.4, 0.06, 0.05, 0.3)
 such as that of the downwash, and in m the lever of a payload that hangs beside the centre of the net.
 """
 _CONSTANT_SHARE = 0.11
-"""Standard error, relative, that no flight shows: masses and centres of mass of the vehicle file, downwash on the arm."""
+"""Relative standard error due to causes that cannot be seen in a flight: errors of the vehicle file's masses and centres of mass, and
+downwash on the arm."""
 _FRICTION_SHARE, _FRICTION_SIGMA_NM = 0.08, 0.012
 _CONSTANT_SIGMA_MAX = 0.17
 _FRICTION_SIGMA_MAX_NM = 0.06
@@ -67,14 +69,14 @@ def _joint(
     joint: int, rows: Array, currents: Array, chains: list[int], constant_nm_a: float, friction_nm: float
 ) -> tuple[Quantity, Quantity]:
     name = f"joint {joint + 1}"
-    k_key, k_title = f"joint{joint + 1}_torque_per_amp_nm_a", f"{name}: torque constant"
-    c_key, c_title = f"joint{joint + 1}_friction_nm", f"{name}: friction while it moves"
+    constant = Quantity(f"joint{joint + 1}_torque_per_amp_nm_a", f"{name}: torque constant", "N m/A", 3)
+    rubbing = Quantity(f"joint{joint + 1}_friction_nm", f"{name}: friction while it moves", "N m", 3)
     both_ways = len(rows) >= BINS_MIN and abs(float(np.mean(rows[:, 1]))) < 0.8
     if not both_ways:
         how = (
             f"moved for {_BIN_S * len(rows):.1f} s; {BINS_MIN * _BIN_S:g} s in both directions are needed, as in catch"
         )
-        return Quantity(k_key, k_title, "N m/A", 3, how), Quantity(c_key, c_title, "N m", 3, how)
+        return replace(constant, how=how), replace(rubbing, how=how)
     fit = robust_fit(rows, currents, chains, _SIGMAS, constant_nm_a)
     k = 1.0 / float(fit.theta[0])
     speed, load = float(np.mean(np.abs(rows[:, 2]))), float(np.mean(np.abs(rows[:, 0])))
@@ -86,18 +88,19 @@ def _joint(
     c_sigma = combined(
         math.sqrt(max(0.0, float(slope @ fit.covariance @ slope))), _FRICTION_SHARE * friction, _FRICTION_SIGMA_NM
     )
-    constant = Quantity(
-        k_key, k_title, "N m/A", 3, "current against gravity and inertia while the joint moves, masses as in the vehicle file",
-        k, k_sigma, f"{constant_nm_a:g}",
-    )  # fmt: skip
-    if not 0.0 < k_sigma <= _CONSTANT_SIGMA_MAX * k:
+    constant, rubbing = replace(constant, now=f"{constant_nm_a:g}"), replace(rubbing, now=f"{friction_nm:g}")
+    if 0.0 < k_sigma <= _CONSTANT_SIGMA_MAX * k:
+        how = "current against gravity and inertia while the joint moves, masses as in the vehicle file"
+        constant = replace(constant, how=how, value=k, sigma=k_sigma)
+    else:
         how = f"known only to ± {100 * SIGMAS_95 * abs(k_sigma / k):.0f} %; companion arm friction measures it"
-        constant = Quantity(k_key, k_title, "N m/A", 3, how, now=f"{constant_nm_a:g}")
-    how = f"difference between the directions, at {speed:.1f} rad/s and {load:.2f} N m"
-    rubbing = Quantity(c_key, c_title, "N m", 3, how, friction, c_sigma, f"{friction_nm:g}")
-    if c_sigma > _FRICTION_SIGMA_MAX_NM:
+        constant = replace(constant, how=how)
+    if c_sigma <= _FRICTION_SIGMA_MAX_NM:
+        how = f"difference between the directions, at {speed:.1f} rad/s and {load:.2f} N m"
+        rubbing = replace(rubbing, how=how, value=friction, sigma=c_sigma)
+    else:
         how = f"known only to ± {SIGMAS_95 * c_sigma:.2f} N m; companion arm friction measures it"
-        rubbing = Quantity(c_key, c_title, "N m", 3, how, now=f"{friction_nm:g}")
+        rubbing = replace(rubbing, how=how)
     return constant, rubbing
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,13 +23,13 @@ _LAGS = 100
 
 def payload(flight: Flight) -> Quantity:
     """Return the mass of the payload in the net."""
-    key, title = "payload_kg", "payload"
+    mass = Quantity("payload_kg", "payload", "kg", 3)
     if not flight.vehicle.has_net:
-        return Quantity(key, title, "kg", 3, "the vehicle has no net")
+        return replace(mass, how="the vehicle has no net")
     if flight.catch is None:
-        return Quantity(key, title, "kg", 3, "nothing was caught; fly catch")
+        return replace(mass, how="nothing was caught; fly catch")
     if flight.vehicle.devices.force is None:
-        return Quantity(key, title, "kg", 3, "the vehicle has no force sensor")
+        return replace(mass, how="the vehicle has no force sensor")
 
     def force_up_n(begin: int, end: int) -> Array:
         forces = [
@@ -45,14 +46,14 @@ def payload(flight: Flight) -> Quantity:
         [[], *(force_up_n(max(begin, first), end) for begin, end in flight.airborne if first < end <= flight.catch)]
     )
     if len(after) < 2 * _LAGS or len(before) < 2 * _LAGS:
-        return Quantity(key, title, "kg", 3, "too little flight before or after the catch; fly catch to its end")
+        return replace(mass, how="too little flight before or after the catch; fly catch to its end")
     value = float(before.mean() - after.mean()) / GRAVITY_M_S2
     sigma = combined(_mean_sigma(before), _mean_sigma(after), _FORCE_SIGMA_N) / GRAVITY_M_S2
     sigma = combined(sigma, _SCALE_SHARE * value)
     if value < 3.0 * sigma:
-        return Quantity(key, title, "kg", 3, "nothing stayed in the net after the impact; fly catch again")
+        return replace(mass, how="nothing stayed in the net after the impact; fly catch again")
     how = "weight on the force sensor, after minus before the catch"
-    return Quantity(key, title, "kg", 3, how, value, sigma)
+    return replace(mass, how=how, value=value, sigma=sigma)
 
 
 def _mean_sigma(values: Array) -> float:

@@ -59,12 +59,7 @@ def _mean(quantities: list[Quantity]) -> float:
 
 
 def world_text(found: Identification, name: str) -> str:
-    """Return a world file: the laboratory with what was identified in place of its draws.
-
-    Args:
-        found: what the flight shows.
-        name: the log's name, for the comment.
-    """
+    """Return a world file: the laboratory with what was identified in place of its draws."""
     lab: dict[str, Any] = read_document(shipped_file("worlds", BASE)).data
     lines = [
         "# yaml-language-server: $schema=../schema/world.schema.json",
@@ -87,7 +82,7 @@ def world_text(found: Identification, name: str) -> str:
 
 
 _Found = dict[str, dict[str, tuple[Any, str]]]
-"""Value and remark by section and key of a world; a key of the world itself is a section with that one key."""
+"""Values of a world file, each with its remark, by section and key. A key outside of all sections has a section of its own name."""
 
 
 def _world(found: Identification, lab: Mapping[str, Any]) -> _Found:

@@ -20,12 +20,12 @@ class Quantity:
     unit: str
     digits: int
     """Decimal places in the text."""
-    how: str
+    how: str = ""
     """How it was found, or what the flight lacked and which flight would show it; one line."""
     value: float | None = None
     """None if this flight does not show the quantity."""
     sigma: float = 0.0
-    """Standard error: that of the fit, with correlated residuals, and that of what the method assumes."""
+    """Standard error, which combines the error of the fit (with correlated residuals) and that of the method's assumptions."""
     now: str = ""
     """What the vehicle file or the laboratory has now; empty if neither has such a key."""
     scale: float = 1.0

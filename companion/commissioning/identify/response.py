@@ -165,11 +165,7 @@ def fit_response(
 
 def _filtered(white: Array, values: Array) -> Array:
     """Return the values after the whitening filter, without its transient."""
-    count, order = len(values), len(white) - 1
-    total = np.zeros_like(values[order:])
-    for k, factor in enumerate(white):
-        total += factor * values[order - k : count - k]
-    return total
+    return np.asarray(np.apply_along_axis(np.convolve, 0, values, white, "valid"), dtype=np.float64)
 
 
 def _whitening(residuals: Sequence[Array], order: int) -> tuple[Array, float]:

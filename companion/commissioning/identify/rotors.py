@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -46,22 +47,22 @@ _DRAG_SHARE = 0.1
 
 def hover_thrust(flight: Flight) -> tuple[Quantity, HoverFit | None]:
     """Return the hover thrust, and the fit with its slope over the battery voltage."""
-    title = "hover thrust"
+    hover = Quantity("hover_thrust", "hover thrust", "", 4)
     try:
         fit = fit_hover_thrust(flight.log)
     except HoverFitError as error:
-        return Quantity("hover_thrust", title, "", 4, str(error).removeprefix(f"{flight.log.path}: ")), None
+        return replace(hover, how=str(error).removeprefix(f"{flight.log.path}: ")), None
     at = "" if fit.voltage_mean_v is None else f" at {fit.voltage_mean_v:.1f} V"
     slope = "" if fit.slope is None else f", {fit.slope.per_v:+.4f} ± {1.96 * fit.slope.standard_error_per_v:.4f} per V"
     configured = "" if fit.configured is None else f"{fit.configured:.4f}"
     how = f"force balance of {fit.used_s:.0f} s of steady flight{at}{slope}"
     sigma = combined(fit.standard_error, HOVER_SHARE * fit.hover_thrust)
-    return Quantity("hover_thrust", title, "", 4, how, fit.hover_thrust, sigma, configured), fit
+    return replace(hover, how=how, value=fit.hover_thrust, sigma=sigma, now=configured), fit
 
 
 def thrust_lag(flight: Flight, hover: float | None) -> Quantity:
     """Return the time from a thrust setpoint to the thrust: delay plus time constant."""
-    title, key = "thrust lag (delay + time constant)", "thrust_lag_s"
+    lag = Quantity("thrust_lag_s", "thrust lag (delay + time constant)", "ms", 0, scale=1e3)
     velocity = flight.delta_velocity_m_s[:, 2]
     pieces = []
     for begin, end in flight.airborne:
@@ -72,7 +73,7 @@ def thrust_lag(flight: Flight, hover: float | None) -> Quantity:
     moved = float(np.std(np.concatenate([piece.input - piece.input.mean() for piece in pieces])))
     if hover is None or moved < _THRUST_MOVED:
         how = f"the thrust setpoint moved by {moved:.4f} (standard deviation); fly climbs and descents, such as circuit"
-        return Quantity(key, title, "ms", 0, how, scale=1e3)
+        return replace(lag, how=how)
     gain = GRAVITY_M_S2 / hover
 
     def transfer(p: Array, s: Spectrum) -> Spectrum:
@@ -93,14 +94,14 @@ def thrust_lag(flight: Flight, hover: float | None) -> Quantity:
     sigma = combined(sigma, _LAG_SIGMA_S)
     if sigma > _LAG_SIGMA_MAX_S:
         how = f"the thrust moved too little: known only to ± {1e3 * 1.96 * sigma:.0f} ms; fly climbs and descents, such as circuit"
-        return Quantity(key, title, "ms", 0, how, scale=1e3)
+        return replace(lag, how=how)
     how = f"thrust setpoint to vertical specific force, below {_CUTOFF_HZ:g} Hz"
-    return Quantity(key, title, "ms", 0, how, value, sigma, "lab 54 to 76 ms", 1e3)
+    return replace(lag, how=how, value=value, sigma=sigma, now="lab 54 to 76 ms")
 
 
 def drag(flight: Flight) -> Quantity:
     """Return the drag over mass and speed: the specific force across the rotor axis against the velocity."""
-    title, key = "drag over mass", "drag_1_s"
+    found = Quantity("drag_1_s", "drag over mass", "1/s", 2)
     every = max(1, round(_DRAG_BIN_S / STEP_S))
     velocity_world = flight.log.column(lambda i, o, s: i.vehicle.velocity_world_m_s if i.vehicle else None, 3)
     attitude = flight.log.column(lambda i, o, s: i.vehicle.attitude_wxyz if i.vehicle else None, 4)
@@ -130,7 +131,7 @@ def drag(flight: Flight) -> Quantity:
     rms = float(np.sqrt(2.0 * np.mean(speed**2)))
     if rms < _SPEED_MIN_M_S:
         how = f"the vehicle moved at {rms:.2f} m/s (RMS); fly at 0.5 m/s or more, such as circuit"
-        return Quantity(key, title, "1/s", 2, how)
+        return replace(found, how=how)
     tethered = flight.vehicle.tether is not None
     rows = np.stack([-speed, -sign] if tethered else [-speed], axis=1)
     scatter = float(np.std(force_m_s2))
@@ -142,4 +143,4 @@ def drag(flight: Flight) -> Quantity:
     covariance = inverse @ (long_run(rows * residual[:, None], lags) + prior * scatter**2) @ inverse
     sigma = combined(math.sqrt(float(covariance[0, 0])), _DRAG_SHARE * abs(float(value[0])))
     how = f"specific force across the rotor axis against the velocity, {rms:.2f} m/s RMS"
-    return Quantity(key, title, "1/s", 2, how, float(value[0]), sigma, "lab 0.20 to 0.62 1/s")
+    return replace(found, how=how, value=float(value[0]), sigma=sigma, now="lab 0.20 to 0.62 1/s")

@@ -37,7 +37,7 @@ Row = tuple[Inputs, Outputs, Sent]
 
 @dataclass(frozen=True)
 class Flight:
-    """A flight in which something can be found."""
+    """A flight that is long enough to identify parameters from it."""
 
     log: FlightLog
     vehicle: Vehicle

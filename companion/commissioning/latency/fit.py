@@ -108,7 +108,6 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
     """Measure the delay from one tap.
 
     Args:
-        tap: a tap that was found in `imu`.
         imu: samples in order of time.
         poses: poses in order of arrival.
         noise: noise of motion capture per axis, one sigma, m and rad (`mocap_noise`).
@@ -118,9 +117,7 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
     seen = [p for p in poses if tap.t_s - BEFORE_S - 0.1 <= p.t_s <= tap.t_s + AFTER_S + high + 0.05]
     rest = [p for p in seen if p.t_s <= tap.t_s - 0.01]
     if len(felt) < 40 or len(rest) < 3 or len(seen) < 15:
-        return TapDelay(
-            tap=tap, delay_s=0.0, error_s=math.inf, correlation=0.0, problem="IMU samples are missing around the tap"
-        )
+        return _unusable(tap, "IMU samples are missing around the tap")
     course = _Course(felt, mean_attitude([pose.attitude for pose in rest[-12:]]))
     delay_s = 0.0
     for step_s, (first_s, last_s) in ((_COARSE_S, DELAY_SPAN_S), (_FINE_S, (0.0, 0.0))):
@@ -132,23 +129,11 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
         until_s = centre_s + AFTER_S + (high if step_s == _COARSE_S else 0.0)
         window = [pose for pose in seen if centre_s - BEFORE_S <= pose.t_s <= until_s]
         if len(window) < 12:
-            return TapDelay(
-                tap=tap,
-                delay_s=0.0,
-                error_s=math.inf,
-                correlation=0.0,
-                problem="motion capture was lost around the tap",
-            )
+            return _unusable(tap, "motion capture was lost around the tap")
         costs, nothing, free = course.costs(window, grid, noise)
         best = int(np.argmin(costs))
         if not 0 < best < len(grid) - 1:
-            return TapDelay(
-                tap=tap,
-                delay_s=float(grid[best]),
-                error_s=math.inf,
-                correlation=0.0,
-                problem="motion capture shows no similar motion",
-            )
+            return _unusable(tap, "motion capture shows no similar motion", float(grid[best]))
         delay_s, curvature = _vertex(grid, costs, best)
     least = float(costs[best])
     correlation = math.sqrt(max(0.0, 1.0 - least / nothing)) if nothing > 0.0 else 0.0
@@ -160,6 +145,10 @@ def measure_tap(tap: Tap, imu: Sequence[ImuAt], poses: Sequence[PoseAt], noise: 
     elif error_s > TAP_ERROR_MAX_S:
         problem = f"too weak: its time is known only to within {1e3 * error_s:.1f} ms"
     return TapDelay(tap=tap, delay_s=delay_s, error_s=error_s, correlation=correlation, problem=problem)
+
+
+def _unusable(tap: Tap, problem: str, delay_s: float = 0.0) -> TapDelay:
+    return TapDelay(tap=tap, delay_s=delay_s, error_s=math.inf, correlation=0.0, problem=problem)
 
 
 def agreeing(taps: Sequence[TapDelay]) -> list[TapDelay]:

@@ -11,12 +11,18 @@ from typing import Any, Final
 from companion.config.base import Location
 from companion.config.document import Data
 from companion.model.check_row import Row
-from companion.model.frames import quat_rotate, wrap_rad
+from companion.model.frames import wrap_rad
 from companion.model.types import Vec3
-from companion.preflight.axes import IDENTITY, Y_UP, AxisMap
+from companion.preflight.axes import IDENTITY, AxisMap
 from companion.preflight.checks import Check
-from companion.preflight.hand_test.evaluation import LEVEL_MAX_DEG, YAW_MAX_DEG, best_axes, yaw_offset_deg
-from companion.preflight.hand_test.motion import angle_rad
+from companion.preflight.hand_test.evaluation import (
+    LEVEL_MAX_DEG,
+    YAW_MAX_DEG,
+    best_axes,
+    gravity_off_deg,
+    proposed_up_axis,
+    yaw_offset_deg,
+)
 from companion.preflight.hand_test.steps import HandResult
 
 WORLD_YAW = Check("align.world_yaw", "world's yaw", why="the room, the tether and the mission are given in these axes")
@@ -30,8 +36,6 @@ class Alignment:
     axes: AxisMap
     """The true directions of the rigid body's streamed axes."""
     mirrored: bool
-    level: bool
-    """Whether gravity is vertical in the stream. If so, either the axes of the whole stream are wrong, or none are."""
     up_axis: str
     """Proposed `devices.mocap.up_axis`."""
     body_yaw_deg: float
@@ -44,17 +48,11 @@ def alignment(result: HandResult, up_axis: str, start_yaw_rad: float) -> Alignme
     """Find the axes from a finished test.
 
     Args:
-        result: result of the test.
         up_axis: `devices.mocap.up_axis` during the test.
         start_yaw_rad: true yaw of the nose during the forward motion: the mission's start yaw.
     """
     axes = best_axes(result)
-    level = angle_rad(quat_rotate(result.stood.attitude, result.stood.force_m_s2), _UP) <= math.radians(LEVEL_MAX_DEG)
-    proposed = up_axis
-    if level and axes == Y_UP and up_axis == "z":
-        proposed = "y"
-    elif level and axes == Y_UP.inverse and up_axis == "y":
-        proposed = "z"
+    level = gravity_off_deg(result) <= LEVEL_MAX_DEG
     upright = axes.determinant > 0 and axes.vector(_UP) == _UP
     world_yaw_deg: float | None = None
     if upright:
@@ -63,8 +61,7 @@ def alignment(result: HandResult, up_axis: str, start_yaw_rad: float) -> Alignme
     return Alignment(
         axes=axes,
         mirrored=axes.determinant < 0,
-        level=level,
-        up_axis=proposed,
+        up_axis=proposed_up_axis(level, axes, up_axis),
         body_yaw_deg=yaw_offset_deg(result.forward),
         world_yaw_deg=world_yaw_deg,
     )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
@@ -118,12 +119,10 @@ def timing(frames: Sequence[FrameSeen]) -> Timing | None:
         return None
     n = [frame.number - frames[0].number for frame in frames]
     t = [frame.arrived_s - frames[0].arrived_s for frame in frames]
-    mean_n, mean_t = sum(n) / len(n), sum(t) / len(t)
-    spread = sum((a - mean_n) ** 2 for a in n)
-    period_s = sum((a - mean_n) * (b - mean_t) for a, b in zip(n, t, strict=True)) / spread
+    period_s, first_s = statistics.linear_regression(n, t)
     if period_s <= 0.0:
         return None
-    off = sorted(b - mean_t - period_s * (a - mean_n) for a, b in zip(n, t, strict=True))
+    off = sorted(b - first_s - period_s * a for a, b in zip(n, t, strict=True))
     early = _percentile(off, 0.05)
     stamped_s = frames[-1].timestamp_s - frames[0].timestamp_s
     return Timing(
@@ -144,19 +143,15 @@ def bodies(frames: Sequence[FrameSeen], names: Mapping[int, str]) -> list[BodyMo
     for number in sorted(ids):
         seen = [body for frame in frames for body in frame.bodies if body.id == number]
         tracked = [body for body in seen if body.tracking_valid]
-        moved_m = 0.0
-        if tracked:
-            spans = [max(b.position_m[i] for b in tracked) - min(b.position_m[i] for b in tracked) for i in range(3)]
-            moved_m = math.sqrt(sum(span * span for span in spans))
-        error_m = sum(body.error_m for body in tracked) / len(tracked) if tracked else 0.0
+        axes = zip(*(body.position_m for body in tracked), strict=True)
         found.append(
             BodyMotion(
                 id=number,
                 name=names.get(number, ""),
                 frames=len(seen),
                 tracked=len(tracked),
-                moved_m=moved_m,
-                error_m=error_m,
+                moved_m=math.hypot(*(max(values) - min(values) for values in axes)),
+                error_m=statistics.fmean(body.error_m for body in tracked) if tracked else 0.0,
             )
         )
     return found

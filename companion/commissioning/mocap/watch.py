@@ -11,6 +11,7 @@ import fcntl
 import socket
 import struct
 from collections.abc import Callable
+from ipaddress import IPv4Interface
 from pathlib import Path
 from typing import Final
 
@@ -24,16 +25,12 @@ from companion.runtime.clock import Clock
 
 _SIOCGIFADDR, _SIOCGIFNETMASK = 0x8915, 0x891B
 _ASK_PERIOD_S: Final = 0.25
+_ANSWERS_S: Final = 1.0
+"""Time to wait for the answers to a broadcast."""
 
 
 def watcher(device: MocapDevice, clock: Clock, on_frame: Callable[[FrameSeen], None]) -> NatNetMocap:
-    """Return an unopened motion-capture driver that reports every rigid body of every frame and requires none.
-
-    Args:
-        device: addresses, transport, version.
-        clock: the flight clock.
-        on_frame: called with every frame in order of arrival.
-    """
+    """Return an unopened motion-capture driver that reports every rigid body of every frame and requires none."""
 
     def show(frame: Frame, datagram: bytes, arrived_s: float) -> None:
         bodies = (driver.client.other_body(datagram, number) for number in frame.body_ids)
@@ -52,13 +49,11 @@ def watcher(device: MocapDevice, clock: Clock, on_frame: Callable[[FrameSeen], N
     return driver
 
 
-async def discover(interface: str, command_port: int, within_s: float = 1.0) -> dict[str, ServerInfo]:
+async def discover(interface: str, command_port: int) -> dict[str, ServerInfo]:
     """Return the NatNet servers of the segment by address: a connect request is broadcast and the answers are collected.
 
     Args:
         interface: address of this computer in that segment; 0.0.0.0 for all segments.
-        command_port: NatNet's command port, 1510 unless changed in Motive.
-        within_s: time to wait for answers.
     """
     found: dict[str, ServerInfo] = {}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
@@ -69,7 +64,7 @@ async def discover(interface: str, command_port: int, within_s: float = 1.0) -> 
         except OSError:
             return found  # not an address of this computer; the driver has reported it
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(within_s):
+            async with asyncio.timeout(_ANSWERS_S):
                 while True:
                     for target in _broadcast_addresses(interface):
                         with contextlib.suppress(OSError):  # a segment that is down
@@ -99,7 +94,7 @@ def path_to(server_ip: str, device: MocapDevice) -> Route:
             probe.bind((device.interface, 0))
         probe.connect((server_ip, device.command_port))
         local = probe.getsockname()[0]
-    name = next((name for name, (address, _) in _interfaces().items() if address == local), "")
+    name = next((name for name, one in _interfaces().items() if str(one.ip) == local), "")
     if not name and local.startswith("127."):
         name = "lo"
     how = f"multicast {device.multicast_group}:{device.data_port}" if device.transport == "multicast" else "unicast"
@@ -108,23 +103,25 @@ def path_to(server_ip: str, device: MocapDevice) -> Route:
 
 def _broadcast_addresses(interface: str) -> list[str]:
     """Return the broadcast addresses of the interface's segments, and the limited broadcast."""
-    found = []
-    for address, mask in _interfaces().values():
-        if interface in ("0.0.0.0", address) or (interface.startswith("127.") and address.startswith("127.")):
-            (a,), (m,) = (struct.unpack("!I", socket.inet_aton(text)) for text in (address, mask))
-            found.append(socket.inet_ntoa(struct.pack("!I", a | (~m & 0xFFFFFFFF))))
-    if interface.startswith("127."):
+    loopback = interface.startswith("127.")
+    found = [
+        str(one.network.broadcast_address)
+        for one in _interfaces().values()
+        if interface in ("0.0.0.0", str(one.ip)) or (loopback and one.ip.is_loopback)
+    ]
+    if loopback:
         return found or ["127.255.255.255"]
     return [*found, "255.255.255.255"]
 
 
-def _interfaces() -> dict[str, tuple[str, str]]:
+def _interfaces() -> dict[str, IPv4Interface]:
     """Return IPv4 address and netmask of each network interface (ioctl SIOCGIFADDR, SIOCGIFNETMASK)."""
     found = {}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         for _, name in socket.if_nameindex():
             with contextlib.suppress(OSError):  # no IPv4 address
-                found[name] = (_ioctl(probe, _SIOCGIFADDR, name), _ioctl(probe, _SIOCGIFNETMASK, name))
+                address, mask = (_ioctl(probe, request, name) for request in (_SIOCGIFADDR, _SIOCGIFNETMASK))
+                found[name] = IPv4Interface(f"{address}/{mask}")
     return found
 
 

@@ -49,8 +49,6 @@ def make_server(authority: Pair, hosts: Sequence[str], days: int, now: datetime.
     """Return a certificate for the broker, with a new key, signed by the authority.
 
     Args:
-        authority: the signing authority.
-        hosts: names and addresses of the broker.
         days: validity, at most that of the authority.
         now: current time with time zone.
 

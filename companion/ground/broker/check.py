@@ -49,7 +49,6 @@ def check(access: BrokerAccess, vehicle: str | None = None) -> CheckResult:
     """Connect and try every topic.
 
     Args:
-        access: broker, login, certificates.
         vehicle: vehicle whose topics are tested: each of its readers, and the vehicle itself on ``command``, counts one rejected
             message. None to use a name that no vehicle has.
 

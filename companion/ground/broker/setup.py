@@ -65,8 +65,6 @@ def create(folder: Path, users: BrokerUsers, now: datetime.datetime) -> None:
 
     Args:
         folder: absolute path; must not exist or must be empty.
-        users: hosts and users.
-        now: with time zone.
 
     Raises:
         ConfigError: a name is invalid, or the folder is not empty.
@@ -96,10 +94,7 @@ def renew_certificate(folder: Path, hosts: Sequence[str], days: int, now: dateti
     """Create a new key and certificate of the broker, signed by the same authority: no other computer needs a new file.
 
     Args:
-        folder: folder made by `create`.
         hosts: names and addresses of the broker; empty for those of the old certificate.
-        days: validity of the new certificate.
-        now: with time zone.
 
     Returns:
         The hosts in the new certificate.

@@ -45,7 +45,6 @@ def broker_access(url: str, login_file: str | None, ca_file: str | None, named: 
     """Read the files that the settings name.
 
     Args:
-        url: mqtt://HOST:PORT or mqtts://HOST:PORT.
         login_file: YAML file with `username` and `password`, readable by its owner alone.
         ca_file: CA certificates (PEM) to verify the broker's certificate; None for the system's authorities.
         named: names of the settings, for messages.

@@ -141,11 +141,7 @@ def make_command(
     """Return a signed command with a new nonce; `companion.ground.protocol.messages.encode` makes the payload.
 
     Args:
-        name: the command.
-        vehicle: the vehicle's name in topics.
         session: `State.session` or `Stream.session` of the flight.
-        operator: the operator's name.
-        key: the operator's key, `Operators.key`.
         t_ms: current flight clock of the vehicle, `FlightClock.now_ms`.
         hold: number of the hold that a RESUME ends, `Stream.hold`; 0 for other commands.
 
@@ -241,11 +237,6 @@ class _History:
 class Verifier:
     """Verifies messages of the vehicle's ``command`` topic. No I/O and no clock; it keeps a history of the commands that it has
     verified.
-
-    Args:
-        operators: operators who may command.
-        vehicle: the vehicle's name in topics.
-        session: session id of this flight.
     """
 
     def __init__(self, operators: Operators, vehicle: str, session: str) -> None:
@@ -266,7 +257,6 @@ class Verifier:
         """Verify one message; never raises, whatever the payload.
 
         Args:
-            payload: received bytes.
             retained: whether the broker had retained the message; if so its age is unknown, and later subscribers would receive it
                 again.
             now_t_s: flight clock, s; None before it starts. The verifier uses the latest time of all calls.

@@ -32,9 +32,7 @@ class Connection(aiomqtt.Client):
     """One connection; each attempt needs a new instance.
 
     Args:
-        access: settings of the broker.
         identifier: client id; a new connection with the same id ends the previous one at the broker.
-        on_message: called for every message.
         packet_max_bytes: Maximum Packet Size; the broker drops larger messages.
         answer_s: timeout for each answer of the broker.
         will: message that the broker publishes if the connection breaks.

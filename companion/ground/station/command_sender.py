@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from companion.ground.protocol.access import BrokerAccess
 from companion.ground.protocol.commands import make_command
-from companion.ground.protocol.keys import default_operators_file, load_operators
+from companion.ground.protocol.keys import SAFER_COMMANDS, default_operators_file, load_operators
 from companion.ground.protocol.messages import Ack, CommandName, Topic, encode
 from companion.ground.protocol.proof import Signer
 from companion.ground.station.link import Link, LinkError
@@ -19,7 +19,6 @@ ANSWER_S = 1.5
 """Timeout for the vehicle's `Ack`."""
 ATTEMPTS = 3
 """Attempts to send a command that makes the flight safer, each with its own nonce. Other commands are sent once."""
-REPEATED = frozenset({CommandName.HOLD, CommandName.LAND, CommandName.ABORT})
 FALLBACK_ADVICE = "use Ctrl-C or the pilot's switch"
 NO_ANSWER = f"no answer from the vehicle within {ANSWER_S:g} s: {FALLBACK_ADVICE}"
 
@@ -87,8 +86,6 @@ class CommandSender:
     """Sends commands of one operator to any known vehicle.
 
     Args:
-        link: connection to the broker.
-        tracker: session and clock of each vehicle.
         signer: the operator, or why there is none.
     """
 
@@ -120,8 +117,6 @@ class CommandSender:
         or a new flight, ends the attempts.
 
         Args:
-            vehicle: name of the vehicle.
-            command: command to send.
             notify: called when an attempt is sent, and when one fails.
             hold: number of the hold that a RESUME ends, as the operator saw it; None for the hold of the newest message.
 
@@ -136,7 +131,7 @@ class CommandSender:
         order = self._newest[vehicle] = object()
         answer: asyncio.Future[Ack] = asyncio.get_running_loop().create_future()
         nonces: list[str] = []
-        tries = ATTEMPTS if command in REPEATED else 1
+        tries = ATTEMPTS if command in SAFER_COMMANDS else 1
         try:
             for number in range(1, tries + 1):
                 problem = await self._attempt(self._signer, vehicle, command, hold, session, answer, nonces, notify)

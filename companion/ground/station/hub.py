@@ -91,7 +91,6 @@ class Hub:
     """All viewers of one monitor.
 
     Args:
-        tracker: state of the vehicles, for new viewers.
         broker_text: text to show until the state of the broker connection is known.
     """
 

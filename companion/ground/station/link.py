@@ -33,7 +33,6 @@ class Link:
     """Receives from one broker and publishes to it, reconnecting when necessary.
 
     Args:
-        access: settings of the broker.
         topics: topic filters and their QoS, in the order of subscription.
         on_message: called in the event loop for every message.
         on_change: called in the event loop with (connected, one line for display) after each change.

@@ -39,7 +39,6 @@ def read_for_page(path: Path, number: int) -> ReplayLog:
     """Read a log and convert it for the page.
 
     Args:
-        path: the log.
         number: index of this log on the page.
 
     Raises:

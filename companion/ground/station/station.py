@@ -21,10 +21,8 @@ class Station:
     """Tracks all vehicles of a broker, or one of them.
 
     Args:
-        access: settings of the broker.
         signer: the operator who signs commands at this station, or why commands are not possible.
         only: name of the one vehicle to track; None for all.
-        on_record: called with every record.
         on_change: called when the connection changes, with one line for display.
         topics: topics to subscribe to, in this order.
         in_order: subscribe to all topics with QoS 0: no message overtakes another, and retained messages arrive first. If false,

@@ -129,8 +129,6 @@ class VehicleTracker:
         """Store and return the record of a message; None if the message is not a valid record.
 
         Args:
-            topic: full name.
-            payload: received bytes.
             retained: whether the broker had retained the message; if so its age is unknown.
             now_s: local monotonic clock.
         """

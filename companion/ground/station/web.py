@@ -81,7 +81,6 @@ class Monitor:
     """The web server.
 
     Args:
-        serving: address and TLS settings.
         hub: distributes messages to viewers; None for a replay.
         commands: sends commands; None for a replay.
         replay_logs: the logs of a replay.
@@ -201,7 +200,7 @@ class Monitor:
 
     def hello(self, given: object) -> str:
         """Return the hello message for a viewer with this token."""
-        why_not = self.view_only_reason or (None if same_token(given, self._token) else NO_TOKEN)
+        why_not = self.why_not(given)
         return json.dumps(
             {
                 "kind": "hello",
@@ -214,9 +213,9 @@ class Monitor:
             }
         )
 
-    def may_command(self, given: object) -> bool:
-        """Whether a viewer with this token may send commands."""
-        return self.view_only_reason is None and same_token(given, self._token)
+    def why_not(self, given: object) -> str | None:
+        """Return why a viewer with this token may not send commands; None if it may."""
+        return self.view_only_reason or (None if same_token(given, self._token) else NO_TOKEN)
 
     def add_viewer(self, token: object) -> Outbox | None:
         """Add a viewer; return None if there are too many."""
@@ -337,10 +336,11 @@ class _Session:
                     return
 
     def _command(self, vehicle: str, command: CommandName, hold: int | None, outbox: Outbox) -> None:
-        if self._monitor.may_command(self._token):
+        why_not = self._monitor.why_not(self._token)
+        if why_not is None:
             self._monitor.send_command(vehicle, command, hold, outbox)
         else:
-            outbox.put(_note(Failed(vehicle, command, self._monitor.view_only_reason or NO_TOKEN)))
+            outbox.put(_note(Failed(vehicle, command, why_not)))
 
 
 COMMANDS = {command.value: command for command in CommandName}

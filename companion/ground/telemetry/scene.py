@@ -20,8 +20,6 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
     """Return the scene of a flight.
 
     Args:
-        config: effective configuration.
-        session: session id of the flight.
         path_world_m: planned path at equal time steps; thinned to `PATH_POINTS_MAX` evenly spaced points if it has more.
         mission_s: planned duration; 0 before it is planned.
     """

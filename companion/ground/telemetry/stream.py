@@ -116,7 +116,6 @@ class StreamBuilder:
         """Add a line from a source other than the core: PX4, the guardian or the telemetry.
 
         Args:
-            t_s: flight clock.
             severity: value of `companion.model.types.Severity`.
             source: sender, used as the line's id.
             text: cut to `TEXT_MAX` characters.
@@ -147,7 +146,6 @@ class StreamBuilder:
 
         Args:
             wall_s: seconds since 1970.
-            dropped: number of records that the recorder has lost.
             recorder_error: why recording stopped, or None.
 
         Raises:
@@ -245,10 +243,8 @@ def replay(
 
     Args:
         rows: ticks in order, such as `companion.analysis.log.FlightLog.rows()` returns.
-        config: configuration of the flight.
         session: any session id.
         epoch_offset_s: wall clock when the flight clock was zero.
-        rate_hz: rate of the messages; halved until a long flight fits into `max_records`.
         max_records: maximum number of messages, at least 2.
         max_events: number of newest events to keep.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from companion.ground.protocol.messages import Timing
 from companion.ground.telemetry.health import UNKNOWN_S
@@ -53,22 +54,11 @@ class WorstTimings:
 
 def merge_timings(timings: Sequence[Timing]) -> Timing:
     """Return the worst timings of consecutive messages."""
-
-    def worst(name: str) -> float | None:
-        return max((v for t in timings if (v := getattr(t, name)) is not None), default=None)
-
-    last = timings[-1]
-    return Timing(
-        lateness_ms=worst("lateness_ms") or 0.0,
-        mocap_age_ms=worst("mocap_age_ms"),
-        mocap_to_setpoint_ms=worst("mocap_to_setpoint_ms"),
-        joint_read_to_write_ms=worst("joint_read_to_write_ms"),
-        core_ms=worst("core_ms") or 0.0,
-        missed=last.missed,
-        dropped=last.dropped,
-        whole_ms=worst("whole_ms"),
-        bus_read_ms=worst("bus_read_ms"),
-    )
+    columns = {name: [getattr(timing, name) for timing in timings] for name in Timing.__struct_fields__}
+    worst: dict[str, Any] = {
+        name: max((value for value in values if value is not None), default=None) for name, values in columns.items()
+    }
+    return Timing(**worst)
 
 
 def _ms(duration_s: float) -> float | None:

@@ -14,7 +14,7 @@ from companion.model.frames import quat_rotate
 from companion.model.types import Vec3
 from companion.preflight.axes import ALL, IDENTITY, Y_UP, AxisMap
 from companion.preflight.checks import Check
-from companion.preflight.hand_test.motion import Motion, angle_rad, norm
+from companion.preflight.hand_test.motion import Motion, angle_rad
 from companion.preflight.hand_test.steps import HandResult
 
 _ASTRAY = "the controller would push in the wrong directions"
@@ -68,54 +68,49 @@ def rows(result: HandResult, up_axis: str) -> list[Row]:
     """Return one row per property that the test measures.
 
     Args:
-        result: result of a finished test.
         up_axis: devices.mocap.up_axis, "y" or "z".
     """
     lift, forward, turn = result.lift, result.forward, result.turn
     up_body = result.stood.force_m_s2
     requested = _as_requested(lift, forward, turn, up_body)
     fix = _BOARD if not requested.ok and _seen_as_requested(result) else _explain(result, up_axis)
-    level_deg = math.degrees(angle_rad(quat_rotate(result.stood.attitude, up_body), _UP))
+    level_deg = gravity_off_deg(result)
     lift_deg = math.degrees(angle_rad(lift.response, lift.felt_m))
     yaw_deg = yaw_offset_deg(forward)
     slant_deg = math.degrees(angle_rad(forward.response, forward.felt_m))
     felt_deg, seen_deg = (math.degrees(value) for value in (turn.felt_turn_rad[2], turn.seen_turn_rad[2]))
     axis_deg = math.degrees(angle_rad(turn.seen_turn_rad, turn.felt_turn_rad))
-    scales = (norm(lift.response), norm(forward.response))
-
-    def row(check: Check, ok: bool, read: str, wanted: str, wrong: str = fix) -> Row:
-        return check.good(read, wanted) if ok else check.bad(read, wanted, wrong)
+    scales = (math.hypot(*lift.response), math.hypot(*forward.response))
 
     far = "calibrate the motion-capture volume again (wand length), or the accelerometer if it reads wrong at rest"
     return [
         DONE.good("lift, forward and turn were recognised"),
         requested,
-        row(
-            LEVEL,
+        LEVEL.row(
             level_deg <= LEVEL_MAX_DEG,
             f"gravity points {level_deg:.1f} deg from the stream's vertical",
             f"within {LEVEL_MAX_DEG:g} deg",
+            fix,
         ),
-        row(
-            LIFT,
+        LIFT.row(
             lift_deg <= AXIS_MAX_DEG,
             f"IMU {_way(lift.felt_m)}, motion capture {_way(lift.seen_m)}, {lift_deg:.0f} deg apart",
             f"within {AXIS_MAX_DEG:g} deg",
+            fix,
         ),
-        row(
-            FORWARD,
+        FORWARD.row(
             abs(yaw_deg) <= YAW_MAX_DEG and slant_deg <= AXIS_MAX_DEG,
             f"IMU {_way(forward.felt_m)}, motion capture {_way(forward.seen_m)}; the body's yaw is off by {yaw_deg:+.0f} deg",
             f"within {YAW_MAX_DEG:g} deg",
+            fix,
         ),
-        row(
-            TURN,
+        TURN.row(
             abs(seen_deg - felt_deg) <= TURN_MAX_DEG and axis_deg <= AXIS_MAX_DEG,
             f"IMU {felt_deg:+.0f} deg about its vertical, motion capture {seen_deg:+.0f} deg",
             f"within {TURN_MAX_DEG:g} deg",
+            fix,
         ),
-        row(
-            SCALE,
+        SCALE.row(
             all(SCALE_SPAN[0] <= scale <= SCALE_SPAN[1] for scale in scales),
             f"motion capture measured {scales[0]:.2f} m up and {scales[1]:.2f} m forward for each metre that the IMU measured",
             f"{SCALE_SPAN[0]:g} to {SCALE_SPAN[1]:g} m",
@@ -156,6 +151,27 @@ def _seen_as_requested(result: HandResult) -> bool:
     return straight and result.turn.seen_turn_rad[2] > 0.0
 
 
+def gravity_off_deg(result: HandResult) -> float:
+    """Return the angle between measured gravity and the stream's vertical before the lift, deg."""
+    return math.degrees(angle_rad(quat_rotate(result.stood.attitude, result.stood.force_m_s2), _UP))
+
+
+def proposed_up_axis(level: bool, axes: AxisMap, up_axis: str) -> str:
+    """Return the value of devices.mocap.up_axis that puts the axes right, or the present one if none does.
+
+    Args:
+        level: whether gravity is vertical in the stream. It is vertical in a stream whose axes are all wrong, but not in one in which
+            only the body's axes are wrong.
+        axes: axes of the rigid body (`best_axes`).
+        up_axis: devices.mocap.up_axis during the test.
+    """
+    if level and axes == Y_UP and up_axis == "z":
+        return "y"
+    if level and axes == Y_UP.inverse and up_axis == "y":
+        return "z"
+    return up_axis
+
+
 def best_axes(result: HandResult) -> AxisMap:
     """Return which of the 48 axis maps of the rigid body fits all measurements best."""
     polar = [(m.felt_m, m.response) for m in (result.lift, result.forward)]
@@ -179,12 +195,9 @@ def _explain(result: HandResult, up_axis: str) -> str:
             f"the stream is left-handed (its x, y, z look like the true {', '.join(axes.names)}): use Motive's right-handed "
             "axes, without axis conversion"
         )
-    # Gravity is vertical in a stream whose axes are all wrong, but not in one in which only the body's axes are wrong.
-    level = angle_rad(quat_rotate(result.stood.attitude, result.stood.force_m_s2), _UP) <= math.radians(LEVEL_MAX_DEG)
-    if level and axes == Y_UP and up_axis == "z":
-        return "the stream looks y-up: set devices.mocap.up_axis: y"
-    if level and axes == Y_UP.inverse and up_axis == "y":
-        return "the stream looks z-up: set devices.mocap.up_axis: z"
+    level = gravity_off_deg(result) <= LEVEL_MAX_DEG
+    if (proposed := proposed_up_axis(level, axes, up_axis)) != up_axis:
+        return f"the stream looks {proposed}-up: set devices.mocap.up_axis: {proposed}"
     if axes.vector(_UP) == _UP and (axes != IDENTITY or abs(yaw_deg) > YAW_MAX_DEG):
         side = "left" if yaw_deg > 0.0 else "right"
         return f"the rigid body's zero is turned: its x axis points {abs(yaw_deg):.0f} deg to the {side} of the nose; {_RESET}"
@@ -199,7 +212,7 @@ def _explain(result: HandResult, up_axis: str) -> str:
 def _way(v: Vec3) -> str:
     """Return a displacement as text, such as "0.29 m forward"."""
     words = (("forward", "back"), ("left", "right"), ("up", "down"))
-    size = norm(v)
+    size = math.hypot(*v)
     parts = [
         f"{abs(part):.2f} m {pair[part < 0.0]}"
         for part, pair in zip(v, words, strict=True)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
 
+from companion.model.algebra import dot
 from companion.model.frames import quat_conjugate, quat_multiply, quat_normalize, quat_rotate
 from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 
@@ -90,7 +91,7 @@ def measure(
     paces = [quat_rotate(back, _scaled(_minus(b, a), 1.0 / GRID_S)) for a, b in pairwise(places)]
     felt_paces = [_scaled(_plus(a, b), 0.5) for a, b in pairwise(velocity)]
     felt = _travel(velocity)
-    length = norm(felt)
+    length = math.hypot(*felt)
     response = (0.0, 0.0, 0.0)
     if length > 1e-6:
         direction = _scaled(felt, 1.0 / length)
@@ -130,7 +131,7 @@ def _felt(imu: Sequence[ImuAt], times: Sequence[float], bias: Vec3) -> tuple[lis
 
 def turned(q: Quat, rate_rad_s: Vec3, dt_s: float) -> Quat:
     """Return the attitude after a rotation at a constant body rate for `dt_s`."""
-    angle = norm(rate_rad_s) * dt_s
+    angle = math.hypot(*rate_rad_s) * dt_s
     if angle < 1e-12:
         return q
     x, y, z = _scaled(rate_rad_s, math.sin(0.5 * angle) / angle * dt_s)
@@ -195,7 +196,7 @@ def _no_gaps(stamps: Sequence[float], start_s: float, end_s: float, what: str) -
 def rotation_vector(q: Quat) -> Vec3:
     """Return axis times angle (rad, at most pi) of a unit quaternion."""
     w, x, y, z = q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
-    sine = math.sqrt(x * x + y * y + z * z)
+    sine = math.hypot(x, y, z)
     k = 2.0 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0
     return (k * x, k * y, k * z)
 
@@ -216,23 +217,13 @@ def mean_attitude(values: Sequence[Quat]) -> Quat:
 
 def turned_rad(a: Quat, b: Quat) -> float:
     """Return the angle between two attitudes, rad."""
-    return norm(rotation_vector(quat_multiply(quat_conjugate(a), b)))
+    return math.hypot(*rotation_vector(quat_multiply(quat_conjugate(a), b)))
 
 
 def angle_rad(a: Vec3, b: Vec3) -> float:
     """Return the angle between two vectors, rad; pi if one of them is zero."""
-    size = norm(a) * norm(b)
+    size = math.hypot(*a) * math.hypot(*b)
     return math.acos(max(-1.0, min(1.0, dot(a, b) / size))) if size > 1e-12 else math.pi
-
-
-def dot(a: Vec3, b: Vec3) -> float:
-    """Return the scalar product."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def norm(v: Vec3) -> float:
-    """Return the length of a vector."""
-    return math.sqrt(dot(v, v))
 
 
 def _plus(a: Vec3, b: Vec3) -> Vec3:

@@ -71,8 +71,8 @@ def record_path(environment: Mapping[str, str] = os.environ) -> Path:
 
 
 def on_record(setup: Setup, tests: Sequence[Passed]) -> tuple[str, str]:
-    """Return `Observations.hand_test` and `hand_test_changed`: when the test was passed with this set-up, or else what has changed
-    since.
+    """Return when the test was passed with this set-up, and what has changed since it was passed with another one of the same vehicle;
+    one of the texts, or both, are empty (`Observations.hand_test`, `hand_test_changed`).
     """
     for test in reversed(tests):
         if test.setup == setup:

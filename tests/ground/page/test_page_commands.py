@@ -142,8 +142,8 @@ def test_start_needs_a_vehicle_that_waits_and_a_long_press(stub: MonitorStub, pa
     news = playing(flown().streams[0], waits_for_start=True)
     page.show(news())
     assert "start" in page.enabled() and "resume" not in page.enabled()
-    _hold_down(page, "start", 0.7, news)
-    _hold_down(page, "start", 0.9, news)
+    _hold_start(page, 0.7, news)
+    _hold_start(page, 0.9, news)
     page.press("hold")
     assert asked(stub, 2) == ["start", "hold"]
 
@@ -205,9 +205,9 @@ def test_a_vehicle_that_hears_no_commands_says_so(page: Page) -> None:
     assert page.text("#commands-why") == "commands are disabled in the vehicle file"
 
 
-def _hold_down(page: Page, command: str, seconds: float, news: Callable[[], Message]) -> None:
-    """Hold a button down while the vehicle keeps sending."""
-    page.tab.hover(f"[data-command='{command}']")
+def _hold_start(page: Page, seconds: float, news: Callable[[], Message]) -> None:
+    """Hold START down while the vehicle keeps sending."""
+    page.tab.hover("[data-command='start']")
     page.tab.mouse.down()
     for _ in range(round(seconds / 0.1)):
         page.run(0.1)

@@ -38,7 +38,7 @@ export class EventList {
     for (const line of fresh) this._add(line);
     while (this._rows.length > 200) this._rows.pop().element.remove();
     this._announce(fresh, vehicle?.replayed);
-    this._count(vehicle?.events?.count);
+    this._count();
   }
 
   _clear() {
@@ -47,7 +47,7 @@ export class EventList {
   }
 
   _add(line) {
-    const text = make("span", { className: "text", text: line.text, children: [] });
+    const text = make("span", { className: "text", text: line.text });
     text.append(make("span", { className: "id", text: line.id }));
     const element = make("li", {
       data: { severity: line.severity, event: line.id },

@@ -18,8 +18,8 @@ function armPlot(joints) {
   const series = [];
   for (let index = 0; index < joints; index += 1) {
     const colour = `${index + 1}`;
-    series.push({ label: angle(index), unit: "", colour, value: joint("arm_rad", index) });
-    series.push({ label: "ref", unit: "", colour, dashed: true, value: joint("reference_arm_rad", index) });
+    series.push({ label: angle(index), colour, value: joint("arm_rad", index) });
+    series.push({ label: "ref", colour, dashed: true, value: joint("reference_arm_rad", index) });
   }
   return { title: "Arm, °", digits: 0, span: 20, series, limits: jointLimits };
 }
@@ -27,8 +27,8 @@ function armPlot(joints) {
 const CONTACT = {
   title: "Force on the surface, N", digits: 1, span: 2, state: (r) => r.contact?.mode,
   series: [
-    { label: "measured", unit: "", colour: "1", value: (r) => r.contact?.force_n },
-    { label: "wanted", unit: "", colour: "2", dashed: true, value: (r) => r.contact?.wanted_n },
+    { label: "measured", colour: "1", value: (r) => r.contact?.force_n },
+    { label: "wanted", colour: "2", dashed: true, value: (r) => r.contact?.wanted_n },
   ],
 };
 
@@ -37,28 +37,28 @@ const plotsOf = (joints, contact) => [
   ...(contact ? [CONTACT] : []),
   {
     title: "Position error ‖e_p‖, m", digits: 3, floor: 0, span: 0.02,
-    series: [{ label: "", unit: "", colour: "1", value: (r) => r.e_p_m }],
+    series: [{ label: "", colour: "1", value: (r) => r.e_p_m }],
     limits: (scene) => [{ value: scene.tracking_warn_m, label: "warn", level: "warn" }, { value: scene.tracking_abort_m, label: "abort", level: "bad" }],
   },
   {
     title: "Attitude error ‖e_q‖, °", digits: 1, floor: 0, span: 2,
-    series: [{ label: "", unit: "", colour: "1", value: (r) => r.e_q_deg }],
+    series: [{ label: "", colour: "1", value: (r) => r.e_q_deg }],
     limits: (scene) => [{ value: degrees(scene.tilt_abort_rad), label: "tilt abort", level: "bad" }],
   },
   ...(joints ? [armPlot(joints)] : []),
   {
     title: "Thrust", digits: 3, span: 0.08,
     series: [
-      { label: "sent", unit: "", colour: "1", value: (r) => r.thrust },
-      { label: "hover", unit: "", colour: "2", dashed: true, value: (r) => r.control?.hover_thrust },
+      { label: "sent", colour: "1", value: (r) => r.thrust },
+      { label: "hover", colour: "2", dashed: true, value: (r) => r.control?.hover_thrust },
     ],
     limits: () => [{ value: 1, label: "full", level: "bad" }],
   },
   {
     title: "Adaptation", digits: 4, floor: 0, span: 0.002, spanRight: 0.002,
     series: [
-      { label: "ρ", unit: "", colour: "1", value: (r) => r.control?.rho },
-      { label: "‖H‖", unit: "", colour: "4", right: true, value: (r) => norm(r.control?.h_hat) },
+      { label: "ρ", colour: "1", value: (r) => r.control?.rho },
+      { label: "‖H‖", colour: "4", right: true, value: (r) => norm(r.control?.h_hat) },
     ],
   },
   {
@@ -72,10 +72,10 @@ const plotsOf = (joints, contact) => [
   {
     title: "Times, ms", digits: 1, floor: 0, span: 5,
     series: [
-      { label: "late", unit: "", colour: "1", value: (r) => r.timing.lateness_ms },
-      { label: "mocap", unit: "", colour: "3", value: (r) => r.timing.mocap_age_ms },
-      { label: "sent", unit: "", colour: "4", value: (r) => r.timing.mocap_to_setpoint_ms },
-      { label: "tick", unit: "", colour: "2", value: (r) => r.timing.whole_ms },
+      { label: "late", colour: "1", value: (r) => r.timing.lateness_ms },
+      { label: "mocap", colour: "3", value: (r) => r.timing.mocap_age_ms },
+      { label: "sent", colour: "4", value: (r) => r.timing.mocap_to_setpoint_ms },
+      { label: "tick", colour: "2", value: (r) => r.timing.whole_ms },
     ],
   },
 ];
