@@ -39,6 +39,7 @@ COMPILED = (
     "companion/safety/*.py",
     "companion/mission/*.py",
     "companion/model/*.py",
+    "companion/io/dynamixel/scale.py",
     "companion/io/px4/delta_velocity.py",
     "sitl/autopilot/*.py",
     "sitl/faults/injector.py",

@@ -15,7 +15,7 @@ from companion.analysis.log import Array, FlightLog
 from companion.control.sensing import CatchDetector, ObservedCatchDetector
 from companion.model.arm_skeleton import logged_skeleton
 from companion.model.best_pose import best_pose
-from companion.model.frames import quat_conjugate, quat_rotate
+from companion.model.frames import quat_rotate
 from companion.model.types import PhaseKind
 
 Mask = npt.NDArray[np.bool_]
@@ -187,22 +187,30 @@ def _joint_torque_error_nm(log: FlightLog, used: Mask, period_s: float) -> Array
     if skeleton is None or len(skeleton.joint_axes) != joints:
         return np.full((int(used.sum()), joints), np.nan)
     force = log.column(lambda i, o, s: o.control.force_ext_world_n if o.control else None, 3)[used]
-    lasting, k = np.zeros(3), period_s / DESIRED_FORCE_TIME_S
-    passing = np.empty_like(force)
-    for n, sample in enumerate(force):
-        passing[n] = sample - lasting
-        lasting = lasting + k * passing[n]
-    quats = log.column(lambda i, o, s: i.vehicle.attitude_wxyz if i.vehicle else None, 4)[used].tolist()
-    turned = zip(quats, passing.tolist(), strict=True)
-    force_body = np.array([quat_rotate(quat_conjugate(q), tuple(one)) for q, one in turned]).reshape(-1, 3)
+    passing = np.stack([_passing(column, period_s / DESIRED_FORCE_TIME_S) for column in force.T.tolist()], axis=1)
+    quats = log.column(lambda i, o, s: i.vehicle.attitude_wxyz if i.vehicle else None, 4)[used]
+    w, x, y, z = quats.T
+    body_x = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
+    body_y = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1)
+    body_z = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    force_body = np.stack([(passing * axis).sum(axis=1) for axis in (body_x, body_y, body_z)], axis=1)
     points, axes = pose(skeleton, log.columns.arm_rad[used])
     torques = [(np.cross(axes[:, j], points[:, -1] - points[:, j]) * force_body).sum(axis=1) for j in range(joints)]
     return np.stack(torques, axis=1) if torques else np.zeros((len(force_body), 0))
 
 
+def _passing(values: list[float], k: float) -> list[float]:
+    """Return the values minus their low-pass, which moves by `k` of the difference with each value."""
+    lasting, passing = 0.0, []
+    for value in values:
+        passing.append(value - lasting)
+        lasting += k * passing[-1]
+    return passing
+
+
 def lowpass_zero_phase(rows: Array, period_s: float, cutoff_hz: float) -> Array:
-    """Apply a second-order Butterworth low-pass filter forwards and backwards along axis 0 (gain 1/2 at the cutoff), with odd
-    reflection at the ends.
+    """Apply a second-order Butterworth low-pass filter forwards and backwards along axis 0 of `rows`, (ticks, columns), with odd
+    reflection at the ends; its gain is 1/2 at the cutoff.
     """
     k = math.tan(math.pi * min(cutoff_hz * period_s, 0.49))
     norm = 1.0 / (1.0 + math.sqrt(2.0) * k + k * k)
@@ -213,13 +221,18 @@ def lowpass_zero_phase(rows: Array, period_s: float, cutoff_hz: float) -> Array:
     signal = np.concatenate([head, rows, tail])
 
     def once(x: Array) -> Array:
-        out = np.empty_like(x)
-        x1 = x2 = y1 = y2 = x[0]
-        for n in range(len(x)):
-            y = b0 * (x[n] + 2.0 * x1 + x2) - a1 * y1 - a2 * y2
-            x2, x1, y2, y1 = x1, x[n], y1, y
-            out[n] = y
-        return out
+        first = x[:1]
+        driven = b0 * (x + 2.0 * np.concatenate([first, x[:-1]]) + np.concatenate([first, first, x[:-2]]))
+        columns = []
+        # The recursion takes floats: with arrays of one tick each, a catch takes 75 instead of 18 ms.
+        for start, column in zip(x[0].tolist(), driven.T.tolist(), strict=True):
+            y1 = y2 = start
+            out = []
+            for value in column:
+                y1, y2 = value - a1 * y1 - a2 * y2, y1
+                out.append(y1)
+            columns.append(out)
+        return np.array(columns).T
 
     return once(once(signal)[::-1])[::-1][pad : pad + len(rows)]
 

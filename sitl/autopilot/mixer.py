@@ -30,7 +30,7 @@ class Mixer:
         ]
         self.count = len(rows)
         self.roll, self.pitch, self.yaw, self.thrust = (tuple(row[axis] for row in rows) for axis in range(4))
-        self._rows = tuple((t, roll / t, pitch / t, yaw / t) for roll, pitch, yaw, t in rows)
+        self._rows = [(t, roll / t, pitch / t, yaw / t) for roll, pitch, yaw, t in rows]
         self._most = 1.0 / max(self.thrust)
         self._turn_room = 1.0 / max(abs(yaw) for *_, yaw in self._rows)
         self.unsaturated = True
@@ -52,9 +52,8 @@ class Mixer:
         room = min(base + least, self._most - base - most) * self._turn_room
         turn = max(-room, min(room, yaw)) if room > 0 else 0.0
         self.unsaturated = span <= 1.0 and abs(base - thrust) < 0.05
-        return tuple(
-            [
-                0.0 if (command := t * (base + v + y * turn)) < 0.0 else 1.0 if command > 1.0 else command
-                for (t, _, _, y), v in zip(rows, tilt, strict=True)
-            ]
-        )
+        commands = []
+        for i, (t, _, _, y) in enumerate(rows):
+            command = t * (base + tilt[i] + y * turn)
+            commands.append(0.0 if command < 0.0 else 1.0 if command > 1.0 else command)
+        return tuple(commands)

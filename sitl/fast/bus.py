@@ -8,7 +8,8 @@ from msgspec.structs import replace
 
 from companion.config.arm import Joint
 from companion.config.vehicle import Vehicle
-from companion.io.dynamixel.registers import JointScale, joint_scale
+from companion.io.dynamixel.registers import joint_scale
+from companion.io.dynamixel.scale import JointScale
 from companion.model.servos import WATCHDOG_ERROR
 from companion.model.types import ArmState, Joints
 from sitl.faults.injector import COOL_C, Faults

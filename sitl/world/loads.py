@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 
 from companion.model.types import Vec3
+from sitl.world.views import Writer
 
 EFFECT_PERIOD_S = 0.01
 """Time between two updates of the loads that effects exert."""
@@ -19,7 +20,7 @@ class Loads:
     """
 
     def __init__(self, data: mujoco.MjData) -> None:
-        self._rows = tuple(data.xfrc_applied)  # views: looking them up in every step costs more
+        self._rows = [Writer(row) for row in data.xfrc_applied]
         self._loads: tuple[dict[str, tuple[Vec3, Vec3]], ...] = tuple({} for _ in self._rows)
         self._changed: set[int] = set()
 
@@ -34,5 +35,5 @@ class Loads:
             fx = fy = fz = tx = ty = tz = 0.0
             for (ax, ay, az), (bx, by, bz) in self._loads[body].values():
                 fx, fy, fz, tx, ty, tz = fx + ax, fy + ay, fz + az, tx + bx, ty + by, tz + bz
-            self._rows[body][:] = (fx, fy, fz, tx, ty, tz)
+            self._rows[body].write((fx, fy, fz, tx, ty, tz))
         self._changed.clear()

@@ -369,7 +369,7 @@ class Plant:
         scale = self._config.force_scale
         if scale != 1.0:
             wrench = (_scaled(wrench[0], scale), _scaled(wrench[1], scale))
-        return wrench if self._force_sensor is None else self._force_sensor.rounded(*wrench)
+        return wrench if self._force_sensor is None else self._force_sensor.rounded(wrench[0], wrench[1])
 
 
 def _scaled(v: Vec3, k: float) -> Vec3:

@@ -27,6 +27,7 @@ from sitl.world.loads import EFFECT_PERIOD_S, ZERO, Loads
 from sitl.world.model import has_tip, mjcf
 from sitl.world.payload import Payload
 from sitl.world.surfaces import Surfaces
+from sitl.world.views import Writer, vec3_of
 
 PHYSICS_DT_S: Final = 0.002
 FALL_M_S: Final = 2.5
@@ -174,13 +175,14 @@ class World:
         self.snag: tuple[Vec3, float] | None = None
         """Point where the tether is snagged and its free length from there to the vehicle; None if it is not snagged."""
         self._tether = m.tendon("tether").id if vehicle.tether is not None else None
-        self._attachment = m.site("tether").id
+        self._attached = self.data.site_xpos[m.site("tether").id]
         self._thrust: Thrusts = (0.0,) * layout.count
         self.crashed = False
         self._events: list[WorldEvent] = []
         d = self.data
         # Views: looking up MuJoCo's arrays in every step costs more than reading them.
         self._ctrl, self._qpos, self._qvel, self._sensordata = d.ctrl, d.qpos, d.qvel, d.sensordata
+        self._controls = Writer(d.ctrl)
         self.loads = Loads(d)
         self.payload = Payload(self, vehicle, config)
         self.effects = self._effects_on()
@@ -282,7 +284,7 @@ class World:
         thrust = tuple([near * force for force in thrust])
         if self.rotor_share is not None:
             thrust = tuple([force * share for force, share in zip(thrust, self.rotor_share, strict=True)])
-        self._ctrl[:] = thrust + joint_torque_nm
+        self._controls.write(thrust + joint_torque_nm)
         self.loads.set(self._base, "drag and snag", self._drag_and_snag_n(thrust, drag))
         if self.effects:
             if self._step % _EFFECT_STEPS == 0:
@@ -340,8 +342,7 @@ class World:
     @property
     def attachment_world_m(self) -> Vec3:
         """Point where the tether is attached to the vehicle, world frame; the body's origin without a tether."""
-        x, y, z = self.data.site_xpos[self._attachment].tolist()
-        return (x, y, z)
+        return vec3_of(self._attached)
 
     @property
     def tether_length_m(self) -> float:

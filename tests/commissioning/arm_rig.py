@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from companion.io.devices import AvailableDevices, VisionFilter
-from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.arm import DynamixelArm
+from companion.io.dynamixel.scale import RAD_PER_COUNT
 from companion.io.protocols import DeviceError
 from companion.model.check_row import Row
 from companion.model.exit_codes import EXIT_OK
@@ -134,7 +134,7 @@ def bench(folder: Path, servos: str = "[{}, {}]") -> Iterator[Rig]:
     for model, joint, angle_rad in zip(
         models, vehicle.arm.joints, start_of(start.position_m, start.yaw_deg, start.arm_deg).arm_rad, strict=True
     ):
-        model.update(0.0, joint.zero_count * dxl.RAD_PER_COUNT + joint.sign * angle_rad, 0.0)
+        model.update(0.0, joint.zero_count * RAD_PER_COUNT + joint.sign * angle_rad, 0.0)
     with sandbox_in(folder / "tool") as sandbox, served(ServoBus(plugged_in(models, config.world))) as port:
         yield Rig(sandbox, port, _copy(folder))
 

@@ -15,7 +15,7 @@ from companion.commissioning.arm.zero import HELD_S, ZeroGuide, ZeroView
 from companion.config.arm import Arm
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
-from companion.io.dynamixel.registers import RAD_PER_COUNT
+from companion.io.dynamixel.scale import RAD_PER_COUNT
 from companion.model.servos import COUNTS_PER_TURN
 from companion.model.types import Joints
 from tests.commissioning.arm_rig import SHIPPED

@@ -20,8 +20,8 @@ import serial
 from companion.config.arm import Arm as ArmConfig
 from companion.config.arm import Joint
 from companion.config.devices import ArmDevice
-from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.arm import DynamixelArm
+from companion.io.dynamixel.scale import RAD_PER_COUNT
 from companion.io.protocols import Arm as ArmEdge
 from companion.io.protocols import DeviceError
 from companion.model.observations import ServoReport
@@ -58,7 +58,7 @@ def arm_config(*joints: Joint, torque_per_amp_nm_a: float | None = KT) -> ArmCon
 
 
 def shaft_rad(joint: Joint, angle_rad: float) -> float:
-    return joint.zero_count * dxl.RAD_PER_COUNT + joint.sign * angle_rad
+    return joint.zero_count * RAD_PER_COUNT + joint.sign * angle_rad
 
 
 def new_servos(baud: int = 3_000_000, start_deg: tuple[float, float] = START_DEG) -> list[ServoModel]:

@@ -6,7 +6,8 @@ from companion.config.arm import Arm
 from companion.config.devices import ArmDevice, DynamixelOptions
 from companion.io.arm.thread import OPEN_TIMEOUT_S, ThreadedArm
 from companion.io.dynamixel.bus import ArmBus, Counts
-from companion.io.dynamixel.registers import WATCHDOG_TRIPPED, Block, JointScale
+from companion.io.dynamixel.registers import WATCHDOG_TRIPPED, Block
+from companion.io.dynamixel.scale import JointScale
 from companion.model.servos import WATCHDOG_ERROR
 from companion.model.types import ArmState, Joints
 from companion.runtime.clock import Clock

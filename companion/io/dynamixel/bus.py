@@ -15,7 +15,8 @@ from dynamixel_sdk import COMM_SUCCESS, PacketHandler
 from companion.config.arm import Arm, Joint
 from companion.config.devices import ArmDevice
 from companion.io.dynamixel import registers as dxl
-from companion.io.dynamixel.registers import Block, JointScale, Register
+from companion.io.dynamixel.registers import Block, Register
+from companion.io.dynamixel.scale import RAD_PER_COUNT, JointScale
 from companion.io.protocols import DeviceError
 from companion.model.observations import ServoReport
 from companion.model.servos import COUNTS_PER_TURN, hardware_error_text, model_text
@@ -229,7 +230,7 @@ class ArmBus:
     def _within_limits(self, joint: Joint, scale: JointScale, block: Block) -> JointScale:
         zero_count = joint.zero_count + dxl.turn_offset_counts(joint, block.position_count)
         scale = JointScale(scale.sign, zero_count, scale.torque_nm_per_count, scale.current_max_counts)
-        angle_deg = scale.angle_rad(block.position_count) * 360.0 / (COUNTS_PER_TURN * dxl.RAD_PER_COUNT)
+        angle_deg = scale.angle_rad(block.position_count) * 360.0 / (COUNTS_PER_TURN * RAD_PER_COUNT)
         low_deg, high_deg = joint.angle_deg
         if not low_deg <= angle_deg <= high_deg:
             raise self._error(

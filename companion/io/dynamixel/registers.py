@@ -21,8 +21,9 @@ from dynamixel_sdk import PortHandler
 from serial.tools import list_ports
 
 from companion.config.arm import Joint
+from companion.io.dynamixel.scale import JointScale
 from companion.io.protocols import DeviceError
-from companion.model.servos import COUNTS_PER_TURN, RPM_PER_COUNT
+from companion.model.servos import COUNTS_PER_TURN
 
 MODE_CURRENT: Final = 0
 WATCHDOG_UNIT_MS = 20
@@ -30,9 +31,6 @@ RETURN_DELAY_UNIT_US = 2
 VOLTAGE_UNIT_V = 0.1
 WATCHDOG_TRIPPED = 0xFF
 """Value of register 98 after the bus watchdog has tripped."""
-
-RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_TURN
-RAD_S_PER_COUNT: Final = RPM_PER_COUNT * 2.0 * math.pi / 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,40 +106,6 @@ class Block:
     def from_bytes(data: bytes) -> Block:
         """Decode `BLOCK_SIZE` bytes of indirect data."""
         return Block(*_BLOCK.unpack(data))
-
-
-@dataclass(frozen=True, slots=True)
-class JointScale:
-    """Conversion between one servo's register units and the paper's joint angle."""
-
-    sign: int
-    zero_count: int
-    """Present position at joint angle 0, including whole turns of the encoder."""
-    torque_nm_per_count: float
-    current_max_counts: int
-
-    def angle_rad(self, position_count: int) -> float:
-        """Return the joint angle, rad."""
-        return self.sign * (position_count - self.zero_count) * RAD_PER_COUNT
-
-    def velocity_rad_s(self, velocity_count: int) -> float:
-        """Return the joint velocity, rad/s."""
-        return self.sign * velocity_count * RAD_S_PER_COUNT
-
-    def torque_nm(self, current_count: int) -> float:
-        """Return the joint torque that a current produces, N m."""
-        return self.sign * current_count * self.torque_nm_per_count
-
-    def current_counts(self, torque_nm: float) -> int:
-        """Return the goal current for a joint torque, rounded and clipped.
-
-        Raises:
-            ValueError: the torque is not finite.
-        """
-        if not math.isfinite(torque_nm):
-            raise ValueError(f"joint torque {torque_nm} is not finite")
-        limit = self.current_max_counts
-        return max(-limit, min(limit, round(self.sign * torque_nm / self.torque_nm_per_count)))
 
 
 def joint_scale(joint: Joint, torque_per_amp_nm_a: float, current_limit_counts: int) -> JointScale:

@@ -80,7 +80,9 @@ class BatteryPack:
 
     def step(self, dt_s: float, thrust_n: Iterable[float]) -> None:
         """Draw the current for these rotor thrusts during one physics step."""
-        rotors_n15 = sum([force * math.sqrt(force) for force in thrust_n])
+        rotors_n15 = 0.0
+        for force in thrust_n:
+            rotors_n15 += force * math.sqrt(force)
         power_w = self._electronics_w + self._power_w_n15 * rotors_n15
         self.voltage_v = voltage_v = self._loaded_v(open_circuit_v(self.remaining, self._cells), power_w)
         self.current_a = current_a = power_w / voltage_v

@@ -11,23 +11,25 @@ middle (cross-flow principle, Hoerner 1965); the whole flow loads net and payloa
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from companion.config.arm_chain import chain_of, without_tool
 from companion.config.vehicle import Vehicle
+from companion.model.algebra import mat_vec, vec_mat
 from companion.model.rotors import RotorLayout
-from companion.model.types import Vec3
+from companion.model.types import Mat3, Vec3
 from companion.sitl_config.effects.downwash import Downwash as DownwashConfig
+from sitl.world.effects.rotors import Thrusts
 from sitl.world.loads import EFFECT_PERIOD_S
 from sitl.world.model import PAYLOAD_RADIUS_M
 from sitl.world.ornstein_uhlenbeck import OrnsteinUhlenbeck
+from sitl.world.views import mat3_of, vec3_of
 
 if TYPE_CHECKING:
     from sitl.world.world import World
 
 _NOISE = 14
-_ROOT_HALF = math.sqrt(0.5)
+_ROOT_HALF: Final = math.sqrt(0.5)
 
 
 class Wakes:
@@ -41,14 +43,15 @@ class Wakes:
 
     def __init__(self, layout: RotorLayout, radius_m: float, spread: float) -> None:
         self._radius_m, self._spread = radius_m, spread
-        rows: dict[float, list[tuple[int, float]]] = {}
+        self._across_m = list(dict.fromkeys(y for _, y, _ in layout.positions_body_m))
+        """Positions along y."""
+        rows: dict[float, list[tuple[int, int]]] = {}
         for i, (x, y, _) in enumerate(layout.positions_body_m):
-            rows.setdefault(x, []).append((i, y))
-        self._rows = tuple((x, tuple(row)) for x, row in rows.items())
-        """Position along x and, of each rotor there, its index and its position along y."""
-        self._across_m = tuple(dict.fromkeys(y for _, y, _ in layout.positions_body_m))
+            rows.setdefault(x, []).append((i, self._across_m.index(y)))
+        self._rows: list[tuple[float, list[tuple[int, int]]]] = list(rows.items())
+        """Position along x and, of each rotor there, its index and that of its position along y."""
 
-    def pressure_pa(self, thrust_n: Sequence[float], point_m: Vec3, blur_m: float = 0.0) -> float:
+    def pressure_pa(self, thrust_n: Thrusts, point_m: Vec3, blur_m: float = 0.0) -> float:
         """Return the mean dynamic pressure at a point in Pa.
 
         Args:
@@ -65,10 +68,13 @@ class Wakes:
         area_m2 = math.pi * radius_m * radius_m * 0.5 / developed
         half_m = 0.5 * math.sqrt(area_m2)
         per_m = _ROOT_HALF / math.sqrt(spread_m * spread_m + blur_m * blur_m)
-        across = {to: _smeared(y - to, half_m, per_m) for to in self._across_m}
+        across = [_smeared(y - to, half_m, per_m) for to in self._across_m]
         inside_n = 0.0
         for to, row in self._rows:
-            inside_n += _smeared(x - to, half_m, per_m) * sum([thrust_n[i] * across[y_i] for i, y_i in row])
+            row_n = 0.0
+            for rotor, at in row:
+                row_n += thrust_n[rotor] * across[at]
+            inside_n += _smeared(x - to, half_m, per_m) * row_n
         return 0.5 * developed * inside_n / area_m2
 
 
@@ -105,7 +111,7 @@ class Downwash:
         self, config: DownwashConfig, rotor_radius_m: float, vehicle: Vehicle, world: World, seed: int
     ) -> None:
         model, data = world.model, world.data
-        self._config, self._seed = config, seed
+        self._config, self._seed, self._intensity = config, seed, config.turbulence_intensity
         layout = vehicle.airframe.rotor_layout
         self._wakes, self._height_m = Wakes(layout, rotor_radius_m, config.spread), layout.height_m
         self._radius_m = rotor_radius_m
@@ -146,20 +152,17 @@ class Downwash:
         """Set the wakes' forces on links, net and payload."""
         gusts = self._turbulence.step()
         thrust_n = world.rotor_thrust_n
-        origin = self._base_position.tolist()
-        axes = self._base_axes.tolist()
-        down = (-axes[2], -axes[5], -axes[8])
-        intensity = self._config.turbulence_intensity
-        *link_flows, flow = [
-            (down[0] + intensity * x, down[1] + intensity * y, down[2] + intensity * z) for x, y, z in gusts
-        ]
-        for (body, joint, matrix, centre, (dx, dy, dz), half_m, area_m2), (ux, uy, uz) in zip(
+        origin = vec3_of(self._base_position)
+        axes = mat3_of(self._base_axes)
+        (_, _, zx), (_, _, zy), (_, _, zz) = axes
+        intensity = self._intensity
+        *link_flows, flow = [(-zx + intensity * x, -zy + intensity * y, -zz + intensity * z) for x, y, z in gusts]
+        for (body, joint, matrix, centre, direction, half_m, area_m2), (ux, uy, uz) in zip(
             self._links, link_flows, strict=True
         ):
-            a, b, c, d, e, f, g, h, i = matrix.tolist()
-            ex, ey, ez = a * dx + b * dy + c * dz, d * dx + e * dy + f * dz, g * dx + h * dy + i * dz
-            x, y, z = joint.tolist()
-            cx, cy, cz = centre.tolist()
+            ex, ey, ez = mat_vec(mat3_of(matrix), direction)
+            x, y, z = vec3_of(joint)
+            cx, cy, cz = vec3_of(centre)
             x, y, z = x + half_m * ex, y + half_m * ey, z + half_m * ez
             along = ux * ex + uy * ey + uz * ez
             nx, ny, nz = ux - along * ex, uy - along * ey, uz - along * ez
@@ -175,19 +178,17 @@ class Downwash:
         ux, uy, uz = flow
         speed = math.sqrt(ux * ux + uy * uy + uz * uz)
         for body, centre, area_m2, blur_m in self._compact:
-            x, y, z = centre.tolist()
+            x, y, z = vec3_of(centre)
             k = area_m2 * speed * self._pressure_pa(thrust_n, origin, axes, (x, y, z), blur_m)
             world.loads.set(body, "downwash", (k * ux, k * uy, k * uz))
 
-    def _pressure_pa(
-        self, thrust_n: Sequence[float], origin: list[float], axes: list[float], point: Vec3, blur_m: float
-    ) -> float:
+    def _pressure_pa(self, thrust_n: Thrusts, origin: Vec3, axes: Mat3, point: Vec3, blur_m: float) -> float:
         """Return the mean dynamic pressure in Pa at a point in the world frame; it falls to zero over the last rotor radius above
         the floor.
         """
         px, py, pz = point
         x, y, z = px - origin[0], py - origin[1], pz - origin[2]
-        a, b, c, d, e, f, g, h, i = axes
-        body: Vec3 = (a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z - self._height_m)
+        bx, by, bz = vec_mat((x, y, z), axes)
+        body = (bx, by, bz - self._height_m)
         near = min(1.0, max(0.0, pz / self._radius_m))
         return near * near * self._wakes.pressure_pa(thrust_n, body, blur_m)

@@ -19,6 +19,7 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Vec3
 from companion.sitl_config.effects.net import Net as NetConfig
 from sitl.world.loads import ZERO, Loads
+from sitl.world.views import mat3_of, vec3_of
 
 RIM_STIFFNESS_N_M = 3000.0
 SETTLED_S: Final = 0.4
@@ -149,7 +150,8 @@ class Net:
         self._config, self._radii_m = config, (hoop_radius_m, payload_radius_m)
         self._model, self._data, self._loads = model, data, loads
         base, link, self._net = (model.body(name).id for name in ("base", "sensor", "net"))
-        self._centre, self._axes, self._velocity = data.xpos[self._net], data.xmat[link], data.cvel[self._net]
+        self._centre, self._axes = data.xpos[self._net], data.xmat[link]
+        self._turning, self._velocity = data.cvel[self._net][:3], data.cvel[self._net][3:]
         self._com, self._net_com = data.subtree_com[base], data.xipos[self._net]
         self._bags: dict[int, tuple[Bag, int, int]] = {}
         self._touching: set[int] = set()
@@ -211,10 +213,10 @@ class Net:
         """Apply the contact force to the payload at this position and velocity (world frame), and the opposite force to the net."""
         px, py, pz = position_m
         vx, vy, vz = velocity_m_s
-        cx, cy, cz = self._centre.tolist()
-        xx, yx, zx, xy, yy, zy, xz, yz, zz = self._axes.tolist()
-        wx, wy, wz, ux, uy, uz = self._velocity.tolist()
-        ox, oy, oz = self._com.tolist()
+        cx, cy, cz = vec3_of(self._centre)
+        (xx, yx, zx), (xy, yy, zy), (xz, yz, zz) = mat3_of(self._axes)
+        (wx, wy, wz), (ux, uy, uz) = vec3_of(self._turning), vec3_of(self._velocity)
+        ox, oy, oz = vec3_of(self._com)
         gx, gy, gz = px - cx, py - cy, pz - cz
         # MuJoCo gives the net's velocity at the vehicle's centre of mass.
         lx, ly, lz = px - ox, py - oy, pz - oz
@@ -231,7 +233,7 @@ class Net:
             return
         a, b, c = force
         fx, fy, fz = xx * a + yx * b + zx * c, xy * a + yy * b + zy * c, xz * a + yz * b + zz * c
-        mx, my, mz = self._net_com.tolist()
+        mx, my, mz = vec3_of(self._net_com)
         gx, gy, gz = px - mx, py - my, pz - mz
         self._touching.add(body)
         self._loads.set(body, "net", (fx, fy, fz))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from companion.config.tether import Tether
 from companion.model.constants import GRAVITY_M_S2
 from companion.sitl_config.effects.tether_line import TetherLine as TetherLineConfig
+from sitl.world.views import vec3_of
 
 if TYPE_CHECKING:
     from sitl.world.world import World
@@ -112,7 +113,7 @@ class TetherLine:
             / math.sqrt(vx * vx + vy * vy + _SLIDES_M_S**2)
         )
         fx, fy, fz = k * dx - drag * vx, k * dy - drag * vy, -down_n
-        cx, cy, cz = world.data.xipos[self._base].tolist()
+        cx, cy, cz = vec3_of(world.data.xipos[self._base])
         rx, ry, rz = end[0] - cx, end[1] - cy, end[2] - cz
         torque = (ry * fz - rz * fy, rz * fx - rx * fz, rx * fy - ry * fx)
         world.loads.set(self._base, "tether", (fx, fy, fz), torque)

@@ -63,7 +63,7 @@ def test_every_wake_of_an_octocopter_is_below_its_own_rotor() -> None:
     layout = standard_layout("octa_x", 0.5, 0.0)
     wakes = Wakes(layout, 0.1, SHARP)
     for number in range(8):
-        thrust_n = [float(i == number) for i in range(8)]
+        thrust_n = tuple(float(i == number) for i in range(8))
         found = [wakes.pressure_pa(thrust_n, (x, y, -0.05)) > 0.0 for x, y, _ in layout.positions_body_m]
         assert found == [i == number for i in range(8)]
 
