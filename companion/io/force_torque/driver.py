@@ -8,7 +8,7 @@ import logging
 import os
 from contextlib import suppress
 from types import TracebackType
-from typing import ClassVar, Final, Self
+from typing import Final, Self
 
 import serial
 from serial.tools import list_ports
@@ -42,7 +42,7 @@ class RobotousForceTorque(SampleStream):
         answer_timeout_s: timeout for each reply of the sensor, and for the first samples.
     """
 
-    options: ClassVar = Rft60Options
+    options = Rft60Options
 
     def __init__(self, device: ForceDevice, clock: Clock, *, answer_timeout_s: float = 2.0) -> None:
         super().__init__(f"force sensor {device.port}", device.rate_hz)
