@@ -60,7 +60,7 @@ class MemorySerial:
         """Bytes that repeat without end after the answers."""
         self._waiting = bytearray()
 
-    def write(self, sent: list[int]) -> int:
+    def write(self, sent: list[int] | bytes) -> int:
         self._waiting += self.answer(bytes(sent))
         return len(sent)
 
@@ -96,7 +96,7 @@ class MemoryPort(dxl.ServoPort):
         self.tx_time_per_byte = 10_000.0 / cflag_baud
         return True
 
-    def writePort(self, packet: list[int]) -> int:
+    def writePort(self, packet: list[int] | bytes) -> int:
         written: int = self.ser.write(packet)
         return written
 

@@ -80,6 +80,18 @@ def test_a_problem_ends_readiness_and_is_reported(pair: Pair) -> None:
         asyncio.run(client.wait_ready(-1.0))
 
 
+def test_the_next_message_is_read_when_it_is_due(pair: Pair, clock: Clock) -> None:
+    client, guardian = pair
+    guardian.send(heartbeat.READY)
+    client.listen()
+    guardian.send(heartbeat.PROBLEM)
+    client.listen()
+    assert client.ready
+    clock.now_s += heartbeat.READY_PERIOD_S
+    client.listen()
+    assert not client.ready
+
+
 def test_a_dead_guardian_is_noticed_and_costs_nothing(pair: Pair) -> None:
     client, guardian = pair
     guardian.send(heartbeat.READY)

@@ -5,10 +5,13 @@ from __future__ import annotations
 import pytest
 from dynamixel_sdk import COMM_SUCCESS, PacketHandler
 
+from companion.io.dynamixel import packets
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.registers import cycle_bytes, cycle_s
 from sitl.servo.bus import ServoLine
 from sitl.servo.model import ServoModel
+
+ANSWER_BYTES = packets.STATUS_BYTES + dxl.BLOCK_SIZE
 
 
 class CountingPort:
@@ -16,17 +19,19 @@ class CountingPort:
 
     def __init__(self, count: int) -> None:
         self._line = ServoLine([ServoModel(servo_id) for servo_id in range(1, count + 1)])
-        self._answer = b""
+        self.answer = b""
         self.is_using = False
         self.bytes = 0
+        self.sent: list[bytes] = []
 
     def writePort(self, packet: list[int]) -> int:
-        self._answer += self._line.feed(bytes(packet))
+        self.sent.append(bytes(packet))
+        self.answer += self._line.feed(bytes(packet))
         self.bytes += len(packet)
         return len(packet)
 
     def readPort(self, length: int) -> bytes:
-        data, self._answer = self._answer[:length], self._answer[length:]
+        data, self.answer = self.answer[:length], self.answer[length:]
         self.bytes += len(data)
         return data
 
@@ -39,15 +44,28 @@ class CountingPort:
 
 
 @pytest.mark.parametrize("count", [1, 2, 7])
-def test_a_cycle_has_the_computed_number_of_bytes(count: int) -> None:
+def test_a_cycle_has_the_computed_number_of_bytes_and_is_that_of_the_sdk(count: int) -> None:
     port, protocol, ids = CountingPort(count), PacketHandler(2.0), list(range(1, count + 1))
     assert protocol.syncReadTx(port, dxl.INDIRECT_DATA_1, dxl.BLOCK_SIZE, ids, count, False) == COMM_SUCCESS
-    for servo_id in ids:
-        data, result, _ = protocol.readRx(port, servo_id, dxl.BLOCK_SIZE)
+    assert port.sent[-1] == packets.sync_read(dxl.INDIRECT_DATA_1, dxl.BLOCK_SIZE, ids)
+    answers = port.answer
+    for i, servo_id in enumerate(ids):
+        data, result, error = protocol.readRx(port, servo_id, dxl.BLOCK_SIZE)
         assert (len(data), result) == (dxl.BLOCK_SIZE, COMM_SUCCESS)
+        packet = answers[i * ANSWER_BYTES : (i + 1) * ANSWER_BYTES]
+        assert packets.status_data(packet, servo_id, dxl.BLOCK_SIZE) == (bytes(data), error)
+        assert packets.status_data(packet, servo_id + 1, dxl.BLOCK_SIZE) is None
+        assert packets.status_data(packet, servo_id, dxl.BLOCK_SIZE - 1) is None
+        assert packets.status_data(packet[:-1], servo_id, dxl.BLOCK_SIZE) is None
+        assert packets.status_data(packet + b"x", servo_id, dxl.BLOCK_SIZE) is None
+        for at in range(ANSWER_BYTES):
+            damaged = packet[:at] + bytes([packet[at] ^ 1]) + packet[at + 1 :]
+            assert packets.status_data(damaged, servo_id, dxl.BLOCK_SIZE) is None
     port.is_using = False
-    goals = [value for servo_id in ids for value in (servo_id, 10, 0)]
-    protocol.syncWriteTxOnly(port, dxl.GOAL_CURRENT.address, dxl.GOAL_CURRENT.size, goals, len(goals))
+    goals = [-1 - servo_id for servo_id in ids]
+    parameters = [value for i, goal in zip(ids, goals, strict=True) for value in (i, goal & 0xFF, goal >> 8 & 0xFF)]
+    protocol.syncWriteTxOnly(port, dxl.GOAL_CURRENT.address, dxl.GOAL_CURRENT.size, parameters, len(parameters))
+    assert port.sent[-1] == packets.sync_write_int16(dxl.GOAL_CURRENT.address, ids, goals)
     assert port.bytes == cycle_bytes(count)
 
 

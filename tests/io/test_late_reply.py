@@ -28,7 +28,7 @@ class LateSerial(MemorySerial):
         self._free_s = 0.0
         self._coming: list[tuple[float, bytes]] = []
 
-    def write(self, sent: list[int]) -> int:
+    def write(self, sent: list[int] | bytes) -> int:
         held_up_s = HELD_UP_S if next(self.exchanges) == self._late_exchange else 0.0
         self._free_s = max(self._free_s, self.now_s + held_up_s) + REPLY_S
         self._coming.append((self._free_s, self.answer(bytes(sent))))

@@ -1,7 +1,7 @@
 """Blocking communication with the arm's servos: check and set up, one read and one write per cycle, release.
 
 Everything here runs in the bus thread, but for `write_currents`, which the event loop calls while the thread does not use the bus
-(`companion.io.arm.thread`). The dynamixel-sdk implements the protocol.
+(`companion.io.arm.thread`). The dynamixel-sdk implements the protocol; `companion.io.dynamixel.packets` spares it the usual cycle.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dynamixel_sdk import COMM_SUCCESS, PacketHandler
 
 from companion.config.arm import Arm, Joint
 from companion.config.devices import ArmDevice
+from companion.io.dynamixel import packets
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.registers import Block, Register
 from companion.io.dynamixel.scale import RAD_PER_COUNT, JointScale
@@ -24,6 +25,7 @@ from companion.model.servos import COUNTS_PER_TURN, hardware_error_text, model_t
 _FLIGHT_REPLY_TIMEOUT_MS = 8.0
 """Reply timeout in flight, the longest delay caused by an absent servo."""
 _USB_LATENCY_MAX_MS = 4
+_ANSWER_BYTES = packets.STATUS_BYTES + dxl.BLOCK_SIZE
 _ERROR_NUMBER = 0x7F
 _CRC_ERROR = 3
 SETUP_ATTEMPTS = 5
@@ -52,6 +54,7 @@ class ArmBus:
         self._ids = [joint.servo_id for joint in arm.joints]
         self._protocol = PacketHandler(2.0)
         self._port = dxl.ServoPort(device.port)
+        self._request = packets.sync_read(dxl.INDIRECT_DATA_1, dxl.BLOCK_SIZE, self._ids)
         self._deadline_s = 0.0
         self._watchdog = device.watchdog_ms // dxl.WATCHDOG_UNIT_MS
         self._touched = False
@@ -96,16 +99,26 @@ class ArmBus:
         Raises:
             OSError: the port is gone.
         """
-        port, protocol, ids = self._port, self._protocol, self._ids
+        port = self._port
         self._begin()
-        if protocol.syncReadTx(port, dxl.INDIRECT_DATA_1, dxl.BLOCK_SIZE, ids, len(ids), False) != COMM_SUCCESS:
+        port.clearPort()
+        if port.writePort(self._request) != len(self._request):
             return None
+        port.setPacketTimeout(len(self._ids) * _ANSWER_BYTES)
         blocks: list[Block] = []
-        for servo_id in ids:
-            data, result, error = protocol.readRx(port, servo_id, dxl.BLOCK_SIZE)
-            if result != COMM_SUCCESS or error & _ERROR_NUMBER or len(data) != dxl.BLOCK_SIZE:
+        for servo_id in self._ids:
+            answer = packets.status_data(port.peek(_ANSWER_BYTES), servo_id, dxl.BLOCK_SIZE)
+            if answer is not None:
+                data, error = answer
+                port.skip(_ANSWER_BYTES)
+            else:  # late, in parts, damaged or mixed with noise
+                received, result, error = self._protocol.readRx(port, servo_id, dxl.BLOCK_SIZE)
+                if result != COMM_SUCCESS or len(received) != dxl.BLOCK_SIZE:
+                    return None
+                data = bytes(received)
+            if error & _ERROR_NUMBER:
                 return None
-            block = Block.from_bytes(bytes(data))
+            block = Block.from_bytes(data)
             if block.bus_watchdog not in (self._watchdog, dxl.WATCHDOG_TRIPPED):
                 return (
                     None  # restarted by itself (a loose supply): its indirect addresses are lost, the block is invalid
@@ -119,13 +132,7 @@ class ArmBus:
         Raises:
             OSError: the port is gone.
         """
-        self._begin(discard=False)  # it has no reply; the next read discards
-        parameters: list[int] = []
-        for servo_id, count in zip(self._ids, counts, strict=True):
-            parameters += (servo_id, count & 0xFF, count >> 8 & 0xFF)
-        self._protocol.syncWriteTxOnly(
-            self._port, dxl.GOAL_CURRENT.address, dxl.GOAL_CURRENT.size, parameters, len(parameters)
-        )
+        self._port.writePort(packets.sync_write_int16(dxl.GOAL_CURRENT.address, self._ids, counts))
 
     def restart_watchdogs(self) -> None:
         """Clear tripped bus watchdogs and restart them with goal current 0. The next read shows the result.
@@ -267,10 +274,9 @@ class ArmBus:
             voltage_v=round(self._read(joint, dxl.PRESENT_VOLTAGE) * dxl.VOLTAGE_UNIT_V, 1),
         )
 
-    def _begin(self, *, discard: bool = True) -> None:
-        """Prepare the port for a transaction that first discards what has arrived, unless `discard` is False."""
+    def _begin(self) -> None:
+        """Prepare the port for a transaction of the SDK."""
         self._port.is_using = False  # an exception in an earlier transaction leaves it set
-        self._port.discards_input = discard
 
     # --- registers ---------------------------------------------------------------------------------------------------
 

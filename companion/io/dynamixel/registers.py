@@ -163,8 +163,6 @@ class ServoPort(PortHandler):  # type: ignore[misc]
     late_reply_ms = 100.0
     """Pause after a timeout, in which a late reply is discarded. A reply does not name its register: without the pause it
     would be taken for the reply to the next request. 0 where all requests are the same."""
-    discards_input = True
-    """Whether `clearPort` discards what has arrived. A request without a reply needs no such system call."""
 
     def setupPort(self, cflag_baud: int) -> bool:
         """Open the port at `self.baudrate` (called by the SDK).
@@ -210,14 +208,12 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         self._taken_bytes = 0
 
     def clearPort(self) -> None:
-        """Discard the bytes that have arrived; after a timeout, also wait for a late reply and discard it. Do nothing unless
-        `discards_input`. The SDK calls this before each request.
+        """Discard the bytes that have arrived; after a timeout, also wait for a late reply and discard it. The SDK calls this before
+        each request.
 
         Raises:
             OSError: the port is gone.
         """
-        if not self.discards_input:
-            return
         if self._reply_missing:
             self._reply_missing = False
             end_ms = self.getCurrentTime() + self.late_reply_ms
@@ -242,6 +238,24 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         self._taken_bytes += len(data)
         return data
 
+    def peek(self, length: int) -> bytes:
+        """Return up to `length` bytes, after at most 1 ms, and leave them in place for `readPort` and `skip`.
+
+        Raises:
+            OSError: the port is gone.
+        """
+        if len(self._arrived) < length:
+            more = self._receive()
+            self._arrived += more
+            if not more:
+                self._waited_ms += _POLL_MS
+        return self._arrived[:length]
+
+    def skip(self, length: int) -> None:
+        """Take the bytes that `peek` returned."""
+        self._arrived = self._arrived[length:]
+        self._taken_bytes += length
+
     def _receive(self) -> bytes:
         """Return all bytes that have arrived, after a wait of at most 1 ms; empty if none have. pyserial's `read` takes only the bytes
         asked for, so that each packet would cost two waits and two reads.
@@ -256,7 +270,7 @@ class ServoPort(PortHandler):  # type: ignore[misc]
             raise OSError(f"{self.port_name}: disconnected, or another program reads from it")
         return data
 
-    def writePort(self, packet: list[int]) -> int:
+    def writePort(self, packet: list[int] | bytes) -> int:
         """Pass a packet to the port's output buffer, which has room for many, and return the number of bytes taken. pyserial's `write`
         waits once more after each packet.
 

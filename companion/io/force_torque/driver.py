@@ -6,7 +6,6 @@ import asyncio
 import errno
 import logging
 import os
-import select
 from contextlib import suppress
 from types import TracebackType
 from typing import Final, Self
@@ -58,10 +57,8 @@ class RobotousForceTorque(SampleStream):
 
     def latest(self) -> ForceSample | None:
         """Return the newest raw sample; never blocks."""
-        if self._in_ticks and self._lost is None and self._serial is not None:
-            # An empty read alone does not tell a lost port from one without new bytes.
-            if select.select((self._serial.fileno(),), (), (), 0.0)[0]:
-                self._on_readable()
+        if self._in_ticks and self._lost is None:
+            self._on_readable()
         return super().latest()
 
     def read_in_ticks(self) -> None:
@@ -114,7 +111,10 @@ class RobotousForceTorque(SampleStream):
 
     def _open(self) -> serial.Serial:
         try:
-            opened = serial.Serial(self._device.port, self._device.baud, timeout=0, exclusive=True)
+            # The last argument sets VMIN to 1: only a lost port then returns an empty read, not one without new bytes.
+            opened = serial.Serial(
+                self._device.port, self._device.baud, timeout=0, exclusive=True, inter_byte_timeout=0
+            )
         except (OSError, ValueError) as error:  # SerialException is an OSError
             raise DeviceError(f"{self._where}: {self._why_not_open(error)}") from None
         # USB adapters otherwise delay bytes by up to 16 ms; ports without this setting (a pty) have no such delay.

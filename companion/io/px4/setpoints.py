@@ -50,12 +50,13 @@ class DirectSetpoints:
     def __init__(self, direct: MavlinkDirect, system_id: int) -> None:
         self._direct = direct
         self._system_id = system_id
+        self._message = MavlinkMessage("SET_ATTITUDE_TARGET")
 
     def send(self, setpoint: AttitudeSetpoint, t_s: float) -> bool:
         """Send SET_ATTITUDE_TARGET with the given quaternion, stamped with the flight clock."""
-        fields = messages.attitude_target_json(setpoint, int(t_s * 1e3), self._system_id)
+        self._message.fields_json = messages.attitude_target_json(setpoint, int(t_s * 1e3), self._system_id)
         try:
-            self._direct.send_message(MavlinkMessage("SET_ATTITUDE_TARGET", fields_json=fields))
+            self._direct.send_message(self._message)
         except MavsdkError as error:
             _log.debug("SET_ATTITUDE_TARGET not sent: %s", error)
             return False
