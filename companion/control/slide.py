@@ -30,7 +30,7 @@ velocity of the vehicle is late."""
 FORCE_GAIN, FORCE_S, FORCE_MAX_N = 9.0, 0.1, 5.0
 """Gain of the arm's force on the force error, time constant of its filter, and its bound. The loop closes at gain / time constant =
 90 rad/s."""
-DITHER_N, DITHER_TICKS = 0.5, 4
+DITHER_N, DITHER_TICKS = 0.3, 4
 """Dither: a force on the tip, up and down along the surface, which presses neither more nor less, and the ticks after which its sign
 changes (25 Hz)."""
 SOFTEN_S = 0.3
