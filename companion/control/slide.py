@@ -39,8 +39,8 @@ ATTITUDE_P, RATE_P, INTEGRATOR_S = 6.5, 0.15, 0.75
 """PX4's defaults of MC_PITCH_P and MC_PITCHRATE_P, and MC_PITCHRATE_P over MC_PITCHRATE_I."""
 _RESTS_M_S = 1e-6
 """Speed below which the reference of the tip rests."""
-TURN_MAX_RAD = math.radians(10.0)
-"""Largest turn of the setpoint, per axis: a wrong reading of the force sensor must not tilt the vehicle further."""
+TURN_MAX_RAD = math.radians(5.0)
+"""Largest turn of the setpoint, per axis. With 10 deg, a force sensor that was wrong by 3 N on each axis led to a press with 13 N."""
 OPPOSED_SHARE = 0.55
 """Fraction of the friction's moment that the setpoint opposes. With 1.0 the tip swings."""
 STEER_RAD_M, STEER_MAX_RAD = 10.0, math.radians(12.0)
