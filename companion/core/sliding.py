@@ -1,11 +1,8 @@
 """Moves the tip along the surface: a phase `slide`. Pure.
 
-The reference moves straight, once the force is reached, and the tip's path begins where the tip is. Friction would leave the tip
-behind: a force along the way, the integral of the tip's lag, acts on base and arm (`slide_world_n`). It is limited by the largest
-friction that the mission allows, and ends with the slide.
-
-Friction across the tool is a torque at the sensor, and its cross-talk reads as force along the tool: up to half of the wanted one. The
-vehicle's motion shows the true force, with gusts. What it shows in excess of the measured force, averaged, is added to that one.
+The reference moves straight, once the force is reached, and the tip's path begins where the tip is. Against friction, the weak springs
+of base and arm would leave the tip far behind: a force along the way, in proportion to the tip's lag and to its integral, acts on base
+and arm (`slide_world_n`). It is limited by the largest friction that the mission allows, and ends with the slide.
 """
 
 from __future__ import annotations
@@ -21,12 +18,10 @@ from companion.mission import contact as c
 from companion.mission.surface import axes
 from companion.model.types import ContactMode, ContactState, Vec3
 
-LAG_N_MS = 80.0
-"""Rate of the force along the way, per lag of the tip."""
-BEYOND_FRICTION_N = 0.8
-"""Largest force along the way beyond the largest friction: gears rub, too."""
-UNSEEN_S, UNSEEN_SHARE, UNSEEN_MAX_N = 1.5, 0.9, 2.0
-"""Time over which the force that the sensor does not measure is averaged, fraction of it that is believed, and its bound."""
+LAG_N_M, LAG_N_MS = 30.0, 40.0
+"""Force along the way per lag of the tip, and its rate. With twice as much, the tip sticks and slips."""
+BEYOND_FRICTION_N = 0.5
+"""Largest force along the way beyond the largest friction."""
 STUCK_M, STUCK_S = 0.05, 0.5
 """Lag of the tip from which it is stuck, and for how long."""
 RELEASE_N_S = 3.0
@@ -63,15 +58,13 @@ def slid(t: Transition, contact: ContactState, phase: Slide, approach: Approach 
         contact = replace(contact, mode=ContactMode.SLIDE, since_s=t.i.t_s, beside_m=beside_m)
     lag_m = _along(contact, contact.beside_m) - _along(contact, beside_m)
     integral_n = min(most_n, max(-most_n, contact.lag_integral_n + LAG_N_MS * dt_s * lag_m))
-    unseen_n = contact.unseen_n + dt_s / UNSEEN_S * (UNSEEN_SHARE * contact.disagreement_n - contact.unseen_n)
     contact = replace(
         contact,
-        unseen_n=min(UNSEEN_MAX_N, max(-UNSEEN_MAX_N, unseen_n)),
         lag_m=lag_m,
         lag_integral_n=integral_n,
         stuck_s=contact.stuck_s + dt_s if abs(lag_m) > STUCK_M else 0.0,
     )
-    return _driven(contact, integral_n)
+    return _driven(contact, min(most_n, max(-most_n, integral_n + LAG_N_M * lag_m)))
 
 
 def _driven(contact: ContactState, force_n: float) -> ContactState:
@@ -85,15 +78,13 @@ def _along(contact: ContactState, vector: Vec3) -> float:
 
 
 def released(contact: ContactState, dt_s: float) -> ContactState:
-    """Return the state with less force along the surface, because the tip does not slide; its friction, of which the sensor's error
-    came, ends as well.
-    """
+    """Return the state with less force along the surface, because the tip does not slide."""
     if contact.slide_world_n == _ENDED:
-        return contact if contact.unseen_n == 0.0 else replace(contact, unseen_n=0.0)
+        return contact
     x, y, z = contact.slide_world_n
     size_n = math.hypot(x, y, z)
     k = max(0.0, 1.0 - RELEASE_N_S * dt_s / size_n)
-    return replace(contact, slide_world_n=(k * x, k * y, k * z) if k > 0.0 else _ENDED, unseen_n=k * contact.unseen_n)
+    return replace(contact, slide_world_n=(k * x, k * y, k * z) if k > 0.0 else _ENDED)
 
 
 def way(contact: ContactState) -> Vec3:

@@ -313,7 +313,7 @@ class ContactState(Record, frozen=True, kw_only=True):
     bias_n: float
     """Mean force against the direction before the approach."""
     force_n: float
-    """Measured force of the surface against the direction, less `bias_n` and with `unseen_n`."""
+    """Measured force of the surface against the direction, less `bias_n`."""
     beyond_s: float
     """Time for which the force has been beyond the threshold that ends the mode."""
     wanted_n: float
@@ -358,8 +358,6 @@ class ContactState(Record, frozen=True, kw_only=True):
     """Integral part of the force along a slide."""
     slide_world_n: Vec3 = (0.0, 0.0, 0.0)
     """Force along the surface that moves the tip against friction."""
-    unseen_n: float = 0.0
-    """Force against the direction that the sensor does not measure, averaged: the vehicle's motion shows it during a slide."""
     stuck_s: float = 0.0
     """Time for which the tip has been too far behind its reference."""
 
