@@ -14,14 +14,14 @@ from companion.model.codec import differences, fingerprint, from_packet, to_pack
 from companion.model.types import Inputs, Outputs, Sent
 from companion.plugins import CONTROL_LAWS, installed
 
-PAIRS_FINGERPRINT = "1e7b00d5cd62de28"
-"""Fingerprint of the records of versions up to 0.2.0, which differ only in that every arm has two joints."""
-NO_CONTACT_FINGERPRINT = "9b601c4b6d344318"
-"""Fingerprint of the records before there were contact phases, which differ only in the fields of the contact."""
-NO_ONLINE_FINGERPRINT = "d9237ed1d1bff80d"
-"""Fingerprint of the records before a law could optimise its gains in flight, which differ only in `ControlLog.impedance_scale`."""
-NO_SLIDE_FINGERPRINT = "d2306038621d169b"
-"""Fingerprint of the records before a tip could slide, which differ only in the fields of the contact and `Reference.slide_world_n`."""
+OLDER_FINGERPRINTS = (
+    "1e7b00d5cd62de28",  # versions up to 0.2.0: every arm has two joints
+    "9b601c4b6d344318",  # before there were contact phases
+    "d9237ed1d1bff80d",  # before a law could optimise its gains in flight: `ControlLog.impedance_scale`
+    "d2306038621d169b",  # before a tip could slide: `Reference.slide_world_n`, fields of the contact
+    "f5ff3bacfaa725ce",  # before a slide corrected the measured force and steered: `unseen_n`, `steer_rad`
+)
+"""Fingerprints of records that lack only fields that have a default now."""
 
 
 class Core(Protocol):
@@ -97,8 +97,7 @@ def check_replayable(log: FlightLog) -> str:
         raise LogError(
             f"{log.path}: was recorded by {found}, but this is companion {__version__}; replay it with the version that recorded it"
         )
-    older = (PAIRS_FINGERPRINT, NO_CONTACT_FINGERPRINT, NO_ONLINE_FINGERPRINT, NO_SLIDE_FINGERPRINT)
-    if about.get("records") not in (fingerprint(Inputs, Outputs, Sent), *older):
+    if about.get("records") not in (fingerprint(Inputs, Outputs, Sent), *OLDER_FINGERPRINTS):
         raise LogError(
             f"{log.path}: the fields of its records differ from those of this version; it was written by "
             f"{writer(log.metadata)}; replay it with that version"

@@ -18,6 +18,7 @@ from companion.control.online import OnlineImpedance
 from companion.control.sensing import CatchDetector, ForceSensing, MeanAcceleration, ObservedCatchDetector
 from companion.control.slide import Slide
 from companion.control.types import Controller, Law, PlantState, Tuning
+from companion.model.algebra import across, dot
 from companion.model.codec import Record
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_from_euler_zyx, quat_rotate
@@ -196,7 +197,8 @@ class VehicleControl:
             self._slide.end()
         elif torque is not None:
             torque = self._slide.torque_nm(dt_s, torque, state, reference.slide_world_n, pressing, force)
-            attitude = self._slide.attitude(dt_s, attitude, state, _across(force, pressing))
+            friction = None if force is None else across(force, pressing)
+            attitude = self._slide.attitude(dt_s, attitude, state, reference, friction)
         if self._observer is not None:
             observed = self._observer.force_n
             log = msgspec.structs.replace(log, force_observed_world_n=observed, force_measured_world_n=force)
@@ -257,13 +259,6 @@ def _used(force: Vec3 | None, direction: Vec3 | None) -> Vec3 | None:
     """Return the force that the law gets: with a direction, only the part along it."""
     if force is None or direction is None:
         return force
-    (fx, fy, fz), (nx, ny, nz) = force, direction
-    along = fx * nx + fy * ny + fz * nz
+    nx, ny, nz = direction
+    along = dot(force, direction)
     return (along * nx, along * ny, along * nz)
-
-
-def _across(force: Vec3 | None, direction: Vec3) -> Vec3 | None:
-    """Return the part of a force across a direction."""
-    if force is None or (along := _used(force, direction)) is None:
-        return None
-    return (force[0] - along[0], force[1] - along[1], force[2] - along[2])

@@ -190,9 +190,10 @@ def _contradiction(t: Transition, contact: ContactState) -> tuple[Notice, str] |
         text = f"{contact.unopposed_n:.1f} N of the push act against nothing (limit {limit_n:g} N)"
         return notices.CONTACT_LOST, text
     else:
-        shown_n = contact.force_n + contact.disagreement_n
+        sensed_n = c.sensed_n(contact)
+        shown_n = sensed_n + contact.disagreement_n
         text = (
-            f"the force sensor measures {contact.force_n:.1f} N, the vehicle's motion shows {shown_n:.1f} N "
+            f"the force sensor measures {sensed_n:.1f} N, the vehicle's motion shows {shown_n:.1f} N "
             f"(limit {limit_n:g} N apart)"
         )
     return notices.CONTACT_DISAGREES, text

@@ -19,7 +19,7 @@ from companion.core.flight_state import Observation, Request, Tare
 from companion.core.sequence import missing_inputs
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters, event_of
-from companion.mission.contact import along
+from companion.mission.contact import along, sensed_n
 from companion.mission.plan import Plan
 from companion.model import flight_stage as seq
 from companion.model.best_pose import pose_used_s
@@ -154,7 +154,9 @@ class FlightCore:
         situation.tracking_error_m = self._control.tracking_error_m if stage is _PLAN else None
         situation.control = self._log
         contact = self._state.contact
-        situation.contact_n = contact.force_n if contact is not None and contact.touches else None
+        situation.contact_n = (
+            max(contact.force_n, sensed_n(contact)) if contact is not None and contact.touches else None
+        )
         situation.waiting = stage is Stage.WAIT and bool(missing_inputs(inputs, self._vehicle))
         armed_by_others = stage in seq.BEFORE_ARMING and seq.is_armed(inputs.status)
         if armed_by_others:

@@ -2,7 +2,11 @@
 
 The reference moves straight, once the force is reached, and the tip's path begins where the tip is. Against friction, the weak springs
 of base and arm would leave the tip far behind: a force along the way, in proportion to the tip's lag and to its integral, acts on base
-and arm (`slide_world_n`). It is limited by the largest friction that the mission allows, and ends with the slide.
+and arm (`slide_world_n`). It is limited by the largest friction that the mission allows, and ends with the slide. A turn of the yaw
+setpoint steers the tip towards its path (`steer_rad`).
+
+Friction across the tool is a torque at the sensor, and its cross-talk reads as force along the tool: up to half of the wanted one. The
+vehicle's motion shows the true force, with gusts. What it shows in excess of the measured force, averaged, is added to that one.
 """
 
 from __future__ import annotations
@@ -22,6 +26,12 @@ LAG_N_M, LAG_N_MS = 30.0, 40.0
 """Force along the way per lag of the tip, and its rate. With twice as much, the tip sticks and slips."""
 BEYOND_FRICTION_N = 0.5
 """Largest force along the way beyond the largest friction."""
+STEER_RAD_M, STEER_MAX_RAD = 10.0, math.radians(12.0)
+"""Turn of the yaw setpoint per distance of the tip beside its path, and its bound. PX4's yaw is soft: 10 deg make some 0.07 N m."""
+STEERED_S = 0.3
+"""Time constant with which that turn ends after a slide."""
+UNSEEN_S, UNSEEN_SHARE, UNSEEN_MAX_N = 1.5, 0.9, 2.0
+"""Time over which the force that the sensor does not measure is averaged, fraction of it that is believed, and its bound."""
 STUCK_M, STUCK_S = 0.05, 0.5
 """Lag of the tip from which it is stuck, and for how long."""
 RELEASE_N_S = 3.0
@@ -58,8 +68,13 @@ def slid(t: Transition, contact: ContactState, phase: Slide, approach: Approach 
         contact = replace(contact, mode=ContactMode.SLIDE, since_s=t.i.t_s, beside_m=beside_m)
     lag_m = _along(contact, contact.beside_m) - _along(contact, beside_m)
     integral_n = min(most_n, max(-most_n, contact.lag_integral_n + LAG_N_MS * dt_s * lag_m))
+    unseen_n = contact.unseen_n + dt_s / UNSEEN_S * (UNSEEN_SHARE * contact.disagreement_n - contact.unseen_n)
+    nx, ny, _ = contact.direction_world  # left of it is (-ny, nx); nothing on a floor, where no yaw moves the tip alone
+    left_m = nx * (beside_m[1] - contact.beside_m[1]) - ny * (beside_m[0] - contact.beside_m[0])
     contact = replace(
         contact,
+        steer_rad=min(STEER_MAX_RAD, max(-STEER_MAX_RAD, -STEER_RAD_M * left_m)),
+        unseen_n=min(UNSEEN_MAX_N, max(-UNSEEN_MAX_N, unseen_n)),
         lag_m=lag_m,
         lag_integral_n=integral_n,
         stuck_s=contact.stuck_s + dt_s if abs(lag_m) > STUCK_M else 0.0,
@@ -78,13 +93,17 @@ def _along(contact: ContactState, vector: Vec3) -> float:
 
 
 def released(contact: ContactState, dt_s: float) -> ContactState:
-    """Return the state with less force along the surface, because the tip does not slide."""
+    """Return the state with less force along the surface, because the tip does not slide; its friction, of which the sensor's error
+    came, ends as well.
+    """
+    if contact.steer_rad != 0.0:
+        contact = replace(contact, steer_rad=(1.0 - dt_s / STEERED_S) * contact.steer_rad)
     if contact.slide_world_n == _ENDED:
-        return contact
+        return contact if contact.unseen_n == 0.0 else replace(contact, unseen_n=0.0)
     x, y, z = contact.slide_world_n
     size_n = math.hypot(x, y, z)
     k = max(0.0, 1.0 - RELEASE_N_S * dt_s / size_n)
-    return replace(contact, slide_world_n=(k * x, k * y, k * z) if k > 0.0 else _ENDED)
+    return replace(contact, slide_world_n=(k * x, k * y, k * z) if k > 0.0 else _ENDED, unseen_n=k * contact.unseen_n)
 
 
 def way(contact: ContactState) -> Vec3:

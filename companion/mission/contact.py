@@ -146,10 +146,9 @@ def along(reference: Reference, contact: ContactState) -> Reference:
         x, y, z = x + tilting * sx, y + tilting * sy, z + tilting * sz
         vx, vy, vz = vx + rate * sx, vy + rate * sy, vz + rate * sz
     slide = None
-    if (
-        contact.slide_world_n != _NO_FORCE
-    ):  # the arm needs the wanted force as well; together both remain the base's force
-        (sx, sy, sz), wanted = contact.slide_world_n, contact.wanted_n
+    if contact.slide_world_n != _NO_FORCE:
+        # The arm also holds what the sensor is to read while the wanted force acts; together both remain the base's force.
+        (sx, sy, sz), wanted = contact.slide_world_n, contact.wanted_n + contact.bias_n - contact.unseen_n
         slide = (sx + wanted * nx, sy + wanted * ny, sz + wanted * nz)
         push -= wanted
     yaw, yaw_rate, shift = reference.yaw_rad, reference.yaw_rate_rad_s, contact.shift
@@ -179,6 +178,7 @@ def along(reference: Reference, contact: ContactState) -> Reference:
         arm_acceleration_rad_s2=arm_acceleration,
         push_world_n=(push * nx, push * ny, push * nz) if contact.touches else None,
         slide_world_n=slide,
+        steer_rad=contact.steer_rad,
     )
 
 
@@ -237,19 +237,19 @@ def measured(
     contact = replace(contact, tilting_n=contact.tilting_n + dt_s / TILT_S * (contact.push_n - contact.tilting_n))
     if contact.mode is ContactMode.WEIGH:
         contact = replace(contact, bias_n=contact.bias_n + 3.0 * dt_s / weigh_s * (against_n - contact.bias_n))
-    contact = replace(contact, force_n=against_n - contact.bias_n)
+    contact = replace(contact, force_n=against_n - contact.bias_n + contact.unseen_n)
     if disturbance_world_n is None:
         return contact
     unlike_n = -_along(contact.direction_world, disturbance_world_n) - against_n
     mean_n, disagreement_n, unopposed_n = contact.disagreement_bias_n, contact.disagreement_n, contact.unopposed_n
     if contact.mode is ContactMode.WEIGH:
         return replace(contact, disagreement_bias_n=mean_n + 3.0 * dt_s / weigh_s * (unlike_n - mean_n))
-    shown_n = contact.force_n + unlike_n - mean_n
+    shown_n = sensed_n(contact) + unlike_n - mean_n
     disagreement_n += dt_s / DISAGREEMENT_S * (unlike_n - mean_n - disagreement_n)
     unopposed_n += dt_s / DISAGREEMENT_S * (contact.push_n - shown_n - unopposed_n)
     # A gust towards the surface acts like a push against nothing; a push below the limit cannot exceed it, and with a gust the
     # sensor measures more than the push.
-    pushes = contact.push_n > max(disagreement_max_n, contact.force_n) and unopposed_n > disagreement_max_n
+    pushes = contact.push_n > max(disagreement_max_n, sensed_n(contact)) and unopposed_n > disagreement_max_n
     holds = disagreement_n > disagreement_max_n or pushes
     return replace(
         contact,
@@ -347,9 +347,14 @@ def averaged(contact: ContactState, tip_world_m: Vec3) -> ContactState:
     )
 
 
+def sensed_n(contact: ContactState) -> float:
+    """Return the force that the sensor measures, without what only the vehicle's motion shows, N."""
+    return contact.force_n - contact.unseen_n
+
+
 def touches(contact: ContactState, touch_n: float) -> bool:
     """Return whether the measured force shows that the tool still touches the surface."""
-    return contact.force_n > LOST_SHARE * touch_n
+    return sensed_n(contact) > LOST_SHARE * touch_n
 
 
 def pressed(contact: ContactState, t_s: float, dt_s: float, touch_n: float, force_n: float) -> ContactState:

@@ -17,6 +17,13 @@ def cross(a: Vec3, b: Vec3) -> Vec3:
     return (ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
 
 
+def across(v: Vec3, direction: Vec3) -> Vec3:
+    """Return the part of a vector across a unit vector."""
+    along = dot(v, direction)
+    (x, y, z), (nx, ny, nz) = v, direction
+    return (x - along * nx, y - along * ny, z - along * nz)
+
+
 def mat_vec(m: Mat3, v: Vec3) -> Vec3:
     """Return M v."""
     (a, b, c), (d, e, f), (g, h, i) = m

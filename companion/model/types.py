@@ -313,7 +313,7 @@ class ContactState(Record, frozen=True, kw_only=True):
     bias_n: float
     """Mean force against the direction before the approach."""
     force_n: float
-    """Measured force of the surface against the direction, less `bias_n`."""
+    """Measured force of the surface against the direction, less `bias_n` and with `unseen_n`."""
     beyond_s: float
     """Time for which the force has been beyond the threshold that ends the mode."""
     wanted_n: float
@@ -358,6 +358,10 @@ class ContactState(Record, frozen=True, kw_only=True):
     """Integral part of the force along a slide."""
     slide_world_n: Vec3 = (0.0, 0.0, 0.0)
     """Force along the surface that moves the tip against friction."""
+    unseen_n: float = 0.0
+    """Force against the direction that the sensor does not measure, averaged: the vehicle's motion shows it during a slide."""
+    steer_rad: float = 0.0
+    """Turn of the yaw setpoint that steers a sliding tip towards its path."""
     stuck_s: float = 0.0
     """Time for which the tip has been too far behind its reference."""
 
@@ -380,6 +384,8 @@ class Reference(Record, frozen=True, kw_only=True):
     slide_world_n: Vec3 | None = None
     """Force that vehicle and arm are to exert with a tip that slides, world frame: along the surface against friction, and the wanted
     force across it; None unless the tip slides."""
+    steer_rad: float = 0.0
+    """Turn of the yaw setpoint, besides `yaw_rad`, that steers a sliding tip: friction holds the yaw of the vehicle."""
 
 
 class AttitudeSetpoint(Record, frozen=True):

@@ -182,6 +182,7 @@ class Governor:
             jerk_world_m_s3=(0.0, 0.0, 0.0),
             push_world_n=reference.push_world_n,
             slide_world_n=reference.slide_world_n,
+            steer_rad=reference.steer_rad,
         )
         return Governed(constrained, reasons)
 

@@ -14,9 +14,11 @@ from companion.control import slide as control
 from companion.control.arm_model import manipulator_of
 from companion.control.types import PlantState
 from companion.core.flight_core import FlightCore
+from companion.core.sliding import STEER_MAX_RAD, UNSEEN_MAX_N
 from companion.mission.check import check_mission
+from companion.mission.contact import touches
 from companion.model.frames import euler_zyx_from_quat
-from companion.model.types import ContactMode, Joints, Outcome
+from companion.model.types import ContactMode, Outcome, Reference
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight, FastResult
@@ -24,17 +26,21 @@ from sitl.fast.loop import FastFlight, FastResult
 SLIDE = "configs/missions/slide.yaml"
 
 
-def slide(friction: float) -> tuple[FastFlight, FastResult]:
-    """Fly a short slide in the ideal world, with little of a way to the wall and back."""
+def short_slide(friction: float) -> list[str]:
+    """Return the overrides of a short slide, with little of a way to the wall and back."""
     wall = {"point_m": [1.5, 0.0, 1.09], "normal": [-1.0, 0.0, 0.0], "stiffness_n_m": 1e4, "friction": friction}
-    overrides = [
+    return [
         f"world.surfaces={json.dumps([wall])}",
         "mission.start.position_m=[0.4,0.0]",
         "mission.phases[3]={type: approach, direction: [1.0, 0.0, 0.0], distance_max_m: 0.35, speed_m_s: 0.05}",
         "mission.phases[4].by_m=[0.0,-0.3]",
         "mission.phases[6].to_m=[0.5,0.0,1.35]",
     ]
-    flight = FastFlight(load_sitl(SLIDE, world="ideal", overrides=overrides))
+
+
+def slide(friction: float, *more: str) -> tuple[FastFlight, FastResult]:
+    """Fly a short slide in the ideal world."""
+    flight = FastFlight(load_sitl(SLIDE, world="ideal", overrides=[*short_slide(friction), *more]))
     return flight, flight.run(90.0)
 
 
@@ -63,31 +69,64 @@ def test_a_tool_that_is_caught_leads_away_from_the_wall() -> None:
 
 def test_a_wrong_reading_of_the_force_turns_the_setpoint_by_a_bounded_angle() -> None:
     vehicle, state = load_sitl(SLIDE).vehicle, at_rest()
-    level = state.attitude_wxyz
     slide = control.Slide(vehicle)
     slide.torque_nm(0.005, (0.0, 0.0), state, (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), None)
-    turned = slide.attitude(0.005, level, state, (0.0, 0.0, 200.0))
+    turned = slide.attitude(0.005, state.attitude_wxyz, state, reference(), (0.0, 0.0, 200.0))
     assert max(map(abs, euler_zyx_from_quat(turned))) == pytest.approx(control.TURN_MAX_RAD)
 
 
-def test_the_arm_yields_across_the_surface_and_answers_the_force_error_by_a_bounded_force() -> None:
-    vehicle, state = load_sitl(SLIDE).vehicle, at_rest()
-    into, slide = (1.0, 0.0, 0.0), control.Slide(vehicle)
+def test_the_arm_pushes_along_the_way_and_answers_the_force_error_by_a_bounded_force() -> None:
+    vehicle, state, into = load_sitl(SLIDE).vehicle, at_rest(), (1.0, 0.0, 0.0)
     jacobian = np.array(manipulator_of(vehicle).jacobian_body_m(state.arm_rad))[[0, 2]]
+    slide = control.Slide(vehicle)
 
-    def tip_force(arm: Joints, reading_n: float) -> Any:
-        moved = replace(state, arm_rad=arm)
-        torque = slide.torque_nm(0.005, (0.0, 0.0), moved, (3.0, 0.0, 0.0), into, (-reading_n, 0.0, 0.0))
+    def tip_force(reading_n: float) -> Any:
+        torque = slide.torque_nm(0.005, (0.0, 0.0), state, (3.0, 0.0, -0.5), into, (-reading_n, 0.0, 0.0))
         return np.linalg.solve(jacobian.T, torque)
 
-    assert np.abs(tip_force(state.arm_rad, 3.0)).max() < 1e-9
-    across, along = (np.linalg.solve(jacobian, step) for step in ([0.005, 0.0], [0.0, 0.005]))
-    a, b = state.arm_rad
-    assert np.abs(tip_force((a + across[0], b + across[1]), 3.0)).max() < 0.05
-    assert tip_force((a + along[0], b + along[1]), 3.0)[1] < -0.1
+    assert tip_force(3.0) == pytest.approx([0.0, -0.5])
     for _ in range(200):
-        force = tip_force(state.arm_rad, 200.0)
-    assert force[0] == pytest.approx(-control.FORCE_MAX_N, rel=1e-3) and abs(force[1]) < 1e-9
+        force = tip_force(200.0)
+    assert force == pytest.approx([-control.FORCE_MAX_N, -0.5], rel=1e-3)
+
+
+def test_a_tip_beside_its_path_is_steered_back_and_the_turn_ends_with_the_slide() -> None:
+    _, result = slide(0.5, "world.wind_m_s=[0.0,1.5,0.0]")
+    pairs = [(o.contact, o.reference) for o in result.outputs if o.contact is not None and o.reference is not None]
+    turns = [reference.steer_rad for contact, reference in pairs if contact.mode is ContactMode.SLIDE]
+    assert 0.01 < max(map(abs, turns)) <= STEER_MAX_RAD
+    assert result.outputs[-1].outcome is Outcome.COMPLETED and abs(pairs[-1][1].steer_rad) < 1e-3
+
+
+def test_a_slide_believes_the_motion_of_the_vehicle_within_a_bound_and_a_lost_surface_at_once() -> None:
+    _, result = slide(0.5, "world.force_scale=0.7")
+    assert result.outputs[-1].outcome is Outcome.COMPLETED and result.layout is not None
+    sliding = [o.contact for o in result.outputs if o.contact is not None and o.contact.mode is ContactMode.SLIDE]
+    assert all(abs(contact.unseen_n) <= UNSEEN_MAX_N for contact in sliding)
+    assert sliding[-1].unseen_n > 0.6  # 30 % of 3 N, believed by nine tenths
+    forces = [
+        -result.layout.contact(s.sensors)[1][0]
+        for s, o in zip(result.snapshots, result.outputs, strict=True)
+        if o.contact is not None and o.contact.mode is ContactMode.SLIDE
+    ]
+    assert np.mean(forces[-400:]) == pytest.approx(3.0, abs=0.4)  # 4.3 N by the sensor alone
+    assert not touches(replace(sliding[-1], force_n=sliding[-1].unseen_n), 1.0)
+
+
+def reference() -> Reference:
+    """Return the reference of a vehicle at rest."""
+    rest = (0.0, 0.0, 0.0)
+    return Reference(
+        position_world_m=rest,
+        velocity_world_m_s=rest,
+        acceleration_world_m_s2=rest,
+        yaw_rad=0.0,
+        yaw_rate_rad_s=0.0,
+        arm_rad=(1.1, 1.4),
+        arm_rate_rad_s=(0.0, 0.0),
+        arm_acceleration_rad_s2=(0.0, 0.0),
+        jerk_world_m_s3=rest,
+    )
 
 
 def at_rest() -> PlantState:

@@ -16,6 +16,7 @@ from companion.analysis.contact import rotor_distance_m
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK
 from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight
+from tests.core.test_sliding import short_slide
 from tests.flights.test_fast_flights import short
 from tests.support import HOVER, HOVERS_S, SHORT_CATCH, Ended, Sandbox, read_summary, run_here, sandbox_in, set_options
 
@@ -114,3 +115,16 @@ def test_a_lost_arm_lands_it_and_another_programs_end_is_found(tmp_path_factory:
     assert summary["latency_ms"]["mocap_to_setpoint"]["p99"] is None
     distance_m = rotor_distance_m(summary)
     assert distance_m is not None and 50.0 < distance_m < 51.0
+
+
+def test_a_tip_slides_along_a_wall(tmp_path_factory: pytest.TempPathFactory) -> None:
+    with sandbox_in(tmp_path_factory.mktemp("slide")) as sandbox:
+        options = [part for override in short_slide(0.5) for part in ("--set", override)]
+        ended = sandbox.run("fly", "slide", "--sitl", "--world", "ideal", "--out", "out", *options)
+        sandbox.assert_nobody_left()
+        summary = read_summary(sandbox.cwd / "out")
+    assert ended.code == EXIT_OK, ended
+    contact = summary["contact"]
+    assert contact["slid_m"] == pytest.approx(0.3, abs=0.03)
+    # Coarse: the computer may be busy.
+    assert contact["path_rms_m"] < 0.04 and contact["rms_error_n"] < 1.5
