@@ -80,7 +80,7 @@ def flown(seed: int, mission: str = "press", datum: bool = False) -> Press:
     wanted_n = np.array([0.0 if c is None or c.mode not in _PRESSING else c.wanted_n for c in contacts])
     pressing = wanted_n > wanted_n[-1]
     most_n = float(wanted_n.max())
-    steady = np.flatnonzero(wanted_n == most_n)[SETTLE_TICKS:]
+    steady = np.flatnonzero(pressing & (wanted_n == most_n))[SETTLE_TICKS:]
     sliding = np.flatnonzero([c is not None and c.mode is ContactMode.SLIDE for c in contacts])
     beside_m = (contact_summary(row_of(flight.config.flight, result, None)[1]) or {}).get("path_rms_m")
     found = next((c.surface for c in reversed(contacts) if c is not None and c.surface is not None), None)
