@@ -110,18 +110,19 @@ class Slide:
             reference: its `steer_rad` turns the yaw.
             friction_world_n: measured force on the tip along the surface; None if it is unknown.
         """
-        if not self._slides or friction_world_n is None:
+        if not self._slides:
             return attitude_wxyz
-        fx, fy, fz = quat_rotate(quat_conjugate(state.attitude_wxyz), friction_world_n)
-        x, y, z = self._manipulator.net_body_m(state.arm_rad)
-        mx, my = y * fz - z * fy, z * fx - x * fz
-        hx, hy = self._held_nm
-        k = 1.0 - math.exp(-dt_s / INTEGRATOR_S)
-        self._held_nm = hx, hy = hx + k * (mx - hx), hy + k * (my - hy)
-        turn_x, turn_y = self._rad_per_nm * (hx - mx), self._rad_per_nm * (hy - my)
-        turn_x = min(max(turn_x, -TURN_MAX_RAD), TURN_MAX_RAD)
-        turn_y = min(max(turn_y, -TURN_MAX_RAD), TURN_MAX_RAD)
-        return quat_multiply(attitude_wxyz, quat_from_euler_zyx(turn_x, turn_y, reference.steer_rad))
+        turn_x = turn_y = 0.0
+        if friction_world_n is not None:
+            fx, fy, fz = quat_rotate(quat_conjugate(state.attitude_wxyz), friction_world_n)
+            x, y, z = self._manipulator.net_body_m(state.arm_rad)
+            mx, my = y * fz - z * fy, z * fx - x * fz
+            hx, hy = self._held_nm
+            k = 1.0 - math.exp(-dt_s / INTEGRATOR_S)
+            self._held_nm = hx, hy = hx + k * (mx - hx), hy + k * (my - hy)
+            turn_x = min(max(self._rad_per_nm * (hx - mx), -TURN_MAX_RAD), TURN_MAX_RAD)
+            turn_y = min(max(self._rad_per_nm * (hy - my), -TURN_MAX_RAD), TURN_MAX_RAD)
+        return quat_multiply(attitude_wxyz, quat_from_euler_zyx(turn_x, turn_y, reference.steer_rad or 0.0))
 
     def end(self) -> None:
         """Forget the slide: the tool touches nothing any more."""

@@ -178,7 +178,7 @@ def along(reference: Reference, contact: ContactState) -> Reference:
         arm_acceleration_rad_s2=arm_acceleration,
         push_world_n=(push * nx, push * ny, push * nz) if contact.touches else None,
         slide_world_n=slide,
-        steer_rad=contact.steer_rad,
+        steer_rad=contact.steer_rad or None,
     )
 
 

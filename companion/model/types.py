@@ -384,7 +384,7 @@ class Reference(Record, frozen=True, kw_only=True):
     slide_world_n: Vec3 | None = None
     """Force that vehicle and arm are to exert with a tip that slides, world frame: along the surface against friction, and the wanted
     force across it; None unless the tip slides."""
-    steer_rad: float = 0.0
+    steer_rad: float | None = None
     """Turn of the yaw setpoint, besides `yaw_rad`, that steers a sliding tip: friction holds the yaw of the vehicle."""
 
 

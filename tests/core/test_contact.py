@@ -223,7 +223,9 @@ def test_a_force_sensor_whose_zero_shifts_during_the_approach_neither_pushes_int
     flight = FastFlight(load_sitl("press", world="wall", overrides=[faults, "mission.phases[3].face_m=null", *SHORT]))
     result = flight.run(90.0)
     surfaces = flight.plant.world.surfaces
-    assert {"contact_lost", "tether_snagged"} & set(events(result))  # a shift by 3 N also looks like a tether that pulls
+    assert {"contact_lost", "tether_snagged"} & set(
+        events(result)
+    )  # a shift by 3 N also looks like a tether that pulls
     assert result.outputs[-1].outcome is Outcome.ABORTED and not result.crashed
     assert surfaces is not None and surfaces.force_max_n < 7.5 and surfaces.rotor_distance_min_m > 0.15
 

@@ -157,10 +157,10 @@ def test_the_arm_gives_way_as_its_impedance_says(preset: str, force: Vec3, base_
     assert difference < 0.2 * peak(ideal.arm)
 
 
-def test_without_friction_the_arm_is_within_five_percent() -> None:
+def test_without_friction_the_arm_is_within_ten_percent() -> None:
     without = ("world.joint_friction_nm=0", "controller.arm_friction_share=0")
     measured, ideal, _ = pushed("recommended", DOWN, False, *without)
-    assert peak(measured.arm) == pytest.approx(peak(ideal.arm), rel=0.05)
+    assert peak(measured.arm) == pytest.approx(peak(ideal.arm), rel=0.1)
 
 
 @pytest.mark.parametrize("force", [DOWN, BACK, LEFT], ids=["down", "back", "left"])
