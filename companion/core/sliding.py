@@ -29,7 +29,7 @@ BEYOND_FRICTION_N = 0.5
 STEER_RAD_M, STEER_MAX_RAD = 10.0, math.radians(12.0)
 """Turn of the yaw setpoint per distance of the tip beside its path, and its bound. PX4's yaw is soft: 10 deg make some 0.07 N m."""
 STEERED_S = 0.3
-"""Time constant with which that turn ends after a slide."""
+"""Time constant with which the turn of the yaw setpoint decays after a slide."""
 UNSEEN_S, UNSEEN_SHARE, UNSEEN_MAX_N = 1.5, 0.9, 2.0
 """Time over which the force that the sensor does not measure is averaged, fraction of it that is believed, and its bound."""
 STUCK_M, STUCK_S = 0.05, 0.5

@@ -18,7 +18,7 @@ def cross(a: Vec3, b: Vec3) -> Vec3:
 
 
 def across(v: Vec3, direction: Vec3) -> Vec3:
-    """Return the part of a vector across a unit vector."""
+    """Return the part of a vector perpendicular to a direction, a unit vector."""
     along = dot(v, direction)
     (x, y, z), (nx, ny, nz) = v, direction
     return (x - along * nx, y - along * ny, z - along * nz)

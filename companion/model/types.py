@@ -313,7 +313,7 @@ class ContactState(Record, frozen=True, kw_only=True):
     bias_n: float
     """Mean force against the direction before the approach."""
     force_n: float
-    """Measured force of the surface against the direction, less `bias_n` and with `unseen_n`."""
+    """Force of the surface against the direction: the sensor's, less `bias_n`, plus `unseen_n`."""
     beyond_s: float
     """Time for which the force has been beyond the threshold that ends the mode."""
     wanted_n: float
@@ -385,7 +385,7 @@ class Reference(Record, frozen=True, kw_only=True):
     """Force that vehicle and arm are to exert with a tip that slides, world frame: along the surface against friction, and the wanted
     force across it; None unless the tip slides."""
     steer_rad: float | None = None
-    """Turn of the yaw setpoint, besides `yaw_rad`, that steers a sliding tip: friction holds the yaw of the vehicle."""
+    """Angle added to the yaw setpoint to steer a sliding tip towards its path; the yaw error is still that from `yaw_rad`."""
 
 
 class AttitudeSetpoint(Record, frozen=True):
