@@ -152,7 +152,7 @@ def bare_mavsdk(frames: int) -> tuple[Latency, Latency]:
 
 
 def autopilot_edge(frames: int) -> tuple[Latency, Latency]:
-    """Receive, then call MavsdkAutopilot.send_attitude, which converts, checks and sends through MavlinkDirect."""
+    """Receive, then call MavsdkAutopilot.send_attitude, which converts, checks and sends."""
     from companion.config.devices import AutopilotDevice
     from companion.io.px4.driver import MavsdkAutopilot
     from companion.model.types import IDENTITY_QUAT, AttitudeSetpoint

@@ -57,7 +57,7 @@ def add_parser(commands: Any) -> None:
         default=DEFAULT_VEHICLE,
         help=f"vehicle file with PX4's address (default: {DEFAULT_VEHICLE})",
     )
-    where.add_argument("--address", help="address in MAVSDK's notation, e.g. udpin://0.0.0.0:14540")
+    where.add_argument("--address", help="address of the link, e.g. udpin://0.0.0.0:14540")
     params.add_argument(
         "--backup", type=Path, metavar="FILE", help="file for the old values (default: px4_TIME.params)"
     )

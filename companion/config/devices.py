@@ -14,12 +14,11 @@ class AutopilotDevice(Model):
     """PX4 over MAVLink."""
 
     address: str
-    """MAVSDK connection, such as udpin://0.0.0.0:14540 or serial:///dev/ttyAMA0:921600."""
+    """Address of the link, such as udpin://0.0.0.0:14540 or serial:///dev/ttyAMA0:921600."""
     discovery_timeout_s: Positive = 10.0
     setpoint_path: Literal["direct", "offboard"] = "direct"
-    """How SET_ATTITUDE_TARGET is sent: direct (MAVSDK's MavlinkDirect, which sends only when the flight loop does) or offboard
-    (MAVSDK's
-    Offboard plugin, whose thread repeats the last setpoint at 20 Hz, even while the flight loop hangs)."""
+    """How SET_ATTITUDE_TARGET is sent: direct (only when the flight loop sends it) or offboard (MAVSDK's Offboard plugin, whose thread
+    repeats the last setpoint at 20 Hz, even while the flight loop hangs)."""
 
 
 ANY_INTERFACE = "0.0.0.0"

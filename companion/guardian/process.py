@@ -21,11 +21,12 @@ from typing import TYPE_CHECKING
 
 from companion.guardian import heartbeat
 from companion.guardian.heartbeat import Heartbeat
-from companion.guardian.link import Link, Wire, address_problem, is_udp, open_wire
+from companion.guardian.link import Link
 from companion.guardian.mocap import MocapClient, MocapProblem, open_client
 from companion.guardian.monitors import StallWatch
 from companion.guardian.settings import Settings, read_settings
 from companion.guardian.takeover_landing import Notice, TakeoverLanding
+from companion.io.px4.wire import Wire, is_udp, open_wire
 from companion.model.codec import to_packet
 from companion.model.packets import LogLine
 from companion.model.types import SafetyAction, Severity
@@ -121,7 +122,7 @@ class Guardian:
         self._external = settings.mocap.type == "external"
         self._mocap: MocapClient | PluginClient | None = None
         """None until it is open, and if another program feeds PX4, which then needs no poses from the guardian."""
-        self._problem = address_problem(settings.autopilot_address)
+        self._problem: str | None = None
         self._status_s = float("-inf")
         self._errors: set[str] = set()
         """Internal errors that have been reported."""
@@ -139,7 +140,7 @@ class Guardian:
                 if not self._external:
                     self._mocap = open_client(self._settings.mocap)
             except MocapProblem as problem:
-                self._problem = self._problem or str(problem)
+                self._problem = str(problem)
             reason = self._stand_by()
             if reason is None or self._heartbeats.last is None:
                 return 0

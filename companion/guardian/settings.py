@@ -15,7 +15,7 @@ class Settings:
     """Settings of the guardian."""
 
     autopilot_address: str
-    """Address in MAVSDK's notation, such as udpin://0.0.0.0:14540."""
+    """Address of the link, such as udpin://0.0.0.0:14540."""
     mocap: MocapSettings
     clearance_m: float
     """`airframe.ground_clearance_m`."""

@@ -540,6 +540,6 @@ class LinkIdentity(Record, frozen=True, kw_only=True):
     own_system: int
     own_component: int
     local_port: int
-    """UDP port from which MAVSDK sends; 0 if it is unknown or the link is not UDP."""
+    """Own UDP port; 0 if it is unknown or the link is not UDP."""
     peer: tuple[str, int] | None = None
-    """PX4's IPv4 address and UDP port, the only sender that MAVSDK accepts; None if the link is not UDP."""
+    """PX4's IPv4 address and UDP port, the only sender that is accepted; None if the link is not UDP."""

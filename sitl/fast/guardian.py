@@ -60,9 +60,9 @@ class MemoryWire:
         for message in self._decoder.parse_buffer(data) or ():
             self._receiver.handle(self._end, message)
 
-    def receive(self) -> list[bytes]:
-        """Return and clear the packets that the stub has sent."""
-        waiting = list(self._waiting)
+    def receive(self) -> list[tuple[float, bytes]]:
+        """Return and clear the packets that the stub has sent; nobody asks when they arrived."""
+        waiting = [(math.nan, data) for data in self._waiting]
         self._waiting.clear()
         return waiting
 

@@ -15,10 +15,11 @@ from pymavlink.dialects.v20 import common as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
 from companion.config.devices import AutopilotDevice
-from companion.guardian.link import Link, UdpWire
+from companion.guardian.link import Link
 from companion.guardian.px4 import Px4State
 from companion.io.px4 import messages
 from companion.io.px4.driver import MavsdkAutopilot
+from companion.io.px4.wire import UdpWire
 from companion.model.types import FlightMode, VehicleState
 from tests.fuzz.mutate import mutated
 from tests.fuzz.target import Target, Wrong, one_line
@@ -35,9 +36,9 @@ class MemoryWire(UdpWire):
     def __init__(self) -> None:
         self.waiting: list[bytes] = []
 
-    def receive(self) -> list[bytes]:
+    def receive(self) -> list[tuple[float, bytes]]:
         waiting, self.waiting = self.waiting, []
-        return waiting
+        return [(0.0, data) for data in waiting]
 
 
 class MavlinkTarget(Target):
@@ -155,8 +156,8 @@ class MavlinkWireTarget(Target):
             if time.monotonic() > deadline_s:
                 raise Wrong(f"a valid heartbeat behind it is not understood: {status}")
             peer.say(heartbeat)
+            edge.vehicle()
             time.sleep(0.0005)
-        edge.vehicle()
         for line in edge.take_messages():
             one_line(line, "a message for people")
         peer.received.clear()

@@ -42,7 +42,7 @@ class Wire:
     def send(self, data: bytes) -> None:
         self.sent += self._decoder.parse_buffer(data) or []
 
-    def receive(self) -> list[bytes]:
+    def receive(self) -> list[tuple[float, bytes]]:
         return []
 
     def close(self) -> None:

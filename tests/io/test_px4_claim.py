@@ -18,10 +18,10 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.config.devices import AutopilotDevice
 from companion.io.protocols import DeviceError
+from companion.io.px4 import frames as px4_frames
 from companion.io.px4.claim import LinkClaim
 from companion.io.px4.driver import MavsdkAutopilot
-from companion.io.qgroundcontrol import frames as ground_frames
-from companion.io.qgroundcontrol.frames import AutopilotHeartbeat
+from companion.io.px4.frames import AutopilotHeartbeat
 from companion.model.types import MocapPose
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import Px4Peer, free_udp_port
@@ -178,23 +178,23 @@ def test_little_of_a_strangers_datagram_is_read(
     """Counted in the control loop's own call: frames cut out, and checksums computed."""
     counted: Counter[str] = Counter()
     for name in ("_frame_at", "_checksum"):
-        monkeypatch.setattr(ground_frames, name, _counting(counted, name, getattr(ground_frames, name)))
+        monkeypatch.setattr(px4_frames, name, _counting(counted, name, getattr(px4_frames, name)))
     port = free_udp_port()
     with (
         closing(LinkClaim(f"udpin://127.0.0.1:{port}")) as claim,
         closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger,
     ):
         stranger.sendto(data, ("127.0.0.1", port))
-        assert claim.take_rival(0.0) is None
+        assert claim.take_rival() is None
         assert (counted["_frame_at"] <= frames_max, counted["_checksum"] <= checksums_max) == (True, True), counted
         stranger.sendto(forged_heartbeat(), ("127.0.0.1", port))
-        claim.take_rival(0.0)
+        claim.take_rival()
         assert claim.peer is not None and claim.peer[1] == stranger.getsockname()[1], "a valid HEARTBEAT is still read"
 
 
 def test_a_heartbeat_among_the_messages_that_a_bridge_puts_into_one_datagram_is_read() -> None:
     other = mavlink.MAVLink_attitude_message(0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6).pack(mavlink.MAVLink(None, 1, 1))
-    assert ground_frames.autopilot_heartbeat(other * 20 + forged_heartbeat()) == AutopilotHeartbeat(1, True)
+    assert px4_frames.autopilot_heartbeat(other * 20 + forged_heartbeat()) == AutopilotHeartbeat(1, True)
 
 
 def _counting(counted: Counter[str], name: str, real: Callable[..., Any]) -> Callable[..., Any]:
@@ -259,8 +259,8 @@ def test_px4_that_a_router_moved_to_another_port_is_heard_there() -> None:
 
                     await eventually(armed, "PX4 is heard at its new port")
                     assert autopilot.identity().peer == moved.address
-                    said = [text for text in texts if "messages are now accepted from there only" in text]
-                    assert len(said) == 1 and f"{moved.address[0]}:{moved.address[1]}" in said[0]
+                    said = [text for text in texts if "the link uses that port" in text]
+                    assert len(said) == 1 and f"now sends from port {moved.address[1]}" in said[0]
 
     asyncio.run(main())
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
 
 from companion.io.px4 import messages
+from companion.io.px4.frames import FrameWriter
 from companion.io.px4.requests import ANSWER_DEADLINE_S, RETRY_S, SETTLE_S, RequestQueue
 from companion.io.px4.texts import SAME_TEXT_S
 from companion.model.types import AttitudeSetpoint, AutopilotRequest, FlightMode, LandedState
@@ -35,17 +38,17 @@ def test_px4_modes(main: int, sub: int, mode: FlightMode) -> None:
     assert messages.flight_mode(CUSTOM, main << 16 | sub << 24) is mode
 
 
-def test_mavsdks_null_is_nan_and_a_missing_time_is_none() -> None:
-    position_m, velocity_m_s = messages.local_position_ned('{"x":1,"y":-2.5,"z":null,"vx":0.1,"vy":0.2,"vz":0.3}')
-    assert position_m[:2] == (1.0, -2.5)
-    assert math.isnan(position_m[2])
-    assert velocity_m_s == (0.1, 0.2, 0.3)
-    fields = '"q1":1.0,"q2":0.0,"q3":0.0,"q4":null,"rollspeed":0.5,"pitchspeed":-0.5,"yawspeed":0.25,"more":[0]}'
-    q, rates_rad_s, boot_s = messages.attitude_quaternion('{"time_boot_ms":1500,' + fields)
-    assert (q[:3], math.isnan(q[3]), rates_rad_s, boot_s) == ((1.0, 0.0, 0.0), True, (0.5, -0.5, 0.25), 1.5)
-    assert messages.attitude_quaternion('{"time_boot_ms":0,' + fields)[2] is None
-    assert messages.highres_imu('{"time_usec":2500000,"xacc":1,"yacc":2,"zacc":3}') == ((1.0, 2.0, 3.0), 2.5)
-    assert messages.highres_imu('{"time_usec":0,"xacc":1,"yacc":2,"zacc":3}')[1] is None
+def test_a_truncated_payload_ends_in_zeros_and_a_missing_time_is_none() -> None:
+    assert messages.local_position_ned(struct.pack("<I3f", 7, 1.0, -2.5, math.inf)) == (
+        (1.0, -2.5, math.inf),
+        (0.0,) * 3,
+    )
+    attitude = struct.pack("<7f", 1.0, 0.0, 0.0, 0.0, 0.5, -0.5, 0.25)
+    read = messages.attitude_quaternion(struct.pack("<I", 1500) + attitude + b"more")
+    assert read == ((1.0, 0.0, 0.0, 0.0), (0.5, -0.5, 0.25), 1.5)
+    assert messages.attitude_quaternion(struct.pack("<I", 0) + attitude)[2] is None
+    assert messages.highres_imu(struct.pack("<Q3f", 2500000, 1.0, 2.0, 3.0)) == ((1.0, 2.0, 3.0), 2.5)
+    assert messages.highres_imu(struct.pack("<Q3f", 0, 1.0, 2.0, 3.0))[1] is None
 
 
 def test_a_mode_without_the_custom_flag_is_unknown() -> None:
@@ -74,11 +77,12 @@ def test_battery_that_the_autopilot_does_not_know_is_none() -> None:
 
 def test_the_setpoint_keeps_single_precision() -> None:
     q = (0.9238795325112867, 0.0, 0.0, 0.3826834323650898)
-    fields = json.loads(messages.attitude_target_json(AttitudeSetpoint(q, 0.123456789), 2**32 + 5, 7))
-    assert fields["time_boot_ms"] == 5  # 32 bits on the wire
-    assert fields["target_system"] == 7
-    assert math.hypot(*fields["q"]) == pytest.approx(1.0, abs=1e-8)
-    assert fields["thrust"] == pytest.approx(0.123456789, abs=1e-9)
+    payload = messages.attitude_target(AttitudeSetpoint(q, 0.123456789), 2**32 + 5, 7)
+    sent = mavlink.MAVLink(None).parse_buffer(FrameWriter(1, 191).frame(messages.SET_ATTITUDE_TARGET_ID, payload))[0]
+    assert sent.time_boot_ms == 5  # 32 bits on the wire
+    assert sent.target_system == 7
+    assert math.hypot(*sent.q) == pytest.approx(1.0, abs=1e-7)
+    assert sent.thrust == pytest.approx(0.123456789, abs=1e-8)
 
 
 def test_answers_in_words() -> None:

@@ -404,7 +404,7 @@ class NoForwarder:
     def identity(self) -> LinkIdentity:
         raise AssertionError
 
-    async def forward_to(self, port: int) -> int:
+    def forward_to(self, port: int) -> int:
         raise AssertionError
 
 
@@ -444,7 +444,7 @@ def test_when_the_flight_process_dies_the_ground_is_informed_and_the_relay_ends(
     with GroundPeer() as ground, ours:
         with theirs:
             arguments = ["--fd", str(theirs.fileno()), "--host", "127.0.0.1", "--port", str(ground.port)]
-            arguments += ["--system", "1", "--own", "1", "195", "--name", "qgc"]
+            arguments += ["--system", "1", "--name", "qgc"]
             command = [sys.executable, "-m", "companion.io.qgroundcontrol.relay", *arguments]
             relay = subprocess.Popen(command, pass_fds=(theirs.fileno(),))
         try:

@@ -8,23 +8,26 @@ request (`tc1` = 0) immediately with its time; half the round-trip time is used 
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 import statistics
+import struct
 from bisect import bisect_left
-from collections import deque
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Final, Self
 
 from companion.config.devices import AutopilotDevice
 from companion.io.protocols import DeviceError
+from companion.io.px4 import messages
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.frames import flu_from_frd
 from companion.preflight.hand_test.motion import ImuAt
 from companion.runtime.clock import Clock
 
 SYNC_PERIOD_S: Final = 0.1
+_TIMESYNC_ID: Final = 111
+_TIMESYNC: Final = struct.Struct("<qq")
+_IMU: Final = struct.Struct("<Q6f")
 _SYNC_MIN: Final = 5
 _SYNC_DEADLINE_S: Final = 5.0
 _NEAR: Final = 30
@@ -48,7 +51,7 @@ class LatencyLink(MavsdkAutopilot):
     def __init__(self, device: AutopilotDevice, clock: Clock) -> None:
         super().__init__(device, clock)
         self._now = clock
-        self._heard: deque[tuple[float, str, str]] = deque()
+        self._keep_flight_state = self._readers[messages.HIGHRES_IMU_ID]
         self._asked_ns: set[int] = set()
         self._asking: asyncio.Task[None] | None = None
         self.syncs: list[Sync] = []
@@ -62,8 +65,8 @@ class LatencyLink(MavsdkAutopilot):
         """
         await super().__aenter__()
         try:
-            self._direct.subscribe_message("HIGHRES_IMU", self._on_message)
-            self._direct.subscribe_message("TIMESYNC", self._on_message)
+            self._readers[messages.HIGHRES_IMU_ID] = self._on_imu
+            self._readers[_TIMESYNC_ID] = self._on_sync
             self._asking = asyncio.create_task(self._ask_clock(), name="timesync")
             await self._first_answers()
         except BaseException:
@@ -82,7 +85,6 @@ class LatencyLink(MavsdkAutopilot):
 
     def imu(self, last_s: float = math.inf) -> list[ImuAt]:
         """Return all samples so far on the companion's clock, or those of the last `last_s`."""
-        self._read()
         offsets = _Offsets(self.syncs)
         found: list[ImuAt] = []
         from_s = self._raw[-1][1] - last_s if self._raw else 0.0
@@ -95,22 +97,19 @@ class LatencyLink(MavsdkAutopilot):
 
     def imu_age_s(self) -> float | None:
         """Return the median time from a sample to the arrival of its message; None if none arrived."""
-        self._read()
         offsets = _Offsets(self.syncs)
         ages = [arrived_s - (px4_s - offsets.at(px4_s)) for arrived_s, px4_s, _ in self._raw]
         return statistics.median(ages) if ages else None
 
     def round_trip_s(self) -> float:
         """Return the median round trip of TIMESYNC."""
-        self._read()
         return statistics.median(sync.round_trip_s for sync in self.syncs)
 
     async def _first_answers(self) -> None:
         try:
             async with asyncio.timeout(_SYNC_DEADLINE_S):
-                while len(self.syncs) < _SYNC_MIN or not self._raw:
+                while len(self.syncs) < _SYNC_MIN or not self._raw:  # noqa: ASYNC110 - read from the link by its own timer
                     await asyncio.sleep(SYNC_PERIOD_S)
-                    self._read()
         except TimeoutError:
             what = "an answer to TIMESYNC" if len(self.syncs) < _SYNC_MIN else "HIGHRES_IMU"
             raise DeviceError(
@@ -122,24 +121,17 @@ class LatencyLink(MavsdkAutopilot):
         while True:
             asked_ns = int(self._now() * 1e9)
             self._asked_ns.add(asked_ns)
-            self._send("TIMESYNC", json.dumps({"tc1": 0, "ts1": asked_ns}))
+            self._send_message(_TIMESYNC_ID, _TIMESYNC.pack(0, asked_ns))
             await asyncio.sleep(SYNC_PERIOD_S)
 
-    def _on_message(self, message: Any, _: Any) -> None:
-        """Time-stamp and store a message; runs in an MAVSDK thread."""
-        self._heard.append((self._now(), message.message_name, message.fields_json))
+    def _on_imu(self, arrived_s: float, payload: bytes) -> None:
+        self._keep_flight_state(arrived_s, payload)
+        time_us, xa, ya, za, xg, yg, zg = _IMU.unpack_from(payload.ljust(_IMU.size, b"\0"))
+        sample = ImuAt(0.0, flu_from_frd((xa, ya, za)), flu_from_frd((xg, yg, zg)))
+        self._raw.append((arrived_s, 1e-6 * time_us, sample))
 
-    def _read(self) -> None:
-        while self._heard:
-            arrived_s, name, text = self._heard.popleft()
-            fields = json.loads(text)
-            if name == "TIMESYNC":
-                self._take_sync(arrived_s, int(fields["tc1"]), int(fields["ts1"]))
-            elif name == "HIGHRES_IMU":
-                force = flu_from_frd((float(fields["xacc"]), float(fields["yacc"]), float(fields["zacc"])))
-                rate = flu_from_frd((float(fields["xgyro"]), float(fields["ygyro"]), float(fields["zgyro"])))
-                px4_s = 1e-6 * int(fields["time_usec"])
-                self._raw.append((arrived_s, px4_s, ImuAt(0.0, force, rate)))
+    def _on_sync(self, arrived_s: float, payload: bytes) -> None:
+        self._take_sync(arrived_s, *_TIMESYNC.unpack_from(payload.ljust(_TIMESYNC.size, b"\0")))
 
     def _take_sync(self, arrived_s: float, px4_ns: int, asked_ns: int) -> None:
         if px4_ns == 0 or asked_ns not in self._asked_ns:

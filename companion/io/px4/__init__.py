@@ -1,3 +1,4 @@
-"""PX4 through MAVSDK. `driver` implements `companion.io.protocols.Autopilot` with the other modules: `link` opens the connection,
-`inbox` receives telemetry, `requests` paces commands, `setpoints` sends attitude setpoints and `params` accesses parameters.
+"""PX4 through MAVSDK, on a link of our own. `driver` implements `companion.io.protocols.Autopilot` with the other modules: `wire`
+transports bytes, `frames` and `messages` convert them, `link` and `claim` open the link, `inbox` keeps telemetry, `requests` paces
+commands, `setpoints` sends attitude setpoints and `params` accesses parameters.
 """

@@ -1,27 +1,21 @@
-"""Exclusive use of the link to PX4: only this process holds the local end, and only the address verified as PX4's is the remote end."""
+"""Exclusive use of a UDP link to PX4: only this process has the local end, and only PX4's verified address is the remote end."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
-import fcntl
-import os
 import socket
 from collections.abc import AsyncIterator
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.io.px4.frames import autopilot_heartbeat
 from companion.io.px4.link import (
     bind_alone,
     device_error,
     no_heartbeat,
     parse_address,
-    pin_new_udp,
-    udp_sockets,
 )
-from companion.io.px4.udp_peer import REPIN_SILENCE_S
-from companion.io.qgroundcontrol.frames import autopilot_heartbeat
 
 Peer = tuple[str, int]
 """IPv4 address and UDP port."""
@@ -33,14 +27,11 @@ _CALL_PERIOD_S = 1.0
 
 
 class LinkClaim:
-    """This process's hold on a link, besides MAVSDK's own descriptor.
+    """This process's hold on a link, besides the wire that carries the data.
 
-    A serial port is locked with flock on the device itself, so that the lock applies under every name of the device and pyserial's
-    `exclusive` mode conflicts with it. A `udpin` port is bound without SO_REUSEADDR and only then shared with MAVSDK, which sets
-    that option and would join any program on the port. MAVSDK's socket is connected to PX4's address once that is verified; from
-    then on the kernel delivers datagrams of all other senders to the socket held here. When PX4 is silent for REPIN_SILENCE_S and
-    another port of the same IPv4 address sends a HEARTBEAT with PX4's system id, MAVSDK's socket is connected to that port, because
-    a restarted router sends from a new one.
+    A `udpin` port is bound without SO_REUSEADDR, so that no other program has it, and only then shared with the wire. The wire is
+    connected to PX4's address once that is verified; from then on the kernel delivers datagrams of all other senders to the socket
+    held here.
 
     Args:
         address: as in `devices.autopilot.address`, checked.
@@ -52,20 +43,14 @@ class LinkClaim:
     def __init__(self, address: str) -> None:
         self._address = address
         self._parts = parse_address(address)
-        self._lock: int | None = None
         self._port: socket.socket | None = None
-        self._mavsdk: socket.socket | None = None
-        self._moved: str | None = None
         self._rivals: set[Peer] = set()
         self._reported = 0
         self._system = 0
         self._armed = False
-        self._before: frozenset[int] = frozenset()
         self.peer: Peer | None = None
         """PX4's UDP address; None before it is verified, and on TCP and serial links, which have one peer."""
-        if self._parts.serial:
-            self._lock = _lock(address, self._parts.host)
-        elif self._parts.kind == "udpin":
+        if self._parts.kind == "udpin":
             self._port = bind_alone(address, self._parts.host, self._parts.port, socket.SOCK_DGRAM)
             self._port.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._port.setblocking(False)
@@ -78,9 +63,8 @@ class LinkClaim:
             DeviceError: no HEARTBEAT within `timeout_s`, or HEARTBEATs from two addresses while PX4 is not armed.
         """
         if self._parts.kind == "udpout":
-            with contextlib.suppress(OSError):  # MAVSDK reports a host name that does not resolve
+            with contextlib.suppress(OSError):  # opening the wire reports a host name that does not resolve
                 self.peer = (socket.gethostbyname(self._parts.host), self._parts.port)
-        self._before = frozenset(udp_sockets())
         if self._port is None:
             return
         loop = asyncio.get_running_loop()
@@ -97,7 +81,7 @@ class LinkClaim:
         """While the context is open, send PX4 a HEARTBEAT from the port of a `udpin` link every second until MAVSDK has received
         one from PX4.
 
-        PX4 on Ethernet may broadcast until it has received a partner's message (MAV_x_BROADCAST), and MAVSDK's connected socket
+        PX4 on Ethernet may broadcast until it has received a partner's message (MAV_x_BROADCAST), and the wire's connected socket
         receives no broadcasts. Several HEARTBEATs are needed, because PX4 accepts no partner in the first 3 s after it has opened
         its port.
 
@@ -111,26 +95,6 @@ class LinkClaim:
             calls.cancel()
             await asyncio.wait([calls])  # the port may be closed next, and so may the event loop
 
-    def pin(self) -> int:
-        """Connect the UDP socket that MAVSDK opened since `find_px4` to PX4's address; return its local port, or 0 if the link is not
-        UDP.
-
-        Raises:
-            DeviceError: /proc does not show the socket.
-        """
-        if self.peer is None:
-            return 0
-        try:
-            twin, port = pin_new_udp(self._before, self.peer)
-            if self._port is None:
-                twin.close()
-            else:
-                self._mavsdk = twin
-            return port
-        except OSError as error:
-            found = error.strerror or str(error)
-            raise device_error(self._address, "MAVSDK's socket in /proc", found, "mount /proc") from None
-
     def refuse_rivals(self) -> None:
         """Reject a second sender that has claimed to be PX4. If PX4 was found armed, and so may be in the air, `take_rival` handles
         such senders instead.
@@ -138,28 +102,21 @@ class LinkClaim:
         Raises:
             DeviceError: there is such a sender, and PX4 was found disarmed.
         """
-        self._drain(silent=False)
+        for _ in range(_DRAIN_DATAGRAMS):
+            if not self._read_one():
+                break
         if self._rivals and not self._armed:
             found = f"{_text(self.peer)} and {', '.join(sorted(map(_text, self._rivals)))}"
             fix = "stop the other sender, or use a link of PX4's own (serial, or a port that only PX4 sends to)"
             raise device_error(self._address, f"PX4 (system {self._system}) at one address", found, fix)
 
-    def take_rival(self, silent_s: float) -> str | None:
-        """Read one datagram from another sender, or all of them while PX4 is silent. Never waits.
-
-        Args:
-            silent_s: time since the newest message of PX4.
+    def take_rival(self) -> str | None:
+        """Read one datagram from another sender. Never waits.
 
         Returns:
-            A line for the log if a new sender claims to be PX4, or if PX4 is received at another port from now on.
+            A line for the log if a new sender claims to be PX4.
         """
-        if silent_s > REPIN_SILENCE_S:
-            self._drain(silent=True)
-            if self._moved is not None:
-                moved, self._moved = self._moved, None
-                return moved
-        else:
-            self._read_one()
+        self._read_one()
         if len(self._rivals) == self._reported:
             return None
         self._reported = len(self._rivals)
@@ -167,50 +124,20 @@ class LinkClaim:
         return f"{newest} claims to be PX4 (system {self._system}), which is at {_text(self.peer)}; ignored"
 
     def close(self) -> None:
-        """Release the port. MAVSDK's descriptor must be closed first."""
-        if self._mavsdk is not None:
-            self._mavsdk.close()
-            self._mavsdk = None
+        """Release the port."""
         if self._port is not None:
             self._port.close()
             self._port = None
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
 
-    def _drain(self, *, silent: bool) -> None:
-        for _ in range(_DRAIN_DATAGRAMS):
-            if self._moved is not None or not self._read_one(silent):
-                break
-
-    def _read_one(self, silent: bool = False) -> bool:
+    def _read_one(self) -> bool:
         if self._port is None:
             return False
         try:
-            datagram, sender = self._port.recvfrom(_DATAGRAM_MAX_BYTES)
-            if not (silent and self._repin(datagram, sender)):
-                self._hear(datagram, sender)
+            self._hear(*self._port.recvfrom(_DATAGRAM_MAX_BYTES))
         except BlockingIOError:
             return False
         except OSError:  # an ICMP error: nothing was read, but more may be waiting
             return True
-        return True
-
-    def _repin(self, datagram: bytes, sender: Peer) -> bool:
-        """Return whether the datagram shows PX4 at another port of its address; MAVSDK then receives from that port only."""
-        if self._mavsdk is None or self.peer is None or sender == self.peer or sender[0] != self.peer[0]:
-            return False
-        heard = autopilot_heartbeat(datagram)
-        if heard is None or heard.system != self._system:
-            return False
-        self._mavsdk.connect(sender)
-        self._moved = (
-            f"PX4 (system {self._system}) was silent at {_text(self.peer)} for {REPIN_SILENCE_S:g} s and is heard at {_text(sender)}; "
-            "messages are now accepted from there only"
-        )
-        self.peer = sender
-        self._rivals.discard(sender)
-        self._reported = len(self._rivals)
         return True
 
     def _hear(self, datagram: bytes, sender: Peer) -> None:
@@ -233,24 +160,6 @@ class LinkClaim:
             with contextlib.suppress(OSError):  # no route at this moment; the next datagram may get through
                 self._port.sendto(data, self.peer)
             await asyncio.sleep(_CALL_PERIOD_S)
-
-
-def _lock(address: str, path: str) -> int:
-    """Lock a serial port and return the descriptor that holds the lock. No child process inherits it."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY)
-    except OSError as error:
-        fix = "check the cable and that no other program holds it"
-        raise device_error(address, f"to open {path}", error.strerror or str(error), fix) from None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(descriptor)
-        busy = error.errno in (errno.EWOULDBLOCK, errno.EACCES)
-        found = "another program on it" if busy else error.strerror or str(error)
-        fix = f"stop that program (another companion? `fuser {path}` names it)"
-        raise device_error(address, f"the serial port {path} to be free", found, fix) from None
-    return descriptor
 
 
 def _text(peer: Peer | None) -> str:

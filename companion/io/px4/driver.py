@@ -1,7 +1,9 @@
-"""Driver of PX4 that uses MAVSDK's native binding.
+"""Driver of PX4: MAVSDK's native binding on a link that the driver itself reads and writes.
 
-MAVSDK's callbacks run in C++ threads and only store the newest values; frames are converted when the flight loop reads them. The hot
-path (`send_attitude`, `send_vision`) is one synchronous native call each.
+MAVSDK makes JSON of every message and calls Python from its own threads, which costs more than all else that a tick does with PX4. So
+the link is the driver's (`companion.io.px4.wire`): once per tick it reads what has arrived, decodes the streams of the vehicle's
+state, and passes everything else to MAVSDK, whose `raw://` connection returns what is to be sent. Setpoints and poses are written
+straight onto the link. Decision 14 (docs/decisions) gives the figures.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import socket
 import time
 from collections.abc import Callable, Iterable
 from types import TracebackType
@@ -17,7 +20,6 @@ from typing import Any, Self
 from mavsdk import ComponentType, Configuration, Mavsdk, MavsdkError
 from mavsdk.plugins.info.info import Info
 from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkDirectResult, MavlinkMessage
-from mavsdk.plugins.mocap.mocap import AngleBody, Covariance, Mocap, PositionBody, VisionPositionEstimate
 from mavsdk.plugins.param.param import Param
 from mavsdk.plugins.telemetry.telemetry import Telemetry
 
@@ -26,20 +28,14 @@ from companion.io.protocols import DeviceError
 from companion.io.px4 import messages
 from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls
 from companion.io.px4.claim import LinkClaim
+from companion.io.px4.frames import FrameReader, FrameWriter
 from companion.io.px4.inbox import ESTIMATOR_RATE_HZ, Inbox, ask_for_streams, stop_unread_streams
-from companion.io.px4.link import (
-    add_connection,
-    check_address,
-    device_error,
-    first_autopilot,
-    pin_new_udp,
-    quiet_native_log,
-    udp_sockets,
-)
+from companion.io.px4.link import check_address, device_error, first_autopilot, open_link, quiet_native_log
 from companion.io.px4.origin import ensure_origin
 from companion.io.px4.params import ParamTransfer
 from companion.io.px4.requests import SENT_ONCE, RequestQueue
 from companion.io.px4.setpoints import SetpointPath, setpoint_path
+from companion.io.px4.wire import OpenWire, UdpWire
 from companion.model.estimator import EstimatorReport
 from companion.model.observations import StateCounts
 from companion.model.types import (
@@ -56,8 +52,10 @@ _CONNECT_DEADLINE_S = 5.0
 _HEARTBEAT_DEADLINE_S = 5.0
 """Deadline for PX4's heartbeat, which is sent once per second."""
 _CLOSE_DEADLINE_S = 4.0
-# One NaN makes PX4 use EKF2_EVP_NOISE and EKF2_EVA_NOISE instead of a covariance.
-_COVARIANCE_FROM_PARAMS = Covariance([float("nan")])
+_PUMP_S, _PUMP_IN_FLIGHT_S = 0.005, 0.05
+"""Period at which the link is read while the flight loop does not read it, as at start-up, and at which that is checked otherwise."""
+_RELAY_DATAGRAMS_MAX = 16
+_DATAGRAM_MAX_BYTES = 65535
 
 _log = logging.getLogger(__name__)
 
@@ -91,18 +89,23 @@ class MavsdkAutopilot:
         self._calls = NativeCalls(device.address)
         self._mavsdk: Any = None
         self._connection: Any = None
-        self._second: Any = None
+        self._wire: OpenWire | None = None
+        self._reader = FrameReader(stream=False)
+        self._writer = FrameWriter(0, 0)
+        self._readers = self._inbox.readers
+        self._relay: socket.socket | None = None
+        self._pump_timer: asyncio.TimerHandle | None = None
+        self._polled_s = 0.0
         self._restore_log: Callable[[], None] | None = None
         self._direct: Any = None
         self._setpoints: SetpointPath | None = None
-        self._mocap: Any = None
         self._info: Any = None
         self._params: ParamTransfer | None = None
         self._open = False
         self._loop: asyncio.AbstractEventLoop | None = None
         self._system_id = 0
         self._own_ids = (0, 0)
-        self._local_port = 0
+        self._reports: list[str] = []
         self._claim: LinkClaim | None = None
 
     async def __aenter__(self) -> Self:
@@ -119,19 +122,24 @@ class MavsdkAutopilot:
             configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
             self._own_ids = (int(configuration.system_id), int(configuration.component_id))
             self._mavsdk = Mavsdk(configuration)
+            self._connection = self._mavsdk.add_any_connection_with_handle("raw://")
+            self._mavsdk.subscribe_raw_bytes_to_be_sent(self._send_for_mavsdk)
             self._claim = claim = LinkClaim(address)
             await claim.find_px4(self._device.discovery_timeout_s)
-            self._connection = await self._calls.run(
-                *("the connection to open", _CONNECT_DEADLINE_S, add_connection),
-                *(self._mavsdk, address, self._forwarding),
+            self._writer = FrameWriter(*self._own_ids)
+            self._reader = FrameReader(stream=claim.peer is None)
+            self._wire = await self._calls.run(
+                *("the connection to open", _CONNECT_DEADLINE_S, open_link),
+                *(address, claim.peer, self._clock, self._reports.append),
             )
-            self._local_port = claim.pin()
+            self._pump()
             async with claim.calling(self._own_ids):
                 system = await first_autopilot(self._mavsdk, address, self._device.discovery_timeout_s)
             self._system_id = int(system.get_system_id())
+            if isinstance(self._wire, UdpWire):
+                self._wire.system = self._system_id
             self._direct = MavlinkDirect(system)
-            self._setpoints = setpoint_path(self._device.setpoint_path, system, self._direct)
-            self._mocap = Mocap(system)
+            self._setpoints = setpoint_path(self._device.setpoint_path, system, self._send_message)
             telemetry = Telemetry(system)
             self._params = ParamTransfer(
                 address, self._clock, self._calls, self._direct, Param(system), self._system_id
@@ -160,44 +168,31 @@ class MavsdkAutopilot:
 
     def identity(self) -> LinkIdentity:
         """Return the ids of both ends of the open link."""
-        peer = self._claim.peer if self._claim is not None else None
-        own_system, own_component = self._own_ids
+        wire, (own_system, own_component) = self._wire, self._own_ids
         return LinkIdentity(
             autopilot_system=self._system_id,
             own_system=own_system,
             own_component=own_component,
-            local_port=self._local_port,
-            peer=peer,
+            local_port=wire.local_port if wire is not None else 0,
+            peer=wire.remote if wire is not None else None,
         )
 
-    async def forward_to(self, port: int) -> int:
-        """Forward MAVLink between PX4 and the local UDP port `port`. Return the local port from which MAVSDK sends.
-
-        MAVSDK trusts messages from that connection as it trusts PX4's: only the relay (`companion.io.qgroundcontrol.relay`) may be at
-        the other end, and all other senders are ignored.
-
-        Raises:
-            DeviceError: the connection cannot be opened, or cannot be restricted to that one peer.
+    def forward_to(self, port: int) -> int:
+        """Forward MAVLink between PX4 and a local UDP port, that of the relay (`companion.io.qgroundcontrol.relay`). Return the local
+        port from which it is sent; datagrams of all other senders are ignored.
         """
         self._require_open()
-        assert self._forwarding, "a driver made without forwarding"
-        address = f"udpout://127.0.0.1:{port}"
-        before = frozenset(udp_sockets())
-        expected = "the connection for forwarding to open"
-        self._second = await self._calls.run(expected, _CONNECT_DEADLINE_S, add_connection, self._mavsdk, address, True)
-        try:
-            twin, own_port = pin_new_udp(before, ("127.0.0.1", port))
-            twin.close()
-            return own_port
-        except OSError as error:
-            self._drop_second()
-            fix = "mount /proc, or fly without ground.qgroundcontrol"
-            raise device_error(address, "MAVSDK's socket in /proc", error.strerror or str(error), fix) from None
+        self._relay = relay = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        relay.setblocking(False)
+        relay.bind(("127.0.0.1", 0))
+        relay.connect(("127.0.0.1", port))
+        return int(relay.getsockname()[1])
 
     def vehicle(self) -> VehicleState | None:
-        """Return the latest fused state, or None before position, attitude, rates and IMU have all arrived. Stamps are arrival
-        times.
+        """Read the link, then return the latest fused state, or None before position, attitude, rates and IMU have all arrived. Stamps
+        are arrival times.
         """
+        self._poll()
         return self._inbox.vehicle()
 
     def status(self) -> AutopilotStatus | None:
@@ -228,27 +223,15 @@ class MavsdkAutopilot:
         return self._setpoints.send(setpoint, self._clock())
 
     def send_vision(self, pose: MocapPose) -> bool:
-        """Send VISION_POSITION_ESTIMATE at once. Return False if the link is closed or MAVSDK rejected it.
+        """Send VISION_POSITION_ESTIMATE at once. Return False if the link is closed.
 
         Raises:
             ValueError: the pose is not finite.
         """
-        position_ned_m, (roll_rad, pitch_rad, yaw_rad) = messages.vision_ned(pose)
+        payload = messages.vision_position_estimate(pose)
         if not self._open:
             return False
-        estimate = VisionPositionEstimate(
-            # Without TIMESYNC, which PX4 1.16 does not accept from MAVSDK, PX4 stamps on arrival (and subtracts
-            # EKF2_EV_DELAY); the companion's own clock is what a log reader can use. MAVSDK would replace 0.
-            time_usec=max(1, int(pose.stamp_s * 1e6)),
-            position_body=PositionBody(*position_ned_m),
-            angle_body=AngleBody(roll_rad, pitch_rad, yaw_rad),
-            pose_covariance=_COVARIANCE_FROM_PARAMS,
-        )
-        try:
-            self._mocap.set_vision_position_estimate(estimate)
-        except MavsdkError as error:
-            _log.debug("VISION_POSITION_ESTIMATE not sent: %s", error)
-            return False
+        self._send_message(messages.VISION_POSITION_ESTIMATE_ID, payload)
         return True
 
     def request(self, request: AutopilotRequest) -> None:
@@ -282,7 +265,10 @@ class MavsdkAutopilot:
         sender that claims to be PX4.
         """
         texts = self._requests.take_messages(self._clock())
-        rival = self._claim.take_rival(self._inbox.silent_s()) if self._claim is not None else None
+        if self._reports:
+            texts += self._reports
+            self._reports.clear()
+        rival = self._claim.take_rival() if self._claim is not None else None
         return texts if rival is None else [*texts, rival]
 
     async def read_params(self, names: Iterable[str]) -> dict[str, float | int]:
@@ -385,21 +371,68 @@ class MavsdkAutopilot:
             return False
         return True
 
+    def _pump(self) -> None:
+        """Read the link regularly while the flight loop does not."""
+        assert self._loop is not None
+        idle = self._clock() - self._polled_s > 1.5 * _PUMP_S
+        if idle:
+            self._poll()
+        self._pump_timer = self._loop.call_later(_PUMP_S if idle else _PUMP_IN_FLIGHT_S, self._pump)
+
+    def _poll(self) -> None:
+        """Read what has arrived: decode the vehicle's state, and pass everything else to MAVSDK."""
+        self._polled_s = self._clock()
+        if self._wire is None:
+            return
+        others: list[bytes] = []
+        for arrived_s, data in self._wire.receive():
+            forwarded: list[bytes] = []
+            for message_id, system, component, payload, frame in self._reader.read(data):
+                read = self._readers.get(message_id)
+                forwarded.append(frame)
+                if read is None or system != self._system_id or component != messages.MAV_COMP_ID_AUTOPILOT1:
+                    others.append(frame)
+                else:
+                    read(arrived_s, payload)
+            if self._relay is not None and forwarded:
+                with contextlib.suppress(OSError):  # the relay does not keep up or has ended: lost, as on any link
+                    self._relay.send(b"".join(forwarded))
+        if others:
+            self._mavsdk.pass_received_raw_bytes(b"".join(others))
+        if self._relay is not None:
+            self._send_for_relay(self._relay)
+
+    def _send_for_relay(self, relay: socket.socket) -> None:
+        assert self._wire is not None
+        for _ in range(_RELAY_DATAGRAMS_MAX):
+            try:
+                self._wire.send(relay.recv(_DATAGRAM_MAX_BYTES))
+            except OSError:  # nothing more, or an ICMP error of an earlier send
+                return
+
+    def _send_message(self, message_id: int, payload: bytes) -> None:
+        if self._wire is not None:
+            self._wire.send(self._writer.frame(message_id, payload))
+
+    def _send_for_mavsdk(self, data: bytes, *_: Any) -> None:
+        """Send what MAVSDK sends, in a thread of MAVSDK."""
+        wire = self._wire
+        if wire is not None:
+            wire.send(self._writer.numbered(bytes(data)))
+
     async def _close(self) -> None:
         self._open = False
+        if self._pump_timer is not None:
+            self._pump_timer.cancel()
+        wire, self._wire = self._wire, None
+        for held in (wire, self._relay, self._claim):  # from here on nothing can leave
+            if held is not None:
+                held.close()
         if self._connection is not None:
-            self._mavsdk.remove_connection(self._connection)  # takes 0.2 ms; from here on nothing can leave
+            self._mavsdk.remove_connection(self._connection)
             self._connection = None
-        self._drop_second()
-        if self._claim is not None:
-            self._claim.close()
         # Shielded: a second Ctrl-C must not leave MAVSDK half destroyed.
         await asyncio.shield(asyncio.get_running_loop().run_in_executor(None, self._tear_down))
-
-    def _drop_second(self) -> None:
-        if self._second is not None:
-            self._mavsdk.remove_connection(self._second)
-            self._second = None
 
     def _tear_down(self) -> None:
         deadline_s = time.monotonic() + _CLOSE_DEADLINE_S

@@ -1,10 +1,13 @@
-"""Telemetry of PX4: MAVSDK's threads store the newest message of each kind, and the flight loop reads them as records."""
+"""Telemetry of PX4: the newest message of each kind, which the flight loop reads as records.
+
+The three streams of the vehicle's state are decoded from the link in the flight loop itself; all other messages come from MAVSDK's
+threads.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import json
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -23,7 +26,6 @@ from companion.model.frames import flu_from_frd
 from companion.model.observations import StateCounts
 from companion.model.types import AutopilotStatus, FlightMode, Quat, Vec3, VehicleState
 from companion.runtime.clock import Clock
-from companion.runtime.native_threads import keep_interpreter_state
 
 POSITION_RATE_HZ = 200.0
 """Requested rate of LOCAL_POSITION_NED; PX4 delivers about 124 Hz."""
@@ -35,8 +37,8 @@ ESTIMATOR_RATE_HZ = 5.0
 
 
 class Inbox:
-    """Store for PX4's messages. MAVSDK's threads write it, one assignment per message. A tuple is replaced as a whole, so a reader
-    never sees a partial update.
+    """Store for PX4's messages. MAVSDK's threads write it as well, one assignment per message. A tuple is replaced as a whole, so a
+    reader never sees a partial update.
     """
 
     def __init__(self, clock: Clock, requests: RequestQueue, after_heartbeat: Callable[[], None]) -> None:
@@ -61,14 +63,7 @@ class Inbox:
         self._estimator_report: EstimatorReport | None = None
 
     def subscribe(self, telemetry: Telemetry, direct: MavlinkDirect) -> None:
-        """Subscribe to PX4's messages; every one that arrives is stored from then on.
-
-        The fast ones come through MavlinkDirect, as JSON, which MAVSDK makes of every message whether it is read or not. The Telemetry
-        plugin would call twice per ATTITUDE_QUATERNION: 780 calls into Python per second instead of 570.
-        """
-        direct.subscribe_message("LOCAL_POSITION_NED", self._on_position)
-        direct.subscribe_message("ATTITUDE_QUATERNION", self._on_attitude)
-        direct.subscribe_message("HIGHRES_IMU", self._on_imu)
+        """Subscribe to the messages that come through MAVSDK; every one that arrives is stored from then on."""
         self._telemetry = telemetry  # MAVSDK's plugin ends its subscriptions when it is garbage-collected
         telemetry.subscribe_landed_state(self._on_landed)
         telemetry.subscribe_battery(self._on_battery)
@@ -130,38 +125,38 @@ class Inbox:
             self._estimator_report = messages.estimator_report(json.loads(newest[1]), newest[0])
         return self._estimator_report
 
-    def silent_s(self) -> float:
-        """Return the time since the newest message of PX4, s; infinite before the first."""
-        newest = (self._attitude, self._imu, self._position, self._heartbeat)
-        return self._clock() - max((message[0] for message in newest if message is not None), default=-math.inf)
-
     def counts(self) -> StateCounts:
         """Return the number of state messages since the link was opened."""
         return StateCounts(self._positions, self._attitudes, self._imus)
 
-    # Callbacks: C++ threads, one message type in one thread. Each makes one assignment, and one more for a count or a
-    # sum.
+    @property
+    def readers(self) -> dict[int, Callable[[float, bytes], None]]:
+        """Return what stores each stream of the vehicle's state, by message id; to be called with arrival and payload of a message of
+        the autopilot.
+        """
+        return {
+            messages.LOCAL_POSITION_NED_ID: self._on_position,
+            messages.ATTITUDE_QUATERNION_ID: self._on_attitude,
+            messages.HIGHRES_IMU_ID: self._on_imu,
+        }
 
-    def _on_position(self, message: Any, _: Any) -> None:
-        if message.component_id == messages.MAV_COMP_ID_AUTOPILOT1:
-            self._position = (self._clock(), *messages.local_position_ned(message.fields_json))
-            self._positions += 1
+    def _on_position(self, stamp_s: float, payload: bytes) -> None:
+        self._position = (stamp_s, *messages.local_position_ned(payload))
+        self._positions += 1
 
-    def _on_attitude(self, message: Any, _: Any) -> None:
-        if message.component_id == messages.MAV_COMP_ID_AUTOPILOT1:
-            self._attitude = (self._clock(), *messages.attitude_quaternion(message.fields_json))
-            self._attitudes += 1
+    def _on_attitude(self, stamp_s: float, payload: bytes) -> None:
+        self._attitude = (stamp_s, *messages.attitude_quaternion(payload))
+        self._attitudes += 1
 
-    def _on_imu(self, message: Any, _: Any) -> None:
-        keep_interpreter_state()
-        if message.component_id != messages.MAV_COMP_ID_AUTOPILOT1:
-            return
-        force_m_s2, boot_s = messages.highres_imu(message.fields_json)
+    def _on_imu(self, stamp_s: float, payload: bytes) -> None:
+        force_m_s2, boot_s = messages.highres_imu(payload)
         total = self._delta_velocity_frd
         if boot_s is not None:
             total.add(boot_s, force_m_s2)
-        self._imu = (self._clock(), force_m_s2, total.boot_s, total.sum_m_s, total.gaps)
+        self._imu = (stamp_s, force_m_s2, total.boot_s, total.sum_m_s, total.gaps)
         self._imus += 1
+
+    # Callbacks of MAVSDK: C++ threads, one message type in one thread.
 
     def _on_landed(self, value: Any, _: Any) -> None:
         self._landed = int(value)

@@ -1,4 +1,4 @@
-"""Opens MAVSDK's connection to PX4; every failure is reported in one line."""
+"""Opens the link to PX4; every failure is reported in one line."""
 
 from __future__ import annotations
 
@@ -10,20 +10,19 @@ import re
 import socket
 import stat
 import threading
-from collections.abc import Callable, Container
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from mavsdk import Autopilot as AutopilotKind
-from mavsdk import ConnectionResult, Mavsdk, log_subscribe, log_unsubscribe
-from mavsdk.exceptions import ConnectionError as MavsdkConnectionError
-from mavsdk.mavsdk import ForwardingOption
+from mavsdk import Mavsdk, log_subscribe, log_unsubscribe
 
 from companion.io.protocols import DeviceError
+from companion.io.px4.wire import OpenWire, open_wire
+from companion.runtime.clock import Clock
 
 _ADDRESS = re.compile(
-    r"(?P<net>udpin|udpout|tcpin|tcpout)://(?P<host>[^:/?]+):(?P<port>\d+)"
+    r"(?P<net>udpin|udpout|tcpout)://(?P<host>[^:/?]+):(?P<port>\d+)"
     r"|(?P<serial>serial|serial_flowcontrol)://(?P<path>/[^:]+):(?P<baud>\d+)"
 )
 _FORMS = "udpin://0.0.0.0:14540, udpout://HOST:PORT, tcpout://HOST:PORT or serial:///dev/ttyAMA0:921600"
@@ -61,8 +60,6 @@ def check_address(address: str) -> None:
     port = int(match["port"])
     if not 0 < port <= 65535:
         raise device_error(address, "a port from 1 to 65535", str(port), "correct devices.autopilot.address")
-    if match["net"] == "tcpin":
-        bind_alone(address, match["host"], port, socket.SOCK_STREAM).close()
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +67,7 @@ class AddressParts:
     """Parts of an address."""
 
     kind: str
-    """udpin, udpout, tcpin, tcpout, serial or serial_flowcontrol."""
+    """udpin, udpout, tcpout, serial or serial_flowcontrol."""
     host: str
     """Host, or the path of the device on a serial link."""
     port: int
@@ -128,27 +125,29 @@ def bind_alone(address: str, host: str, port: int, kind: socket.SocketKind) -> s
     return bound
 
 
-def add_connection(mavsdk: Mavsdk, address: str, forwarding: bool = False) -> Any:
-    """Open the connection and return the handle for `Mavsdk.remove_connection`. Blocks while a TCP connection is made.
+def open_link(address: str, peer: tuple[str, int] | None, clock: Clock, report: Callable[[str], None]) -> OpenWire:
+    """Return the open wire to PX4; its port is the claim's (`companion.io.px4.claim`). Blocks while a TCP connection is made.
 
     Args:
-        mavsdk: the instance.
         address: checked address.
-        forwarding: whether messages are forwarded to and from the other connections that forward.
+        peer: PX4's verified UDP address.
+        clock: the flight clock.
+        report: called with a line when PX4 is received at another port.
 
     Raises:
-        DeviceError: MAVSDK could not open it.
+        DeviceError: it could not be opened.
     """
     try:
-        option = ForwardingOption.ON if forwarding else ForwardingOption.OFF
-        return mavsdk.add_any_connection_with_handle_and_forwarding(address, option)
-    except MavsdkConnectionError as error:
-        found = str(error).removeprefix("Connection failed: ").lower().replace("_", " ")
-        if ConnectionResult.BAUDRATE_UNKNOWN.name in str(error):
-            fix = "use a baud rate that the port supports, 921600 for PX4's TELEM2"
+        return open_wire(address, 0, peer, clock, share_port=True, report=report)
+    except OSError as error:
+        parts = parse_address(address)
+        if parts.serial and error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+            fix = f"stop that program (another companion? `fuser {parts.host}` names it)"
+            expected, found = f"the serial port {parts.host} to be free", "another program on it"
         else:
-            fix = "check the cable and the address, and that no other program holds it"
-        raise device_error(address, "to open the connection", found, fix) from None
+            expected, found = "to open the connection", error.strerror or str(error)
+            fix = "check the cable and the address, and use a baud rate that the port supports, 921600 for PX4's TELEM2"
+        raise device_error(address, expected, found, fix) from None
 
 
 async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any:
@@ -179,64 +178,6 @@ async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any
     if kind != AutopilotKind.PX4:
         raise device_error(address, "PX4", kind.name, "connect a PX4 autopilot; companion supports no other autopilot")
     return system
-
-
-@dataclass(frozen=True, slots=True)
-class UdpSocket:
-    """A UDP (IPv4) socket of this process."""
-
-    descriptor: int
-    port: int
-
-
-def udp_sockets() -> dict[int, UdpSocket]:
-    """Return the UDP (IPv4) sockets of this process by inode; empty if /proc does not show them."""
-    try:
-        own = {link: int(name) for name in os.listdir("/proc/self/fd") if (link := _link_of(name)) is not None}
-        table = Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]
-    except OSError:
-        return {}
-    rows = (line.split() for line in table)
-    return {
-        int(row[9]): UdpSocket(own[link], int(row[1].rpartition(":")[2], 16))
-        for row in rows
-        if (link := f"socket:[{row[9]}]") in own
-    }
-
-
-def pin_new_udp(before: Container[int], peer: tuple[str, int]) -> tuple[socket.socket, int]:
-    """Connect the one UDP socket that MAVSDK has opened since to `peer`: the kernel then drops datagrams of all other senders.
-
-    MAVSDK itself accepts messages from every sender, on a `udpout` connection as well.
-
-    Args:
-        before: inodes of `udp_sockets` before MAVSDK opened the connection.
-        peer: IPv4 address and port.
-
-    Returns:
-        A second descriptor of the socket, by which it can be connected to another peer, and the socket's local port. The port is
-        free once both descriptors are closed.
-
-    Raises:
-        OSError: the socket is not found, or cannot be connected.
-    """
-    new = [found for inode, found in udp_sockets().items() if inode not in before]
-    if len(new) != 1:
-        raise OSError(errno.ENOENT, f"{len(new)} new sockets")
-    twin = socket.socket(fileno=os.dup(new[0].descriptor))
-    try:
-        twin.connect(peer)
-    except OSError:
-        twin.close()
-        raise
-    return twin, new[0].port
-
-
-def _link_of(descriptor: str) -> str | None:
-    try:
-        return os.readlink(f"/proc/self/fd/{descriptor}")
-    except OSError:  # closed in the meantime
-        return None
 
 
 def _log_native(level: Any, message: str, file: str | None, line: int) -> bool:

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 from collections.abc import Mapping
 from typing import Any
-
-import msgspec
 
 from companion.model.estimator import EstimatorReport
 from companion.model.frames import (
@@ -33,6 +32,8 @@ from companion.model.types import (
     VehicleState,
 )
 
+LOCAL_POSITION_NED_ID, ATTITUDE_QUATERNION_ID, HIGHRES_IMU_ID = 32, 31, 105
+SET_ATTITUDE_TARGET_ID, VISION_POSITION_ESTIMATE_ID = 82, 102
 GPS_GLOBAL_ORIGIN_ID = 49
 ESTIMATOR_STATUS_ID = 230
 UNREAD_IDS = (30, 33, 36, 65, 74, 83, 85, 87, 141, 290, 291, 331)
@@ -52,7 +53,7 @@ MAV_MODE_FLAG_SAFETY_ARMED = 128
 _PX4_MAIN_MODE_AUTO = 4
 _PX4_MAIN_MODE_OFFBOARD = 6
 # Body rates are not commanded: ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE | PITCH | YAW.
-_TYPE_MASK_IGNORE_RATES = 7
+TYPE_MASK_IGNORE_RATES = 7
 _QUAT_NORM_TOLERANCE = 1e-2
 
 # PX4's px4_custom_mode.h. Main modes in which a pilot steers; 9 simple, 11 altitude cruise.
@@ -109,60 +110,26 @@ def flight_mode(base_mode: int, custom_mode: int) -> FlightMode:
     return FlightMode.MANUAL if main in _PX4_PILOT_MAIN_MODES else FlightMode.OTHER
 
 
-class _LocalPosition(msgspec.Struct):
-    x: float | None
-    y: float | None
-    z: float | None
-    vx: float | None
-    vy: float | None
-    vz: float | None
+_LOCAL_POSITION, _ATTITUDE, _IMU = struct.Struct("<I6f"), struct.Struct("<I7f"), struct.Struct("<Q3f")
+_ATTITUDE_TARGET, _VISION = struct.Struct("<I8f3B"), struct.Struct("<Q7f")
 
 
-class _Attitude(msgspec.Struct):
-    time_boot_ms: int
-    q1: float | None
-    q2: float | None
-    q3: float | None
-    q4: float | None
-    rollspeed: float | None
-    pitchspeed: float | None
-    yawspeed: float | None
+def local_position_ned(payload: bytes) -> tuple[Vec3, Vec3]:
+    """Return position (m) and velocity (m/s) of LOCAL_POSITION_NED in NED."""
+    _, x, y, z, vx, vy, vz = _LOCAL_POSITION.unpack_from(payload.ljust(_LOCAL_POSITION.size, b"\0"))
+    return (x, y, z), (vx, vy, vz)
 
 
-class _Imu(msgspec.Struct):
-    time_usec: int
-    xacc: float | None
-    yacc: float | None
-    zacc: float | None
-
-
-_local_position = msgspec.json.Decoder(_LocalPosition)
-_attitude = msgspec.json.Decoder(_Attitude)
-_imu = msgspec.json.Decoder(_Imu)
-
-
-def local_position_ned(fields_json: str) -> tuple[Vec3, Vec3]:
-    """Return position (m) and velocity (m/s) of LOCAL_POSITION_NED in NED. MAVSDK writes NaN as null; it is NaN again here."""
-    m = _local_position.decode(fields_json)
-    return (_number(m.x), _number(m.y), _number(m.z)), (_number(m.vx), _number(m.vy), _number(m.vz))
-
-
-def attitude_quaternion(fields_json: str) -> tuple[Quat, Vec3, float | None]:
+def attitude_quaternion(payload: bytes) -> tuple[Quat, Vec3, float | None]:
     """Return attitude FRD -> NED, body rates FRD (rad/s) and time since boot (s; None if it is 0) of ATTITUDE_QUATERNION."""
-    m = _attitude.decode(fields_json)
-    q = (_number(m.q1), _number(m.q2), _number(m.q3), _number(m.q4))
-    rates_rad_s = (_number(m.rollspeed), _number(m.pitchspeed), _number(m.yawspeed))
-    return q, rates_rad_s, m.time_boot_ms * 1e-3 if m.time_boot_ms else None
+    boot_ms, q1, q2, q3, q4, roll, pitch, yaw = _ATTITUDE.unpack_from(payload.ljust(_ATTITUDE.size, b"\0"))
+    return (q1, q2, q3, q4), (roll, pitch, yaw), boot_ms * 1e-3 if boot_ms else None
 
 
-def highres_imu(fields_json: str) -> tuple[Vec3, float | None]:
+def highres_imu(payload: bytes) -> tuple[Vec3, float | None]:
     """Return specific force FRD (m/s^2) and time since boot (s; None if it is 0) of HIGHRES_IMU."""
-    m = _imu.decode(fields_json)
-    return (_number(m.xacc), _number(m.yacc), _number(m.zacc)), m.time_usec * 1e-6 if m.time_usec else None
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
+    boot_us, x, y, z = _IMU.unpack_from(payload.ljust(_IMU.size, b"\0"))
+    return (x, y, z), boot_us * 1e-6 if boot_us else None
 
 
 def landed_state(value: int) -> LandedState:
@@ -231,15 +198,12 @@ def attitude_target_deg(setpoint: AttitudeSetpoint) -> Vec3:
     return math.degrees(roll_rad), math.degrees(pitch_rad), math.degrees(yaw_rad)
 
 
-def attitude_target_json(setpoint: AttitudeSetpoint, time_boot_ms: int, target_system: int) -> str:
-    """Return SET_ATTITUDE_TARGET: quaternion FRD -> NED and thrust, body rates ignored; raises the errors of `attitude_target_ned`."""
-    q = attitude_target_ned(setpoint)
-    return (
-        f'{{"time_boot_ms":{time_boot_ms & 0xFFFFFFFF},"target_system":{target_system},'
-        f'"target_component":{MAV_COMP_ID_AUTOPILOT1},"type_mask":{_TYPE_MASK_IGNORE_RATES},'
-        f'"q":[{q[0]:.9g},{q[1]:.9g},{q[2]:.9g},{q[3]:.9g}],'
-        f'"body_roll_rate":0,"body_pitch_rate":0,"body_yaw_rate":0,"thrust":{setpoint.thrust:.9g}}}'
-    )
+def attitude_target(setpoint: AttitudeSetpoint, time_boot_ms: int, target_system: int) -> bytes:
+    """Return the payload of SET_ATTITUDE_TARGET: quaternion FRD -> NED and thrust, body rates ignored; raises the errors of
+    `attitude_target_ned`.
+    """
+    q, target = attitude_target_ned(setpoint), (target_system, MAV_COMP_ID_AUTOPILOT1, TYPE_MASK_IGNORE_RATES)
+    return _ATTITUDE_TARGET.pack(time_boot_ms & 0xFFFFFFFF, *q, 0.0, 0.0, 0.0, setpoint.thrust, *target)
 
 
 def vision_ned(pose: MocapPose) -> tuple[Vec3, Vec3]:
@@ -252,6 +216,16 @@ def vision_ned(pose: MocapPose) -> tuple[Vec3, Vec3]:
         raise ValueError(f"mocap pose {pose.position_world_m}, {pose.attitude_wxyz} is not finite")
     attitude = attitude_ned_frd_from_enu_flu(quat_normalize(pose.attitude_wxyz))
     return ned_from_enu(pose.position_world_m), euler_zyx_from_quat(attitude)
+
+
+def vision_position_estimate(pose: MocapPose) -> bytes:
+    """Return the payload of VISION_POSITION_ESTIMATE; raises the errors of `vision_ned`.
+
+    Without TIMESYNC, which PX4 1.16 does not accept from MAVSDK, PX4 stamps on arrival (and subtracts EKF2_EV_DELAY); the companion's
+    own clock is what a log reader can use. The first covariance is NaN, which makes PX4 use EKF2_EVP_NOISE and EKF2_EVA_NOISE.
+    """
+    position_ned_m, euler_rad = vision_ned(pose)
+    return _VISION.pack(max(1, int(pose.stamp_s * 1e6)), *position_ned_m, *euler_rad, math.nan)
 
 
 def command(request: AutopilotRequest) -> tuple[int, float, float]:

@@ -1,6 +1,6 @@
-"""The process between MAVSDK and a MAVLink ground station: `python -m companion.io.qgroundcontrol.relay`.
+"""The process between the flight process and a MAVLink ground station: `python -m companion.io.qgroundcontrol.relay`.
 
-It holds three sockets: the channel to the flight process, one to MAVSDK's second connection (loopback) and one to the ground station.
+It holds three sockets: the channel to the flight process, one to its link to PX4 (loopback) and one to the ground station.
 The latter two are connected, so the kernel drops datagrams from any other address. A flood from the ground costs this process time, not
 the flight. It ends when the channel closes.
 
@@ -47,11 +47,10 @@ class Relay:
 
     Args:
         channel: channel to the flight process.
-        vehicle: UDP, bound on loopback; connected once MAVSDK's port is known.
+        vehicle: UDP, bound on loopback; connected once the flight process's port is known.
         ground: UDP, connected to the ground station.
         uplink: filter of the ground station's messages.
         vehicle_system: MAVLink system id of the vehicle.
-        own: system and component id of MAVSDK; the system is the vehicle's.
         name: the ground station's address for display.
     """
 
@@ -62,16 +61,15 @@ class Relay:
         ground: socket.socket,
         uplink: UplinkFilter,
         vehicle_system: int,
-        own: tuple[int, int],
         name: str,
     ) -> None:
         self._channel, self._vehicle, self._ground, self._name = channel, vehicle, ground, name
         for one in (channel, vehicle, ground):
             one.setblocking(False)
         self._open = False
-        """Whether MAVSDK's port is known."""
+        """Whether the flight process's port is known."""
         self._bye = False
-        self._uplink, self._downlink, self._texts = uplink, DownlinkFilter(own), Texts()
+        self._uplink, self._downlink, self._texts = uplink, DownlinkFilter(), Texts()
         self._encoder = mavlink.MAVLink(None, srcSystem=vehicle_system, srcComponent=COMPONENT)
         self._situation: str | None = None
         self._beat_s = self._report_s = 0.0
@@ -147,7 +145,9 @@ class Relay:
                 self._texts.say(int(mavlink.MAV_SEVERITY_INFO), self._situation)
             self._heard_s = now_s
             for frame in passed:
-                with contextlib.suppress(OSError):  # MAVSDK does not keep up: the message is lost, as on any link
+                with contextlib.suppress(
+                    OSError
+                ):  # the flight process does not keep up: the message is lost, as on any link
                     self._vehicle.send(frame)
 
     def _report(self, now_s: float) -> None:
@@ -193,7 +193,6 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--host", required=True, help="ground station, an IP address")
     parser.add_argument("--port", type=int, required=True)
     parser.add_argument("--system", type=int, required=True, help="MAVLink system id of the vehicle")
-    parser.add_argument("--own", type=int, nargs=2, required=True, help="system and component id of MAVSDK")
     parser.add_argument("--name", required=True, help="the ground station's address for display")
     parser.add_argument("--while-armed", action="store_true", help="pass everything even while PX4 is armed")
     parser.add_argument("--console", action="store_true", help="pass SERIAL_CONTROL while PX4 is not armed")
@@ -215,7 +214,7 @@ def main(argv: list[str] | None = None) -> int:
             return 1
         channel.send(pack({"port": vehicle.getsockname()[1]}))
         uplink = UplinkFilter(a.system, while_armed=a.while_armed, console=a.console)
-        Relay(channel, vehicle, ground, uplink, a.system, (a.own[0], a.own[1]), a.name).run()
+        Relay(channel, vehicle, ground, uplink, a.system, a.name).run()
     return 0
 
 

@@ -1,8 +1,7 @@
 """Link to QGroundControl or any other MAVLink ground station: forwards MAVLink between it and PX4.
 
-MAVSDK forwards between PX4's connection and a second one on loopback. It does not distinguish messages by the connection on which
-they arrive: a HEARTBEAT with PX4's ids from the ground would count as PX4's. The second connection therefore ends at a process
-(`companion.io.qgroundcontrol.relay`) that blocks such messages and also sends the companion's own texts. A call here costs the
+The driver of PX4 forwards frames to and from a process on loopback (`companion.io.qgroundcontrol.relay`) that blocks what a ground
+station must not send and also sends the companion's own texts. A call here costs the
 control tick one send on a local socket.
 """
 
@@ -41,8 +40,8 @@ class Forwarder(Protocol):
     def identity(self) -> LinkIdentity:
         """Return the ids of both ends of the link to PX4."""
 
-    async def forward_to(self, port: int) -> int:
-        """Open MAVSDK's second connection to a UDP port of 127.0.0.1; return MAVSDK's own port."""
+    def forward_to(self, port: int) -> int:
+        """Forward MAVLink between PX4 and a UDP port of 127.0.0.1; return the port from which it is sent."""
 
 
 def ground_error(address: str, expected: str, found: str, fix: str) -> DeviceError:
@@ -85,7 +84,7 @@ class GroundStation:
         self._phase: str | None = None
         self._messages: list[str] = []
         self.vehicle_port = 0
-        """UDP port on loopback of MAVSDK's second connection; 0 if it is not open."""
+        """UDP port on loopback from which frames are forwarded; 0 if it is not open."""
 
     @property
     def relay_pid(self) -> int | None:
@@ -102,7 +101,7 @@ class GroundStation:
         )
 
     async def __aenter__(self) -> Self:
-        """Resolve the host, start the relay, open MAVSDK's connection to it. The ground station need not be present.
+        """Resolve the host, start the relay, forward frames to it. The ground station need not be present.
 
         Raises:
             DeviceError: the address or its host is invalid, or the relay does not start; nothing stays open.
@@ -110,7 +109,7 @@ class GroundStation:
         host = await self._resolve(*check_address(self.address))
         try:
             port = await self._start(*host)
-            self.vehicle_port = await self._autopilot.forward_to(port)
+            self.vehicle_port = self._autopilot.forward_to(port)
             self._send({"vehicle_port": self.vehicle_port})
         except BaseException:
             await self._close()
@@ -120,7 +119,7 @@ class GroundStation:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop the relay's output. MAVSDK's connection ends with the autopilot's link."""
+        """Stop the relay's output. Forwarding ends with the autopilot's link."""
         self._send({"bye": True})
         await self._close()
 
@@ -209,7 +208,6 @@ class GroundStation:
         arguments = [
             *(sys.executable, "-P", "-m", "companion.io.qgroundcontrol.relay", "--fd", str(theirs.fileno())),
             *("--host", ip, "--port", str(port), "--system", str(identity.autopilot_system)),
-            *("--own", str(identity.own_system), str(identity.own_component)),
             *("--name", self.address.removeprefix("udpout://")),
             *(["--while-armed"] if self._while_armed else []),
             *(["--console"] if self._console else []),

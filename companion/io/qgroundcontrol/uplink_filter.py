@@ -13,19 +13,16 @@ from collections import Counter
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.io.px4.frames import REQUEST_EVENT, Frame, autopilot_heartbeat, frames
 from companion.io.qgroundcontrol.frames import (
     COMMANDS,
     GROUND_MESSAGES,
     GROUND_SYSTEMS_MAX,
     REFUSED_COMMANDS,
-    REQUEST_EVENT,
     UP_BURST,
     UP_RATE_HZ,
-    Frame,
     TokenBucket,
-    autopilot_heartbeat,
     command_of,
-    frames,
 )
 
 HEARTBEAT_MAX_AGE_S = 3.0
@@ -72,7 +69,7 @@ class ArmedState:
         self._arming_s = -math.inf
 
     def hear(self, datagram: bytes, now_s: float) -> None:
-        """Update the state from a datagram of PX4's that MAVSDK forwards; only PX4's HEARTBEAT has an effect."""
+        """Update the state from a datagram of PX4's; only PX4's HEARTBEAT has an effect."""
         heard = autopilot_heartbeat(datagram)
         if heard is not None and heard.system == self._vehicle_system:
             self._disarmed_s = None if heard.armed else now_s

@@ -1,0 +1,267 @@
+"""Byte transports to PX4: UDP, TCP client and serial port. No call waits; the flight process and the guardian use the same."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import re
+import socket
+import time
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from companion.io.arrival import STAMP_ROOM_BYTES, arrived_s, stamp_arrivals
+from companion.io.px4.frames import autopilot_heartbeat
+from companion.io.px4.udp_peer import REPIN_SILENCE_S, disconnect_udp
+from companion.runtime.clock import Clock
+
+_LOG = logging.getLogger(__name__)
+_NET = re.compile(r"(udpin|udpout|tcpout)://([^:/?]+):(\d+)")
+_SERIAL = re.compile(r"(serial|serial_flowcontrol)://(/[^:]+):(\d+)")
+_MAX_BYTES = 65535
+_ROUND_DATAGRAMS = 1000
+_CONNECT_TIMEOUT_S = 0.5
+
+
+class Wire(Protocol):
+    """Byte transport to PX4."""
+
+    @property
+    def ready(self) -> bool:
+        """Whether PX4's address is known."""
+
+    @property
+    def lost(self) -> bool:
+        """Whether the connection has ended. A lost wire ends every wait on it and transfers no data."""
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait on."""
+
+    def send(self, data: bytes) -> None:
+        """Send one message; drop it if the transport does not accept it."""
+
+    def receive(self) -> list[tuple[float, bytes]]:
+        """Return all data that has arrived, with the time of its arrival, or of this call where the kernel gives none."""
+
+    def close(self) -> None:
+        """Close the transport."""
+
+
+class _ChannelWire:
+    """A wire over a socket or serial port."""
+
+    ready = True
+    lost = False
+    remote: tuple[str, int] | None = None
+    """PX4's UDP address; None while it is unknown, and on TCP and serial links, which have one peer."""
+    local_port = 0
+    """Own UDP port; 0 on TCP and serial links."""
+
+    def __init__(self, channel: Any, clock: Clock) -> None:
+        self._channel = channel
+        self._clock = clock
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait on."""
+        return int(self._channel.fileno())
+
+    def close(self) -> None:
+        """Close the transport."""
+        with contextlib.suppress(OSError):
+            self._channel.close()
+
+
+class UdpWire(_ChannelWire):
+    """UDP transport: bound to the port that PX4 sends to (`udpin`), or sending to PX4 from the flight process's port (`udpout`).
+    PX4 only sends to the first peer of a UDP link, so the port must stay the same. Once PX4's address is known the socket is
+    connected to it and the kernel drops datagrams of all other senders. After REPIN_SILENCE_S without a datagram the socket is
+    disconnected, then connected to the next sender at the same IPv4 address that sends a HEARTBEAT with PX4's system id: a
+    restarted router sends from a new port.
+
+    Args:
+        local: address to bind; None for any.
+        remote: PX4's address; None to use the sender of the first valid HEARTBEAT of an autopilot.
+        clock: clock of the arrivals.
+        share_port: another socket that reads nothing holds the port as well: that of the process's claim, or of a killed flight
+            process. Of several sockets connected to PX4, the newest receives the datagrams (measured, Linux 6.18).
+        report: called with a line when PX4 is received at another port.
+    """
+
+    def __init__(
+        self,
+        local: tuple[str, int] | None,
+        remote: tuple[str, int] | None,
+        clock: Clock = time.monotonic,
+        *,
+        share_port: bool = False,
+        report: Callable[[str], None] = _LOG.warning,
+    ) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        super().__init__(self._socket, clock)
+        stamp_arrivals(self._socket)
+        self._report = report
+        self._bound = local is not None
+        self._connected = False
+        self._heard_s = 0.0
+        self.system: int | None = None
+        """MAVLink system id of PX4; None accepts any."""
+        self.ready = False
+        """PX4's address is known."""
+        try:
+            self._socket.setblocking(False)
+            if share_port:
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if local is not None:
+                self._socket.bind(local)
+            if remote is not None:
+                self._connect(remote)
+            self.local_port = self._socket.getsockname()[1]
+        except OSError:
+            self._socket.close()
+            raise
+
+    def send(self, data: bytes) -> None:
+        """Send to PX4; do nothing before its address is known."""
+        if self.remote is not None:
+            with contextlib.suppress(OSError):
+                self._socket.sendto(data, self.remote)
+
+    def receive(self) -> list[tuple[float, bytes]]:
+        """Return datagrams from PX4's address; while the address is unknown, only the HEARTBEAT that reveals it."""
+        # Disconnecting would take an unbound socket's port away from it.
+        if self._connected and self._bound and self._clock() - self._heard_s > REPIN_SILENCE_S:
+            disconnect_udp(self._socket)
+            self._connected = False
+        found: list[tuple[float, bytes]] = []
+        for _ in range(_ROUND_DATAGRAMS):
+            try:
+                data, notes, _, sender = self._socket.recvmsg(_MAX_BYTES, STAMP_ROOM_BYTES)
+            except (BlockingIOError, InterruptedError):
+                break
+            except OSError:  # an ICMP error of an earlier send
+                continue
+            if not self._connected and self._is_from_px4(data, sender):
+                self._connect(sender)
+            if sender == self.remote:
+                found.append((arrived_s(notes, self._clock), data))
+        if found:
+            self._heard_s = self._clock()
+        return found
+
+    def _is_from_px4(self, data: bytes, sender: tuple[str, int]) -> bool:
+        """Whether the datagram identifies its sender as PX4."""
+        if self.remote is not None and sender[0] != self.remote[0]:
+            return False
+        heard = autopilot_heartbeat(data)
+        return heard is not None and (self.system is None or heard.system == self.system)
+
+    def _connect(self, remote: tuple[str, int]) -> None:
+        before, self.remote = self.remote, remote
+        self._socket.connect(remote)
+        self._heard_s = self._clock()
+        self._connected = self.ready = True
+        if before is not None and remote != before:
+            self._report(
+                f"PX4 sent nothing from {before[0]}:{before[1]} for {REPIN_SILENCE_S:g} s and now sends from port {remote[1]}; "
+                "the link uses that port"
+            )
+
+
+class TcpWire(_ChannelWire):
+    """TCP client transport."""
+
+    def __init__(self, remote: tuple[str, int], clock: Clock) -> None:
+        self._socket = socket.create_connection(remote, _CONNECT_TIMEOUT_S)
+        super().__init__(self._socket, clock)
+        self._socket.setblocking(False)
+
+    def send(self, data: bytes) -> None:
+        """Send what fits into the send buffer; the receiver resynchronises on the next message."""
+        with contextlib.suppress(OSError):
+            self._socket.send(data)
+
+    def receive(self) -> list[tuple[float, bytes]]:
+        """Return the data that has arrived. End of stream or an error marks the wire as lost."""
+        try:
+            data = self._socket.recv(_MAX_BYTES)
+        except (BlockingIOError, InterruptedError):
+            return []
+        except OSError:
+            data = b""
+        self.lost = not data
+        return [(self._clock(), data)] if data else []
+
+
+class SerialWire(_ChannelWire):
+    """Serial transport, 8N1."""
+
+    def __init__(self, path: str, baud: int, flow_control: bool, clock: Clock) -> None:
+        import serial  # imported here because the other links do not need it
+
+        if baud not in serial.Serial.BAUDRATES:
+            raise OSError(errno.EINVAL, "no usual baud rate")
+        # exclusive: a lock (flock) on the device itself, so it applies under every name of the device
+        self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, rtscts=flow_control, exclusive=True)
+        super().__init__(self._port, clock)
+
+    def send(self, data: bytes) -> None:
+        """Write as many bytes as the port accepts."""
+        with contextlib.suppress(OSError):
+            self._port.write(data)
+
+    def receive(self) -> list[tuple[float, bytes]]:
+        """Return the data that has arrived. A port that is readable but has no data (unplugged, hung up) is lost."""
+        try:
+            data = self._port.read(_MAX_BYTES)
+        except OSError:  # serial.SerialException is one
+            self.lost = True
+            return []
+        return [(self._clock(), data)] if data else []
+
+
+OpenWire = UdpWire | TcpWire | SerialWire
+
+
+def is_udp(address: str) -> bool:
+    """Whether the address is a UDP link. A UDP link can be opened while the killed flight process still holds it."""
+    net = _NET.fullmatch(address)
+    return net is not None and net[1] in ("udpin", "udpout")
+
+
+def open_wire(
+    address: str,
+    local_port: int = 0,
+    peer: tuple[str, int] | None = None,
+    clock: Clock = time.monotonic,
+    *,
+    share_port: bool = False,
+    report: Callable[[str], None] = _LOG.warning,
+) -> OpenWire:
+    """Open the link to PX4.
+
+    Args:
+        address: value of `devices.autopilot.address`.
+        local_port: own UDP port of a `udpout` link; 0 for any.
+        peer: PX4's UDP address as a HEARTBEAT has confirmed it; None if unknown.
+        clock: clock of the arrivals.
+        share_port: another socket that reads nothing holds the port as well; only for UDP links (`is_udp`).
+        report: see `UdpWire`.
+
+    Raises:
+        OSError: the link does not exist, or another process holds it.
+    """
+    net = _NET.fullmatch(address)
+    if net is not None:
+        kind, host, port = net[1], net[2], int(net[3])
+        if kind == "tcpout":
+            return TcpWire((host, port), clock)
+        if kind == "udpin":
+            return UdpWire((host, port), peer, clock, share_port=share_port, report=report)
+        remote = peer or (socket.gethostbyname(host), port)
+        local = ("", local_port) if local_port else None
+        return UdpWire(local, remote, clock, share_port=share_port, report=report)
+    port_of = _SERIAL.fullmatch(address)
+    if port_of is None:
+        raise OSError(f"{address}: unknown link type")
+    return SerialWire(port_of[2], int(port_of[3]), port_of[1] == "serial_flowcontrol", clock)
