@@ -157,6 +157,17 @@ def test_the_observer_is_bounded_and_freezes_on_request() -> None:
     assert observer.force_n == before
 
 
+@pytest.mark.parametrize(
+    ("known_n", "acceleration"),
+    [((math.nan, 0.0, 0.0), ZERO), (ZERO, (0.0, math.nan, 0.0)), (ZERO, (0.0, 0.0, math.inf))],
+)
+def test_values_that_are_not_finite_leave_the_observer_unchanged(known_n: Vec3, acceleration: Vec3) -> None:
+    observer = DisturbanceObserver(3.0, (0.1, 0.1, 0.1), 0.05, 100.0)
+    before = [observer.step(0.005, ZERO, (1.0, 0.0, 0.0), learn=True) for _ in range(200)][-1]
+    assert observer.step(0.005, known_n, acceleration, learn=True) == before
+    assert observer.step(0.005, ZERO, (1.0, 0.0, 0.0), learn=True) == pytest.approx(before, abs=1e-3)
+
+
 def test_a_force_that_the_base_gives_way_to_is_not_observed_away(config: FlightConfig) -> None:
     """With base rows on, a pushed base that moves as its impedance says is not disturbed; without them the same push is."""
     assert isinstance(config.controller, AdaptiveConfig)

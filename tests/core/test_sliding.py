@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,12 +20,19 @@ from companion.core.sliding import STEER_MAX_RAD, UNSEEN_MAX_N
 from companion.mission.check import check_mission
 from companion.mission.contact import touches
 from companion.model.frames import euler_zyx_from_quat
-from companion.model.types import ContactMode, Outcome, Reference
+from companion.model.types import ContactMode, Inputs, Outcome, Reference, Vec3
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight, FastResult
 
 SLIDE = "configs/missions/slide.yaml"
+NAN: Vec3 = (math.nan, math.nan, math.nan)
+BROKEN: dict[int, Callable[[Inputs], Inputs]] = {
+    0: lambda i: replace(i, vehicle=replace(i.vehicle, specific_force_body_m_s2=NAN, delta_velocity_body_m_s=NAN)),  # type: ignore[type-var]
+    20: lambda i: replace(i, mocap=replace(i.mocap, position_world_m=NAN)),  # type: ignore[type-var]
+    40: lambda i: replace(i, arm=replace(i.arm, angle_rad=NAN[:2])),  # type: ignore[type-var]
+}
+"""Ticks with NaN in the record from which the force on the vehicle, the place of the tip, or the arm's joint angles come."""
 
 
 def short_slide(friction: float) -> list[str]:
@@ -44,8 +53,13 @@ def slide(friction: float, *more: str) -> tuple[FastFlight, FastResult]:
     return flight, flight.run(90.0)
 
 
-def test_the_tip_follows_its_path_while_the_force_is_held() -> None:
-    flight, result = slide(0.5)
+@pytest.fixture(scope="module")
+def slid() -> tuple[FastFlight, FastResult]:
+    return slide(0.5)
+
+
+def test_the_tip_follows_its_path_while_the_force_is_held(slid: tuple[FastFlight, FastResult]) -> None:
+    flight, result = slid
     assert result.outputs[-1].outcome is Outcome.COMPLETED and not result.crashed and result.layout is not None
     assert {e.id for o in result.outputs for e in o.events} == {"takeoff", "touched", "touchdown"}
     sliding = np.array([o.contact is not None and o.contact.mode is ContactMode.SLIDE for o in result.outputs])
@@ -59,6 +73,29 @@ def test_the_tip_follows_its_path_while_the_force_is_held() -> None:
     assert ("slide", "0.30 m along the surface") in contact_lines({"contact": summary})
     core = FlightCore(flight.config.flight)
     assert all(core.step(i) == o for i, o in zip(result.inputs, result.outputs, strict=True))
+
+
+def test_values_that_are_not_finite_neither_steer_nor_press_and_a_wrong_force_is_still_found(
+    slid: tuple[FastFlight, FastResult],
+) -> None:
+    flight, result = slid
+    sliding = [k for k, o in enumerate(result.outputs) if o.contact is not None and o.contact.mode is ContactMode.SLIDE]
+    first, core, seen = sliding[300], FlightCore(flight.config.flight), []
+    for k, i in enumerate(result.inputs[: first + 300]):
+        if k >= first + 200:  # the sensor measures 5 N less than acts
+            assert i.force is not None
+            x, y, z = i.force.force_sensor_n
+            i = replace(i, force=replace(i.force, force_sensor_n=(x + 5.0, y, z)))
+        o = core.step(BROKEN[k - first](i) if k - first in BROKEN else i)
+        seen += [event.id for event in o.events]
+        a, b = o.contact, result.outputs[k].contact
+        if first <= k < first + 200:
+            assert a is not None and b is not None and a.mode is ContactMode.SLIDE
+            assert a.push_n == pytest.approx(b.push_n, abs=0.1) and a.unseen_n == pytest.approx(b.unseen_n, abs=0.1)
+            assert a.steer_rad == pytest.approx(b.steer_rad, abs=0.05)
+            assert a.disagreement_n == pytest.approx(b.disagreement_n, abs=0.3)
+            assert a.unopposed_n == pytest.approx(b.unopposed_n, abs=0.3)
+    assert {"vehicle_not_finite", "mocap_not_finite", "arm_not_finite"} < set(seen) and seen[-1] == "contact_disagrees"
 
 
 def test_a_tool_that_is_caught_leads_away_from_the_wall() -> None:
