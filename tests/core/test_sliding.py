@@ -12,6 +12,7 @@ import pytest
 from msgspec.structs import replace
 
 from companion.analysis.contact import contact_lines, contact_summary
+from companion.analysis.contact_plots import contact_force
 from companion.control import slide as control
 from companion.control.arm_model import manipulator_of
 from companion.control.types import PlantState
@@ -71,6 +72,14 @@ def test_the_tip_follows_its_path_while_the_force_is_held(slid: tuple[FastFlight
     summary = contact_summary(log)
     assert summary is not None and summary["path_rms_m"] < 0.012
     assert ("slide", "0.30 m along the surface") in contact_lines({"contact": summary})
+    drawn = contact_force(log)
+    assert drawn is not None
+    sensor, corrected, wanted = drawn.axes[0].get_lines()
+    labels = [sensor.get_label(), corrected.get_label(), wanted.get_label()]
+    assert labels == ["sensor", "with the correction from the vehicle's motion", "wanted"]
+    corrected_n = np.asarray(corrected.get_ydata())
+    assert corrected_n[sliding].mean() == pytest.approx(summary["mean_n"])
+    assert np.isnan(corrected_n[: np.flatnonzero(sliding)[0]]).all()  # before the slide there is only the sensor's
     core = FlightCore(flight.config.flight)
     assert all(core.step(i) == o for i, o in zip(result.inputs, result.outputs, strict=True))
 
