@@ -15,18 +15,21 @@ from companion.analysis.contact import contact_lines, contact_summary
 from companion.analysis.contact_plots import contact_force
 from companion.control import slide as control
 from companion.control.arm_model import manipulator_of
-from companion.control.types import PlantState
 from companion.core.flight_core import FlightCore
 from companion.core.sliding import STEER_MAX_RAD, UNSEEN_MAX_N
 from companion.mission.check import check_mission
 from companion.mission.contact import touches
+from companion.mission.reference import at_rest
 from companion.model.frames import euler_zyx_from_quat
-from companion.model.types import ContactMode, Inputs, Outcome, Reference, Vec3
+from companion.model.types import ContactMode, Inputs, Joints, Outcome, Vec3
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight, FastResult
+from tests.control.states import ZERO, at
 
 SLIDE = "configs/missions/slide.yaml"
+ARM: Joints = (1.1, 1.4)
+"""The arm stretched forward."""
 NAN: Vec3 = (math.nan, math.nan, math.nan)
 BROKEN: dict[int, Callable[[Inputs], Inputs]] = {
     0: lambda i: replace(i, vehicle=replace(i.vehicle, specific_force_body_m_s2=NAN, delta_velocity_body_m_s=NAN)),  # type: ignore[type-var]
@@ -114,15 +117,15 @@ def test_a_tool_that_is_caught_leads_away_from_the_wall() -> None:
 
 
 def test_a_wrong_reading_of_the_force_turns_the_setpoint_by_a_bounded_angle() -> None:
-    vehicle, state = load_sitl(SLIDE).vehicle, at_rest()
+    vehicle, state = load_sitl(SLIDE).vehicle, at(arm=ARM, force=None)
     slide = control.Slide(vehicle)
     slide.torque_nm(0.005, (0.0, 0.0), state, (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), None)
-    turned = slide.attitude(0.005, state.attitude_wxyz, state, reference(), (0.0, 0.0, 200.0))
+    turned = slide.attitude(0.005, state.attitude_wxyz, state, at_rest(ZERO, 0.0, ARM), (0.0, 0.0, 200.0))
     assert max(map(abs, euler_zyx_from_quat(turned))) == pytest.approx(control.TURN_MAX_RAD)
 
 
 def test_the_arm_pushes_along_the_way_and_answers_the_force_error_by_a_bounded_force() -> None:
-    vehicle, state, into = load_sitl(SLIDE).vehicle, at_rest(), (1.0, 0.0, 0.0)
+    vehicle, state, into = load_sitl(SLIDE).vehicle, at(arm=ARM, force=None), (1.0, 0.0, 0.0)
     jacobian = np.array(manipulator_of(vehicle).jacobian_body_m(state.arm_rad))[[0, 2]]
     slide = control.Slide(vehicle)
 
@@ -157,36 +160,6 @@ def test_a_slide_believes_the_motion_of_the_vehicle_within_a_bound_and_a_lost_su
     ]
     assert np.mean(forces[-400:]) == pytest.approx(3.0, abs=0.4)  # 4.3 N by the sensor alone
     assert not touches(replace(sliding[-1], force_n=sliding[-1].unseen_n), 1.0)
-
-
-def reference() -> Reference:
-    """Return the reference of a vehicle at rest."""
-    rest = (0.0, 0.0, 0.0)
-    return Reference(
-        position_world_m=rest,
-        velocity_world_m_s=rest,
-        acceleration_world_m_s2=rest,
-        yaw_rad=0.0,
-        yaw_rate_rad_s=0.0,
-        arm_rad=(1.1, 1.4),
-        arm_rate_rad_s=(0.0, 0.0),
-        arm_acceleration_rad_s2=(0.0, 0.0),
-        jerk_world_m_s3=rest,
-    )
-
-
-def at_rest() -> PlantState:
-    """Return the state of a level vehicle at rest whose arm is stretched."""
-    rest = (0.0, 0.0, 0.0)
-    return PlantState(
-        position_world_m=rest,
-        velocity_world_m_s=rest,
-        acceleration_world_m_s2=rest,
-        attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
-        angular_rate_body_rad_s=rest,
-        arm_rad=(1.1, 1.4),
-        arm_rate_rad_s=(0.0, 0.0),
-    )
 
 
 @pytest.mark.parametrize(
