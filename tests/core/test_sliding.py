@@ -110,6 +110,28 @@ def test_values_that_are_not_finite_neither_steer_nor_press_and_a_wrong_force_is
     assert {"vehicle_not_finite", "mocap_not_finite", "arm_not_finite"} < set(seen) and seen[-1] == "contact_disagrees"
 
 
+def test_a_reading_across_the_tool_that_no_friction_explains_is_no_tether(slid: tuple[FastFlight, FastResult]) -> None:
+    flight, result = slid
+    first = next(k for k, o in enumerate(result.outputs) if o.contact is not None and o.contact.slide_world_n[2] < -1.0)
+    core, seen = FlightCore(flight.config.flight), []
+    for k, i in enumerate(result.inputs[: first + 500]):
+        if k >= first:
+            assert i.force is not None
+            x, y, z = i.force.force_sensor_n
+            i = replace(i, force=replace(i.force, force_sensor_n=(x, y + 4.0, z)))
+        seen += [event.id for event in core.step(i).events]
+    assert seen == ["takeoff", "touched"]
+
+
+def test_a_tether_that_jams_in_a_slide_is_noticed_before_the_tip_has_lost_the_wall() -> None:
+    jams = "world.faults=[{kind: tether_taut, t_s: 16.0, size: 0.0}]"
+    above = "vehicle.tether.anchor_world_m=[0.0,0.0,2.2]"  # on the way down the distance grows
+    result = FastFlight(load_sitl(SLIDE, world="ideal", overrides=[*short_slide(0.5), above, jams])).run(22.0)
+    snagged = next(k for k, o in enumerate(result.outputs) if any(e.id == "tether_snagged" for e in o.events))
+    before = result.outputs[snagged - 1].contact
+    assert before is not None and before.mode is ContactMode.SLIDE and not result.crashed
+
+
 def test_a_tool_that_is_caught_leads_away_from_the_wall() -> None:
     _, result = slide(2.0)
     assert "contact_stuck" in [e.id for o in result.outputs for e in o.events]
