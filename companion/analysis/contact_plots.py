@@ -58,7 +58,11 @@ def contact_force(log: FlightLog) -> Figure | None:
     observed = bool(np.isfinite(sensor).any())
     if observed:
         line(normal, t, sensor[:, 0], "force sensor", SERIES[2])
-    line(normal, t, force[:, 0], "momentum observer" if observed else "measured", SERIES[0])
+    corrected = log.column(lambda i, o, s: o.contact.force_n if o.contact and o.contact.unseen_n != 0.0 else None)
+    differs = bool(np.isfinite(corrected).any())
+    line(normal, t, force[:, 0], "momentum observer" if observed else "sensor" if differs else "measured", SERIES[0])
+    if differs:
+        line(normal, t, corrected, "with the correction from the vehicle's motion", SERIES[4])
     line(normal, t, wanted, "wanted", INK, reference=True)
     line(plane, t, _smooth(force[:, 1], t), "to the right", SERIES[1])
     line(plane, t, _smooth(force[:, 2], t), "up", SERIES[3])

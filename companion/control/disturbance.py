@@ -34,7 +34,7 @@ class DisturbanceObserver:
         """The estimate, world frame, N."""
 
     def step(self, dt_s: float, known_n: Vec3, acceleration_world_m_s2: Vec3, learn: bool) -> Vec3:
-        """Run one tick and return the estimate, world frame, N.
+        """Run one tick and return the estimate, world frame, N. Values that are not finite leave it unchanged.
 
         Args:
             dt_s: time since the last tick.
@@ -42,7 +42,7 @@ class DisturbanceObserver:
             acceleration_world_m_s2: measured acceleration.
             learn: if False, the estimate does not change (on the ground, or while the actuators are saturated).
         """
-        if not self.on:
+        if not self.on or not math.isfinite(sum(known_n) + sum(acceleration_world_m_s2)):
             return self.force_n
         lx, ly, lz = self._lagged or known_n
         kx, ky, kz = known_n

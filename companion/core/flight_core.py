@@ -11,12 +11,14 @@ from typing import Final
 import msgspec
 
 from companion.config.loader import FlightConfig
+from companion.config.mission import Slide
 from companion.config.vehicle import OBSERVER
 from companion.control.types import Tuning
 from companion.control.vehicle_control import Command, VehicleControl
 from companion.core.contact import force_on_tool_n
 from companion.core.flight_state import Observation, Request, Tare
 from companion.core.sequence import missing_inputs
+from companion.core.sliding import within_friction
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters, event_of
 from companion.mission.contact import along, sensed_n
@@ -25,7 +27,17 @@ from companion.model import flight_stage as seq
 from companion.model.best_pose import pose_used_s
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.flight_stage import Stage
-from companion.model.types import ControlLog, Event, Inputs, Outputs, PhaseKind, Reference, SafetyAction, Vec3
+from companion.model.types import (
+    ContactMode,
+    ControlLog,
+    Event,
+    Inputs,
+    Outputs,
+    PhaseKind,
+    Reference,
+    SafetyAction,
+    Vec3,
+)
 from companion.safety import notices
 from companion.safety.gate import ARM_FRESH_S, Gate, Refusal
 from companion.safety.governor import Governor
@@ -43,6 +55,7 @@ _POSE_AGE_MAX_S: Final = 0.1
 _PLAN: Final = Stage.PLAN
 _SPOOL: Final = Stage.SPOOL
 _TOUCHDOWN: Final = Stage.TOUCHDOWN
+_SLIDE: Final = ContactMode.SLIDE
 _NO_ERROR: Vec3 = (0.0, 0.0, 0.0)
 
 
@@ -202,6 +215,12 @@ class FlightCore:
             tool_n = (-contact.force_n * nx, -contact.force_n * ny, -contact.force_n * nz)
         else:
             tool_n = log.force_measured_world_n if touching or self._observes else log.force_ext_world_n
+        if tool_n is not None and contact is not None and contact.mode is _SLIDE:
+            segment = self._state.contact_segment
+            assert segment is not None
+            phase = self._parameters.config.mission.phases[segment.index]
+            assert isinstance(phase, Slide)
+            tool_n = within_friction(contact, phase, tool_n)
         self._situation.tether = state = watch.update(
             i.t_s,
             v.position_world_m,

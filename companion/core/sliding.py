@@ -20,6 +20,7 @@ from companion.core.probing import ahead_m, tip_world_m
 from companion.core.transition import Transition
 from companion.mission import contact as c
 from companion.mission.surface import axes
+from companion.model.algebra import across
 from companion.model.types import ContactMode, ContactState, Vec3
 
 LAG_N_M, LAG_N_MS = 30.0, 40.0
@@ -63,7 +64,7 @@ def slid(t: Transition, contact: ContactState, phase: Slide, approach: Approach 
         return contact
     if not felt:  # nothing rubs: the force would move the tip away
         return replace(contact, lag_integral_n=0.0, slide_world_n=_ENDED)
-    most_n = phase.friction_max * phase.force_n + BEYOND_FRICTION_N
+    most_n = _most_n(phase)
     if not slides:
         contact = replace(contact, mode=ContactMode.SLIDE, since_s=t.i.t_s, beside_m=beside_m)
     lag_m = _along(contact, contact.beside_m) - _along(contact, beside_m)
@@ -80,6 +81,21 @@ def slid(t: Transition, contact: ContactState, phase: Slide, approach: Approach 
         stuck_s=contact.stuck_s + dt_s if abs(lag_m) > STUCK_M else 0.0,
     )
     return _driven(contact, min(most_n, max(-most_n, integral_n + LAG_N_M * lag_m)))
+
+
+def within_friction(contact: ContactState, phase: Slide, force_world_n: Vec3) -> Vec3:
+    """Return a measured force whose part along the surface is limited to the largest friction: what exceeds it is cross-talk."""
+    x, y, z = across(force_world_n, contact.direction_world)
+    size_n, most_n = math.hypot(x, y, z), _most_n(phase)
+    if size_n <= most_n:
+        return force_world_n
+    k, (fx, fy, fz) = 1.0 - most_n / size_n, force_world_n
+    return (fx - k * x, fy - k * y, fz - k * z)
+
+
+def _most_n(phase: Slide) -> float:
+    """Return the largest force along the surface: the largest friction, and a little more."""
+    return phase.friction_max * phase.force_n + BEYOND_FRICTION_N
 
 
 def _driven(contact: ContactState, force_n: float) -> ContactState:

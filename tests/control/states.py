@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from companion.control.types import PlantState
-from companion.model.types import IDENTITY_QUAT, Joints, Vec3
+from companion.model.types import IDENTITY_QUAT, Joints, Quat, Vec3
 
 POSE: Joints = (math.radians(100), math.radians(60))
 ZERO: Vec3 = (0.0, 0.0, 0.0)
@@ -17,12 +17,14 @@ def at(
     arm: Joints = POSE,
     arm_rate: Joints = (0.0, 0.0),
     force: Vec3 | None = ZERO,
+    acceleration: Vec3 = ZERO,
+    attitude: Quat = IDENTITY_QUAT,
 ) -> PlantState:
     return PlantState(
         position_world_m=position,
         velocity_world_m_s=velocity,
-        acceleration_world_m_s2=ZERO,
-        attitude_wxyz=IDENTITY_QUAT,
+        acceleration_world_m_s2=acceleration,
+        attitude_wxyz=attitude,
         angular_rate_body_rad_s=ZERO,
         arm_rad=arm,
         arm_rate_rad_s=arm_rate,

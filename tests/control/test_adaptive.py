@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,10 +15,14 @@ from companion.config.loader import FlightConfig, load_flight
 from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.impedance import Impedance
 from companion.control.types import PlantState, Wrench
-from companion.model.types import IDENTITY_QUAT, Joints, Reference, Vec3
+from companion.mission.reference import at_rest
+from companion.model.types import IDENTITY_QUAT, Joints
+from tests.control.states import at
 
 FOLD: Joints = (math.radians(165), math.radians(140))
 HOVER = 0.49
+REFERENCE = at_rest((0.0, 0.0, 1.0), 0.0, FOLD)
+state = partial(at, arm=FOLD)
 
 
 @pytest.fixture(scope="module", params=["paper", "recommended"])
@@ -30,45 +35,10 @@ def law(config: FlightConfig) -> AdaptiveConfig:
     return config.controller
 
 
-def reference(position: Vec3 = (0.0, 0.0, 1.0), arm: Joints = FOLD) -> Reference:
-    zero: Vec3 = (0.0, 0.0, 0.0)
-    return Reference(
-        position_world_m=position,
-        velocity_world_m_s=zero,
-        acceleration_world_m_s2=zero,
-        yaw_rad=0.0,
-        yaw_rate_rad_s=0.0,
-        arm_rad=arm,
-        arm_rate_rad_s=(0.0, 0.0),
-        arm_acceleration_rad_s2=(0.0, 0.0),
-        jerk_world_m_s3=(0.0, 0.0, 0.0),
-    )
-
-
-def state(
-    position: Vec3 = (0.0, 0.0, 1.0),
-    velocity: Vec3 = (0.0, 0.0, 0.0),
-    arm: Joints = FOLD,
-    arm_rate: Joints = (0.0, 0.0),
-    force: Vec3 | None = (0.0, 0.0, 0.0),
-) -> PlantState:
-    zero: Vec3 = (0.0, 0.0, 0.0)
-    return PlantState(
-        position_world_m=position,
-        velocity_world_m_s=velocity,
-        acceleration_world_m_s2=zero,
-        attitude_wxyz=IDENTITY_QUAT,
-        angular_rate_body_rad_s=zero,
-        arm_rad=arm,
-        arm_rate_rad_s=arm_rate,
-        force_ext_world_n=force,
-    )
-
-
 def settled(config: FlightConfig, plant: PlantState, ticks: int = 400) -> Wrench:
     controller = AdaptiveController(law(config), config.vehicle, HOVER)
     for _ in range(ticks):
-        wrench = controller.step(0.005, plant, reference(), 1.0)
+        wrench = controller.step(0.005, plant, REFERENCE, 1.0)
     return wrench
 
 

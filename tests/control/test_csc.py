@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from companion.config.controller import CscConfig
 from companion.config.loader import FlightConfig
@@ -14,8 +15,9 @@ from companion.control.arm_model import dynamics_of
 from companion.control.csc import CscController
 from companion.control.types import PlantState, Wrench
 from companion.core.flight_core import FlightCore
+from companion.mission.reference import at_rest
 from companion.model.frames import quat_rotate, rotation_matrix
-from companion.model.types import IDENTITY_QUAT, PhaseKind, Reference, Vec3
+from companion.model.types import IDENTITY_QUAT, PhaseKind, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from tests.control.states import POSE, ZERO, at
@@ -42,17 +44,7 @@ def flown(*overrides: str) -> FastResult:
 
 def stepped(config: SitlConfig, state: PlantState, acceleration: Vec3 = ZERO, vertical_scale: float = 1.0) -> Wrench:
     """The first tick: level, and nothing filtered yet."""
-    reference = Reference(
-        position_world_m=(0.0, 0.0, 1.0),
-        velocity_world_m_s=ZERO,
-        acceleration_world_m_s2=acceleration,
-        yaw_rad=0.0,
-        yaw_rate_rad_s=0.0,
-        arm_rad=POSE,
-        arm_rate_rad_s=(0.0, 0.0),
-        arm_acceleration_rad_s2=(0.0, 0.0),
-        jerk_world_m_s3=(0.0, 0.0, 0.0),
-    )
+    reference = replace(at_rest((0.0, 0.0, 1.0), 0.0, POSE), acceleration_world_m_s2=acceleration)
     return CscController(law(config), config.vehicle, 0.49).step(0.005, state, reference, vertical_scale)
 
 
@@ -168,16 +160,7 @@ def test_the_net_force_is_felt_in_the_body_frame() -> None:
     """A force along the body's y axis turns no joint."""
     config = configured()
     c = CscController(law(config), config.vehicle, 0.49)
-    tilted = PlantState(
-        position_world_m=(0.0, 0.0, 1.0),
-        velocity_world_m_s=ZERO,
-        acceleration_world_m_s2=ZERO,
-        attitude_wxyz=(math.cos(0.1), math.sin(0.1), 0.0, 0.0),
-        angular_rate_body_rad_s=ZERO,
-        arm_rad=POSE,
-        arm_rate_rad_s=(0.0, 0.0),
-        force_ext_world_n=ZERO,
-    )
+    tilted = at(attitude=(math.cos(0.1), math.sin(0.1), 0.0, 0.0))
     sideways = quat_rotate(tilted.attitude_wxyz, (0.0, 2.0, 0.0))
     tau_ext, _ = c._external(tilted, sideways)
     assert tau_ext[6:8] == pytest.approx((0.0, 0.0), abs=1e-12)

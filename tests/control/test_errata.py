@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 import pytest
+from msgspec.structs import replace
 
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import FlightConfig, load_flight
@@ -20,8 +21,10 @@ from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.arm_model import manipulator_of
 from companion.control.impedance import Impedance
 from companion.control.types import PlantState
+from companion.mission.reference import at_rest
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import IDENTITY_QUAT, Reference, Vec3
+from companion.model.types import IDENTITY_QUAT, Vec3
+from tests.control.states import at
 
 Array = npt.NDArray[np.float64]
 DT_S = 0.005
@@ -82,17 +85,7 @@ class Machine:
     def state(self) -> PlantState:
         x, y, z, a1, a2 = self.chi.tolist()
         vx, vy, vz, w1, w2 = self.rate.tolist()
-        zero: Vec3 = (0.0, 0.0, 0.0)
-        return PlantState(
-            position_world_m=(x, y, z),
-            velocity_world_m_s=(vx, vy, vz),
-            acceleration_world_m_s2=zero,
-            attitude_wxyz=IDENTITY_QUAT,
-            angular_rate_body_rad_s=zero,
-            arm_rad=(a1, a2),
-            arm_rate_rad_s=(w1, w2),
-            force_ext_world_n=self.force_world_n,
-        )
+        return at(position=(x, y, z), velocity=(vx, vy, vz), arm=(a1, a2), arm_rate=(w1, w2), force=self.force_world_n)
 
     def tau_ext(self) -> Array:
         a1, a2 = self.chi[3:5].tolist()
@@ -119,14 +112,9 @@ class Machine:
         self.rate += DT_S * acceleration
 
 
-TARGET = Reference(
-    position_world_m=(0.0, 0.0, 1.0),
-    velocity_world_m_s=(0.0, 0.0, 0.0),
+TARGET = replace(
+    at_rest((0.0, 0.0, 1.0), 0.0, POSE),
     acceleration_world_m_s2=(0.1, 0.0, 0.0),
-    yaw_rad=0.0,
-    yaw_rate_rad_s=0.0,
-    arm_rad=POSE,
-    arm_rate_rad_s=(0.0, 0.0),
     arm_acceleration_rad_s2=(0.2, -0.1),
     jerk_world_m_s3=(0.3, -0.2, 0.0),
 )

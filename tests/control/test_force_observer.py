@@ -22,16 +22,7 @@ HOVER: Vec3 = (0.0, 0.0, 0.0)
 
 
 def state(acceleration: Vec3 = ZERO, arm: Joints = POSE) -> PlantState:
-    found = at(arm=arm, arm_rate=(0.0,) * len(arm), force=None)
-    return PlantState(
-        position_world_m=found.position_world_m,
-        velocity_world_m_s=found.velocity_world_m_s,
-        acceleration_world_m_s2=acceleration,
-        attitude_wxyz=found.attitude_wxyz,
-        angular_rate_body_rad_s=found.angular_rate_body_rad_s,
-        arm_rad=arm,
-        arm_rate_rad_s=found.arm_rate_rad_s,
-    )
+    return at(acceleration=acceleration, arm=arm, arm_rate=(0.0,) * len(arm), force=None)
 
 
 class Run:

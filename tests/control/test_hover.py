@@ -15,6 +15,7 @@ from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind, Quat, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
+from tests.control.states import at
 from tests.support import CATCH, SHORT_CATCH
 
 MASS_KG = 3.0
@@ -25,17 +26,7 @@ DT_S = 0.005
 def state(
     acceleration: Vec3 = (0.0, 0.0, 0.0), attitude: Quat = IDENTITY_QUAT, force: Vec3 | None = (0.0, 0.0, 0.0)
 ) -> PlantState:
-    zero: Vec3 = (0.0, 0.0, 0.0)
-    return PlantState(
-        position_world_m=zero,
-        velocity_world_m_s=zero,
-        acceleration_world_m_s2=acceleration,
-        attitude_wxyz=attitude,
-        angular_rate_body_rad_s=zero,
-        arm_rad=(1.7, 1.0),
-        arm_rate_rad_s=(0.0, 0.0),
-        force_ext_world_n=force,
-    )
+    return at(acceleration=acceleration, attitude=attitude, arm=(1.7, 1.0), force=force)
 
 
 def learnt(

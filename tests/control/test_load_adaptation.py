@@ -16,9 +16,10 @@ from companion.config.loader import load_flight
 from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.arm_model import manipulator_of
 from companion.control.load_adaptation import LoadAdaptation
+from companion.mission.reference import at_rest
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import IDENTITY_QUAT, ControlLog, Joints, Matrix, Reference
-from tests.control.states import POSE, ZERO, at
+from companion.model.types import IDENTITY_QUAT, ControlLog, Joints, Matrix
+from tests.control.states import POSE, at
 from tests.support import tool_of
 
 CONFIG = load_flight("configs/missions/catch.yaml", preset="recommended")
@@ -26,17 +27,7 @@ MANIPULATOR = manipulator_of(CONFIG.vehicle)
 DT_S = 0.005
 MASS_KG, DAMPING = 3.0, 9.0
 """A row M s' = -Lambda s + load - theta."""
-REFERENCE = Reference(
-    position_world_m=(0.0, 0.0, 1.0),
-    velocity_world_m_s=ZERO,
-    acceleration_world_m_s2=ZERO,
-    yaw_rad=0.0,
-    yaw_rate_rad_s=0.0,
-    arm_rad=POSE,
-    arm_rate_rad_s=(0.0, 0.0),
-    arm_acceleration_rad_s2=(0.0, 0.0),
-    jerk_world_m_s3=ZERO,
-)
+REFERENCE = at_rest((0.0, 0.0, 1.0), 0.0, POSE)
 
 
 def law(**changes: Any) -> AdaptiveConfig:

@@ -7,6 +7,7 @@ import random
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import FlightConfig, load_flight
@@ -14,8 +15,9 @@ from companion.control.adaptive import AdaptiveController
 from companion.control.arm_model import dynamics_of
 from companion.control.common import Actuation
 from companion.control.disturbance import DisturbanceObserver
-from companion.control.types import PlantState
-from companion.model.types import IDENTITY_QUAT, Joints, Reference, Vec3
+from companion.mission.reference import at_rest
+from companion.model.types import Joints, Reference, Vec3
+from tests.control.states import at
 
 POSE: Joints = (math.radians(100), math.radians(60))
 ZERO: Vec3 = (0.0, 0.0, 0.0)
@@ -35,16 +37,7 @@ def config() -> FlightConfig:
 def tau(config: FlightConfig, option: dict[str, Any], reference: Reference, rate: Joints = (0.0, 0.0)) -> list[float]:
     assert isinstance(config.controller, AdaptiveConfig)
     controller = AdaptiveController(config.controller.model_copy(update=OFF | option), config.vehicle, 0.49)
-    state = PlantState(
-        position_world_m=(0.0, 0.0, 1.0),
-        velocity_world_m_s=ZERO,
-        acceleration_world_m_s2=ZERO,
-        attitude_wxyz=IDENTITY_QUAT,
-        angular_rate_body_rad_s=ZERO,
-        arm_rad=POSE,
-        arm_rate_rad_s=rate,
-        force_ext_world_n=ZERO,
-    )
+    state = at(arm_rate=rate)
     return list(controller.step(0.005, state, reference, 1.0).log.tau)
 
 
@@ -56,17 +49,7 @@ def difference(
 
 
 def test_the_lead_adds_mass_times_jerk_times_lead_and_only_sideways(config: FlightConfig) -> None:
-    reference = Reference(
-        position_world_m=(0.0, 0.0, 1.0),
-        velocity_world_m_s=ZERO,
-        acceleration_world_m_s2=ZERO,
-        yaw_rad=0.0,
-        yaw_rate_rad_s=0.0,
-        arm_rad=POSE,
-        arm_rate_rad_s=(0.0, 0.0),
-        arm_acceleration_rad_s2=(0.0, 0.0),
-        jerk_world_m_s3=(2.0, -1.0, 3.0),
-    )
+    reference = replace(at_rest((0.0, 0.0, 1.0), 0.0, POSE), jerk_world_m_s3=(2.0, -1.0, 3.0))
     added = difference(config, {"feedforward_lead_s": 0.15}, reference)
     assert added[:3] == pytest.approx([3.0 * 0.15 * 2.0, -3.0 * 0.15 * 1.0, 0.0])
     assert added[6:] == [0.0, 0.0]
@@ -75,45 +58,15 @@ def test_the_lead_adds_mass_times_jerk_times_lead_and_only_sideways(config: Flig
 def test_friction_follows_the_rate_that_is_wanted_not_the_one_that_is_measured(config: FlightConfig) -> None:
     option = {"arm_friction_share": 1.0}
     friction_nm = config.vehicle.arm.joint_friction_nm
-    moving = Reference(
-        position_world_m=(0.0, 0.0, 1.0),
-        velocity_world_m_s=ZERO,
-        acceleration_world_m_s2=ZERO,
-        yaw_rad=0.0,
-        yaw_rate_rad_s=0.0,
-        arm_rad=POSE,
-        arm_rate_rad_s=(1.0, -1.0),
-        arm_acceleration_rad_s2=(0.0, 0.0),
-        jerk_world_m_s3=(0.0, 0.0, 0.0),
-    )
+    moving = replace(at_rest((0.0, 0.0, 1.0), 0.0, POSE), arm_rate_rad_s=(1.0, -1.0))
     added = difference(config, option, moving)
     assert added[6:] == pytest.approx([friction_nm, -friction_nm], rel=1e-3)
-    resting = Reference(
-        position_world_m=(0.0, 0.0, 1.0),
-        velocity_world_m_s=ZERO,
-        acceleration_world_m_s2=ZERO,
-        yaw_rad=0.0,
-        yaw_rate_rad_s=0.0,
-        arm_rad=POSE,
-        arm_rate_rad_s=(0.0, 0.0),
-        arm_acceleration_rad_s2=(0.0, 0.0),
-        jerk_world_m_s3=(0.0, 0.0, 0.0),
-    )
+    resting = at_rest((0.0, 0.0, 1.0), 0.0, POSE)
     assert difference(config, option, resting, rate=(1.0, -1.0))[6:] == pytest.approx([0.0, 0.0], abs=1e-12)
 
 
 def test_the_arms_inertia_takes_the_place_of_m_d(config: FlightConfig) -> None:
-    reference = Reference(
-        position_world_m=(0.0, 0.0, 1.0),
-        velocity_world_m_s=ZERO,
-        acceleration_world_m_s2=ZERO,
-        yaw_rad=0.0,
-        yaw_rate_rad_s=0.0,
-        arm_rad=POSE,
-        arm_rate_rad_s=(0.0, 0.0),
-        arm_acceleration_rad_s2=(2.0, 1.0),
-        jerk_world_m_s3=(0.0, 0.0, 0.0),
-    )
+    reference = replace(at_rest((0.0, 0.0, 1.0), 0.0, POSE), arm_acceleration_rad_s2=(2.0, 1.0))
     added = difference(config, {"arm_inertia_nominal": True}, reference)
     (m11, m12), (m21, m22) = dynamics_of(config.vehicle).arm_terms(POSE, (0.0, 0.0)).mass
     assert isinstance(config.controller, AdaptiveConfig)
@@ -157,6 +110,17 @@ def test_the_observer_is_bounded_and_freezes_on_request() -> None:
     assert observer.force_n == before
 
 
+@pytest.mark.parametrize(
+    ("known_n", "acceleration"),
+    [((math.nan, 0.0, 0.0), ZERO), (ZERO, (0.0, math.nan, 0.0)), (ZERO, (0.0, 0.0, math.inf))],
+)
+def test_values_that_are_not_finite_leave_the_observer_unchanged(known_n: Vec3, acceleration: Vec3) -> None:
+    observer = DisturbanceObserver(3.0, (0.1, 0.1, 0.1), 0.05, 100.0)
+    before = [observer.step(0.005, ZERO, (1.0, 0.0, 0.0), learn=True) for _ in range(200)][-1]
+    assert observer.step(0.005, known_n, acceleration, learn=True) == before
+    assert observer.step(0.005, ZERO, (1.0, 0.0, 0.0), learn=True) == pytest.approx(before, abs=1e-3)
+
+
 def test_a_force_that_the_base_gives_way_to_is_not_observed_away(config: FlightConfig) -> None:
     """With base rows on, a pushed base that moves as its impedance says is not disturbed; without them the same push is."""
     assert isinstance(config.controller, AdaptiveConfig)
@@ -167,27 +131,8 @@ def test_a_force_that_the_base_gives_way_to_is_not_observed_away(config: FlightC
         )
         controller = AdaptiveController(law, config.vehicle, 0.49)
         for _ in range(400):
-            state = PlantState(
-                position_world_m=(0.0, 0.0, 1.0),
-                velocity_world_m_s=ZERO,
-                acceleration_world_m_s2=(2.0 / 3.0, 0.0, 0.0),
-                attitude_wxyz=IDENTITY_QUAT,
-                angular_rate_body_rad_s=ZERO,
-                arm_rad=POSE,
-                arm_rate_rad_s=(0.0, 0.0),
-                force_ext_world_n=(2.0, 0.0, 0.0),
-            )
-            reference = Reference(
-                position_world_m=(0.0, 0.0, 1.0),
-                velocity_world_m_s=ZERO,
-                acceleration_world_m_s2=ZERO,
-                yaw_rad=0.0,
-                yaw_rate_rad_s=0.0,
-                arm_rad=POSE,
-                arm_rate_rad_s=(0.0, 0.0),
-                arm_acceleration_rad_s2=(0.0, 0.0),
-                jerk_world_m_s3=(0.0, 0.0, 0.0),
-            )
+            state = at(acceleration=(2.0 / 3.0, 0.0, 0.0), force=(2.0, 0.0, 0.0))
+            reference = at_rest((0.0, 0.0, 1.0), 0.0, POSE)
             controller.step(0.005, state, reference, 1.0)
         found.append(controller._compensation._observer.force_n[0])
     without, with_rows = found

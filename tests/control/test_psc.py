@@ -16,12 +16,13 @@ from companion.control.arm_model import dynamics_of, manipulator_of
 from companion.control.payload_mass import PayloadEstimator
 from companion.control.psc import PscController
 from companion.control.types import PlantState, Wrench
-from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind, Reference
+from companion.mission.reference import at_rest
+from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight, FastResult
 from tests.analysis.recorded import record
-from tests.control.states import POSE, ZERO, at
+from tests.control.states import POSE, at
 from tests.flights.test_fast_flights import error_after_catch_m, event_ids
 from tests.support import SHORT_CATCH
 
@@ -48,16 +49,8 @@ def flown(*overrides: str) -> FastResult:
     return FastFlight(configured(*overrides)).run(until_mission_s=11.0)
 
 
-REFERENCE = Reference(
-    position_world_m=(0.0, 0.0, 1.0),
-    velocity_world_m_s=ZERO,
-    acceleration_world_m_s2=(0.2, 0.0, 0.1),
-    yaw_rad=0.0,
-    yaw_rate_rad_s=0.0,
-    arm_rad=POSE,
-    arm_rate_rad_s=(0.0, 0.0),
-    arm_acceleration_rad_s2=(0.3, -0.2),
-    jerk_world_m_s3=(0.0, 0.0, 0.0),
+REFERENCE = replace(
+    at_rest((0.0, 0.0, 1.0), 0.0, POSE), acceleration_world_m_s2=(0.2, 0.0, 0.1), arm_acceleration_rad_s2=(0.3, -0.2)
 )
 
 

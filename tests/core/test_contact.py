@@ -172,11 +172,14 @@ def test_report_and_ground_station_show_the_force_and_the_report_the_true_one(
     flight, result = pressed
     log = row_of(flight.config.flight, result, None)[1]
     assert flight.plant.world.surfaces is not None
+    found = contact_summary(log)
+    assert found is not None
     about, force, true, rotors, _, surface = contact_lines(
-        {"contact": contact_summary(log), "world": {"contact": flight.plant.world.surfaces.report()}}
+        {"contact": found, "world": {"contact": flight.plant.world.surfaces.report()}}
     )
     assert about[1] == "4 touches, 3 of them to find the surface" and force[1].startswith("5.00 N wanted")
-    assert surface[1].startswith("found by 3 points at [1.")
+    x, y, z = found["surface"]["point_m"]
+    assert surface[1].startswith(f"found by 3 points at [{x:.3f}, {y:.3f}, {z:.3f}] m, normal [-")
     assert 0.1 < float(rotors[1].split()[0]) < 0.6
     true_n = float(true[1].split()[0])
     assert true_n == pytest.approx(5.0, abs=0.25)
@@ -186,6 +189,7 @@ def test_report_and_ground_station_show_the_force_and_the_report_the_true_one(
     assert scene_of(flight.config.flight, "s").has_contact
     drawn = contact_force(log)
     assert drawn is not None and contact_path(log) is not None
+    assert [line.get_label() for line in drawn.axes[0].get_lines()] == ["measured", "wanted"]
     bands = {text.get_text() for text in drawn.legends[0].get_texts()}
     assert bands == {"weigh", "approach", "press", "leave", "move"}
     assert found_surface(log) is None  # a plane fits any three points
@@ -220,12 +224,12 @@ def test_a_force_sensor_that_dies_during_approach_or_press_leads_away_from_the_w
 
 def test_a_force_sensor_whose_zero_shifts_during_the_approach_neither_pushes_into_the_wall_nor_stays_at_it() -> None:
     faults = "world.faults=[{kind: force_bias, t_s: 7.0, size: 3.0}]"
-    flight = FastFlight(load_sitl("press", world="wall", overrides=[faults, "mission.phases[3].face_m=null", *SHORT]))
+    # A shift by 3 N also looks like a tether that pulls: whether that is noticed first would be luck.
+    sets = [faults, "vehicle.tether=null", "mission.phases[3].face_m=null", *SHORT]
+    flight = FastFlight(load_sitl("press", world="wall", overrides=sets))
     result = flight.run(90.0)
     surfaces = flight.plant.world.surfaces
-    assert {"contact_lost", "tether_snagged"} & set(
-        events(result)
-    )  # a shift by 3 N also looks like a tether that pulls
+    assert "contact_lost" in events(result)
     assert result.outputs[-1].outcome is Outcome.ABORTED and not result.crashed
     assert surfaces is not None and surfaces.force_max_n < 7.5 and surfaces.rotor_distance_min_m > 0.15
 

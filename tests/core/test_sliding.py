@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,20 +12,31 @@ import pytest
 from msgspec.structs import replace
 
 from companion.analysis.contact import contact_lines, contact_summary
+from companion.analysis.contact_plots import contact_force
 from companion.control import slide as control
 from companion.control.arm_model import manipulator_of
-from companion.control.types import PlantState
 from companion.core.flight_core import FlightCore
 from companion.core.sliding import STEER_MAX_RAD, UNSEEN_MAX_N
 from companion.mission.check import check_mission
 from companion.mission.contact import touches
+from companion.mission.reference import at_rest
 from companion.model.frames import euler_zyx_from_quat
-from companion.model.types import ContactMode, Outcome, Reference
+from companion.model.types import ContactMode, Inputs, Joints, Outcome, Vec3
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight, FastResult
+from tests.control.states import ZERO, at
 
 SLIDE = "configs/missions/slide.yaml"
+ARM: Joints = (1.1, 1.4)
+"""The arm stretched forward."""
+NAN: Vec3 = (math.nan, math.nan, math.nan)
+BROKEN: dict[int, Callable[[Inputs], Inputs]] = {
+    0: lambda i: replace(i, vehicle=replace(i.vehicle, specific_force_body_m_s2=NAN, delta_velocity_body_m_s=NAN)),  # type: ignore[type-var]
+    20: lambda i: replace(i, mocap=replace(i.mocap, position_world_m=NAN)),  # type: ignore[type-var]
+    40: lambda i: replace(i, arm=replace(i.arm, angle_rad=NAN[:2])),  # type: ignore[type-var]
+}
+"""Ticks with NaN in the record from which the force on the vehicle, the place of the tip, or the arm's joint angles come."""
 
 
 def short_slide(friction: float) -> list[str]:
@@ -44,8 +57,13 @@ def slide(friction: float, *more: str) -> tuple[FastFlight, FastResult]:
     return flight, flight.run(90.0)
 
 
-def test_the_tip_follows_its_path_while_the_force_is_held() -> None:
-    flight, result = slide(0.5)
+@pytest.fixture(scope="module")
+def slid() -> tuple[FastFlight, FastResult]:
+    return slide(0.5)
+
+
+def test_the_tip_follows_its_path_while_the_force_is_held(slid: tuple[FastFlight, FastResult]) -> None:
+    flight, result = slid
     assert result.outputs[-1].outcome is Outcome.COMPLETED and not result.crashed and result.layout is not None
     assert {e.id for o in result.outputs for e in o.events} == {"takeoff", "touched", "touchdown"}
     sliding = np.array([o.contact is not None and o.contact.mode is ContactMode.SLIDE for o in result.outputs])
@@ -57,8 +75,61 @@ def test_the_tip_follows_its_path_while_the_force_is_held() -> None:
     summary = contact_summary(log)
     assert summary is not None and summary["path_rms_m"] < 0.012
     assert ("slide", "0.30 m along the surface") in contact_lines({"contact": summary})
+    drawn = contact_force(log)
+    assert drawn is not None
+    sensor, corrected, wanted = drawn.axes[0].get_lines()
+    labels = [sensor.get_label(), corrected.get_label(), wanted.get_label()]
+    assert labels == ["sensor", "with the correction from the vehicle's motion", "wanted"]
+    corrected_n = np.asarray(corrected.get_ydata())
+    assert corrected_n[sliding].mean() == pytest.approx(summary["mean_n"])
+    assert np.isnan(corrected_n[: np.flatnonzero(sliding)[0]]).all()  # before the slide there is only the sensor's
     core = FlightCore(flight.config.flight)
     assert all(core.step(i) == o for i, o in zip(result.inputs, result.outputs, strict=True))
+
+
+def test_values_that_are_not_finite_neither_steer_nor_press_and_a_wrong_force_is_still_found(
+    slid: tuple[FastFlight, FastResult],
+) -> None:
+    flight, result = slid
+    sliding = [k for k, o in enumerate(result.outputs) if o.contact is not None and o.contact.mode is ContactMode.SLIDE]
+    first, core, seen = sliding[300], FlightCore(flight.config.flight), []
+    for k, i in enumerate(result.inputs[: first + 300]):
+        if k >= first + 200:  # the sensor measures 5 N less than acts
+            assert i.force is not None
+            x, y, z = i.force.force_sensor_n
+            i = replace(i, force=replace(i.force, force_sensor_n=(x + 5.0, y, z)))
+        o = core.step(BROKEN[k - first](i) if k - first in BROKEN else i)
+        seen += [event.id for event in o.events]
+        a, b = o.contact, result.outputs[k].contact
+        if first <= k < first + 200:
+            assert a is not None and b is not None and a.mode is ContactMode.SLIDE
+            assert a.push_n == pytest.approx(b.push_n, abs=0.1) and a.unseen_n == pytest.approx(b.unseen_n, abs=0.1)
+            assert a.steer_rad == pytest.approx(b.steer_rad, abs=0.05)
+            assert a.disagreement_n == pytest.approx(b.disagreement_n, abs=0.3)
+            assert a.unopposed_n == pytest.approx(b.unopposed_n, abs=0.3)
+    assert {"vehicle_not_finite", "mocap_not_finite", "arm_not_finite"} < set(seen) and seen[-1] == "contact_disagrees"
+
+
+def test_a_reading_across_the_tool_that_no_friction_explains_is_no_tether(slid: tuple[FastFlight, FastResult]) -> None:
+    flight, result = slid
+    first = next(k for k, o in enumerate(result.outputs) if o.contact is not None and o.contact.slide_world_n[2] < -1.0)
+    core, seen = FlightCore(flight.config.flight), []
+    for k, i in enumerate(result.inputs[: first + 500]):
+        if k >= first:
+            assert i.force is not None
+            x, y, z = i.force.force_sensor_n
+            i = replace(i, force=replace(i.force, force_sensor_n=(x, y + 4.0, z)))
+        seen += [event.id for event in core.step(i).events]
+    assert seen == ["takeoff", "touched"]
+
+
+def test_a_tether_that_jams_in_a_slide_is_noticed_before_the_tip_has_lost_the_wall() -> None:
+    jams = "world.faults=[{kind: tether_taut, t_s: 16.0, size: 0.0}]"
+    above = "vehicle.tether.anchor_world_m=[0.0,0.0,2.2]"  # on the way down the distance grows
+    result = FastFlight(load_sitl(SLIDE, world="ideal", overrides=[*short_slide(0.5), above, jams])).run(22.0)
+    snagged = next(k for k, o in enumerate(result.outputs) if any(e.id == "tether_snagged" for e in o.events))
+    before = result.outputs[snagged - 1].contact
+    assert before is not None and before.mode is ContactMode.SLIDE and not result.crashed
 
 
 def test_a_tool_that_is_caught_leads_away_from_the_wall() -> None:
@@ -68,15 +139,15 @@ def test_a_tool_that_is_caught_leads_away_from_the_wall() -> None:
 
 
 def test_a_wrong_reading_of_the_force_turns_the_setpoint_by_a_bounded_angle() -> None:
-    vehicle, state = load_sitl(SLIDE).vehicle, at_rest()
+    vehicle, state = load_sitl(SLIDE).vehicle, at(arm=ARM, force=None)
     slide = control.Slide(vehicle)
     slide.torque_nm(0.005, (0.0, 0.0), state, (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), None)
-    turned = slide.attitude(0.005, state.attitude_wxyz, state, reference(), (0.0, 0.0, 200.0))
+    turned = slide.attitude(0.005, state.attitude_wxyz, state, at_rest(ZERO, 0.0, ARM), (0.0, 0.0, 200.0))
     assert max(map(abs, euler_zyx_from_quat(turned))) == pytest.approx(control.TURN_MAX_RAD)
 
 
 def test_the_arm_pushes_along_the_way_and_answers_the_force_error_by_a_bounded_force() -> None:
-    vehicle, state, into = load_sitl(SLIDE).vehicle, at_rest(), (1.0, 0.0, 0.0)
+    vehicle, state, into = load_sitl(SLIDE).vehicle, at(arm=ARM, force=None), (1.0, 0.0, 0.0)
     jacobian = np.array(manipulator_of(vehicle).jacobian_body_m(state.arm_rad))[[0, 2]]
     slide = control.Slide(vehicle)
 
@@ -111,36 +182,6 @@ def test_a_slide_believes_the_motion_of_the_vehicle_within_a_bound_and_a_lost_su
     ]
     assert np.mean(forces[-400:]) == pytest.approx(3.0, abs=0.4)  # 4.3 N by the sensor alone
     assert not touches(replace(sliding[-1], force_n=sliding[-1].unseen_n), 1.0)
-
-
-def reference() -> Reference:
-    """Return the reference of a vehicle at rest."""
-    rest = (0.0, 0.0, 0.0)
-    return Reference(
-        position_world_m=rest,
-        velocity_world_m_s=rest,
-        acceleration_world_m_s2=rest,
-        yaw_rad=0.0,
-        yaw_rate_rad_s=0.0,
-        arm_rad=(1.1, 1.4),
-        arm_rate_rad_s=(0.0, 0.0),
-        arm_acceleration_rad_s2=(0.0, 0.0),
-        jerk_world_m_s3=rest,
-    )
-
-
-def at_rest() -> PlantState:
-    """Return the state of a level vehicle at rest whose arm is stretched."""
-    rest = (0.0, 0.0, 0.0)
-    return PlantState(
-        position_world_m=rest,
-        velocity_world_m_s=rest,
-        acceleration_world_m_s2=rest,
-        attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
-        angular_rate_body_rad_s=rest,
-        arm_rad=(1.1, 1.4),
-        arm_rate_rad_s=(0.0, 0.0),
-    )
 
 
 @pytest.mark.parametrize(

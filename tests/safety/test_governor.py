@@ -9,6 +9,7 @@ from functools import cache
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.mission.plan import Plan
@@ -33,17 +34,7 @@ def governor(*overrides: str) -> Governor:
 
 
 def asked(p: Vec3, v: Vec3 = (0.0, 0.0, 0.0), a: Vec3 = (0.0, 0.0, 0.0)) -> Reference:
-    return Reference(
-        position_world_m=p,
-        velocity_world_m_s=v,
-        acceleration_world_m_s2=a,
-        yaw_rad=0.3,
-        yaw_rate_rad_s=0.0,
-        arm_rad=ARM,
-        arm_rate_rad_s=(0.0, 0.0),
-        arm_acceleration_rad_s2=(0.0, 0.0),
-        jerk_world_m_s3=(0.0, 0.0, 0.0),
-    )
+    return replace(at_rest(p, 0.3, ARM), velocity_world_m_s=v, acceleration_world_m_s2=a)
 
 
 def tether(*, taut: bool = False, snagged: bool = False) -> TetherState:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +52,8 @@ def test_poses_reach_px4_on_a_link_of_their_own() -> None:
     asyncio.run(run())
 
 
-def fly(mission: Any, *faults: dict[str, Any]) -> tuple[FastFlight, FastResult]:
-    overrides = [EXTERNAL, "world.seed=1", f"world.faults={json.dumps(list(faults))}"]
+def fly(mission: Any, *faults: dict[str, Any], sets: Sequence[str] = ()) -> tuple[FastFlight, FastResult]:
+    overrides = [EXTERNAL, "world.seed=1", f"world.faults={json.dumps(list(faults))}", *sets]
     flight = FastFlight(load_sitl(mission, preset="recommended", overrides=overrides))
     return flight, flight.run()
 
@@ -96,9 +97,10 @@ def test_the_guardian_lands_on_the_other_programs_poses() -> None:
     assert not result.crashed and not result.armed
 
 
-@pytest.mark.parametrize("kind", ["mocap_jump", "mocap_freeze", "mocap_occluded"])
-def test_wrong_poses_of_the_other_program_end_in_no_crash(kind: str) -> None:
-    _, result = fly(HOVER, {"kind": kind, "t_s": 6.0})
-    assert not result.crashed
-    # Without any pose PX4 is alone, and in half of the laboratories it floats: docs/contact.md, Without the link.
-    assert kind == "mocap_occluded" or not result.armed
+@pytest.mark.parametrize(("kind", "height_m"), [("mocap_jump", 1.0), ("mocap_freeze", 1.0), ("mocap_occluded", 0.5)])
+def test_wrong_poses_of_the_other_program_end_in_no_crash_and_rotors_that_stop(kind: str, height_m: float) -> None:
+    """Without any pose PX4's estimate lasts for 6 s, enough to land from 0.5 m; from 1 m PX4 may float (docs/contact.md, Without the
+    link).
+    """
+    _, result = fly(HOVER, {"kind": kind, "t_s": 6.0}, sets=[f"mission.phases[0].height_m={height_m}"])
+    assert not result.crashed and not result.armed

@@ -330,6 +330,6 @@ def test_a_flight_whose_payload_missed_flies_on_and_catches_the_next_one() -> No
         True,
         None,
     )
-    # The impact may overload the sensor: in half of the laboratories it does.
-    ids = [event.id for output in result.outputs for event in output.events if event.id != "force_overload"]
-    assert ids == ["takeoff", "catch", "touchdown"]
+    # The impact, 4 N m give or take 1, overloads the sensor (4 N m) or does not; before and after it nothing may.
+    ids = [event.id for output in result.outputs for event in output.events]
+    assert ids in (["takeoff", *overload, "catch", "touchdown"] for overload in ([], ["force_overload"]))
