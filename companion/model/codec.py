@@ -214,7 +214,9 @@ def _schema(hint: Any) -> dict[str, Any]:
         return {
             "type": "object",
             "properties": {name: _schema(_without_none(hints[name])) for name in names},
-            "required": [name for name in names if _without_none(hints[name]) is hints[name]],
+            "required": [
+                field.name for field in msgspec.structs.fields(hint) if field.required
+            ],  # a default is left out
             "additionalProperties": False,
         }
     if typing.get_origin(hint) is tuple:
