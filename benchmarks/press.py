@@ -8,7 +8,7 @@ moved, as in Motive, by what the wall was found too far.
 Each seed draws a laboratory, and a wall of 1e3 to 1e5 N/m with a friction of 0.1 to 0.8, tilted by up to 15 deg about both axes and
 up to 5 cm from where the mission expects it. Prints a line for each flight and a summary: the steady error of the true and of the
 measured force along the wall's normal from 1.5 s after the wanted force is reached, the largest force, the normal and the place that
-were found.
+were found. `--set vehicle.force_source=observer` flies without a force sensor.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import argparse
 import json
 import math
 import random
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,14 +60,17 @@ class Press:
     place_error_mm: float
 
 
-def flown(seed: int, mission: str = "press", datum: bool = False) -> Press:
-    """Fly a mission (`press`, `probe`, `slide`) on the wall of a seed; with a datum, after a probe of a wall whose place is known."""
+def flown(seed: int, mission: str = "press", datum: bool = False, more: Sequence[str] = ()) -> Press:
+    """Fly a mission (`press`, `probe`, `slide`) on the wall of a seed; with a datum, after a probe of a wall whose place is known.
+
+    More settings are those of `companion fly --set`.
+    """
     draw = random.Random(seed)
     stiffness_n_m, friction = 10.0 ** draw.uniform(3.0, 5.0), draw.uniform(0.1, 0.8)
     tilt_deg, place_m = [draw.uniform(-15.0, 15.0), draw.uniform(-15.0, 15.0)], draw.uniform(-0.05, 0.05)
     wall = {"point_m": [1.5, 0.0, 1.09], "normal": [-1.0, 0.0, 0.0], "stiffness_n_m": stiffness_n_m}
     wall |= {"friction": friction, "tilt_error_deg": tilt_deg, "place_error_m": place_m}
-    sets = [f"world.surfaces={json.dumps([wall])}", f"world.seed={seed}"]
+    sets = [f"world.surfaces={json.dumps([wall])}", f"world.seed={seed}", *more]
     if datum:
         sets.append(f"world.mocap.pivot_offset_m={json.dumps(_moved_pivot_m(seed))}")
     flight = FastFlight(load_sitl(f"configs/missions/{mission}.yaml", world="lab", overrides=sets))
@@ -138,13 +142,16 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=5001)
     parser.add_argument("--mission", choices=["press", "probe", "slide"], default="press")
     parser.add_argument("--datum", action="store_true")
+    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="as of companion fly")
     arguments = parser.parse_args()
     presses = []
     for seed in range(arguments.first_seed, arguments.first_seed + arguments.draws):
-        presses.append(flown(seed, arguments.mission, arguments.datum))
+        presses.append(flown(seed, arguments.mission, arguments.datum, arguments.set))
         print(presses[-1], flush=True)
     completed = [press for press in presses if press.completed]
     print(f"{len(completed)} of {len(presses)} completed, {sum(press.crashed for press in presses)} crashed")
+    if not completed:
+        return
     print(f"nearest rotor {min(press.rotor_distance_m for press in presses):.2f} m")
     for name in (
         *("true_error", "measured_error", "largest_true_n", "largest_measured_n"),
