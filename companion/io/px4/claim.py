@@ -14,8 +14,8 @@ from companion.io.px4.link import (
     bind_alone,
     device_error,
     no_heartbeat,
-    parse_address,
 )
+from companion.io.px4.wire import parse_address
 
 Peer = tuple[str, int]
 """IPv4 address and UDP port."""

@@ -6,25 +6,19 @@ import asyncio
 import errno
 import logging
 import os
-import re
 import socket
 import stat
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from mavsdk import Autopilot as AutopilotKind
 from mavsdk import Mavsdk, log_subscribe, log_unsubscribe
 
 from companion.io.protocols import DeviceError
-from companion.io.px4.wire import OpenWire, open_wire
+from companion.io.px4.wire import OpenWire, open_wire, parse_address
 from companion.runtime.clock import Clock
 
-_ADDRESS = re.compile(
-    r"(?P<net>udpin|udpout|tcpout)://(?P<host>[^:/?]+):(?P<port>\d+)"
-    r"|(?P<serial>serial|serial_flowcontrol)://(?P<path>/[^:]+):(?P<baud>\d+)"
-)
 _FORMS = "udpin://0.0.0.0:14540, udpout://HOST:PORT, tcpout://HOST:PORT or serial:///dev/ttyAMA0:921600"
 
 _native_log = logging.getLogger("companion.mavsdk")
@@ -51,46 +45,15 @@ def check_address(address: str) -> None:
         DeviceError: the syntax or the port is invalid, the local address is busy or not one of this computer, or the serial port is
             missing or not accessible.
     """
-    match = _ADDRESS.fullmatch(address)
-    if match is None:
-        raise device_error(address, f"an address like {_FORMS}", "something else", "correct devices.autopilot.address")
-    if match["serial"]:
-        _check_serial(address, match["path"])
-        return
-    port = int(match["port"])
-    if not 0 < port <= 65535:
-        raise device_error(address, "a port from 1 to 65535", str(port), "correct devices.autopilot.address")
-
-
-@dataclass(frozen=True, slots=True)
-class AddressParts:
-    """Parts of an address."""
-
-    kind: str
-    """udpin, udpout, tcpout, serial or serial_flowcontrol."""
-    host: str
-    """Host, or the path of the device on a serial link."""
-    port: int
-    """Port, or the baud rate on a serial link."""
-
-    @property
-    def serial(self) -> bool:
-        """Return whether the link is a serial port."""
-        return self.kind in ("serial", "serial_flowcontrol")
-
-
-def parse_address(address: str) -> AddressParts:
-    """Return the parts of an address that `check_address` accepts.
-
-    Raises:
-        ValueError: `check_address` does not accept it.
-    """
-    match = _ADDRESS.fullmatch(address)
-    if match is None:
-        raise ValueError(f"expected an address like {_FORMS}, got {address!r}")
-    if match["serial"]:
-        return AddressParts(match["serial"], match["path"], int(match["baud"]))
-    return AddressParts(match["net"], match["host"], int(match["port"]))
+    try:
+        parts = parse_address(address)
+    except ValueError:
+        fix = "correct devices.autopilot.address"
+        raise device_error(address, f"an address like {_FORMS}", "something else", fix) from None
+    if parts.serial:
+        _check_serial(address, parts.host)
+    elif not 0 < parts.port <= 65535:
+        raise device_error(address, "a port from 1 to 65535", str(parts.port), "correct devices.autopilot.address")
 
 
 def _check_serial(address: str, path: str) -> None:

@@ -3,25 +3,66 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import logging
+import os
 import re
 import socket
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from companion.io.arrival import STAMP_ROOM_BYTES, arrived_s, stamp_arrivals
 from companion.io.px4.frames import autopilot_heartbeat
-from companion.io.px4.udp_peer import REPIN_SILENCE_S, disconnect_udp
 from companion.runtime.clock import Clock
 
 _LOG = logging.getLogger(__name__)
-_NET = re.compile(r"(udpin|udpout|tcpout)://([^:/?]+):(\d+)")
-_SERIAL = re.compile(r"(serial|serial_flowcontrol)://(/[^:]+):(\d+)")
+_KINDS, _PORTS = "udpin|udpout|tcpout", "serial|serial_flowcontrol"
+_ADDRESS = re.compile(
+    rf"(?P<net>{_KINDS})://(?P<host>[^:/?]+):(?P<port>\d+)|(?P<serial>{_PORTS})://(?P<path>/[^:]+):(?P<baud>\d+)"
+)
 _MAX_BYTES = 65535
 _ROUND_DATAGRAMS = 1000
 _CONNECT_TIMEOUT_S = 0.5
+REPIN_SILENCE_S = 1.0
+"""Silence after which PX4 is looked for at other ports of its address; PX4 sends hundreds of datagrams per second."""
+_ANY_PEER = bytes(16)
+"""A sockaddr of family AF_UNSPEC."""
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+@dataclass(frozen=True, slots=True)
+class AddressParts:
+    """Parts of an address."""
+
+    kind: str
+    """udpin, udpout, tcpout, serial or serial_flowcontrol."""
+    host: str
+    """Host, or the path of the device on a serial link."""
+    port: int
+    """Port, or the baud rate on a serial link."""
+
+    @property
+    def serial(self) -> bool:
+        """Return whether the link is a serial port."""
+        return self.kind in ("serial", "serial_flowcontrol")
+
+
+def parse_address(address: str) -> AddressParts:
+    """Return the parts of an address.
+
+    Raises:
+        ValueError: the address is none of these.
+    """
+    match = _ADDRESS.fullmatch(address)
+    if match is None:
+        raise ValueError(f"{address!r}: expected {_KINDS}://HOST:PORT or {_PORTS}:///dev/NAME:BAUD")
+    if match["serial"]:
+        return AddressParts(match["serial"], match["path"], int(match["baud"]))
+    return AddressParts(match["net"], match["host"], int(match["port"]))
 
 
 class Wire(Protocol):
@@ -131,7 +172,7 @@ class UdpWire(_ChannelWire):
         """Return datagrams from PX4's address; while the address is unknown, only the HEARTBEAT that reveals it."""
         # Disconnecting would take an unbound socket's port away from it.
         if self._connected and self._bound and self._clock() - self._heard_s > REPIN_SILENCE_S:
-            disconnect_udp(self._socket)
+            _disconnect(self._socket)
             self._connected = False
         found: list[tuple[float, bytes]] = []
         for _ in range(_ROUND_DATAGRAMS):
@@ -166,6 +207,17 @@ class UdpWire(_ChannelWire):
                 f"PX4 sent nothing from {before[0]}:{before[1]} for {REPIN_SILENCE_S:g} s and now sends from port {remote[1]}; "
                 "the link uses that port"
             )
+
+
+def _disconnect(connected: socket.socket) -> None:
+    """Let the socket receive from every sender again. It keeps its local port.
+
+    Raises:
+        OSError: the kernel refuses.
+    """
+    if _libc.connect(connected.fileno(), _ANY_PEER, len(_ANY_PEER)) != 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
 
 
 class TcpWire(_ChannelWire):
@@ -225,8 +277,7 @@ OpenWire = UdpWire | TcpWire | SerialWire
 
 def is_udp(address: str) -> bool:
     """Whether the address is a UDP link. A UDP link can be opened while the killed flight process still holds it."""
-    net = _NET.fullmatch(address)
-    return net is not None and net[1] in ("udpin", "udpout")
+    return address.startswith(("udpin://", "udpout://"))
 
 
 def open_wire(
@@ -251,17 +302,13 @@ def open_wire(
     Raises:
         OSError: the link does not exist, or another process holds it.
     """
-    net = _NET.fullmatch(address)
-    if net is not None:
-        kind, host, port = net[1], net[2], int(net[3])
-        if kind == "tcpout":
-            return TcpWire((host, port), clock)
-        if kind == "udpin":
-            return UdpWire((host, port), peer, clock, share_port=share_port, report=report)
-        remote = peer or (socket.gethostbyname(host), port)
-        local = ("", local_port) if local_port else None
-        return UdpWire(local, remote, clock, share_port=share_port, report=report)
-    port_of = _SERIAL.fullmatch(address)
-    if port_of is None:
-        raise OSError(f"{address}: unknown link type")
-    return SerialWire(port_of[2], int(port_of[3]), port_of[1] == "serial_flowcontrol", clock)
+    parts = parse_address(address)
+    if parts.serial:
+        return SerialWire(parts.host, parts.port, parts.kind == "serial_flowcontrol", clock)
+    if parts.kind == "tcpout":
+        return TcpWire((parts.host, parts.port), clock)
+    if parts.kind == "udpin":
+        return UdpWire((parts.host, parts.port), peer, clock, share_port=share_port, report=report)
+    remote = peer or (socket.gethostbyname(parts.host), parts.port)
+    local = ("", local_port) if local_port else None
+    return UdpWire(local, remote, clock, share_port=share_port, report=report)
