@@ -42,7 +42,7 @@ class DisturbanceObserver:
             acceleration_world_m_s2: measured acceleration.
             learn: if False, the estimate does not change (on the ground, or while the actuators are saturated).
         """
-        if not self.on or not math.isfinite(sum(known_n) + sum(acceleration_world_m_s2)):
+        if not self.on or not math.isfinite(sum((*known_n, *acceleration_world_m_s2))):
             return self.force_n
         lx, ly, lz = self._lagged or known_n
         kx, ky, kz = known_n

@@ -97,7 +97,7 @@ class ForceObserver:
         """
         acceleration = state.acceleration_world_m_s2
         moment = quat_rotate(state.attitude_wxyz, self.first_moment_body_kg_m(state.arm_rad))
-        if not math.isfinite(sum(known_n) + sum(acceleration) + sum(moment)):
+        if not math.isfinite(sum((*known_n, *acceleration, *moment))):
             return self.force_n
         k = dt_s / (dt_s + TIME_S)
         dx, dy, dz = self._base.step(dt_s, known_n, acceleration, learn=True)
