@@ -55,10 +55,11 @@ class MemoryWire:
         """Return whether PX4 was found; always True."""
         return True
 
-    def send(self, data: bytes) -> None:
+    def send(self, data: bytes) -> bool:
         """Deliver MAVLink bytes to the stub at once."""
         for message in self._decoder.parse_buffer(data) or ():
             self._receiver.handle(self._end, message)
+        return True
 
     def receive(self) -> list[tuple[float, bytes]]:
         """Return and clear the packets that the stub has sent; nobody asks when they arrived."""

@@ -39,8 +39,9 @@ class Wire:
     def fileno(self) -> int:
         return -1
 
-    def send(self, data: bytes) -> None:
+    def send(self, data: bytes) -> bool:
         self.sent += self._decoder.parse_buffer(data) or []
+        return True
 
     def receive(self) -> list[tuple[float, bytes]]:
         return []

@@ -55,7 +55,7 @@ def test_udpin_takes_nobody_for_px4_but_the_sender_of_a_valid_heartbeat(data: by
         closing(socket.socket(type=socket.SOCK_DGRAM)) as px4,
     ):
         px4.settimeout(DEADLINE_S)
-        wire.send(b"lost")
+        assert not wire.send(b"lost")
         stranger.sendto(data, ("127.0.0.1", port))
         wait_readable(wire)
         assert received(wire) == []
@@ -64,7 +64,7 @@ def test_udpin_takes_nobody_for_px4_but_the_sender_of_a_valid_heartbeat(data: by
         wait_readable(wire)
         assert received(wire) == [heartbeat()]
         assert wire.ready
-        wire.send(b"heard")
+        assert wire.send(b"heard")
         assert px4.recv(100) == b"heard"
 
 
@@ -191,7 +191,7 @@ def test_a_serial_port_that_hangs_up_is_lost() -> None:
         os.close(master)
         wait_readable(wire)
         assert (wire.receive(), wire.lost) == ([], True)
-        wire.send(b"into the void")
+        assert not wire.send(b"into the void")
 
 
 def test_a_tcp_connection_that_ends_is_lost() -> None:

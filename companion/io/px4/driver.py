@@ -223,7 +223,7 @@ class MavsdkAutopilot:
         return self._setpoints.send(setpoint, self._clock())
 
     def send_vision(self, pose: MocapPose) -> bool:
-        """Send VISION_POSITION_ESTIMATE at once. Return False if the link is closed.
+        """Send VISION_POSITION_ESTIMATE at once. Return False if it was not sent.
 
         Raises:
             ValueError: the pose is not finite.
@@ -231,8 +231,7 @@ class MavsdkAutopilot:
         payload = messages.vision_position_estimate(pose)
         if not self._open:
             return False
-        self._send_message(messages.VISION_POSITION_ESTIMATE_ID, payload)
-        return True
+        return self._send_message(messages.VISION_POSITION_ESTIMATE_ID, payload)
 
     def request(self, request: AutopilotRequest) -> None:
         """Send the request's command unless one of its kind is in progress or was sent a moment ago. Returns at once.
@@ -410,9 +409,8 @@ class MavsdkAutopilot:
             except OSError:  # nothing more, or an ICMP error of an earlier send
                 return
 
-    def _send_message(self, message_id: int, payload: bytes) -> None:
-        if self._wire is not None:
-            self._wire.send(self._writer.frame(message_id, payload))
+    def _send_message(self, message_id: int, payload: bytes) -> bool:
+        return self._wire is not None and self._wire.send(self._writer.frame(message_id, payload))
 
     def _send_for_mavsdk(self, data: bytes, *_: Any) -> None:
         """Send what MAVSDK sends, in a thread of MAVSDK."""

@@ -22,7 +22,7 @@ class SetpointPath(Protocol):
     """A path of setpoints to PX4."""
 
     def send(self, setpoint: AttitudeSetpoint, t_s: float) -> bool:
-        """Send at once. Return False if MAVSDK rejected it.
+        """Send at once. Return False if it was not sent.
 
         Raises:
             ValueError: a value is invalid; nothing was sent.
@@ -32,13 +32,13 @@ class SetpointPath(Protocol):
         """Stop sending until the next `send`."""
 
 
-def setpoint_path(kind: Literal["direct", "offboard"], system: Any, send: Callable[[int, bytes], None]) -> SetpointPath:
+def setpoint_path(kind: Literal["direct", "offboard"], system: Any, send: Callable[[int, bytes], bool]) -> SetpointPath:
     """Return the path that `devices.autopilot.setpoint_path` selects.
 
     Args:
         kind: the path.
         system: the MAVSDK system.
-        send: sends a message, given by id and payload.
+        send: sends a message, given by id and payload; returns whether it was sent.
     """
     if kind == "offboard":
         return OffboardSetpoints(system)
@@ -50,15 +50,14 @@ class DirectSetpoints:
     the companion hangs.
     """
 
-    def __init__(self, send: Callable[[int, bytes], None], system_id: int) -> None:
+    def __init__(self, send: Callable[[int, bytes], bool], system_id: int) -> None:
         self._send = send
         self._system_id = system_id
 
     def send(self, setpoint: AttitudeSetpoint, t_s: float) -> bool:
         """Send SET_ATTITUDE_TARGET with the given quaternion, stamped with the flight clock."""
         payload = messages.attitude_target(setpoint, int(t_s * 1e3), self._system_id)
-        self._send(messages.SET_ATTITUDE_TARGET_ID, payload)
-        return True
+        return self._send(messages.SET_ATTITUDE_TARGET_ID, payload)
 
     def stop(self) -> None:
         """Do nothing, because this path sends nothing by itself."""

@@ -55,7 +55,7 @@ def parse_address(address: str) -> AddressParts:
     """Return the parts of an address.
 
     Raises:
-        ValueError: the address is none of these.
+        ValueError: the address has none of the known forms.
     """
     match = _ADDRESS.fullmatch(address)
     if match is None:
@@ -79,8 +79,8 @@ class Wire(Protocol):
     def fileno(self) -> int:
         """Return the descriptor to wait on."""
 
-    def send(self, data: bytes) -> None:
-        """Send one message; drop it if the transport does not accept it."""
+    def send(self, data: bytes) -> bool:
+        """Send one message. Return False if the transport does not accept the whole of it; the rest is dropped."""
 
     def receive(self) -> list[tuple[float, bytes]]:
         """Return all data that has arrived, with the time of its arrival, or of this call where the kernel gives none."""
@@ -162,11 +162,12 @@ class UdpWire(_ChannelWire):
             self._socket.close()
             raise
 
-    def send(self, data: bytes) -> None:
+    def send(self, data: bytes) -> bool:
         """Send to PX4; do nothing before its address is known."""
         if self.remote is not None:
             with contextlib.suppress(OSError):
-                self._socket.sendto(data, self.remote)
+                return self._socket.sendto(data, self.remote) == len(data)
+        return False
 
     def receive(self) -> list[tuple[float, bytes]]:
         """Return datagrams from PX4's address; while the address is unknown, only the HEARTBEAT that reveals it."""
@@ -228,10 +229,11 @@ class TcpWire(_ChannelWire):
         super().__init__(self._socket, clock)
         self._socket.setblocking(False)
 
-    def send(self, data: bytes) -> None:
+    def send(self, data: bytes) -> bool:
         """Send what fits into the send buffer; the receiver resynchronises on the next message."""
         with contextlib.suppress(OSError):
-            self._socket.send(data)
+            return self._socket.send(data) == len(data)
+        return False
 
     def receive(self) -> list[tuple[float, bytes]]:
         """Return the data that has arrived. End of stream or an error marks the wire as lost."""
@@ -257,10 +259,11 @@ class SerialWire(_ChannelWire):
         self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, rtscts=flow_control, exclusive=True)
         super().__init__(self._port, clock)
 
-    def send(self, data: bytes) -> None:
+    def send(self, data: bytes) -> bool:
         """Write as many bytes as the port accepts."""
         with contextlib.suppress(OSError):
-            self._port.write(data)
+            return bool(self._port.write(data) == len(data))
+        return False
 
     def receive(self) -> list[tuple[float, bytes]]:
         """Return the data that has arrived. A port that is readable but has no data (unplugged, hung up) is lost."""
