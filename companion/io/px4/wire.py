@@ -173,8 +173,9 @@ class UdpWire(_ChannelWire):
         """Return datagrams from PX4's address; while the address is unknown, only the HEARTBEAT that reveals it."""
         # Disconnecting would take an unbound socket's port away from it.
         if self._connected and self._bound and self._clock() - self._heard_s > REPIN_SILENCE_S:
-            _disconnect(self._socket)
-            self._connected = False
+            with contextlib.suppress(OSError):  # tried again at the next call; it must not end the flight
+                _disconnect(self._socket)
+                self._connected = False
         found: list[tuple[float, bytes]] = []
         for _ in range(_ROUND_DATAGRAMS):
             try:
@@ -184,7 +185,8 @@ class UdpWire(_ChannelWire):
             except OSError:  # an ICMP error of an earlier send
                 continue
             if not self._connected and self._is_from_px4(data, sender):
-                self._connect(sender)
+                with contextlib.suppress(OSError):
+                    self._connect(sender)
             if sender == self.remote:
                 found.append((arrived_s(notes, self._clock), data))
         if found:
@@ -199,8 +201,8 @@ class UdpWire(_ChannelWire):
         return heard is not None and (self.system is None or heard.system == self.system)
 
     def _connect(self, remote: tuple[str, int]) -> None:
-        before, self.remote = self.remote, remote
         self._socket.connect(remote)
+        before, self.remote = self.remote, remote
         self._heard_s = self._clock()
         self._connected = self.ready = True
         if before is not None and remote != before:
