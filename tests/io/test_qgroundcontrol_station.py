@@ -24,9 +24,9 @@ from companion.config.loader import load_flight
 from companion.io.protocols import DeviceError
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.io.qgroundcontrol.channel import pack, unpack
-from companion.io.qgroundcontrol.frames import UP_BURST, UP_RATE_HZ
 from companion.io.qgroundcontrol.relay import GONE
 from companion.io.qgroundcontrol.station import GroundStation, check_address
+from companion.io.qgroundcontrol.uplink_filter import UP_BURST, UP_RATE_HZ
 from companion.model.types import (
     AttitudeSetpoint,
     AutopilotRequest,

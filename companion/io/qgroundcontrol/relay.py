@@ -25,7 +25,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.io.qgroundcontrol.channel import pack, unpack
-from companion.io.qgroundcontrol.frames import DownlinkFilter
+from companion.io.qgroundcontrol.downlink_filter import DownlinkFilter
 from companion.io.qgroundcontrol.texts import COMPONENT, Texts, heartbeat_message, value_messages
 from companion.io.qgroundcontrol.uplink_filter import UplinkFilter
 

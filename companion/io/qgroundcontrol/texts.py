@@ -12,7 +12,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.io.qgroundcontrol.frames import TokenBucket
+from companion.io.qgroundcontrol.token_bucket import TokenBucket
 from companion.model.types import Event, Inputs, Outcome, Outputs, SafetyAction, Severity
 
 COMPONENT = int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)

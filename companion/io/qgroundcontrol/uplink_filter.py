@@ -1,5 +1,8 @@
 """Filter of messages from a ground station to the vehicle. Pure: time is an argument.
 
+A message passes only as a whole frame with a valid checksum, of a kind that ground stations need, and never with the vehicle's own
+ids (`docs/qgroundcontrol.md`).
+
 While PX4 is armed only listed messages pass: those that read, and those that end or pause the flight (LAND, HOLD, a pilot's mode, a
 disarm that PX4 itself may refuse). Everything else is refused until PX4 is disarmed, including a forced disarm, a restart, flight
 termination, parameters, missions, files, and RETURN, which climbs although the vehicle is tethered.
@@ -14,17 +17,31 @@ from collections import Counter
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.io.px4.frames import REQUEST_EVENT, Frame, autopilot_heartbeat, frames
-from companion.io.qgroundcontrol.frames import (
-    COMMANDS,
-    GROUND_MESSAGES,
-    GROUND_SYSTEMS_MAX,
-    REFUSED_COMMANDS,
-    UP_BURST,
-    UP_RATE_HZ,
-    TokenBucket,
-    command_of,
-)
+from companion.io.qgroundcontrol.token_bucket import TokenBucket
 
+UP_RATE_HZ = 100.0
+UP_BURST = 100
+"""Largest burst of messages from the ground; a ground station with a joystick needs 60 per second."""
+GROUND_SYSTEMS_MAX = 4
+"""Largest number of ground stations' system ids, because PX4 keeps a record of each."""
+GROUND_MESSAGES = frozenset(
+    getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
+    for name in (
+        *("HEARTBEAT", "PING", "SYSTEM_TIME", "SET_MODE", "MANUAL_CONTROL", "COMMAND_LONG", "COMMAND_INT"),
+        *("PARAM_REQUEST_READ", "PARAM_REQUEST_LIST", "PARAM_SET", "FILE_TRANSFER_PROTOCOL", "SERIAL_CONTROL"),
+        *("MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_REQUEST_LIST", "MISSION_COUNT", "MISSION_ITEM"),
+        *("MISSION_ITEM_INT", "MISSION_ACK", "MISSION_CLEAR_ALL", "MISSION_SET_CURRENT"),
+        *("LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_ERASE", "LOG_REQUEST_END", "LOGGING_ACK"),
+    )
+) | {REQUEST_EVENT}
+"""Messages that a ground station may send. Setpoints, estimates of the vehicle's pose, sensor readings and replies are not
+among them.
+"""
+REFUSED_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 611, 43003})
+"""Commands that would slow the flight's streams (511) or move the estimate (SET_GLOBAL_ORIGIN, EXTERNAL_POSITION_ESTIMATE)."""
+COMMANDS = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
+_COMMAND_OFFSET = 28
+"""Offset of the uint16 `command` in the payload of both COMMAND_LONG and COMMAND_INT."""
 HEARTBEAT_MAX_AGE_S = 3.0
 """Max age of PX4's heartbeat, which is sent once per second. Without a fresh one PX4 counts as armed."""
 
@@ -175,3 +192,8 @@ def _mode_allowed(base_mode: float, main_mode: float, sub_mode: float) -> bool:
 def _padded(frame: Frame, size: int) -> bytes:
     """Return the payload's first `size` bytes; MAVLink 2 truncates trailing zeros."""
     return frame.payload[:size].ljust(size, b"\0")
+
+
+def command_of(payload: bytes) -> int:
+    """Return the MAV_CMD; MAVLink 2 truncates trailing zeros of a payload."""
+    return int.from_bytes(payload[_COMMAND_OFFSET : _COMMAND_OFFSET + 2], "little")

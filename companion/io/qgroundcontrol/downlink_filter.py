@@ -1,9 +1,4 @@
-"""Extracts MAVLink frames to and from a ground station from datagrams, checks them, and passes or refuses them. Pure: no socket, no
-clock.
-
-A message from the ground passes only as a whole frame with a valid checksum, of a kind that ground stations need, and never with
-the vehicle's own ids (`docs/qgroundcontrol.md`).
-"""
+"""Filter of the vehicle's messages to a ground station. Pure: time is an argument."""
 
 from __future__ import annotations
 
@@ -11,34 +6,11 @@ from collections import Counter
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.io.px4.frames import CRC_EXTRA, REQUEST_EVENT, Frame, frames
+from companion.io.px4.frames import CRC_EXTRA, Frame, frames
 
-UP_RATE_HZ = 100.0
-UP_BURST = 100
-"""Largest burst of messages from the ground; a ground station with a joystick needs 60 per second."""
-GROUND_SYSTEMS_MAX = 4
-"""Largest number of ground stations' system ids, because PX4 keeps a record of each."""
 STREAM_RATE_HZ = 10.0
 """Rate of each fast stream to the ground; the companion requests up to 250 Hz from PX4."""
 
-GROUND_MESSAGES = frozenset(
-    getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
-    for name in (
-        *("HEARTBEAT", "PING", "SYSTEM_TIME", "SET_MODE", "MANUAL_CONTROL", "COMMAND_LONG", "COMMAND_INT"),
-        *("PARAM_REQUEST_READ", "PARAM_REQUEST_LIST", "PARAM_SET", "FILE_TRANSFER_PROTOCOL", "SERIAL_CONTROL"),
-        *("MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_REQUEST_LIST", "MISSION_COUNT", "MISSION_ITEM"),
-        *("MISSION_ITEM_INT", "MISSION_ACK", "MISSION_CLEAR_ALL", "MISSION_SET_CURRENT"),
-        *("LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_ERASE", "LOG_REQUEST_END", "LOGGING_ACK"),
-    )
-) | {REQUEST_EVENT}
-"""Messages that a ground station may send. Setpoints, estimates of the vehicle's pose, sensor readings and replies are not
-among them.
-"""
-REFUSED_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 611, 43003})
-"""Commands that would slow the flight's streams (511) or move the estimate (SET_GLOBAL_ORIGIN, EXTERNAL_POSITION_ESTIMATE)."""
-COMMANDS = (mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT)
-_COMMAND_OFFSET = 28
-"""Offset of the uint16 `command` in the payload of both COMMAND_LONG and COMMAND_INT."""
 
 FAST_STREAMS = frozenset(
     getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
@@ -63,31 +35,6 @@ FAST_STREAMS = frozenset(
         *("ALTITUDE", "DISTANCE_SENSOR", "OPTICAL_FLOW_RAD", "VIBRATION", "ESTIMATOR_STATUS"),
     )
 )
-
-
-class TokenBucket:
-    """Token bucket: limits a burst and the mean rate."""
-
-    def __init__(self, rate_hz: float, burst: int) -> None:
-        self._rate_hz = rate_hz
-        self._burst = float(burst)
-        self._left = float(burst)
-        self._seen_s: float | None = None
-
-    def take(self, now_s: float) -> bool:
-        """Return whether one more message is allowed, and count it."""
-        if self._seen_s is not None:
-            self._left = min(self._burst, self._left + (now_s - self._seen_s) * self._rate_hz)
-        self._seen_s = now_s
-        if self._left < 1.0:
-            return False
-        self._left -= 1.0
-        return True
-
-
-def command_of(payload: bytes) -> int:
-    """Return the MAV_CMD; MAVLink 2 truncates trailing zeros of a payload."""
-    return int.from_bytes(payload[_COMMAND_OFFSET : _COMMAND_OFFSET + 2], "little")
 
 
 class DownlinkFilter:

@@ -12,9 +12,9 @@ from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
-from companion.io.qgroundcontrol.frames import GROUND_SYSTEMS_MAX, STREAM_RATE_HZ, UP_BURST, UP_RATE_HZ, DownlinkFilter
+from companion.io.qgroundcontrol.downlink_filter import STREAM_RATE_HZ, DownlinkFilter
 from companion.io.qgroundcontrol.texts import TEXTS_WAITING_MAX, VALUE_NAMES, Texts, event_text, value_messages, values
-from companion.io.qgroundcontrol.uplink_filter import UplinkFilter
+from companion.io.qgroundcontrol.uplink_filter import GROUND_SYSTEMS_MAX, UP_BURST, UP_RATE_HZ, UplinkFilter
 from companion.model.types import Event, SafetyAction, Severity
 from tests.analysis.synthetic_flight import synthetic_flight
 
