@@ -2,7 +2,8 @@
 answers the force error, and an attitude setpoint that opposes the moment of the friction and steers the tip.
 
 The base moves by some millimetres in every gust. The joints answer the measured force error at once, while the base's push follows
-slowly. Nothing makes the arm stiffer: a stiff arm whose torques come 5 ms late swings (docs/contact.md).
+slowly. Nothing makes the arm stiffer: a stiff arm whose torques come 5 ms late swings (docs/contact.md). The friction of the gears
+would keep 1 to 2 N of each answer from the tip; the torques that overcome it follow the measured joint rates.
 
 Friction acts far ahead of the rotors and pitches the vehicle. PX4 holds the attitude against it only after its rate integrator has
 followed; until then the thrust presses with 0.5 N per degree too much or too little, which changes the friction again: the tip sticks
@@ -23,9 +24,13 @@ from companion.model.algebra import dot
 from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.types import Joints, Quat, Reference, Vec3
 
-FORCE_GAIN, FORCE_S, FORCE_MAX_N = 6.0, 0.1, 5.0
+FORCE_GAIN, FORCE_S, FORCE_MAX_N = 6.0, 0.07, 5.0
 """Gain of the arm's force on the force error, time constant of its filter, and its bound. The loop closes at gain / time constant =
-60 rad/s.
+86 rad/s.
+"""
+GEAR_LOSS_SHARE, GEAR_RATE_RAD_S = 0.15, 0.05
+"""Friction of the gears that the joints overcome, as a fraction of the torque, in addition to `arm.joint_friction_nm`; and the rate
+below which this torque fades out, two steps of the servos' velocity reading.
 """
 ATTITUDE_P, RATE_P, INTEGRATOR_S = 6.5, 0.15, 0.75
 """PX4's defaults of MC_PITCH_P and MC_PITCHRATE_P, and MC_PITCHRATE_P over MC_PITCHRATE_I."""
@@ -44,6 +49,7 @@ class Slide:
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._manipulator, self._torque_max_nm = manipulator_of(vehicle), vehicle.joint_torque_limits_nm
+        self._friction_nm = vehicle.arm.joint_friction_nm
         airframe = vehicle.airframe
         arms_m = [abs(x) for x, _, _ in airframe.rotor_layout.positions_body_m]
         torque_max_nm = 0.5 * airframe.thrust_max_n * sum(arms_m, 0.0) / len(arms_m)
@@ -84,7 +90,12 @@ class Slide:
         force_world_n = (fx + more_n * nx, fy + more_n * ny, fz + more_n * nz)
         force_body_n = quat_rotate(quat_conjugate(state.attitude_wxyz), force_world_n)
         more_nm = self._manipulator.joint_torque_from_force(state.arm_rad, force_body_n)
-        return tuple([min(max(t + f, -m), m) for t, f, m in zip(torque_nm, more_nm, self._torque_max_nm, strict=True)])
+        limited_nm = []
+        for torque, more, rate, most in zip(torque_nm, more_nm, state.arm_rate_rad_s, self._torque_max_nm, strict=True):
+            torque += more
+            torque += (self._friction_nm + GEAR_LOSS_SHARE * abs(torque)) * math.tanh(rate / GEAR_RATE_RAD_S)
+            limited_nm.append(min(max(torque, -most), most))
+        return tuple(limited_nm)
 
     def _answer_n(self, dt_s: float, wanted_n: float, measured_world_n: Vec3 | None, direction_world: Vec3) -> float:
         """Return the force along the press with which the arm answers the force error."""
