@@ -14,7 +14,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.guardian.link import Link
-from companion.io.px4.wire import SerialWire, TcpWire, UdpWire, Wire, open_wire
+from companion.io.px4.wire import ROUND_DATAGRAMS, SerialWire, TcpWire, UdpWire, Wire, open_wire
 from tests.io.px4_peer import free_udp_port
 from tests.support import DEADLINE_S, wait_until
 
@@ -66,6 +66,17 @@ def test_udpin_takes_nobody_for_px4_but_the_sender_of_a_valid_heartbeat(data: by
         assert wire.ready
         assert wire.send(b"heard")
         assert px4.recv(100) == b"heard"
+
+
+def test_a_flood_from_px4s_own_address_is_read_in_parts() -> None:
+    port = free_udp_port()
+    with opened(f"udpin://127.0.0.1:{port}") as wire, closing(socket.socket(type=socket.SOCK_DGRAM)) as px4:
+        sent = [heartbeat(), *(b"%d" % number for number in range(ROUND_DATAGRAMS + 20))]
+        for data in sent:
+            px4.sendto(data, ("127.0.0.1", port))
+        wait_readable(wire)
+        assert received(wire) == sent[:ROUND_DATAGRAMS]
+        assert received(wire) == sent[ROUND_DATAGRAMS:]
 
 
 @pytest.mark.parametrize("kind", ["udpin", "udpout"])

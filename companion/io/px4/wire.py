@@ -24,7 +24,8 @@ _ADDRESS = re.compile(
     rf"(?P<net>{_KINDS})://(?P<host>[^:/?]+):(?P<port>\d+)|(?P<serial>{_PORTS})://(?P<path>/[^:]+):(?P<baud>\d+)"
 )
 _MAX_BYTES = 65535
-_ROUND_DATAGRAMS = 1000
+ROUND_DATAGRAMS = 200
+"""Most datagrams read in one call, so that a flood from PX4's own address does not hold up a tick; PX4 sends some 600 per second."""
 _CONNECT_TIMEOUT_S = 0.5
 REPIN_SILENCE_S = 1.0
 """Silence after which PX4 is looked for at other ports of its address; PX4 sends hundreds of datagrams per second."""
@@ -83,7 +84,7 @@ class Wire(Protocol):
         """Send one message. Return False if the transport does not accept the whole of it; the rest is dropped."""
 
     def receive(self) -> list[tuple[float, bytes]]:
-        """Return all data that has arrived, with the time of its arrival, or of this call where the kernel gives none."""
+        """Return the data that has arrived, with the time of its arrival, or of this call where the kernel gives none."""
 
     def close(self) -> None:
         """Close the transport."""
@@ -177,7 +178,7 @@ class UdpWire(_ChannelWire):
                 _disconnect(self._socket)
                 self._connected = False
         found: list[tuple[float, bytes]] = []
-        for _ in range(_ROUND_DATAGRAMS):
+        for _ in range(ROUND_DATAGRAMS):
             try:
                 data, notes, _, sender = self._socket.recvmsg(_MAX_BYTES, STAMP_ROOM_BYTES)
             except (BlockingIOError, InterruptedError):
