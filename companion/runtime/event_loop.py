@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 
 _T = TypeVar("_T")
 
-_RECENT_S = 0.0002
+_RECENT_S = 0.001
+"""Longer than a tick's first round, which takes 0.1 to 0.5 ms, depending on the computer."""
 
 
 class _Selector(selectors.SelectSelector):
