@@ -9,9 +9,8 @@ sensor executes only STOP and SET_BIAS and answers neither.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 from companion.model.types import Vec3
 
@@ -66,8 +65,7 @@ class Overload(IntEnum):
     TZ = 0x01
 
 
-@dataclass(frozen=True, slots=True)
-class Wrench:
+class Wrench(NamedTuple):
     """One measurement in the sensor frame."""
 
     force_n: Vec3

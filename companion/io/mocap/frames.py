@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from companion.io.mocap.natnet import (
     COUNT_BYTES,
@@ -39,8 +38,7 @@ _PARAM_TRACKING_VALID = 0x01
 _QUAT_NORM_TOLERANCE = 0.02
 
 
-@dataclass(frozen=True, slots=True)
-class RigidBody:
+class RigidBody(NamedTuple):
     """One rigid body of a frame, in the axes that the server streams."""
 
     id: int
@@ -50,8 +48,7 @@ class RigidBody:
     tracking_valid: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(NamedTuple):
     """The data of one frame that the companion uses."""
 
     number: int
