@@ -27,7 +27,6 @@ from sitl.servo.protocol import (
 from sitl.servo.registers import BAUDS
 
 _BITS_PER_BYTE = 10
-_CLEAR_TURNS = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
 _PARTIAL_TIMEOUT_S = 0.02
 """Byte-to-byte timeout. The real servo's is 1.5 ms, but a pty on a busy computer may be slower."""
 _BAUD_OF_SPEED = {getattr(termios, f"B{baud}"): baud for baud in BAUDS if hasattr(termios, f"B{baud}")}
@@ -83,7 +82,6 @@ class ServoLine:
             Instruction.SYNC_WRITE: self._sync_write,
             Instruction.FAST_SYNC_READ: self._fast_sync_read,
             Instruction.BULK_READ: self._bulk_read,
-            Instruction.BULK_WRITE: self._bulk_write,
             Instruction.FAST_BULK_READ: self._fast_bulk_read,
         }.get(packet.instruction)  # type: ignore[call-overload]
         if packet.packet_id == BROADCAST_ID:
@@ -129,22 +127,12 @@ class ServoLine:
                     if len(parameters) != 4:
                         raise ServoRefusal(StatusError.DATA_LENGTH)
                     data = servo.read(_word(parameters, 0), _word(parameters, 2))
-                case Instruction.WRITE | Instruction.REG_WRITE:
+                case Instruction.WRITE:
                     if len(parameters) < 3:
                         raise ServoRefusal(StatusError.DATA_LENGTH)
-                    write = servo.write if packet.instruction == Instruction.WRITE else servo.register_write
-                    write(_word(parameters, 0), parameters[2:])
-                case Instruction.ACTION:
-                    servo.action()
+                    servo.write(_word(parameters, 0), parameters[2:])
                 case Instruction.REBOOT:
                     servo.reboot()
-                case Instruction.CLEAR:
-                    if parameters != _CLEAR_TURNS:
-                        raise ServoRefusal(StatusError.DATA_RANGE)
-                    servo.clear_turns()
-                case Instruction.FACTORY_RESET:
-                    # It would change ids and baud rates, by which the world addresses the servos.
-                    raise ServoRefusal(StatusError.RESULT_FAIL)
                 case _:
                     raise ServoRefusal(StatusError.INSTRUCTION)
         except ServoRefusal as refusal:
@@ -198,23 +186,10 @@ class ServoLine:
         if len(parameters) >= 4:
             address, length = _word(parameters, 0), _word(parameters, 2)
             for i in range(4, len(parameters) - length, 1 + length):
-                self._quiet_write(parameters[i], address, parameters[i + 1 : i + 1 + length])
+                for servo in self._having(parameters[i]):
+                    with contextlib.suppress(ServoRefusal):  # a write to several servos has no status packet
+                        servo.write(address, parameters[i + 1 : i + 1 + length])
         return b""
-
-    def _bulk_write(self, parameters: bytes) -> bytes:
-        i = 0
-        while i + 5 <= len(parameters):
-            length = _word(parameters, i + 3)
-            data = parameters[i + 5 : i + 5 + length]
-            if len(data) == length:
-                self._quiet_write(parameters[i], _word(parameters, i + 1), data)
-            i += 5 + length
-        return b""
-
-    def _quiet_write(self, servo_id: int, address: int, data: bytes) -> None:
-        for servo in self._having(servo_id):
-            with contextlib.suppress(ServoRefusal):  # a write to several servos has no status packet
-                servo.write(address, data)
 
     # --- helpers -----------------------------------------------------------------------------------------------------
 

@@ -98,7 +98,6 @@ class ServoModel:
         """Number of times that the LED has been switched on."""
         self._shutdown = False
         self._silent = False
-        self._registered: tuple[int, bytes] | None = None
         self._power_on()
 
     # --- side of the world -------------------------------------------------------------------------------------------
@@ -227,29 +226,6 @@ class ServoModel:
         for register, value in self._checked(address, data):
             self._apply(register, value)
 
-    def register_write(self, address: int, data: bytes) -> None:
-        """Store a write, which `action` carries out later.
-
-        Raises:
-            ServoRefusal: as for `write`.
-        """
-        self._checked(address, data)
-        self._registered = (address, data)
-        self._set(reg.REGISTERED_INSTRUCTION, 1)
-
-    def action(self) -> None:
-        """Carry out the registered write.
-
-        Raises:
-            ServoRefusal: INSTRUCTION if no write is registered; otherwise as for `write`.
-        """
-        if self._registered is None:
-            raise ServoRefusal(StatusError.INSTRUCTION)
-        address, data = self._registered
-        self._registered = None
-        self._set(reg.REGISTERED_INSTRUCTION, 0)
-        self.write(address, data)
-
     def reboot(self) -> None:
         """Restart: reset RAM, keep EEPROM, and clear errors unless their cause persists."""
         memory = self._memory
@@ -262,19 +238,7 @@ class ServoModel:
         for _, data, count in reg.INDIRECT_BLOCKS:
             memory[data : data + count] = bytes(count)
         self._shutdown = False
-        self._registered = None
         self._power_on()
-
-    def clear_turns(self) -> None:
-        """Reduce the present position to one turn (CLEAR 0x01).
-
-        Raises:
-            ServoRefusal: RESULT_FAIL if the shaft is moving.
-        """
-        self._show_present()
-        if self._memory[122]:
-            raise ServoRefusal(StatusError.RESULT_FAIL)
-        self.drive.forget_turns()
 
     # --- registers ---------------------------------------------------------------------------------------------------
 

@@ -218,15 +218,3 @@ def test_voltage_error_is_reported_but_does_not_shut_down_by_default() -> None:
     servo = in_current_mode()
     servo.set_voltage_v(9.0)
     assert (get(servo, 70, 1), get(servo, 64, 1), get(servo, 144, 2)) == (1, 1, 90)
-
-
-def test_clear_is_refused_while_the_shaft_moves() -> None:
-    servo = ServoModel(1)
-    clear = packet(1, bytes((0x10, 0x01, 0x44, 0x58, 0x4C, 0x22)))
-    line = ServoLine([servo])
-    servo.update(0.0, 0.0, 0.0)
-    servo.update(0.1, 7.0, 3.0)
-    assert line.feed(clear) == status(1, StatusError.RESULT_FAIL)
-    servo.update(0.2, 7.0, 0.0)
-    assert line.feed(clear) == status(1, 0)
-    assert 0 <= get(servo, 132, 4, signed=True) < 4096
