@@ -22,8 +22,8 @@ CLOCK_FREQUENCY_HZ: Final = 10_000_000
 """Frequency of the Windows performance counter, as Motive reports it."""
 _CLOCK_ORIGIN_S: Final = 1000.0  # the server has been running; tick 0 means "no stamp"
 _APPLICATION = b"Motive"
-_OLDEST, _SELECTABLE, _MARKER_NAMES, _SIZES, _PIVOT_ROTATION, _NEWEST = (3, 0), (4, 0), (4, 0), (4, 1), (4, 2), (4, 4)
-"""Versions from which a server has the named property, and the oldest and newest version that the SDK describes."""
+_MARKER_NAMES, _SIZES, _PIVOT_ROTATION, _NEWEST = (4, 0), (4, 1), (4, 2), (4, 4)
+"""Versions from which a server has the named property, and the newest version that the SDK describes."""
 _CLIENT_TIMEOUT_S: Final = 5.0
 _MARKERS_BODY_M: Final[tuple[Vec3, ...]] = (
     (0.16, 0.0, 0.05),
@@ -60,8 +60,7 @@ class BodyPose:
 class NatNetServer:
     """Streams motion-capture frames and answers clients; an async context manager on the running event loop.
 
-    A client becomes a unicast client when it connects or, with a multicast group, when it sends a keep-alive. A unicast client of a
-    server from version 4.0 on may choose an older bitstream ("Bitstream,3.0").
+    A client becomes a unicast client when it connects or, with a multicast group, when it sends a keep-alive.
 
     Args:
         version: NatNet bitstream version, such as "4.1". One later than 4.4 has an additional section of unknown content.
@@ -70,7 +69,6 @@ class NatNetServer:
         data_port: source port of every frame and destination of multicast frames; 0 for any free one.
         multicast_group: multicast address, or None to stream to unicast clients only.
         bodies: id and name of each rigid body.
-        rate_hz: answer to the FrameRate request.
     """
 
     def __init__(
@@ -81,13 +79,11 @@ class NatNetServer:
         data_port: int = 0,
         multicast_group: str | None = None,
         bodies: Sequence[tuple[int, str]] = ((1, "companion"),),
-        rate_hz: float = 200.0,
     ) -> None:
         self.version = version
         self.interface = interface
         self.multicast_group = multicast_group
         self.bodies = tuple(bodies)
-        self.rate_hz = rate_hz
         self.dropped = 0
         """Number of datagrams that could not be sent."""
         self.requests = 0
@@ -95,9 +91,9 @@ class NatNetServer:
         self._command: socket.socket | None = None
         self._data: socket.socket | None = None
         self._broadcast: socket.socket | None = None
-        self._clients: dict[tuple[str, int], tuple[float, str]] = {}
+        self._clients: dict[tuple[str, int], float] = {}
+        """Time at which each unicast client was last heard, by its address."""
         self._number = 0
-        self._last: tuple[float, tuple[BodyPose, ...], float | None] = (0.0, (), None)
 
     @property
     def command_port(self) -> int:
@@ -159,23 +155,15 @@ class NatNetServer:
             exposure_t_s: middle of the cameras' exposure on the same clock, or None if the cameras do not report it.
         """
         self._number += 1
-        self._last = (t_s, tuple(poses), exposure_t_s)
-        encoded: dict[str, bytes] = {}
-        if self.multicast_group is not None:
-            encoded[self.version] = self._encode_last(self.version)
-            self._send(self._data, encoded[self.version], (self.multicast_group, self.data_port))
         oldest_s = asyncio.get_running_loop().time() - _CLIENT_TIMEOUT_S
-        for address, (seen_s, version) in list(self._clients.items()):
-            if seen_s < oldest_s:
-                del self._clients[address]
-                continue
-            if version not in encoded:
-                encoded[version] = self._encode_last(version)
-            self._send(self._data, encoded[version], address)
-
-    def _encode_last(self, version: str) -> bytes:
-        t_s, poses, exposure_t_s = self._last
-        return encode_frame(version, self._number, t_s, poses, exposure_t_s, dict(self.bodies))
+        self._clients = {address: heard_s for address, heard_s in self._clients.items() if heard_s >= oldest_s}
+        addresses = list(self._clients)
+        if self.multicast_group is not None:
+            addresses.insert(0, (self.multicast_group, self.data_port))
+        if addresses:
+            frame = encode_frame(self.version, self._number, t_s, poses, exposure_t_s, dict(self.bodies))
+            for address in addresses:
+                self._send(self._data, frame, address)
 
     def _bind(self, port: int, address: str = "") -> socket.socket:
         address = address or self.interface
@@ -219,43 +207,16 @@ class NatNetServer:
             return
         message: int = struct.unpack_from("<H", datagram)[0]
         now_s = asyncio.get_running_loop().time()
-        _, version = self._clients.get(address, (now_s, self.version))
         if message == Message.CONNECT:
             if self.multicast_group is None:
-                self._clients[address] = (now_s, version)
+                self._clients[address] = now_s
             self._reply(Message.SERVER_INFO, self._server_info(), address)
         elif message == Message.KEEP_ALIVE:
-            self._clients[address] = (now_s, version)
+            self._clients[address] = now_s
         elif message == Message.REQUEST_MODELDEF:
-            self._reply(Message.MODELDEF, encode_model_definitions(version, self.bodies), address)
-        elif message == Message.REQUEST_FRAME:
-            self._send(self._command, self._encode_last(version), address)
-        elif message == Message.REQUEST:
-            request = datagram[4:].partition(b"\0")[0].decode("utf-8", "replace")
-            self._answer_request(request, address)
+            self._reply(Message.MODELDEF, encode_model_definitions(self.version, self.bodies), address)
         elif message == Message.DISCONNECT:
             self._clients.pop(address, None)
-        else:
-            self._reply(Message.UNRECOGNIZED_REQUEST, b"", address)
-
-    def _answer_request(self, request: str, address: tuple[str, int]) -> None:
-        """Answer NAT_REQUEST: a query with its value, a command with an int32 return code (0 means success)."""
-        name, _, argument = request.partition(",")
-        known = self._clients.get(address)
-        if name == "FrameRate":
-            self._reply(Message.RESPONSE, struct.pack("<f", self.rate_hz), address)
-        elif name == "UnitsToMillimeters":
-            self._reply(Message.RESPONSE, struct.pack("<f", 1000.0), address)
-        elif name == "CurrentMode":
-            self._reply(Message.RESPONSE, struct.pack("<i", 0), address)  # live
-        elif name == "Bitstream" and not argument:
-            self._reply(Message.RESPONSE, f"Bitstream,{known[1] if known else self.version}\0".encode(), address)
-        elif name == "Bitstream":
-            own, asked = _numbers(self.version), _numbers(argument)
-            accepted = own >= _SELECTABLE and _OLDEST <= asked <= own and known is not None
-            if accepted and known is not None:
-                self._clients[address] = (known[0], argument)
-            self._reply(Message.RESPONSE, struct.pack("<i", 0 if accepted else 1), address)
         else:
             self._reply(Message.UNRECOGNIZED_REQUEST, b"", address)
 
@@ -370,9 +331,9 @@ def encode_model_definitions(version: str, bodies: Sequence[tuple[int, str]]) ->
 
 
 def _numbers(version: str) -> tuple[int, int]:
-    """Return the major and minor number of a version, or zeros if the text is not a version."""
+    """Return the major and minor number of a version."""
     major, _, minor = version.partition(".")
-    return (int(major), int(minor)) if major.isdecimal() and minor.isdecimal() else (0, 0)
+    return int(major), int(minor)
 
 
 def _rigid_body(pose: BodyPose) -> bytes:

@@ -179,7 +179,6 @@ class Sitl:
             data_port=self._ports.mocap_data,
             multicast_group=mocap.multicast_group if self._ports.multicast else None,
             bodies=((mocap.rigid_body_id, self._vehicle.name), *self._others),
-            rate_hz=self._config.mocap_rate_hz,
         )
 
     def _mocap_settings(self, server: NatNetServer) -> dict[str, Any]:

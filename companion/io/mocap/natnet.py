@@ -103,9 +103,9 @@ def encode_message(message: Message, payload: bytes = b"") -> bytes:
     return _HEADER.pack(message, len(payload)) + payload
 
 
-def encode_request(message: Message, text: str = "") -> bytes:
-    """Return a client datagram with a zero-terminated string (NAT_REQUEST "FrameRate", keep-alive "", ...)."""
-    return encode_message(message, text.encode() + b"\0")
+def encode_request(message: Message) -> bytes:
+    """Return a client datagram with an empty zero-terminated string, as the SDK's client sends a keep-alive."""
+    return encode_message(message, b"\0")
 
 
 def encode_connect(application: str = "companion") -> bytes:
