@@ -52,8 +52,6 @@ class ForceTorqueServer:
 
     Args:
         product_name: answer to PRODUCT_NAME.
-        serial_number: answer to SERIAL_NUMBER.
-        firmware: answer to FIRMWARE_VERSION.
 
     Attributes:
         silent: fault in which the sensor neither answers nor streams, as with a cut cable.
@@ -61,19 +59,14 @@ class ForceTorqueServer:
         dropped: number of packets that were dropped because nothing reads the pty.
     """
 
-    def __init__(
-        self,
-        product_name: str = "RFT60-HA01",
-        serial_number: str = "RFT60HA-0001",
-        firmware: str = "V1.2.0",
-    ) -> None:
+    def __init__(self, product_name: str = "RFT60-HA01") -> None:
         self.silent = False
         self.stuck = False
         self.dropped = 0
         self._texts = {
             Command.PRODUCT_NAME: product_name,
-            Command.SERIAL_NUMBER: serial_number,
-            Command.FIRMWARE_VERSION: firmware,
+            Command.SERIAL_NUMBER: "RFT60HA-0001",
+            Command.FIRMWARE_VERSION: "V1.2.0",
         }
         self._scanner = PacketScanner(rft.COMMAND_BYTES)
         self._pty = PtyLine(self._on_commands)

@@ -64,7 +64,6 @@ class NatNetServer:
 
     Args:
         version: NatNet bitstream version, such as "4.1". One later than 4.4 has an additional section of unknown content.
-        interface: local address of both sockets, and the multicast interface.
         command_port: command port; 0 for any free one.
         data_port: source port of every frame and destination of multicast frames; 0 for any free one.
         multicast_group: multicast address, or None to stream to unicast clients only.
@@ -74,14 +73,12 @@ class NatNetServer:
     def __init__(
         self,
         version: str = "4.1",
-        interface: str = "127.0.0.1",
         command_port: int = 0,
         data_port: int = 0,
         multicast_group: str | None = None,
         bodies: Sequence[tuple[int, str]] = ((1, "companion"),),
     ) -> None:
         self.version = version
-        self.interface = interface
         self.multicast_group = multicast_group
         self.bodies = tuple(bodies)
         self.dropped = 0
@@ -119,15 +116,14 @@ class NatNetServer:
         """Open both sockets.
 
         Raises:
-            OSError: a port is in use or the interface does not belong to this computer; the text names the cause.
+            OSError: a port is in use; the text names the cause.
         """
         try:
             self._command = self._bind(self._ports[0])
             self._data = self._bind(self._ports[1])
-            if self.interface == LOOPBACK:
-                self._broadcast = self._bind(self.command_port, LOOPBACK_BROADCAST)
+            self._broadcast = self._bind(self.command_port, LOOPBACK_BROADCAST)
             if self.multicast_group is not None:
-                self._data.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self.interface))
+                self._data.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(LOOPBACK))
                 self._data.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
                 self._data.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
         except BaseException:
@@ -165,8 +161,7 @@ class NatNetServer:
             for address in addresses:
                 self._send(self._data, frame, address)
 
-    def _bind(self, port: int, address: str = "") -> socket.socket:
-        address = address or self.interface
+    def _bind(self, port: int, address: str = LOOPBACK) -> socket.socket:
         opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             opened.setblocking(False)

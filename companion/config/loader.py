@@ -46,7 +46,6 @@ MOVED = {
     ("safety", "joint_wall_max_deg"): ("safety", "joint_limit_max_deg"),
 }
 """Keys of vehicle files and logs of version 0.1.0, and their present place."""
-"""Keys of `safety` that were keys of `tether` in version 0.1 and are still accepted there."""
 
 
 class Sources(Model):

@@ -22,6 +22,7 @@ from sitl.udp import Address, UdpEndpoint
 
 Message = Any
 
+_HOST = "127.0.0.1"
 _PARAMS_PER_PUMP = 4
 _GROUND_STATION_TIMEOUT_S = 2.5
 """Time after the last heartbeat for which a ground station counts as connected (HEARTBEAT_TIMEOUT_US of telemetry_status)."""
@@ -175,15 +176,9 @@ class MavlinkServer:
     """
 
     def __init__(
-        self,
-        stub: Px4Stub,
-        onboard: Ports = ONBOARD_PORTS,
-        ground: Ports | None = None,
-        vision: Ports | None = None,
-        host: str = "127.0.0.1",
+        self, stub: Px4Stub, onboard: Ports = ONBOARD_PORTS, ground: Ports | None = None, vision: Ports | None = None
     ) -> None:
         self._stub = stub
-        self._host = host
         self._wanted = [(onboard, False)] + ([(ground, True)] if ground is not None else [])
         self._vision_wanted = vision
         self._vision: Link | None = None
@@ -194,11 +189,6 @@ class MavlinkServer:
     def onboard_port(self) -> int:
         """Local port of the onboard link, while it is open."""
         return self._links[0].port
-
-    @property
-    def ground_port(self) -> int | None:
-        """Local port of the ground station link, or None if there is none."""
-        return self._links[1].port if len(self._links) > 1 else None
 
     @property
     def vision_port(self) -> int:
@@ -243,16 +233,16 @@ class MavlinkServer:
         return self
 
     async def _open(self, receiver: Receiver, ports: Ports, ground: bool) -> Link:
-        partner = (self._host, ports.remote) if ports.remote else None
+        partner = (_HOST, ports.remote) if ports.remote else None
         link = Link(self._stub, receiver, partner, ground)
         loop = asyncio.get_running_loop()
         try:
-            await loop.create_datagram_endpoint(lambda: link, local_addr=(self._host, ports.local))
+            await loop.create_datagram_endpoint(lambda: link, local_addr=(_HOST, ports.local))
         except OSError as error:
             await self._close()
             found = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be opened ({error.strerror})"
             raise LinkError(
-                f"PX4 stub: UDP port {self._host}:{ports.local} {found}; end the program that uses it or choose another port"
+                f"PX4 stub: UDP port {_HOST}:{ports.local} {found}; end the program that uses it or choose another port"
             ) from error
         return link
 

@@ -107,11 +107,6 @@ class Instance:
         return _ONBOARD + self.number
 
     @property
-    def ground_port(self) -> int:
-        """UDP port from which PX4's ground station link sends; every instance sends to 14550."""
-        return _GROUND_OWN + self.number
-
-    @property
     def onboard_address(self) -> tuple[str, int]:
         """Address on which PX4's onboard link listens."""
         return (HOST, _ONBOARD_OWN + self.number)

@@ -358,15 +358,15 @@ def encode(message: object) -> bytes:
     return to_json(message)
 
 
-def decode(cls: type[M], payload: bytes, *, max_bytes: int = MESSAGE_MAX_BYTES) -> M:
+def decode(cls: type[M], payload: bytes) -> M:
     """Return the record of a payload.
 
     Raises:
         MessageError: the payload is too large, is not strict JSON (`companion.ground.protocol.strict_json`), has a different
             version, or does not fit the record.
     """
-    if len(payload) > max_bytes:
-        raise MessageError(f"{len(payload)} bytes, expected at most {max_bytes}")
+    if len(payload) > MESSAGE_MAX_BYTES:
+        raise MessageError(f"{len(payload)} bytes, expected at most {MESSAGE_MAX_BYTES}")
     try:
         data = parse(payload)
         if not isinstance(data, dict) or data.get("v") != VERSION:
