@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 
 from companion.px4.defaults import PX4_DEFAULTS as PX4_DEFAULTS
+from companion.px4.params_file import single
 from companion.px4.required import BY_NAME, simulated_values
 
 MAV_PARAM_TYPE_INT32 = 6
@@ -98,7 +99,7 @@ class Params:
             raise ValueError(f"{name}: {value} is not finite")
         if integer and value != int(value):
             raise ValueError(f"{name}: expected a whole number (INT32), got {value}")
-        stored: Value = int(value) if integer else _single(float(value))
+        stored: Value = int(value) if integer else single(float(value))
         if integer and not -(2**31) <= stored < 2**31:
             raise ValueError(f"{name}: expected a number in the range of INT32, got {value}")
         self._values[name] = stored
@@ -165,7 +166,3 @@ def decode_bytewise(wire: float, mav_type: int) -> Value:
     if mav_type == MAV_PARAM_TYPE_INT32:
         return int(struct.unpack("<i", struct.pack("<f", wire))[0])
     return wire
-
-
-def _single(value: float) -> float:
-    return float(struct.unpack("<f", struct.pack("<f", value))[0])

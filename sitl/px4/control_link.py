@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import math
-import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
 from pymavlink.dialects.v20 import development as mavlink  # common, and CURRENT_MODE
 
+from companion.px4.params_file import single
 from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.modes import NavState, nav_state_from_custom
 from sitl.autopilot.params import MAV_PARAM_TYPE_INT32, Value, decode_bytewise, encode_bytewise
@@ -290,8 +290,5 @@ def same(a: Value, b: Value) -> bool:
     """Return whether PX4 stores both numbers as the same value; it stores floating-point numbers in single precision."""
     if isinstance(a, int) != isinstance(b, int):
         return False
-    return a == b or math.isclose(_single(a), _single(b), rel_tol=1e-6, abs_tol=1e-9)
-
-
-def _single(value: Value) -> float:
-    return float(struct.unpack("<f", struct.pack("<f", value))[0])
+    finite = math.isfinite(a) and math.isfinite(b)
+    return a == b or (finite and math.isclose(single(a), single(b), rel_tol=1e-6, abs_tol=1e-9))
