@@ -11,6 +11,7 @@ from typing import Final, Self
 
 from companion.io.force_torque import rft
 from companion.io.force_torque.rft import Command, Overload, PacketScanner, SetError, Wrench
+from companion.model.algebra import minus
 from companion.model.types import Vec3
 from sitl.pty import PtyLine
 
@@ -130,8 +131,8 @@ class ForceTorqueServer:
         for value, bit in zip(self._torque_nm, _TORQUE_BITS, strict=True):
             bits |= bit if abs(value) > TORQUE_CAPACITY_NM else 0
         self._reading = Wrench(
-            force_n=_subtract(self._force_n, self._bias_force_n),
-            torque_nm=_subtract(self._torque_nm, self._bias_torque_nm),
+            force_n=minus(self._force_n, self._bias_force_n),
+            torque_nm=minus(self._torque_nm, self._bias_torque_nm),
             overload_bits=bits,
         )
         return self._reading
@@ -174,7 +175,3 @@ class ForceTorqueServer:
         else:
             text = self._texts[command].encode("ascii")[:15]
             self._write(rft.pack(bytes((command,)) + text, rft.RESPONSE_BYTES))
-
-
-def _subtract(a: Vec3, b: Vec3) -> Vec3:
-    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])

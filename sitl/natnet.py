@@ -15,6 +15,7 @@ from typing import Final, Self
 
 from companion.io.mocap.definitions import Descriptor
 from companion.io.mocap.natnet import Message
+from companion.model.algebra import plus
 from companion.model.frames import quat_rotate
 from companion.model.types import Quat, Vec3
 
@@ -248,7 +249,7 @@ def encode_frame(
     """
     sizes = _numbers(version) >= _SIZES
     markers = {
-        pose.id: [_add(pose.position_m, quat_rotate(pose.quat_wxyz, offset)) for offset in _MARKERS_BODY_M]
+        pose.id: [plus(pose.position_m, quat_rotate(pose.quat_wxyz, offset)) for offset in _MARKERS_BODY_M]
         for pose in poses
     }
     sets = [(names.get(body_id, f"body {body_id}"), points) for body_id, points in markers.items()]
@@ -339,10 +340,6 @@ def _rigid_body(pose: BodyPose) -> bytes:
 def _marker_params(pose: BodyPose) -> int:
     solved = _MARKER_POINT_CLOUD_SOLVED if pose.valid else _MARKER_OCCLUDED
     return _MARKER_HAS_MODEL | _MARKER_MODEL_SOLVED | solved
-
-
-def _add(a: Vec3, b: Vec3) -> Vec3:
-    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
 def _ticks(t_s: float) -> int:

@@ -10,6 +10,7 @@ from typing import Final
 from companion.config.mission import Approach, Phase, Probe
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
+from companion.model.algebra import dot
 from companion.model.types import FoundSurface, Joints, Vec2, Vec3
 
 TILT_MAX_RAD = math.radians(30.0)
@@ -67,7 +68,7 @@ def plane(tips_m: Sequence[Vec3], direction_world: Vec3, radius_m: float) -> Fou
         radius_m: radius of the tip.
     """
     right, up = axes(direction_world)
-    points = [(_dot(tip, right), _dot(tip, up), _dot(tip, direction_world)) for tip in tips_m]
+    points = [(dot(tip, right), dot(tip, up), dot(tip, direction_world)) for tip in tips_m]
     fit = _fit(points)
     while len(points) >= OUTLIER_POINTS_MIN:
         share, k = max((_outlying(points, k), k) for k in range(len(points)))
@@ -152,7 +153,3 @@ def _elevation_rad(manipulator: Manipulator, arm_rad: Joints) -> float:
         for tip, joint in zip(manipulator.net_body_m(arm_rad), manipulator.joints_body_m(arm_rad)[-1], strict=True)
     )
     return math.atan2(z, math.hypot(x, y))
-
-
-def _dot(a: Vec3, b: Vec3) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

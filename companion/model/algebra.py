@@ -1,8 +1,23 @@
-"""Products of vectors and 3x3 matrices that are tuples of floats, in a fixed order of summation."""
+"""Sums and products of vectors and 3x3 matrices that are tuples of floats, in a fixed order of summation."""
 
 from __future__ import annotations
 
 from companion.model.types import Mat3, Vec3
+
+
+def plus(a: Vec3, b: Vec3) -> Vec3:
+    """Return a + b."""
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+def minus(a: Vec3, b: Vec3) -> Vec3:
+    """Return a - b."""
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+def scaled(v: Vec3, k: float) -> Vec3:
+    """Return k v."""
+    return (k * v[0], k * v[1], k * v[2])
 
 
 def dot(a: Vec3, b: Vec3) -> float:

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from companion.model.algebra import cross, plus
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import (
     quat_conjugate,
@@ -136,7 +137,7 @@ class Handling:
             tx, ty, tz = self._tap(t_s)
             lever = quat_rotate(attitude, _TAP_LEVER_BODY_M)
             fx, fy, fz = fx + tx, fy + ty, fz + tz
-            torque = _plus(torque, _cross(lever, (tx, ty, tz)))
+            torque = plus(torque, cross(lever, (tx, ty, tz)))
         return Wrench(force_n=(fx, fy, fz + grip * self._weight_n), torque_nm=torque)
 
     def _tap(self, t_s: float) -> Vec3:
@@ -194,11 +195,3 @@ def _holding(held_s: float) -> tuple[_Leg, ...]:
     """Return the legs of a round that lifts the vehicle, holds it for `held_s` and puts it back."""
     up, held = _Leg(1.6, 0.0, LIFT_M, 0.0), _Leg(held_s, 0.0, LIFT_M, 0.0)
     return (_Leg(_GRIP_S, 0.0, 0.0, 0.0), up, held, _Leg(2.0, 0.0, 0.0, 0.0), _Leg(_GRIP_S, 0.0, 0.0, 0.0))
-
-
-def _plus(a: Vec3, b: Vec3) -> Vec3:
-    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
-
-
-def _cross(a: Vec3, b: Vec3) -> Vec3:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple, Protocol
 
 from companion.config.arm import Joint
 from companion.config.vehicle import Vehicle
+from companion.model.algebra import scaled
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_normalize
 from companion.model.types import Joints, Quat, Vec2, Vec3
 from companion.sitl_config.distributions import with_model_error
@@ -368,9 +369,5 @@ class Plant:
             wrench = self.faults.wrench(*wrench)
         scale = self._config.force_scale
         if scale != 1.0:
-            wrench = (_scaled(wrench[0], scale), _scaled(wrench[1], scale))
+            wrench = (scaled(wrench[0], scale), scaled(wrench[1], scale))
         return wrench if self._force_sensor is None else self._force_sensor.rounded(wrench[0], wrench[1])
-
-
-def _scaled(v: Vec3, k: float) -> Vec3:
-    return (k * v[0], k * v[1], k * v[2])

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from companion.model.algebra import dot
+from companion.model.algebra import dot, minus, plus, scaled
 from companion.model.frames import quat_conjugate, quat_multiply, quat_normalize, quat_rotate
 from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 
@@ -87,14 +87,14 @@ def measure(
     places = _places(poses, times)
     first, last = _nearest(poses, start_s), _nearest(poses, times[-1])
     back = quat_conjugate(first.attitude)
-    seen_world = _minus(places[-1], places[0])
-    paces = [quat_rotate(back, _scaled(_minus(b, a), 1.0 / GRID_S)) for a, b in pairwise(places)]
-    felt_paces = [_scaled(_plus(a, b), 0.5) for a, b in pairwise(velocity)]
+    seen_world = minus(places[-1], places[0])
+    paces = [quat_rotate(back, scaled(minus(b, a), 1.0 / GRID_S)) for a, b in pairwise(places)]
+    felt_paces = [scaled(plus(a, b), 0.5) for a, b in pairwise(velocity)]
     felt = _travel(velocity)
     length = math.hypot(*felt)
     response = (0.0, 0.0, 0.0)
     if length > 1e-6:
-        direction = _scaled(felt, 1.0 / length)
+        direction = scaled(felt, 1.0 / length)
         response = _response([dot(v, direction) for v in _detrended(felt_paces)], _detrended(paces))
     return Motion(
         duration_s=end_s - start_s,
@@ -120,9 +120,9 @@ def _felt(imu: Sequence[ImuAt], times: Sequence[float], bias: Vec3) -> tuple[lis
                 index += 1
             next_s = imu[index + 1].t_s if index + 1 < len(imu) else math.inf
             step_s = min(until_s, next_s) - now_s
-            rate = _minus(imu[index].rate_rad_s, bias)
+            rate = minus(imu[index].rate_rad_s, bias)
             half = turned(q, rate, 0.5 * step_s)
-            v = _plus(v, _scaled(quat_rotate(half, imu[index].force_m_s2), step_s))
+            v = plus(v, scaled(quat_rotate(half, imu[index].force_m_s2), step_s))
             q = turned(q, rate, step_s)
             now_s += step_s
         velocity.append(v)
@@ -134,7 +134,7 @@ def turned(q: Quat, rate_rad_s: Vec3, dt_s: float) -> Quat:
     angle = math.hypot(*rate_rad_s) * dt_s
     if angle < 1e-12:
         return q
-    x, y, z = _scaled(rate_rad_s, math.sin(0.5 * angle) / angle * dt_s)
+    x, y, z = scaled(rate_rad_s, math.sin(0.5 * angle) / angle * dt_s)
     return quat_normalize(quat_multiply(q, (math.cos(0.5 * angle), x, y, z)))
 
 
@@ -146,7 +146,7 @@ def _places(poses: Sequence[PoseAt], times: Sequence[float]) -> list[Vec3]:
         after = min(max(1, bisect_left(stamps, t_s)), len(poses) - 1)
         a, b = poses[after - 1], poses[after]
         share = (t_s - a.t_s) / (b.t_s - a.t_s) if b.t_s > a.t_s else 0.0
-        places.append(_plus(a.position_m, _scaled(_minus(b.position_m, a.position_m), min(1.0, max(0.0, share)))))
+        places.append(plus(a.position_m, scaled(minus(b.position_m, a.position_m), min(1.0, max(0.0, share)))))
     return places
 
 
@@ -157,11 +157,11 @@ def _nearest(poses: Sequence[PoseAt], t_s: float) -> PoseAt:
 def _travel(velocity: Sequence[Vec3]) -> Vec3:
     """Return the displacement of a velocity that is zero at both ends, with the linear growth due to gravity and bias removed."""
     count = len(velocity) - 1
-    drift = _scaled(velocity[-1], 1.0 / count)
+    drift = scaled(velocity[-1], 1.0 / count)
     total: Vec3 = (0.0, 0.0, 0.0)
     for k, v in enumerate(velocity):
-        total = _plus(total, _minus(v, _scaled(drift, k)))
-    return _scaled(total, GRID_S)
+        total = plus(total, minus(v, scaled(drift, k)))
+    return scaled(total, GRID_S)
 
 
 def _detrended(values: Sequence[Vec3]) -> list[Vec3]:
@@ -224,15 +224,3 @@ def angle_rad(a: Vec3, b: Vec3) -> float:
     """Return the angle between two vectors, rad; pi if one of them is zero."""
     size = math.hypot(*a) * math.hypot(*b)
     return math.acos(max(-1.0, min(1.0, dot(a, b) / size))) if size > 1e-12 else math.pi
-
-
-def _plus(a: Vec3, b: Vec3) -> Vec3:
-    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
-
-
-def _minus(a: Vec3, b: Vec3) -> Vec3:
-    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
-
-
-def _scaled(v: Vec3, k: float) -> Vec3:
-    return (k * v[0], k * v[1], k * v[2])
