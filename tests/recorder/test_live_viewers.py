@@ -10,7 +10,6 @@ import asyncio
 import base64
 import contextlib
 import fcntl
-import functools
 import itertools
 import json
 import select
@@ -29,8 +28,7 @@ import pytest
 from companion.model.types import Severity
 from companion.recorder.client import RecorderProcess
 from tests.recorder.flights import Row, config_json, offer, started, tethered
-from tests.recorder.protobuf_wire import Descriptors
-from tests.recorder.viewers import view
+from tests.recorder.viewers import protobuf_decoder, view
 from tests.support import DEADLINE_S, wait_until
 
 RECORDS = {"/inputs", "/outputs", "/sent"}
@@ -70,12 +68,7 @@ class Viewer:
 def decoded(channel: dict[str, Any], data: bytes) -> Any:
     if channel["encoding"] == "json":
         return json.loads(data)
-    return descriptors(channel["schema"]).decode(channel["schemaName"], data)
-
-
-@functools.cache
-def descriptors(schema: str) -> Descriptors:
-    return Descriptors(base64.b64decode(schema))
+    return protobuf_decoder(channel["schemaName"], base64.b64decode(channel["schema"]))(data)
 
 
 def free_port() -> int:

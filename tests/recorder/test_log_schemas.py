@@ -8,13 +8,10 @@ from typing import Any
 
 import jsonschema
 import pytest
-from mcap.exceptions import EndOfFile
-from mcap.reader import NonSeekingReader
 
 from companion.analysis.log import FlightLog
 from tests.recorder.flights import EPOCH_NS, config_json, offer, record, started, tethered
-from tests.recorder.protobuf_wire import Descriptors, WireError
-from tests.recorder.viewers import Viewed, view
+from tests.recorder.viewers import Viewed, protobuf_decoder, view
 from tests.support import DEADLINE_S, wait_until
 
 JSON = {
@@ -82,10 +79,13 @@ def test_a_message_that_breaks_its_schema_is_found(synthetic: Viewed) -> None:
         broken = {**first.data, key: value}
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(broken, json.loads(synthetic.schemas["/outputs"][3]))
-    types = Descriptors(synthetic.schemas["/tf"][3])
-    for data in (b"\x0a\xff", b"\xfa\x7f\x01", b"\x21\x00"):
-        with pytest.raises(WireError):
-            types.decode("foxglove.FrameTransform", data)
+    decode = protobuf_decoder("foxglove.FrameTransform", synthetic.schemas["/tf"][3])
+    for unknown in (b"\xfa\x7f\x00", b"\x0a\x02\x78\x01"):
+        with pytest.raises(AssertionError, match="unknown fields"):
+            decode(unknown)
+    log = protobuf_decoder("foxglove.Log", synthetic.schemas["/log"][3])
+    with pytest.raises(AssertionError, match="level: 99"):
+        log(b"\x10\x63")
 
 
 def test_json_schemas_use_only_what_viewers_read(synthetic: Viewed) -> None:
@@ -151,32 +151,3 @@ def test_the_log_of_a_killed_recorder_opens_and_keeps_to_its_schemas(tmp_path: P
     log = FlightLog.read(path)
     assert not log.closed
     assert len(log.inputs) in counts
-
-
-def test_protobuf_s_own_library_decodes_the_same(viewed: Viewed, flown: Path) -> None:
-    decoder = pytest.importorskip("mcap_protobuf.decoder", reason="mcap-protobuf-support is not installed")
-    theirs = []
-    with flown.open("rb") as file:
-        reader = NonSeekingReader(file, decoder_factories=[decoder.DecoderFactory()])
-        try:
-            topics = list(PROTOBUF)
-            for _, channel, message, decoded in reader.iter_decoded_messages(topics=topics, log_time_order=False):
-                theirs.append((channel.topic, message.log_time, plain(decoded)))
-        except EndOfFile:
-            pytest.fail("the log is whole")
-    ours = [(m.topic, m.log_time_ns, m.data) for m in viewed.messages if m.topic in PROTOBUF]
-    assert ours == theirs
-
-
-def plain(message: Any) -> Any:
-    """Return a message of the protobuf library as nested dicts, including defaults."""
-    found: dict[str, Any] = {}
-    for field in message.DESCRIPTOR.fields:
-        value = getattr(message, field.name)
-        if field.message_type is None:
-            found[field.name] = list(value) if field.is_repeated else value
-        elif field.is_repeated:
-            found[field.name] = [plain(item) for item in value]
-        else:
-            found[field.name] = plain(value) if message.HasField(field.name) else None
-    return found

@@ -9,16 +9,16 @@ from __future__ import annotations
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
-
-from tests.recorder.protobuf_wire import Descriptors
+from mcap.records import Schema
+from mcap_protobuf.decoder import DecoderFactory
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,6 @@ def view(path: Path, *, whole: bool = True) -> Viewed:
     """Read a log with the mcap library: through its summary, or (`whole` False) as far as it is readable."""
     messages: list[Seen] = []
     schemas: dict[str, tuple[str, str, str, bytes]] = {}
-    descriptors: dict[bytes, Descriptors] = {}
     with path.open("rb") as file:
         reader = make_reader(file) if whole else NonSeekingReader(file)
         if whole:
@@ -86,8 +85,7 @@ def view(path: Path, *, whole: bool = True) -> Viewed:
                 if channel.message_encoding == "json":
                     data = json.loads(message.data)
                 else:
-                    types = descriptors.setdefault(schema.data, Descriptors(schema.data))
-                    data = types.decode(schema.name, message.data)
+                    data = protobuf_decoder(schema.name, schema.data)(message.data)
                 messages.append(
                     Seen(
                         *(channel.topic, schema.name, channel.message_encoding, schema.encoding),
@@ -97,6 +95,38 @@ def view(path: Path, *, whole: bool = True) -> Viewed:
         except EndOfFile:
             assert not whole
     return Viewed(tuple(messages), schemas)
+
+
+@cache
+def protobuf_decoder(name: str, descriptors: bytes) -> Callable[[bytes], Any]:
+    """Return what decodes messages of a type by its descriptors in a log; what the type does not have is refused."""
+    decode = DecoderFactory().decoder_for("protobuf", Schema(id=1, name=name, encoding="protobuf", data=descriptors))
+    assert decode is not None
+
+    def decoded(data: bytes) -> Any:
+        message = decode(data)
+        size = message.ByteSize()
+        message.DiscardUnknownFields()
+        assert message.ByteSize() == size, f"{name}: unknown fields"
+        return _plain(message)
+
+    return decoded
+
+
+def _plain(message: Any) -> Any:
+    """Return a message as nested dicts, including defaults; an absent message is None."""
+    found: dict[str, Any] = {}
+    for field in message.DESCRIPTOR.fields:
+        value = getattr(message, field.name)
+        if field.message_type is None:
+            found[field.name] = list(value) if field.is_repeated else value
+            if field.enum_type is not None and not field.is_repeated:
+                assert value in field.enum_type.values_by_number, f"{field.full_name}: {value}"
+        elif field.is_repeated:
+            found[field.name] = [_plain(item) for item in value]
+        else:
+            found[field.name] = _plain(value) if message.HasField(field.name) else None
+    return found
 
 
 _STEP = re.compile(r"\.(\w+)|\[(\d+)\]")
