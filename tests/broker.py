@@ -12,17 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tests.browser import missing
-from tests.support import DEADLINE_S, ROOT
+from tests.support import DEADLINE_S, ROOT, free_port
 
 LOOPBACK = ROOT / "configs/mosquitto/loopback.conf"
-
-
-def free_port() -> int:
-    """A TCP port of loopback that nobody uses now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def mosquitto() -> str:

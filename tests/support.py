@@ -13,6 +13,7 @@ import math
 import os
 import select
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -400,6 +401,17 @@ def _assert_keys(found: Any, wanted: dict[str, Any], where: str) -> None:
     for key, below in wanted.items():
         if below is not None:
             _assert_keys(found[key], below, f"{where}.{key}")
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    """A port that nobody uses now, at no address of this computer: of TCP, unless the kind says otherwise."""
+    with socket.socket(type=kind) as probe:
+        probe.bind(("", 0))
+        return int(probe.getsockname()[1])
+
+
+def free_udp_port() -> int:
+    return free_port(socket.SOCK_DGRAM)
 
 
 def wait_until(condition: Callable[[], bool], why: Callable[[], str], within_s: float = DEADLINE_S) -> None:

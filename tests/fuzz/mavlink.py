@@ -23,7 +23,8 @@ from companion.io.px4.wire import UdpWire
 from companion.model.types import FlightMode, VehicleState
 from tests.fuzz.mutate import mutated
 from tests.fuzz.target import Target, Wrong, one_line
-from tests.io.px4_peer import Px4Peer, free_udp_port
+from tests.io.px4_peer import Px4Peer
+from tests.support import free_udp_port
 
 _SIZE_MAX_BYTES = 1500
 _HEADER_BYTES, _CRC_BYTES, _STX = 10, 2, 0xFD

@@ -27,8 +27,8 @@ from companion.ground.broker import setup as broker_setup
 from companion.ground.protocol.commands import Accepted, Reason, Refused, Verifier, make_command
 from companion.ground.protocol.keys import load_login, load_operators, new_key
 from companion.ground.protocol.messages import COMMAND_MAX_BYTES, Command, CommandName, Topic, encode
-from tests.broker import LOOPBACK, Broker, free_port, loopback_broker
-from tests.support import DEADLINE_S, ROOT
+from tests.broker import LOOPBACK, Broker, loopback_broker
+from tests.support import DEADLINE_S, ROOT, free_port
 from tools.docs.mosquitto import example_files
 
 pytestmark = pytest.mark.waits

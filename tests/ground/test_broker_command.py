@@ -17,8 +17,9 @@ from companion.config.ground import Ground
 from companion.ground.broker import setup as broker_setup
 from companion.ground.broker.certificates import certificate_hosts, make_authority, make_server
 from companion.ground.protocol.keys import load_login, load_operators
-from tests.broker import free_port, loopback_broker
+from tests.broker import loopback_broker
 from tests.ground.test_broker import WANTED, Site, running
+from tests.support import free_port
 
 pytestmark = pytest.mark.waits
 

@@ -14,10 +14,10 @@ from companion.ground.protocol.keys import Operator, load_operators, operators_t
 from companion.ground.protocol.messages import Presence, Topic
 from companion.ground.station.command_sender import ATTEMPTS
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
-from tests.broker import Broker, free_port
+from tests.broker import Broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, played
 from tests.ground.vehicle import played_vehicle
-from tests.support import Ended, sandbox_in
+from tests.support import Ended, free_port, sandbox_in
 
 pytestmark = pytest.mark.waits
 

@@ -23,10 +23,10 @@ from companion.ground.station.replay_log import read_for_page
 from companion.model.codec import to_json
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.analysis.synthetic_flight import record_flight
-from tests.broker import Broker, free_port, loopback_broker
+from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, played, self_signed
 from tests.ground.vehicle import played_vehicle
-from tests.support import CATCH, Sandbox, sandbox_in
+from tests.support import CATCH, Sandbox, free_port, sandbox_in
 
 pytestmark = pytest.mark.waits
 

@@ -26,8 +26,8 @@ from companion.model.packets import LogLine, Packet, read_packet
 from companion.model.types import Quat, Vec3
 from companion.runtime import ipc
 from sitl.natnet import BodyPose, NatNetServer
-from tests.io.px4_peer import Px4Peer, free_udp_port
-from tests.support import DEADLINE_S, HOVER, wait_until
+from tests.io.px4_peer import Px4Peer
+from tests.support import DEADLINE_S, HOVER, free_udp_port, wait_until
 
 LAND_MODE = 4 << 16 | 6 << 24
 HOLD_MODE = 4 << 16 | 3 << 24

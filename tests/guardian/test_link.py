@@ -15,9 +15,9 @@ from companion.guardian.link import Link
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import MocapPose
-from tests.io.px4_peer import Px4Peer, free_udp_port
+from tests.io.px4_peer import Px4Peer
 from tests.io.test_px4_wire import heartbeat, opened
-from tests.support import wait_until
+from tests.support import free_udp_port, wait_until
 
 POSE = MocapPose(
     stamp_s=12.345678,

@@ -23,12 +23,6 @@ PARAMS: dict[str, float | int] = {
 """As PX4 stores them; the bytes of some of the integers are no number when they are read as a float."""
 
 
-def free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 class Px4Peer:
     """Heartbeats to `port` on loopback, 10 Hz by default; streams what SET_MESSAGE_INTERVAL asked for; records all that arrives."""
 

@@ -31,15 +31,8 @@ from companion.model.types import (
     VehicleState,
 )
 from companion.runtime.clock import flight_clock
-from tests.io.px4_peer import (
-    ACCEL_FRD_M_S2,
-    GYRO_FRD_RAD_S,
-    PARAMS,
-    POSITION_NED_M,
-    VELOCITY_NED_M_S,
-    Px4Peer,
-    free_udp_port,
-)
+from tests.io.px4_peer import ACCEL_FRD_M_S2, GYRO_FRD_RAD_S, PARAMS, POSITION_NED_M, VELOCITY_NED_M_S, Px4Peer
+from tests.support import free_udp_port
 
 pytestmark = pytest.mark.waits
 

@@ -24,9 +24,9 @@ from companion.io.px4.driver import MavsdkAutopilot
 from companion.io.px4.frames import AutopilotHeartbeat
 from companion.model.types import MocapPose
 from companion.runtime.clock import flight_clock
-from tests.io.px4_peer import Px4Peer, free_udp_port
+from tests.io.px4_peer import Px4Peer
 from tests.io.test_px4 import edge, eventually, refused
-from tests.support import DEADLINE_S
+from tests.support import DEADLINE_S, free_udp_port
 
 pytestmark = pytest.mark.waits
 

@@ -20,8 +20,8 @@ from companion.model.types import (
     MocapPose,
 )
 from companion.runtime.clock import Clock, flight_clock
-from tests.io.px4_peer import free_udp_port
 from tests.io.stub_rig import standing_stub
+from tests.support import free_udp_port
 
 pytestmark = pytest.mark.waits
 

@@ -15,8 +15,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.guardian.link import Link
 from companion.io.px4.wire import ROUND_DATAGRAMS, SerialWire, TcpWire, UdpWire, Wire, open_wire
-from tests.io.px4_peer import free_udp_port
-from tests.support import DEADLINE_S, wait_until
+from tests.support import DEADLINE_S, free_udp_port, wait_until
 
 
 def heartbeat(system: int = 1, component: int = 1) -> bytes:

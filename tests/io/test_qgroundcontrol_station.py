@@ -42,10 +42,10 @@ from companion.model.types import (
     TetherState,
 )
 from companion.runtime.clock import flight_clock
-from tests.io.px4_peer import POSITION_NED_M, Px4Peer, free_udp_port
+from tests.io.px4_peer import POSITION_NED_M, Px4Peer
 from tests.io.qgroundcontrol_peer import GroundPeer
 from tests.io.stub_rig import standing_stub
-from tests.support import CATCH
+from tests.support import CATCH, free_udp_port
 
 pytestmark = pytest.mark.waits
 

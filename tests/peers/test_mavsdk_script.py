@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import socket
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,17 +13,12 @@ import pytest
 from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
 from tests.sitl.px4_rig import Rig
+from tests.support import free_udp_port
 
 pytestmark = pytest.mark.waits
 
 SCRIPT = Path(__file__).with_name("mavsdk_mission.py")
 DEADLINE_S = 150.0
-
-
-def free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 async def fly_script(rig: Rig) -> tuple[int, list[dict[str, Any]], str, float]:

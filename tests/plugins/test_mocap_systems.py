@@ -36,7 +36,7 @@ from companion.runtime import event_loop
 from companion.runtime.clock import flight_clock
 from companion.testing import check_mocap
 from tests.plugins.installed import on_path, write_distribution
-from tests.support import DEADLINE_S, ROOT
+from tests.support import DEADLINE_S, ROOT, free_udp_port
 
 EXAMPLE = ROOT / "examples/mocap_vicon"
 VEHICLE = (ROOT / "configs/vehicles/tarot650_2r.yaml").read_text(encoding="utf-8")
@@ -132,12 +132,6 @@ def installed(tmp_path: Path) -> Iterator[None]:
         yield
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("", 0))
-        return int(probe.getsockname()[1])
-
-
 def vicon(port: int) -> MocapDevice:
     options: dict[str, JsonValue] = {"object_name": "quad", "port": port}
     return MocapDevice(type="vicon", server="127.0.0.1", interface="127.0.0.1", rigid_body_id=1, options=options)
@@ -191,7 +185,7 @@ def settings_of(device: MocapDevice) -> MocapSettings:
 
 def test_flight_and_guardian_receive_the_same_poses() -> None:
     async def run() -> None:
-        port, clock = free_port(), flight_clock()
+        port, clock = free_udp_port(), flight_clock()
         device = vicon(port)
         poses: list[MocapPose] = []
         client = open_client(settings_of(device))
@@ -214,7 +208,7 @@ def test_flight_and_guardian_receive_the_same_poses() -> None:
 
 
 def test_the_example_and_a_system_that_answers_every_call_keep_the_contract() -> None:
-    port, stop = free_port(), threading.Event()
+    port, stop = free_udp_port(), threading.Event()
 
     def send() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -248,7 +242,7 @@ def test_options_that_the_system_refuses_break_the_contract() -> None:
 
 def test_an_object_that_is_not_tracked_is_reported() -> None:
     async def run() -> None:
-        port = free_port()
+        port = free_udp_port()
         device = vicon(port)
         driver = PluginMocap(device, flight_clock(), lambda _: None, body_timeout_s=0.3)
         async with broadcasting(port, ("quad", (0.0,) * 6)):
@@ -259,7 +253,7 @@ def test_an_object_that_is_not_tracked_is_reported() -> None:
 
 
 def test_damaged_datagrams_are_rejected() -> None:
-    port = free_port()
+    port = free_udp_port()
     client = open_client(settings_of(vicon(port)))
     whole = datagram(7, STRANGER, QUAD)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -273,7 +267,7 @@ def test_damaged_datagrams_are_rejected() -> None:
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 @pytest.mark.parametrize("at", [0, 4])
 def test_a_vicon_object_that_is_not_finite_does_not_stop_the_others(value: float, at: int) -> None:
-    port = free_port()
+    port = free_udp_port()
     tracker = device_class(MOCAP_SYSTEMS, "vicon")(settings_of(vicon(port)))
     broken = list(QUAD[1])
     broken[at] = value

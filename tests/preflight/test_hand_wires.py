@@ -26,10 +26,9 @@ from companion.preflight.hand_test import record as hand_record
 from companion.preflight.hand_test.command import run_hand_test
 from companion.runtime.clock import flight_clock
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from tests.io.px4_peer import free_udp_port
 from tests.io.stub_rig import standing_stub
 from tests.io.test_px4_stub import companion
-from tests.support import CATCH, DEADLINE_S, Sandbox, World, sandbox_in
+from tests.support import CATCH, DEADLINE_S, Sandbox, World, free_udp_port, sandbox_in
 
 pytestmark = [pytest.mark.flight, pytest.mark.xdist_group("the world with a hand")]
 

@@ -16,8 +16,9 @@ from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.px4 import params_file
 from companion.px4.params_file import single
 from companion.px4.required import file_values
-from tests.io.px4_peer import Px4Peer, free_udp_port
+from tests.io.px4_peer import Px4Peer
 from tests.io.stub_rig import standing_stub
+from tests.support import free_udp_port
 
 pytestmark = pytest.mark.waits
 SPOILED = {"EKF2_EV_CTRL": 3, "COM_OF_LOSS_T": 5.0, "EKF2_HGT_REF": 0}

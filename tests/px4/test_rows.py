@@ -22,8 +22,8 @@ from companion.runtime.clock import flight_clock
 from companion.sitl_config.loader import load_world
 from companion.sitl_config.world import World
 from sitl.autopilot.backend import stub_of
-from tests.io.px4_peer import free_udp_port
 from tests.io.stub_rig import standing_stub
+from tests.support import free_udp_port
 
 VEHICLE_FILE = Path(__file__).parents[2] / "configs/vehicles/tarot650_2r.yaml"
 FIRMWARE = "PX4 1.16.1 release (git 94cb20127)"

@@ -29,7 +29,7 @@ from companion.model.types import Severity
 from companion.recorder.client import RecorderProcess
 from tests.recorder.flights import Row, config_json, offer, started, tethered
 from tests.recorder.viewers import protobuf_decoder, view
-from tests.support import DEADLINE_S, wait_until
+from tests.support import DEADLINE_S, free_port, wait_until
 
 RECORDS = {"/inputs", "/outputs", "/sent"}
 SHOWN = {*RECORDS, "/tf", "/tf_arm", "/pose", "/reference", "/scene", "/scene_path", "/scene_static"}
@@ -69,11 +69,6 @@ def decoded(channel: dict[str, Any], data: bytes) -> Any:
     if channel["encoding"] == "json":
         return json.loads(data)
     return protobuf_decoder(channel["schemaName"], base64.b64decode(channel["schema"]))(data)
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
 
 
 @contextlib.contextmanager

@@ -26,9 +26,9 @@ from companion.ground.protocol.messages import (
     decode,
 )
 from companion.model.types import OperatorCommand, SafetyAction, Severity
-from tests.broker import Broker, free_port, loopback_broker
+from tests.broker import Broker, loopback_broker
 from tests.recorder.telemetry_rig import ROWS, VEHICLE, Listener, flight_with, log_lines
-from tests.support import DEADLINE_S, wait_until
+from tests.support import DEADLINE_S, free_port, wait_until
 from tools.docs.telemetry import schema_of
 
 pytestmark = pytest.mark.waits

@@ -27,10 +27,10 @@ from companion.ground.protocol.commands import make_command
 from companion.ground.protocol.keys import load_operators, new_key, write_private
 from companion.ground.protocol.messages import Ack, CommandName, Events, Presence, State, Topic, encode
 from companion.model.types import GroundCommand, OperatorCommand, SafetyAction
-from tests.broker import Broker, free_port, loopback_broker
+from tests.broker import Broker, loopback_broker
 from tests.ground.test_broker import WANTED, Site, running
 from tests.recorder.telemetry_rig import ROWS, VEHICLE, Listener, command, config_of, flight_with, log_lines
-from tests.support import CATCH, DEADLINE_S
+from tests.support import CATCH, DEADLINE_S, free_port
 
 pytestmark = pytest.mark.waits
 
