@@ -18,6 +18,7 @@ import subprocess
 import sys
 import threading
 import time
+import tty
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -401,6 +402,18 @@ def _assert_keys(found: Any, wanted: dict[str, Any], where: str) -> None:
     for key, below in wanted.items():
         if below is not None:
             _assert_keys(found[key], below, f"{where}.{key}")
+
+
+@contextlib.contextmanager
+def serial_line() -> Iterator[tuple[int, str]]:
+    """A serial line: its far end, which only the test answers, and the name of the port at the near one."""
+    far, near = os.openpty()
+    try:
+        tty.setraw(near)
+        yield far, os.ttyname(near)
+    finally:
+        os.close(near)
+        os.close(far)
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:

@@ -7,12 +7,10 @@ a flight opens its devices, in this process.
 
 from __future__ import annotations
 
-import os
 import re
 import socket
-import tty
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -25,7 +23,7 @@ from companion.io.protocols import DeviceError
 from companion.model.exit_codes import EXIT_REFUSED
 from companion.runtime.clock import flight_clock
 from companion.runtime.event_loop import run
-from tests.support import CATCH, Ended, Sandbox, World, read_summary, sandbox_in, set_options
+from tests.support import CATCH, Ended, Sandbox, World, read_summary, sandbox_in, serial_line, set_options
 
 SHARED = pytest.mark.xdist_group("the world that refuses")
 """Tests that share one world run in one process."""
@@ -49,18 +47,6 @@ def udp_port() -> socket.socket:
     taken = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     taken.bind(("127.0.0.1", 0))
     return taken
-
-
-@contextmanager
-def silent_pty() -> Iterator[str]:
-    """A serial port whose other end never answers."""
-    master, slave = os.openpty()
-    try:
-        tty.setraw(slave)
-        yield os.ttyname(slave)
-    finally:
-        os.close(slave)
-        os.close(master)
 
 
 def refused(sandbox: Sandbox, world: World, *options: str, events: bool = False) -> Ended:
@@ -223,7 +209,7 @@ def test_names_a_port_that_another_program_holds(world: World, device: str, refu
     ],
 )
 def test_names_a_device_that_is_silent(world: World, device: str, refusal: str) -> None:
-    with silent_pty() as port:
+    with serial_line() as (_, port):
         line = refused_at_opening(world, *world.addresses(**{device: {"port": port}}))
     assert re.search(refusal.replace("PORT", port), line)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import tty
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
@@ -21,6 +20,7 @@ from companion.io.protocols import DeviceError, ForceTorque
 from companion.model.types import ForceSample
 from companion.runtime.clock import flight_clock
 from sitl.force_torque import ForceTorqueServer
+from tests.support import serial_line
 
 WAIT_S = 20.0
 # 0x55AA and -0x55AB in counts: SOP and EOP in the payload, both ways round.
@@ -365,15 +365,12 @@ def test_other_model() -> None:
 def babbler(garbage: bytes) -> Iterator[str]:
     """A tty whose other end answers every question with garbage."""
     loop = asyncio.get_running_loop()
-    master, slave = os.openpty()
-    try:
-        tty.setraw(slave)
-        loop.add_reader(master, lambda: os.write(master, garbage) if os.read(master, 100) else None)
-        yield os.ttyname(slave)
-    finally:
-        loop.remove_reader(master)
-        os.close(master)
-        os.close(slave)
+    with serial_line() as (far, port):
+        loop.add_reader(far, lambda: os.write(far, garbage) if os.read(far, 100) else None)
+        try:
+            yield port
+        finally:
+            loop.remove_reader(far)
 
 
 @pytest.mark.waits

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-import os
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -32,7 +31,7 @@ from companion.model.types import (
 )
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import ACCEL_FRD_M_S2, GYRO_FRD_RAD_S, PARAMS, POSITION_NED_M, VELOCITY_NED_M_S, Px4Peer
-from tests.support import free_udp_port
+from tests.support import free_udp_port, serial_line
 
 pytestmark = pytest.mark.waits
 
@@ -653,12 +652,8 @@ def test_a_plain_file_is_no_serial_port(tmp_path: Path) -> None:
 
 
 def test_a_baud_rate_that_no_port_has_is_refused() -> None:
-    master, slave = os.openpty()
-    try:
-        assert "to open the connection" in asyncio.run(refused(f"serial://{os.ttyname(slave)}:123"))
-    finally:
-        os.close(slave)
-        os.close(master)
+    with serial_line() as (_, port):
+        assert "to open the connection" in asyncio.run(refused(f"serial://{port}:123"))
 
 
 def test_cancelling_the_wait_for_a_heartbeat_leaves_no_port_behind() -> None:

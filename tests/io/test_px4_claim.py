@@ -5,10 +5,9 @@ from __future__ import annotations
 import asyncio
 import os
 import socket
-import tty
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from companion.model.types import MocapPose
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import Px4Peer
 from tests.io.test_px4 import edge, eventually, refused
-from tests.support import DEADLINE_S, free_udp_port
+from tests.support import DEADLINE_S, free_udp_port, serial_line
 
 pytestmark = pytest.mark.waits
 
@@ -43,19 +42,8 @@ def forged_heartbeat() -> bytes:
 WRONG_HEARTBEAT = forged_heartbeat()[:-2] + b"\0\0"
 
 
-@contextmanager
-def serial_port() -> Iterator[str]:
-    master, slave = os.openpty()
-    try:
-        tty.setraw(slave)
-        yield os.ttyname(slave)
-    finally:
-        os.close(slave)
-        os.close(master)
-
-
 def test_a_serial_port_that_another_program_has_locked_is_refused_by_every_name(tmp_path: Path) -> None:
-    with serial_port() as port, serial.Serial(port, exclusive=True):
+    with serial_line() as (_, port), serial.Serial(port, exclusive=True):
         by_id = tmp_path / "by-id"
         by_id.symlink_to(port)
         for name in (port, by_id):
@@ -76,7 +64,7 @@ def test_a_second_flight_on_the_same_serial_port_is_refused_and_the_first_keeps_
             await entering
         return text
 
-    with serial_port() as port:
+    with serial_line() as (_, port):
         assert "to be free, found another program on it" in asyncio.run(main(port))
         assert not _is_locked(port), "what was refused or ended holds nothing"
 

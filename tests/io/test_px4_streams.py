@@ -8,7 +8,6 @@ import os
 import select
 import socket
 import threading
-import tty
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 
@@ -20,7 +19,7 @@ from companion.model.types import AttitudeSetpoint
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import PARAMS, Px4Peer
 from tests.io.test_px4 import eventually
-from tests.support import DEADLINE_S
+from tests.support import DEADLINE_S, serial_line
 
 pytestmark = pytest.mark.waits
 
@@ -59,14 +58,8 @@ def bridged(open_stream: Callable[[], int]) -> Iterator[None]:
 
 @contextmanager
 def serial_link() -> Iterator[str]:
-    master, slave = os.openpty()
-    try:
-        tty.setraw(slave)
-        with bridged(lambda: master):
-            yield f"serial://{os.ttyname(slave)}:921600"
-    finally:
-        os.close(slave)
-        os.close(master)
+    with serial_line() as (far, port), bridged(lambda: far):
+        yield f"serial://{port}:921600"
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.guardian.link import Link
 from companion.io.px4.wire import ROUND_DATAGRAMS, SerialWire, TcpWire, UdpWire, Wire, open_wire
-from tests.support import DEADLINE_S, free_udp_port, wait_until
+from tests.support import DEADLINE_S, free_udp_port, serial_line, wait_until
 
 
 def heartbeat(system: int = 1, component: int = 1) -> bytes:
@@ -165,31 +165,21 @@ def test_tcpout() -> None:
 
 
 def test_serial() -> None:
-    master, slave = os.openpty()
-    try:
-        tty.setraw(slave)
-        with opened(f"serial://{os.ttyname(slave)}:921600") as wire:
-            assert isinstance(wire, SerialWire)
-            wire.send(heartbeat())
-            assert os.read(master, 1000) == heartbeat()
-            os.write(master, heartbeat())
-            wait_readable(wire)
-            assert b"".join(received(wire)) == heartbeat()
-    finally:
-        os.close(slave)
-        os.close(master)
+    with serial_line() as (far, port), opened(f"serial://{port}:921600") as wire:
+        assert isinstance(wire, SerialWire)
+        wire.send(heartbeat())
+        assert os.read(far, 1000) == heartbeat()
+        os.write(far, heartbeat())
+        wait_readable(wire)
+        assert b"".join(received(wire)) == heartbeat()
 
 
 def test_a_serial_port_that_another_process_holds_is_not_opened() -> None:
-    master, slave = os.openpty()
-    try:
-        with opened(f"serial://{os.ttyname(slave)}:921600"), pytest.raises(OSError, match="exclusively"):
-            open_wire(f"serial://{os.ttyname(slave)}:921600", 0)
-        with opened(f"serial://{os.ttyname(slave)}:921600"):
+    with serial_line() as (_, port):
+        with opened(f"serial://{port}:921600"), pytest.raises(OSError, match="exclusively"):
+            open_wire(f"serial://{port}:921600", 0)
+        with opened(f"serial://{port}:921600"):
             pass
-    finally:
-        os.close(slave)
-        os.close(master)
 
 
 def test_a_serial_port_that_hangs_up_is_lost() -> None:

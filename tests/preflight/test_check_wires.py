@@ -8,7 +8,6 @@ import asyncio
 import json
 import os
 import signal
-import tty
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from companion.px4 import required
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel, ServoRefusal
 from sitl.servo.protocol import StatusError
-from tests.support import CATCH, HOVER, Ended, Sandbox, World, read_summary, sandbox_in, set_options
+from tests.support import CATCH, HOVER, Ended, Sandbox, World, read_summary, sandbox_in, serial_line, set_options
 
 OPERATING_MODE, MODE_POSITION = 11, 3
 
@@ -150,17 +149,11 @@ def test_ctrl_c_during_the_preflight_of_a_flight_ends_it_with_nothing_armed(sand
 
 @pytest.mark.waits
 def test_ctrl_c_during_a_check_leaves_nothing(sandbox: Sandbox) -> None:
-    master, slave = os.openpty()
-    try:
-        tty.setraw(slave)
-        networks = {"vehicle.devices.mocap.interface": "127.0.0.1"}
-        options = set_options(**{"vehicle.devices.force.port": os.ttyname(slave)}, **networks)
+    with serial_line() as (far, port):
+        options = set_options(**{"vehicle.devices.force.port": port, "vehicle.devices.mocap.interface": "127.0.0.1"})
         with sandbox.start("check", HOVER, *options) as running:
-            assert os.read(master, 1)  # it speaks to the sensor
+            assert os.read(far, 1)  # it speaks to the sensor
             running.signal(signal.SIGINT)
             ended = running.end()
-    finally:
-        os.close(slave)
-        os.close(master)
     sandbox.assert_nobody_left()
     assert (ended.code, ended.out, ended.err) == (EXIT_ABORTED, "", "companion check: interrupted\n"), ended
