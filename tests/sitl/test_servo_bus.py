@@ -12,17 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sitl.servo.bus import ServoBus, ServoLine
-from sitl.servo.model import RAD_PER_COUNT, ServoModel, ServoRefusal
-from sitl.servo.protocol import (
-    HEADER,
-    Instruction,
-    PacketParser,
-    StatusError,
-    packet,
-    status,
-    stuff,
-    unstuff,
-)
+from sitl.servo.model import RAD_PER_COUNT, ServoModel
+from sitl.servo.protocol import HEADER, Instruction, PacketParser, StatusError, packet, status, stuff, unstuff
+from tests.sitl.test_servo_model import get
 
 AMP = 2.69e-3
 
@@ -35,27 +27,6 @@ def line_of(*servos: ServoModel) -> ServoLine:
     for servo in servos:
         servo.write(9, b"\x00")
     return ServoLine(servos)
-
-
-def word(value: int, size: int = 2) -> bytes:
-    return value.to_bytes(size, "little", signed=value < 0)
-
-
-def get(servo: ServoModel, address: int, size: int, *, signed: bool = False) -> int:
-    return int.from_bytes(servo.read(address, size), "little", signed=signed)
-
-
-def refusal(servo: ServoModel, address: int, data: bytes) -> StatusError:
-    with pytest.raises(ServoRefusal) as caught:
-        servo.write(address, data)
-    return caught.value.error
-
-
-def in_current_mode(servo_id: int = 1) -> ServoModel:
-    servo = ServoModel(servo_id)
-    servo.write(11, b"\x00")
-    servo.write(64, b"\x01")
-    return servo
 
 
 # --- packets, byte for byte as in the e-manual ----------------------------------------------------------------------------
