@@ -18,6 +18,7 @@ from hypothesis.internal.conjecture import providers
 from hypothesis.internal.constants_ast import Constants
 
 from tests.marked import MARKS, files_of
+from tests.support import Sandbox, sandbox_in
 
 _LOADED_COMPUTER = [HealthCheck.too_slow]
 """Neither this check nor a deadline may fail a test: both measure the computer."""
@@ -68,6 +69,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for mark in MARKS:
             if item.get_closest_marker(mark) is not None and item.path not in files_of(mark):
                 raise pytest.UsageError(f"{item.nodeid}: write pytest.mark.{mark} into its own file")
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
+    """A place to run `companion` in."""
+    with sandbox_in(tmp_path) as sandbox:
+        yield sandbox
 
 
 @pytest.fixture(scope="module", autouse=True)

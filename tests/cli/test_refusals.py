@@ -36,12 +36,6 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
         yield world
 
 
-@pytest.fixture
-def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
-    with sandbox_in(tmp_path) as sandbox:
-        yield sandbox
-
-
 def udp_port() -> socket.socket:
     """A UDP port of 127.0.0.1 that is taken, and on which nobody speaks."""
     taken = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

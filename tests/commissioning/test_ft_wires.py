@@ -14,12 +14,12 @@ from companion.config.loader import load_vehicle
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.runtime.clock import flight_clock
 from sitl.force_torque import ForceTorqueServer
-from tests.commissioning.test_mocap_wires import VEHICLE, bad, changes, document, sandbox, vehicle
+from tests.commissioning.test_mocap_wires import VEHICLE, bad, changes, document, vehicle
 from tests.support import Sandbox, World, run_here, tool_of
 
 pytestmark = pytest.mark.waits
 
-__all__ = ["sandbox", "vehicle"]
+__all__ = ["vehicle"]
 WEIGHT_KG = 0.5
 HUNG_S = 5.0
 """After the first reading: well after the look at the empty net."""

@@ -10,12 +10,10 @@ from pathlib import Path
 import pytest
 
 from companion.model.exit_codes import EXIT_ABORTED
-from tests.commissioning.test_mocap_wires import VEHICLE, sandbox
+from tests.commissioning.test_mocap_wires import VEHICLE
 from tests.support import CATCH, DEADLINE_S, Running, Sandbox, World, sandbox_in
 
 pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("tools that are interrupted")]
-
-__all__ = ["sandbox"]
 
 
 @pytest.fixture(scope="module")

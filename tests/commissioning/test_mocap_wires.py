@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
-from tests.support import CATCH, ROOT, Ended, Sandbox, World, run_here, sandbox_in, set_options
+from tests.support import CATCH, ROOT, Ended, Sandbox, World, run_here, set_options
 
 pytestmark = pytest.mark.waits
 
@@ -20,12 +20,6 @@ VEHICLE = ROOT / "configs/vehicles/tarot650_2r.yaml"
 WATCH_S = 2
 LIFTED_S = 4
 """The hand lifts the machine as soon as the world begins."""
-
-
-@pytest.fixture
-def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
-    with sandbox_in(tmp_path) as made:
-        yield made
 
 
 @pytest.fixture

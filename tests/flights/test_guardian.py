@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,6 @@ from companion.model.exit_codes import EXIT_ABORTED, EXIT_REFUSED
 from tests.support import HOVER, Sandbox, read_summary, sandbox_in
 
 FLY = ("fly", HOVER, "--sitl", "--out", "out", "--set", "mission.phases[1].duration_s=2.0")
-
-
-@pytest.fixture
-def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
-    with sandbox_in(tmp_path) as sandbox:
-        yield sandbox
 
 
 def events_of(summary: dict[str, Any]) -> list[str]:

@@ -69,12 +69,6 @@ LANDED_M = 0.4
 """Of the body's origin, which stands 0.3 m high."""
 
 
-@pytest.fixture
-def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
-    with sandbox_in(tmp_path) as sandbox:
-        yield sandbox
-
-
 def faults(*kinds: str, on_stub: str | None) -> pytest.MarkDecorator:
     """Every fault on the real PX4; on the stub one or none of them, since its guardian is the same in every test."""
     cases = [pytest.param("px4", kind, marks=REAL) for kind in kinds]

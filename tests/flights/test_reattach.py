@@ -8,7 +8,7 @@ import contextlib
 import os
 import signal
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import pytest
 from companion.analysis.log import FlightLog
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST
 from companion.model.types import AutopilotRequest
-from tests.support import HOVER, Running, Sandbox, World, read_summary, sandbox_in, set_options, wait_until
+from tests.support import HOVER, Running, Sandbox, World, read_summary, set_options, wait_until
 
 LONG = set_options(
     **{"mission.phases[1].duration_s": 40.0, "mission.phases[0].height_m": 1.2, "mission.phases[0].duration_s": 3.0}
@@ -25,12 +25,6 @@ LONG = set_options(
 SLOW = "world.px4_params={MPC_LAND_SPEED: 0.3}"
 """PX4's own landing takes longer than a busy computer takes to start the next companion."""
 IN_FLIGHT = "  hold\n"
-
-
-@pytest.fixture
-def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
-    with sandbox_in(tmp_path) as sandbox:
-        yield sandbox
 
 
 def kill_the_companion(sandbox: Sandbox, first: Running) -> None:

@@ -41,12 +41,6 @@ PROCESSES = {
 }
 
 
-@pytest.fixture
-def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
-    with sandbox_in(tmp_path) as sandbox:
-        yield sandbox
-
-
 def events_of(summary: dict[str, Any]) -> list[str]:
     return [event["id"] for event in summary["events"]]
 
