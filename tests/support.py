@@ -6,6 +6,7 @@ A pty lives as long as the process that holds its master, so no process means no
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
 import json
@@ -433,6 +434,14 @@ def wait_until(condition: Callable[[], bool], why: Callable[[], str], within_s: 
     while not condition():
         assert time.monotonic() < deadline_s, why()
         time.sleep(0.05)
+
+
+async def eventually(condition: Callable[[], bool], what: str, within_s: float = 30.0) -> None:
+    """Let the event loop run until the condition holds, which other threads or the loop's tasks bring about."""
+    deadline_s = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < deadline_s, f"not within {within_s} s: {what}"
+        await asyncio.sleep(0.01)
 
 
 def position_error_m(i: Inputs, o: Outputs) -> float:

@@ -6,7 +6,6 @@ import asyncio
 import logging
 import math
 import socket
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from companion.model.types import (
 )
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import ACCEL_FRD_M_S2, GYRO_FRD_RAD_S, PARAMS, POSITION_NED_M, VELOCITY_NED_M_S, Px4Peer
-from tests.support import free_udp_port, serial_line
+from tests.support import eventually, free_udp_port, serial_line
 
 pytestmark = pytest.mark.waits
 
@@ -42,15 +41,6 @@ DO_SET_MODE, NAV_LAND, ARM_DISARM = 176, 21, 400
 def edge(port: int, discovery_timeout_s: float = 20.0) -> MavsdkAutopilot:
     device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=discovery_timeout_s)
     return MavsdkAutopilot(device, flight_clock())
-
-
-async def eventually(predicate: Callable[[], bool], what: str, deadline_s: float = 20.0) -> None:
-    try:
-        async with asyncio.timeout(deadline_s):
-            while not predicate():  # noqa: ASYNC110 - what is awaited happens in MAVSDK's and the peer's threads
-                await asyncio.sleep(0.01)
-    except TimeoutError:
-        pytest.fail(f"not within {deadline_s} s: {what}")
 
 
 async def refused(address: str, discovery_timeout_s: float = 20.0) -> str:

@@ -24,8 +24,8 @@ from companion.io.px4.frames import AutopilotHeartbeat
 from companion.model.types import MocapPose
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import Px4Peer
-from tests.io.test_px4 import edge, eventually, refused
-from tests.support import DEADLINE_S, free_udp_port, serial_line
+from tests.io.test_px4 import edge, refused
+from tests.support import DEADLINE_S, eventually, free_udp_port, serial_line
 
 pytestmark = pytest.mark.waits
 

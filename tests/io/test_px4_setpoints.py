@@ -14,8 +14,8 @@ from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import AttitudeSetpoint, FlightMode, Vec3
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import Px4Peer
-from tests.io.test_px4 import DO_SET_MODE, GOLDEN_ATTITUDES, eventually
-from tests.support import free_udp_port
+from tests.io.test_px4 import DO_SET_MODE, GOLDEN_ATTITUDES
+from tests.support import eventually, free_udp_port
 
 pytestmark = pytest.mark.waits
 

@@ -18,8 +18,7 @@ from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.types import AttitudeSetpoint
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import PARAMS, Px4Peer
-from tests.io.test_px4 import eventually
-from tests.support import DEADLINE_S, serial_line
+from tests.support import DEADLINE_S, eventually, serial_line
 
 pytestmark = pytest.mark.waits
 

@@ -45,7 +45,7 @@ from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import POSITION_NED_M, Px4Peer
 from tests.io.qgroundcontrol_peer import GroundPeer
 from tests.io.stub_rig import standing_stub
-from tests.support import CATCH, free_udp_port
+from tests.support import CATCH, eventually, free_udp_port
 
 pytestmark = pytest.mark.waits
 
@@ -115,15 +115,6 @@ async def send_setpoints(autopilot: MavsdkAutopilot, px4: Px4Peer, count: int, e
     await asyncio.to_thread(px4.wait_for, "SET_ATTITUDE_TARGET", count)
 
 
-async def until(done: Callable[[], bool], what: str) -> None:
-    try:
-        async with asyncio.timeout(DEADLINE_S):
-            while not done():  # noqa: ASYNC110 - written by other threads
-                await asyncio.sleep(0.01)
-    except TimeoutError:
-        pytest.fail(f"not within {DEADLINE_S} s: {what}")
-
-
 def test_qgroundcontrol_sees_the_stub_reads_a_parameter_and_hears_our_words() -> None:
     async def fly() -> None:
         port = free_udp_port()
@@ -175,11 +166,11 @@ def test_a_forced_disarm_from_the_ground_does_not_reach_an_armed_px4(kind: str) 
                     forced = (0.0, 21196.0, 0.0, 0.0)
                     ground.say(mavlink.MAVLink_command_int_message(1, 1, 0, 400, 0, 0, *forced, 0, 0, 0.0))
                 ground.say(mavlink.MAVLink_command_long_message(1, 1, 21, 0, *[0.0] * 7))
-                await until(lambda: bool(px4.commands(21)), "LAND, which was sent after it")
+                await eventually(lambda: bool(px4.commands(21)), "LAND, which was sent after it")
                 assert px4.commands(400) == []
                 assert [message for message in px4.of("COMMAND_INT") if message.command == 400] == []
                 told: list[str] = []
-                await until(lambda: told.extend(station.take_messages()) or len(told) > 1, "what was refused")  # type: ignore[func-returns-value]
+                await eventually(lambda: told.extend(station.take_messages()) or len(told) > 1, "what was refused")  # type: ignore[func-returns-value]
                 assert any("1 command 400 while PX4 is armed" in text for text in told), told
 
     asyncio.run(fly())
@@ -190,13 +181,13 @@ def test_a_mode_that_the_ground_chose_reaches_px4_and_the_companion_sees_it() ->
         port = free_udp_port()
         with GroundPeer() as ground:
             async with standing_stub(port), link(port, ground.address) as (autopilot, _):
-                await until(lambda: autopilot.status() is not None, "a heartbeat")
+                await eventually(lambda: autopilot.status() is not None, "a heartbeat")
                 await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1, autopilot=mavlink.MAV_AUTOPILOT_PX4)
                 custom = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
                 for main, sub, mode in ((1.0, 0.0, FlightMode.MANUAL), (4.0, 3.0, FlightMode.HOLD)):
                     fields = (custom, main, sub, 0.0, 0.0, 0.0, 0.0)
                     ground.say(mavlink.MAVLink_command_long_message(1, 1, 176, 0, *fields))
-                    await until(lambda mode=mode: (s := autopilot.status()) is not None and s.mode is mode, mode.name)  # type: ignore[misc]
+                    await eventually(lambda m=mode: (s := autopilot.status()) is not None and s.mode is m, mode.name)  # type: ignore[misc]
                 await asyncio.to_thread(ground.wait_for, "COMMAND_ACK", 1, command=176)
 
     asyncio.run(fly())
@@ -234,7 +225,7 @@ def test_nothing_that_the_ground_forges_enters_the_companions_state() -> None:
         port = free_udp_port()
         with GroundPeer() as ground, Px4Peer(port) as px4, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             async with link(port, ground.address) as (autopilot, station):
-                await until(lambda: autopilot.vehicle() is not None and autopilot.status() is not None, "a state")
+                await eventually(lambda: autopilot.vehicle() is not None and autopilot.status() is not None, "a state")
                 # PX4 falls silent: nothing overwrites what comes in.
                 px4.beating = False
                 await asyncio.to_thread(px4.packets_so_far)
@@ -258,8 +249,8 @@ def test_nothing_that_the_ground_forges_enters_the_companions_state() -> None:
                 # The same from PX4's side is believed: this test can tell.
                 for message in _forgeries():
                     px4.say(message)
-                await until(lambda: autopilot.vehicle() != before, "PX4's own")
-                await until(lambda: (s := autopilot.status()) is not None and s.armed, "PX4's own heartbeat")
+                await eventually(lambda: autopilot.vehicle() != before, "PX4's own")
+                await eventually(lambda: (s := autopilot.status()) is not None and s.armed, "PX4's own heartbeat")
                 assert "attitude" in _believed(autopilot)
 
     asyncio.run(fly())
@@ -329,7 +320,7 @@ def test_a_ground_station_that_connects_late_receives_the_phase() -> None:
                 await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text="phase catch")
                 assert len(ground.of("STATUSTEXT", 191)) == 1
                 ground.beating = True
-                await until(lambda: len(ground.of("STATUSTEXT", 191)) == 2, "the phase again")
+                await eventually(lambda: len(ground.of("STATUSTEXT", 191)) == 2, "the phase again")
 
     asyncio.run(fly())
 
@@ -368,7 +359,7 @@ def test_a_relay_that_was_killed_costs_the_ground_station_and_nothing_else() -> 
                     return any("relay has ended" in line for line in said)
 
                 # A killed process ends when the kernel comes to it.
-                await until(told, "the relay's end")
+                await eventually(told, "the relay's end")
                 assert [line for line in said if "relay has ended" in line] == [
                     f"ground station {ground.address}: the relay has ended; nothing is forwarded"
                 ]

@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import termios
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,6 +23,7 @@ from sitl.faults.processes import inject_process_fault
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
 from sitl.servo.protocol import packet, status
+from tests.sitl.simulated_devices import turns_until
 from tests.support import CATCH, DEADLINE_S
 
 # -- the servo bus -----------------------------------------------------------------------------------------------------
@@ -47,7 +48,7 @@ def test_a_damaged_instruction_is_heard_by_nobody() -> None:
                 speed[4] = speed[5] = termios.B3000000
                 termios.tcsetattr(fd, termios.TCSANOW, speed)
                 os.write(fd, packet(1, bytes((3, _LED, 0, 1))))
-                await _turns_until(lambda: len(asked) == 1)
+                await turns_until(lambda: len(asked) == 1)
                 os.write(fd, packet(1, bytes((2, 0, 0, 6, 0))))
                 expected = status(1, 0, servo.read(0, 6))
                 return servo.read(_LED, 1)[0], await _read(fd, len(expected))
@@ -57,14 +58,6 @@ def test_a_damaged_instruction_is_heard_by_nobody() -> None:
     led, answer = asyncio.run(scenario())
     assert led == 0, "the damaged write was carried out"
     assert answer == status(1, 0, ServoModel(1).read(0, 6)), "and the answer to it came first"
-
-
-async def _turns_until(done: Callable[[], bool]) -> None:
-    loop = asyncio.get_running_loop()
-    give_up_s = loop.time() + DEADLINE_S
-    while not done():
-        assert loop.time() < give_up_s
-        await asyncio.sleep(0)
 
 
 async def _read(fd: int, size: int) -> bytes:
