@@ -34,8 +34,9 @@ BROKEN: dict[int, tuple[str, dict[str, Any]]] = {
     0: ("vehicle", {"specific_force_body_m_s2": NAN, "delta_velocity_body_m_s": NAN}),
     20: ("mocap", {"position_world_m": NAN}),
     40: ("arm", {"angle_rad": NAN[:2]}),
+    60: ("arm", {"velocity_rad_s": NAN[:2]}),
 }
-"""Ticks with NaN in the record from which the force on the vehicle, the place of the tip, or the arm's joint angles come."""
+"""Ticks with NaN in the record from which the force on the vehicle, the place of the tip, or the arm's joint angles and rates come."""
 
 
 def short_slide(friction: float) -> list[str]:
@@ -161,6 +162,19 @@ def test_the_arm_pushes_along_the_way_and_answers_the_force_error_by_a_bounded_f
     for _ in range(200):
         force = tip_force(200.0)
     assert force == pytest.approx([-control.FORCE_MAX_N, -0.5], rel=1e-3)
+
+
+def test_a_turning_joint_overcomes_the_friction_of_its_gear_and_a_resting_one_gets_nothing() -> None:
+    vehicle, law_nm, into = load_sitl(SLIDE).vehicle, (-1.0, 0.5), (1.0, 0.0, 0.0)
+
+    def torque_nm(rate_rad_s: Joints) -> Joints:
+        state = at(arm=ARM, arm_rate=rate_rad_s, force=None)
+        return control.Slide(vehicle).torque_nm(0.005, law_nm, state, (0.0, 0.0, 0.0), into, None)
+
+    assert torque_nm((0.0, 0.0)) == pytest.approx(law_nm)
+    loss_nm = [vehicle.arm.joint_friction_nm + control.GEAR_LOSS_SHARE * abs(torque) for torque in law_nm]
+    assert torque_nm((-5.0, -5.0)) == pytest.approx((-1.0 - loss_nm[0], 0.5 - loss_nm[1]))
+    assert torque_nm((5.0, 5.0)) == pytest.approx((-1.0 + loss_nm[0], 0.5 + loss_nm[1]))
 
 
 def test_a_tip_beside_its_path_is_steered_back_and_the_turn_ends_with_the_slide() -> None:
