@@ -19,7 +19,6 @@ from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
-from benchmarks.measuring.setpoint import NotMeasured
 from tests.support import ROOT
 
 PACKAGES = ("pyperformance==1.14.0", "pyperf==2.10.0")
@@ -58,6 +57,10 @@ results/bm-20221024-3.11.0-deaf509 (linux x86_64).
 """
 DEVIATIONS = 2.0
 """Half of the range in standard deviations: the range holds 19 programs of 20."""
+
+
+class NotMeasured(Exception):
+    """The reason why the programs were not measured, in one line."""
 
 
 @dataclass(frozen=True, slots=True)

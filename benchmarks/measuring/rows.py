@@ -76,7 +76,7 @@ def sections(parts: Mapping[str, Figures]) -> list[Section]:
         "later than two periods": "later_than_two",
         "deadlines without a tick": "skipped",
     }
-    loops = {"the companion's edge alone": "edge", "pymavlink echo": "pymavlink", "bare loop over gRPC": "grpc"}
+    loops = {"the companion's edge alone": "edge", "pymavlink echo": "pymavlink"}
     ends = {"to setpoint": "inside", "to setpoint, wire to wire": "wire"}
     system = find(
         "hover", "threads", as_figures=lambda found: {"value": sum(float(each["system"]) for each in found.values())}
@@ -85,7 +85,7 @@ def sections(parts: Mapping[str, Figures]) -> list[Section]:
         "hover", "threads", as_figures=lambda found: {name: _cpu(each)["value"] for name, each in found.items()}
     )
     main_thread = find("hover", "threads", MAIN, as_figures=_cpu)
-    lateness, what = "lateness of a tick, ms", "mocap to setpoint, ms: flight"
+    lateness = "lateness of a tick, ms"
     cpu, memory = "cpu_percent", "rss_mb"
     return [
         Section("Ticks", texts.TICKS, LATENESS, [
@@ -97,8 +97,7 @@ def sections(parts: Mapping[str, Figures]) -> list[Section]:
             *(_row(name, "empty loop", value("hover", "flight", key), value("hover", "empty", key)) for name, key in counts.items()),
         ]),
         Section("Motion capture to setpoint", texts.SETPOINT, P50_P99, [
-            _row(what, BARE_BESIDE, setpoint, bare, Target(2.0)),
-            _row(what, "bare loop over gRPC", setpoint, find("setpoint", "grpc", "wire"), Target(0.2)),
+            _row("mocap to setpoint, ms: flight", BARE_BESIDE, setpoint, bare, Target(2.0)),
             _row("tick begun to setpoint, ms: flight", BARE_BESIDE, find("hover", "start_to_setpoint_ms"), bare),
             *(
                 _row(f"mocap {end}, ms: {name}", BARE, find("setpoint", key, which), find("setpoint", "native", which))

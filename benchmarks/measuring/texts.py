@@ -28,10 +28,9 @@ From the arrival of a motion-capture datagram (kernel time stamp) to the return 
 each in its own process with the flight's priority, against a process that sends the datagrams and receives the setpoints. One of
 them ran during the hover; the others ran one after the other without a flight.
 
-Wire to wire is on the clock of the process at the other end: datagram sent to SET_ATTITUDE_TARGET received. Over gRPC (MAVSDK 3,
-its server at the same priority) the call returns before the setpoint leaves, so its wire-to-wire figure is compared with the
-flight. The flight has no such figure, because its other end is the unmodified simulated world. Native MAVSDK sends from its own
-thread; the difference of the driver's two rows is what that adds. pymavlink echo packs and sends without a link: the lower bound.
+Wire to wire is on the clock of the process at the other end: datagram sent to SET_ATTITUDE_TARGET received. The flight has no such
+figure, because its other end is the unmodified simulated world. Native MAVSDK sends from its own thread; the difference of the
+driver's two rows is what that adds. pymavlink echo packs and sends without a link: the lower bound.
 """)
 
 BUS = _paragraphs("""

@@ -11,9 +11,8 @@ import pytest
 
 from benchmarks.measuring.figures import MET, NOT_MET
 from benchmarks.measuring.hover import of_threads
-from benchmarks.measuring.pi import PI4_PER_PI5, PI5_S, Slower, nbody_check, shortest_s, slower
+from benchmarks.measuring.pi import PI4_PER_PI5, PI5_S, NotMeasured, Slower, nbody_check, shortest_s, slower
 from benchmarks.measuring.rows import sections
-from benchmarks.measuring.setpoint import NotMeasured
 from benchmarks.soaking.processes import threads
 from companion.runtime.native_threads import name_thread
 

@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 from benchmarks import __main__ as command
-from benchmarks.measuring import setpoint
 from benchmarks.measuring.figures import problems
 from benchmarks.measuring.hover_log import read_hover
 from benchmarks.measuring.page import markdown
@@ -44,7 +43,7 @@ GOOD: dict[str, Any] = {
         "in_world": {"cycle_ms": spread(1.0, 2.0), "command_ms": spread(0.02, 0.03)},
     },
     "setpoint": {name: {"inside": spread(0.1, 0.2), "wire": spread(wire, 2 * wire)}
-                 for name, wire in (("native", 0.15), ("edge", 0.2), ("pymavlink", 0.1), ("grpc", 5.0))},
+                 for name, wire in (("native", 0.15), ("edge", 0.2), ("pymavlink", 0.1))},
     "hover": {
         "exit_code": 0, "outcome": "completed", "recorder_dropped": 0, "warnings": ["no more than a hint"], "hover_s": 594.0,
         "viewer": "headless Chromium", "realtime": "SCHED_FIFO 50", "limits": {"vehicle.safety.preflight_s": 2.0},
@@ -80,7 +79,7 @@ def changed(*keys: str, to: Any) -> dict[str, Any]:
 def test_every_target_can_be_met() -> None:
     tables = sections(GOOD)
     assert problems(tables) == []
-    assert sum(row.target is not None for table in tables for row in table.rows) == 19
+    assert sum(row.target is not None for table in tables for row in table.rows) == 18
 
 
 @pytest.mark.parametrize(
@@ -89,7 +88,6 @@ def test_every_target_can_be_met() -> None:
         (("hover", "flight", "lateness_ms"), spread(0.1, 1.51), "lateness of a tick"),
         (("hover", "late_alone"), [0.012], "later than two periods while"),
         (("hover", "setpoint_ms"), spread(0.161, 0.3), "beside bare loop on native MAVSDK"),
-        (("setpoint", "grpc", "wire"), spread(0.5, 2.0), "beside bare loop over gRPC"),
         (("hover", "bus_cycle_ms"), spread(1.51, 2.0), "joint read begun"),
         (("core", "core_ms"), spread(0.101, 0.2), "FlightCore.step, us"),
         (("hover", "core_ms"), spread(0.081, 0.2), "FlightCore.step in the flight"),
@@ -114,12 +112,10 @@ def test_each_target_can_be_missed(keys: tuple[str, ...], bad: Any, words: str) 
 def test_what_was_not_measured_says_why_and_is_a_problem() -> None:
     failed = results(GOOD, hover="no broker")
     told = problems(command.tables_of(failed))
-    assert len(told) == 14
+    assert len(told) == 13
     assert all(line.endswith(": not measured: no broker") for line in told)
     assert "* **hover was not measured: no broker**" in markdown(failed, command.tables_of(failed))
-    assert len(problems(command.tables_of(results({})))) == 19
-    [only] = problems(sections(changed("setpoint", "grpc", to={"not_measured": "no network"})))
-    assert only == "mocap to setpoint, ms: flight beside bare loop over gRPC: not measured: no network"
+    assert len(problems(command.tables_of(results({})))) == 18
     without_bare = changed("hover", "bare", to={"not_measured": "it had not ended"})
     assert problems(sections(without_bare))[0].endswith("in the same minutes: not measured: it had not ended")
 
@@ -127,7 +123,6 @@ def test_what_was_not_measured_says_why_and_is_a_problem() -> None:
 def test_the_page_says_what_kind_of_run_it_was() -> None:
     text = markdown(results(GOOD), sections(GOOD))
     assert "1.3 / 1 = 1.30" in text
-    assert "0.12 / 5 = 0.02" in text
     assert "the flight said: no more than a hint" in text
     assert "quick" not in text
     quick = results(GOOD)
@@ -238,12 +233,6 @@ def test_no_results_no_page(tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as ended:
         command.main(["--page", "--out", str(tmp_path)])
     assert ended.value.code == 2
-
-
-def test_an_environment_that_cannot_be_made_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "executable", "/bin/false")
-    with pytest.raises(setpoint.NotMeasured, match="could not be installed"):
-        setpoint.grpc_environment(tmp_path / "none")
 
 
 def test_an_echo_answers_every_datagram_over_real_sockets() -> None:
