@@ -42,7 +42,14 @@ VEHICLE = Check(
     "a key that is left out has the value of the Tarot 650, which is wrong for another machine",
     warns=True,
 )
-CHECKS = (VEHICLE, PLAN, ARM, ROOM)
+TAKEOVER = Check(
+    "mission.takeover",
+    "guardian's takeover",
+    "`safety.react_time_s` is more than `safety.guardian_timeout_s`",
+    "after a takeover the vehicle would stop farther away than room, tether and mission allow for",
+    warns=True,
+)
+CHECKS = (VEHICLE, PLAN, ARM, ROOM, TAKEOVER)
 
 
 def rows(o: Observations, config: FlightConfig) -> Iterator[Row]:
@@ -65,6 +72,9 @@ def rows(o: Observations, config: FlightConfig) -> Iterator[Row]:
     pose = last_pose(o, external=vehicle.devices.mocap.external)
     if pose is not None:
         yield _room(pose.position_world_m, vehicle.room, vehicle.airframe.radius_m)
+    react_s, timeout_s = vehicle.safety.react_time_s, vehicle.safety.guardian_timeout_s
+    fix = "lower safety.guardian_timeout_s, or raise safety.react_time_s as well"
+    yield TAKEOVER.row(react_s > timeout_s, f"{react_s:g} s", f"more than {timeout_s:g} s", fix)
 
 
 def _arm(angle_rad: Joints, start: Start) -> Row:

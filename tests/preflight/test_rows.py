@@ -232,6 +232,9 @@ CASES = {
     "mission that cannot be flown": Case("mission.plan", "leaves the room", "correct the mission", {"plan": ("leaves the room",)}),
     "arm elsewhere": Case("mission.arm", "(150, 140)", "by hand", {"arm": r.arm(angle_rad=(math.radians(150), r.ARM_RAD[1]))}),
     "near the wall": Case("mission.room", "(-1.00,", "further in", {}, vehicle={"room.x_m": (-1.3, 2.2)}),
+    "patient guardian": Case(
+        "mission.takeover", "0.18 s", "raise safety.react_time_s", {}, WARN, vehicle={"safety.guardian_timeout_s": 0.3}
+    ),
     "little disk": Case("machine.disk", "40 MB", "--out", {"machine": r.machine(disk_free_bytes=40_000_000)}, WARN),
     "full disk": Case("machine.disk", "20 MB", "delete", {"machine": r.machine(disk_free_bytes=20_000_000)}),
     "slow processor": Case("machine.governor", "powersave", "cpupower", {"machine": r.machine(governors=("powersave",))}, WARN),
