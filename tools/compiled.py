@@ -9,7 +9,9 @@ and a step of the flight core takes an eighth less. Other compilers, and a compu
 
 from __future__ import annotations
 
+import contextlib
 import filecmp
+import io
 import os
 import shlex
 import shutil
@@ -106,6 +108,7 @@ def is_current() -> bool:
 def build() -> Path:
     """Compile the modules and return the path of the wheel."""
     from mypyc.build import mypycify
+    from pybind11.setup_helpers import ParallelCompile
     from setuptools import setup
     from setuptools.command.build_py import build_py
 
@@ -121,15 +124,23 @@ def build() -> Path:
     WORK.mkdir(parents=True, exist_ok=True)
     os.environ["CFLAGS"] = FLAGS
     os.chdir(ROOT)
-    extensions = mypycify(
-        [f"--config-file={ROOT / 'pyproject.toml'}", f"--cache-dir={WORK / 'cache'}", *modules()],
-        opt_level="2",
-        debug_level="0",
-        group_name="companion_sitl",
-        multi_file=True,
-        target_dir=str(WORK / "c"),
-    )
-    warnings.filterwarnings("ignore", module="setuptools")  # it recommends other ways to call it
+    print("compiling for some minutes ...", flush=True)
+    said = io.StringIO()  # warnings about generator expressions, hundreds of lines; the errors if there are any
+    try:
+        with contextlib.redirect_stdout(said):
+            extensions = mypycify(
+                [f"--config-file={ROOT / 'pyproject.toml'}", f"--cache-dir={WORK / 'cache'}", *modules()],
+                opt_level="2",
+                debug_level="0",
+                group_name="companion_sitl",
+                multi_file=True,
+                target_dir=str(WORK / "c"),
+            )
+    except SystemExit:
+        print(said.getvalue(), file=sys.stderr)
+        raise
+    warnings.filterwarnings("ignore", module="setuptools|distutils")  # they recommend other ways to call them
+    ParallelCompile(default=len(os.sched_getaffinity(0))).install()
 
     plain = [list(extension.extra_compile_args) for extension in extensions]
 
