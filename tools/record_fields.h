@@ -1,4 +1,4 @@
-/* Reads of a record's field and of a module's name in the compiled modules.
+/* Reads of a record's field, of a module's name and of a float in the compiled modules.
 
 Each place in the code remembers the version of the object's type and the field's offset, as CPython's interpreter does (LOAD_ATTR_SLOT).
 mypyc searches the type for the name at every read, which made up a fifth of a control tick. A changed type has another version.
@@ -46,6 +46,12 @@ static inline PyObject *companion_field(PyObject *object, PyObject *name, Compan
     }
     return companion_find_field(object, name, field);
 }
+
+static inline double companion_double(PyObject *object) {
+    return PyFloat_CheckExact(object) ? PyFloat_AS_DOUBLE(object) : PyFloat_AsDouble(object);
+}
+
+#define PyFloat_AsDouble(object) companion_double(object)
 
 #undef CPyObject_GetAttr
 #define CPyObject_GetAttr(object, name)                    \
