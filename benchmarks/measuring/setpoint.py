@@ -1,4 +1,4 @@
-"""Mocap datagram in -> SET_ATTITUDE_TARGET out: bare loops on native MAVSDK and on pymavlink, and the companion's edge."""
+"""Measures the time from a motion-capture datagram to SET_ATTITUDE_TARGET, in bare loops on MAVSDK and pymavlink and in the driver."""
 
 from __future__ import annotations
 

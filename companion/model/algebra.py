@@ -16,7 +16,7 @@ def minus(a: Vec3, b: Vec3) -> Vec3:
 
 
 def scaled(v: Vec3, k: float) -> Vec3:
-    """Return k v."""
+    """Return the vector v multiplied by the number k."""
     return (k * v[0], k * v[1], k * v[2])
 
 

@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Any
 
 import pytest
@@ -53,6 +54,11 @@ DEADLINE_S = 30.0
 LEVEL = AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.2)
 HOLD_MODE = (4 << 16) | (3 << 24)
 PILOT_MODE = 3 << 16
+
+
+def is_in_mode(autopilot: MavsdkAutopilot, mode: FlightMode) -> bool:
+    status = autopilot.status()
+    return status is not None and status.mode is mode
 
 
 def inputs(tick: int = 0) -> Inputs:
@@ -169,9 +175,14 @@ def test_a_forced_disarm_from_the_ground_does_not_reach_an_armed_px4(kind: str) 
                 await eventually(lambda: bool(px4.commands(21)), "LAND, which was sent after it")
                 assert px4.commands(400) == []
                 assert [message for message in px4.of("COMMAND_INT") if message.command == 400] == []
-                told: list[str] = []
-                await eventually(lambda: told.extend(station.take_messages()) or len(told) > 1, "what was refused")  # type: ignore[func-returns-value]
-                assert any("1 command 400 while PX4 is armed" in text for text in told), told
+                texts: list[str] = []
+
+                def refused() -> bool:
+                    texts.extend(station.take_messages())
+                    return len(texts) > 1
+
+                await eventually(refused, "what was refused")
+                assert any("1 command 400 while PX4 is armed" in text for text in texts), texts
 
     asyncio.run(fly())
 
@@ -187,7 +198,7 @@ def test_a_mode_that_the_ground_chose_reaches_px4_and_the_companion_sees_it() ->
                 for main, sub, mode in ((1.0, 0.0, FlightMode.MANUAL), (4.0, 3.0, FlightMode.HOLD)):
                     fields = (custom, main, sub, 0.0, 0.0, 0.0, 0.0)
                     ground.say(mavlink.MAVLink_command_long_message(1, 1, 176, 0, *fields))
-                    await eventually(lambda m=mode: (s := autopilot.status()) is not None and s.mode is m, mode.name)  # type: ignore[misc]
+                    await eventually(partial(is_in_mode, autopilot, mode), mode.name)
                 await asyncio.to_thread(ground.wait_for, "COMMAND_ACK", 1, command=176)
 
     asyncio.run(fly())

@@ -104,7 +104,7 @@ def encode_message(message: Message, payload: bytes = b"") -> bytes:
 
 
 def encode_request(message: Message) -> bytes:
-    """Return a client datagram with an empty zero-terminated string, as the SDK's client sends a keep-alive."""
+    """Return a request to the server. Its payload is one zero byte, an empty string, as in the requests of NatNet's own client."""
     return encode_message(message, b"\0")
 
 
