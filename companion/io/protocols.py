@@ -74,6 +74,9 @@ class Autopilot(Device, Protocol):
     def request(self, request: AutopilotRequest) -> None:
         """Send a request without waiting for the answer, unless the same request is in progress."""
 
+    def start_sums(self) -> None:
+        """Start the sums over PX4's samples, such as the change of velocity, at zero; called when the flight begins."""
+
     def take_messages(self) -> list[str]:
         """Return PX4's messages and notices about its link since the last call, oldest first."""
 

@@ -115,6 +115,9 @@ class ObedientAutopilot(Standing):
         else:
             self.armed = False
 
+    def start_sums(self) -> None:
+        """Has none."""
+
     def take_messages(self) -> list[str]:
         return []
 

@@ -73,7 +73,7 @@ class MavlinkTarget(Target):
         self._check(state.vehicle(), state.yaw_rad())
         for message in self._received(self._corpus[0]):
             state.take(3.0, message)
-            armed_and_mode = messages.heartbeat_state(_fields_json(message))[:2]
+            armed_and_mode = messages.heartbeat_state(message.base_mode, message.custom_mode, message.system_status)[:2]
             status = state.status()
             if armed_and_mode == (True, FlightMode.OFFBOARD) and status is not None and status.heartbeat_stamp_s == 3.0:
                 return
@@ -86,7 +86,7 @@ class MavlinkTarget(Target):
     def _convert(self, message: Any) -> None:
         kind = message.get_type()
         if kind == "HEARTBEAT":
-            armed, mode, _ = messages.heartbeat_state(_fields_json(message))
+            armed, mode, _ = messages.heartbeat_state(message.base_mode, message.custom_mode, message.system_status)
             if not isinstance(armed, bool) or not isinstance(mode, FlightMode):
                 raise Wrong(f"heartbeat: {armed}, {mode}")
         elif kind == "COMMAND_ACK":
@@ -94,7 +94,7 @@ class MavlinkTarget(Target):
             if (reason is None) != (message.result == 0):
                 raise Wrong(f"COMMAND_ACK {message.result}: {reason}")
         elif kind == "BATTERY_STATUS":
-            voltage_v, remaining = messages.battery(message.voltages[0] * 1e-3, float(message.battery_remaining))
+            voltage_v, remaining = messages.battery(message.voltages, message.battery_remaining)
             if (voltage_v is not None and voltage_v <= 0.0) or (remaining is not None and not 0.0 <= remaining <= 1.0):
                 raise Wrong(f"battery {voltage_v} V, {remaining}")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import struct
 
@@ -16,6 +15,7 @@ from companion.io.px4.texts import SAME_TEXT_S
 from companion.model.types import AttitudeSetpoint, AutopilotRequest, FlightMode, LandedState
 
 ARM, LAND, NONE = AutopilotRequest.ARM, AutopilotRequest.LAND, AutopilotRequest.NONE
+ARM_DISARM, DENIED = 400, 2
 CUSTOM = 1
 
 
@@ -60,8 +60,7 @@ def test_a_mode_without_the_custom_flag_is_unknown() -> None:
 def test_a_heartbeat_says_armed_mode_and_whether_a_failsafe_acts(
     base_mode: int, armed: bool, system_status: int
 ) -> None:
-    fields = {"base_mode": base_mode, "custom_mode": 6 << 16, "system_status": system_status}
-    assert messages.heartbeat_state(json.dumps(fields)) == (armed, FlightMode.OFFBOARD, system_status)
+    assert messages.heartbeat_state(base_mode, 6 << 16, system_status) == (armed, FlightMode.OFFBOARD, system_status)
 
 
 def test_an_unheard_of_landed_state_is_unknown() -> None:
@@ -70,9 +69,9 @@ def test_an_unheard_of_landed_state_is_unknown() -> None:
 
 
 def test_battery_that_the_autopilot_does_not_know_is_none() -> None:
-    assert messages.battery(15.2, 40.0) == pytest.approx((15.2, 0.4))
-    assert messages.battery(math.nan, math.nan) == (None, None)
-    assert messages.battery(0.0, -1.0) == (None, None)
+    assert messages.battery([15200, *[65535] * 9], 40) == pytest.approx((15.2, 0.4))
+    assert messages.battery([3800] * 4 + [65535] * 6, 40) == pytest.approx((15.2, 0.4))
+    assert messages.battery([65535] * 10, -1) == (None, None)
 
 
 def test_the_setpoint_keeps_single_precision() -> None:
@@ -91,40 +90,67 @@ def test_answers_in_words() -> None:
     assert messages.refusal('{"result":99}') == "unknown result (MAV_RESULT 99)"
 
 
-def test_a_request_repeated_in_every_tick_is_one_command_until_it_is_answered() -> None:
+def test_a_request_repeated_in_every_tick_is_a_command_every_half_second_until_it_is_answered() -> None:
     requests = RequestQueue()
-    assert requests.claim(ARM, 0.0)
-    assert not any(requests.claim(ARM, tick * 0.005) for tick in range(1, 500))
+    sent_s = [tick * 0.005 for tick in range(400) if requests.claim(ARM, tick * 0.005)]
+    assert sent_s == pytest.approx([0.0, 0.5, 1.0, 1.5])
     assert requests.pending() == 1
-    requests.answer(ARM, "denied", 2.5)
+    requests.answer(ARM_DISARM, DENIED, 2.5)
+    assert requests.pending() == 0
     assert requests.claim(ARM, 2.5)
-    assert requests.take_messages(2.5) == ["ARM refused: denied"]
+    assert requests.take_messages(2.5) == ["ARM refused: denied (MAV_RESULT 2)"]
     assert requests.take_messages(2.5) == []
 
 
 def test_a_refused_request_waits_half_a_second_from_command_to_command() -> None:
     requests = RequestQueue()
     assert requests.claim(ARM, 0.0)
-    requests.answer(ARM, "denied", 0.01)
+    requests.answer(ARM_DISARM, DENIED, 0.01)
     assert not requests.claim(ARM, RETRY_S - 0.001)
     assert requests.claim(ARM, RETRY_S)
+
+
+def test_a_command_in_progress_is_not_repeated_before_its_deadline() -> None:
+    requests = RequestQueue()
+    assert requests.claim(ARM, 0.0)
+    requests.answer(ARM_DISARM, messages.MAV_RESULT_IN_PROGRESS, 0.1)
+    assert not requests.claim(ARM, 0.1 + ANSWER_DEADLINE_S - 0.001)
+    assert requests.claim(ARM, 0.1 + ANSWER_DEADLINE_S)
 
 
 def test_the_same_refusal_is_reported_again_only_after_a_while() -> None:
     requests = RequestQueue()
     for t_s in (0.0, 1.0, SAME_TEXT_S):
         assert requests.claim(ARM, t_s)
-        requests.answer(ARM, "denied", t_s)
-    assert requests.take_messages(SAME_TEXT_S) == ["ARM refused: denied"] * 2
+        requests.answer(ARM_DISARM, DENIED, t_s)
+    assert requests.take_messages(SAME_TEXT_S) == ["ARM refused: denied (MAV_RESULT 2)"] * 2
 
 
 def test_an_accepted_request_waits_for_the_heartbeat_that_shows_it() -> None:
     requests = RequestQueue()
     assert requests.claim(ARM, 0.0)
-    requests.answer(ARM, None, 0.01)
+    requests.answer(ARM_DISARM, 0, 0.01)
     assert not requests.claim(ARM, SETTLE_S)
     assert requests.claim(ARM, 0.01 + SETTLE_S)
     assert requests.take_messages(2.0) == []
+
+
+def test_an_answer_to_arming_goes_to_the_older_of_arm_and_disarm() -> None:
+    requests = RequestQueue()
+    assert requests.claim(ARM, 0.0)
+    assert requests.claim(AutopilotRequest.DISARM, 0.1)
+    requests.answer(ARM_DISARM, DENIED, 0.2)
+    requests.answer(ARM_DISARM, 0, 0.3)
+    assert requests.take_messages(0.3) == ["ARM refused: denied (MAV_RESULT 2)"]
+    assert requests.pending() == 0
+
+
+def test_an_answer_to_another_programs_command_is_ignored() -> None:
+    requests = RequestQueue()
+    assert requests.claim(ARM, 0.0)
+    requests.answer(511, DENIED, 0.1)
+    assert requests.pending() == 1
+    assert requests.take_messages(0.1) == []
 
 
 def test_land_never_waits_for_another_kind() -> None:
@@ -136,12 +162,11 @@ def test_land_never_waits_for_another_kind() -> None:
     assert requests.pending() == 3
 
 
-def test_a_lost_answer_does_not_block_the_request_for_ever() -> None:
+def test_a_lost_answer_is_reported_after_its_deadline() -> None:
     requests = RequestQueue()
-    assert requests.claim(LAND, 0.0)
-    assert not requests.claim(LAND, ANSWER_DEADLINE_S - 0.001)
-    assert requests.claim(LAND, ANSWER_DEADLINE_S)
-    assert requests.take_messages(ANSWER_DEADLINE_S) == ["LAND: no answer within 3 s; requesting it again"]
+    times_s = [k * RETRY_S for k in range(8)]
+    assert all(requests.claim(LAND, t_s) for t_s in times_s)
+    assert requests.take_messages(times_s[-1]) == ["LAND: no answer within 3 s; requesting it again"]
 
 
 def test_the_newest_messages_are_kept_when_nobody_takes_them() -> None:

@@ -1,9 +1,9 @@
 """Driver of PX4: MAVSDK's native binding on a link that the driver itself reads and writes.
 
 MAVSDK makes JSON of every message and calls Python from its own threads, which costs more than all else that a tick does with PX4. So
-the link is the driver's (`companion.io.px4.wire`): once per tick it reads what has arrived, decodes the streams of the vehicle's
-state, and passes everything else to MAVSDK, whose `raw://` connection returns what is to be sent. Setpoints and poses are written
-straight onto the link. Decision 14 (docs/decisions) gives the figures.
+the link is the driver's (`companion.io.px4.wire`): once per tick it reads what has arrived, decodes what the flight uses, and passes
+everything but the streams of the vehicle's state to MAVSDK, whose `raw://` connection returns what is to be sent. Setpoints, poses and
+commands are written straight onto the link. Decision 14 (docs/decisions) gives the figures.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import socket
-import time
 from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import Any, Self
 
 from mavsdk import ComponentType, Configuration, Mavsdk, MavsdkError
 from mavsdk.plugins.info.info import Info
-from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkDirectResult, MavlinkMessage
+from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect
 from mavsdk.plugins.param.param import Param
 from mavsdk.plugins.telemetry.telemetry import Telemetry
 
@@ -33,7 +33,7 @@ from companion.io.px4.inbox import ESTIMATOR_RATE_HZ, Inbox, ask_for_streams, st
 from companion.io.px4.link import check_address, device_error, first_autopilot, open_link, quiet_native_log
 from companion.io.px4.origin import ensure_origin
 from companion.io.px4.params import ParamTransfer
-from companion.io.px4.requests import SENT_ONCE, RequestQueue
+from companion.io.px4.requests import RequestQueue
 from companion.io.px4.setpoints import SetpointPath, setpoint_path
 from companion.io.px4.wire import OpenWire, UdpWire
 from companion.model.estimator import EstimatorReport
@@ -85,7 +85,7 @@ class MavsdkAutopilot:
         self._forwarding = forwarding
         self._clock = clock
         self._requests = RequestQueue()
-        self._inbox = Inbox(clock, self._requests, self._on_heartbeat)
+        self._inbox = Inbox(self._requests, self._show_ground_station)
         self._calls = NativeCalls(device.address)
         self._mavsdk: Any = None
         self._connection: Any = None
@@ -95,7 +95,7 @@ class MavsdkAutopilot:
         self._readers = self._inbox.readers
         self._relay: socket.socket | None = None
         self._pump_timer: asyncio.TimerHandle | None = None
-        self._polled_s = 0.0
+        self._polled_s = -math.inf
         self._restore_log: Callable[[], None] | None = None
         self._direct: Any = None
         self._setpoints: SetpointPath | None = None
@@ -145,8 +145,6 @@ class MavsdkAutopilot:
                 address, self._clock, self._calls, self._direct, Param(system), self._system_id
             )
             self._info = Info(system)
-            self._inbox.subscribe(telemetry, self._direct)
-            self._direct.subscribe_message("COMMAND_ACK", self._on_ack)
             streams = (telemetry, self._direct, self._system_id, self._estimator_rate_hz)
             await ask_for_streams(address, self._calls, *streams)
             self._open = True
@@ -234,30 +232,12 @@ class MavsdkAutopilot:
         return self._send_message(messages.VISION_POSITION_ESTIMATE_ID, payload)
 
     def request(self, request: AutopilotRequest) -> None:
-        """Send the request's command unless one of its kind is in progress or was sent a moment ago. Returns at once.
+        """Send the request's command, once, unless one of its kind is in progress or was sent a moment ago. Returns at once.
 
         LAND never waits for a command of another kind. `take_messages` returns refusals.
         """
-        if not self._open or not self._requests.claim(request, self._clock()):
-            return
-
-        def answered(result: Any, ack: Any, _: Any) -> None:
-            if result == MavlinkDirectResult.SUCCESS:
-                reason = messages.refusal(ack.fields_json)
-            else:
-                reason = f"no COMMAND_ACK ({result.name.lower().replace('_', ' ')})"
-            self._requests.answer(request, reason, self._clock())
-
-        command = MavlinkMessage("COMMAND_LONG", fields_json=messages.command_json(request, self._system_id))
-        if request in SENT_ONCE:
-            self._direct.send_message(command)
-        else:
-            self._direct.send_command_async(command, answered)
-
-    def _on_ack(self, message: Any, _: Any) -> None:
-        """Handle COMMAND_ACK, in a thread of MAVSDK."""
-        if messages.answers_arming(message.fields_json):
-            self._requests.answer_sent_once(messages.refusal(message.fields_json), self._clock())
+        if self._open and self._requests.claim(request, self._clock()):
+            self._send_message(messages.COMMAND_LONG_ID, messages.command_long(request, self._system_id))
 
     def take_messages(self) -> list[str]:
         """Return, oldest first, all refusals and STATUSTEXTs since the last call, and reports of a new port of PX4 or of a second
@@ -309,10 +289,14 @@ class MavsdkAutopilot:
         self._require_open()
         return await ensure_origin(self._device.address, self._calls, self._direct, self._system_id, self._armed)
 
+    def start_sums(self) -> None:
+        """Start the sums over PX4's samples, such as the change of velocity, at zero; called when the flight begins."""
+        self._inbox.start_sums()
+
     async def _armed(self) -> bool:
         try:
             async with asyncio.timeout(_HEARTBEAT_DEADLINE_S):
-                while (status := self._inbox.status()) is None:  # noqa: ASYNC110 - written by MAVSDK's threads
+                while (status := self._inbox.status()) is None:  # noqa: ASYNC110 - `_pump` reads the link
                     await asyncio.sleep(0.02)
         except TimeoutError:
             expected = f"a PX4 heartbeat within {_HEARTBEAT_DEADLINE_S:g} s"
@@ -345,12 +329,6 @@ class MavsdkAutopilot:
             fix = "open it first"
             raise device_error(self._device.address, "an open link", "a closed one", fix)
 
-    def _on_heartbeat(self) -> None:
-        """Handle HEARTBEAT, in a thread of MAVSDK."""
-        assert self._loop is not None
-        with contextlib.suppress(RuntimeError):  # the loop is closed: MAVSDK hung and was not closed
-            self._loop.call_soon_threadsafe(self._show_ground_station)
-
     def _show_ground_station(self) -> None:
         """Answer the heartbeat of a disarmed PX4 with that of a ground station, because PX4 reports the
         reasons why it refuses to arm only to a ground station.
@@ -360,15 +338,7 @@ class MavsdkAutopilot:
         """
         status = self._inbox.status()
         if self._open and status is not None and not status.armed:
-            self._send("HEARTBEAT", messages.GROUND_STATION_HEARTBEAT_JSON)
-
-    def _send(self, name: str, fields_json: str) -> bool:
-        try:
-            self._direct.send_message(MavlinkMessage(name, fields_json=fields_json))
-        except MavsdkError as error:
-            _log.debug("%s not sent: %s", name, error)
-            return False
-        return True
+            self._send_message(messages.HEARTBEAT_ID, messages.GROUND_STATION_HEARTBEAT)
 
     def _pump(self) -> None:
         """Read the link regularly while the flight loop does not."""
@@ -379,7 +349,7 @@ class MavsdkAutopilot:
         self._pump_timer = self._loop.call_later(_PUMP_S if idle else _PUMP_IN_FLIGHT_S, self._pump)
 
     def _poll(self) -> None:
-        """Read what has arrived: decode the vehicle's state, and pass everything else to MAVSDK."""
+        """Read what has arrived: decode what the flight uses, and pass everything but the vehicle's state to MAVSDK."""
         self._polled_s = self._clock()
         if self._wire is None:
             return
@@ -387,12 +357,16 @@ class MavsdkAutopilot:
         for arrived_s, data in self._wire.receive():
             forwarded: list[bytes] = []
             for message_id, system, component, payload, frame in self._reader.read(data):
-                read = self._readers.get(message_id)
                 forwarded.append(frame)
-                if read is None or system != self._system_id or component != messages.MAV_COMP_ID_AUTOPILOT1:
-                    others.append(frame)
-                else:
+                # A gimbal or camera with the same system id has a heartbeat of its own.
+                px4 = system == self._system_id and component == messages.MAV_COMP_ID_AUTOPILOT1
+                read = self._readers.get(message_id) if px4 else None
+                if read is not None:
                     read(arrived_s, payload)
+                    continue
+                others.append(frame)
+                if px4:
+                    self._inbox.take(arrived_s, message_id, frame)
             if self._relay is not None and forwarded:
                 with contextlib.suppress(OSError):  # the relay does not keep up or has ended: lost, as on any link
                     self._relay.send(b"".join(forwarded))
@@ -433,17 +407,14 @@ class MavsdkAutopilot:
         await asyncio.shield(asyncio.get_running_loop().run_in_executor(None, self._tear_down))
 
     def _tear_down(self) -> None:
-        deadline_s = time.monotonic() + _CLOSE_DEADLINE_S
         try:
-            # MAVSDK must not be destroyed under a call that is still inside it, nor before the last command's callback has run.
+            # MAVSDK must not be destroyed under a call that is still inside it.
             if not self._calls.finish(_CLOSE_DEADLINE_S):
                 _log.error(
                     "autopilot %s: a call into MAVSDK hangs; it is not closed before the process ends",
                     self._device.address,
                 )
                 return
-            while self._requests.pending() and time.monotonic() < deadline_s:
-                time.sleep(0.02)
             if self._mavsdk is not None:
                 self._mavsdk.destroy()
         except Exception as error:

@@ -1,13 +1,11 @@
 """Telemetry of PX4: the newest message of each kind, which the flight loop reads as records.
 
-The three streams of the vehicle's state are decoded from the link in the flight loop itself; all other messages come from MAVSDK's
-threads.
+The three fast streams of the vehicle's state are decoded by `companion.io.px4.messages`, all other messages by pymavlink.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +13,7 @@ from mavsdk import MavsdkError
 from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkMessage
 from mavsdk.plugins.telemetry.telemetry import Telemetry
 from msgspec.structs import replace
+from pymavlink.dialects.v20 import common as mavlink
 
 from companion.io.px4 import messages
 from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls
@@ -24,8 +23,7 @@ from companion.io.px4.requests import RequestQueue
 from companion.model.estimator import EstimatorReport
 from companion.model.frames import flu_from_frd
 from companion.model.observations import StateCounts
-from companion.model.types import AutopilotStatus, FlightMode, Quat, Vec3, VehicleState
-from companion.runtime.clock import Clock
+from companion.model.types import AutopilotStatus, FlightMode, LandedState, Quat, Vec3, VehicleState
 
 POSITION_RATE_HZ = 200.0
 """Requested rate of LOCAL_POSITION_NED; PX4 delivers about 124 Hz."""
@@ -37,41 +35,55 @@ ESTIMATOR_RATE_HZ = 5.0
 
 
 class Inbox:
-    """Store for PX4's messages. MAVSDK's threads write it as well, one assignment per message. A tuple is replaced as a whole, so a
-    reader never sees a partial update.
+    """Store for PX4's messages.
+
+    Args:
+        requests: receives answers to commands and status texts.
+        after_heartbeat: called after each HEARTBEAT.
     """
 
-    def __init__(self, clock: Clock, requests: RequestQueue, after_heartbeat: Callable[[], None]) -> None:
-        self._clock = clock
+    def __init__(self, requests: RequestQueue, after_heartbeat: Callable[[], None]) -> None:
         self._requests = requests
         self._after_heartbeat = after_heartbeat
         self._position: tuple[float, Vec3, Vec3] | None = None
         self._attitude: tuple[float, Quat, Vec3, float | None] | None = None
         self._imu: tuple[float, Vec3, float | None, Vec3, int] | None = None
         self._delta_velocity_frd = DeltaVelocity()
-        self._heartbeat: tuple[float, str] | None = None
-        self._estimator: tuple[float, str] | None = None
+        self._heartbeat: tuple[float, bool, FlightMode, int] | None = None
+        self._estimator: EstimatorReport | None = None
         self._positions = self._attitudes = self._imus = 0
-        self._landed = 0
-        self._battery: tuple[float, float] = (float("nan"), float("nan"))
+        self._landed = LandedState.UNKNOWN
+        self._battery: tuple[float | None, float | None] = (None, None)
+        self._decoder = mavlink.MAVLink(None)
+        self._takers: dict[int, Callable[[float, Any], None]] = {
+            mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._on_heartbeat,
+            mavlink.MAVLINK_MSG_ID_COMMAND_ACK: self._on_ack,
+            mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._on_landed,
+            mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: self._on_battery,
+            mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: self._on_estimator,
+            mavlink.MAVLINK_MSG_ID_STATUSTEXT: self._on_status_text,
+        }
 
         self._vehicle_key: tuple[Any, ...] | None = None
         self._vehicle: VehicleState | None = None
-        self._heartbeat_read: tuple[float, str] | None = None
-        self._state: tuple[bool, FlightMode, int | None] = (False, FlightMode.UNKNOWN, None)
-        self._estimator_read: tuple[float, str] | None = None
-        self._estimator_report: EstimatorReport | None = None
 
-    def subscribe(self, telemetry: Telemetry, direct: MavlinkDirect) -> None:
-        """Subscribe to the messages that come through MAVSDK; every one that arrives is stored from then on."""
-        self._telemetry = telemetry  # MAVSDK's plugin ends its subscriptions when it is garbage-collected
-        telemetry.subscribe_landed_state(self._on_landed)
-        telemetry.subscribe_battery(self._on_battery)
-        # System.is_connected turns false seconds late; HEARTBEAT itself is the evidence, and carries armed and mode.
-        direct.subscribe_message("HEARTBEAT", self._on_heartbeat)
-        direct.subscribe_message("ESTIMATOR_STATUS", self._on_estimator)
-        # Telemetry.status_text cuts the first long text after PX4's boot in two and keeps one of exactly 50 characters back.
-        direct.subscribe_message("STATUSTEXT", self._on_status_text)
+    def start_sums(self) -> None:
+        """Start the integral of the specific force at zero; called when the flight begins."""
+        self._delta_velocity_frd = DeltaVelocity()
+
+    def take(self, stamp_s: float, message_id: int, frame: bytes) -> None:
+        """Store a message of the autopilot that is not one of `readers`, if the companion reads it.
+
+        Args:
+            stamp_s: arrival on the flight clock.
+            message_id: MAVLink message id.
+            frame: whole frame with a valid checksum.
+        """
+        taker = self._takers.get(message_id)
+        if taker is None:
+            return
+        with contextlib.suppress(mavlink.MAVError):  # a field that pymavlink does not accept
+            taker(stamp_s, self._decoder.decode(bytearray(frame)))
 
     def vehicle(self) -> VehicleState | None:
         """Return the latest fused state, or None before position, attitude, rates and IMU have all arrived. Stamps are arrival
@@ -99,19 +111,15 @@ class Inbox:
         """Return the latest status, or None before the first heartbeat. `heartbeat_stamp_s` is the arrival of the newest
         HEARTBEAT.
         """
-        heartbeat = self._heartbeat
-        if heartbeat is None:
+        if self._heartbeat is None:
             return None
-        if heartbeat is not self._heartbeat_read:
-            self._heartbeat_read = heartbeat
-            self._state = messages.heartbeat_state(heartbeat[1])
-        armed, mode, system_status = self._state
-        voltage_v, remaining = messages.battery(*self._battery)
+        stamp_s, armed, mode, system_status = self._heartbeat
+        voltage_v, remaining = self._battery
         return AutopilotStatus(
-            heartbeat_stamp_s=heartbeat[0],
+            heartbeat_stamp_s=stamp_s,
             armed=armed,
             mode=mode,
-            landed=messages.landed_state(self._landed),
+            landed=self._landed,
             battery_voltage_v=voltage_v,
             battery_remaining=remaining,
             system_status=system_status,
@@ -119,11 +127,7 @@ class Inbox:
 
     def estimator(self) -> EstimatorReport | None:
         """Return the latest ESTIMATOR_STATUS, stamped on arrival, or None before the first."""
-        newest = self._estimator
-        if newest is not None and newest is not self._estimator_read:
-            self._estimator_read = newest
-            self._estimator_report = messages.estimator_report(json.loads(newest[1]), newest[0])
-        return self._estimator_report
+        return self._estimator
 
     def counts(self) -> StateCounts:
         """Return the number of state messages since the link was opened."""
@@ -156,27 +160,25 @@ class Inbox:
         self._imu = (stamp_s, force_m_s2, total.boot_s, total.sum_m_s, total.gaps)
         self._imus += 1
 
-    # Callbacks of MAVSDK: C++ threads, one message type in one thread.
+    def _on_heartbeat(self, stamp_s: float, message: Any) -> None:
+        state = messages.heartbeat_state(message.base_mode, message.custom_mode, message.system_status)
+        self._heartbeat = (stamp_s, *state)
+        self._after_heartbeat()
 
-    def _on_landed(self, value: Any, _: Any) -> None:
-        self._landed = int(value)
+    def _on_ack(self, stamp_s: float, message: Any) -> None:
+        self._requests.answer(message.command, message.result, stamp_s)
 
-    def _on_battery(self, value: Any, _: Any) -> None:
-        self._battery = (value.voltage_v, value.remaining_percent)
+    def _on_landed(self, stamp_s: float, message: Any) -> None:
+        self._landed = messages.landed_state(message.landed_state)
 
-    def _on_status_text(self, message: Any, _: Any) -> None:
-        if message.component_id == messages.MAV_COMP_ID_AUTOPILOT1:
-            self._requests.hear(json.loads(message.fields_json), self._clock())
+    def _on_battery(self, stamp_s: float, message: Any) -> None:
+        self._battery = messages.battery(message.voltages, message.battery_remaining)
 
-    def _on_heartbeat(self, message: Any, _: Any) -> None:
-        # A gimbal or camera with the same system id has a heartbeat of its own.
-        if message.component_id == messages.MAV_COMP_ID_AUTOPILOT1:
-            self._heartbeat = (self._clock(), message.fields_json)
-            self._after_heartbeat()
+    def _on_estimator(self, stamp_s: float, message: Any) -> None:
+        self._estimator = messages.estimator_report(message.to_dict(), stamp_s)
 
-    def _on_estimator(self, message: Any, _: Any) -> None:
-        if message.component_id == messages.MAV_COMP_ID_AUTOPILOT1:
-            self._estimator = (self._clock(), message.fields_json)
+    def _on_status_text(self, stamp_s: float, message: Any) -> None:
+        self._requests.hear(message.to_dict(), stamp_s)
 
 
 async def ask_for_streams(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from companion.model.estimator import EstimatorReport
@@ -42,10 +42,10 @@ ATTITUDE, GLOBAL_POSITION_INT, SERVO_OUTPUT_RAW, RC_CHANNELS, VFR_HUD, ATTITUDE_
 POSITION_TARGET_GLOBAL_INT, ALTITUDE, ESC_INFO, ESC_STATUS, ODOMETRY. TIMESYNC stays, for PX4's clock.
 """
 _REQUEST_MESSAGE, _SET_MESSAGE_INTERVAL = 512, 511
-GROUND_STATION_HEARTBEAT_JSON = (
-    '{"type":6,"autopilot":8,"base_mode":0,"custom_mode":0,"system_status":4,"mavlink_version":3}'
-)
-"""HEARTBEAT: MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, MAV_STATE_ACTIVE."""
+HEARTBEAT_ID, COMMAND_LONG_ID, COMMAND_ACK_ID = 0, 76, 77
+GROUND_STATION_HEARTBEAT = struct.pack("<I5B", 0, 6, 8, 0, 4, 3)
+"""Payload of HEARTBEAT: MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, MAV_STATE_ACTIVE."""
+MAV_RESULT_IN_PROGRESS = 5
 
 MAV_COMP_ID_AUTOPILOT1 = 1
 _MAV_MODE_FLAG_CUSTOM_MODE_ENABLED = 1
@@ -55,6 +55,8 @@ _PX4_MAIN_MODE_OFFBOARD = 6
 # Body rates are not commanded: ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE | PITCH | YAW.
 TYPE_MASK_IGNORE_RATES = 7
 _QUAT_NORM_TOLERANCE = 1e-2
+_NO_CELL = 0xFFFF
+"""Value of an unused cell in BATTERY_STATUS.voltages."""
 
 # PX4's px4_custom_mode.h. Main modes in which a pilot steers; 9 simple, 11 altitude cruise.
 _PX4_PILOT_MAIN_MODES = frozenset({1, 2, 3, 5, 7, 8, 9, 11})
@@ -90,12 +92,9 @@ _COMMANDS: dict[AutopilotRequest, tuple[int, float, float]] = {
 }
 
 
-def heartbeat_state(heartbeat_json: str) -> tuple[bool, FlightMode, int]:
-    """Return the armed flag, flight mode and MAV_STATE from a HEARTBEAT's fields (`base_mode`, `custom_mode`, `system_status`)."""
-    fields = json.loads(heartbeat_json)
-    base_mode = int(fields["base_mode"])
-    armed = bool(base_mode & MAV_MODE_FLAG_SAFETY_ARMED)
-    return armed, flight_mode(base_mode, int(fields["custom_mode"])), int(fields["system_status"])
+def heartbeat_state(base_mode: int, custom_mode: int, system_status: int) -> tuple[bool, FlightMode, int]:
+    """Return the armed flag, flight mode and MAV_STATE from a HEARTBEAT's fields."""
+    return bool(base_mode & MAV_MODE_FLAG_SAFETY_ARMED), flight_mode(base_mode, custom_mode), system_status
 
 
 def flight_mode(base_mode: int, custom_mode: int) -> FlightMode:
@@ -111,7 +110,7 @@ def flight_mode(base_mode: int, custom_mode: int) -> FlightMode:
 
 
 _LOCAL_POSITION, _ATTITUDE, _IMU = struct.Struct("<I6f"), struct.Struct("<I7f"), struct.Struct("<Q3f")
-_ATTITUDE_TARGET, _VISION = struct.Struct("<I8f3B"), struct.Struct("<Q7f")
+_ATTITUDE_TARGET, _VISION, _COMMAND_LONG = struct.Struct("<I8f3B"), struct.Struct("<Q7f"), struct.Struct("<7fH3B")
 
 
 def local_position_ned(payload: bytes) -> tuple[Vec3, Vec3]:
@@ -137,11 +136,12 @@ def landed_state(value: int) -> LandedState:
     return _LANDED_STATES[value] if 0 <= value < len(_LANDED_STATES) else LandedState.UNKNOWN
 
 
-def battery(voltage_v: float, remaining_percent: float) -> tuple[float | None, float | None]:
-    """Return voltage in V and remaining charge, 0 to 1; a value is None if the autopilot reports it as unknown (NaN or negative)."""
-    voltage = voltage_v if math.isfinite(voltage_v) and voltage_v > 0.0 else None
-    known = math.isfinite(remaining_percent) and remaining_percent >= 0.0
-    return voltage, min(remaining_percent / 100.0, 1.0) if known else None
+def battery(voltages_mv: Sequence[int], remaining_percent: int) -> tuple[float | None, float | None]:
+    """Return voltage (V) and remaining charge (0 to 1) of BATTERY_STATUS, given the fields `voltages` and `battery_remaining`. A value
+    that the autopilot does not know is None.
+    """
+    voltage_v = sum(cell for cell in voltages_mv if cell != _NO_CELL) * 1e-3
+    return voltage_v or None, min(remaining_percent / 100.0, 1.0) if remaining_percent >= 0 else None
 
 
 def vehicle_state(
@@ -238,9 +238,10 @@ def command(request: AutopilotRequest) -> tuple[int, float, float]:
     return _COMMANDS[request]
 
 
-def command_json(request: AutopilotRequest, target_system: int) -> str:
-    """Return COMMAND_LONG for a request with the fields of `command`; raises the errors of `command`."""
-    return _command_json(*command(request), target_system)
+def command_long(request: AutopilotRequest, target_system: int) -> bytes:
+    """Return the payload of COMMAND_LONG for a request with the fields of `command`; raises the errors of `command`."""
+    number, param1, param2 = command(request)
+    return _COMMAND_LONG.pack(param1, param2, 0.0, 0.0, 0.0, 0.0, 0.0, number, target_system, MAV_COMP_ID_AUTOPILOT1, 0)
 
 
 def request_message_json(message_id: int, target_system: int) -> str:
@@ -300,11 +301,6 @@ def refusal(ack_json: str) -> str | None:
     """Return the reason if a COMMAND_ACK is a refusal, or None if it is an acceptance."""
     result = int(json.loads(ack_json)["result"])
     return None if result == 0 else result_text(result)
-
-
-def answers_arming(ack_json: str) -> bool:
-    """Return whether a COMMAND_ACK answers MAV_CMD_COMPONENT_ARM_DISARM (400)."""
-    return int(json.loads(ack_json)["command"]) == _COMMANDS[AutopilotRequest.ARM][0]
 
 
 def result_text(result: int) -> str:
