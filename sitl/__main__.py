@@ -12,15 +12,18 @@ import contextlib
 import json
 import os
 import signal
+import socket
 import sys
 from pathlib import Path
 from typing import Any
 
-from companion.runtime.event_loop import run
-from companion.runtime.realtime import WORLD_PRIORITY, claim_realtime
+from companion.runtime.event_loop import fine_loop
+from companion.runtime.realtime import WORLD_PRIORITY, claim_realtime, collect_no_garbage
+from companion.runtime.simulated_time import Page
 from companion.sitl_config.loader import SitlConfig
 from sitl.autopilot.mavlink import LinkError
 from sitl.faults.timing import FaultError, with_fault_times
+from sitl.lockstep import LockstepLoop, TimeKeeper
 from sitl.px4.backend import RealPx4
 from sitl.px4.hil_link import Px4Error
 from sitl.server import Ports, Sitl, start_of
@@ -38,7 +41,9 @@ def _send(message: dict[str, Any]) -> None:
         os.write(1, json.dumps(message).encode() + b"\n")  # unbuffered, so that nothing is flushed into a closed pipe
 
 
-async def _serve(config: SitlConfig, for_launcher: bool, truth_file: Path, px4_folder: Path | None) -> None:
+async def _serve(
+    config: SitlConfig, for_launcher: bool, truth_file: Path, px4_folder: Path | None, keeper: TimeKeeper | None
+) -> None:
     start = config.mission.start
     ports = Ports() if for_launcher else _STANDARD
     on_message = _send if for_launcher else _print_message
@@ -47,7 +52,7 @@ async def _serve(config: SitlConfig, for_launcher: bool, truth_file: Path, px4_f
         airframe = config.vehicle.airframe
         px4 = RealPx4(airframe, config.world, px4_folder, lambda text: on_message({"type": "progress", "text": text}))
     pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
-    sitl = Sitl(config.vehicle, config.world, pose, ports, on_message, px4)
+    sitl = Sitl(config.vehicle, config.world, pose, ports, on_message, px4, keeper)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, sitl.stop)
@@ -61,7 +66,10 @@ async def _serve(config: SitlConfig, for_launcher: bool, truth_file: Path, px4_f
 
         if for_launcher:
             _end_with_launcher(sitl)
-        claim_realtime(WORLD_PRIORITY, lock_memory=False)
+        if keeper is None:
+            claim_realtime(WORLD_PRIORITY, lock_memory=False)
+        else:
+            collect_no_garbage()
         await sitl.run(on_ready)
     if for_launcher:
         _send_final(sitl, truth_file if config.world.faults or config.world.throws > 1 else None)
@@ -128,11 +136,20 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--px4", type=Path, metavar="DIR", help="fly a real PX4; this folder keeps its parameters and logs"
     )
+    parser.add_argument("--time", metavar="PAGE,FLIGHT,GUARDIAN", help="descriptors of simulated time; none: real time")
+    parser.add_argument("--speed", type=float, default=1.0, help="simulated seconds in a second at most")
     arguments = parser.parse_args(argv)
     config = SitlConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
     try:
         truth_file = arguments.config.with_name(TRUTH_FILE)
-        run(_serve(with_fault_times(config), arguments.for_launcher, truth_file, arguments.px4))
+        keeper = None
+        if arguments.time is not None:
+            page, flight, guardian = map(int, arguments.time.split(","))
+            channels = {"flight": socket.socket(fileno=flight), "guardian": socket.socket(fileno=guardian)}
+            keeper = TimeKeeper(Page(page), channels, arguments.speed)
+        served = _serve(with_fault_times(config), arguments.for_launcher, truth_file, arguments.px4, keeper)
+        with asyncio.Runner(loop_factory=fine_loop if keeper is None else LockstepLoop) as runner:
+            runner.run(served)
     except (OSError, LinkError, FaultError, Px4Error) as error:
         text = f"sitl: {error}"
         if arguments.for_launcher:

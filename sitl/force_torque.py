@@ -20,6 +20,7 @@ TORQUE_CAPACITY_NM: Final = 4.0
 _ZERO: Vec3 = (0.0, 0.0, 0.0)
 _FORCE_BITS = (Overload.FX, Overload.FY, Overload.FZ)
 _TORQUE_BITS = (Overload.TX, Overload.TY, Overload.TZ)
+TIME_EPSILON_S: Final = 1e-9
 _MAX_CATCH_UP = 8  # packets; if the world's time jumps further, the rest is skipped
 
 
@@ -53,6 +54,7 @@ class ForceTorqueServer:
 
     Args:
         product_name: answer to PRODUCT_NAME.
+        in_lockstep: whether a packet is sent only when the companion can read it.
 
     Attributes:
         silent: fault in which the sensor neither answers nor streams, as with a cut cable.
@@ -60,7 +62,7 @@ class ForceTorqueServer:
         dropped: number of packets that were dropped because nothing reads the pty.
     """
 
-    def __init__(self, product_name: str = "RFT60-HA01") -> None:
+    def __init__(self, product_name: str = "RFT60-HA01", *, in_lockstep: bool = False) -> None:
         self.silent = False
         self.stuck = False
         self.dropped = 0
@@ -71,6 +73,7 @@ class ForceTorqueServer:
         }
         self._scanner = PacketScanner(rft.COMMAND_BYTES)
         self._pty = PtyLine(self._on_commands)
+        self._pty.arrives_at_once = in_lockstep
         self._force_n: Vec3 = _ZERO
         self._torque_nm: Vec3 = _ZERO
         self._bias_force_n: Vec3 = _ZERO
@@ -107,6 +110,14 @@ class ForceTorqueServer:
         self._force_n = force_n
         self._torque_nm = torque_nm
 
+    def start_over(self) -> None:
+        """Send the next packet at world time zero: world time starts over."""
+        self._due_s = 0.0
+
+    def due(self, t_s: float) -> bool:
+        """Return whether a packet is due by world time `t_s`."""
+        return self._streaming and (self._due_s is None or t_s >= self._due_s - TIME_EPSILON_S)
+
     def tick(self, t_s: float) -> None:
         """Send every packet that is due by world time `t_s`; call this method every 1 to 2 ms of world time."""
         if not self._streaming:
@@ -114,7 +125,7 @@ class ForceTorqueServer:
         period_s = 1.0 / self.rate_hz
         if self._due_s is None or t_s - self._due_s > _MAX_CATCH_UP * period_s:
             self._due_s = t_s
-        while self._due_s <= t_s:
+        while self._due_s <= t_s + TIME_EPSILON_S:
             self._due_s += period_s
             self._send_reading(Command.START)
 

@@ -26,6 +26,8 @@ _APPLICATION = b"Motive"
 _MARKER_NAMES, _SIZES, _PIVOT_ROTATION, _NEWEST = (4, 0), (4, 1), (4, 2), (4, 4)
 """Versions from which a server has the named property, and the newest version that the SDK describes."""
 _CLIENT_TIMEOUT_S: Final = 5.0
+_NUMBERS: Final = 100_000
+"""More frames than a server sends before a flight begins."""
 _MARKERS_BODY_M: Final[tuple[Vec3, ...]] = (
     (0.16, 0.0, 0.05),
     (-0.12, 0.10, 0.05),
@@ -92,6 +94,8 @@ class NatNetServer:
         self._clients: dict[tuple[str, int], float] = {}
         """Time at which each unicast client was last heard, by its address."""
         self._number = 0
+        self._now_s = 0.0
+        """Time of the newest frame on the world's clock."""
 
     @property
     def command_port(self) -> int:
@@ -143,6 +147,12 @@ class NatNetServer:
     def _listening(self) -> list[socket.socket]:
         return [opened for opened in (self._command, self._broadcast) if opened is not None]
 
+    def start_over(self) -> None:
+        """Go on at a frame number that does not depend on the past: world time starts over."""
+        self._number += _NUMBERS - self._number % _NUMBERS
+        self._clients = dict.fromkeys(self._clients, 0.0)
+        self._now_s = 0.0
+
     def publish(self, t_s: float, poses: Sequence[BodyPose], exposure_t_s: float | None) -> None:
         """Send one frame to every client; never blocks.
 
@@ -152,7 +162,8 @@ class NatNetServer:
             exposure_t_s: middle of the cameras' exposure on the same clock, or None if the cameras do not report it.
         """
         self._number += 1
-        oldest_s = asyncio.get_running_loop().time() - _CLIENT_TIMEOUT_S
+        self._now_s = t_s
+        oldest_s = t_s - _CLIENT_TIMEOUT_S
         self._clients = {address: heard_s for address, heard_s in self._clients.items() if heard_s >= oldest_s}
         addresses = list(self._clients)
         if self.multicast_group is not None:
@@ -202,7 +213,7 @@ class NatNetServer:
         if len(datagram) < 4:
             return
         message: int = struct.unpack_from("<H", datagram)[0]
-        now_s = asyncio.get_running_loop().time()
+        now_s = self._now_s
         if message == Message.CONNECT:
             if self.multicast_group is None:
                 self._clients[address] = now_s

@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import os
+import select
+import struct
 import termios
+import time
 import tty
 from collections.abc import Callable
+from typing import Final
+
+_INT: Final = struct.Struct("i")
+_ARRIVAL_TIMEOUT_S: Final = 0.2
+_ARRIVAL_LOOK_S: Final = 0.0005
+_UNREAD_BYTES: Final = 1024
+"""Number of waiting bytes from which nobody reads the line."""
 
 
 class PtyLine:
@@ -17,6 +28,8 @@ class PtyLine:
     """
 
     def __init__(self, on_bytes: Callable[[bytes], None]) -> None:
+        self.arrives_at_once = False
+        """Whether `write` returns only when the companion can read the bytes, for a world in lockstep."""
         self.path = ""
         """Device that the companion opens; valid while the line is open."""
         self._on_bytes = on_bytes
@@ -57,10 +70,24 @@ class PtyLine:
         """
         if self._device_fd < 0:
             return 0
+        waiting = self._waiting() if self.arrives_at_once else _UNREAD_BYTES
         try:
-            return len(data) - os.write(self._device_fd, data)
+            written = os.write(self._device_fd, data)
         except BlockingIOError:
             return len(data)
+        if waiting < _UNREAD_BYTES:
+            self._await_arrival(waiting + written)
+        return len(data) - written
+
+    def _waiting(self) -> int:
+        """Return the number of bytes that the companion can read."""
+        return int(_INT.unpack(fcntl.ioctl(self._companion_fd, termios.FIONREAD, _INT.pack(0)))[0])
+
+    def _await_arrival(self, expected: int) -> None:
+        """Wait until a thread of the kernel has carried the bytes to the companion's end."""
+        deadline_s = time.monotonic() + _ARRIVAL_TIMEOUT_S
+        while self._waiting() < expected and time.monotonic() < deadline_s:
+            select.select((self._companion_fd,), (), (), _ARRIVAL_LOOK_S)
 
     def speed(self) -> int:
         """Return the line speed that the companion has set, as a termios constant (`termios.B3000000` and so on)."""

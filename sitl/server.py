@@ -1,7 +1,7 @@
-"""The simulated world in real time: the plant, with every device behind its real protocol.
+"""The simulated world behind its wires: the plant, with every device behind its real protocol.
 
-The world's clock follows the wall clock. If the process falls behind by more than `_CATCH_UP_S`, the world pauses instead of catching
-up; `slipped_s` counts the lost time.
+In lockstep with a flight, the world owns the time and waits for the flight (`sitl.lockstep`). On its own it follows the wall clock: if
+the process falls behind by more than `CATCH_UP_S`, the world pauses instead of catching up; `slipped_s` counts the lost time.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from sitl.external_vision import ExternalVision
 from sitl.faults.injector import Faults, Sample, sample
 from sitl.faults.processes import SIGNALS, ProcessFaults, environment, inject_process_fault
 from sitl.force_torque import ForceTorqueServer
+from sitl.lockstep import CATCH_UP_S, LockstepLoop, TimeKeeper
 from sitl.natnet import OTHER_BODY, OTHER_PLACE_M, BodyPose, NatNetServer
 from sitl.px4.hil_link import Px4Error
 from sitl.servo.bus import ServoBus
@@ -35,8 +36,11 @@ from sitl.world.arm_handling import ArmHandling
 from sitl.world.plant import MocapFrame, Plant
 from sitl.world.world import PHYSICS_DT_S
 
-_CATCH_UP_S = 0.03
 COURSE_PERIOD_S, FRAMES_PERIOD_S = 0.01, 0.5
+BEFORE_S = -3600.0
+"""Simulated time when a world in lockstep starts; it jumps to zero when the flight begins."""
+BUS_PATIENCE_S = 0.2
+"""Wall time that bytes take at most from the companion's end of a serial line to the world's."""
 INJECT_RETRY_S = 0.2
 """Time between two searches for the target process of a fault."""
 OTHER_PROCESS_FAULTS: tuple[FaultKind, ...] = ("kill_recorder", "kill_guardian", "disk_full")
@@ -76,6 +80,7 @@ class Sitl:
         ports: UDP ports.
         on_message: called with every event, as a message for the launcher.
         autopilot: a real PX4, or None for the stub.
+        keeper: simulated time, for a world in lockstep; None for a world in real time.
     """
 
     def __init__(
@@ -86,7 +91,9 @@ class Sitl:
         ports: Ports,
         on_message: OnMessage,
         autopilot: AutopilotBackend | None = None,
+        keeper: TimeKeeper | None = None,
     ) -> None:
+        self._keeper = keeper
         self._vehicle = vehicle
         self._config = config
         self._on_message = on_message
@@ -94,21 +101,16 @@ class Sitl:
         self._on_bus = plugged_in(self.servos, config)
         stub_ports = LinkPorts(ports.autopilot_local, ports.autopilot_remote)
         self.autopilot: AutopilotBackend = autopilot or StubBackend(
-            vehicle.airframe, config, stub_ports, external_vision=vehicle.devices.mocap.external
-        )
-        pose = (start.position_m, start.yaw_rad, start.arm_rad)
-        self.plant = Plant(vehicle, config, self.autopilot, self.servos, pose, between_steps=True)
-        self.autopilot.attach(self.plant.world)
-        self.faults = Faults(
+            vehicle.airframe,
             config,
-            self.plant.world,
-            self.autopilot.fault_target,
-            [servo.drive for servo in self.servos],
-            vehicle.tether,
-            self.servos,
+            stub_ports,
+            external_vision=vehicle.devices.mocap.external,
+            in_lockstep=keeper is not None,
         )
-        if config.faults:
-            self.plant.faults = self.faults
+        self._start = start
+        self._sent_frame = False
+        """Whether motion capture has sent a frame in this step."""
+        self._make_plant()
         self.bus: ServoBus | None = None
         """The servo bus; None if the vehicle has no arm, or while the links are not open."""
         self.mocap: NatNetServer | ExternalVision | None = None
@@ -117,7 +119,7 @@ class Sitl:
         """The emulated force sensor; None if the vehicle has none, or while the links are not open."""
         other = config.mocap_other_id
         self._others = () if other is None else ((other, OTHER_BODY),)
-        self._arm_handling = ArmHandling(vehicle.arm, pose[2]) if config.arm_hand and self.servos else None
+        self._arm_handling = ArmHandling(vehicle.arm, start.arm_rad) if config.arm_hand and self.servos else None
         self.flight = ProcessFaults()
         self.course: list[Sample] = []
         """True position, tilt and tether of the vehicle, sampled from the first fault."""
@@ -139,15 +141,55 @@ class Sitl:
         self._end_s = math.inf
         self._lost_servo: ServoModel | None = None
 
+    def _make_plant(self) -> None:
+        vehicle, config, start = self._vehicle, self._config, self._start
+        pose = (start.position_m, start.yaw_rad, start.arm_rad)
+        # In lockstep as in the fast closed loop: cameras expose at the end of a step, and all else happens there, too.
+        between_steps = self._keeper is None
+        self.plant = Plant(vehicle, config, self.autopilot, self.servos, pose, between_steps=between_steps)
+        self.autopilot.attach(self.plant.world)
+        self.faults = Faults(
+            config,
+            self.plant.world,
+            self.autopilot.fault_target,
+            [servo.drive for servo in self.servos],
+            vehicle.tether,
+            self.servos,
+        )
+        if config.faults:
+            self.plant.faults = self.faults
+
+    def _start_over(self) -> None:
+        """Put the world back to its beginning, as the flight begins: what happens in the flight does not depend on how long the
+        preflight took. What the companion has set in the devices stays.
+        """
+        assert self._keeper is not None
+        if not self.autopilot.start_over():
+            return
+        for servo in self.servos:
+            servo.drive.start_over()
+        self._make_plant()
+        if self.force is not None:
+            self.force.start_over()
+        if isinstance(self.mocap, NatNetServer):
+            self.mocap.start_over()
+        self.course.clear()
+        self.frames.clear()
+        self.modes.clear()
+        self._course_due_s = self._inject_due_s = 0.0
+        self._keeper.set(0.0)
+
     @contextlib.asynccontextmanager
     async def wires(self) -> AsyncIterator[dict[str, dict[str, Any]]]:
         """Open every link and yield the addresses in the form of a vehicle file's `devices` settings."""
         device = self._vehicle.devices
         async with contextlib.AsyncExitStack() as stack:
             if device.arm is not None:
-                self.bus = await stack.enter_async_context(ServoBus(self._on_bus))
+                page = None if self._keeper is None else self._keeper.page
+                self.bus = await stack.enter_async_context(ServoBus(self._on_bus, page=page))
             if device.force is not None:
-                self.force = await stack.enter_async_context(ForceTorqueServer())
+                sensor = ForceTorqueServer(in_lockstep=self._keeper is not None)
+                self.force = await stack.enter_async_context(sensor)
             addresses: dict[str, dict[str, Any]] = {}
             if not device.mocap.external:
                 self.mocap = server = await stack.enter_async_context(self._natnet_server())
@@ -211,7 +253,7 @@ class Sitl:
         self._end_s = min(self._end_s, self.plant.t_s + _LEAVE_S)
 
     async def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
-        """Run the world in real time until `stop` or `leave` ends it; call `on_ready` once the autopilot is ready to fly.
+        """Run the world until `stop` or `leave` ends it; call `on_ready` once the autopilot is ready to fly.
 
         Raises:
             Px4Error: a real PX4 cannot be started, has ended or hangs.
@@ -220,7 +262,7 @@ class Sitl:
             async with asyncio.TaskGroup() as group:
                 preparing = group.create_task(self._prepare(on_ready))
                 try:
-                    await self._follow_clock()
+                    await (self._follow_clock() if self._keeper is None else self._in_lockstep(self._keeper))
                 finally:
                     if self._next_frame is not None:
                         self._next_frame.cancel()
@@ -232,16 +274,41 @@ class Sitl:
         await self.autopilot.prepare()
         on_ready()
 
+    @property
+    def _ends(self) -> bool:
+        return self.plant.t_s >= self._end_s or (self._leaving and not self.autopilot.armed)
+
+    async def _in_lockstep(self, keeper: TimeKeeper) -> None:
+        """Step, let the flight do what it does at this instant, and so on."""
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, LockstepLoop)
+        before_s = 0.0 if self.autopilot.lockstep else BEFORE_S
+        keeper.set(before_s + self.plant.t_s)
+        with keeper.listening():
+            while not self._ends:
+                if self.autopilot.lockstep:
+                    await self.autopilot.answered()
+                self._sent_frame = False
+                self._step()
+                await keeper.advance(before_s + self.plant.t_s, self._sent_frame)
+                if self.bus is not None:
+                    await self.bus.take(keeper.bus_bytes, BUS_PATIENCE_S)
+                await loop.handle_all()
+                if keeper.begins():
+                    plant = self.plant
+                    self._start_over()
+                    before_s = before_s if self.plant is plant else 0.0
+
     async def _follow_clock(self) -> None:
         lockstep = self.autopilot.lockstep
         origin_s = self._origin_s = time.monotonic() - self.plant.t_s
-        while self.plant.t_s < self._end_s and not (self._leaving and not self.autopilot.armed):
+        while not self._ends:
             behind_s = time.monotonic() - origin_s - self.plant.t_s
-            if behind_s > _CATCH_UP_S:
-                origin_s = self._origin_s = origin_s + behind_s - _CATCH_UP_S
-                self.slipped_s += behind_s - _CATCH_UP_S
-                self.autopilot.skip(behind_s - _CATCH_UP_S)
-                behind_s = _CATCH_UP_S
+            if behind_s > CATCH_UP_S:
+                origin_s = self._origin_s = origin_s + behind_s - CATCH_UP_S
+                self.slipped_s += behind_s - CATCH_UP_S
+                self.autopilot.skip(behind_s - CATCH_UP_S)
+                behind_s = CATCH_UP_S
             for _ in range(int(behind_s / PHYSICS_DT_S)):
                 if lockstep:
                     await self.autopilot.answered()
@@ -259,7 +326,8 @@ class Sitl:
         plant.step(autopilot.armed)
         if autopilot.lockstep and plant.imu_due:
             autopilot.sense(plant.sample_imu())
-        for leaves_s, frame in plant.mocap_until(plant.t_s + PHYSICS_DT_S - 1e-6):
+        ahead_s = PHYSICS_DT_S - 1e-6 if self._keeper is None else 0.0
+        for leaves_s, frame in plant.mocap_until(plant.t_s + ahead_s):
             if leaves_s <= plant.t_s:
                 self._publish(frame, plant.t_s)
             else:
@@ -267,7 +335,8 @@ class Sitl:
                 self._next_frame = loop.call_at(self._origin_s + leaves_s, self._publish, frame, leaves_s)
         if self.force is not None:
             plant.force_is_read = self.force.streaming
-            self.force.set_wrench(*plant.force_torque())
+            if self._keeper is None or self.force.due(plant.t_s) or not self.force.streaming:
+                self.force.set_wrench(*plant.force_torque())
             self.force.tick(plant.t_s)
         autopilot.pump(plant.t_s, plant.battery())
         observed, armed = autopilot.observe(), autopilot.armed
@@ -296,6 +365,7 @@ class Sitl:
             world.hold_arm(held)
 
     def _publish(self, frame: MocapFrame, t_s: float) -> None:
+        self._sent_frame = True
         if isinstance(self.mocap, ExternalVision):
             self.mocap.publish(frame, t_s)
             return
@@ -312,7 +382,9 @@ class Sitl:
         for kind in SIGNALS:
             if plant.fault(kind) is not None:
                 seen = self.autopilot.observe()
-                self.flight.inject(kind, plant.t_s, plant.truth.position_world_m, seen.vision_received)
+                injected = self.flight.inject(kind, plant.t_s, plant.truth.position_world_m, seen.vision_received)
+                if injected and self._keeper is not None:
+                    self._keeper.do_not_wait_for("flight")
         self._inject_process_faults()
         self._record_course()
         down = plant.fault("link_loss") is not None or self.autopilot.down

@@ -55,6 +55,7 @@ def empty_summary(
         "graded_every": 1,
         "world": None,
         "autopilot": None,
+        "clock": {"kind": "real", "pace": None, "speed": None},
     }
 
 
@@ -84,6 +85,7 @@ def summarise(
     summary = empty_summary(
         outcome=outcome, controller=controller, preset=preset, payload_kg=payload_kg, recorder=recorder or counted
     )
+    summary["clock"]["kind"] = log.metadata.get("flight", {}).get("clock", "real")
     if not log.inputs:
         return summary
     caught = metrics.catch_index(log)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import errno
 import importlib
+import math
 import os
 import re
 import shlex
@@ -133,6 +134,16 @@ def make_parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
     fly.add_argument(
         "--sitl", metavar="stub|px4", help="fly in the simulated world: with the PX4 stub, or with a real PX4 (SITL)"
     )
+    fly.add_argument(
+        "--speed",
+        metavar="FACTOR|max",
+        help="with --sitl: simulated seconds in a second at most (default: 1; a busy computer takes longer)",
+    )
+    fly.add_argument(
+        "--real-time",
+        action="store_true",
+        help="with --sitl: on the computer's clock, as on the vehicle, to measure latency and jitter",
+    )
     fly.add_argument("--out", metavar="DIR", help="folder for log and report (default: flights/TIME-MISSION)")
     fly.add_argument(
         "--no-report", action="store_true", help="write only log and summary; companion report writes the rest"
@@ -247,6 +258,9 @@ def _fly(arguments: argparse.Namespace) -> int:
     if arguments.sitl not in (None, "stub", "px4"):
         print_error(f"companion fly: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
         return EXIT_BAD_INPUT
+    speed = _speed(arguments)
+    if speed is not None and not speed > 0.0:
+        return EXIT_BAD_INPUT
     if arguments.out is not None and not arguments.out.strip():
         print_error("companion fly: --out: expected the name of a folder, got an empty one")
         return EXIT_BAD_INPUT
@@ -270,7 +284,34 @@ def _fly(arguments: argparse.Namespace) -> int:
     if problem is not None:
         print_error(f"companion fly: --out {out}: {problem}")
         return EXIT_BAD_INPUT
-    return run_flight(config, out, sitl=arguments.sitl, console=terminal_console(), report=not arguments.no_report)
+    return run_flight(
+        config, out, sitl=arguments.sitl, console=terminal_console(), report=not arguments.no_report, speed=speed
+    )
+
+
+def _speed(arguments: argparse.Namespace) -> float | None:
+    """Return the speed of a flight in simulated time, or None for one in real time; 0 if the options are invalid, after a line."""
+    given = arguments.speed
+    problem = None
+    if (given is not None or arguments.real_time) and arguments.sitl is None:
+        option = "--speed" if given is not None else "--real-time"
+        problem = (
+            f"{option}: expected only with --sitl, because a vehicle flies in real time; add --sitl or leave it out"
+        )
+    elif given is not None and arguments.real_time:
+        problem = f"--speed {given}: expected not together with --real-time, which flies on the computer's clock; leave one out"
+    if problem is None and (given is None or given == "max"):
+        return None if arguments.real_time or arguments.sitl is None else math.inf if given else 1.0
+    if problem is None:
+        try:
+            speed = float(given)
+        except ValueError:
+            speed = math.nan
+        if 0.0 < speed < math.inf:
+            return speed
+        problem = f"--speed {given}: expected a number above 0, such as 0.25, or max"
+    print_error(f"companion fly: {problem}")
+    return 0.0
 
 
 def _no_server(config: FlightConfig) -> list[str]:

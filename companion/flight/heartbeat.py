@@ -34,7 +34,7 @@ class Heartbeats:
 
     Args:
         identity: identity of the MAVLink link that the guardian would take over.
-        origin_s: `time.monotonic` when the flight clock was zero.
+        origin_s: `companion.runtime.clock.monotonic` when the flight clock was zero.
     """
 
     def __init__(self, identity: LinkIdentity, origin_s: float) -> None:
@@ -105,7 +105,7 @@ class FlightGuard:
     Args:
         client: connection to the guardian.
         identity: identity of the MAVLink link that the guardian would take over.
-        origin_s: `time.monotonic` when the flight clock was zero.
+        origin_s: `companion.runtime.clock.monotonic` when the flight clock was zero.
     """
 
     def __init__(self, client: GuardianClient, identity: LinkIdentity, origin_s: float) -> None:

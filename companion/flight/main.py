@@ -14,7 +14,6 @@ import os
 import signal
 import socket
 import sys
-import time
 import traceback
 from pathlib import Path
 
@@ -28,7 +27,7 @@ from companion.flight.command_queue import Operator, StartCancelled
 from companion.flight.fallback_landing import land_without_core, unflown
 from companion.flight.heartbeat import FlightGuard
 from companion.flight.startup import Checked, Refused, check_before_flight, with_hover_thrust
-from companion.flight.ticker import Ticker
+from companion.flight.ticker import SIMULATED_START_S, SimulatedTicker, Ticker
 from companion.guardian.client import GuardianClient
 from companion.io.devices import Devices, open_devices
 from companion.io.protocols import DeviceError
@@ -48,10 +47,10 @@ from companion.model.types import (
     Severity,
 )
 from companion.recorder.client import RecorderProcess, epoch_offset_ns
-from companion.runtime import ipc
-from companion.runtime.clock import Clock, flight_clock
+from companion.runtime import ipc, simulated_time
+from companion.runtime.clock import Clock, clock_origin_s, flight_clock
 from companion.runtime.event_loop import run
-from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
+from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime, collect_no_garbage
 from companion.safety.rules import REATTACHED
 
 STATUS_EVERY = 20
@@ -86,6 +85,8 @@ class Flight:
         self._clock = clock
         self._core = FlightCore(config)
         self._missed = 0
+        self._slow: SimulatedTicker | None = None
+        """The ticker of simulated time; None in real time."""
         self._period_s = TICK_PERIOD_S
         self._phase = ""
         """The phase last reported to the launcher."""
@@ -94,15 +95,24 @@ class Flight:
 
     async def run(self) -> Outcome:
         """Run ticks until the flight ends; return its outcome."""
-        ticker = Ticker(self._period_s, self._clock, self._frame_rate_hz)
-        self._devices.vision.on_frame = ticker.frame
+        simulated = simulated_time.current()
+        if simulated is None:
+            in_real_time = Ticker(self._period_s, self._clock, self._frame_rate_hz)
+            self._devices.vision.on_frame = in_real_time.frame
+            ticker: Ticker | SimulatedTicker = in_real_time
+        else:
+            if not self._devices.found_armed:
+                await simulated.begin(SIMULATED_START_S)
+            ticker = self._slow = SimulatedTicker(self._period_s, self._clock)
+        self._devices.autopilot.start_sums()
         if self._devices.force is not None:
             self._devices.force.read_in_ticks()
         tick = 0
         before: Outputs | None = None
         if self._devices.ground is not None:
             self._tell_forwarding(self._clock(), self._devices.ground.line)
-        self._begin_read(ticker.due_s)
+        if isinstance(ticker, Ticker):
+            self._schedule_read(ticker.due_s)
         while True:
             now = await ticker.next()
             turn = self._operator.next()
@@ -120,11 +130,11 @@ class Flight:
                 return outputs.outcome
             if tick == 0 and self._devices.found_armed and not self._goes_on(outputs):
                 return Outcome.ABORTED
-            # At the end, because it wakes the bus thread, which competes for the interpreter.
-            self._begin_read(ticker.due_s)
+            if isinstance(ticker, Ticker):  # at the end: it wakes the bus thread, which competes for the interpreter
+                self._schedule_read(ticker.due_s)
             tick += 1
 
-    def _begin_read(self, due_s: float) -> None:
+    def _schedule_read(self, due_s: float) -> None:
         """Schedule the read of the joint state for the tick that is due at `due_s`."""
         arm = self._devices.arm
         if arm is not None:
@@ -150,6 +160,8 @@ class Flight:
             estimator=devices.autopilot.estimator() if self._external else None,
         )
         outputs = self._core.step(inputs)
+        if self._slow is not None:
+            await self._slow.computed()
         devices.vision.open = outputs.mocap_trusted
         core_s = self._clock()
         attitude_sent = devices.autopilot.send_attitude(outputs.attitude)
@@ -276,6 +288,15 @@ class Flight:
         }
 
 
+def _claim_computer(config: FlightConfig) -> str:
+    """Return, in words, what the operating system grants the flight process for precise timing."""
+    if simulated_time.current() is not None:
+        collect_no_garbage()
+        return "simulated time, which waits for this computer"
+    computer = config.vehicle.computer
+    return str(claim_realtime(FLIGHT_PRIORITY, cpus=computer.cpus, lock_memory=computer.lock_memory))
+
+
 def _device_plugins(vehicle: Vehicle) -> dict[str, str]:
     """Return name, distribution and version of each device that a plug-in provides, for the log."""
     devices = vehicle.devices
@@ -310,7 +331,7 @@ async def fly(
         Refused: the preflight refuses the flight; nothing was armed.
         StartCancelled: a landing was requested before the first tick; nothing was armed.
     """
-    origin_s = time.monotonic()
+    origin_s = clock_origin_s()
     clock = flight_clock(origin_s)
     client = GuardianClient(guardian_channel, clock) if guardian_channel is not None else None
     operator = Operator(channel)
@@ -339,6 +360,7 @@ async def fly(
                     "law_version": law.version,
                     "preset": config.controller.preset,
                     "simulated": str(sitl).lower(),
+                    "clock": "real" if simulated_time.current() is None else "simulated",
                     **_device_plugins(config.vehicle),
                 },
                 simulated=sitl,
@@ -359,8 +381,7 @@ async def fly(
             if client is not None:
                 client.share_recorder(recorder.client.fileno())
             flight = Flight(config, devices, recorder, channel, operator, clock, guardian)
-            computer = config.vehicle.computer
-            got = str(claim_realtime(FLIGHT_PRIORITY, cpus=computer.cpus, lock_memory=computer.lock_memory))
+            got = _claim_computer(config)
             recorder.client.metadata("realtime", {"got": got})
             ipc.send(channel, {"type": "started", "recorder_pid": recorder.process.pid, "realtime": got})
             try:
@@ -391,7 +412,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--channel", type=int, required=True, help="socket to the launcher")
     parser.add_argument("--guardian", type=int, required=True, help="socket to the guardian")
     parser.add_argument("--sitl", action="store_true", help="the devices are simulated")
+    parser.add_argument("--time", help="page and channel of simulated time")
     arguments = parser.parse_args(argv)
+    if arguments.time is not None:
+        simulated_time.enter(arguments.time)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher handles Ctrl-C and requests a landing
     config = FlightConfig.model_validate_json(arguments.config.read_text(encoding="utf-8"))
     channel = socket.socket(fileno=arguments.channel)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import time
 from dataclasses import dataclass
 
 from companion.runtime.clock import Clock
@@ -18,6 +19,10 @@ _GAIN, _SLEW_S = 0.1, 0.00025
 """Fraction of a frame's timing error by which the next deadline moves, and the largest such step."""
 _PATIENCE = 3.0
 """Number of periods without a frame in its window after which ticks no longer wait for frames."""
+SIMULATED_START_S = 0.5
+"""Time from the beginning of a simulated flight to its first tick: every device has sent new data by then."""
+STEP_S = 0.002
+"""Step of simulated time: a tick that starts that much after its deadline is not late."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +112,43 @@ class Ticker:
         finally:
             timer.cancel()
             self._waiter = None
+
+
+class SimulatedTicker:
+    """Times the ticks in simulated time, at multiples of their period. The world lets time stand while a tick works.
+
+    A tick that takes more than a period of processor time, as on no vehicle that may fly, is late by what it took.
+
+    Args:
+        period_s: period of the ticks.
+        clock: the flight clock.
+    """
+
+    def __init__(self, period_s: float, clock: Clock) -> None:
+        self._period_s = period_s
+        self._clock = clock
+        self._due_s = clock()
+        self._begun_cpu_s = 0.0
+        self.skipped = 0
+
+    async def next(self) -> TickTime:
+        """Wait until the next tick is due."""
+        self._due_s += self._period_s
+        late_periods = int((self._clock() - self._due_s) / self._period_s)
+        if late_periods > 0:
+            self.skipped += late_periods
+            self._due_s += late_periods * self._period_s
+        due_s = self._due_s
+        await asyncio.sleep(max(0.0, due_s - self._clock()))
+        start_s = self._clock()
+        self._begun_cpu_s = time.thread_time()
+        return TickTime(start_s, max(0.0, start_s - due_s - STEP_S))
+
+    async def computed(self) -> None:
+        """Let the processor time of a slow tick pass; called between its computation and its outputs."""
+        took_s = time.thread_time() - self._begun_cpu_s
+        if took_s > self._period_s:
+            await asyncio.sleep(took_s)
 
 
 def _wake(waiter: asyncio.Future[None]) -> None:

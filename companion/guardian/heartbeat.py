@@ -33,7 +33,7 @@ class Heartbeat(Record, frozen=True, kw_only=True):
     t_s: float
     """Flight clock."""
     origin_s: float
-    """`time.monotonic` when the flight clock was zero: the time base of the poses sent to PX4."""
+    """`companion.runtime.clock.monotonic` when the flight clock was zero: the time base of the poses sent to PX4."""
     mission_t_s: float
     """Time since take-off was commanded; 0 before that."""
     lifting: bool

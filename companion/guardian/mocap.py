@@ -58,7 +58,7 @@ class MocapClient:
         )
         self._sent_s = float("-inf")
         self.tracked_s = float("-inf")
-        """`time.monotonic` of the newest frame in which the body was tracked."""
+        """`monotonic` of the newest frame in which the body was tracked."""
 
     @property
     def problem(self) -> str | None:

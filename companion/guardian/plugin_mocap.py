@@ -30,7 +30,7 @@ class PluginClient:
         """Beginning of a text on this client."""
         self._client: PoseClient = plugins.find(plugins.MOCAP_SYSTEMS, settings.type).load()(settings)
         self.tracked_s = float("-inf")
-        """`time.monotonic` of the newest frame in which the body was tracked."""
+        """`monotonic` of the newest frame in which the body was tracked."""
         self._failure: str | None = None
         self._rejected: str | None = None
         self.sockets: tuple[socket.socket, ...] = ()

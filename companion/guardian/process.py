@@ -13,7 +13,6 @@ import os
 import select
 import signal
 import socket
-import time
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,7 +29,8 @@ from companion.io.px4.wire import Wire, is_udp, open_wire
 from companion.model.codec import to_packet
 from companion.model.packets import LogLine
 from companion.model.types import SafetyAction, Severity
-from companion.runtime import ipc
+from companion.runtime import ipc, simulated_time
+from companion.runtime.clock import monotonic
 from companion.runtime.realtime import GUARDIAN_PRIORITY, claim_realtime
 
 if TYPE_CHECKING:
@@ -54,12 +54,17 @@ class FlightProcess:
 
     def __init__(self, pidfd: int) -> None:
         self.pidfd = pidfd
-        self._poll = select.poll()
-        self._poll.register(pidfd, select.POLLIN)
+        self._end = select.poll()
+        self._end.register(pidfd, select.POLLIN)
 
     def wait(self, timeout_s: float) -> bool:
         """Wait up to `timeout_s`; return whether the process is dead. The kernel has then closed its sockets."""
-        return bool(self._poll.poll(max(0, round(timeout_s * 1e3))))
+        return bool(self._end.poll(max(0, round(timeout_s * 1e3))))
+
+    def watch(self) -> bool:
+        """Wait for one period of the guardian, or for the end of the process; return whether it is dead."""
+        simulated_time.wait(self._end, PERIOD_S, data=False)
+        return self.wait(0.0)
 
     def kill(self) -> None:
         """Send SIGKILL, the only signal that ends a hung process in every case."""
@@ -129,7 +134,7 @@ class Guardian:
         self._link_reported = False
         """Whether the closed link has been reported."""
         self._reopen_s = float("-inf")
-        """Earliest `time.monotonic` at which a lost link is reopened."""
+        """Earliest `monotonic` at which a lost link is reopened."""
         self._silent_s = 0.0
         """Longest silence while the rotors might turn."""
 
@@ -162,8 +167,8 @@ class Guardian:
         watch = StallWatch(self._settings.timeout_s)
         status_s = float("-inf")
         while True:
-            dead = self._flight.wait(PERIOD_S)
-            now_s = time.monotonic()
+            dead = self._flight.watch()
+            now_s = monotonic()
             heard = self._heartbeats.receive()
             last = self._heartbeats.last
             if self._mocap is not None:
@@ -204,7 +209,7 @@ class Guardian:
         """Kill the flight process, open its link and land; return whether the vehicle has landed."""
         self._flight.kill()
         gone = self._flight.wait(KILL_TIMEOUT_S)
-        now_s = time.monotonic() - last.origin_s
+        now_s = monotonic() - last.origin_s
         text = f"{reason}; the guardian has taken over" + (
             "" if gone else " (the flight process was killed but has not ended)"
         )
@@ -220,15 +225,15 @@ class Guardian:
 
     def _open_link(self, last: Heartbeat) -> Link | None:
         """Open the flight process's link; try again while another process holds it. Return None after LINK_TIMEOUT_S."""
-        deadline_s = time.monotonic() + LINK_TIMEOUT_S
+        deadline_s = monotonic() + LINK_TIMEOUT_S
         while True:
             wire = self._try_wire(last)
             if wire is not None:
                 return Link(wire, (last.own_system, last.own_component), last.autopilot_system)
-            if time.monotonic() > deadline_s:
+            if monotonic() > deadline_s:
                 return None
             self._send_status(0)
-            time.sleep(PERIOD_S)
+            simulated_time.wait(select.poll(), PERIOD_S, data=False)
 
     def _try_wire(self, last: Heartbeat) -> Wire | None:
         """Open the wire, or return None and report the first failure.
@@ -242,7 +247,7 @@ class Guardian:
             share_port = not self._flight.wait(0.0)
             if share_port and not is_udp(address):
                 raise OSError(errno.EBUSY, "the killed flight process still holds the link")
-            wire = open_wire(address, last.local_port, last.peer, share_port=share_port)
+            wire = open_wire(address, last.local_port, last.peer, monotonic, share_port=share_port)
         except OSError as error:
             self._report_no_link(last, error.strerror or str(error))
             return None
@@ -253,12 +258,12 @@ class Guardian:
         if not self._link_reported:
             self._link_reported = True
             text = f"autopilot {self._settings.autopilot_address}: {found}; trying again"
-            now_s = time.monotonic() - last.origin_s
+            now_s = monotonic() - last.origin_s
             self._publish(last, Notice(now_s, "guardian_no_link", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
 
     def _restore_link(self, last: Heartbeat, link: Link, landing: TakeoverLanding, waiting: select.poll) -> None:
         """Close a lost link, because it would end every wait at once, and try to reopen it every REOPEN_PERIOD_S."""
-        now_s = time.monotonic()
+        now_s = monotonic()
         if not link.wire.lost or now_s < self._reopen_s:
             return
         self._reopen_s = now_s + REOPEN_PERIOD_S
@@ -284,14 +289,14 @@ class Guardian:
             self._settings.clearance_m,
             self._settings.tilt_max_rad,
             link,
-            time.monotonic() - last.origin_s,
+            monotonic() - last.origin_s,
             lambda notice: self._publish(last, notice),
             external=self._external,
         )
         step_s = float("-inf")
         while landing.landed is None:
-            waiting.poll(PERIOD_S * 1e3)
-            now_s = time.monotonic()
+            simulated_time.wait(waiting, PERIOD_S, data=True)
+            now_s = monotonic()
             t_s = now_s - last.origin_s
             with self._contain_errors(last, landing, "motion capture"):
                 if mocap is not None:
@@ -314,7 +319,7 @@ class Guardian:
         try:
             yield
         except Exception as error:
-            t_s = time.monotonic() - last.origin_s
+            t_s = monotonic() - last.origin_s
             text = f"an error in {what} ({type(error).__name__}: {error}); the landing continues"
             if text not in self._errors and len(self._errors) < ERRORS_REPORTED_MAX:
                 self._errors.add(text)
@@ -328,7 +333,7 @@ class Guardian:
 
     def _send_status(self, poses_sent: int) -> None:
         """Send a status message to the launcher, twice a second."""
-        now_s = time.monotonic()
+        now_s = monotonic()
         if now_s - self._status_s >= STATUS_PERIOD_S:
             self._status_s = now_s
             ipc.send(self._channel, {"type": "guardian_status", "poses_sent": poses_sent})
@@ -381,7 +386,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--heartbeats", type=int, required=True, help="socket to the flight process")
     parser.add_argument("--channel", type=int, required=True, help="socket to the launcher")
     parser.add_argument("--pidfd", type=int, required=True, help="pidfd of the flight process")
+    parser.add_argument("--time", help="page and channel of simulated time")
     arguments = parser.parse_args(argv)
+    if arguments.time is not None:
+        simulated_time.enter(arguments.time)
     for number in (
         signal.SIGINT,
         signal.SIGHUP,
@@ -389,5 +397,6 @@ def main(argv: list[str] | None = None) -> int:
         signal.signal(number, signal.SIG_IGN)
     settings = read_settings(arguments.config)
     with socket.socket(fileno=arguments.heartbeats) as heartbeats, socket.socket(fileno=arguments.channel) as channel:
-        claim_realtime(GUARDIAN_PRIORITY)
+        if simulated_time.current() is None:
+            claim_realtime(GUARDIAN_PRIORITY)
         return Guardian(settings, HeartbeatReceiver(heartbeats), channel, FlightProcess(arguments.pidfd)).run()

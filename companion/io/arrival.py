@@ -8,6 +8,7 @@ import struct
 import time
 from typing import Final
 
+from companion.runtime import simulated_time
 from companion.runtime.clock import Clock
 
 _SO_TIMESTAMPNS: Final = 35  # from <asm-generic/socket.h>, valid on x86 and ARM; Python has no name for it
@@ -18,7 +19,11 @@ _WAITED_MAX_S = 0.1
 
 
 def stamp_arrivals(opened: socket.socket) -> None:
-    """Make the kernel timestamp datagrams on arrival (SO_TIMESTAMPNS). If it cannot, `arrived_s` returns the time of the read."""
+    """Make the kernel timestamp datagrams on arrival (SO_TIMESTAMPNS). If it cannot, and in simulated time, which does not pass while a
+    datagram waits, `arrived_s` returns the time of the read.
+    """
+    if simulated_time.current() is not None:
+        return
     with contextlib.suppress(OSError):
         opened.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 

@@ -26,10 +26,17 @@ class GuardianProcess:
         flight_pid: id of the flight process, a child that has not been reaped.
         heartbeats: the guardian's end of the socket to the flight process; closed here.
         shared: descriptors that the guardian keeps open for the simulated world.
+        in_time: arguments of simulated time; empty in real time.
     """
 
     def __init__(
-        self, config_path: Path, out: Path, flight_pid: int, heartbeats: socket.socket, shared: Sequence[int]
+        self,
+        config_path: Path,
+        out: Path,
+        flight_pid: int,
+        heartbeats: socket.socket,
+        shared: Sequence[int],
+        in_time: Sequence[str] = (),
     ) -> None:
         self.log = out / "guardian.log"
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -48,6 +55,7 @@ class GuardianProcess:
                             "--pidfd",
                             str(pidfd),
                         ),
+                        *in_time,
                     ],
                     stdin=subprocess.DEVNULL,
                     stdout=log,

@@ -24,6 +24,7 @@ from companion.config.loader import FlightConfig
 from companion.guardian.heartbeat import HANG_TEXT
 from companion.launcher.cpu_contention import CpuContention
 from companion.launcher.guardian_process import GuardianProcess
+from companion.launcher.shared_time import SharedTime
 from companion.launcher.sitl_process import SitlProcess
 from companion.model.exit_codes import EXIT_CODES
 from companion.model.types import Outcome, PhaseKind, SafetyAction, Severity
@@ -70,6 +71,8 @@ class FlightResult:
     """
     guardian_events: tuple[dict[str, Any], ...] = ()
     """Events of the guardian in the format of summary.json; empty if it did not take over."""
+    pace: float | None = None
+    """Simulated seconds per second of the flight; None in real time, and for a flight without a tick."""
     lines: tuple[str, ...] = ()
     """Lines for the user: why the flight was refused, or which process failed and where its log is."""
 
@@ -98,10 +101,19 @@ class Launcher:
             the sitl process receives the configuration of the world.
         out: existing folder for all files of the flight.
         sitl: autopilot of the simulated world; None for hardware.
+        speed: simulated seconds in a second of real time at most, with SITL; None for a flight in real time.
         on_message: called with every message of the flight process, for the display; messages of the world have "source": "sitl".
     """
 
-    def __init__(self, config: SitlConfig, out: Path, *, sitl: Sitl | None, on_message: OnMessage) -> None:
+    def __init__(
+        self, config: SitlConfig, out: Path, *, sitl: Sitl | None, on_message: OnMessage, speed: float | None = None
+    ) -> None:
+        self._speed = speed if sitl is not None else None
+        self._time: SharedTime | None = None
+        """Simulated time; None in real time."""
+        self._flown_from: tuple[float, float] | None = None
+        """Simulated time and wall time of the first status message."""
+        self._pace: float | None = None
         self._config = config
         self._out = out
         self._sitl = sitl
@@ -141,7 +153,9 @@ class Launcher:
         try:
             config = self._config.flight
             if self._sitl is not None:
-                sitl = SitlProcess(self._config, self._out, px4=self._sitl == "px4")
+                if self._speed is not None:
+                    self._time = SharedTime(self._speed)
+                sitl = SitlProcess(self._config, self._out, self._time, px4=self._sitl == "px4")
                 config = replace_device_settings(
                     config, sitl.devices(self._on_world_message, lambda: self._stop_requested)
                 )
@@ -156,8 +170,13 @@ class Launcher:
             # A child that has not left the terminal's process group yet receives the Ctrl-C, too.
             outcome = Outcome.ABORTED
         finally:
+            if self._time is not None:
+                for name in ("flight", "guardian"):  # a process that was never started is not waited for
+                    self._time.started(name)
             if sitl is not None:
                 sitl.stop()
+            if self._time is not None:
+                self._time.close()
         world = sitl.final if sitl is not None else {}
         if world.get("crashed") and outcome is not Outcome.REFUSED:
             outcome = Outcome.CRASHED
@@ -169,6 +188,7 @@ class Launcher:
             world=world,
             events=tuple(self._events),
             guardian_events=events,
+            pace=self._pace,
             lines=self._user_lines(outcome),
         )
 
@@ -182,6 +202,7 @@ class Launcher:
         # Flight and guardian also keep the world's standard input open, so that the world runs until all have exited. If this process
         # is killed, the flight process can still land and see that it has landed.
         shared = () if sitl is None or sitl.process.stdin is None else (sitl.process.stdin.fileno(),)
+        in_time, inherited = ((), ()) if self._time is None else self._time.of("flight")
         with ours, heartbeats_in:
             ours.setblocking(False)
             with theirs, heartbeats_out, open(log_path, "wb") as log:
@@ -191,11 +212,12 @@ class Launcher:
                         *("--config", str(config_path), "--out", str(self._out)),
                         *("--channel", str(theirs.fileno()), "--guardian", str(heartbeats_out.fileno())),
                         *(("--sitl",) if sitl is not None else ()),
+                        *in_time,
                     ],
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=log,
-                    pass_fds=(theirs.fileno(), heartbeats_out.fileno(), *shared),
+                    pass_fds=(theirs.fileno(), heartbeats_out.fileno(), *shared, *inherited),
                     start_new_session=True,
                     env={**os.environ, "TMPDIR": str(tmp), **(sitl.flight_environment if sitl is not None else {})},
                 )
@@ -208,8 +230,16 @@ class Launcher:
                     "flight process": process.pid,
                     **({"simulated world": sitl.process.pid} if sitl is not None else {}),
                 }
-                self._cpu_contention = CpuContention(pids)
-                self._guardian = guardian = GuardianProcess(config_path, self._out, process.pid, heartbeats_in, shared)
+                if self._time is None:  # else time waits for a busy computer
+                    self._cpu_contention = CpuContention(pids)
+                in_time, inherited = ((), ()) if self._time is None else self._time.of("guardian")
+                shared = (*shared, *inherited)
+                self._guardian = guardian = GuardianProcess(
+                    config_path, self._out, process.pid, heartbeats_in, shared, in_time
+                )
+                if self._time is not None:
+                    self._time.started("flight")
+                    self._time.started("guardian")
                 if self._stop_requested:
                     self.request_landing()
                 self._watch(process, ours, guardian, sitl)
@@ -291,7 +321,8 @@ class Launcher:
     ) -> None:
         """Forward the messages of flight and guardian until both have closed their channels; kill a process that hangs."""
         flight_open = True
-        heard_s = flight_open_s = time.monotonic()
+        flight_open_s = time.monotonic()
+        heard_s = self._now_s()
         while flight_open or guardian.open:
             channels = [channel] * flight_open + [guardian.channel] * guardian.open
             readable, _, _ = select.select(channels, [], [], 0.5)
@@ -307,13 +338,14 @@ class Launcher:
                 self._check_cpu_contention(message)
             now_s = time.monotonic()
             self._cpu_contention.sample(now_s)
+            self._report_pace()
             if channel in readable:
-                heard_s = now_s
+                heard_s = self._now_s()
                 flight_open = self._receive(channel)
             elif flight_open and process.poll() is not None:
                 self._receive(channel)  # its last messages may have come after `select`
                 flight_open = False
-            elif flight_open and self._flying and not guardian.took_over and now_s - heard_s > FLIGHT_SILENT_TIMEOUT_S:
+            elif flight_open and self._flying and not guardian.took_over and self._silent(heard_s):
                 text = f"flight: the flight process sent nothing for {FLIGHT_SILENT_TIMEOUT_S:g} s and was killed"
                 self._failures.append(text)
                 process.kill()
@@ -324,6 +356,26 @@ class Launcher:
                 self._failures.append("guardian: the guardian process hung and was killed")
                 guardian.kill()
                 return
+
+    def _now_s(self) -> float:
+        """Return the time that the flight lives in."""
+        return time.monotonic() if self._time is None else self._time.now_s()
+
+    def _silent(self, heard_s: float) -> bool:
+        return self._now_s() - heard_s > FLIGHT_SILENT_TIMEOUT_S
+
+    def _measure_pace(self) -> None:
+        if self._time is None:
+            return
+        now_s, wall_s = self._time.now_s(), time.monotonic()
+        from_s, from_wall_s = self._flown_from = self._flown_from or (now_s, wall_s)
+        if wall_s > from_wall_s:
+            self._pace = (now_s - from_s) / (wall_s - from_wall_s)
+
+    def _report_pace(self) -> None:
+        pace = None if self._time is None or not self._flying else self._time.pace()
+        if pace is not None:
+            self._on_message({"type": "pace", "factor": pace, "speed": self._speed})
 
     def _receive(self, channel: socket.socket) -> bool:
         """Handle the waiting messages of the flight process; return False if it has closed its channel."""
@@ -344,6 +396,7 @@ class Launcher:
         elif kind == "started":
             self._recorder_pid = message["recorder_pid"]
         elif kind == "status":
+            self._measure_pace()
             self._flying = message["kind"] != PhaseKind.DONE.value
         elif kind == "event":
             fields = {key: message[key] for key in ("id", "severity", "action", "text")}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,25 @@ GB of memory.
 """
 
 
-def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Console, report: bool = True) -> int:
-    """Run a flight, write its summary and, if requested, its report; return the exit code."""
+def run_flight(
+    config: SitlConfig,
+    out: Path,
+    *,
+    sitl: Sitl | None,
+    console: Console,
+    report: bool = True,
+    speed: float | None = None,
+) -> int:
+    """Run a flight, write its summary and, if requested, its report; return the exit code.
+
+    Args:
+        config: checked configuration.
+        out: folder of the flight.
+        sitl: as for `Launcher`.
+        console: where to print.
+        report: whether to write the report.
+        speed: as for `Launcher`.
+    """
     where = config.vehicle.name if sitl is None else "SITL" if sitl == "stub" else "a real PX4 in SITL"
     title = f"{config.mission.name}: {config.controller.law} ({config.controller.preset}) on {where}"
     display = FlightDisplay(console, title)
@@ -36,7 +54,7 @@ def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Con
         else:
             display.on_message(message)
 
-    launcher = Launcher(config, out, sitl=sitl, on_message=on_message)
+    launcher = Launcher(config, out, sitl=sitl, on_message=on_message, speed=speed)
     # A second Ctrl-C after the end of a short flight must not lose the summary.
     with landing_signals(launcher.request_landing):
         with display:
@@ -47,7 +65,7 @@ def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Con
         for line in result.lines:
             print_error(line)
         try:
-            log, summary = _summary(config, result, out)
+            log, summary = _summary(config, result, out, speed)
         except OSError as error:
             print_error(f"{out}: summary.json cannot be written: {error.strerror}")
             return result.exit_code
@@ -67,7 +85,9 @@ def run_flight(config: SitlConfig, out: Path, *, sitl: Sitl | None, console: Con
     return result.exit_code
 
 
-def _summary(config: SitlConfig, result: FlightResult, out: Path) -> tuple[FlightLog | None, dict[str, Any]]:
+def _summary(
+    config: SitlConfig, result: FlightResult, out: Path, speed: float | None
+) -> tuple[FlightLog | None, dict[str, Any]]:
     """Read the log if it exists, and write summary.json."""
     log = None
     path = out / "flight.mcap"
@@ -84,6 +104,7 @@ def _summary(config: SitlConfig, result: FlightResult, out: Path) -> tuple[Fligh
         "recorder": result.recorder,
     }
     summary = summarise(log, **about) if log is not None else empty_summary(**about)
+    summary["clock"] |= {"pace": result.pace, "speed": speed if speed is None or math.isfinite(speed) else "max"}
     summary["autopilot"] = autopilot_of(log, result.world)
     knobs = result.world.get("knobs")
     summary["world"] = knobs and {

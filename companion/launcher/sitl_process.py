@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from companion.launcher.shared_time import SharedTime
 from companion.runtime.subprocesses import JsonLines, LaunchError, how_it_ended, last_line, terminate, write_text
 from companion.sitl_config.loader import SitlConfig
 
@@ -27,25 +28,39 @@ SITL_TERMINATE_TIMEOUT_S = 10.0
 
 
 class SitlProcess:
-    """A running simulated world."""
+    """A running simulated world.
 
-    def __init__(self, config: SitlConfig, out: Path, *, px4: bool = False) -> None:
+    Args:
+        config: checked configuration.
+        out: folder of the flight.
+        shared_time: simulated time of the flight; None for a world in real time.
+        px4: whether the world flies a real PX4.
+    """
+
+    def __init__(
+        self, config: SitlConfig, out: Path, shared_time: SharedTime | None = None, *, px4: bool = False
+    ) -> None:
         self._px4 = px4
         self._error: str | None = None
         path = out / "sitl_config.json"
         write_text(path, config.model_dump_json(indent=1))
         self.log = out / "sitl.log"
+        in_time, inherited = ((), ()) if shared_time is None else shared_time.of_world()
         with open(self.log, "wb") as log:
             self.process = subprocess.Popen(
                 [
                     *(sys.executable, "-P", "-m", "sitl", "--config", str(path), "--for-launcher"),
                     *(("--px4", str((out / PX4_FOLDER).resolve())) if px4 else ()),
+                    *in_time,
                 ],
+                pass_fds=inherited,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
                 start_new_session=True,
             )
+        if shared_time is not None:
+            shared_time.world_started()
         assert self.process.stdout is not None
         self._lines = JsonLines(self.process.stdout.fileno())
         self.final: dict[str, Any] = {}

@@ -16,6 +16,7 @@ from companion.model.observations import Observations
 from companion.preflight import evaluation
 from companion.preflight.hand_test import record as hand_record
 from companion.preflight.observe import Progress, observe
+from companion.runtime import simulated_time
 from companion.runtime.clock import Clock
 from companion.runtime.compiled import COMPILED
 from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime
@@ -44,8 +45,9 @@ async def preflight(
         passed, changed = _hand_test(config, devices.mocap.server.protocol_version)
         known = replace(known, hand_test=passed, hand_test_changed=changed)
     computer = config.vehicle.computer
-    # As in flight, so that a busy computer is not mistaken for a bad bus or network.
-    claim_realtime(FLIGHT_PRIORITY, cpus=computer.cpus, lock_memory=computer.lock_memory)
+    if simulated_time.current() is None:
+        # As in flight, so that a busy computer is not mistaken for a bad bus or network.
+        claim_realtime(FLIGHT_PRIORITY, cpus=computer.cpus, lock_memory=computer.lock_memory)
     seen = await observe(
         devices,
         config,

@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import select
 import socket
 import subprocess
 import sys
@@ -25,6 +26,7 @@ from companion.io.protocols import DeviceError
 from companion.model.codec import to_packet
 from companion.model.packets import Close, CommandAnswer, LogLine, Metadata, Packet, Tick
 from companion.model.types import GroundCommand, Inputs, OperatorCommand, Outputs, SafetyAction, Sent, Severity
+from companion.runtime import simulated_time
 from companion.runtime.subprocesses import JsonLines
 
 _BUFFER_BYTES = 8 * 2**20
@@ -33,6 +35,8 @@ _MESSAGES_PER_TICK = 16
 """Maximum number of messages read in a tick; the rest are read in the next one."""
 _COMMANDS = {command.value: command for command in OperatorCommand if command is not OperatorCommand.NONE}
 _SO_SNDBUFFORCE = 32
+_ROOM_TIMEOUT_S = 2.0
+"""Longest wait for a recorder whose channel is full, in simulated time only."""
 
 
 class RecorderClient:
@@ -137,7 +141,10 @@ class RecorderClient:
         self._offered += 1
         if not self._dead:
             try:
-                self._socket.send(to_packet(packet))
+                data = to_packet(packet)
+                if simulated_time.current() is not None:  # time stands while the recorder makes room
+                    select.select((), (self._socket,), (), _ROOM_TIMEOUT_S)
+                self._socket.send(data)
                 return True
             except BlockingIOError:
                 pass  # full
@@ -294,8 +301,10 @@ class RecorderProcess:
 
 
 def epoch_offset_ns(flight_clock_s: float) -> int:
-    """Return the Unix time (ns) at which the flight clock was zero. `flight_clock_s` is its current reading."""
-    return time.time_ns() - round(flight_clock_s * 1e9)
+    """Return the Unix time (ns) at which the flight clock was zero. `flight_clock_s` is its current reading. In simulated time the
+    flight clock starts when the flight begins, which is about now.
+    """
+    return time.time_ns() - (round(flight_clock_s * 1e9) if simulated_time.current() is None else 0)
 
 
 def _enlarge(channel: socket.socket) -> None:

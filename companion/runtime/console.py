@@ -78,6 +78,8 @@ def print_error(text: object) -> None:
     stream.flush()
 
 
+SLOW_PACE = 0.8
+"""Share of the wanted pace below which simulated time counts as slow."""
 _SEVERITY_STYLE = {"info": "cyan", "warning": "yellow", "critical": "bold red"}
 _OUTCOME_STYLE = {"completed": "bold green", "aborted": "bold yellow", "refused": "bold yellow"}
 
@@ -108,6 +110,7 @@ class FlightDisplay:
         self._console = console
         self._title = title
         self._phase = ""
+        self._slow = False
         self._event = ""
         """Text of the newest event; no line is printed for a phase that begins with an event of the same name."""
         self._progress = Progress(
@@ -168,10 +171,20 @@ class FlightDisplay:
             style = "cyan" if message["accepted"] else "yellow"
             words = f"{message['operator']} commanded {message['command']}: {message['text']}"
             self._line(f"t {message['t_s']:6.2f} s", words, style)
+        elif kind == "pace":
+            self._pace(message["factor"], message["speed"])
         elif kind == "busy":
             self._line("computer", message["text"], "yellow")
         elif kind == "ground":
             self._line("ground", message["text"], "cyan")
+
+    def _pace(self, factor: float, speed: float) -> None:
+        """Show how fast simulated time runs, once when it becomes slower than asked for."""
+        slow = factor < SLOW_PACE * min(speed, 1.0)
+        if slow and not self._slow:
+            text = f"{factor:.1f} x real time: this computer is busy; the flight takes longer and is the same"
+            self._line("computer", text, "yellow")
+        self._slow = slow
 
     def _preflight(self, rows: list[Message]) -> None:
         """Show the preflight's result. The checks that refuse the flight are printed at the end, as the reason for the refusal."""
@@ -252,12 +265,18 @@ def print_result(
         facts.add_row("catch", "none" if catch is None else f"t = {catch:.2f} s{doubt}")
     for name, text in contact:
         facts.add_row(name, escape(text))
-    loop = summary.get("loop") or {}
+    loop, clock = summary.get("loop") or {}, summary.get("clock") or {}
     if loop.get("ticks"):
         rate_hz, late_ms = loop["rate_hz"], loop["lateness_ms"]["p99"]  # None after a tick or two
         rate = "" if rate_hz is None else f"{rate_hz:.0f} Hz, "
-        late = "" if late_ms is None else f", late p99 {late_ms:.1f} ms"
+        simulated = clock.get("kind") == "simulated"
+        late = "" if late_ms is None or simulated else f", late p99 {late_ms:.1f} ms"
         facts.add_row("control loop", f"{rate}{loop['ticks']} ticks, {loop['missed']} missed{late}")
+    pace, speed = clock.get("pace"), clock.get("speed")
+    if pace is not None:
+        wanted = speed if isinstance(speed, float) else 1.0
+        slow = ": this computer is busy" if pace < SLOW_PACE * min(1.0, wanted) else ""
+        facts.add_row("pace", f"{pace:.1f} x real time{slow}")
     recorder = summary.get("recorder") or {}
     if recorder.get("samples") is not None:
         facts.add_row("recorder", f"{recorder['samples']} ticks, {recorder['dropped']} dropped")

@@ -1,13 +1,19 @@
-"""Event loop for processes with precise timers."""
+"""Event loops for processes with precise timers: in real time, and in simulated time."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import math
+import select
 import selectors
 import signal
 import time
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from typing import Any, TypeVar
+
+from companion.runtime import simulated_time
+from companion.runtime.simulated_time import SimulatedTime
 
 _T = TypeVar("_T")
 
@@ -39,9 +45,82 @@ def fine_loop() -> asyncio.AbstractEventLoop:
     return asyncio.SelectorEventLoop(_Selector())
 
 
+class _SimulatedSelector(selectors.SelectSelector):
+    """Reports to the world when nothing is left to do at the present instant, then waits for the next grant."""
+
+    def __init__(self, simulated: SimulatedTime) -> None:
+        super().__init__()
+        self._simulated = simulated
+        self._grant = select.poll()
+        self._grant.register(simulated, select.POLLIN)
+        self.held = 0
+        """Number of callers that wait for a thread of this process, for which time stands."""
+
+    def wake_on(self, descriptor: int) -> None:
+        """Also end the wait for a grant when this descriptor is readable: the loop's own, for signals and threads."""
+        self._grant.register(descriptor, select.POLLIN)
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        ready = super().select(0)
+        simulated = self._simulated
+        if ready or (timeout is not None and timeout <= 0.0):
+            return ready
+        if self.held or simulated.lost:
+            return super().select(timeout if simulated.lost else None)
+        simulated.report(math.inf if timeout is None else simulated.now() + timeout)
+        self._grant.poll()
+        simulated.take_grants()
+        return super().select(0)
+
+
+class SimulatedLoop(asyncio.SelectorEventLoop):
+    """Event loop whose timers follow simulated time (`companion.runtime.simulated_time`)."""
+
+    def __init__(self, simulated: SimulatedTime) -> None:
+        self._simulated = simulated
+        self._waits = _SimulatedSelector(simulated)
+        super().__init__(self._waits)
+        self._waits.wake_on(self._ssock.fileno())  # type: ignore[attr-defined]
+
+    def time(self) -> float:
+        """Return simulated time, s."""
+        return self._simulated.now()
+
+    def run_in_executor(self, executor: Any, func: Callable[..., _T], *args: Any) -> asyncio.Future[_T]:  # type: ignore[override]
+        """Run a call in a thread, in real time: meanwhile the world runs no faster."""
+        self._simulated.threads += 1
+        future = super().run_in_executor(executor, func, *args)
+        future.add_done_callback(self._thread_is_done)
+        return future
+
+    def _thread_is_done(self, _: asyncio.Future[Any]) -> None:
+        self._simulated.threads -= 1
+
+    @contextlib.contextmanager
+    def time_stands(self) -> Iterator[None]:
+        """Let simulated time stand while the block waits for a thread of this process."""
+        self._waits.held += 1
+        try:
+            yield
+        finally:
+            self._waits.held -= 1
+
+
+def time_stands() -> contextlib.AbstractContextManager[None]:
+    """Return a context in which simulated time stands, for a wait for a thread of this process. In real time it does nothing."""
+    loop = asyncio.get_running_loop()
+    return loop.time_stands() if isinstance(loop, SimulatedLoop) else contextlib.nullcontext()
+
+
+def process_loop() -> asyncio.AbstractEventLoop:
+    """Return an event loop for the time that this process lives in."""
+    simulated = simulated_time.current()
+    return fine_loop() if simulated is None else SimulatedLoop(simulated)
+
+
 def run(main: Coroutine[Any, Any, _T]) -> _T:
-    """Run a coroutine like `asyncio.run`, on a `fine_loop`."""
-    with asyncio.Runner(loop_factory=fine_loop) as runner:
+    """Run a coroutine like `asyncio.run`, on a `process_loop`."""
+    with asyncio.Runner(loop_factory=process_loop) as runner:
         return runner.run(main)
 
 

@@ -148,7 +148,7 @@ class Px4Stub:
         self.clock_ahead_s = 0.0
         """Total duration of the world's pauses, during which PX4's own clock continues."""
         self.since_sample_s = 0.0
-        """Time from the last IMU sample to the arrival of the message being answered, for PX4's clock; set by the links."""
+        """Time from the last IMU sample to the arrival of the message being handled; set by the links."""
         self._queue: deque[tuple[float, OffboardTarget]] = deque()
         self._offboard: OffboardTarget | None = None
         self._setpoint_at_s: float | None = None
@@ -157,6 +157,11 @@ class Px4Stub:
         self._position_at_s = -math.inf
         self._flying: NavState | None = None
         self._climb_rate_controlled = False
+
+    @property
+    def arrival_s(self) -> float:
+        """World time at which the message that is being handled arrived."""
+        return self.t_s + self.since_sample_s
 
     @property
     def armed(self) -> bool:
@@ -278,6 +283,16 @@ class Px4Stub:
         self._cascade.reset()
         self._next_commander_s = self._position_at_s = -math.inf
         self._climb_rate_controlled = False
+
+    def start_over(self) -> None:
+        """Return to the state before the first step: world time starts over. Parameters and the global origin stay."""
+        origin = self.origin
+        self.t_s = 0.0
+        self.reboot(0.0)
+        self.origin, self.imu, self.battery = origin, None, Battery()
+        self.notices.clear()
+        self.vision_received = 0
+        self.clock_ahead_s = self.since_sample_s = 0.0
 
     def pilot_sets_mode(self, state: NavState) -> None:
         """Change the mode as the mode switch of a pilot's radio does; set the origin and the home position first if they are not

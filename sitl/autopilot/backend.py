@@ -23,6 +23,8 @@ from sitl.faults.injector import Autopilot as FaultyAutopilot
 from sitl.udp import Address
 from sitl.world.world import World
 
+LINK_DELAY_S = 0.002
+"""Time from sending a setpoint to its arrival at PX4 where the link itself takes no simulated time."""
 STUB_VERSION = "1.16"
 """PX4 version that the stub imitates."""
 
@@ -82,6 +84,9 @@ class AutopilotBackend(Protocol):
 
     def set_link(self, down: bool, delay_s: float) -> None:
         """Inject link faults in both directions: nothing arrives if `down`; otherwise messages arrive `delay_s` late."""
+
+    def start_over(self) -> bool:
+        """Return to the state before the first step, because world time starts over; return False if this autopilot cannot."""
 
     def skip(self, paused_s: float) -> None:
         """Advance the autopilot's own clock by a pause of the world, because a real autopilot's clock does not pause."""
@@ -151,11 +156,20 @@ class StubBackend:
 
     lockstep = False
 
-    def __init__(self, airframe: Airframe, config: WorldConfig, ports: Ports, *, external_vision: bool = False) -> None:
+    def __init__(
+        self,
+        airframe: Airframe,
+        config: WorldConfig,
+        ports: Ports,
+        *,
+        external_vision: bool = False,
+        in_lockstep: bool = False,
+    ) -> None:
         self._external_vision = external_vision
+        self._in_lockstep = in_lockstep
         self._config = config
         self._ports = ports
-        self.px4 = stub_of(config, airframe)
+        self.px4 = stub_of(config, airframe, LINK_DELAY_S if in_lockstep else 0.0)
 
     @property
     def armed(self) -> bool:
@@ -186,7 +200,7 @@ class StubBackend:
         """Open MAVLink over UDP and yield the companion's address."""
         ground = GROUND_PORTS if self._ports.remote else None
         vision = (VISION_PORTS if self._ports.remote else Ports(0, 0)) if self._external_vision else None
-        async with MavlinkServer(self.px4, self._ports, ground, vision) as self._mavlink:
+        async with MavlinkServer(self.px4, self._ports, ground, vision, in_lockstep=self._in_lockstep) as self._mavlink:
             yield f"udpout://127.0.0.1:{self._mavlink.onboard_port}"
 
     async def prepare(self) -> None:
@@ -213,6 +227,14 @@ class StubBackend:
         if down is not self._mavlink.link_down:
             self._mavlink.link_down = down
         self._mavlink.delay_s = delay_s
+
+    def start_over(self) -> bool:
+        """Start the stub over, unless it is armed."""
+        if self.armed:
+            return False
+        self.px4.start_over()
+        self._mavlink.start_over()
+        return True
 
     def skip(self, paused_s: float) -> None:
         """Advance the clock with which the stub stamps its messages."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import errno
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -32,6 +33,7 @@ _TEXTS_KEPT, _TEXT_STALE_S = 8, 5.0
 
 
 _STEP_MAX_S = 0.03
+_TIME_EPSILON_S = 1e-9
 
 
 class LinkError(Exception):
@@ -75,17 +77,25 @@ class Link(UdpEndpoint):
         self._ground_station_at_s: float | None = None
         self._texts: deque[tuple[float, int, bytes]] = deque(maxlen=_TEXTS_KEPT)
         self._text_id = 0
+        self._delayed: deque[tuple[float, Callable[[bytes, Address], None], bytes, Address]] = deque()
+        """Datagrams under way: (world time of arrival, handler, data, address)."""
+        self.in_lockstep = False
+        """Whether the world waits for the companion: time stands between two calls of `pump`."""
         self._pumped: tuple[float, float] | None = None
         """(wall-clock time, world time) of the last `pump`."""
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
-        """Decode and handle a datagram, after `delay_s`."""
+        """Decode and handle a datagram, after `delay_s` of world time."""
         if self.delay_s:
-            asyncio.get_running_loop().call_later(self.delay_s, self._take, data, addr)
+            self._later(self._take, data, (addr[0], addr[1]))
         else:
-            self._take(data, addr)
+            self._take(data, (addr[0], addr[1]))
 
-    def _take(self, data: bytes, addr: tuple[str | Any, int]) -> None:
+    def _later(self, handle: Callable[[bytes, Address], None], data: bytes, address: Address) -> None:
+        now_s = self._stub.t_s if self._pumped is None else self._pumped[1]
+        self._delayed.append((now_s + self.delay_s, handle, data, address))
+
+    def _take(self, data: bytes, addr: Address) -> None:
         if self.down:
             return
         messages = self._decoder.parse_buffer(data)
@@ -96,7 +106,7 @@ class Link(UdpEndpoint):
                 continue
             self.messages_in += 1
             if not self._loyal or self._spoken_to_of_boot != self._stub.booted_at_s:
-                self._spoken_to_of_boot, self._partner = self._stub.booted_at_s, (addr[0], addr[1])
+                self._spoken_to_of_boot, self._partner = self._stub.booted_at_s, addr
             self._stub.since_sample_s = self._since_sample_s()
             self._receiver.handle(self, message)
 
@@ -104,7 +114,9 @@ class Link(UdpEndpoint):
         if self._pumped is None:
             return 0.0
         wall_s, t_s = self._pumped
-        since_s = t_s - self._stub.t_s + asyncio.get_running_loop().time() - wall_s
+        since_s = t_s - self._stub.t_s
+        if not self.in_lockstep:
+            since_s += asyncio.get_running_loop().time() - wall_s
         return min(_STEP_MAX_S, max(0.0, since_s))  # after a longer gap the world counts as paused
 
     def send(self, message: Message) -> None:
@@ -114,13 +126,21 @@ class Link(UdpEndpoint):
         data = message.pack(self._encoder)
         self._encoder.seq = (self._encoder.seq + 1) % 256
         if self.delay_s:
-            asyncio.get_running_loop().call_later(self.delay_s, self._send_late, data, self._partner)
+            self._later(self._send_late, data, self._partner)
         else:
             self.send_to(data, self._partner)
 
     def _send_late(self, data: bytes, partner: Address) -> None:
         if not self.down:
             self.send_to(data, partner)
+
+    def start_over(self) -> None:
+        """Forget what was to be sent: world time starts over. Rates and partner stay."""
+        self.schedule.start_over()
+        self._texts.clear()
+        self._params_to_send.clear()
+        self._ground_station_at_s = self._pumped = None
+        self._spoken_to_of_boot = self._stub.booted_at_s
 
     def send_all_params(self) -> None:
         """Queue _HASH_CHECK and every parameter; each `pump` sends a few of them."""
@@ -153,6 +173,9 @@ class Link(UdpEndpoint):
     def pump(self, t_s: float) -> None:
         """Send the streams that are due at world time `t_s` and a few queued parameters."""
         self._pumped = (asyncio.get_running_loop().time(), t_s)
+        while self._delayed and self._delayed[0][0] <= t_s + _TIME_EPSILON_S:
+            _, handle, data, address = self._delayed.popleft()
+            handle(data, address)
         if self.down or self._partner is None:
             return
         for message in self.schedule.messages(self._stub, t_s):
@@ -176,9 +199,16 @@ class MavlinkServer:
     """
 
     def __init__(
-        self, stub: Px4Stub, onboard: Ports = ONBOARD_PORTS, ground: Ports | None = None, vision: Ports | None = None
+        self,
+        stub: Px4Stub,
+        onboard: Ports = ONBOARD_PORTS,
+        ground: Ports | None = None,
+        vision: Ports | None = None,
+        *,
+        in_lockstep: bool = False,
     ) -> None:
         self._stub = stub
+        self._in_lockstep = in_lockstep
         self._wanted = [(onboard, False)] + ([(ground, True)] if ground is not None else [])
         self._vision_wanted = vision
         self._vision: Link | None = None
@@ -222,6 +252,11 @@ class MavlinkServer:
         """Number of messages decoded on all links."""
         return sum(link.messages_in for link in self._links)
 
+    def start_over(self) -> None:
+        """Forget what was to be sent on all links: world time starts over."""
+        for link in self._links if self._vision is None else (*self._links, self._vision):
+            link.start_over()
+
     async def __aenter__(self) -> Self:
         receiver = Receiver(self._stub)
         for ports, ground in self._wanted:
@@ -235,6 +270,7 @@ class MavlinkServer:
     async def _open(self, receiver: Receiver, ports: Ports, ground: bool) -> Link:
         partner = (_HOST, ports.remote) if ports.remote else None
         link = Link(self._stub, receiver, partner, ground)
+        link.in_lockstep = self._in_lockstep
         loop = asyncio.get_running_loop()
         try:
             await loop.create_datagram_endpoint(lambda: link, local_addr=(_HOST, ports.local))

@@ -143,7 +143,7 @@ class Receiver:
     def _command(self, link: Reply, message: Message, params: Command7) -> None:
         result = self._link_command(link, message.command, params)
         if result is None:
-            result = self._stub.on_command(self._stub.t_s, message.command, params)
+            result = self._stub.on_command(self._stub.arrival_s, message.command, params)
         link.send(
             mavlink.MAVLink_command_ack_message(
                 message.command, int(result), 0, 0, message.get_srcSystem(), message.get_srcComponent()
@@ -180,7 +180,7 @@ class Receiver:
     def _set_mode(self, link: Reply, message: Message) -> None:
         main_mode, sub_mode = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
         params: Command7 = (float(message.base_mode), float(main_mode), float(sub_mode), 0.0, 0.0, 0.0, 0.0)
-        self._stub.on_command(self._stub.t_s, Command.DO_SET_MODE, params)
+        self._stub.on_command(self._stub.arrival_s, Command.DO_SET_MODE, params)
 
     def _set_attitude_target(self, _link: Reply, message: Message) -> None:
         m = message
@@ -188,7 +188,7 @@ class Receiver:
         rates = (m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate)
         target = decode_attitude_target(m.type_mask, q, rates, m.thrust)
         if target is not None:
-            self._stub.on_setpoint(self._stub.t_s, target)
+            self._stub.on_setpoint(self._stub.arrival_s, target)
 
     def _set_position_target(self, _link: Reply, message: Message) -> None:
         m = message
@@ -203,7 +203,7 @@ class Receiver:
             self._stub.heading_rad,
         )
         if target is not None:
-            self._stub.on_setpoint(self._stub.t_s, target)
+            self._stub.on_setpoint(self._stub.arrival_s, target)
 
     def _vision_position_estimate(self, _link: Reply, message: Message) -> None:
         m = message
@@ -219,7 +219,7 @@ class Receiver:
 
     def _vision(self, position_ned_m: Vec3, attitude: tuple[float, float, float, float]) -> None:
         if all(map(math.isfinite, (*position_ned_m, *attitude))):
-            self._stub.on_vision(self._stub.t_s, position_ned_m, attitude)
+            self._stub.on_vision(self._stub.arrival_s, position_ned_m, attitude)
 
     def _set_origin(self, link: Reply, message: Message) -> None:
         self._stub.set_origin(Origin(message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3))

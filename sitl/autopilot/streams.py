@@ -94,6 +94,10 @@ class Schedule:
         for key, rate_hz in self._default_hz.items():
             self.set_rate(key, rate_hz)
 
+    def start_over(self) -> None:
+        """Let every stream be due at once: world time starts over."""
+        self._due_s = dict.fromkeys(self._due_s, -math.inf)
+
     def set_rate(self, message_id: int, rate_hz: float) -> bool:
         """Set the rate of a stream, limited by PX4's maximum; 0 stops it. Return False if there is no such stream."""
         stream = STREAMS.get(message_id)

@@ -29,7 +29,7 @@ class FastLink:
     def __init__(self, faults: Faults, world: World, px4: Px4Stub, tick_s: float) -> None:
         self._faults, self._world, self._px4, self._tick_s = faults, world, px4, tick_s
         self._in_flight: deque[tuple[float, Callable[[], None]]] = deque()
-        self._received: deque[tuple[VehicleState | None, AutopilotStatus]] = deque(maxlen=MEMORY)
+        self._received: deque[tuple[VehicleState | None, AutopilotStatus | None]] = deque(maxlen=MEMORY)
         """States that PX4 sent in the last ticks, newest first."""
 
     @property
@@ -56,8 +56,8 @@ class FastLink:
                 deliver()
 
     def receive(
-        self, state: VehicleState | None, status: AutopilotStatus
-    ) -> tuple[VehicleState | None, AutopilotStatus]:
+        self, state: VehicleState | None, status: AutopilotStatus | None
+    ) -> tuple[VehicleState | None, AutopilotStatus | None]:
         """Return what the core receives in this tick: a delayed state if the link is slow, the last received state if the link is
         lost.
         """
@@ -78,4 +78,6 @@ class FastLink:
                 attitude_stamp_s=state.attitude_stamp_s + delay_s,
                 imu_stamp_s=state.imu_stamp_s + delay_s,
             )
-        return state, replace(status, heartbeat_stamp_s=status.heartbeat_stamp_s + delay_s)
+        if status is not None:
+            status = replace(status, heartbeat_stamp_s=status.heartbeat_stamp_s + delay_s)
+        return state, status

@@ -12,21 +12,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
+from msgspec.structs import replace
+
 from companion.core.flight_core import FlightCore
-from companion.io.px4.delta_velocity import DeltaVelocity
-from companion.io.px4.messages import estimator_report
+from companion.flight.ticker import SIMULATED_START_S
 from companion.model.constants import TICK_PERIOD_S
-from companion.model.estimator import WATCHED_RATE_HZ, EstimatorReport
 from companion.model.frames import (
-    attitude_enu_flu_from_ned_frd,
     attitude_ned_frd_from_enu_flu,
-    enu_from_ned,
-    flu_from_frd,
     ned_from_enu,
 )
 from companion.model.types import (
     AutopilotRequest,
-    AutopilotStatus,
     Event,
     FlightMode,
     ForceSample,
@@ -37,31 +33,28 @@ from companion.model.types import (
     Outputs,
     Quat,
     Vec3,
-    VehicleState,
 )
 from companion.sitl_config.faults import FaultKind
 from companion.sitl_config.loader import SitlConfig
-from sitl.autopilot.autopilot import Command7, Px4Stub
-from sitl.autopilot.backend import set_hover_thrust, stub_of
+from sitl.autopilot.autopilot import Command7
+from sitl.autopilot.backend import LINK_DELAY_S, set_hover_thrust, stub_of
 from sitl.autopilot.commander import FORCE_MAGIC, Command
 from sitl.autopilot.modes import NavState
-from sitl.autopilot.telemetry import estimator_status, system_status
-from sitl.autopilot.types import AttitudeTarget, ImuSample, RotorCommands
+from sitl.autopilot.types import AttitudeTarget
 from sitl.fast.bus import FastBus, scales_of
 from sitl.fast.guardian import TAKE_OVER_S, FastGuardian, Landing
 from sitl.fast.link import FastLink
+from sitl.fast.telemetry import FastTelemetry
 from sitl.faults.injector import Faults
 from sitl.faults.timing import with_fault_times
-from sitl.force_torque import overloaded, quantised
+from sitl.force_torque import TIME_EPSILON_S, overloaded, quantised
 from sitl.server import start_of
 from sitl.servo.from_config import plugged_in, servos_of
 from sitl.world.plant import MocapFrame, Plant
 from sitl.world.world import Layout, Snapshot, Truth
 
-LINK_DELAY_S = 0.002
-"""Time from sending a setpoint to its arrival at PX4."""
-POSITION_PERIOD_S: Final = 1.0 / 124.0
-"""Period of PX4's fastest position stream; attitude and IMU data arrive with every tick."""
+START_S: Final = SIMULATED_START_S
+"""World time at the first tick, as over the wires."""
 _NO_COMMAND: Final = OperatorCommand.NONE
 _LAND: Final = OperatorCommand.LAND
 _ON_GROUND: Final = LandedState.ON_GROUND
@@ -124,22 +117,6 @@ def _garbage_collection_paused() -> Iterator[None]:
             gc.enable()
 
 
-class _RecordedImu:
-    """Steps PX4 and sums its IMU samples, as the companion does with the IMU stream."""
-
-    def __init__(self, px4: Px4Stub) -> None:
-        self._px4 = px4
-        self.total = DeltaVelocity()
-
-    def step(self, imu: ImuSample) -> RotorCommands:
-        """Step PX4 by one IMU sample, add the sample to `total` and return the rotor commands."""
-        rotors = self._px4.step(imu)
-        boot_s = imu.t_s - self._px4.booted_at_s
-        if boot_s >= 0.0 and self._px4.imu is not None:
-            self.total.add(boot_s, self._px4.imu.accel_frd_m_s2)
-        return rotors
-
-
 class FastFlight:
     """One flight in the fast closed loop.
 
@@ -156,8 +133,7 @@ class FastFlight:
         servos = servos_of(vehicle, world)
         drives = [servo.drive for servo in servos]
         pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
-        self._imu = _RecordedImu(self.px4)
-        self.plant = Plant(vehicle, world, self._imu, drives, (pose.position_m, pose.yaw_rad, pose.arm_rad))
+        self.plant = Plant(vehicle, world, self.px4, drives, (pose.position_m, pose.yaw_rad, pose.arm_rad))
         self.faults = Faults(world, self.plant.world, self.px4, drives, vehicle.tether)
         if world.faults:
             self.plant.faults = self.faults
@@ -176,11 +152,12 @@ class FastFlight:
         self._external = vehicle.devices.mocap.external
         """Whether another program feeds PX4 with poses: the companion receives none."""
         self._mocap: MocapPose | None = None
-        self._has_force = vehicle.devices.force is not None
+        force = vehicle.devices.force
+        self._force_period_s = None if force is None else 1.0 / force.rate_hz
+        """Period of the force sensor's samples; None if the vehicle has none."""
+        self._force_due_s = 0.0
         self._force: ForceSample | None = None
-        self._position = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
-        self._estimator_s = -math.inf
-        self._report: EstimatorReport | None = None
+        self._telemetry = FastTelemetry(self.px4, self.plant.battery, external=self._external)
         self._trusted = True
         """Whether the core trusts motion capture; only trusted poses are forwarded to PX4."""
         self._dropped = 0
@@ -198,14 +175,16 @@ class FastFlight:
     def _run(self, result: FastResult, limit_s: float, until_mission_s: float = math.inf) -> None:
         plant, core, px4 = self.plant, self.core, self.px4
         world, guardian = plant.world, self._guardian
-        period = tick = 0
+        period, tick = round(START_S / TICK_PERIOD_S), 0
+        while world.t_s < START_S - 1e-9:
+            self._step()
+            self._bus.keep_alive(world.t_s)
+        self._telemetry.start_sums()
         while world.t_s < limit_s:
             period += 1
             due_s = period * TICK_PERIOD_S - 1e-9
             while world.t_s < due_s:
-                plant.step(px4.armed)
-                for frame in plant.take_mocap():
-                    self._deliver(frame)
+                self._step()
             if guardian is not None and self._flight_process_stalled(guardian):
                 if guardian.decides_to_take_over(world.t_s, False, plant.fault("kill_flight") is not None):
                     self._guardian_lands(guardian, result, limit_s)
@@ -231,6 +210,26 @@ class FastFlight:
             result.guardian_events = guardian.events
             self._settle(result)
         result.armed = px4.armed
+
+    def _step(self) -> None:
+        """Advance the world by a step, and let motion capture and PX4 send what is due."""
+        plant = self.plant
+        plant.step(self.px4.armed)
+        for frame in plant.take_mocap()[-1:]:  # of frames that wait, the driver delivers the newest
+            self._deliver(frame)
+        if self._force_period_s is not None and plant.world.t_s >= self._force_due_s - TIME_EPSILON_S:
+            self._force_due_s += self._force_period_s
+            self._sample_force()
+        self._telemetry.pump(plant.world.t_s)
+
+    def _sample_force(self) -> None:
+        """Take a sample of the force sensor, which the next tick reads."""
+        force_n, torque_nm = self.plant.force_torque()
+        if self.plant.fault("force_loss") is not None:
+            return
+        force, torque = quantised(force_n, torque_nm)
+        overload = overloaded(force_n, torque_nm)
+        self._force = ForceSample(stamp_s=math.nan, force_sensor_n=force, torque_sensor_nm=torque, overload=overload)
 
     def _settle(self, result: FastResult) -> None:
         """Let PX4 finish the landing of a flight that has ended in the air."""
@@ -318,21 +317,17 @@ class FastFlight:
         plant, t_s = self.plant, self.plant.world.t_s
         dropped, guardian_ready = 0, None
         if plant.faults is None:
-            vehicle, status = self._vehicle(t_s), self._status(t_s)
+            vehicle, status = self._telemetry.vehicle(t_s), self._telemetry.status(t_s)
         else:
             self._link.deliver_due()
-            vehicle, status = self._link.receive(self._vehicle(t_s), self._status(t_s))
+            vehicle, status = self._link.receive(self._telemetry.vehicle(t_s), self._telemetry.status(t_s))
             active = self.faults.active
             guardian_ready = "kill_guardian" not in active
             if "kill_recorder" in active or "disk_full" in active:
                 self._dropped += 1
             dropped = self._dropped
-        if self._has_force and plant.fault("force_loss") is None:
-            force_n, torque_nm = plant.force_torque()
-            force, torque = quantised(force_n, torque_nm)
-            self._force = ForceSample(
-                stamp_s=t_s, force_sensor_n=force, torque_sensor_nm=torque, overload=overloaded(force_n, torque_nm)
-            )
+        if self._force is not None and math.isnan(self._force.stamp_s):
+            self._force = replace(self._force, stamp_s=t_s)
         land = self._land_at_s is not None and t_s >= self._land_at_s
         return Inputs(
             tick=tick,
@@ -345,52 +340,7 @@ class FastFlight:
             command=_LAND if land else _NO_COMMAND,
             recorder_dropped=dropped,
             guardian_ready=guardian_ready,
-            estimator=self._estimator(t_s) if self._external else None,
-        )
-
-    def _vehicle(self, t_s: float) -> VehicleState | None:
-        estimate = self.px4.estimate
-        if estimate is None:
-            return None
-        if not (estimate.vision_fused or (estimate.position_valid if self._external else self._mocap is not None)):
-            return None
-        if t_s - self._position[2] >= POSITION_PERIOD_S - 1e-9:
-            self._position = (enu_from_ned(estimate.position_ned_m), enu_from_ned(estimate.velocity_ned_m_s), t_s)
-        position, velocity, stamp_s = self._position
-        return VehicleState(
-            position_stamp_s=stamp_s,
-            attitude_stamp_s=t_s,
-            imu_stamp_s=t_s,
-            position_world_m=position,
-            velocity_world_m_s=velocity,
-            attitude_wxyz=attitude_enu_flu_from_ned_frd(estimate.attitude_ned_frd),
-            angular_rate_body_rad_s=flu_from_frd(estimate.rates_frd_rad_s),
-            specific_force_body_m_s2=flu_from_frd(estimate.accel_frd_m_s2),
-            boot_s=None if self.plant.faults is None else t_s - self.px4.booted_at_s,
-            imu_boot_s=self._imu.total.boot_s,
-            delta_velocity_body_m_s=flu_from_frd(self._imu.total.sum_m_s),
-            imu_gaps=self._imu.total.gaps,
-        )
-
-    def _estimator(self, t_s: float) -> EstimatorReport | None:
-        """Return the newest ESTIMATOR_STATUS, as PX4 sends it; None before the first."""
-        if self._link.alive and t_s - self._estimator_s >= 1.0 / WATCHED_RATE_HZ - 1e-9:
-            message = estimator_status(self.px4)
-            if message is not None:
-                self._estimator_s, self._report = t_s, estimator_report(message.to_dict(), t_s)
-        return self._report
-
-    def _status(self, t_s: float) -> AutopilotStatus:
-        commander = self.px4.commander
-        battery = self.plant.battery()
-        return AutopilotStatus(
-            heartbeat_stamp_s=t_s,
-            armed=commander.armed,
-            mode=_MODES.get(commander.nav_state, FlightMode.OTHER),
-            landed=_ON_GROUND if self.px4.land.landed else _IN_AIR,
-            battery_voltage_v=battery.voltage_v,
-            battery_remaining=battery.remaining,
-            system_status=system_status(self.px4),
+            estimator=self._telemetry.estimator(t_s) if self._external else None,
         )
 
     def _carry_out(self, outputs: Outputs) -> None:

@@ -279,6 +279,10 @@ class RealPx4:
         if self._relay is not None:
             self._relay.down, self._relay.delay_s = down, delay_s
 
+    def start_over(self) -> bool:
+        """Return False: the clock of a real PX4 cannot go back."""
+        return False
+
     def skip(self, paused_s: float) -> None:
         """Do nothing: PX4 has no clock but world time, and a gap in its samples would disturb its estimate."""
 

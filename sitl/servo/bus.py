@@ -11,6 +11,7 @@ import termios
 from collections.abc import Callable, Iterable
 from typing import Self
 
+from companion.runtime.simulated_time import Page
 from sitl.pty import PtyLine
 from sitl.servo.model import ServoModel, ServoRefusal
 from sitl.servo.protocol import (
@@ -241,14 +242,20 @@ class ServoBus:
 
     Args:
         servos: the servos on the wire.
+        page: page of simulated time, on which the bus writes how much it has answered; None in real time. In simulated time the
+            transmission takes no time.
         wire_time: delay every answer by the transmission time of request and answer at the line's baud rate and by the return
             delays. The event loop's granularity of 1 ms represents the latency timer of the USB adapter.
 
     The companion's baud rate is read from the pty's line settings; servos at another baud rate stay silent, as on a real wire.
     """
 
-    def __init__(self, servos: Iterable[ServoModel], *, wire_time: bool = True) -> None:
+    def __init__(self, servos: Iterable[ServoModel], *, wire_time: bool = True, page: Page | None = None) -> None:
         self.line = ServoLine(servos)
+        self._page = page
+        self._taken = asyncio.Event()
+        self.taken_bytes = 0
+        """Bytes of instructions that were read from the line."""
         self.dropped_bytes = 0
         """Bytes of answers that were dropped because the line was not read."""
         self.damaged: Callable[[], bool] = lambda: False
@@ -277,25 +284,38 @@ class ServoBus:
     def _on_bytes(self, data: bytes) -> None:
         loop = asyncio.get_running_loop()
         now_s = loop.time()
-        if self.line.packet_pending and now_s - self._last_byte_s > _PARTIAL_TIMEOUT_S:
+        if self._page is None and self.line.packet_pending and now_s - self._last_byte_s > _PARTIAL_TIMEOUT_S:
             self.line.drop_partial()
         self._last_byte_s = now_s
         # No servo supports a speed without a name in termios.
         baud_bps = _BAUD_OF_SPEED.get(self._pty.speed(), 0)
         answer, delay_s = self.answer_to(data, baud_bps)
-        if not answer:
+        if self._page is not None or not self._wire_time:
+            if answer:
+                self._send(answer)
+            self.taken_bytes += len(data)
+            self._taken.set()
+            if self._page is not None:
+                self._page.bus_answered_bytes = self.taken_bytes
             return
-        if not self._wire_time:
-            self._send(answer)
+        if not answer:
             return
         on_wire_s = (len(data) + len(answer)) * _BITS_PER_BYTE / baud_bps
         self._line_free_s = max(now_s, self._line_free_s) + on_wire_s + delay_s
         self._timers = {timer for timer in self._timers if not timer.cancelled() and timer.when() > now_s}
         self._timers.add(loop.call_at(self._line_free_s, self._send, answer))
 
+    async def take(self, count: int, timeout_s: float) -> None:
+        """Wait until `count` bytes of instructions have been read from the line, at most `timeout_s` of wall time."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                while self.taken_bytes < count:
+                    self._taken.clear()
+                    await self._taken.wait()
+
     def inject(self, noise: bytes) -> None:
         """Send bytes on the line unchanged, for example noise."""
-        self._pty.write(noise)
+        self._send(noise)
 
     def answer_to(self, data: bytes, baud_bps: int) -> tuple[bytes, float]:
         """Return the servos' answer to a request sent at a given baud rate, and their total return delay in s; noise may corrupt
@@ -307,4 +327,7 @@ class ServoBus:
         return self.line.exchange(data, baud_bps)
 
     def _send(self, answer: bytes) -> None:
-        self.dropped_bytes += self._pty.write(answer)
+        dropped = self._pty.write(answer)
+        self.dropped_bytes += dropped
+        if self._page is not None:
+            self._page.bus_sent_bytes += len(answer) - dropped

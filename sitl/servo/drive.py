@@ -75,6 +75,14 @@ class ServoDrive:
         self._current_counts = 0
         self.forget_turns()
 
+    def start_over(self) -> None:
+        """Forget the course of the shaft, pending goals and a tripped watchdog: world time starts over. Settings stay."""
+        self.now_s = self._current = self._heard_s = 0.0
+        self.slip_counts = 0
+        self._updated = False
+        self.set_goal_current(0, at_once=True)
+        self.start_watchdog(self._watchdog_s)
+
     def update(self, t_s: float, shaft_angle_rad: float, shaft_velocity_rad_s: float) -> float:
         """Process the shaft's state and return the motor current.
 

@@ -168,7 +168,7 @@ def flown(died_s: float, back_s: float, change: Change = lambda i: i) -> tuple[F
     return flight, flight.run()
 
 
-@pytest.mark.parametrize(("died_s", "gone_s"), [(5.0, 8.0), (9.4, 0.1), (9.4, 2.5)])
+@pytest.mark.parametrize(("died_s", "gone_s"), [(7.2, 8.0), (11.6, 0.1), (11.6, 2.5)])
 def test_started_again_in_the_air_it_lands_what_still_flies(died_s: float, gone_s: float) -> None:
     """PX4 has been without motion capture: after 4.5 s it descends blindly and never finds that it stands."""
     flight, result = flown(died_s, died_s + gone_s)
@@ -183,8 +183,8 @@ def test_started_again_in_the_air_it_lands_what_still_flies(died_s: float, gone_
 
 
 def test_the_arm_folds_from_where_it_is_at_a_bounded_rate() -> None:
-    _, result = flown(9.4, 9.6)
-    back = [truth.joint_angle_rad for truth in result.truth if truth.t_s >= 9.6]
+    _, result = flown(11.6, 11.8)
+    back = [truth.joint_angle_rad for truth in result.truth if truth.t_s >= 11.8]
     fastest = max(
         abs(b - a) / 0.005
         for before, after in itertools.pairwise(back[20:])
@@ -196,18 +196,18 @@ def test_the_arm_folds_from_where_it_is_at_a_bounded_rate() -> None:
 
 
 def test_with_a_dead_arm_bus_it_lands_all_the_same() -> None:
-    flight, result = flown(9.4, 9.6, lambda i: replace(i, arm=None, force=None) if i.t_s >= 9.4 else i)
+    flight, result = flown(11.6, 11.8, lambda i: replace(i, arm=None, force=None) if i.t_s >= 11.6 else i)
     assert result.outputs[-1].outcome is Outcome.ABORTED
     assert not result.crashed and not flight.px4.armed
-    assert all(o.arm_torque_nm is None for o in result.outputs if o.t_s >= 9.4)
+    assert all(o.arm_torque_nm is None for o in result.outputs if o.t_s >= 11.6)
 
 
 def test_a_pilot_who_flies_is_only_given_motion_capture() -> None:
     def change(i: Inputs) -> Inputs:
-        return put("status", mode=FlightMode.MANUAL)(i) if i.t_s >= 9.4 else i
+        return put("status", mode=FlightMode.MANUAL)(i) if i.t_s >= 11.6 else i
 
-    _, result = flown(9.4, 9.6, change)
-    after = [o for o in result.outputs if o.t_s >= 9.6]
+    _, result = flown(11.6, 11.8, change)
+    after = [o for o in result.outputs if o.t_s >= 11.8]
     assert all(o.attitude is None and o.request is AutopilotRequest.NONE for o in after)
     assert ids(after).count("reattached") == 1
     assert after[-1].outcome is Outcome.ABORTED, "PX4 disarmed"

@@ -102,14 +102,14 @@ def test_held_too_long_it_lands() -> None:
 
 
 def test_held_just_above_the_floor_it_lands() -> None:
-    result = flown(asking((3.6, OperatorCommand.HOLD)))
+    result = flown(asking((5.8, OperatorCommand.HOLD)))
     assert result.outputs[-1].outcome is Outcome.ABORTED
     assert "no_room_to_stay" in event_ids(result)
     assert_safe(result)
 
 
 def test_a_landing_is_not_held() -> None:
-    result = short_flown(asking((8.0, OperatorCommand.HOLD)))
+    result = short_flown(asking((10.2, OperatorCommand.HOLD)))
     assert "operator_hold" in event_ids(result)
     assert result.outputs[-1].outcome is Outcome.COMPLETED
 
@@ -258,7 +258,7 @@ def test_broken_values_for_good_are_a_lost_device(part: str, lost: str) -> None:
 
 def test_poses_of_another_body_are_not_passed_on_and_px4_lands() -> None:
     def change(i: Inputs) -> Inputs:
-        if i.mocap is None or i.t_s < 5.0:
+        if i.mocap is None or i.t_s < 7.2:
             return i
         x, y, z = i.mocap.position_world_m
         return replace(i, mocap=replace(i.mocap, position_world_m=(x + 0.8, y, z)))
@@ -267,8 +267,8 @@ def test_poses_of_another_body_are_not_passed_on_and_px4_lands() -> None:
     ids = event_ids(result)
     assert ids[:3] == ["takeoff", "mocap_jump", "mocap_swapped"]
     swapped = next(e for o in result.outputs for e in o.events if e.id == "mocap_swapped")
-    assert swapped.t_s - 5.0 < short().vehicle.safety.mocap_timeout_s + 0.05
-    assert all(o.mocap_trusted == (o.t_s < 5.0) for o in result.outputs if o.t_s < 7.0)
+    assert swapped.t_s - 7.2 < short().vehicle.safety.mocap_timeout_s + 0.05
+    assert all(o.mocap_trusted == (o.t_s < 7.2) for o in result.outputs if o.t_s < 9.2)
 
 
 # -- nothing is sent again -------------------------------------------------------------------------------------------

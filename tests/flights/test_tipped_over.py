@@ -47,7 +47,7 @@ class TippedOver(FastFlight):
 
 
 @pytest.mark.parametrize(
-    ("below_m", "after_s"), [(0.35, 6.5), (0.31, 8.0)], ids=["just before touch-down", "after touch-down"]
+    ("below_m", "after_s"), [(0.35, 8.7), (0.31, 10.2)], ids=["just before touch-down", "after touch-down"]
 )
 def test_tipped_over_on_the_floor_its_rotors_are_stopped_by_the_flight(below_m: float, after_s: float) -> None:
     flight = TippedOver(below_m, after_s)
@@ -60,7 +60,7 @@ def test_tipped_over_on_the_floor_its_rotors_are_stopped_by_the_flight(below_m: 
 
 
 def test_tipped_over_on_the_floor_its_rotors_are_stopped_by_the_guardian() -> None:
-    flight = TippedOver(0.35, 6.5, "{kind: kill_flight, t_s: 4.4}")
+    flight = TippedOver(0.35, 8.7, "{kind: kill_flight, t_s: 4.4}")
     result = flight.run()
     assert result.guardian_landed is True
     assert "tipped over on the floor: FORCE_DISARM is requested at once" in [e.text for e in result.guardian_events]

@@ -115,7 +115,7 @@ def test_over_a_slow_link_everything_comes_in_order_and_that_much_later(flight: 
         link.deliver_due()
         link.send(lambda sent_s=t_s: arrived.append((sent_s, world.t_s)))  # type: ignore[misc]
         state, heard = link.receive(*at_rest(t_s))
-        assert state is not None
+        assert state is not None and heard is not None
         if tick >= 10:
             assert state.position_world_m[0] == pytest.approx(t_s - 0.05), "what was said then"
             assert state.attitude_stamp_s == heard.heartbeat_stamp_s == pytest.approx(t_s), "but it arrives now"
@@ -135,6 +135,7 @@ def test_over_a_dead_link_nothing_comes_and_the_last_word_stays(flight: FastFlig
     assert link.receive(*at_rest(1.0)) == last
     flight.faults.active.clear()
     assert link.receive(*at_rest(1.0)) == at_rest(1.0)
+    assert last[1] is not None
     assert replace(last[1], heartbeat_stamp_s=1.0) == at_rest(1.0)[1]
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import math
 import queue
 import threading
-import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
@@ -22,6 +22,7 @@ from companion.model.observations import ArmStatement, ServoReport
 from companion.model.servos import WATCHDOG_ERROR
 from companion.model.types import ArmState, Joints
 from companion.runtime.clock import Clock
+from companion.runtime.event_loop import time_stands
 
 OPEN_TIMEOUT_S: Final = 8.0
 _FIRST_READS = 5
@@ -77,7 +78,7 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
         self._jobs: queue.SimpleQueue[object] = queue.SimpleQueue()
         """Queue of `_Read` objects and of the markers above."""
         self._goals: deque[Goal] = deque(maxlen=1)
-        self._goal_handed_s = 0.0
+        self._goal_handed_s = math.inf
         self._bus_in_use = threading.Lock()
         self._state: ArmState | None = None
         self._failures = 0
@@ -153,7 +154,8 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
             assert self._loop is not None, "the arm is not open"
             waiter = reading.waiter = self._loop.create_future()
             if not reading.done:  # otherwise the thread may have checked for a waiter before there was one
-                await asyncio.wait((waiter,), timeout=timeout_s)
+                with time_stands():
+                    await asyncio.wait((waiter,), timeout=timeout_s)
             if not reading.done:
                 return self._state
         self._reading = None
@@ -172,7 +174,7 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
             ValueError: a torque is not finite.
         """
         goal, sent_nm = self._encode(torque_nm)
-        self._goal_handed_s = time.monotonic()
+        self._goal_handed_s = self._clock()
         if self.writes_at_once and self._bus_in_use.acquire(blocking=False):
             try:
                 self._goals.clear()  # an older one that the thread has not sent yet
@@ -204,13 +206,8 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
         watchdog_s, limp = self._watchdog_s, self._limp
         later: _Read | None = None
         while True:
-            wait_s = watchdog_s / KEEPALIVES_PER_WATCHDOG
-            if later is not None:
-                wait_s = min(wait_s, later.at_s - self._clock())
-            try:
-                job = self._jobs.get(timeout=max(0.0, wait_s))
-            except queue.Empty:
-                job = None
+            due_s = self._clock() + watchdog_s / KEEPALIVES_PER_WATCHDOG
+            job = self._next_job(due_s if later is None else min(due_s, later.at_s))
             if job is _STOP:
                 return
             if job is _WRITE:
@@ -237,10 +234,19 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
             if tripped:
                 with self._bus_in_use:
                     self._try(self._restart_watchdogs)
-            elif self._goal_handed_s > 0.0 and time.monotonic() - self._goal_handed_s > watchdog_s:
+            elif self._clock() - self._goal_handed_s > watchdog_s:
                 # Repeated, because a sync write has no reply and our reads keep the servos' watchdogs from tripping.
                 with self._bus_in_use:
                     self._try(lambda: self._write_bus(limp))
+
+    def _next_job(self, due_s: float) -> object:
+        """Return the next job; None if none has come by `due_s` on the flight clock, which may be slower than the computer's."""
+        while True:
+            try:
+                return self._jobs.get(timeout=max(0.0, due_s - self._clock()))
+            except queue.Empty:
+                if self._clock() >= due_s:
+                    return None
 
     def _write_newest(self) -> None:
         with self._bus_in_use:

@@ -7,7 +7,6 @@ Everything here runs in the bus thread, but for `write_currents`, which the even
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Callable
 
 from dynamixel_sdk import COMM_SUCCESS, PacketHandler
@@ -21,6 +20,7 @@ from companion.io.dynamixel.scale import RAD_PER_COUNT, JointScale
 from companion.io.protocols import DeviceError
 from companion.model.observations import ServoReport
 from companion.model.servos import COUNTS_PER_TURN, hardware_error_text, model_text
+from companion.runtime.clock import monotonic
 
 _FLIGHT_REPLY_TIMEOUT_MS = 8.0
 """Reply timeout in flight, the longest delay caused by an absent servo."""
@@ -53,7 +53,7 @@ class ArmBus:
         self._aborted = aborted
         self._ids = [joint.servo_id for joint in arm.joints]
         self._protocol = PacketHandler(2.0)
-        self._port = dxl.ServoPort(device.port)
+        self._port = dxl.servo_port(device.port)
         self._request = packets.sync_read(dxl.INDIRECT_DATA_1, dxl.BLOCK_SIZE, self._ids)
         self._deadline_s = 0.0
         self._watchdog = device.watchdog_ms // dxl.WATCHDOG_UNIT_MS
@@ -67,7 +67,7 @@ class ArmBus:
         Raises:
             DeviceError: a servo or the port does not meet the requirements; the text is one line.
         """
-        self._deadline_s = time.monotonic() + timeout_s
+        self._deadline_s = monotonic() + timeout_s
         self._open_port()
         for joint in self._joints:
             self._check_identity(joint)
@@ -328,7 +328,7 @@ class ArmBus:
     def _check_time(self) -> None:
         if self._aborted():
             raise self._error("set-up", None, "given up")
-        if time.monotonic() > self._deadline_s:
+        if monotonic() > self._deadline_s:
             raise self._error("set-up", None, "not finished in time: the servos answer too slowly; check the cables")
 
     def _error(self, what: str, ids: int | list[int] | None, text: str) -> DeviceError:

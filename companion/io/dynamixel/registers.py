@@ -24,6 +24,8 @@ from companion.config.arm import Joint
 from companion.io.dynamixel.scale import JointScale
 from companion.io.protocols import DeviceError
 from companion.model.servos import COUNTS_PER_TURN
+from companion.runtime import simulated_time
+from companion.runtime.simulated_time import SimulatedTime
 
 MODE_CURRENT: Final = 0
 WATCHDOG_UNIT_MS = 20
@@ -88,6 +90,8 @@ def cycle_s(servos: int, baud: int) -> float:
 _POLL_MS = 1.0
 _NOISE_PATIENCE = 20.0
 NOISE_BYTES = 4096
+_LOOK_S = 0.001
+"""Longest wait in simulated time without asking whether a reply is still to come."""
 """More bytes than the replies to any one instruction: 252 servos answer a broadcast ping with 14 bytes each."""
 
 
@@ -260,8 +264,9 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         """Return all bytes that have arrived, after a wait of at most 1 ms; empty if none have. pyserial's `read` takes only the bytes
         asked for, so that each packet would cost two waits and two reads.
         """
-        if not select.select((self.ser.fd,), (), (), _POLL_MS * 1e-3)[0]:
-            return b""
+        return self._read_now() if select.select((self.ser.fd,), (), (), _POLL_MS * 1e-3)[0] else b""
+
+    def _read_now(self) -> bytes:
         try:
             data = os.read(self.ser.fd, NOISE_BYTES)
         except BlockingIOError:
@@ -286,6 +291,63 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         silence = elapsed_ms > self.packet_timeout and self._waited_ms > 0.5 * self.packet_timeout
         self._reply_missing = noise or silence
         return self._reply_missing
+
+
+class SimulatedPort(ServoPort):
+    """Serial port to the servo bus in simulated time, which stands while a reply is on its way: a reply is missing once the world has
+    answered everything that was written.
+    """
+
+    def __init__(self, port_name: str | None, simulated: SimulatedTime) -> None:
+        super().__init__(port_name)
+        self._simulated = simulated
+        self._silent = False
+
+    def getCurrentTime(self) -> float:
+        """Return simulated time, ms."""
+        return self._simulated.now() * 1e3
+
+    def setPacketTimeoutMillis(self, msec: float) -> None:
+        """Expect a reply."""
+        super().setPacketTimeoutMillis(msec)
+        self._silent = False
+
+    def writePort(self, packet: list[int] | bytes) -> int:
+        """Pass a packet to the port and count its bytes."""
+        written = super().writePort(packet)
+        self._simulated.bus_bytes += written
+        return written
+
+    def clearPort(self) -> None:
+        """Discard the bytes that have arrived, and count them."""
+        while self._received():
+            pass
+        self._arrived = b""
+
+    def isPacketTimeout(self) -> bool:
+        """Return whether no reply will arrive."""
+        return self._silent or self._taken_bytes > NOISE_BYTES
+
+    def _receive(self) -> bytes:
+        while True:
+            if data := self._received(_LOOK_S):
+                return data
+            if self._simulated.bus_is_silent:
+                self._silent = True
+                return b""
+
+    def _received(self, timeout_s: float = 0.0) -> bytes:
+        if not select.select((self.ser.fd,), (), (), timeout_s)[0]:
+            return b""
+        data = self._read_now()
+        self._simulated.bus_received_bytes += len(data)
+        return data
+
+
+def servo_port(port_name: str | None) -> ServoPort:
+    """Return a port for the time that this process lives in."""
+    simulated = simulated_time.current()
+    return ServoPort(port_name) if simulated is None else SimulatedPort(port_name, simulated)
 
 
 def _open_failure(port: str, error: Exception) -> str:

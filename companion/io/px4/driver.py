@@ -291,6 +291,7 @@ class MavsdkAutopilot:
 
     def start_sums(self) -> None:
         """Start the sums over PX4's samples, such as the change of velocity, at zero; called when the flight begins."""
+        self._poll()  # samples that wait on the link belong to the time before
         self._inbox.start_sums()
 
     async def _armed(self) -> bool:

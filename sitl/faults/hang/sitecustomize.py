@@ -18,10 +18,12 @@ def _hold_gil(*_: object) -> None:
 
 def _stall_loop(*_: object) -> None:
     """Block the event loop: other threads continue, but no tick runs."""
+    from companion.runtime.clock import monotonic  # simulated time, if the flight lives in it
+
     # The signal handler runs in the thread of the event loop.
-    until_s = time.monotonic() + float(os.environ.get("COMPANION_SITL_STALL_S", "inf"))
-    while (left_s := until_s - time.monotonic()) > 0.0:
-        time.sleep(min(left_s, 3600.0))
+    until_s = monotonic() + float(os.environ.get("COMPANION_SITL_STALL_S", "inf"))
+    while (left_s := until_s - monotonic()) > 0.0:
+        time.sleep(min(left_s, 0.01))
 
 
 if "companion.flight.main" in sys.orig_argv:

@@ -1,0 +1,230 @@
+"""The world's side of simulated time (`companion.runtime.simulated_time`): it grants the present instant to the processes of a flight,
+waits for their reports, and keeps the pace.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import selectors
+import socket
+import struct
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+from companion.runtime.simulated_time import GRANT, REPORT, Flags, Page, Report
+
+PATIENCE_S: Final = 2.0
+"""Wall time that the world waits for a process before it goes on without it, at the pace of real time: the process hangs."""
+CATCH_UP_S: Final = 0.03
+"""A world that is further behind its pace does not catch up."""
+_EPSILON_S: Final = 1e-9
+
+
+class CountingSelector(selectors.SelectSelector):
+    """Counts the descriptors that were ready when the event loop last asked."""
+
+    ready = 0
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        """Select as usual, and count."""
+        found = super().select(timeout)
+        self.ready = len(found)
+        return found
+
+
+class LockstepLoop(asyncio.SelectorEventLoop):
+    """Event loop of a world in lockstep."""
+
+    def __init__(self) -> None:
+        self._counts = CountingSelector()
+        super().__init__(self._counts)
+
+    async def handle_all(self) -> None:
+        """Handle everything that has arrived at the descriptors of this loop."""
+        while True:
+            await asyncio.sleep(0)
+            if not self._counts.ready:
+                return
+
+
+class Process:
+    """A process of the flight.
+
+    Args:
+        channel: the world's end of its channel.
+    """
+
+    def __init__(self, channel: socket.socket) -> None:
+        channel.setblocking(False)
+        self._channel = channel
+        self._granted = 0
+        self._report: Report | None = None
+        self.begins = False
+        """Whether it has asked the world to start over."""
+        self.waited_for = True
+        """Whether the world waits for its reports: it does not hang."""
+        self.ended = False
+
+    def fileno(self) -> int:
+        """Return the channel's descriptor."""
+        return self._channel.fileno()
+
+    @property
+    def bus_bytes(self) -> int:
+        """Bytes that it had written to the servo bus at its last report."""
+        return 0 if self._report is None else self._report.bus_bytes
+
+    @property
+    def busy(self) -> bool:
+        """Whether it has begun to work at the granted instant and has not reported."""
+        return self._report is not None and self._report.grant < self._granted and not self.ended
+
+    @property
+    def hurried(self) -> bool:
+        """Whether simulated time may run faster than real time, as far as this process is concerned."""
+        if self.ended:
+            return True
+        return self._report is not None and self.waited_for and not self._report.flags & Flags.THREADS
+
+    def wants(self, now_s: float, data: bool) -> bool:
+        """Return whether it wants to work at this instant.
+
+        Args:
+            now_s: simulated time.
+            data: whether a frame of motion capture was sent.
+        """
+        report = self._report
+        if report is None or self.ended or self.busy:
+            return False
+        return report.wake_s <= now_s + _EPSILON_S or (data and bool(report.flags & Flags.DATA))
+
+    def grant(self) -> None:
+        """Let it work at the present instant."""
+        self._granted += 1
+        try:
+            self._channel.send(GRANT.pack(self._granted))
+        except BlockingIOError:
+            self._granted -= 1
+        except OSError:
+            self.ended = True
+
+    def read(self) -> None:
+        """Read its reports."""
+        while not self.ended:
+            try:
+                data = self._channel.recv(REPORT.size)
+            except BlockingIOError:
+                return
+            except OSError:
+                data = b""
+            if not data:
+                self.ended = True
+                return
+            with contextlib.suppress(struct.error):
+                self._report = report = Report(*REPORT.unpack(data))
+                self.begins = self.begins or bool(report.flags & Flags.BEGIN)
+                self.waited_for = self.waited_for or report.grant == self._granted
+
+
+class TimeKeeper:
+    """Simulated time, owned by the world.
+
+    Args:
+        page: the shared page.
+        channels: the world's ends of the channels to the processes of the flight, by name.
+        speed: simulated seconds in a second of real time at most.
+    """
+
+    def __init__(self, page: Page, channels: Mapping[str, socket.socket], speed: float) -> None:
+        self.page = page
+        self.processes = {name: Process(channel) for name, channel in channels.items()}
+        self._speed = speed
+        self._changed = asyncio.Event()
+        self._from: tuple[float, float] | None = None
+        """Simulated time and wall time from which the pace is kept."""
+
+    @contextlib.contextmanager
+    def listening(self) -> Iterator[None]:
+        """Read the reports while this context is open."""
+        loop = asyncio.get_running_loop()
+        for process in self.processes.values():
+            loop.add_reader(process, self._on_report, process)
+        try:
+            yield
+        finally:
+            for process in self.processes.values():
+                loop.remove_reader(process)
+
+    def _on_report(self, process: Process) -> None:
+        process.read()
+        if process.ended:
+            asyncio.get_running_loop().remove_reader(process)
+        self._changed.set()
+
+    def do_not_wait_for(self, name: str) -> None:
+        """Go on without a process that is known to hang, until it reports again."""
+        self.processes[name].waited_for = False
+
+    @property
+    def bus_bytes(self) -> int:
+        """Bytes that the flight has written to the servo bus."""
+        return max(process.bus_bytes for process in self.processes.values())
+
+    def begins(self) -> bool:
+        """Return whether a process has asked the world to start over, once."""
+        asked = [process for process in self.processes.values() if process.begins]
+        for process in asked:
+            process.begins = False
+        return bool(asked)
+
+    def set(self, now_s: float) -> None:
+        """Set the simulated time, which may jump."""
+        self.page.now_s = now_s
+        self._from = None
+
+    async def advance(self, now_s: float, data: bool) -> None:
+        """Advance simulated time, let every process that wants to work do so, and keep the pace.
+
+        Args:
+            now_s: simulated time.
+            data: whether a frame of motion capture was sent.
+        """
+        self.page.now_s = now_s
+        processes = tuple(self.processes.values())
+        granted = [process for process in processes if process.wants(now_s, data)]
+        for process in granted:
+            process.grant()
+        await self._reports(processes)
+        await self._keep_pace(now_s, processes)
+
+    async def _reports(self, processes: Sequence[Process]) -> None:
+        deadline_s = math.inf
+        while any(process.busy and process.waited_for for process in processes):
+            now_s = time.monotonic()
+            deadline_s = min(deadline_s, now_s + PATIENCE_S)
+            self._changed.clear()
+            try:
+                async with asyncio.timeout(deadline_s - now_s):
+                    await self._changed.wait()
+            except TimeoutError:
+                for process in processes:
+                    process.waited_for = process.waited_for and not process.busy
+
+    async def _keep_pace(self, now_s: float, processes: Sequence[Process]) -> None:
+        speed = self._speed if all(process.hurried for process in processes) else min(1.0, self._speed)
+        if math.isinf(speed):
+            self._from = None
+            return
+        wall_s = time.monotonic()
+        from_s, from_wall_s = self._from or (now_s, wall_s)
+        ahead_s = (now_s - from_s) / speed - (wall_s - from_wall_s)
+        if ahead_s > 0.0:
+            await asyncio.sleep(ahead_s)
+            self._from = (from_s, from_wall_s)
+        else:
+            # Late: the pace is kept from here, at most `CATCH_UP_S` behind.
+            behind_s = max(0.0, -ahead_s - CATCH_UP_S)
+            self._from = (from_s, from_wall_s + behind_s)
