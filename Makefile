@@ -50,12 +50,12 @@ press: install
 compile: install
 	@$(BIN)/python -m tools.compiled
 
-# All stages, whatever comes of them, and a summary. The same examples, checks and skips for everybody.
+# The checks of make lint are among the tests. The same examples, checks and skips for everybody.
 test: install debian
-	@$(BIN)/python -m tests.stages
+	@$(BIN)/python -m pytest -n auto --dist loadgroup
 
 lint: install
-	@$(BIN)/python -m tests.stages format lint imports types
+	@$(BIN)/ruff format --check . && $(BIN)/ruff check . && $(BIN)/lint-imports --no-cache && $(BIN)/mypy
 
 # Property tests and damaged input at every wire, at random, for whoever changes a parser: make explore MINUTES=10
 explore: install

@@ -74,7 +74,7 @@ def fly(minutes: float, overrides: Sequence[str], folder: Path, console: Console
         *overrides,
     ]
     command = [
-        *(sys.executable, "-m", "companion", "fly", str(MISSION), "--sitl", "--world", "ideal"),
+        *(sys.executable, "-m", "companion", "fly", str(MISSION), "--sitl", "--real-time", "--world", "ideal"),
         *("--out", str(folder / "flight"), "--set", *settings),
     ]
     console.print(f"{count} repetitions, {planned_s / 60.0:.1f} minutes; {folder}", highlight=False, soft_wrap=True)

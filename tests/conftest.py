@@ -17,7 +17,6 @@ from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
 from hypothesis.internal.constants_ast import Constants
 
-from tests.marked import MARKS, files_of
 from tests.support import Sandbox, sandbox_in
 
 _LOADED_COMPUTER = [HealthCheck.too_slow]
@@ -63,12 +62,9 @@ def pytest_configure() -> None:
         providers._get_local_constants = lambda: nothing
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Refuse a mark that its test's file does not name: the mark's stage would not collect the test (`tests.marked`)."""
-    for item in items:
-        for mark in MARKS:
-            if item.get_closest_marker(mark) is not None and item.path not in files_of(mark):
-                raise pytest.UsageError(f"{item.nodeid}: write pytest.mark.{mark} into its own file")
+def pytest_xdist_auto_num_workers() -> int:
+    """Return the number of workers of `pytest -n auto`: two on each processor, because many tests wait for other processes."""
+    return 2 * len(os.sched_getaffinity(0))
 
 
 @pytest.fixture

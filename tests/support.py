@@ -43,8 +43,12 @@ DEADLINE_S = 240.0
 IN_BACKGROUND = ("sh", "-c", 'trap "" INT TERM CHLD; exec "$@"', "sh")
 """Starts a program with signals ignored, as it may inherit them."""
 PREFLIGHT = "vehicle.safety.preflight_s"
+USUAL: dict[str, object] = {PREFLIGHT: 1.0, "vehicle.ground.mqtt": None}
+"""Of every flight of the tests that does not set them itself: the preflight has tests of its own, and no flight of a test speaks to
+whatever broker this computer may have.
+"""
 PATIENT: dict[str, object] = {
-    PREFLIGHT: 1.0,
+    **USUAL,
     "vehicle.safety.arm_timeout_s": 0.4,
     "vehicle.safety.arm_read_failures_max": 60,
     "vehicle.safety.mocap_timeout_s": 0.3,
@@ -52,12 +56,8 @@ PATIENT: dict[str, object] = {
     "vehicle.safety.link_lag_max_s": 0.25,
     "vehicle.safety.guardian_timeout_s": 0.3,
     "vehicle.devices.arm.watchdog_ms": 300,
-    "vehicle.ground.mqtt": None,
 }
-"""Of every flight of the tests that does not set them itself. A shared machine, or one of its cores, is held up now and then by more
-than the vehicle file allows; what these limits are for is tested where time is simulated, and the preflight has tests of its own. And
-no flight of a test speaks to whatever broker this computer may have.
-"""
+"""Of every flight of the tests in real time: a shared computer is held up now and then by more than the vehicle file allows."""
 
 LOW_HOVER: dict[str, object] = {
     "mission.phases[0].height_m": 0.5,
@@ -133,14 +133,16 @@ class Sandbox:
 
     def start(self, *arguments: object, report: bool = False, background: bool = False) -> Running:
         """`companion ARGUMENTS`, in a process group of its own, as a terminal would start it, or a shell without job control in the
-        background; flights are `PATIENT`, and leave a report only if it is asked for. A check watches for as long as the preflight of
-        such a flight."""
+        background. A simulated flight is as fast as the computer, and one in real time is `PATIENT`; it leaves a report only if it is
+        asked for. A check watches for as long as the preflight of such a flight."""
         given = " ".join(map(str, arguments))
         usual: dict[str, object] = {}
         if arguments[:1] == ("fly",):
-            usual = PATIENT | LOW_HOVER if arguments[1:2] == (HOVER,) else PATIENT
+            lockstep = "--sitl" in given and "--real-time" not in given
+            usual = (USUAL if lockstep else PATIENT) | (LOW_HOVER if arguments[1:2] == (HOVER,) else {})
+            arguments += ("--speed", "max") if lockstep and "--speed" not in given else ()
         elif arguments[:1] == ("check",):
-            usual = {PREFLIGHT: PATIENT[PREFLIGHT]}
+            usual = {PREFLIGHT: USUAL[PREFLIGHT]}
         more = {key: value for key, value in usual.items() if key not in given}
         no_report = ["--no-report"] if arguments[:1] == ("fly",) and not report else []
         arguments = in_a_world(arguments)

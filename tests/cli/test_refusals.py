@@ -142,7 +142,6 @@ def refused_at_opening(world: World, *options: str) -> str:
 
 
 @SHARED
-@pytest.mark.waits
 @pytest.mark.parametrize("case", WRONG)
 def test_names(world: World, case: str) -> None:
     wrong = WRONG[case]
@@ -156,7 +155,6 @@ def assert_one_line(ended: Ended, pattern: str) -> None:
 
 
 @SHARED
-@pytest.mark.waits
 def test_refuses_an_autopilot_address_on_which_nobody_speaks(sandbox: Sandbox, world: World) -> None:
     with closing(udp_port()) as nobody:
         autopilot = {"address": f"udpout://127.0.0.1:{nobody.getsockname()[1]}", **QUICK}
@@ -167,7 +165,6 @@ def test_refuses_an_autopilot_address_on_which_nobody_speaks(sandbox: Sandbox, w
 
 
 @SHARED
-@pytest.mark.waits
 def test_names_a_busy_udp_port(world: World) -> None:
     with closing(udp_port()) as busy:
         port = busy.getsockname()[1]
@@ -179,7 +176,6 @@ def test_names_a_busy_udp_port(world: World) -> None:
 
 
 @SHARED
-@pytest.mark.waits
 @pytest.mark.parametrize(
     ("device", "refusal"),
     [
@@ -194,7 +190,6 @@ def test_names_a_port_that_another_program_holds(world: World, device: str, refu
 
 
 @SHARED
-@pytest.mark.waits
 @pytest.mark.parametrize(
     ("device", "refusal"),
     [
@@ -209,7 +204,6 @@ def test_names_a_device_that_is_silent(world: World, device: str, refusal: str) 
 
 
 @SHARED
-@pytest.mark.waits
 def test_names_a_silent_mocap_server(world: World) -> None:
     with closing(udp_port()) as silent:
         port = silent.getsockname()[1]
@@ -220,7 +214,6 @@ def test_names_a_silent_mocap_server(world: World) -> None:
 
 
 @SHARED
-@pytest.mark.flight
 def test_refuses_a_start_other_than_the_missions_though_it_refused_before(
     sandbox: Sandbox, world: World, tmp_path: Path
 ) -> None:

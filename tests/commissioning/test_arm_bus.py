@@ -13,7 +13,6 @@ from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
 from tests.commissioning.arm_rig import served
 
-pytestmark = pytest.mark.waits
 BAUD = 3_000_000
 
 

@@ -18,8 +18,6 @@ from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
 from tests.commissioning.arm_rig import FILES, HAND, SHIPPED, bad_ids, bench, keys, rig, row_of
 
-pytestmark = pytest.mark.waits
-
 OUT_OF_THE_BOX = {
     f"arm.scan.joint{n}.{name}" for n in (1, 2) for name in ("return_delay_time", "operating_mode")
 }  # fmt: skip

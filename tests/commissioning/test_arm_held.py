@@ -22,7 +22,7 @@ from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EX
 from tests.commissioning.arm_rig import FILES, HAND, Rig, rig
 from tests.support import DEADLINE_S
 
-pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("an arm that somebody holds")]
+pytestmark = pytest.mark.xdist_group("an arm that somebody holds")
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,6 @@ from sitl.force_torque import ForceTorqueServer
 from tests.commissioning.test_mocap_wires import VEHICLE, bad, changes, document, vehicle
 from tests.support import Sandbox, World, run_here, tool_of
 
-pytestmark = pytest.mark.waits
-
 __all__ = ["vehicle"]
 WEIGHT_KG = 0.5
 HUNG_S = 5.0

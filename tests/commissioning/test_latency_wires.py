@@ -11,7 +11,6 @@ from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.commissioning.test_mocap_wires import VEHICLE, bad, document
 from tests.support import Ended, Sandbox, World, run_here
 
-pytestmark = pytest.mark.waits
 TAPPED = ("world.hand=true", "world.hand_t_s=2", "world.hand_taps=60", "world.payload_kg=0")
 FEWEST = ("--taps", 5)
 """As few as the tool accepts."""

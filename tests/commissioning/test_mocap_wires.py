@@ -14,8 +14,6 @@ import pytest
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.support import CATCH, ROOT, Ended, Sandbox, World, run_here, set_options
 
-pytestmark = pytest.mark.waits
-
 VEHICLE = ROOT / "configs/vehicles/tarot650_2r.yaml"
 WATCH_S = 2
 LIFTED_S = 4

@@ -10,8 +10,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import pytest
-
 from companion.config.loader import FlightConfig, load_flight
 from companion.flight.command_queue import Operator
 from companion.flight.fallback_landing import unflown
@@ -46,8 +44,6 @@ from companion.recorder.client import RecorderProcess
 from companion.runtime import ipc
 from companion.runtime.clock import Clock, flight_clock
 from tests.support import DEADLINE_S, HOVER
-
-pytestmark = pytest.mark.waits
 
 ZERO = (0.0, 0.0, 0.0)
 RECORDED = MocapCounts(

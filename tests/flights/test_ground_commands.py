@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import pytest
 from mcap.reader import make_reader
 from playwright.sync_api import sync_playwright
 
@@ -80,8 +79,6 @@ def answer(page: Any, command: str) -> str:
     return found
 
 
-@pytest.mark.alone
-@pytest.mark.flight
 def test_the_catch_is_started_watched_held_let_go_on_and_landed_from_the_ground(tmp_path: Path) -> None:
     with (
         loopback_broker(tmp_path) as broker,
@@ -138,7 +135,6 @@ def test_the_catch_is_started_watched_held_let_go_on_and_landed_from_the_ground(
     assert replayed.code == EXIT_OK, replayed.out + replayed.err
 
 
-@pytest.mark.flight
 def test_without_its_recorder_it_still_stands_down_on_ctrl_c(tmp_path: Path) -> None:
     """Waiting for its start, the recorder is killed: no commands any more, told once; Ctrl-C ends it as ever."""
     with loopback_broker(tmp_path) as broker, sandbox_in(tmp_path / "sandbox") as sandbox:

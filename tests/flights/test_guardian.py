@@ -10,8 +10,6 @@ import signal
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_REFUSED
 from tests.support import HOVER, Sandbox, read_summary, sandbox_in
 
@@ -27,7 +25,6 @@ def hooked(folder: Path) -> dict[str, str]:
     return {"PYTHONPATH": os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))}
 
 
-@pytest.mark.flight
 def test_without_a_guardian_nothing_takes_off(tmp_path: Path) -> None:
     """It cannot even start: what it needs is broken."""
     broken = tmp_path / "packages"
@@ -43,7 +40,6 @@ def test_without_a_guardian_nothing_takes_off(tmp_path: Path) -> None:
     assert summary["outcome"] == "refused"
 
 
-@pytest.mark.flight
 def test_a_guardian_that_dies_before_take_off_refuses_the_flight(sandbox: Sandbox) -> None:
     with sandbox.start(*FLY) as running:
         running.wait_for("  wait\n")
@@ -56,7 +52,6 @@ def test_a_guardian_that_dies_before_take_off_refuses_the_flight(sandbox: Sandbo
     assert "takeoff" not in ids
 
 
-@pytest.mark.flight
 def test_an_error_of_the_flight_process_lands_by_the_guardian(tmp_path: Path) -> None:
     """A bug in the core, met in the air: the process ends at once, with a traceback in its log."""
     hooks = tmp_path / "hooks"

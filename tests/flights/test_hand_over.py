@@ -9,8 +9,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from companion.config.loader import FlightConfig, load_flight
 from companion.core.flight_core import FlightCore
 from companion.flight import main as app
@@ -39,7 +37,6 @@ def fly_with_a_bug() -> None:
         print(asyncio.run(app.fly(config, Path(sys.argv[1]), channel)).value)
 
 
-@pytest.mark.flight
 def test_an_internal_error_in_the_air_lands_by_px4(tmp_path: Path) -> None:
     """A full disk under flight.log costs the traceback, not the landing. With room on it, it is there: test_guardian.py."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from companion.analysis.log import FlightLog
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST
 from companion.model.types import AutopilotRequest
@@ -61,7 +59,6 @@ class Paused:
         self._process.send_signal(signal.SIGCONT)
 
 
-@pytest.mark.flight
 def test_started_again_in_the_air_without_the_arm_it_lands_what_it_finds(sandbox: Sandbox) -> None:
     """With the arm: tests/core/test_reattach.py."""
     with World(sandbox, HOVER, ["world.payload_kg=0", SLOW]) as world:
@@ -93,7 +90,6 @@ def test_started_again_in_the_air_without_the_arm_it_lands_what_it_finds(sandbox
     sandbox.assert_nobody_left()
 
 
-@pytest.mark.flight
 def test_hung_beside_a_hung_guardian_px4_lands_it(sandbox: Sandbox) -> None:
     """The launcher kills both and reports it."""
     with World(sandbox, HOVER, ["world.payload_kg=0"]) as world:

@@ -20,7 +20,6 @@ from tests.core.test_sliding import short_slide
 from tests.flights.test_fast_flights import short
 from tests.support import HOVER, HOVERS_S, SHORT_CATCH, Ended, Sandbox, read_summary, run_here, sandbox_in, set_options
 
-pytestmark = pytest.mark.flight
 THE_CATCH = pytest.mark.xdist_group("the catch over wires")
 """Tests that look at one flight run in one process."""
 PAYLOAD_KG = 0.2

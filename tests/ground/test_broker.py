@@ -31,8 +31,6 @@ from tests.broker import LOOPBACK, Broker, loopback_broker
 from tests.support import DEADLINE_S, ROOT, free_port
 from tools.docs.mosquitto import example_files
 
-pytestmark = pytest.mark.waits
-
 NOT_AUTHORISED = 135
 TOO_LARGE = 149
 WANTED = broker_setup.BrokerUsers(

@@ -21,8 +21,6 @@ from tests.broker import loopback_broker
 from tests.ground.test_broker import WANTED, Site, running
 from tests.support import free_port
 
-pytestmark = pytest.mark.waits
-
 ROOMS = ["vehicles/tarot", "vehicles/second", "operators/anna", "operators/bert", "viewers/wall"]
 
 

@@ -19,8 +19,6 @@ from tests.ground.monitor_rig import ANNA, OPERATORS, played
 from tests.ground.vehicle import played_vehicle
 from tests.support import Ended, free_port, sandbox_in
 
-pytestmark = pytest.mark.waits
-
 
 @pytest.fixture
 def keys(tmp_path: Path) -> str:

@@ -41,8 +41,6 @@ from tests.broker import Broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, played, until
 from tests.ground.vehicle import ack_of, flight, played_vehicle, state_of
 
-pytestmark = pytest.mark.waits
-
 STREAM = "companion/rig/stream"
 AROUND = StationStatus("connected", True, "anna", None)
 

@@ -17,8 +17,6 @@ from companion.ground.station.vehicles import LIVE_S, VEHICLES_MAX, ReceivedReco
 from companion.ground.station.web_guard import MESSAGES_BURST, RateLimiter, host_allowed, origin_allowed, same_token
 from tests.ground.vehicle import ack_of, flight, state_of
 
-pytestmark = pytest.mark.waits
-
 SESSION = "s1"
 
 

@@ -28,8 +28,6 @@ from tests.ground.monitor_rig import ANNA, OPERATORS, played, self_signed
 from tests.ground.vehicle import played_vehicle
 from tests.support import CATCH, Sandbox, free_port, sandbox_in
 
-pytestmark = pytest.mark.waits
-
 
 @pytest.fixture
 def sandbox(tmp_path: Path) -> Iterator[Sandbox]:

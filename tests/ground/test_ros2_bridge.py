@@ -110,7 +110,6 @@ def test_each_event_is_new_once_and_a_new_flight_begins_again(bridge: Any) -> No
     assert taken == [["a", "b"], [], ["c", "d"], ["y", "z"], ["e"]]
 
 
-@pytest.mark.waits
 @played
 async def test_hold_and_land_reach_the_vehicle_and_other_words_do_not(bridge: Any, tmp_path: Path) -> None:
     published: list[tuple[str, Any]] = []

@@ -34,8 +34,6 @@ from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, played
 from tests.ground.vehicle import flight, played_vehicle, state_of
 from tests.support import ROOT
 
-pytestmark = pytest.mark.waits
-
 AROUND = StationStatus("connected to mqtt://127.0.0.1:1883", True, "anna", None)
 
 

@@ -33,8 +33,6 @@ from tests.ground.monitor_rig import (
 )
 from tests.ground.vehicle import flight, played_vehicle
 
-pytestmark = pytest.mark.waits
-
 
 @played
 async def test_a_viewer_receives_hello_and_the_known_state_and_then_live_data(broker: Broker) -> None:

@@ -19,8 +19,6 @@ from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, on_page, played, token_of, viewer_of
 from tests.ground.vehicle import PlayedVehicle, played_vehicle
 
-pytestmark = pytest.mark.waits
-
 
 @pytest.mark.parametrize("command", list(CommandName))
 @played

@@ -22,8 +22,6 @@ from sitl.natnet import BodyPose, encode_frame
 from tests.guardian.rig import ARMED, ATTITUDE, DISARMED, LAND_MODE, OFFBOARD_MODE, Cameras, Rig
 from tests.support import DEADLINE_S, wait_until
 
-pytestmark = pytest.mark.waits
-
 NAV_LAND = mavlink.MAV_CMD_NAV_LAND
 
 _HOOK = """

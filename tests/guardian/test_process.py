@@ -19,8 +19,6 @@ from companion.model.types import Outcome
 from tests.guardian.rig import DISARMED, HOLD_MODE, LAND_MODE, OWN_IDS, POSITION_M, Rig
 from tests.support import DEADLINE_S, wait_until
 
-pytestmark = pytest.mark.waits
-
 NAV_LAND, ARM_DISARM = mavlink.MAV_CMD_NAV_LAND, mavlink.MAV_CMD_COMPONENT_ARM_DISARM
 
 

@@ -20,8 +20,6 @@ from companion.install.state import InstallError, PathState, write_state
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.support import ROOT
 
-pytestmark = pytest.mark.waits
-
 UNIT = "etc/systemd/system/companion.service"
 RULES = "etc/udev/rules.d/99-companion.rules"
 MISSION = "/etc/companion/missions/hover.yaml"

@@ -32,8 +32,6 @@ from sitl.servo.bus import ServoBus
 from sitl.servo.kinds import KINDS
 from sitl.servo.model import ServoModel
 
-pytestmark = pytest.mark.waits
-
 KT = 1.3
 NM_PER_COUNT = KT * 2.69e-3
 JOINTS = (

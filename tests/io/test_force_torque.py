@@ -144,7 +144,6 @@ async def sample_with(edge: RobotousForceTorque, force_x_n: float) -> ForceSampl
                     return sample
 
 
-@pytest.mark.waits
 def test_samples_arrive_quantised() -> None:
     async def run() -> None:
         async with ForceTorqueServer() as server, world(server):
@@ -170,7 +169,6 @@ def test_samples_arrive_quantised() -> None:
     asyncio.run(run())
 
 
-@pytest.mark.waits
 def test_reopening_a_sensor_that_still_streams() -> None:
     async def run() -> None:
         async with ForceTorqueServer() as server, world(server):
@@ -185,7 +183,6 @@ def test_reopening_a_sensor_that_still_streams() -> None:
     asyncio.run(run())
 
 
-@pytest.mark.waits
 def test_rate_is_set_and_read_back() -> None:
     async def run() -> None:
         async with ForceTorqueServer() as server, world(server):
@@ -197,7 +194,6 @@ def test_rate_is_set_and_read_back() -> None:
     asyncio.run(run())
 
 
-@pytest.mark.waits
 def test_start_and_stop_bytes_in_the_payload_and_noise_between_packets() -> None:
     async def run() -> None:
         async with ForceTorqueServer() as server, world(server):
@@ -219,7 +215,6 @@ def test_start_and_stop_bytes_in_the_payload_and_noise_between_packets() -> None
     asyncio.run(run())
 
 
-@pytest.mark.waits
 def test_overload_by_the_sensor_and_by_the_device_file() -> None:
     async def run() -> None:
         async with ForceTorqueServer() as server, world(server), driver(server.port, force_max_n=50.0) as edge:
@@ -233,7 +228,6 @@ def test_overload_by_the_sensor_and_by_the_device_file() -> None:
     asyncio.run(run())
 
 
-@pytest.mark.waits
 def test_tare_takes_the_samples_that_it_was_asked_for() -> None:
     async def run() -> None:
         async with ForceTorqueServer() as server, world(server):
@@ -246,7 +240,6 @@ def test_tare_takes_the_samples_that_it_was_asked_for() -> None:
     asyncio.run(run())
 
 
-@pytest.mark.waits
 def test_sensor_falls_silent_in_flight() -> None:
     async def run() -> None:
         async with ForceTorqueServer() as server, world(server), driver(server.port) as edge:
@@ -260,7 +253,6 @@ def test_sensor_falls_silent_in_flight() -> None:
     asyncio.run(run())
 
 
-@pytest.mark.waits
 def test_in_flight_the_ticks_read_the_port() -> None:
     async def run() -> None:
         async with ForceTorqueServer() as server:
@@ -283,7 +275,6 @@ def test_in_flight_the_ticks_read_the_port() -> None:
     asyncio.run(run())
 
 
-@pytest.mark.waits
 def test_port_vanishes_in_flight() -> None:
     async def run() -> None:
         server = ForceTorqueServer()
@@ -331,7 +322,6 @@ def test_port_that_is_a_file(tmp_path: Path) -> None:
     assert path.read_text() == "not a port"
 
 
-@pytest.mark.waits
 def test_silent_sensor() -> None:
     async def run() -> None:
         async with ForceTorqueServer() as server:
@@ -342,7 +332,6 @@ def test_silent_sensor() -> None:
     asyncio.run(run())
 
 
-@pytest.mark.waits
 def test_sensor_that_answers_but_never_streams() -> None:
     async def run() -> None:
         async with ForceTorqueServer() as server:  # no world, so it never ticks
@@ -352,7 +341,6 @@ def test_sensor_that_answers_but_never_streams() -> None:
     asyncio.run(run())
 
 
-@pytest.mark.waits
 def test_other_model() -> None:
     async def run() -> None:
         async with ForceTorqueServer(product_name="RFT40-SA01") as server:
@@ -373,7 +361,6 @@ def babbler(garbage: bytes) -> Iterator[str]:
             loop.remove_reader(far)
 
 
-@pytest.mark.waits
 def test_wrong_checksums() -> None:
     async def run() -> None:
         packet = bytearray(rft.pack(b"\x01RFT60-HA01", rft.RESPONSE_BYTES))
@@ -422,7 +409,6 @@ class Line:
             return []
 
 
-@pytest.mark.waits
 def test_sensor_once_bias_and_refused_rate() -> None:
     async def run() -> None:
         async with ForceTorqueServer() as server:
@@ -448,7 +434,6 @@ def test_sensor_once_bias_and_refused_rate() -> None:
     asyncio.run(run())
 
 
-@pytest.mark.waits
 def test_frames_follow_the_world_clock() -> None:
     async def run() -> None:
         async with ForceTorqueServer() as server:
@@ -478,7 +463,6 @@ def test_frames_follow_the_world_clock() -> None:
     asyncio.run(run())
 
 
-@pytest.mark.waits
 def test_nobody_reads() -> None:
     async def run() -> None:
         async with ForceTorqueServer() as server:

@@ -25,8 +25,6 @@ from companion.runtime.clock import flight_clock
 from sitl.natnet import BodyPose, NatNetServer
 from tests.io.natnet_bytes import LATER, VERSIONS
 
-pytestmark = pytest.mark.waits
-
 GROUP = "239.255.42.99"
 POSE = BodyPose(1, (-1.25, 0.5, 1.0), (0.5, -0.5, 0.5, 0.5), error_m=0.00025)
 STRANGER = BodyPose(4, (3.0, 3.0, 0.0), (1.0, 0.0, 0.0, 0.0))

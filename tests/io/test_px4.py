@@ -32,8 +32,6 @@ from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import ACCEL_FRD_M_S2, GYRO_FRD_RAD_S, PARAMS, POSITION_NED_M, VELOCITY_NED_M_S, Px4Peer
 from tests.support import eventually, free_udp_port, serial_line
 
-pytestmark = pytest.mark.waits
-
 LEAN_RAD = 0.2
 DO_SET_MODE, NAV_LAND, ARM_DISARM = 176, 21, 400
 

@@ -27,8 +27,6 @@ from tests.io.px4_peer import Px4Peer
 from tests.io.test_px4 import edge, refused
 from tests.support import DEADLINE_S, eventually, free_udp_port, serial_line
 
-pytestmark = pytest.mark.waits
-
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 ARMED = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 

@@ -17,8 +17,6 @@ from tests.io.px4_peer import Px4Peer
 from tests.io.test_px4 import DO_SET_MODE, GOLDEN_ATTITUDES
 from tests.support import eventually, free_udp_port
 
-pytestmark = pytest.mark.waits
-
 Way = Literal["direct", "offboard"]
 WAYS: tuple[Way, ...] = get_args(Way)
 LEVEL = AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.5)

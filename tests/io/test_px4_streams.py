@@ -20,8 +20,6 @@ from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import PARAMS, Px4Peer
 from tests.support import DEADLINE_S, eventually, serial_line
 
-pytestmark = pytest.mark.waits
-
 PIECE_BYTES = 17
 """Bytes that a bridge passes at once: no message arrives whole."""
 

@@ -23,8 +23,6 @@ from companion.runtime.clock import Clock, flight_clock
 from tests.io.stub_rig import standing_stub
 from tests.support import free_udp_port
 
-pytestmark = pytest.mark.waits
-
 POSITION_WORLD_M = (-1.0, 0.5, 0.25)
 YAW_RAD = 0.4
 

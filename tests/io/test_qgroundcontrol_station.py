@@ -48,8 +48,6 @@ from tests.io.qgroundcontrol_peer import GroundPeer
 from tests.io.stub_rig import standing_stub
 from tests.support import CATCH, eventually, free_udp_port
 
-pytestmark = pytest.mark.waits
-
 DEADLINE_S = 30.0
 LEVEL = AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.2)
 HOLD_MODE = (4 << 16) | (3 << 24)

@@ -45,7 +45,6 @@ def events_of(summary: dict[str, Any]) -> list[str]:
     return [event["id"] for event in summary["events"]]
 
 
-@pytest.mark.waits
 def test_given_up_while_the_world_starts(sandbox: Sandbox) -> None:
     with sandbox.start(*FLY) as running:
         running.wait_for("Ctrl-C lands")
@@ -73,7 +72,6 @@ def motive_that_never_answers() -> Iterator[tuple[socket.socket, list[str]]]:
         yield motive, set_options(**{f"vehicle.devices.mocap.{key}": value for key, value in there.items()})
 
 
-@pytest.mark.waits
 @pytest.mark.parametrize(
     ("number", "background"),
     [(signal.SIGTERM, False), (signal.SIGINT, True)],
@@ -99,7 +97,6 @@ def test_given_up_while_a_device_is_being_opened(sandbox: Sandbox, number: signa
     assert not any(path.exists() for path in numbers)
 
 
-@pytest.mark.waits
 def test_killed_while_a_device_is_being_opened(sandbox: Sandbox) -> None:
     with (
         motive_that_never_answers() as (motive, options),
@@ -110,12 +107,11 @@ def test_killed_while_a_device_is_being_opened(sandbox: Sandbox) -> None:
         sandbox.assert_nobody_left(DEADLINE_S)
 
 
-@pytest.mark.flight
 def test_given_up_before_arming(sandbox: Sandbox) -> None:
     """With a core of its own, if there are several: the flight alone runs on it, and the terminal says what it got."""
     own, rest = (CORES[-1:], CORES[:-1]) if len(CORES) > 1 else ([], CORES)
     options = set_options(**{"vehicle.computer.cpus": own, "vehicle.computer.lock_memory": False})
-    with sandbox.start(*FLY, *options) as running:
+    with sandbox.start(*FLY, "--real-time", *options) as running:
         running.wait_for("  wait\n")  # it weighs the net for a second
         memory = Path(f"/proc/{sandbox.pid_of(PROCESSES['flight'])}/status").read_text(errors="replace")
         found = {name: affinities(sandbox.pid_of(module)) for name, module in PROCESSES.items()}
@@ -140,7 +136,6 @@ def test_given_up_before_arming(sandbox: Sandbox) -> None:
     assert sorted(os.sched_getaffinity(0)) == CORES
 
 
-@pytest.mark.flight
 def test_asked_to_land_in_flight_and_asked_again(sandbox: Sandbox) -> None:
     with sandbox.start(*FLY) as running:
         running.wait_for(IN_FLIGHT)
@@ -164,7 +159,6 @@ def assert_landed(log: FlightLog) -> None:
     assert last.mocap is not None and last.mocap.position_world_m[2] < 0.4
 
 
-@pytest.mark.flight
 def test_killed_launcher_leaves_a_flight_that_lands_by_itself(sandbox: Sandbox) -> None:
     with sandbox.start(*FLY) as running:
         running.wait_for(IN_FLIGHT)
@@ -177,7 +171,6 @@ def test_killed_launcher_leaves_a_flight_that_lands_by_itself(sandbox: Sandbox) 
     assert (sandbox.cwd / "out/sitl.log").read_text(encoding="utf-8") == ""
 
 
-@pytest.mark.flight
 def test_world_that_dies_in_flight_is_named_in_one_line(sandbox: Sandbox) -> None:
     with sandbox.start(*FLY) as running:
         running.wait_for("  take-off\n")
@@ -190,7 +183,6 @@ def test_world_that_dies_in_flight_is_named_in_one_line(sandbox: Sandbox) -> Non
     assert FlightLog.read(sandbox.cwd / "out/flight.mcap").closed
 
 
-@pytest.mark.waits
 @pytest.mark.parametrize(
     ("package", "line"),
     [
@@ -234,7 +226,6 @@ def test_a_flight_process_that_ends_while_the_launcher_is_busy_is_heard_to_its_l
     assert [message["lines"] for message in heard] == [["because"]]
 
 
-@pytest.mark.waits
 def test_a_world_that_does_not_leave_is_heard_to_its_last_word(tmp_path: Path) -> None:
     # Armed, it would stay until its rotors stand: longer than the launcher waits.
     world = SitlProcess(load_sitl(HOVER), tmp_path)

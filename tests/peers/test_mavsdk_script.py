@@ -15,8 +15,6 @@ from sitl.autopilot.modes import NavState
 from tests.sitl.px4_rig import Rig
 from tests.support import free_udp_port
 
-pytestmark = pytest.mark.waits
-
 SCRIPT = Path(__file__).with_name("mavsdk_mission.py")
 DEADLINE_S = 150.0
 

@@ -43,7 +43,6 @@ from sitl.servo.model import ServoModel
 from tests.plugins.installed import on_path, write_distribution
 from tests.support import ROOT, SHORT_CATCH
 
-pytestmark = pytest.mark.waits
 EXAMPLE = ROOT / "examples/arm_odrive"
 VEHICLE = (ROOT / "configs/vehicles/tarot650_2r.yaml").read_text(encoding="utf-8")
 LONG_S = 30.0

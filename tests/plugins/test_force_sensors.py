@@ -33,7 +33,6 @@ from sitl.server import Ports, Sitl, start_of
 from tests.plugins.installed import on_path, write_distribution
 from tests.support import ROOT
 
-pytestmark = pytest.mark.waits
 EXAMPLE = ROOT / "examples/force_ati"
 VEHICLE = (ROOT / "configs/vehicles/tarot650_2r.yaml").read_text(encoding="utf-8")
 SCRIPTED = '''

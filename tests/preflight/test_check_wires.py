@@ -46,7 +46,6 @@ def refusing(rows: dict[str, dict[str, Any]]) -> set[str]:
     return {name for name, row in rows.items() if not row["ok"] and row["level"] == "refuse"}
 
 
-@pytest.mark.flight
 def test_a_sound_world_may_fly_and_every_row_is_reported(sandbox: Sandbox) -> None:
     ended = sandbox.run("check", CATCH, "--sitl", "--json")
     sandbox.assert_nobody_left()
@@ -59,7 +58,6 @@ def test_a_sound_world_may_fly_and_every_row_is_reported(sandbox: Sandbox) -> No
     assert all(row["read"] and row["why"] for row in rows.values())
 
 
-@pytest.mark.flight
 def test_a_wrong_setting_refuses_the_check_and_the_flight(sandbox: Sandbox, tmp_path: Path) -> None:
     """Wrong joint angle, force bias and two parameters of PX4, in the world alone: the companion believes its files."""
     wrong = (
@@ -112,7 +110,6 @@ class StubbornServo(ServoModel):
         super().write(address, data)
 
 
-@pytest.mark.flight
 def test_devices_that_do_not_open_are_rows_and_the_others_are_looked_at(sandbox: Sandbox, tmp_path: Path) -> None:
     """No force sensor, and a servo that refuses its operating mode."""
 
@@ -132,7 +129,6 @@ def test_devices_that_do_not_open_are_rows_and_the_others_are_looked_at(sandbox:
     assert rows["px4.vision"]["ok"] and rows["mocap.rate"]["ok"] and rows["frames.gravity"]["ok"]
 
 
-@pytest.mark.waits
 def test_ctrl_c_during_the_preflight_of_a_flight_ends_it_with_nothing_armed(sandbox: Sandbox, tmp_path: Path) -> None:
     longer = set_options(**{"vehicle.safety.preflight_s": 60.0})
     with sandbox_in(tmp_path / "world") as around, World(around, HOVER) as world:
@@ -147,7 +143,6 @@ def test_ctrl_c_during_the_preflight_of_a_flight_ends_it_with_nothing_armed(sand
     assert not (sandbox.cwd / "out/preflight.json").exists()
 
 
-@pytest.mark.waits
 def test_ctrl_c_during_a_check_leaves_nothing(sandbox: Sandbox) -> None:
     with serial_line() as (far, port):
         options = set_options(**{"vehicle.devices.force.port": port, "vehicle.devices.mocap.interface": "127.0.0.1"})

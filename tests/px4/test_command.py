@@ -20,7 +20,6 @@ from tests.io.px4_peer import Px4Peer
 from tests.io.stub_rig import standing_stub
 from tests.support import free_udp_port
 
-pytestmark = pytest.mark.waits
 SPOILED = {"EKF2_EV_CTRL": 3, "COM_OF_LOSS_T": 5.0, "EKF2_HGT_REF": 0}
 
 

@@ -31,8 +31,6 @@ from tests.recorder.telemetry_rig import ROWS, VEHICLE, Listener, flight_with, l
 from tests.support import DEADLINE_S, free_port, wait_until
 from tools.docs.telemetry import schema_of
 
-pytestmark = pytest.mark.waits
-
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:

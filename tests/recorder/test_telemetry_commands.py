@@ -32,8 +32,6 @@ from tests.ground.test_broker import WANTED, Site, running
 from tests.recorder.telemetry_rig import ROWS, VEHICLE, Listener, command, config_of, flight_with, log_lines
 from tests.support import CATCH, DEADLINE_S, free_port
 
-pytestmark = pytest.mark.waits
-
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:

@@ -26,7 +26,7 @@ from tests.ground.monitor_stub import (
 from tests.ground.page_browser import Page, events_of, playing, watching
 from tests.support import wait_until
 
-pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.xdist_group("browser")
 
 SAFE = {"hold", "land", "abort"}
 HOSTILE = "<img src=x onerror='window.pwned = 1'><script>window.pwned = 1</script>"

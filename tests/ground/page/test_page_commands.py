@@ -12,7 +12,7 @@ from companion.ground.protocol.messages import Presence
 from tests.ground.monitor_stub import NAME, Message, MonitorStub, ack, flown, relayed, retained, state
 from tests.ground.page_browser import Page, playing
 
-pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.xdist_group("browser")
 
 NONCE = "0123456789abcdef" * 2
 CHOOSE = """(name) => {

@@ -20,7 +20,7 @@ from tests.ground.page_browser import SIZES, Page, events_of, watching
 from tests.machines import overrides_with_joints
 from tests.support import CATCH, HOVER
 
-pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.xdist_group("browser")
 
 TOUCH_PX = 56.0
 LARGE_PX, LARGE_BOLD_PX = 24.0, 18.66

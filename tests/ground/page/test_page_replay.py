@@ -20,7 +20,7 @@ from tests.ground.monitor_stub import Message, MonitorStub, catch_flight, flown,
 from tests.ground.page_browser import Page, watching
 from tests.support import CATCH, free_port, sandbox_in
 
-pytestmark = [pytest.mark.waits, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.xdist_group("browser")
 
 
 def log_of(streams: tuple[Stream, ...] | None = None) -> Message:

@@ -1,0 +1,172 @@
+"""Flights in simulated time: a busy computer makes them slower and changes nothing, and they are those of the fast loop."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from companion.analysis.log import FlightLog
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
+from companion.model.types import Inputs
+from companion.sitl_config.loader import SitlConfig
+from sitl.fast.loop import FastFlight
+from tests.flights.test_guardian import hooked
+from tests.support import HOVER, SHORT_CATCH, Sandbox, read_summary, run_here, sandbox_in, set_options
+
+ONE_FLIGHT = pytest.mark.xdist_group("the flight in lockstep")
+FLOAT32 = 1e-6
+"""Rounding of positions, attitudes and forces on the wires, with what the flight makes of it within some seconds."""
+APART_M = 0.005
+"""After a count of a servo or of the force sensor was rounded the other way."""
+
+
+@contextlib.contextmanager
+def busy_programs(count: int) -> Iterator[None]:
+    """Programs that take all that they get of the processors."""
+    programs = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for program in programs:
+            program.kill()
+            program.wait()
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FlightLog, SitlConfig]]:
+    """A catch in a drawn laboratory."""
+    with sandbox_in(tmp_path_factory.mktemp("lockstep")) as sandbox:
+        ended = sandbox.run("fly", SHORT_CATCH, "--sitl", "--world", "lab", "--seed", "1", "--out", "out")
+        assert ended.code == EXIT_OK, ended
+        out = sandbox.cwd / "out"
+        config = SitlConfig.model_validate_json((out / "sitl_config.json").read_text(encoding="utf-8"))
+        yield FlightLog.read(out / "flight.mcap"), config
+
+
+@ONE_FLIGHT
+def test_beside_busy_programs_it_repeats_itself_bit_for_bit(
+    flown: tuple[FlightLog, SitlConfig], tmp_path: Path
+) -> None:
+    log, _ = flown
+    words = ("fly", SHORT_CATCH, "--sitl", "--world", "lab", "--seed", "1", "--out", "out", "--speed", "3")
+    with busy_programs(2 * len(os.sched_getaffinity(0))), sandbox_in(tmp_path / "again") as sandbox:
+        ended = sandbox.run(*words)
+        assert ended.code == EXIT_OK, ended
+        again = FlightLog.read(sandbox.cwd / "out/flight.mcap")
+    assert len(again.inputs) == len(log.inputs)
+    for name in ("inputs", "outputs", "sent"):
+        pairs = zip(getattr(again, name), getattr(log, name), strict=True)
+        differ = next(((one, other) for one, other in pairs if one != other), None)
+        assert differ is None, (name, differ)
+    assert again.metadata["flight"]["clock"] == "simulated"
+
+
+def counts(inputs: Inputs) -> object:
+    """What the wires carry in counts, and what follows from them."""
+    assert inputs.arm is not None
+    force = None if inputs.force is None else (inputs.force.force_sensor_n, inputs.force.torque_sensor_nm)
+    return inputs.arm.angle_rad, inputs.arm.velocity_rad_s, inputs.arm.torque_nm, force
+
+
+def difference(one: Sequence[float], other: Sequence[float]) -> float:
+    return max(abs(a - b) for a, b in zip(one, other, strict=True))
+
+
+@ONE_FLIGHT
+def test_it_is_the_flight_of_the_fast_loop(flown: tuple[FlightLog, SitlConfig]) -> None:
+    """Tick by tick: equal to the rounding of the wires until the first count differs, and then by millimetres."""
+    log, config = flown
+    fast = FastFlight(config).run()
+    assert [o.phase for o in fast.outputs][:2000] == [o.phase for o in log.outputs][:2000]
+    equal = True
+    for ours, theirs in zip(fast.inputs, log.inputs, strict=False):
+        assert ours.t_s == theirs.t_s
+        assert ours.mocap is not None and theirs.mocap is not None
+        assert ours.vehicle is not None and theirs.vehicle is not None
+        assert ours.mocap.stamp_s == theirs.mocap.stamp_s
+        equal = equal and counts(ours) == counts(theirs)
+        allowed_m = FLOAT32 if equal else APART_M
+        assert difference(ours.mocap.position_world_m, theirs.mocap.position_world_m) < allowed_m, ours.t_s
+        assert difference(ours.vehicle.position_world_m, theirs.vehicle.position_world_m) < allowed_m, ours.t_s
+        if equal:
+            assert difference(ours.vehicle.attitude_wxyz, theirs.vehicle.attitude_wxyz) < FLOAT32, ours.t_s
+            assert ours.vehicle.imu_stamp_s == theirs.vehicle.imu_stamp_s
+    in_flight = [k for k, output in enumerate(log.outputs) if output.mission_t_s > 1.0]
+    assert counts(fast.inputs[in_flight[0]]) == counts(log.inputs[in_flight[0]])
+    assert abs(len(fast.outputs) - len(log.outputs)) <= 3
+
+
+_SLOW_LAW = """
+import sys, time
+
+if "companion.flight.main" in sys.orig_argv:
+    import companion.core.flight_core
+
+    class Slow(companion.core.flight_core.FlightCore):
+        def step(self, inputs):
+            if 400 <= inputs.tick < 420:
+                until_s = time.thread_time() + 0.06
+                while time.thread_time() < until_s:
+                    pass
+            return super().step(inputs)
+
+    companion.core.flight_core.FlightCore = Slow
+"""
+
+
+def test_a_slow_computation_is_late_in_simulated_time(tmp_path: Path) -> None:
+    """60 ms of processor time: as long as on a vehicle, although the world waits."""
+    (tmp_path / "hooks").mkdir()
+    (tmp_path / "hooks/sitecustomize.py").write_text(_SLOW_LAW, encoding="utf-8")
+    with sandbox_in(tmp_path / "sandbox", hooked(tmp_path / "hooks")) as sandbox:
+        sandbox.run("fly", HOVER, "--sitl", "--out", "out")
+        log = FlightLog.read(sandbox.cwd / "out/flight.mcap")
+    slow = next(k for k, inputs in enumerate(log.inputs) if inputs.tick == 405)
+    assert log.inputs[slow].t_s - log.inputs[slow - 1].t_s >= 0.06
+    assert log.sent[slow].setpoint_sent_s - log.inputs[slow].t_s >= 0.06
+    assert "loop_late" in [event.id for outputs in log.outputs for event in outputs.events]
+
+
+def test_a_flight_process_that_somebody_stops_is_landed_by_the_guardian(sandbox: Sandbox) -> None:
+    """The world waits for it, then lets time go on, and the guardian finds it silent."""
+    with sandbox.start("fly", HOVER, "--sitl", "--out", "out") as running:
+        running.wait_for("  take-off\n")
+        os.kill(sandbox.pid_of("companion.flight.main"), signal.SIGSTOP)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert ended.code == EXIT_ABORTED, ended.err
+    assert "hung and was killed; the guardian landed the vehicle" in ended.err
+    assert read_summary(sandbox.cwd / "out")["outcome"] == "aborted"
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (("--sitl", "--speed", "0"), "--speed 0: expected a number above 0, such as 0.25, or max"),
+        (("--sitl", "--speed", "-1"), "--speed -1: expected a number above 0, such as 0.25, or max"),
+        (("--sitl", "--speed", "nan"), "--speed nan: expected a number above 0, such as 0.25, or max"),
+        (("--sitl", "--speed", "fast"), "--speed fast: expected a number above 0, such as 0.25, or max"),
+        (("--sitl", "--speed", "max", "--real-time"), "--speed max: expected not together with --real-time"),
+        (("--speed", "2"), "--speed: expected only with --sitl"),
+        (("--real-time",), "--real-time: expected only with --sitl"),
+    ],
+)
+def test_a_speed_that_cannot_be_flown_is_refused_in_one_line(words: tuple[str, ...], line: str) -> None:
+    ended = run_here("fly", HOVER, *words)
+    assert ended.code == EXIT_BAD_INPUT
+    assert ended.out == ""
+    assert len(ended.err_lines) == 1 and line in ended.err
+
+
+def test_slower_than_real_time_it_completes(sandbox: Sandbox) -> None:
+    """MAVSDK lives on the computer's clock, and hears a heartbeat every 4 s."""
+    short = set_options(**{"mission.phases[1].duration_s": 0.1})
+    ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", "--speed", "0.25", *short)
+    assert (ended.code, ended.err) == (EXIT_OK, "")
