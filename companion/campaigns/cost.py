@@ -57,7 +57,7 @@ def terms_of(row: Row) -> dict[str, float]:
     out.
     """
     values: Mapping[str, Any] = dict(flat(row))
-    expected, caught = row["payload_kg"] > 0, row["catch_t_s"] is not None
+    expected, caught = row["payload_kg"] > 0, row["caught"]
     found = {}
     for term in TERMS:
         key = term.key if caught or expected else term.key.replace(".post.", ".pre.")
@@ -73,7 +73,7 @@ def flight_cost(row: Row) -> float:
         return LOST
     if row["outcome"] == Outcome.ABORTED.value:
         return ABORTED
-    missed = MISSED if row["payload_kg"] > 0 and row["catch_t_s"] is None else 0.0
+    missed = MISSED if row["payload_kg"] > 0 and not row["caught"] else 0.0
     return min(COMPLETED_MAX, missed + sum(terms_of(row).values()))
 
 

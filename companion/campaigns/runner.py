@@ -282,6 +282,17 @@ def counted(rows: Iterable[Row]) -> str:
     return ", ".join(f"{count} {name}" for name, count in outcomes(rows).items())
 
 
+def catches(rows: Iterable[Row]) -> tuple[int, int]:
+    """Return the number of flights whose companion reported a catch that was none, and of those that did not report a true one."""
+    known = [(bool(row["caught"]), row["catch_t_s"] is not None) for row in rows]
+    return known.count((False, True)), known.count((True, False))
+
+
+def catches_text(rows: Iterable[Row]) -> str:
+    """Return the numbers of `catches` as a cell of a table: `1, 0`."""
+    return "{}, {}".format(*catches(rows))
+
+
 def flat(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield the values of nested mappings under their keys joined by dots."""
     for key, value in row.items():

@@ -68,12 +68,19 @@ def fly_to_end(config: SitlConfig, limit_s: float = 90.0, until_mission_s: float
         return Flown(config, None, FastResult(), f"{type(error).__name__}: {error}")
 
 
+def mission_s(result: FastResult, t_s: float | None) -> float | None:
+    """Convert a time from the flight clock to the mission clock, s; None if it is None or the mission has not begun."""
+    begun_s = next((o.t_s - o.mission_t_s for o in result.outputs if o.mission_t_s > 0), None)
+    return None if t_s is None or begun_s is None else t_s - begun_s
+
+
 def row_of(
     config: FlightConfig, result: FastResult, caught_t_s: float | None, error: str | None = None, *, cut: bool = False
 ) -> tuple[Data, FlightLog]:
     """Return the row of a flight and its log.
 
-    The row has the graded results (see `companion.campaigns.compare.aggregate`), but not the flight's identification.
+    The row has the graded results (see `companion.campaigns.compare.aggregate`), but not the flight's identification. What is before
+    and after the catch is the world's truth, in the log as well; only `catch_t_s` is the companion's own event.
 
     Args:
         config: configuration of the flight.
@@ -82,15 +89,14 @@ def row_of(
         error: the exception that ended the flight, if any.
         cut: whether the flight was ended in the air on purpose: it is completed if the supervisor did no more than warn.
     """
-    log = log_of(config, result, caught_t_s)
+    log = log_of(config, _without_catch_events(result), caught_t_s)
     last = result.outputs[-1] if result.outputs else None
     ended = last.outcome if last is not None else None
     if cut and last is not None and ended is None:
         ended = Outcome.COMPLETED if last.action.rank <= SafetyAction.WARN.rank else Outcome.ABORTED
     outcome = Outcome.CRASHED if result.crashed else ended or Outcome.LOST
     completed = outcome is Outcome.COMPLETED
-    index = metrics.catch_index(log)
-    caught = index is not None
+    caught = caught_t_s is not None
     pre, post = metrics.flight_masks(log) if log.inputs else (np.zeros(0, np.bool_), np.zeros(0, np.bool_))
     # A part of the mission that was not flown to its end is not graded.
     nothing = metrics.TrackingRms(None, None, None)
@@ -100,7 +106,10 @@ def row_of(
     return {
         "outcome": outcome.value,
         "error": error,
-        "catch_t_s": log.outputs[index].mission_t_s if index is not None else None,
+        "caught": caught,
+        "catch_t_s": mission_s(
+            result, next((event.t_s for o in result.outputs for event in o.events if event.id == "catch"), None)
+        ),
         "rms": {"pre": dataclasses.asdict(before), "post": dataclasses.asdict(after)},
         "impedance_error": {"position_n": position_n, "arm_nm": arm_nm},
         "final_e_z_m": metrics.final_e_z_m(log) if completed else None,
@@ -133,6 +142,14 @@ def log_of(config: FlightConfig, result: FastResult, caught_t_s: float | None) -
         metadata={"config": {"json": config.model_dump_json()}},
         closed=True,
     )
+
+
+def _without_catch_events(result: FastResult) -> FastResult:
+    kept = [
+        msgspec.structs.replace(output, events=tuple(event for event in output.events if event.id != "catch"))
+        for output in result.outputs
+    ]
+    return dataclasses.replace(result, outputs=kept)
 
 
 def _with_catch(result: FastResult, caught_t_s: float | None) -> tuple[Outputs, ...]:

@@ -24,7 +24,7 @@ from companion.mission.plan import Plan
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Outcome, PhaseKind, SafetyAction
 from companion.sitl_config.loader import SitlConfig
-from sitl.campaigns.flights import Flown, fly_to_end, laboratory_of, row_of, with_world
+from sitl.campaigns.flights import Flown, fly_to_end, laboratory_of, mission_s, row_of, with_world
 from sitl.campaigns.runner import Data
 from sitl.world.payload import THROW_LEAD_S
 
@@ -142,9 +142,9 @@ def fly(config: SitlConfig, flight: Data) -> Data:
 
     The row has: name, number (of the draw), world (every key that is not at its default, and those of `DRAWN`), world_seed,
     model_error, outcome, why (event that ended the mission early), error (exception that ended the flight), thrown, caught (truly),
-    felt (the force sensor still worked), caught_s and noticed_s (mission clock), e_p_m (RMS after the catch, or of the whole flight
-    if nothing was caught), pre_e_p_m, e_q_deg, e_alpha_deg, peak_e_p_m, final_e_z_m, tilt_max_deg, slack_min_m, home_m (distance of
-    the landing from the start), events. A value that was not measured is None.
+    felt (the force sensor still worked), caught_s (true catch, mission clock), catch_t_s (the companion's event, mission clock), e_p_m
+    (RMS after the catch, or of the whole flight if nothing was caught), pre_e_p_m, e_q_deg, e_alpha_deg, peak_e_p_m, final_e_z_m,
+    tilt_max_deg, slack_min_m, home_m (distance of the landing from the start), events. A value that was not measured is None.
     """
     flown = fly_to_end(with_world(config, flight["world"]))
     caught_t_s = flown.caught_t_s
@@ -156,9 +156,8 @@ def fly(config: SitlConfig, flight: Data) -> Data:
             **laboratory_of(flown.config),
             **_graded(flown),
             "thrown": flown.fast is not None and flown.fast.plant.world.payload.thrown_t_s is not None,
-            "caught": caught_t_s is not None,
             "felt": caught_t_s is not None and _felt(flown, caught_t_s),
-            "caught_s": _mission_s(flown, caught_t_s),
+            "caught_s": mission_s(flown.result, caught_t_s),
         }
     }
 
@@ -181,14 +180,14 @@ def _graded(flown: Flown) -> Data:
     # The event that caused a landing is more informative than an earlier one that caused a hold.
     gave_up.sort(key=lambda event: event.action.rank < SafetyAction.LAND.rank)
     ended = gave_up[0] if gave_up and graded["outcome"] != Outcome.COMPLETED.value else None
-    noticed = next((event.t_s for event in events if event.id == "catch"), None)
     before, after = graded["rms"]["pre"], graded["rms"]["post"]
     whole = after if after["e_p_m"] is not None else before
     return {
         "outcome": graded["outcome"],
         "why": f"{ended.id}: {ended.text}" if ended is not None else None,
         "error": graded["error"],
-        "noticed_s": _mission_s(flown, noticed),
+        "caught": graded["caught"],
+        "catch_t_s": graded["catch_t_s"],
         "e_p_m": whole["e_p_m"],
         "pre_e_p_m": before["e_p_m"],
         "e_q_deg": whole["e_q_deg"],
@@ -216,9 +215,3 @@ def _extremes(log: FlightLog) -> Data:
         "slack_min_m": metrics.min_slack_m(log),
         "home_m": math.dist(first[:2], last[:2]),
     }
-
-
-def _mission_s(flown: Flown, t_s: float | None) -> float | None:
-    """Convert a time from the flight clock to the mission clock."""
-    begun = next((o.t_s - o.mission_t_s for o in flown.result.outputs if o.mission_t_s > 0), None)
-    return None if t_s is None or begun is None else t_s - begun

@@ -57,6 +57,7 @@ def compare_row(flight: dict[str, Any], e_p_m: float | None = 0.1, **changes: An
         "model_error": flight.get("model_error", 0.0),
         "outcome": "crashed" if ended else "completed",
         "error": None,
+        "caught": True,
         "catch_t_s": 6.5,
         "rms": {"pre": {"e_p_m": 0.01, "e_q_deg": 1.0, "e_alpha_deg": 1.0}, "post": post},
         "impedance_error": {"position_n": None if ended else 1.0, "arm_nm": None if ended else 0.1},
@@ -88,8 +89,8 @@ def draw_row(number: int, e_p_m: float | None, outcome: str = "completed", caugh
     return {
         "name": f"draw {number}", "number": number, "world": {**WORLD, **world}, "world_seed": 12, "model_error": 0.0,
         "outcome": outcome, "why": None, "error": None,
-        "thrown": True, "caught": caught, "felt": caught, "caught_s": 6.5 if caught else None, "noticed_s": None, "e_p_m": e_p_m,
-        "events": ["takeoff", "touchdown"],
+        "thrown": True, "caught": caught, "felt": caught, "caught_s": 6.5 if caught else None, "e_p_m": e_p_m,
+        "catch_t_s": 6.5 if caught else None, "events": ["takeoff", "touchdown"],
     }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from companion.campaigns.compare.aggregate import Spread, adaptation_pairs, aggregate
 from companion.campaigns.compare.grid import ABLATED, ABLATIONS, flights_of, variants_of
 from companion.campaigns.compare.paper_results import TABLE, printed
-from companion.campaigns.compare.tables import print_tables
+from companion.campaigns.compare.tables import compliance_table, print_tables
 from companion.campaigns.runner import Row
 from companion.sitl_config.loader import load_sitl
 from tests.campaigns.made_up import compare_row
@@ -137,13 +137,26 @@ def test_a_crash_counts_as_worse_than_every_other_flight() -> None:
 
 
 def test_a_payload_that_was_not_caught_is_reported() -> None:
-    missed = row(1, 0.1, catch_t_s=None)
+    missed = row(1, 0.1, caught=False, catch_t_s=None)
     missed["rms"] = {**missed["rms"], "post": {"e_p_m": None, "e_q_deg": None, "e_alpha_deg": None}}
     (group,) = aggregate([missed, row(2, 0.2)])
     assert group.failure_text == "missed 1 of 2"
     assert group.spread("rms.post.e_p_m") == Spread(0.2, 0.2, 1), "not the law's failure"
     (nothing_thrown,) = aggregate([{**missed, "payload_kg": 0.0}])
     assert nothing_thrown.failures == {}
+
+
+def test_a_reported_catch_that_was_none_is_counted_and_not_averaged() -> None:
+    false, undetected = row(1, 0.1, caught=False), row(3, 0.3, catch_t_s=None)
+    (group,) = aggregate([false, row(2, 0.3), undetected])
+    assert group.failures == {"missed": 1}
+    for name in ("rms.post.e_p_m", "impedance_error.arm_nm", "final_abs_e_z_m", "peak_e_p_m", "torque_activity_nm"):
+        spread = group.spread(name)
+        assert spread is not None and spread.flights == 2, name
+    before = group.spread("rms.pre.e_p_m")
+    assert before is not None and before.flights == 3
+    assert (group.jsonable()["false_catches"], group.jsonable()["undetected_catches"]) == (1, 1)
+    assert compliance_table([group]).rows[0].cells[-2].text == "1, 1"
 
 
 def test_adaptation_is_compared_flight_by_flight() -> None:

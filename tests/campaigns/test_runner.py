@@ -180,7 +180,7 @@ def test_draws_are_written_as_table_and_cases_and_a_crash_is_exit_code_5(monkeyp
     fly_made_up(monkeypatch, row)
     ended = run_here("robustness", str(CATCH), "--draws", "12", "--first", "3", "--out", "out", "--keep", "kept.yaml")
     assert ended.code == EXIT_LOST
-    assert "12 worlds: 11 completed, 1 crashed; 12 caught, 0 missed the net" in ended.out
+    assert "12 worlds: 11 completed, 1 crashed; 12 caught, 0 missed the net; 0 false catches, 0 undetected" in ended.out
     assert "payload, kg +1.00" in ended.out
     assert "--preset recommended --world robustness --set world.payload_kg=" in ended.out
     names = {"draws.csv", "robustness.json", "robustness.html", "worst.yaml", "distribution.png"}

@@ -113,9 +113,10 @@ def test_the_cost_of_flights() -> None:
     assert flight_cost({**row, "outcome": "aborted"}) == ABORTED
     assert flight_cost({**row, "error": "ZeroDivisionError"}) == LOST
     nothing = {"e_p_m": None, "e_q_deg": None, "e_alpha_deg": None}
-    missed = {**row, "catch_t_s": None, "rms": {**row["rms"], "post": nothing}}
+    missed = {**row, "caught": False, "catch_t_s": None, "rms": {**row["rms"], "post": nothing}}
     missed["impedance_error"] = {"position_n": None, "arm_nm": None}
     assert flight_cost(missed) == pytest.approx(MISSED + 0.003 + 0.02 + 0.015)
+    assert flight_cost({**missed, "catch_t_s": 6.5}) == flight_cost(missed), "a reported catch that was none is a miss"
     empty = {**missed, "payload_kg": 0.0}
     assert terms_of(empty)["rms.post.e_p_m"] == 0.01, (
         "without a payload the whole flight counts as that after the catch"

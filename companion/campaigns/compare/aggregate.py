@@ -2,9 +2,9 @@
 formats them.
 
 A *row* holds the results of one flight as plain data: controller, preset, payload_kg, seed, world_seed, model_error, outcome,
-error, catch_t_s, rms {pre|post: e_p_m, e_q_deg, e_alpha_deg}, impedance_error {position_n, arm_nm}, final_e_z_m, peak_e_p_m,
-torque_activity_nm. A metric is None if its part of the flight was not completed: errors before a crash do not characterise the
-controller.
+error, caught (the world's truth), catch_t_s (the companion's event, mission clock), rms {pre|post: e_p_m, e_q_deg, e_alpha_deg},
+impedance_error {position_n, arm_nm}, final_e_z_m, peak_e_p_m, torque_activity_nm. A metric is None if its part
+of the flight was not completed: errors before a crash do not characterise the controller.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import Any
 from companion.campaigns.compare.grid import ADAPTATION_OFF, is_ablation
 from companion.campaigns.compare.paper_results import PrintedFlight, printed
 from companion.campaigns.cost import cost_of, flight_cost
-from companion.campaigns.runner import Row, flat
+from companion.campaigns.runner import Row, catches, flat
 
 COMPLETED = "completed"
 MISSED = "missed"
-"""Key in `Group.failures` for flights that were completed without a catch."""
+"""Key in `Group.failures` for flights that were completed without the payload, whatever the companion reported."""
 FIGURES = (
     *(f"rms.{part}.{key}" for part in ("pre", "post") for key in ("e_p_m", "e_q_deg", "e_alpha_deg")),
     "impedance_error.position_n",
@@ -64,9 +64,10 @@ class Group:
 
     def values(self, name: str) -> list[float]:
         """Return the value of one of `FIGURES` for each flight: infinite if the flight failed before its value was known. A
-        completed flight without a value, such as one whose payload missed the net, is left out.
+        completed flight without a value is left out, and one whose payload was not caught in all but the errors before the catch.
         """
-        found = ((row, figure(row, name)) for row in self.rows)
+        before = name.startswith("rms.pre.")
+        found = ((row, figure(row, name)) for row in self.rows if before or _failure(row) != MISSED)
         return [math.inf if value is None else value for row, value in found if value is not None or _ended_early(row)]
 
     def spread(self, name: str) -> Spread | None:
@@ -99,7 +100,7 @@ class Group:
     def jsonable(self) -> dict[str, Any]:
         """Return the group as in compare.json."""
         spreads = {name: self.spread(name) for name in FIGURES}
-        of = self.printed
+        of, (false, undetected) = self.printed, catches(self.rows)
         return {
             "controller": self.controller,
             "preset": self.preset,
@@ -108,6 +109,8 @@ class Group:
             "flights": len(self.rows),
             "completed": sum(row["outcome"] == COMPLETED for row in self.rows),
             "failures": self.failures,
+            "false_catches": false,
+            "undetected_catches": undetected,
             "cost_m": self.cost,
             "p50": _nested({name: None if spread is None else spread.p50 for name, spread in spreads.items()}),
             "p95": _nested({name: None if spread is None else spread.p95 for name, spread in spreads.items()}),
@@ -137,7 +140,7 @@ def _percentile(values: Sequence[float], share: float) -> float | None:
 def _failure(row: Row) -> str | None:
     if _ended_early(row):
         return str(row["outcome"])
-    return MISSED if row["payload_kg"] > 0 and row["catch_t_s"] is None else None
+    return MISSED if row["payload_kg"] > 0 and not row["caught"] else None
 
 
 @dataclass(frozen=True, slots=True)

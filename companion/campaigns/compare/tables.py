@@ -10,6 +10,7 @@ from rich.measure import Measurement
 from companion.analysis.table import Cell, Column, Table, for_terminal, table
 from companion.campaigns.compare.aggregate import MISSED, Group, Spread
 from companion.campaigns.compare.grid import is_ablation, short_label
+from companion.campaigns.runner import catches_text
 
 _PARTS = {"pre": "before", "post": "after"}
 _E_P, _E_Q, _E_ALPHA = ("e_p_m", "‖e_p‖", "m", 4), ("e_q_deg", "‖e_q‖", "deg", 2), ("e_alpha_deg", "‖e_α‖", "deg", 2)
@@ -57,6 +58,7 @@ def tracking_table(groups: Sequence[Group], *, p95: bool = True) -> Table:
 def compliance_table(groups: Sequence[Group], *, p95: bool = True) -> Table:
     """Return the table of compliance after the catch, which the tracking errors do not show."""
     columns = [_ours(*of, p95, failures=position == 0) for position, of in enumerate(_COMPLIANCE)]
+    columns.append(Column("catches false,\nundetected", lambda group: catches_text(group.rows)))
     columns.append(Column("cost\n[m]", lambda group: f"{group.cost:.3f}"))
     return _table("After the catch", columns, groups)
 

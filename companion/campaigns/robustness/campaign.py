@@ -14,7 +14,7 @@ from companion.analysis.table import Cell, Column, Table, for_terminal, number, 
 from companion.campaigns.process import Message
 from companion.campaigns.robustness.cases import Case, Cases, as_cases, fly_command, worse_than, write_cases
 from companion.campaigns.robustness.draws import DRAWN, DRIVERS, SAFE, drivers, influence, thirds, worst
-from companion.campaigns.runner import Campaign, Row, counted, outcomes, print_lines
+from companion.campaigns.runner import Campaign, Row, catches, counted, outcomes, print_lines
 from companion.model.types import Outcome
 
 
@@ -62,12 +62,15 @@ class Robustness(Campaign):
 
     def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
         """Return outcomes, catches, the distribution of the error and its correlations."""
+        false, undetected = catches(rows)
         return {
             "summary": {
                 "flights": len(rows),
                 "outcomes": outcomes(rows),
                 "caught": sum(bool(row["caught"]) for row in rows),
                 "missed": _missed(rows),
+                "false_catches": false,
+                "undetected_catches": undetected,
                 "not_thrown": sum(not row["thrown"] for row in rows),
                 "thirds": [{**asdict(third), "payload_kg": list(third.payload_kg)} for third in thirds(rows)],
                 "influence": influence(rows),
@@ -132,7 +135,9 @@ class Robustness(Campaign):
 
     def _result(self, rows: Sequence[Row]) -> str:
         caught = sum(bool(row["caught"]) for row in rows)
-        return f"{len(rows)} worlds: {counted(rows)}; {caught} caught, {_missed(rows)} missed the net"
+        false, undetected = catches(rows)
+        detected = f"{false} false catches, {undetected} undetected"
+        return f"{len(rows)} worlds: {counted(rows)}; {caught} caught, {_missed(rows)} missed the net; {detected}"
 
     def _dependence(self, rows: Sequence[Row]) -> str:
         strongest = list(influence(rows).items())[:5]
@@ -188,6 +193,7 @@ def thirds_table(rows: Sequence[Row]) -> Table:
         Column("payload", lambda third: "{:.2f} to {:.2f} kg".format(*third.payload_kg), left=True),
         Column("flights", lambda third: str(third.flights)),
         Column("caught", lambda third: str(third.caught)),
+        Column("catches false,\nundetected", lambda third: "{}, {}".format(*third.catches)),
         *map(percentile, ("p50", "p95", "max")),
     )
     return table(columns, thirds(rows), title="RMS of e_p after the catch, m")

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from companion.campaigns.runner import Row
+from companion.campaigns.runner import Row, catches
 from companion.model.types import Outcome
 from companion.sitl_config.per_joint import of_joints
 
@@ -89,6 +89,8 @@ class Third:
     payload_kg: tuple[float, float]
     flights: int
     caught: int
+    catches: tuple[int, int]
+    """Number of false and of undetected catches."""
     e_p_m: dict[str, float | None]
     """p50, p95 and max of the RMS after the catch, over the flights of `graded`."""
 
@@ -108,7 +110,11 @@ def thirds(rows: Sequence[Row]) -> list[Third]:
         errors = [row["e_p_m"] for row in graded(these)]
         shares = np.percentile(errors, [50, 95, 100]).tolist() if errors else (None, None, None)
         caught = sum(bool(row["caught"]) for row in these)
-        found.append(Third((low, high), len(these), caught, dict(zip(("p50", "p95", "max"), shares, strict=True))))
+        found.append(
+            Third(
+                (low, high), len(these), caught, catches(these), dict(zip(("p50", "p95", "max"), shares, strict=True))
+            )
+        )
     return found
 
 

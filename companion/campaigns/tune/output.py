@@ -13,7 +13,7 @@ from rich.console import Console
 from companion.analysis.page import Page, Picture, Section, write_page
 from companion.analysis.table import Column, Table, for_terminal, number, table
 from companion.campaigns.cost import TERMS, cost_of, flight_cost, terms_of
-from companion.campaigns.runner import counted, no_plots, print_lines, to_json
+from companion.campaigns.runner import catches_text, counted, no_plots, print_lines, to_json
 from companion.campaigns.tune.result import Gain, HeldOut, Result, completed, flown
 from companion.control.scaled_gains import controller_yaml as controller_file
 from companion.runtime.console import print_error
@@ -54,6 +54,7 @@ def costs_table(judged: HeldOut) -> Table:
     columns = (
         Column("", lambda side: side, left=True),
         Column("flights", lambda side: counted(sides[side]), left=True),
+        Column("catches false,\nundetected", lambda side: catches_text(sides[side])),
         Column("cost", lambda side: f"{cost_of([*map(flight_cost, sides[side])]):.4f}"),
         Column("worst\nflight", lambda side: f"{max(map(flight_cost, sides[side])):.4f}"),
         *(Column(term.key.removeprefix("rms.").replace(".", "\n"), share(term.key)) for term in TERMS),
