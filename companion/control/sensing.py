@@ -101,13 +101,24 @@ class ForceSensing:
 
 
 class CatchDetector:
-    """Detector of a caught payload: an impact on the sensor followed by a lasting downward force. The payload has left when that force
-    ends.
+    """Detector of a caught payload: an impact on the sensor after which a weight remains. The payload has left when that force ends.
+
+    Forces are relative to the mean force before the impact, because drift and the rotors' wake also act on the empty net.
     """
 
     BLOW_N = 1.5
-    PULL_N = 0.3
-    PULL_TIME_S = 0.25
+    PULL_N = 0.25
+    """Weight above which a payload is in the net: more than the sensor resolves, 0.2 N, and half the weight of 0.05 kg."""
+    SETTLE_S = 0.5
+    """Time after the impact during which the force is not yet a weight: a payload bounces, or falls off the rim."""
+    PULL_TIME_S = 1.0
+    """Time after the impact at which the mean force since `SETTLE_S` confirms the catch or discards the impact."""
+    CALM_S = 0.5
+    """Time without a force above `BLOW_N` after which the next impact replaces the earlier one."""
+    REST_S = 0.5
+    """Time constant of the mean force on the empty net, which is held from the impact on."""
+    LEFT_N = 0.2
+    """Resolution of the sensor: with a smaller force, the net is empty."""
     LEFT_SHARE = 0.3
     """The net is empty when the force, in any direction, is less than this fraction of the payload's measured weight."""
     LEFT_TIME_S = 0.5
@@ -119,6 +130,11 @@ class CatchDetector:
 
     def __init__(self) -> None:
         self._blow_s: float | None = None
+        self._hit_s = 0.0
+        """Time of the last force above `BLOW_N`."""
+        self._rest_n: Vec3 = (0.0, 0.0, 0.0)
+        """Mean force on the empty net."""
+        self._settled = False
         self._pull = 0.0
         self._samples = 0
         self._weight_n = 0.0
@@ -135,23 +151,36 @@ class CatchDetector:
         """Return True only in the tick that confirms a catch. `caught_s` is then the time of the impact."""
         if self.caught_s is not None or force_world_n is None:
             return False
-        x, y, z = force_world_n
+        dt_s, self._last_s = t_s - self._last_s, t_s
+        x, y, z = force_n = self._beyond_rest(force_world_n)
+        if x * x + y * y + z * z > self.BLOW_N**2:
+            if self._blow_s is None or t_s - self._hit_s > self.CALM_S:
+                self._blow_s, self._settled, self._pull, self._samples = t_s, False, 0.0, 0
+            self._hit_s = t_s
         if self._blow_s is None:
-            if x * x + y * y + z * z > self.BLOW_N**2:
-                self._blow_s, self._pull, self._samples = t_s, 0.0, 0
+            k = 1.0 - math.exp(-dt_s / self.REST_S)
+            rx, ry, rz = self._rest_n
+            self._rest_n = (rx + k * x, ry + k * y, rz + k * z)
             return False
+        if not self._settled and t_s - self._blow_s >= self.SETTLE_S:
+            self._settled, self._pull, self._samples = True, 0.0, 0
         self._pull += z
         self._samples += 1
         if t_s - self._blow_s < self.PULL_TIME_S:
             return False
-        if self._pull / self._samples < -self.PULL_N:
+        weight_n = -self._pull / self._samples
+        if weight_n > self.PULL_N:
             self.caught_s = self._blow_s
-            self._weight_n = self.PULL_N  # the mean contains the impact
-            self._carried_n, self._last_s, self._light_since_s = force_world_n, t_s, None
+            self._weight_n, self._carried_n, self._light_since_s = weight_n, force_n, None
             self._acceleration_z_m_s2 = 0.0
             return True
         self._blow_s = None
         return False
+
+    def _beyond_rest(self, force_world_n: Vec3) -> Vec3:
+        x, y, z = force_world_n
+        rx, ry, rz = self._rest_n
+        return (x - rx, y - ry, z - rz)
 
     def carries(self, t_s: float) -> bool:
         """Return whether a payload is, or may be, in the net at time `t_s`."""
@@ -184,9 +213,9 @@ class CatchDetector:
         dt_s, self._last_s = t_s - self._last_s, t_s
         k = 1.0 - math.exp(-dt_s / self.LOWPASS_S)
         x, y, z = self._carried_n
-        fx, fy, fz = force_world_n
+        fx, fy, fz = self._beyond_rest(force_world_n)
         x, y, z = self._carried_n = (x + k * (fx - x), y + k * (fy - y), z + k * (fz - z))
-        force_n, light_n = math.sqrt(x * x + y * y + z * z), self.LEFT_SHARE * self._weight_n
+        force_n, light_n = math.sqrt(x * x + y * y + z * z), max(self.LEFT_N, self.LEFT_SHARE * self._weight_n)
         self._acceleration_z_m_s2 += k * (acceleration_z_m_s2 - self._acceleration_z_m_s2)
         falling = GRAVITY_M_S2 + self._acceleration_z_m_s2 < self.FALLING_SHARE * GRAVITY_M_S2
         if falling or force_n > light_n:
@@ -210,6 +239,11 @@ class ObservedCatchDetector(CatchDetector):
     BLOW_N = 1.8
     PULL_N = 0.5
     PULL_TIME_S = 0.8
+    SETTLE_S = 0.0
+    CALM_S = math.inf
+    """Its noise makes impacts of its own after the one of the payload."""
+    REST_S = math.inf
+    """The observer subtracts a mean of its own."""
     LEFT_SHARE = 0.5
     LEFT_TIME_S = 0.8
     LOWPASS_S = 0.3

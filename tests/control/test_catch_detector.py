@@ -41,7 +41,7 @@ class Net:
         return (0.0, 0.0, -self.payload_kg * (G_M_S2 + acceleration_z_m_s2))
 
     def catch(self) -> None:
-        """A blow of 40 ms, then the weight."""
+        """A blow of 40 ms, then the weight for 1 s."""
         self.feel(0.04, (-6.0, 0.5, -9.0))
         self.feel(1.0, self.hang())
         assert self.detector.caught_s is not None
@@ -66,6 +66,60 @@ def test_catch_after_catch(payload_kg: float) -> None:
         assert len(net.left) == number
         assert 0.5 <= net.left[-1] - gone_s < 0.8
     assert len(net.caught) == 3
+
+
+def test_a_ball_that_hits_the_rim_and_falls_is_no_catch() -> None:
+    net = Net()
+    net.feel(2.0, EMPTY)
+    net.feel(0.03, (-12.0, 0.5, -15.0))
+    net.feel(0.12, (-1.5, 0.1, -2.0))
+    assert net.detector.unconfirmed_s == pytest.approx(2.0 + DT_S), "until then it may be one"
+    net.feel(3.0, EMPTY)
+    assert (net.caught, net.left, net.detector.unconfirmed_s) == ([], [], None)
+
+
+WAKE: Vec3 = (0.1, -0.05, -0.35)
+"""Drift of the sensor and the rotors' wake on the net."""
+
+
+def test_a_force_that_was_there_before_the_blow_is_no_weight() -> None:
+    net = Net()
+    net.feel(3.0, WAKE)
+    net.feel(0.04, (-12.0, 0.5, -15.0))
+    net.feel(2.0, WAKE)
+    assert net.caught == []
+
+
+def test_a_light_payload_leaves_a_net_on_which_the_wake_pulls() -> None:
+    net = Net(0.05)
+    net.feel(3.0, WAKE)
+    net.feel(0.04, (-6.0, 0.5, -6.0))
+    net.feel(3.0, (WAKE[0], WAKE[1], WAKE[2] + net.hang()[2]))
+    assert (len(net.caught), net.left) == (1, [])
+    net.feel(1.0, WAKE)
+    assert len(net.left) == 1
+
+
+@pytest.mark.parametrize("payload_kg", [0.05, 0.2, 0.5])
+@pytest.mark.parametrize("before_s", [0.6, 0.8, 0.95, 1.05])
+def test_a_bump_before_the_ball_hides_no_catch_and_does_not_date_it(before_s: float, payload_kg: float) -> None:
+    net = Net(payload_kg)
+    net.feel(2.0, EMPTY)
+    net.feel(0.04, (3.0, 0.0, 1.0))
+    net.feel(before_s - 0.04, EMPTY)
+    net.catch()
+    assert len(net.caught) == 1
+    assert net.detector.caught_s == pytest.approx(2.0 + before_s + DT_S)
+
+
+def test_a_payload_that_bounces_in_the_net_is_caught_where_it_first_touched() -> None:
+    net = Net(0.1)
+    net.feel(2.0, EMPTY)
+    for _ in range(3):
+        net.feel(0.04, (-6.0, 0.5, -9.0))
+        net.feel(0.11, EMPTY)
+    net.feel(1.0, net.hang())
+    assert net.detector.caught_s == pytest.approx(2.0 + DT_S)
 
 
 def test_a_bump_from_below_is_no_leaving() -> None:

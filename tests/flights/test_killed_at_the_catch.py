@@ -19,7 +19,7 @@ from sitl.fast.loop import FastFlight
 from tests.flights.test_fast_flights import event_ids
 from tests.support import SHORT_CATCH
 
-CONFIRMED_S = 0.25
+CONFIRMED_S = 1.0
 """After the catch."""
 
 
@@ -53,7 +53,7 @@ def test_a_catch_that_the_flight_could_not_confirm_is_in_the_summary(fault: str)
     )
 
 
-@pytest.mark.parametrize("after_s", [0.05, 0.2, 0.3, 0.6])
+@pytest.mark.parametrize("after_s", [0.05, 0.3, 0.8, 1.2])
 def test_a_catch_is_confirmed_by_its_event_alone(after_s: float) -> None:
     summary, ids = summary_of(f"{{kind: kill_flight, after: catch, t_s: {after_s}}}")
     assert summary["catch_confirmed"] is ("catch" in ids) is (after_s > CONFIRMED_S)
