@@ -19,6 +19,9 @@ from companion.sitl_config.loader import SitlConfig, load_sitl
 _OPTIONS = {"world.payload_kg": "--payloads", "world.seed": "--seeds", "world.model_error": "--model-error"}
 """Options to use instead of overriding the keys that the grid sets."""
 
+_FIRST_SEED_MAX = 900_000
+"""Largest first seed: `companion tune` searches in laboratories from 1,000,000 on."""
+
 
 def add_parser(commands: Any) -> None:
     """Add `compare` to the sub-parsers of `companion`."""
@@ -42,7 +45,7 @@ def add_parser(commands: Any) -> None:
         "--presets", type=names, default=(), metavar="NAME,...", help="default: all presets of each law"
     )
     parser.add_argument("--seeds", type=count, default=5, metavar="N", help="number of seeds per cell (default: 5)")
-    parser.add_argument("--first-seed", type=count, default=1, metavar="N", help="first seed (default: 1)")
+    parser.add_argument("--first-seed", type=_first_seed, default=1, metavar="N", help="first seed (default: 1)")
     parser.add_argument(
         "--model-error", type=_model_errors, metavar="SHARE,...",
         help="fractions by which masses, inertia and torque constants differ from the vehicle file, 0 to 0.3, e.g. 0,0.1,0.2,0.3 "
@@ -138,3 +141,10 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
         seeds=seeds,
         model_errors=model_errors,
     )
+
+
+def _first_seed(text: str) -> int:
+    """Parse the first seed, for argparse."""
+    if not text.isdecimal() or not 1 <= int(text) <= _FIRST_SEED_MAX:
+        raise argparse.ArgumentTypeError(f"expected a number from 1 to {_FIRST_SEED_MAX}, got '{text}'")
+    return int(text)

@@ -62,6 +62,12 @@ class Page(HTMLParser):
 COMPARE = ("compare", "--mission", str(CATCH), "--payloads", "0.2", "--controllers", "adaptive", "--out", "out")
 
 
+def test_laboratories_beyond_ten_thousand_can_be_flown(monkeypatch: pytest.MonkeyPatch) -> None:
+    fly_made_up(monkeypatch, compare_row)
+    ended = run_here(*COMPARE, "--presets", "paper", "--seeds", "2", "--first-seed", "10001", "--json")
+    assert [row["seed"] for row in json.loads(ended.out)["rows"]] == [10001, 10002]
+
+
 def test_files_of_a_comparison_hold_what_is_printed(monkeypatch: pytest.MonkeyPatch) -> None:
     def row(flight: dict[str, Any]) -> dict[str, Any]:
         return compare_row(flight, None if flight["preset"] == "paper" else 0.05, error=EVIL)
@@ -227,6 +233,7 @@ CASES = "mission: a.yaml\ncontroller: adaptive\npreset: paper\ncases: []\n"
         (("robustness", "--cases", "nowhere.yaml"), r"nowhere\.yaml: no such file"),
         (("robustness", "--cases", "empty.yaml"), r"empty\.yaml: cases: expected at least one case"),
         (("robustness", "--draws", "0"), r"expected a number from 1 to 10000"),
+        (("compare", "--first-seed", "1000000"), r"expected a number from 1 to 900000"),
         (("robustness", "--set", "world.wind=3"), r"wind"),
     ],
 )  # fmt: skip
