@@ -143,7 +143,7 @@ def test_a_wrong_model_is_visibly_worse(scale: float, sign: int) -> None:
     """15 % in every mass: off its height by the missing weight over the stiffness; too much mass makes up for some payload."""
     right = flown("world.payload_kg=0.2")
     masses = configured("world.payload_kg=0.2", f"controller.model_mass_scale={scale}")
-    wrong = FastFlight(masses).run(until_mission_s=11.0 if scale < 1.0 else 7.0)
+    wrong = FastFlight(masses).run(until_mission_s=11.0 if scale < 1.0 else 8.0)
     assert abs(height_error_before_catch_m(right)) < 0.003
     assert sign * height_error_before_catch_m(wrong) > 0.006
     assert scale > 1.0 or error_after_catch_m(wrong) > 1.25 * error_after_catch_m(right)
