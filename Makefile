@@ -9,7 +9,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # All targets run the source, also after make compile.
 export PYTHONPATH := $(CURDIR)
 
-.PHONY: install lock audit fly press compile test lint explore debian bench docs clean
+.PHONY: install lock audit fly press compile test lint explore mutants debian bench docs clean
 
 install: $(STAMP)
 
@@ -60,6 +60,12 @@ lint: install
 # Property tests and damaged input at every wire, at random, for whoever changes a parser: make explore MINUTES=10
 explore: install
 	@$(BIN)/python -m tests.explore $(MINUTES)
+
+# Which tests cannot fail: a random sample of mutants of each package, judged by its own tests, in some minutes a package:
+# make mutants MUTANTS="safety --seed 2 --count 100"
+mutants: install
+	@test -d build/mutants || $(BIN)/python -m pip install --quiet --disable-pip-version-check --target build/mutants cosmic-ray==8.7.0
+	@$(BIN)/python -m tools.mutants $(MUTANTS)
 
 # What tests need beside Python: a broker, a browser, udevadm. Nobody is asked for a password.
 debian:
