@@ -15,12 +15,13 @@ from companion.model.types import (
     LandedState,
     MocapPose,
     OperatorCommand,
+    Quat,
     VehicleState,
 )
 from companion.safety.autopilot_landing import IMPACT_HOLD_S, TIMEOUT_S, AutopilotLanding, LandingStep
 from companion.safety.touchdown import HEIGHT_HOLD_S, HEIGHT_MARGIN_M
 
-LEVEL = (1.0, 0.0, 0.0, 0.0)
+LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
 ZERO = (0.0, 0.0, 0.0)
 CLEARANCE_M = 0.3
 TILT_MAX_RAD = math.radians(40.0)
@@ -36,22 +37,28 @@ def seen(
     armed: bool = True,
     heard_s: float | None = None,
     mocap: bool = True,
+    mocap_m: float | None = None,
     position_s: float | None = None,
+    attitude: Quat = LEVEL,
+    mocap_attitude: Quat | None = None,
+    attitude_s: float | None = None,
+    imu_s: float | None = None,
+    feels_m_s2: float = 9.81,
+    aside_m: float = 0.0,
 ) -> Inputs:
-    position = (0.0, 0.0, height_m)
-    stamp_s = t_s if position_s is None else position_s
+    """PX4 at a height, in a mode, armed; motion capture agrees where it is not given another value."""
     return Inputs(
         tick=0,
         t_s=t_s,
         vehicle=VehicleState(
-            position_stamp_s=stamp_s,
-            attitude_stamp_s=t_s,
-            imu_stamp_s=t_s,
-            position_world_m=position,
+            position_stamp_s=t_s if position_s is None else position_s,
+            attitude_stamp_s=t_s if attitude_s is None else attitude_s,
+            imu_stamp_s=t_s if imu_s is None else imu_s,
+            position_world_m=(aside_m, 0.0, height_m),
             velocity_world_m_s=(0.0, 0.0, -sink_m_s),
-            attitude_wxyz=LEVEL,
+            attitude_wxyz=attitude,
             angular_rate_body_rad_s=ZERO,
-            specific_force_body_m_s2=(0.0, 0.0, 9.81),
+            specific_force_body_m_s2=(0.0, 0.0, feels_m_s2),
         ),
         status=AutopilotStatus(
             heartbeat_stamp_s=t_s if heard_s is None else heard_s,
@@ -64,8 +71,8 @@ def seen(
         mocap=MocapPose(
             stamp_s=t_s if mocap else 0.0,
             frame_number=1,
-            position_world_m=position,
-            attitude_wxyz=LEVEL,
+            position_world_m=(aside_m, 0.0, height_m if mocap_m is None else mocap_m),
+            attitude_wxyz=attitude if mocap_attitude is None else mocap_attitude,
             tracking_valid=True,
             marker_error_m=0.0,
         ),
@@ -183,6 +190,39 @@ def test_a_slower_descent_after_a_gap_in_px4s_positions_is_no_impact() -> None:
         stamp_s = 1.5 if 1.5 < t_s < 1.75 else t_s
         sink_m_s = 0.65 if stamp_s <= 1.5 else 0.4
         assert not landing.step(seen(t_s, 0.8, sink_m_s=sink_m_s, mocap=False, position_s=stamp_s)).zero_thrust
+
+
+@pytest.mark.parametrize("mocap_m", [CLEARANCE_M + 0.6, None])
+def test_thrust_is_not_cut_while_motion_capture_shows_the_vehicle_high_although_px4_believes_that_it_stands(
+    mocap_m: float | None,
+) -> None:
+    """It hangs on its tether and PX4's height has drifted; the second run shows that it lands otherwise."""
+    landing = Landing(pilot=False)
+    steps = [landing.step(seen(1.0 + k * 0.005, 0.31, mocap_m=mocap_m)) for k in range(600)]
+    assert any(step.zero_thrust for step in steps) is (mocap_m is None)
+
+
+def test_a_touchdown_in_the_first_second_of_the_landing_does_not_count() -> None:
+    """PX4 brakes first: neither its speed nor its height says that it stands."""
+    landing = Landing(pilot=False)
+    times = [k * 0.005 for k in range(1, 600)]
+    cut_s = next(t_s for t_s in times if landing.step(seen(t_s, 0.31)).zero_thrust)
+    assert cut_s == pytest.approx(1.0 + HEIGHT_HOLD_S, abs=0.02)
+
+
+def test_without_px4s_word_a_standing_vehicle_is_disarmed_by_force_after_four_seconds_of_zero_thrust() -> None:
+    landing = Landing(pilot=False)
+    offboard_s = math.inf
+    requests: list[tuple[float, AutopilotRequest]] = []
+    for k in range(1, 1800):
+        t_s = k * 0.005
+        mode = FlightMode.OFFBOARD if t_s >= offboard_s else FlightMode.LAND
+        step = landing.step(seen(t_s, 0.31, mode=mode))
+        requests.append((t_s, step.request))
+        if step.request is AutopilotRequest.OFFBOARD and offboard_s == math.inf:
+            offboard_s = t_s + 1.0
+    first_s = next(t_s for t_s, request in requests if request is AutopilotRequest.FORCE_DISARM)
+    assert first_s == pytest.approx(offboard_s + 4.0, abs=0.02)
 
 
 def test_sinking_is_no_touchdown() -> None:
