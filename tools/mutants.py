@@ -1,7 +1,7 @@
 """Mutation tests: breaks one place of a module at a time and reports which of these mutants no test of its package notices.
 
 `python -m tools.mutants` judges a random sample; cosmic-ray finds the places and writes the mutants. Each package of `PACKAGES` is
-judged by the tests in the folder of the same name, on a copy of the repository in build/mutated. A mutant that runs into the timeout is
+judged by the tests in the folder of the same name, on a copy of the repository in build/. A mutant that runs into the timeout is
 killed.
 
 Not mutated are annotations, imports, asserts, decorators and the options of a class, which no flight reaches, and `<` for `<=`: a
@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, Final
 
 ROOT = Path(__file__).parent.parent
-COPY = ROOT / "build" / "mutated"
+COPY = ROOT / "build" / f"mutated-{os.getpid()}"
 TOOL = ROOT / "build" / "mutants"
 """Where `make mutants` installs cosmic-ray; behind the project's own packages, whose versions count."""
 PACKAGES: Final = {
@@ -251,7 +251,6 @@ def in_order(mutant: Mutant, seconds: dict[str, float]) -> list[str]:
 
 def copy_repository() -> None:
     """Copy all files that git knows or would add."""
-    shutil.rmtree(COPY, ignore_errors=True)
     listed = subprocess.run(["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, check=True)
     for name in listed.stdout.decode().splitlines():
         if (ROOT / name).exists():
@@ -270,7 +269,15 @@ def main() -> int:
     found = operators()
     for name in THIRD_PARTY:
         __import__(name)
-    copy_repository()
+    try:
+        copy_repository()
+        return judge(args, found)
+    finally:
+        shutil.rmtree(COPY, ignore_errors=True)
+
+
+def judge(args: argparse.Namespace, found: dict[str, Any]) -> int:
+    """Judge the mutants of each package."""
     rows = []
     for package in args.packages:
         chosen = [m for m in mutants(package, found) if not args.at or m.place.startswith(tuple(args.at))]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import msgspec
 import pytest
 
 from companion.core import flight_core
@@ -20,14 +21,26 @@ from tests.support import SHORT_CATCH
 
 
 def plain(value: object) -> object:
-    """A record as dictionaries, plans left out: each is another object."""
+    """A copy of a record as dictionaries, down to its last value; plans left out, because each is another object."""
     if isinstance(value, Plan):
         return None
     if isinstance(value, Course):
         return (value.start_s, value.change)
+    if isinstance(value, msgspec.Struct):
+        return {name: plain(getattr(value, name)) for name in value.__struct_fields__}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return value
+    if isinstance(value, dict):
+        return {key: plain(one) for key, one in value.items()}
+    return [plain(one) for one in value] if isinstance(value, list | tuple) else value
+
+
+def test_a_value_deep_in_the_state_is_compared() -> None:
+    """The test below once compared the state with itself."""
+    state = Parameters.of(load_sitl(SHORT_CATCH)).initial_state()
+    before = plain(state)
+    object.__setattr__(state.touchdown.height, "since_s", 1.0)
+    assert plain(state) != before
 
 
 def test_a_transition_done_twice_gives_the_same_and_leaves_its_arguments_alone(monkeypatch: pytest.MonkeyPatch) -> None:

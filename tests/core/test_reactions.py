@@ -1,0 +1,178 @@
+"""What the core does with a tick's most severe event: one transition at a time, from a state that the test makes up."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from companion.config.loader import load_flight
+from companion.core.flight_state import FlightState, Observation, Request
+from companion.core.state_machine import transition
+from companion.core.transition import Parameters
+from companion.mission import contact
+from companion.mission.active_plan import Course
+from companion.mission.plan import Plan
+from companion.mission.reference import at_rest
+from companion.model.flight_stage import Stage
+from companion.model.types import (
+    AutopilotRequest,
+    Event,
+    FlightMode,
+    Outcome,
+    SafetyAction,
+    Severity,
+    TetherState,
+    Vec3,
+)
+from companion.safety.autopilot_landing import AutopilotLanding
+from companion.safety.supervisor import SupervisorState
+from tests.safety.healthy import SLOW, healthy, put
+
+CONFIG = load_flight("configs/missions/catch.yaml")
+P = Parameters.of(CONFIG)
+ANCHOR: Vec3 = (0.0, -1.2, 0.0)  # configs/vehicles/tarot650_2r.yaml
+PULLS = [replace(SLOW, taut=True), replace(SLOW, snagged=True)]
+HERE: Vec3 = (0.0, 0.3, 1.0)
+"""The anchor lies towards -y."""
+
+
+def in_plan(plan_s: float = 6.0) -> FlightState:
+    """In the air, some time into the mission."""
+    now_s = healthy().t_s
+    plan = Plan.build(CONFIG.mission, CONFIG.vehicle)
+    course = Course(plan, now_s - plan_s)
+    return replace(
+        P.initial_state(),
+        stage=Stage.PLAN,
+        entered_s=now_s - plan_s,
+        plan=plan,
+        course=course,
+        mission_start_s=now_s - plan_s,
+    )
+
+
+def after(
+    state: FlightState,
+    event_id: str,
+    action: SafetyAction,
+    *,
+    velocity: Vec3 = (0.0, 0.0, 0.0),
+    tether: TetherState = SLOW,
+    **observed: Any,
+) -> tuple[FlightState, Request]:
+    """The state and the requests after a tick with one event."""
+    event = Event(t_s=healthy().t_s, id=event_id, severity=Severity.CRITICAL, action=action, text="")
+    observation = Observation(
+        **{
+            "inputs": healthy(),
+            "airborne": True,
+            "armed_by_others": False,
+            "standing": None,
+            "reference": replace(at_rest(HERE, 0.4, P.fold_rad), velocity_world_m_s=velocity),
+            "tether": tether,
+            "thrust_share": 1.0,
+            "pose_s": healthy().t_s,
+            "dt_s": 0.005,
+            "force_world_n": None,
+            "disturbance_world_n": None,
+            "position_error_m": (0.0, 0.0, 0.0),
+            "yaw_error_rad": 0.0,
+            **observed,
+        }
+    )
+    return transition(P, state, (event,), observation)
+
+
+def ids(request: Request) -> list[str]:
+    return [event.id for event in request.events]
+
+
+def start_velocity(state: FlightState) -> Vec3:
+    assert state.course is not None and state.aborting
+    return state.course.plan.reference(0.0).velocity_world_m_s
+
+
+OUTWARD_UP: Vec3 = (0.1, 0.4, 0.3)
+
+
+@pytest.mark.parametrize("tether", PULLS)
+def test_a_landing_with_a_taut_tether_does_not_first_fly_on_outward_or_up(tether: TetherState) -> None:
+    state, _ = after(in_plan(), "arm_lost", SafetyAction.LAND, velocity=OUTWARD_UP, tether=tether)
+    assert start_velocity(state) == pytest.approx((0.1, 0.0, 0.0))
+
+
+def test_a_landing_with_a_slack_tether_brakes_from_the_present_velocity() -> None:
+    state, _ = after(in_plan(), "arm_lost", SafetyAction.LAND, velocity=OUTWARD_UP)
+    assert start_velocity(state) == pytest.approx(OUTWARD_UP)
+    assert state.outcome is Outcome.ABORTED
+
+
+def touching(towards: Vec3) -> FlightState:
+    return replace(in_plan(), contact=contact.begun(healthy().t_s, towards, (0.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("towards", "retracts"),
+    [((0.0, -1.0, 0.0), False), ((0.6, -0.8, 0.0), False), ((0.0, 1.0, 0.0), True), (None, True)],
+)
+def test_no_retract_leads_through_the_surface_between_vehicle_and_anchor(towards: Vec3 | None, retracts: bool) -> None:
+    state = in_plan() if towards is None else touching(towards)
+    state, request = after(state, "tether_taut", SafetyAction.RETRACT, tether=PULLS[0])
+    assert ("no_room_to_stay" in ids(request)) is not retracts
+    assert state.supervisor.action is (SafetyAction.RETRACT if retracts else SafetyAction.LAND)
+    assert state.course is not None and state.aborting and state.contact is None
+    last = state.course.plan.reference(state.course.plan.duration_s).position_world_m
+    nearer_m = math.dist(HERE[:2], ANCHOR[:2]) - math.dist(last[:2], ANCHOR[:2])
+    assert nearer_m > 0.3 if retracts else nearer_m < 0.05
+
+
+@pytest.mark.parametrize("mode", [FlightMode.MANUAL, FlightMode.HOLD])
+def test_a_flip_under_a_pilot_begins_no_landing_of_the_companions_own(mode: FlightMode) -> None:
+    """A new landing would command LAND to a pilot in HOLD."""
+    now_s = healthy().t_s
+    landing = AutopilotLanding.begin(now_s - 1.0, P.clearance_m, P.tilt_max_rad, pilot=True, pose_s=now_s)
+    flown = replace(
+        P.initial_state(),
+        stage=Stage.AUTOPILOT_LAND,
+        entered_s=now_s - 1.0,
+        landing=landing,
+        outcome=Outcome.ABORTED,
+        supervisor=SupervisorState(SafetyAction.AUTOPILOT_LAND, "pilot_took_over", now_s - 1.0),
+    )
+    state, request = after(flown, "crashed", SafetyAction.TERMINATE, inputs=put("status", mode=mode)(healthy()))
+    assert request.autopilot is AutopilotRequest.NONE
+    assert state.pilot_flies
+    assert state.outcome is Outcome.ABORTED
+
+
+@pytest.mark.parametrize("height_m", [0.3, 0.58, 0.62])
+def test_a_hold_near_the_floor_is_a_landing(height_m: float) -> None:
+    """There it would hang in its own downwash, 0.3 m above standing height and lower."""
+    state = in_plan()
+    assert state.course is not None
+    plan = state.course.plan
+    assert P.clearance_m == 0.3
+    at_s = next(k * 0.005 for k in range(2000) if plan.reference(k * 0.005).position_world_m[2] >= height_m)
+    state, request = after(in_plan(at_s), "too_fast", SafetyAction.HOLD)
+    lands = height_m < 0.6
+    assert ("no_room_to_stay" in ids(request)) is lands
+    assert state.course is not None and state.course.held is not lands
+    assert state.supervisor.action is (SafetyAction.LAND if lands else SafetyAction.HOLD)
+
+
+def test_before_take_off_a_fault_refuses_the_flight_and_the_operators_word_ends_it() -> None:
+    armed = replace(P.initial_state(), stage=Stage.OFFBOARD, entered_s=healthy().t_s - 1.0)
+    for cause, outcome in (("arm_lost", Outcome.REFUSED), ("operator_land", Outcome.ABORTED)):
+        state, _ = after(armed, cause, SafetyAction.LAND, airborne=False, reference=None)
+        assert (state.stage, state.outcome) == (Stage.STAND_DOWN, outcome)
+
+
+def test_armed_by_others_and_unseen_by_motion_capture_px4s_height_counts_for_nothing() -> None:
+    """The companion has sent PX4 no pose, so PX4's height may have drifted."""
+    state, unseen = replace(P.initial_state(), entered_s=healthy().t_s), replace(healthy(), mocap=None)
+    state, _ = after(state, "reattached", SafetyAction.AUTOPILOT_LAND, armed_by_others=True, inputs=unseen)
+    assert state.stage is Stage.AUTOPILOT_LAND and state.landing is not None
+    assert state.landing.pose_s == state.landing.stop.pose_s == -math.inf
