@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from companion.guardian import heartbeat
 from companion.guardian.heartbeat import Heartbeat
-from companion.guardian.monitors import JUMP_M, SPEED_MAX_M_S, PoseFilter, StallWatch
+from companion.guardian.monitors import PoseFilter, StallWatch
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 byte = st.integers(0, 255)
@@ -95,13 +95,15 @@ def test_what_the_guardian_slept_through_proves_nothing() -> None:
 
 
 def test_an_impossible_pose_is_rejected() -> None:
+    """Half a metre, and 4 m/s since the last accepted pose."""
     plausible = PoseFilter(10.0, (1.0, 2.0, 1.5))
     assert plausible.check(10.005, (1.01, 2.0, 1.5))
-    assert not plausible.check(10.010, (1.01 + JUMP_M + 0.1, 2.0, 1.5))
+    assert not plausible.check(10.010, (1.01 + 0.53, 2.0, 1.5))
     assert plausible.check(10.015, (1.02, 2.0, 1.5)), "the jump has not become the place to measure from"
     assert not plausible.check(10.020, (math.nan, 2.0, 1.5))
-    late_s = 10.015 + 1.0
-    assert plausible.check(late_s, (1.02 + SPEED_MAX_M_S, 2.0, 1.5)), "after a gap more is possible"
+    assert not plausible.check(11.015, (1.02 + 4.6, 2.0, 1.5))
+    assert plausible.check(11.015, (1.02 + 4.4, 2.0, 1.5)), "after a gap more is possible"
+    assert plausible.check(11.015, (1.02 + 4.85, 2.0, 1.5))
 
 
 def test_the_first_pose_is_accepted_if_there_was_none() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -24,15 +25,17 @@ LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
 ON_ITS_BACK = quat_from_euler_zyx(math.pi, 0.0, 0.0)
 ON_ITS_ROTORS = quat_from_euler_zyx(math.radians(-55.0), 0.0, 0.0)
 ARMED = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+DISARMED = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 LAND_MODE, OFFBOARD_MODE = 4 << 16 | 6 << 24, 6 << 16
 
 
 class Wire:
     """PX4's end of the link in memory, which keeps what was sent."""
 
-    ready, lost = True, False
+    lost = False
 
     def __init__(self) -> None:
+        self.ready = True
         self._decoder = mavlink.MAVLink(None)
         self.sent: list[Any] = []
 
@@ -96,6 +99,8 @@ class Landing:
         mocap: bool = True,
         corrupt: Callable[[Any], None] = lambda message: None,
         mode: int = LAND_MODE,
+        armed: bool = True,
+        beating: bool = True,
     ) -> None:
         """Run with PX4 in a mode, armed, at rest at a height, without its land detector; `corrupt` changes each state message."""
         q = attitude_ned_frd_from_enu_flu(attitude)
@@ -109,7 +114,7 @@ class Landing:
             said = [state[name] for name in messages]
             for message in said:
                 corrupt(message)
-            heartbeat = mavlink.MAVLink_heartbeat_message(2, 12, ARMED, mode, 4, 3)
+            heartbeat = mavlink.MAVLink_heartbeat_message(2, 12, ARMED if armed else DISARMED, mode, 4, 3)
             if mocap:
                 number = round(self.t_s / STEP_S)
                 position: Vec3 = (0.0, 0.0, height_m)
@@ -125,7 +130,7 @@ class Landing:
                         )
                     ]
                 )
-            self.takeover.take_messages(self.t_s, [heartbeat, *said])
+            self.takeover.take_messages(self.t_s, [heartbeat, *said] if beating else said)
             if self.takeover.landed is None:
                 self.takeover.step(self.t_s)
 
@@ -188,9 +193,142 @@ def test_from_a_surface_the_vehicle_moves_back_before_px4_is_told_to_land() -> N
     assert landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)
 
 
+AT_A_SURFACE = replace(beat(), back_world_m=(-0.3, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("last", "lands"),
+    [(replace(AT_A_SURFACE, pilot=True), False), (replace(AT_A_SURFACE, mocap_refused=True), True)],
+    ids=["a pilot flies", "motion capture is refused"],
+)
+def test_no_position_setpoint_against_a_pilot_or_on_poses_that_the_flight_process_rejected(
+    last: Heartbeat, lands: bool
+) -> None:
+    landing = Landing(last)
+    landing.run(1.0, mode=OFFBOARD_MODE, height_m=1.1)
+    assert landing.positions == []
+    assert bool(landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)) is lands
+
+
+@pytest.mark.parametrize("armed", [True, False])
+def test_disarmed_it_is_not_moved_back(armed: bool) -> None:
+    landing = Landing(AT_A_SURFACE)
+    landing.run(0.3, mode=OFFBOARD_MODE, height_m=1.1, armed=armed)
+    assert bool(landing.positions) is armed
+
+
+def test_the_way_back_is_flown_at_half_a_metre_per_second_squared_and_consistent_in_itself() -> None:
+    landing = Landing(AT_A_SURFACE)
+    landing.run(4.0, mode=OFFBOARD_MODE, height_m=1.1)
+    found = landing.positions
+    t_s = [m.time_boot_ms * 1e-3 for m in found]
+    for (t0, a), (t1, b) in itertools.pairwise(zip(t_s, found, strict=True)):
+        assert 0.019 < t1 - t0 < 0.031
+        assert b.y - a.y == pytest.approx(0.5 * (a.vy + b.vy) * (t1 - t0), abs=1e-4)
+        assert b.vy - a.vy == pytest.approx(0.5 * (a.afy + b.afy) * (t1 - t0), abs=2e-3)
+    assert max(abs(m.afy) for m in found) == pytest.approx(0.5, abs=0.005)
+    assert t_s[-1] - t_s[0] == pytest.approx(1.86, abs=0.04)
+
+
+def test_without_a_position_of_px4_it_waits_for_one_for_0_3_s_and_then_lands() -> None:
+    landing = Landing(AT_A_SURFACE)
+    landing.run(0.28, mode=OFFBOARD_MODE, messages=("attitude",))
+    assert not landing.positions and not landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)
+    landing.run(0.06, mode=OFFBOARD_MODE, messages=("attitude",))
+    assert not landing.positions and landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)
+
+
+@pytest.mark.parametrize(("after_s", "landed"), [(1.4, None), (1.6, True)])
+def test_a_disarmed_of_before_the_takeover_does_not_end_the_landing_after_an_error(
+    after_s: float, landed: bool | None
+) -> None:
+    """PX4 reports it once a second; the vehicle may have been armed since."""
+    landing = Landing(beat())
+    landing.takeover.take_messages(
+        START_S + after_s, [mavlink.MAVLink_heartbeat_message(2, 12, DISARMED, LAND_MODE, 4, 3)]
+    )
+    landing.takeover.restart(START_S + after_s)
+    assert landing.takeover.landed is landed
+
+
+@pytest.mark.parametrize(
+    ("mode", "armed", "pilot", "commanded"),
+    [
+        (OFFBOARD_MODE, True, False, True),
+        (LAND_MODE, True, False, False),
+        (OFFBOARD_MODE, False, False, False),
+        (OFFBOARD_MODE, True, True, False),
+    ],
+)
+def test_after_an_error_px4_is_told_to_land_unless_it_does_or_a_pilot_flies(
+    mode: int, armed: bool, pilot: bool, commanded: bool
+) -> None:
+    landing = Landing(replace(beat(), pilot=pilot))
+    said = mavlink.MAVLink_heartbeat_message(2, 12, ARMED if armed else DISARMED, mode, 4, 3)
+    landing.takeover.take_messages(START_S + 0.1, [said])
+    landing.takeover.restart(START_S + 0.1)
+    assert bool(landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)) is commanded
+    assert landing.takeover.landed is None
+    landing.takeover.restart(START_S + 4 * TIMEOUT_S + 1.0)
+    assert landing.takeover.landed is not armed, "errors without end"
+
+
+def test_requests_are_repeated_at_their_rates() -> None:
+    landing = Landing(beat())
+    landing.run(2.0, mode=OFFBOARD_MODE, height_m=1.0)
+    assert [m.param1 for m in landing.wire.commands(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)] == [32, 31, 105, 245, 230]
+    assert [m.param2 for m in landing.wire.commands(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)] == [2e4, 2e4, 2e4, 1e5, 1e5]
+    assert len(landing.wire.commands(mavlink.MAV_CMD_REQUEST_MESSAGE)) == pytest.approx(20, abs=2)
+    assert len(landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)) == pytest.approx(8, abs=1)
+    assert len([m for m in landing.wire.sent if m.get_type() == "HEARTBEAT"]) == 2
+    landing.takeover.link_reopened()
+    landing.run(0.1, mode=OFFBOARD_MODE, height_m=1.0)
+    assert len(landing.wire.commands(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)) == 10, "PX4 may have restarted"
+
+
+def test_px4s_mode_is_awaited_for_0_15_s_before_it_is_told_to_land() -> None:
+    landing = Landing(beat())
+    landing.run(0.15, height_m=1.0, beating=False)
+    assert not landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)
+    landing.run(0.03, height_m=1.0, beating=False)
+    assert landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)
+
+
+def test_on_a_link_without_a_peer_it_sends_nothing_for_a_second() -> None:
+    landing = Landing(beat())
+    landing.wire.ready = False
+    landing.run(0.98, height_m=1.0, beating=False, mocap=False)
+    assert landing.wire.sent == []
+    landing.run(0.3, height_m=1.0, beating=False)
+    assert landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)
+
+
+@pytest.mark.parametrize(("beating", "lost_s"), [(True, 4 * TIMEOUT_S), (False, TIMEOUT_S)])
+def test_what_does_not_land_is_given_up_after_four_attempts_and_a_silent_one_after_the_first(
+    beating: bool, lost_s: float
+) -> None:
+    landing = Landing(beat())
+    landing.run(1.0, height_m=2.0)
+    landing.run(lost_s - 2.0, height_m=2.0, beating=beating)
+    assert landing.takeover.landed is None
+    landing.run(2.0, height_m=2.0, beating=beating)
+    assert landing.takeover.landed is False
+    assert landing.notices[-1].id == "guardian_lost_vehicle"
+
+
+def test_a_pose_that_jumps_is_not_sent_and_is_reported_once() -> None:
+    landing = Landing(beat())
+    landing.run(0.5)
+    sent = len(landing.wire.poses)
+    landing.run(0.05, height_m=STANDING_M + 0.8)
+    assert len(landing.wire.poses) == sent
+    assert [notice.id for notice in landing.notices].count("guardian_mocap") == 1
+    assert landing.takeover.pose is not None and landing.takeover.pose.position_world_m[2] == STANDING_M
+
+
 @pytest.mark.parametrize("mode", [LAND_MODE, OFFBOARD_MODE])
 def test_without_a_position_or_out_of_offboard_px4_lands_at_once(mode: int) -> None:
-    landing = Landing(replace(beat(), back_world_m=(-0.3, 0.0, 0.0)))
+    landing = Landing(AT_A_SURFACE)
     landing.run(0.6, mode=mode, messages=("attitude",) if mode == OFFBOARD_MODE else ("position", "attitude"))
     assert not landing.positions
     assert landing.wire.commands(mavlink.MAV_CMD_NAV_LAND) or mode == LAND_MODE
