@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from functools import cache
@@ -85,6 +86,61 @@ def test_committed_missions_pass_untouched(mission: str) -> None:
         governed = g.constrain(DT_S, reference, tether())
         assert governed.limited_by == (), (tick * DT_S, reference)
         assert governed.reference is reference
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("jump_m", "faster", "why"),
+    [(0.0019, 0.0, ()), (0.0021, 0.0, ("acceleration",)), (0.0, 0.99, ()), (0.0, 1.01, ("acceleration",))],
+)
+def test_a_reference_that_jumps_by_2_mm_or_accelerates_beyond_the_limit_is_constrained(
+    axis: int, jump_m: float, faster: float, why: tuple[str, ...]
+) -> None:
+    g = governor()
+    g.constrain(DT_S, asked((0.0, 0.0, 1.0)), None)
+    v, p = [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]
+    v[axis] = faster * g.acceleration_max_m_s2 * DT_S
+    p[axis] += jump_m + 0.5 * v[axis] * DT_S
+    assert g.constrain(DT_S, asked((p[0], p[1], p[2]), (v[0], v[1], v[2])), None).limited_by == why
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.6, 0.0, -0.8)])
+def test_a_reference_faster_than_the_mission_may_fly_is_constrained(direction: Vec3) -> None:
+    for share, why in ((0.999, ()), (1.001, ("speed",))):
+        g = governor()
+        speed_m_s = share * g.speed_max_m_s
+        v = (speed_m_s * direction[0], speed_m_s * direction[1], speed_m_s * direction[2])
+        assert g.constrain(DT_S, asked((0.0, 0.0, 1.0), v), None).limited_by == why
+
+
+def test_what_returns_to_its_reference_does_so_within_seconds_and_does_not_overshoot() -> None:
+    g = governor()
+    follow(g, at_rest((-1.0, 0.0, 1.0), 0.0, ARM), 0.1)
+    goal = at_rest((-0.5, 0.2, 1.1), 0.0, ARM)
+    way = [g.constrain(DT_S, goal, None).reference for _ in range(round(4.0 / DT_S))]
+    left_m = [math.dist(reference.position_world_m, (-0.5, 0.2, 1.1)) for reference in way]
+    assert all(b <= a + CLOSE for a, b in itertools.pairwise(left_m))
+    assert left_m[round(1.0 / DT_S)] < 0.5 * left_m[0]
+    assert left_m[round(2.5 / DT_S)] < 0.02
+    assert way[-1] is goal
+    for a, b in itertools.pairwise(way[: way.index(goal)]):
+        mean = [0.5 * (v + w) for v, w in zip(a.velocity_world_m_s, b.velocity_world_m_s, strict=True)]
+        gone = [(q - p) / DT_S for p, q in zip(a.position_world_m, b.position_world_m, strict=True)]
+        assert math.dist(mean, gone) < 1e-3
+        grown = [(w - v) / DT_S for v, w in zip(a.velocity_world_m_s, b.velocity_world_m_s, strict=True)]
+        assert math.dist(grown, b.acceleration_world_m_s2) < 1e-6
+
+
+@given(st.tuples(st.floats(-2.5, 2.5), st.floats(-2.2, 2.2), st.floats(-1.0, 2.6)))
+def test_the_safe_set_is_the_room_and_the_reach_of_the_tether(p: Vec3) -> None:
+    """The room of the vehicle file less 0.49 m for the rotors and 0.15 m above; a tether of 3 m less its margin of 0.25 m."""
+    within = SafeSet(config().vehicle)
+    walls_m = max(abs(p[0]) - 1.71, abs(p[1]) - 1.31, p[2] - 2.05, 0.3 - 0.75 - p[2])
+    reach_m = math.dist(p, (0.0, -1.2, 0.0)) - 2.75
+    assert within.breach_walls_m(p) == pytest.approx(walls_m)
+    assert within.breach_tether_m(p) == pytest.approx(reach_m)
+    if abs(max(walls_m, reach_m)) > 1e-6:
+        assert within.holds(p) is (max(walls_m, reach_m) <= 0.0)
 
 
 coordinate = st.floats(-20, 20, allow_nan=False)

@@ -514,6 +514,53 @@ def test_fast_flight_and_a_gap_are_no_jump() -> None:
     assert watched(VEHICLE, inputs, flying()) == []
 
 
+@pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (-1, 0, 0), (0, -1, 0), (0, 0, -1)])
+@pytest.mark.parametrize(("size_m", "trusted"), [(0.09, True), (0.11, False)])
+def test_a_jump_is_one_from_ten_centimetres_on_in_every_direction(
+    direction: tuple[int, int, int], size_m: float, trusted: bool
+) -> None:
+    monitors = Monitors(VEHICLE)
+    watched(VEHICLE, [healthy(k) for k in range(3)], flying(), monitors)
+    x, y, z = direction
+    monitors.check(moved("mocap", (size_m * x, size_m * y, size_m * z))(healthy(3)), flying())
+    assert monitors.mocap_trusted is trusted
+
+
+@pytest.mark.parametrize("component", [0, 1, 2])
+def test_a_pose_is_compared_with_where_px4s_velocity_has_carried_the_last_one(component: int) -> None:
+    """80 ms without a frame at 1.5 m/s are 0.12 m, more than the jump limit."""
+    velocity, there = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+    velocity[component], there[component] = 1.5, 0.12
+    monitors = Monitors(VEHICLE)
+    fast = put("vehicle", velocity_world_m_s=tuple(velocity))
+    gone = [fast(replace(healthy(k), mocap=healthy(min(k, 4)).mocap)) for k in range(20)]
+    watched(VEHICLE, gone, flying(), monitors)
+    monitors.check(fast(moved("mocap", (there[0], there[1], there[2]))(healthy(20))), flying())
+    assert monitors.mocap_trusted
+
+
+# -- the room --------------------------------------------------------------------------------------------------------
+
+WALLS = [(0, 1, 1.81), (0, -1, 1.81), (1, 1, 1.41), (1, -1, 1.41), (2, 1, 2.15)]
+"""Axis, side, and the largest coordinate: the room of the vehicle file less 0.49 m for the rotors (0.15 m above), plus 0.1 m."""
+
+
+@pytest.mark.parametrize(("axis", "side", "most_m"), WALLS)
+def test_at_every_wall_the_fence_is_where_the_rotors_leave_the_room(axis: int, side: int, most_m: float) -> None:
+    def found(off_m: float, speed_m_s: float) -> list[str]:
+        place, velocity = [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]
+        place[axis], velocity[axis] = side * (most_m + off_m), side * speed_m_s
+        inputs = after_a_moment(at(*place, *velocity), ticks=60, sound=0)
+        return [event.id for event in watched(VEHICLE, inputs, flying())]
+
+    stop_m = 0.5 * (0.18 + 0.6 + 0.5 / 16.0)  # docs/safety.md: 0.5 m/s; reaction, LAND's stop point, braking
+    assert found(-0.01, 0.0) == []
+    assert found(0.01, 0.0) == ["geofence_left", "geofence_near"]
+    assert found(-stop_m - 0.01, 0.5) == []
+    assert found(-stop_m + 0.01, 0.5) == ["geofence_near"]
+    assert found(-0.01, -0.5) == [], "on its way back"
+
+
 # -- a process that was held up --------------------------------------------------------------------------------------
 
 

@@ -11,10 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.config.vehicle import Vehicle
-from companion.model.frames import quat_from_euler_zyx
+from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.types import Joints, Outcome, Outputs, PhaseKind, Quat, SafetyAction, TetherState, Vec3
 from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
+from companion.safety.tether_pull import PullEstimate
 from companion.safety.tether_shape import Clearance, steepest_slope
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
@@ -84,6 +85,36 @@ def test_used_up_is_taut_and_far_beyond_is_separated() -> None:
     gone = once((0.0, -1.2, LENGTH_M + 0.4))
     assert gone.separated
     assert not gone.snagged
+
+
+TIED = ("vehicle.tether.attachment_body_m=[0.02, -0.13, 0.05]", "vehicle.tether.anchor_world_m=[0.4, -0.7, 0.2]")
+degree = st.floats(-25.0, 25.0)
+
+
+@given(
+    st.tuples(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5), st.floats(0.4, 2.0)),
+    st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
+    st.tuples(degree, degree, st.floats(-180.0, 180.0)),
+)
+def test_any_pose_gives_the_state_of_a_line_from_the_anchor_to_where_it_is_tied(p: Vec3, v: Vec3, deg: Vec3) -> None:
+    machine, tied, anchor = vehicle(*TIED), (0.02, -0.13, 0.05), (0.4, -0.7, 0.2)
+    q = quat_from_euler_zyx(*map(math.radians, deg))
+    back = (q[0], -q[1], -q[2], -q[3])
+    state = watch_of(machine).update(0.0, p, v, q, FOLDED, None, None)
+    lx, ly, lz = (a - b - c for a, b, c in zip(anchor, p, quat_rotate(q, tied), strict=True))
+    range_m, level_m = math.hypot(lx, ly, lz), math.hypot(lx, ly)
+    assert state.range_m == pytest.approx(range_m)
+    assert state.slack_m == pytest.approx(LENGTH_M - range_m)
+    assert state.elevation_rad == pytest.approx(math.atan2(-lz, level_m))
+    outward_m_s = -(v[0] * lx + v[1] * ly + v[2] * lz) / range_m
+    stop_m = StopModel(machine.safety).distance_m(max(0.0, outward_m_s))
+    assert state.stop_slack_m == pytest.approx(LENGTH_M - range_m - stop_m, abs=1e-9)
+    straight = quat_rotate(back, (lx / range_m, ly / range_m, lz / range_m))
+    hanging = None
+    if state.slack_m > 0.0:
+        out, up = steepest_slope(level_m, lz, range_m, state.slack_m)
+        hanging = quat_rotate(back, (lx / level_m * out, ly / level_m * out, up))
+    assert state.clearance_m == pytest.approx(clearance(machine).least_m(straight, hanging, FOLDED), abs=1e-6)
 
 
 def turned(way: Callable[[float], tuple[Vec3, Quat]], overrides: tuple[str, ...] = ()) -> float:
@@ -255,6 +286,44 @@ def test_a_pull_that_grows_with_the_range_is_a_line_that_tightens() -> None:
     states = pulled(2.5, stretched, v=(0.2, 0.1, 0.0))
     assert states[-1].taut
     assert states[-1].slack_m > 0.5
+
+
+@pytest.mark.parametrize("anchor", [(0.0, -1.2, 0.0), (-1.1, 0.4, 0.3), (0.5, 0.1, 2.4)])
+def test_a_pull_comes_through_its_filter_and_counts_after_its_time_and_from_its_threshold_on(anchor: Vec3) -> None:
+    """The threshold is 3 standard deviations of 0.7 N horizontally and 2 N vertically, and `pull_min_n` at least."""
+    tether = tether_of(vehicle(f"vehicle.tether.anchor_world_m={list(anchor)}"))
+    estimate = PullEstimate(tether)
+    to_anchor = towards((0.5, 0.0, 1.0), anchor)
+    spread_n = 1.0 / math.sqrt((to_anchor[0] ** 2 + to_anchor[1] ** 2) / 0.7**2 + to_anchor[2] ** 2 / 2.0**2)
+    least_n = max(tether.pull_min_n, 3.0 * spread_n)
+
+    def run(size_n: float, ticks: int) -> list[bool]:
+        force = (size_n * to_anchor[0], size_n * to_anchor[1], size_n * to_anchor[2])
+        found = []
+        for _ in range(ticks):
+            estimate.update(DT_S, to_anchor, 1.7, force, None)
+            found.append(estimate.pulling)
+        return found
+
+    gain = DT_S / (tether.pull_filter_s + DT_S)
+    run(2.0 * least_n, 40)
+    assert estimate.pull_n == pytest.approx(2.0 * least_n * (1.0 - (1.0 - gain) ** 40))
+    estimate.forget()
+    assert not any(run(0.99 * least_n, 1000))
+    assert run(1.01 * least_n, 2000)[-1]
+    assert run(0.61 * least_n, 2000)[-1], "it goes on until it falls below 0.6 of that"
+    assert not run(0.59 * least_n, 2000)[-1]
+    estimate.forget()
+    beyond = math.ceil(math.log(1.0 - least_n / (1e3 * least_n)) / math.log(1.0 - gain))
+    first = run(1e3 * least_n, 400).index(True)
+    assert first == pytest.approx(beyond - 2 + tether.pull_time_s / DT_S, abs=2.0)
+
+
+@pytest.mark.parametrize(("size_n", "held"), [(5.9, False), (6.1, True)])
+def test_six_newtons_from_the_side_are_something_that_holds_the_vehicle(size_n: float, held: bool) -> None:
+    states = pulled(6.0, lambda t_s, p: (0.6 * size_n, 0.8 * size_n, 0.0))
+    assert states[-1].snagged is held
+    assert states[-1].pull_n == 0.0, "away from the anchor"
 
 
 def test_the_pull_ends_when_the_line_falls_slack_again() -> None:
