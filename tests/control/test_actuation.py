@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from companion.config.controller import LawConfig
 from companion.config.loader import load_flight
 from companion.control.arm_hold import ArmHold, towards
 from companion.control.arm_model import manipulator_of
@@ -20,7 +21,8 @@ from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.types import Vec3
 
 CONFIG = load_flight("configs/missions/catch.yaml")
-VEHICLE = CONFIG.vehicle
+VEHICLE, LAW = CONFIG.vehicle, CONFIG.controller
+assert isinstance(LAW, LawConfig)
 WEIGHT_N = VEHICLE.airframe.mass_kg * 9.81
 DT_S = 0.005
 UP: Vec3 = (0.0, 0.0, 1.0)
@@ -48,7 +50,7 @@ def test_the_vertical_force_is_limited_first_and_the_lateral_one_by_it(
 
 
 def actuation(hover_thrust: float = 0.5) -> Actuation:
-    return Actuation(CONFIG.controller, VEHICLE, hover_thrust)
+    return Actuation(LAW, VEHICLE, hover_thrust)
 
 
 def sent(force: Vec3, torque: tuple[float, float] = (0.0, 0.0), *, ticks: int = 1000, scale: float = 1.0) -> Actuation:
@@ -73,7 +75,7 @@ def test_whatever_a_law_asks_for_thrust_tilt_and_force_stay_within_the_limits(
     x, y, z = found.force_world_n
     assert 0.3 * WEIGHT_N - 1e-9 <= z <= min(0.9 * VEHICLE.airframe.thrust_max_n, 0.9 / 0.5 * WEIGHT_N) + 1e-9
     lateral_n = math.hypot(x, y)
-    assert lateral_n <= CONFIG.controller.lateral_force_max_n + 1e-9
+    assert lateral_n <= LAW.lateral_force_max_n + 1e-9
     assert lateral_n <= z * math.tan(math.radians(VEHICLE.airframe.tilt_max_deg)) + 1e-9
     assert found.collective_n == pytest.approx(max(0.0, x * body_z[0] + z * body_z[2]))
     assert found.attitude_wxyz[0] >= 0.0

@@ -54,36 +54,33 @@ def in_plan(plan_s: float = 6.0) -> FlightState:
     )
 
 
+def tick(state: FlightState, *events: Event, **observed: Any) -> tuple[FlightState, Request]:
+    """The state and the requests after one tick."""
+    observation = {
+        "inputs": healthy(),
+        "airborne": True,
+        "armed_by_others": False,
+        "standing": None,
+        "reference": at_rest(HERE, 0.4, P.fold_rad),
+        "tether": SLOW,
+        "thrust_share": 1.0,
+        "pose_s": healthy().t_s,
+        "dt_s": 0.005,
+        "force_world_n": None,
+        "disturbance_world_n": None,
+        "position_error_m": (0.0, 0.0, 0.0),
+        "yaw_error_rad": 0.0,
+    }
+    return transition(P, state, events, Observation(**{**observation, **observed}))
+
+
 def after(
-    state: FlightState,
-    event_id: str,
-    action: SafetyAction,
-    *,
-    velocity: Vec3 = (0.0, 0.0, 0.0),
-    tether: TetherState = SLOW,
-    **observed: Any,
+    state: FlightState, event_id: str, action: SafetyAction, *, velocity: Vec3 = (0.0, 0.0, 0.0), **observed: Any
 ) -> tuple[FlightState, Request]:
     """The state and the requests after a tick with one event."""
     event = Event(t_s=healthy().t_s, id=event_id, severity=Severity.CRITICAL, action=action, text="")
-    observation = Observation(
-        **{
-            "inputs": healthy(),
-            "airborne": True,
-            "armed_by_others": False,
-            "standing": None,
-            "reference": replace(at_rest(HERE, 0.4, P.fold_rad), velocity_world_m_s=velocity),
-            "tether": tether,
-            "thrust_share": 1.0,
-            "pose_s": healthy().t_s,
-            "dt_s": 0.005,
-            "force_world_n": None,
-            "disturbance_world_n": None,
-            "position_error_m": (0.0, 0.0, 0.0),
-            "yaw_error_rad": 0.0,
-            **observed,
-        }
-    )
-    return transition(P, state, (event,), observation)
+    reference = replace(at_rest(HERE, 0.4, P.fold_rad), velocity_world_m_s=velocity)
+    return tick(state, event, **{"reference": reference, **observed})
 
 
 def ids(request: Request) -> list[str]:

@@ -1,0 +1,201 @@
+"""Each stage of a flight: what it waits for, for how long, and what it requests meanwhile."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import msgspec
+import pytest
+
+from companion.core.flight_state import FlightState
+from companion.core.sequence import missing_inputs
+from companion.mission.active_plan import Course
+from companion.mission.plan import Plan
+from companion.model.flight_stage import Stage
+from companion.model.types import AutopilotRequest, FlightMode, Inputs, LandedState, Outcome, PhaseKind
+from companion.safety.autopilot_landing import AutopilotLanding
+from companion.safety.rotor_stop import RotorStop
+from tests.core.test_reactions import CONFIG, P, ids, in_plan, tick
+from tests.safety.healthy import fed_by_another, healthy, put
+from tests.safety.test_monitors import EXTERNAL
+
+replace = msgspec.structs.replace
+NOW_S = healthy().t_s
+NONE, OFFBOARD, ARM = AutopilotRequest.NONE, AutopilotRequest.OFFBOARD, AutopilotRequest.ARM
+DISARM, FORCE_DISARM, LAND = AutopilotRequest.DISARM, AutopilotRequest.FORCE_DISARM, AutopilotRequest.LAND
+
+
+def in_stage(stage: Stage, elapsed_s: float, **changes: Any) -> FlightState:
+    plan = Plan.build(CONFIG.mission, CONFIG.vehicle)
+    course = Course(plan, NOW_S - elapsed_s)
+    fields = {"stage": stage, "entered_s": NOW_S - elapsed_s, "plan": plan, "course": course, **changes}
+    return replace(P.initial_state(), **fields)
+
+
+def px4(mode: FlightMode = FlightMode.OFFBOARD, *, armed: bool = True, landed: bool = False) -> Inputs:
+    state = LandedState.ON_GROUND if landed else LandedState.IN_AIR
+    return put("status", mode=mode, armed=armed, landed=state)(healthy())
+
+
+OTHER = FlightMode.OTHER
+
+
+@pytest.mark.parametrize(
+    ("stage", "elapsed_s", "inputs", "request_", "next_", "event"),
+    [
+        (Stage.OFFBOARD, 0.79, px4(OTHER), NONE, Stage.OFFBOARD, None),
+        (Stage.OFFBOARD, 0.81, px4(OTHER), OFFBOARD, Stage.OFFBOARD, None),
+        (Stage.OFFBOARD, 0.79, px4(), NONE, Stage.OFFBOARD, None),  # PX4 arms on a stream of setpoints only
+        (Stage.OFFBOARD, 0.81, px4(), NONE, Stage.ARM, None),
+        (Stage.OFFBOARD, 7.99, px4(OTHER), OFFBOARD, Stage.OFFBOARD, None),
+        (Stage.OFFBOARD, 8.01, px4(OTHER), NONE, Stage.STAND_DOWN, "offboard_refused"),
+        (Stage.ARM, 0.0, px4(armed=False), ARM, Stage.ARM, None),
+        (Stage.ARM, 9.99, px4(armed=False), ARM, Stage.ARM, None),
+        (Stage.ARM, 10.01, px4(armed=False), NONE, Stage.STAND_DOWN, "arming_refused"),
+        (Stage.ARM, 1.0, px4(), NONE, Stage.SPOOL, None),
+        (Stage.SPOOL, 1.19, px4(), NONE, Stage.SPOOL, None),
+        (Stage.SPOOL, 1.21, px4(), NONE, Stage.PLAN, "takeoff"),
+        (Stage.TOUCHDOWN, 0.39, px4(), NONE, Stage.TOUCHDOWN, None),
+        (Stage.TOUCHDOWN, 0.41, px4(), NONE, Stage.DISARM, None),
+        (Stage.DISARM, 1.0, px4(armed=False), NONE, Stage.DONE, None),
+        (Stage.DISARM, 7.99, px4(), NONE, Stage.DISARM, None),
+        (Stage.DISARM, 8.01, px4(), NONE, Stage.AUTOPILOT_LAND, "disarm_refused"),
+        (Stage.DISARM, 0.1, px4(OTHER), NONE, Stage.AUTOPILOT_LAND, "disarm_refused"),
+        (Stage.DISARM, 0.1, px4(FlightMode.HOLD), NONE, Stage.AUTOPILOT_LAND, "pilot_took_over"),
+        (Stage.STAND_DOWN, 1.0, px4(armed=False), NONE, Stage.DONE, None),
+        (Stage.STAND_DOWN, 7.99, px4(), NONE, Stage.STAND_DOWN, None),
+        (Stage.STAND_DOWN, 8.01, px4(), NONE, Stage.DONE, "disarm_refused"),
+        (Stage.STAND_DOWN, 8.01, px4(FlightMode.MANUAL), NONE, Stage.AUTOPILOT_LAND, "pilot_took_over"),
+    ],
+)
+def test_each_stage_waits_requests_and_gives_up_in_its_time(
+    stage: Stage, elapsed_s: float, inputs: Inputs, request_: AutopilotRequest, next_: Stage, event: str | None
+) -> None:
+    airborne = stage in (Stage.SPOOL, Stage.TOUCHDOWN, Stage.DISARM)
+    state, request = tick(in_stage(stage, elapsed_s), inputs=inputs, airborne=airborne)
+    assert request.autopilot is request_
+    assert state.stage is next_
+    assert ids(request) == ([] if event is None else [event])
+    if event == "pilot_took_over":
+        assert state.pilot_flies and state.outcome is Outcome.ABORTED
+
+
+def standing(seconds: float) -> RotorStop:
+    """Evidence of this much rest on the ground."""
+    stop = RotorStop.begin(P.clearance_m, P.tilt_max_rad)
+    for k in range(round(seconds / 0.02)):
+        stop = stop.update(on_floor(NOW_S - seconds + k * 0.02))
+    return stop
+
+
+def on_floor(t_s: float, *, landed: bool = True) -> Inputs:
+    i = healthy(t_s=t_s)
+    i = put("vehicle", position_world_m=(0.0, 0.0, 0.3), velocity_world_m_s=(0.0, 0.0, 0.0))(i)
+    i = put("mocap", position_world_m=(0.0, 0.0, 0.3))(i)
+    return put("status", landed=LandedState.ON_GROUND if landed else LandedState.IN_AIR)(i)
+
+
+@pytest.mark.parametrize(
+    ("stage", "rest_s", "landed", "request_"),
+    [
+        (Stage.DISARM, 1.0, True, DISARM),
+        (Stage.DISARM, 0.2, True, NONE),
+        (Stage.DISARM, 1.0, False, NONE),
+        (Stage.DISARM, 4.5, False, FORCE_DISARM),
+        (Stage.STAND_DOWN, 1.0, False, DISARM),
+        (Stage.STAND_DOWN, 0.2, False, NONE),
+    ],
+)
+def test_rotors_are_stopped_on_evidence_only(
+    stage: Stage, rest_s: float, landed: bool, request_: AutopilotRequest
+) -> None:
+    state = in_stage(stage, 5.0, rotor_stop=standing(rest_s))
+    _, request = tick(state, inputs=on_floor(NOW_S, landed=landed), airborne=False)
+    assert request.autopilot is request_
+
+
+@pytest.mark.parametrize(("requested_s", "next_"), [(1.49, Stage.STAND_DOWN), (1.51, Stage.DONE)])
+def test_not_armed_is_believed_1_5_s_after_the_last_request_to_arm(requested_s: float, next_: Stage) -> None:
+    """PX4's HEARTBEAT comes once a second: rotors that spool up look disarmed."""
+    state = in_stage(Stage.STAND_DOWN, 3.0, arm_requested_s=NOW_S - requested_s)
+    assert tick(state, inputs=px4(armed=False), airborne=False)[0].stage is next_
+
+
+@pytest.mark.parametrize(("late_s", "lands"), [(4.9, False), (5.1, True)])
+def test_a_plan_that_ends_without_touchdown_is_landed_by_px4_after_five_seconds(late_s: float, lands: bool) -> None:
+    plan_s = Plan.build(CONFIG.mission, CONFIG.vehicle).duration_s
+    state, request = tick(in_plan(plan_s + late_s))
+    assert (state.stage is Stage.AUTOPILOT_LAND) is lands
+    assert ids(request) == (["no_touchdown"] if lands else [])
+    assert state.outcome is (Outcome.ABORTED if lands else None)
+
+
+def test_spool_up_and_touchdown_scale_the_thrust() -> None:
+    assert in_stage(Stage.SPOOL, 0.6).vertical_scale(NOW_S) == pytest.approx(0.35)
+    assert in_stage(Stage.SPOOL, 2.0).vertical_scale(NOW_S) == pytest.approx(0.7)
+    assert in_stage(Stage.PLAN, 0.2).vertical_scale(NOW_S) == pytest.approx(0.85)
+    assert in_stage(Stage.PLAN, 0.5).vertical_scale(NOW_S) == 1.0
+    assert in_stage(Stage.PLAN, 0.2, aborting=True).vertical_scale(NOW_S) == 1.0
+    assert in_stage(Stage.TOUCHDOWN, 0.1).vertical_scale(NOW_S) == pytest.approx(0.7 * 0.75)
+    assert in_stage(Stage.TOUCHDOWN, 0.5).vertical_scale(NOW_S) == 0.0
+    relieved = dataclasses.replace(P.initial_state().touchdown, relief=0.3)
+    assert replace(in_plan(), touchdown=relieved).vertical_scale(NOW_S) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(
+    ("stage", "kind", "begun", "progress"),
+    [
+        (Stage.WAIT, PhaseKind.GROUND, False, 0.0),
+        (Stage.ARM, PhaseKind.GROUND, False, 0.0),
+        (Stage.TOUCHDOWN, PhaseKind.LANDING, True, 1.0),
+        (Stage.AUTOPILOT_LAND, PhaseKind.LANDING, True, 1.0),
+        (Stage.AUTOPILOT_LAND, PhaseKind.LANDING, False, 0.0),
+        (Stage.DISARM, PhaseKind.DONE, True, 1.0),
+        (Stage.DONE, PhaseKind.DONE, True, 1.0),
+        (Stage.STAND_DOWN, PhaseKind.DONE, False, 0.0),
+    ],
+)
+def test_the_phase_that_the_operator_sees(stage: Stage, kind: PhaseKind, begun: bool, progress: float) -> None:
+    state = in_stage(stage, 1.0, mission_start_s=NOW_S - 1.0 if begun else None)
+    assert state.phase(NOW_S) == (stage.value, kind, progress)
+
+
+def test_the_phase_in_the_plan_is_its_segment_and_an_abort_is_named() -> None:
+    name, kind, progress = in_plan(6.0).phase(NOW_S)
+    assert kind is PhaseKind.FLIGHT and 0.0 < progress < 1.0
+    assert replace(in_plan(6.0), aborting=True).phase(NOW_S)[0] == f"abort: {name}"
+
+
+def test_every_device_that_sent_nothing_is_named() -> None:
+    nothing = replace(healthy(), vehicle=None, status=None, mocap=None, arm=None, force=None)
+    assert missing_inputs(nothing, CONFIG.vehicle) == ["PX4 state", "PX4", "motion capture", "arm", "force sensor"]
+    assert missing_inputs(healthy(), CONFIG.vehicle) == []
+    external = ["PX4 state", "PX4", "PX4's ESTIMATOR_STATUS", "arm", "force sensor"]
+    assert missing_inputs(nothing, EXTERNAL) == external
+    assert missing_inputs(fed_by_another(healthy()), EXTERNAL) == []
+
+
+@pytest.mark.parametrize(("elapsed_s", "refused"), [(14.9, False), (15.1, True)])
+def test_missing_inputs_refuse_the_flight_after_15_s_and_a_flight_that_was_ready_waits_on(
+    elapsed_s: float, refused: bool
+) -> None:
+    lost = replace(healthy(), arm=None)
+    state, request = tick(in_stage(Stage.WAIT, elapsed_s), inputs=lost, airborne=False)
+    assert ids(request) == (["inputs_missing"] if refused else [])
+    assert state.stage is (Stage.STAND_DOWN if refused else Stage.WAIT)
+    assert state.waiting.unready == "no data from: arm"
+    waiting = replace(P.initial_state().waiting, was_ready=True)
+    assert tick(in_stage(Stage.WAIT, 1e3, waiting=waiting), inputs=lost, airborne=False)[0].stage is Stage.WAIT
+    apart = put("mocap", position_world_m=(0.2, 0.0, 1.0))(healthy())
+    _, request = tick(in_stage(Stage.WAIT, elapsed_s), inputs=apart, airborne=False)
+    assert ids(request) == (["vision_not_fused"] if refused else [])
+
+
+@pytest.mark.parametrize("before", [Outcome.ABORTED, Outcome.CRASHED])
+def test_a_vehicle_that_px4_could_not_land_is_lost_unless_it_has_crashed(before: Outcome) -> None:
+    landing = AutopilotLanding.begin(NOW_S - 31.0, P.clearance_m, P.tilt_max_rad, pilot=False, pose_s=-math.inf)
+    state, _ = tick(in_stage(Stage.AUTOPILOT_LAND, 31.0, landing=landing, outcome=before))
+    assert state.stage is Stage.DONE
+    assert state.outcome is (Outcome.CRASHED if before is Outcome.CRASHED else Outcome.LOST)
