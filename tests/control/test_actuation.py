@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import pytest
 from hypothesis import given
@@ -21,8 +22,7 @@ from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.types import Vec3
 
 CONFIG = load_flight("configs/missions/catch.yaml")
-VEHICLE, LAW = CONFIG.vehicle, CONFIG.controller
-assert isinstance(LAW, LawConfig)
+VEHICLE, LAW = CONFIG.vehicle, cast(LawConfig, CONFIG.controller)
 WEIGHT_N = VEHICLE.airframe.mass_kg * 9.81
 DT_S = 0.005
 UP: Vec3 = (0.0, 0.0, 1.0)
