@@ -54,7 +54,9 @@ def in_plan(plan_s: float = 6.0) -> FlightState:
     )
 
 
-def tick(state: FlightState, *events: Event, **observed: Any) -> tuple[FlightState, Request]:
+def tick(
+    state: FlightState, *events: Event, parameters: Parameters = P, **observed: Any
+) -> tuple[FlightState, Request]:
     """The state and the requests after one tick."""
     observation = {
         "inputs": healthy(),
@@ -71,7 +73,7 @@ def tick(state: FlightState, *events: Event, **observed: Any) -> tuple[FlightSta
         "position_error_m": (0.0, 0.0, 0.0),
         "yaw_error_rad": 0.0,
     }
-    return transition(P, state, events, Observation(**{**observation, **observed}))
+    return transition(parameters, state, events, Observation(**{**observation, **observed}))
 
 
 def after(
