@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from companion.model.frames import quat_from_euler_zyx
-from companion.model.types import FlightMode, Inputs
+from companion.model.types import FlightMode, Inputs, LandedState
+from companion.safety.reattach import found_armed
 from companion.safety.rotor_stop import RotorStop
 from tests.safety.test_autopilot_landing import CLEARANCE_M, LEVEL, TILT_MAX_RAD, seen
 
@@ -138,3 +139,28 @@ def test_tipped_over_on_the_floor_its_rotors_are_stopped_if_both_say_so_for_half
 ) -> None:
     found_s = first_s(always(**what), "tipped", until_s=1.5)
     assert found_s == (pytest.approx(0.5, abs=0.011) if stopped else None)
+
+
+@pytest.mark.parametrize(
+    ("what", "flies", "text"),
+    [
+        ({"mode": FlightMode.OFFBOARD}, False, "the companion disarms it"),
+        ({"mode": FlightMode.LAND}, False, "the companion disarms it"),
+        ({"mode": FlightMode.OTHER}, True, "PX4 lands"),
+        ({"height_m": HIGH_M}, True, "PX4 lands"),
+        ({"landed": LandedState.IN_AIR}, True, "PX4 lands"),
+        ({"mocap": False}, True, "PX4 lands"),  # PX4's own height may have drifted
+        ({"height_m": HIGH_M, "mocap_m": LOW_M}, False, "the companion disarms it"),
+        ({"mode": FlightMode.MANUAL}, True, "a pilot has chosen the mode"),
+        ({"mode": FlightMode.HOLD}, True, "a pilot has chosen the mode"),
+    ],
+)
+def test_what_was_armed_by_others_is_disarmed_only_if_it_stands_by_motion_capture_and_by_px4(
+    what: dict[str, Any], flies: bool, text: str
+) -> None:
+    found = always(**{"landed": LandedState.ON_GROUND, **what})(10.0)
+    assert found_armed(found, CLEARANCE_M)[0] is flies
+    said = found_armed(found, CLEARANCE_M)[1]
+    assert text in said and f"mode {what.get('mode', FlightMode.OFFBOARD).value.upper()}" in said
+    seen_m = what.get("mocap_m", what.get("height_m", LOW_M))
+    assert f"height {seen_m:.2f} m" in said
