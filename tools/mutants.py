@@ -264,7 +264,9 @@ def main() -> int:
     parser.add_argument("packages", nargs="*", default=list(PACKAGES), help=f"of {', '.join(PACKAGES)}; default: all")
     parser.add_argument("--seed", type=int, default=1, help="of the sample")
     parser.add_argument("--count", type=int, default=25, help="mutants of each package; 0 means all")
-    parser.add_argument("--at", nargs="*", default=[], help="only mutants whose file:line begins like this")
+    parser.add_argument(
+        "--at", nargs="*", default=[], help="of the sample, only mutants whose file:line begins like this"
+    )
     args = parser.parse_args()
     found = operators()
     for name in THIRD_PARTY:
@@ -280,10 +282,11 @@ def judge(args: argparse.Namespace, found: dict[str, Any]) -> int:
     """Judge the mutants of each package."""
     rows = []
     for package in args.packages:
-        chosen = [m for m in mutants(package, found) if not args.at or m.place.startswith(tuple(args.at))]
+        chosen = list(mutants(package, found))
         total = len(chosen)
         if 0 < args.count < total:
             chosen = random.Random(args.seed).sample(chosen, args.count)
+        chosen = [mutant for mutant in chosen if not args.at or mutant.place.startswith(tuple(args.at))]
         durations = COPY / "durations.json"
         begin_s = time.monotonic()
         if not run_tests([f"tests/{package}"], 1800.0, durations):
