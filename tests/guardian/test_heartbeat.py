@@ -69,6 +69,15 @@ def test_a_beat_that_is_not_finite_or_out_of_range_is_none(change: dict[str, Any
     assert heartbeat.unpack(heartbeat.pack(replace(beat, **change))) is None
 
 
+@given(beats)
+@settings(max_examples=2)
+def test_the_ends_of_the_ranges_are_still_in_them(beat: Heartbeat) -> None:
+    for number, port in ((0, 0), (255, 65535)):
+        ids = {"autopilot_system": number, "own_system": number, "own_component": number}
+        edge = replace(beat, local_port=port, peer=("10.0.0.7", port), back_world_m=(-0.3, 0.0, 0.0), **ids)
+        assert heartbeat.unpack(heartbeat.pack(edge)) == edge
+
+
 def silent_after(watch: StallWatch, period_s: float, rounds: int) -> list[bool]:
     return [watch.update(k * period_s, heard=False) for k in range(rounds)]
 
