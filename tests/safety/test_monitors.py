@@ -703,6 +703,33 @@ def test_in_the_air_a_repeated_pose_is_not_passed_on_at_once() -> None:
     assert monitors.mocap_trusted, "on the ground a pose may well repeat"
 
 
+REPEATS = {
+    "force_stuck": frozen_values("force", "force_sensor_n", "torque_sensor_nm"),
+    "mocap_frozen": frozen_values("mocap", "position_world_m", "attitude_wxyz"),
+    "estimate_frozen": frozen_values("vehicle", "position_world_m"),
+}
+
+
+@pytest.mark.parametrize(
+    ("velocity", "rate", "moves"),
+    [
+        ((0.0, 0.0, 0.029), (0.0, 0.0, 0.049), False),
+        ((0.0, 0.0, 0.031), (0.0, 0.0, 0.0), True),
+        ((0.0, -0.031, 0.0), (0.0, 0.0, 0.0), True),
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.051), True),
+        ((0.0, 0.0, 0.0), (0.0, -0.051, 0.0), True),
+    ],
+)
+@pytest.mark.parametrize("found", REPEATS)
+def test_values_that_repeat_are_a_fault_only_while_the_vehicle_moves(
+    found: str, velocity: tuple[float, float, float], rate: tuple[float, float, float], moves: bool
+) -> None:
+    """It moved until they began to repeat: that proves nothing."""
+    motion = put("vehicle", velocity_world_m_s=velocity, angular_rate_body_rad_s=rate)
+    events = watched(VEHICLE, after_a_moment(both(motion, REPEATS[found]), ticks=300, sound=20), flying())
+    assert [event.id for event in events] == ([found] if moves else [])
+
+
 def test_a_frame_without_the_body_does_not_end_a_freeze() -> None:
     """Otherwise the frozen pose is trusted again for `mocap_frozen_s`, and a landing by PX4 takes it for a new one."""
     monitors, same = Monitors(VEHICLE), frozen_values("mocap", "position_world_m", "attitude_wxyz")

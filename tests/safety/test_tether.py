@@ -335,6 +335,15 @@ def test_a_pull_comes_through_its_filter_and_counts_after_its_time_and_from_its_
     assert first == pytest.approx(beyond - 2 + tether.pull_time_s / DT_S, abs=2.0)
 
 
+@pytest.mark.parametrize(("gap_s", "counts_s"), [(0.03, 0.03), (1.0, 0.05), (-0.1, 0.0)])
+def test_a_gap_between_two_ticks_counts_as_50_ms_at_most(gap_s: float, counts_s: float) -> None:
+    watch, p = watch_of(vehicle()), (0.5, 0.0, 1.0)
+    force = along(5.0)(0.0, p)
+    for t_s in (1.0, 1.0 + gap_s):
+        state = watch.update(t_s, p, STILL, LEVEL, FOLDED, force, None)
+    assert state.pull_n == pytest.approx(5.0 * counts_s / (tether_of(vehicle()).pull_filter_s + counts_s))
+
+
 @pytest.mark.parametrize(("size_n", "held"), [(5.9, False), (6.1, True)])
 def test_six_newtons_from_the_side_are_something_that_holds_the_vehicle(size_n: float, held: bool) -> None:
     states = pulled(6.0, lambda t_s, p: (0.6 * size_n, 0.8 * size_n, 0.0))
