@@ -84,6 +84,12 @@ def test_whatever_a_law_asks_for_thrust_tilt_and_force_stay_within_the_limits(
     assert thrust == pytest.approx((x / share, y / share, z / share), abs=2e-3)
 
 
+def test_upside_down_there_is_no_thrust() -> None:
+    found = actuation()
+    found.step(DT_S, (0.0, 0.0, WEIGHT_N), (0.0, 0.0), (0.0, 0.0, -1.0), 0.0, 1.0)
+    assert found.collective_n == 0.0
+
+
 @pytest.mark.parametrize(("hover_thrust", "most_n"), [(0.5, 1.8 * WEIGHT_N), (0.9, WEIGHT_N), (0.3, 54.0)])
 def test_the_largest_vertical_force_leaves_a_tenth_of_the_thrust(hover_thrust: float, most_n: float) -> None:
     found = actuation(hover_thrust)

@@ -349,6 +349,8 @@ def test_six_newtons_from_the_side_are_something_that_holds_the_vehicle(size_n: 
     states = pulled(6.0, lambda t_s, p: (0.6 * size_n, 0.8 * size_n, 0.0))
     assert states[-1].snagged is held
     assert states[-1].pull_n == 0.0, "away from the anchor"
+    first = next(k for k, state in enumerate(pulled(2.0, lambda t_s, p: (60.0, 80.0, 0.0))) if state.snagged)
+    assert first * DT_S == pytest.approx(tether_of(vehicle()).pull_time_s, abs=0.1), "no blow"
 
 
 def test_the_pull_ends_when_the_line_falls_slack_again() -> None:
