@@ -63,7 +63,7 @@ def sent(force: Vec3, torque: tuple[float, float] = (0.0, 0.0), *, ticks: int = 
 
 @given(
     st.tuples(st.floats(-40.0, 40.0), st.floats(-40.0, 40.0), st.floats(-20.0, 90.0)),
-    st.floats(-3.0, 3.0),
+    st.floats(-6.0, 6.0),
     st.floats(-0.3, 0.3),
 )
 def test_whatever_a_law_asks_for_thrust_tilt_and_force_stay_within_the_limits(

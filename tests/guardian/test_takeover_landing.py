@@ -147,6 +147,19 @@ class Landing:
         return any(m.get_type() == "SET_ATTITUDE_TARGET" for m in self.wire.sent)
 
 
+def test_on_the_floor_level_setpoints_without_thrust_are_streamed_at_50_hz_at_the_present_yaw() -> None:
+    yaw_rad = 0.7
+    landing = Landing(beat())
+    landing.run(3.0, attitude=quat_from_euler_zyx(0.0, 0.0, yaw_rad), mocap=False)
+    found = [m for m in landing.wire.sent if m.get_type() == "SET_ATTITUDE_TARGET"]
+    level = attitude_ned_frd_from_enu_flu(quat_from_euler_zyx(0.0, 0.0, yaw_rad))
+    assert {(m.target_system, m.target_component, m.type_mask, m.thrust) for m in found} == {(1, 1, 7, 0.0)}
+    assert all(m.q == pytest.approx(level, abs=1e-6) for m in found)
+    ms = [m.time_boot_ms for m in found]
+    assert {b - a for a, b in itertools.pairwise(ms)} <= {19, 20, 21, 29, 30, 31}
+    assert ms[-1] == pytest.approx(landing.t_s * 1e3, abs=31)
+
+
 def nan_position(message: Any) -> None:
     if message.get_type() == "LOCAL_POSITION_NED":
         message.x = math.nan
