@@ -16,7 +16,7 @@ from companion.guardian.link import Link
 from companion.guardian.px4 import Px4State
 from companion.guardian.takeover_landing import Notice, TakeoverLanding
 from companion.model.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
-from companion.model.types import MocapPose, Quat, Vec3
+from companion.model.types import LandedState, MocapPose, Quat, Vec3
 from companion.safety.autopilot_landing import TIMEOUT_S
 
 STANDING_M, TILT_MAX_RAD = 0.3, math.radians(40.0)
@@ -183,6 +183,47 @@ def test_a_position_or_an_imu_sample_that_never_came_counts_for_nothing() -> Non
     vehicle = px4.vehicle()
     assert vehicle is not None
     assert (vehicle.position_stamp_s, vehicle.attitude_stamp_s, vehicle.imu_stamp_s) == (-math.inf, 3.0, -math.inf)
+
+
+def test_px4s_messages_become_its_state() -> None:
+    px4 = Px4State()
+    assert (px4.status(), px4.pilot, px4.yaw_rad()) == (None, False, None)
+    px4.take(1.0, mavlink.MAVLink_heartbeat_message(2, 12, ARMED, 3 << 16, 4, 3))
+    assert px4.pilot, "armed and in position mode"
+    px4.take(2.0, mavlink.MAVLink_heartbeat_message(2, 12, DISARMED, 3 << 16, 4, 3))
+    px4.take(2.1, mavlink.MAVLink_extended_sys_state_message(0, mavlink.MAV_LANDED_STATE_ON_GROUND))
+    status = px4.status()
+    assert status is not None and not px4.pilot
+    assert (status.heartbeat_stamp_s, status.armed, status.landed) == (2.0, False, LandedState.ON_GROUND)
+    px4.take(3.0, mavlink.MAVLink_attitude_quaternion_message(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    assert px4.yaw_rad() is None, "no attitude at all"
+    q = attitude_ned_frd_from_enu_flu(quat_from_euler_zyx(0.0, 0.0, 0.7))
+    px4.take(3.1, mavlink.MAVLink_attitude_quaternion_message(0, *q, 0.1, 0.2, 0.3))
+    px4.take(3.2, mavlink.MAVLink_local_position_ned_message(0, 1.0, 2.0, -3.0, 0.1, 0.2, -0.3))
+    px4.take(3.3, mavlink.MAVLink_highres_imu_message(0, 0.0, 0.0, -9.81, *[0.0] * 10, 63))
+    for broken in (
+        mavlink.MAVLink_local_position_ned_message(0, 1.0, 2.0, -3.0, 0.1, 0.2, math.inf),
+        mavlink.MAVLink_attitude_quaternion_message(0, *q, 0.1, 0.2, math.nan),
+        mavlink.MAVLink_highres_imu_message(0, 0.0, math.nan, -9.81, *[0.0] * 10, 63),
+    ):
+        px4.take(4.0, broken)
+    vehicle = px4.vehicle()
+    assert vehicle is not None and px4.yaw_rad() == pytest.approx(0.7)
+    assert (vehicle.position_stamp_s, vehicle.attitude_stamp_s, vehicle.imu_stamp_s) == (3.2, 3.1, 3.3)
+    assert vehicle.position_world_m == pytest.approx((2.0, 1.0, 3.0))
+    assert vehicle.velocity_world_m_s == pytest.approx((0.2, 0.1, 0.3))
+    assert vehicle.specific_force_body_m_s2 == pytest.approx((0.0, 0.0, 9.81))
+
+
+def test_only_a_rejected_manoeuvre_is_a_refusal() -> None:
+    px4 = Px4State()
+    for command in (511, 512):  # SET_MESSAGE_INTERVAL, REQUEST_MESSAGE
+        px4.take(1.0, mavlink.MAVLink_command_ack_message(command, 2))
+    assert px4.refusal is None
+    px4.take(1.0, mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_NAV_LAND, 2))
+    assert px4.refusal is not None and px4.refusal.startswith("MAV_CMD 21 ")
+    px4.take(1.0, mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_NAV_LAND, 0))
+    assert px4.refusal is None
 
 
 def test_tipped_over_on_the_floor_it_is_disarmed_by_force() -> None:
