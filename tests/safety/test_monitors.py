@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -336,6 +337,24 @@ in s, its event must come. Written from the hazards, not from the table of the r
 """
 
 
+READS = """
+    reattached 1.00; mocap_lost 0.20; mocap_invalid 0.20; mocap_swapped 0.30 0; mocap_jump 0.40 0;
+    mocap_dragged 91 40; mocap_slow 31 50; mocap_late 80 50; mocap_too_late 200 120; estimate_disagrees 0.34 0.30;
+    yaw_disagrees 20 15; estimator_silent 0.25; vision_rejected 1.2 1; px4_rebooted 2.0; link_late 92 70;
+    vehicle_state_lost 0.25; heartbeat_lost 2.5; px4_disarmed 1.00; battery_warn 25 30; battery_low 10 20;
+    battery_voltage 13.0 13.2; arm_lost 0.10; arm_read_failures 5; torque_refused 0.0; servo_error 70 2;
+    joint_jump 2 29; servo_warm 68 65; servo_hot 76 75; servo_overload -2.5 0.1; joint_rate 0 745 700;
+    joint_beyond_limit 180 57 5; joint_far_beyond_limit 115 -25 15; force_lost 0.25; force_overload 1 -1 0;
+    force_drift 3.3 0.0 0.0 2.0; loop_late 205 50; loop_stalled 1005 300; tilt 45 40; crashed 120;
+    too_fast 2.1 2.0; climbs_too_fast 1.6 1.5; sinks_too_fast 1.6 1.5; geofence_left -1.90 0.00 1.00;
+    geofence_near 2.26 0.00 1.00; tracking_warn 0.50 0.45; tracking_hold 0.70 0.60; tracking_error 1.20 0.80;
+    thrust_saturated 54 1.0; contact_force_high 15.0 12.0; tether_short 0.05 0.10; tether_taut 1.20 0;
+    tether_snagged 0 1.20; tether_near 0.00 0.01; tether_wound 1.6 1.5; tether_separated 1.80
+"""
+"""The numbers that the operator reads in a rule's text, in its units: what was found, then the limit."""
+NUMBERS = {id_: numbers for id_, *numbers in (row.split() for row in READS.split(";"))}
+
+
 def severity_of(rule_id: str, action: SafetyAction, *, airborne: bool) -> Severity:
     if rule_id.startswith("operator_"):
         return Severity.INFO
@@ -358,8 +377,10 @@ def test_each_fault_is_reported_once_by_name_in_time_and_requests_its_action(rul
         assert event.action is REQUIRED[event.id][1]
         assert event.severity is severity_of(event.id, event.action, airborne=True)
         assert event.text and "{" not in event.text
-    first_s = next(event.t_s for event in events if event.id == rule.id) - START_S
-    assert first_s == pytest.approx(REQUIRED[rule.id][2], abs=1.1 * TICK_S)
+    first = next(event for event in events if event.id == rule.id)
+    assert first.t_s - START_S == pytest.approx(REQUIRED[rule.id][2], abs=1.1 * TICK_S)
+    if "{" in rule.message and not rule.id.endswith("_not_finite"):
+        assert re.findall(r"-?\d+(?:\.\d+)?", first.text.replace("PX4", "")) == NUMBERS.get(rule.id, [])
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
