@@ -71,7 +71,7 @@ THIRD_PARTY = (
     "serial",
 )
 """Imported once; the tests of each mutant run in a fork."""
-TIMEOUT_FACTOR, TIMEOUT_MORE_S = 3.0, 30.0
+TIMEOUT_FACTOR, TIMEOUT_MORE_S = 2.0, 30.0
 Span = tuple[tuple[int, int], tuple[int, int]]
 """First and last position of a piece of source text: line from 1, column from 0."""
 
