@@ -13,7 +13,7 @@ import pytest
 
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
-from companion.model.frames import quat_from_euler_zyx, quat_multiply
+from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.types import Event, FlightMode, Inputs, OperatorCommand, SafetyAction, Severity
 from companion.safety.arm import error_text
 from companion.safety.mocap import unfused
@@ -516,6 +516,33 @@ def test_motion_capture_that_comes_back_slowly_is_reported_with_its_own_rate() -
     events = watched(VEHICLE, after_a_moment(lost_then_slow, ticks=1200), flying())
     assert [event.id for event in events] == ["mocap_lost", "mocap_slow"]
     assert events[1].text == "motion capture arrives at 29 Hz (limit 50 Hz)"
+
+
+@pytest.mark.parametrize("direction", [(0.0, 1.0, 0.0), (0.0, 0.0, -1.0), (-0.6, 0.8, 0.0)])
+@pytest.mark.parametrize("flies", [True, False])
+def test_poses_that_move_are_dragged_unless_the_imu_measures_the_motion(
+    direction: tuple[float, float, float], flies: bool
+) -> None:
+    """From 3.2 s on the vehicle, or only its poses, accelerate by 4 m/s2 to 0.8 m/s; the IMU measures in the body's axes."""
+    into_body = quat_from_euler_zyx(0.0, 0.0, -0.4)
+
+    def change(i: Inputs) -> Inputs:
+        since_s = max(0.0, i.t_s - START_S - 3.2)
+        speed_m_s = min(0.8, 4.0 * since_s)
+        way_m = 0.5 * speed_m_s * min(since_s, 0.2) + 0.8 * max(0.0, since_s - 0.2)
+        x, y, z = direction
+        i = both(
+            moved("mocap", (way_m * x, way_m * y, way_m * z)), moved("vehicle", (way_m * x, way_m * y, way_m * z))
+        )(i)
+        if not flies:
+            return i
+        assert i.vehicle is not None and i.vehicle.delta_velocity_body_m_s is not None
+        gained = quat_rotate(into_body, (speed_m_s * x, speed_m_s * y, speed_m_s * z))
+        sensed = tuple(a + b for a, b in zip(i.vehicle.delta_velocity_body_m_s, gained, strict=True))
+        return put("vehicle", delta_velocity_body_m_s=sensed)(i)
+
+    events = watched(VEHICLE, after_a_moment(change, ticks=730, sound=0), flying())
+    assert ("mocap_dragged" in [event.id for event in events]) is not flies
 
 
 def test_fast_flight_and_a_gap_are_no_jump() -> None:
