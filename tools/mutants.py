@@ -1,8 +1,8 @@
 """Mutation tests: breaks one place of a module at a time and reports which of these mutants no test of its package notices.
 
 `python -m tools.mutants` judges a random sample; cosmic-ray finds the places and writes the mutants. Each package of `PACKAGES` is
-judged by the tests in the folder of the same name, on a copy of the repository in build/. A mutant that runs into the timeout is
-killed.
+judged by the tests in the folder of the same name, on a copy of the repository in build/. A mutant that exceeds the timeout counts as
+killed. A survivor is a missing test, or equivalent: no input makes it behave differently.
 
 Not mutated are annotations, imports, asserts, decorators and the options of a class, which no flight reaches, and `<` for `<=`: a
 measured value equals its limit only by chance.
@@ -259,7 +259,7 @@ def copy_repository() -> None:
 
 
 def main() -> int:
-    """Judge a sample of each package and print the table; the exit status is 0 whatever comes of it."""
+    """Judge a sample of each package and print the table. The exit status is 1 if a test fails without a mutant, else 0."""
     parser = argparse.ArgumentParser(prog="tools.mutants", description=__doc__)
     parser.add_argument("packages", nargs="*", default=list(PACKAGES), help=f"of {', '.join(PACKAGES)}; default: all")
     parser.add_argument("--seed", type=int, default=1, help="of the sample")
