@@ -22,6 +22,7 @@ from companion.model.types import (
     Event,
     FlightMode,
     Outcome,
+    PhaseKind,
     SafetyAction,
     Severity,
     TetherState,
@@ -33,6 +34,7 @@ from tests.safety.healthy import SLOW, healthy, put
 
 CONFIG = load_flight("configs/missions/catch.yaml")
 P = Parameters.of(CONFIG)
+PLAN = Plan.build(CONFIG.mission, CONFIG.vehicle)
 ANCHOR: Vec3 = (0.0, -1.2, 0.0)  # configs/vehicles/tarot650_2r.yaml
 PULLS = [replace(SLOW, taut=True), replace(SLOW, snagged=True)]
 HERE: Vec3 = (0.0, 0.3, 1.0)
@@ -42,13 +44,12 @@ HERE: Vec3 = (0.0, 0.3, 1.0)
 def in_plan(plan_s: float = 6.0) -> FlightState:
     """In the air, some time into the mission."""
     now_s = healthy().t_s
-    plan = Plan.build(CONFIG.mission, CONFIG.vehicle)
-    course = Course(plan, now_s - plan_s)
+    course = Course(PLAN, now_s - plan_s)
     return replace(
         P.initial_state(),
         stage=Stage.PLAN,
         entered_s=now_s - plan_s,
-        plan=plan,
+        plan=PLAN,
         course=course,
         mission_start_s=now_s - plan_s,
     )
@@ -150,16 +151,26 @@ def test_a_flip_under_a_pilot_begins_no_landing_of_the_companions_own(mode: Flig
 @pytest.mark.parametrize("height_m", [0.3, 0.58, 0.62])
 def test_a_hold_near_the_floor_is_a_landing(height_m: float) -> None:
     """There it would hang in its own downwash, 0.3 m above standing height and lower."""
-    state = in_plan()
-    assert state.course is not None
-    plan = state.course.plan
     assert P.clearance_m == 0.3
-    at_s = next(k * 0.005 for k in range(2000) if plan.reference(k * 0.005).position_world_m[2] >= height_m)
+    at_s = next(k * 0.005 for k in range(2000) if PLAN.reference(k * 0.005).position_world_m[2] >= height_m)
     state, request = after(in_plan(at_s), "too_fast", SafetyAction.HOLD)
     lands = height_m < 0.6
     assert ("no_room_to_stay" in ids(request)) is lands
     assert state.course is not None and state.course.held is not lands
     assert state.supervisor.action is (SafetyAction.LAND if lands else SafetyAction.HOLD)
+
+
+@pytest.mark.parametrize("action", [SafetyAction.HOLD, SafetyAction.RETRACT])
+def test_a_landing_that_has_begun_is_not_interrupted(action: SafetyAction) -> None:
+    landing = next(segment for segment in PLAN.segments if segment.kind is PhaseKind.LANDING)
+    assert PLAN.reference(landing.start_s).position_world_m[2] > 0.7, "high enough to hold"
+    before = in_plan(landing.start_s + 0.1)
+    state, request = after(before, "tether_taut", action, tether=PULLS[0])
+    assert state.stage is Stage.PLAN and state.course is not None and not state.course.held
+    if action is SafetyAction.HOLD:
+        assert state.course == before.course and "no_room_to_stay" not in ids(request)
+    else:
+        assert state.aborting and state.supervisor.action is SafetyAction.LAND
 
 
 def test_before_take_off_a_fault_refuses_the_flight_and_the_operators_word_ends_it() -> None:

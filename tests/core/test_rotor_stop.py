@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any
 
 import msgspec
@@ -13,7 +12,6 @@ from hypothesis import strategies as st
 
 from companion.core.flight_core import FlightCore
 from companion.flight.heartbeat import Heartbeats
-from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import (
     AutopilotRequest,
     FlightMode,
@@ -120,23 +118,6 @@ def test_what_climbs_in_offboard_after_a_false_touch_down_is_never_disarmed() ->
     assert not requests(outputs) & set(STOPS)
 
 
-def test_at_rest_at_a_height_where_it_cannot_stand_it_is_never_disarmed() -> None:
-    """It hangs on its tether, or rests in a net: PX4's word that it stands is not taken."""
-    core, machine, _ = machine_from("disarm", landed=LandedState.ON_GROUND)
-    machine.position = (*machine.position[:2], machine.floor_m + 0.3)
-    assert not requests(walked(core, machine, 350)) & set(STOPS)
-
-
-def test_a_move_begins_the_rest_anew() -> None:
-    core, machine, _ = machine_from("disarm")
-    before = walked(core, machine, 150)
-    machine.aside_m_s = 0.3
-    moved = walked(core, machine, 10)
-    machine.aside_m_s = 0.0
-    after = walked(core, machine, 180)
-    assert not requests([*before, *moved, *after]) & set(STOPS)
-
-
 def test_px4_that_leaves_offboard_before_it_is_disarmed_lands() -> None:
     core, machine, _ = machine_from("disarm")
     machine.mode = FlightMode.OTHER
@@ -221,22 +202,6 @@ def test_it_rights_itself_late_while_the_forced_disarm_is_refused_and_is_landed(
     assert requests(walked(core, machine, 60)) == {AutopilotRequest.LAND}
 
 
-def test_an_attitude_that_motion_capture_contradicts_stops_no_rotor() -> None:
-    core, machine, _ = flipped(mocap_attitude=UPRIGHT, feels_m_s2=9.81)
-    outputs = walked(core, machine, 60)
-    assert not requests(outputs) & set(STOPS)
-    assert AutopilotRequest.LAND in requests(outputs)
-
-
-@pytest.mark.parametrize(("feels_m_s2", "stopped"), [(-9.81, True), (0.0, True), (9.81, False)])
-def test_where_motion_capture_does_not_see_it_the_accelerometer_confirms(feels_m_s2: float, stopped: bool) -> None:
-    core, machine, _ = machine_from("hold", seen=False)
-    walked(core, machine, 16)
-    machine.attitude, machine.feels_m_s2 = ON_ITS_BACK, feels_m_s2
-    outputs = walked(core, machine, 40)
-    assert (AutopilotRequest.FORCE_DISARM in requests(outputs)) is stopped
-
-
 def test_flipped_under_a_pilot_nothing_is_sent() -> None:
     core, machine, _ = flipped(attitude=UPRIGHT, mode=FlightMode.MANUAL, feels_m_s2=9.81, up_m_s=0.0)
     walked(core, machine, 10)
@@ -272,46 +237,6 @@ def test_tipped_over_on_the_floor_it_is_disarmed_by_force_for_as_long_as_it_take
     assert ids(outputs).count("crashed") == 1
     machine.armed = False
     assert walked(core, machine, 40)[-1].outcome is Outcome.CRASHED
-
-
-def test_rocking_on_the_floor_it_is_disarmed_by_force_all_the_same() -> None:
-    core, machine, account = tipped("land", mode=FlightMode.LAND)
-    outputs = []
-    for tick in range(40):
-        tilt_deg = 57.0 + 15.0 * math.cos(2.0 * math.pi * tick / 25)
-        machine.attitude = quat_from_euler_zyx(math.radians(-tilt_deg), 0.0, 0.0)
-        outputs += walked(core, machine, 1, account)
-    assert 0.48 < first_s(outputs, AutopilotRequest.FORCE_DISARM) < 0.68
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"height_m": 0.26},
-        {"seen": False},
-        {"mocap_attitude": UPRIGHT},
-        {"mode": FlightMode.MANUAL},
-        {"mode": FlightMode.OTHER},
-        {"attitude": quat_from_euler_zyx(math.radians(39.0), 0.0, 0.0)},
-    ],
-    ids=["high", "not seen", "contradicted", "a pilot", "another mode", "within the limit"],
-)
-@pytest.mark.parametrize("phase", ["land", "disarm"])
-def test_what_only_seems_tipped_over_is_not_disarmed_for_it(phase: str, changes: dict[str, Any]) -> None:
-    core, machine, account = tipped(phase, **{"mode": FlightMode.LAND, **changes})
-    machine.up_m_s = 0.02 if "height_m" in changes else 0.0
-    assert not requests(walked(core, machine, 100, account)) & set(STOPS)
-
-
-def test_it_rights_itself_before_half_a_second_and_is_landed() -> None:
-    core, machine, account = tipped("land")
-    outputs = walked(core, machine, 10, account)
-    machine.mode = FlightMode.LAND
-    outputs += walked(core, machine, 13, account)
-    machine.attitude, machine.feels_m_s2 = UPRIGHT, 9.81
-    outputs += walked(core, machine, 60, account)
-    assert AutopilotRequest.FORCE_DISARM not in requests(outputs)
-    assert AutopilotRequest.LAND in requests(outputs)
 
 
 @pytest.mark.parametrize("phase", ["touchdown", "disarm"])

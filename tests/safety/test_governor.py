@@ -240,6 +240,21 @@ def test_what_lies_outside_is_followed_to_the_edge(to: Vec3, why: str, expected:
         assert edge.position_world_m == pytest.approx(expected, abs=0.01)
 
 
+def test_a_motion_that_begins_outside_begins_at_the_nearest_corner_of_reach_and_room() -> None:
+    """In the thin corners alternating projections do not arrive; the last step starts from a point inside."""
+    corners = ("vehicle.tether.length_m=1.5", "vehicle.tether.anchor_world_m=[-1.8, -1.2, 0]")
+    for overrides in (corners, ("vehicle.tether.length_m=1.6", "vehicle.tether.anchor_world_m=[0, -1.8, 3.3]")):
+        g, within = governor(*overrides), SafeSet(config(*overrides).vehicle)
+        for x, y, z in itertools.product(
+            (-20.0, -1.8, -1.0, 0.2, 3.0), (-9.0, -1.2, 0.4, 7.0), (-3.0, 0.5, 1.5, 2.1, 8.0)
+        ):
+            g.reset()
+            begun = g.constrain(DT_S, at_rest((x, y, z), 0.0, ARM), None).reference.position_world_m
+            assert within.breach_tether_m(begun) <= CLOSE and within.breach_walls_m(begun) <= CLOSE
+            if within.holds((x, y, z)):
+                assert begun == (x, y, z)
+
+
 def test_along_the_edge_it_slides() -> None:
     g = governor()
     follow(g, at_rest((-1.0, 0.5, 1.0), 0.0, ARM), 0.1)
