@@ -518,6 +518,12 @@ def test_motion_capture_that_comes_back_slowly_is_reported_with_its_own_rate() -
     assert events[1].text == "motion capture arrives at 29 Hz (limit 50 Hz)"
 
 
+def test_a_pose_that_is_lost_disagrees_with_nothing() -> None:
+    """PX4's estimate drifts on without it: one cause, one event."""
+    events = watched(VEHICLE, after_a_moment(both(drifting, turning, stopped("mocap"))), flying())
+    assert [event.id for event in events] == ["mocap_lost"]
+
+
 @pytest.mark.parametrize("direction", [(0.0, 1.0, 0.0), (0.0, 0.0, -1.0), (-0.6, 0.8, 0.0)])
 @pytest.mark.parametrize("flies", [True, False])
 def test_poses_that_move_are_dragged_unless_the_imu_measures_the_motion(
@@ -776,6 +782,15 @@ def test_values_that_repeat_are_a_fault_only_while_the_vehicle_moves(
     motion = put("vehicle", velocity_world_m_s=velocity, angular_rate_body_rad_s=rate)
     events = watched(VEHICLE, after_a_moment(both(motion, REPEATS[found]), ticks=300, sound=20), flying())
     assert [event.id for event in events] == ([found] if moves else [])
+
+
+@pytest.mark.parametrize(("situation", "trusted"), [(flying, False), (standing, True)])
+def test_on_the_ground_a_force_that_repeats_itself_is_still_one(
+    situation: Callable[[], Situation], trusted: bool
+) -> None:
+    monitors = Monitors(VEHICLE)
+    watched(VEHICLE, after_a_moment(REPEATS["force_stuck"], ticks=200), situation(), monitors)
+    assert monitors.trusted is not None and (monitors.trusted.force is not None) is trusted
 
 
 def test_a_frame_without_the_body_does_not_end_a_freeze() -> None:

@@ -90,6 +90,14 @@ def test_a_move_of_more_than_five_centimetres_begins_the_rest_anew() -> None:
     assert first_s(moved(0.06), "may_force", until_s=7.5) == pytest.approx(7.0, abs=0.03)
 
 
+def test_a_source_that_goes_or_comes_back_begins_the_rest_anew() -> None:
+    def seen_at(t_s: float) -> Inputs:
+        return seen(t_s, LOW_M, mocap=not 12.0 <= t_s < 12.6)
+
+    # Without a fresh pose from 12 s on, again from 12.6 s on; 0.08 s to measure that it does not sink.
+    assert first_s(seen_at, "may_force", until_s=9.0) == pytest.approx(2.6 + 0.08 + 4.0, abs=0.03)
+
+
 @pytest.mark.parametrize(
     ("what", "stopped"),
     [
