@@ -264,11 +264,13 @@ def test_no_position_setpoint_against_a_pilot_or_on_poses_that_the_flight_proces
     assert bool(landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)) is lands
 
 
-@pytest.mark.parametrize("armed", [True, False])
-def test_disarmed_it_is_not_moved_back(armed: bool) -> None:
+@pytest.mark.parametrize(
+    ("mode", "armed", "moves"), [(OFFBOARD_MODE, True, True), (OFFBOARD_MODE, False, False), (LAND_MODE, True, False)]
+)
+def test_disarmed_or_out_of_offboard_it_is_not_moved_back(mode: int, armed: bool, moves: bool) -> None:
     landing = Landing(AT_A_SURFACE)
-    landing.run(0.3, mode=OFFBOARD_MODE, height_m=1.1, armed=armed)
-    assert bool(landing.positions) is armed
+    landing.run(0.6, mode=mode, height_m=1.1, armed=armed)
+    assert bool(landing.positions) is moves
 
 
 def test_the_way_back_is_flown_at_half_a_metre_per_second_squared_and_consistent_in_itself() -> None:
@@ -378,14 +380,6 @@ def test_a_pose_that_jumps_is_not_sent_and_is_reported_once() -> None:
     assert len(landing.wire.poses) == sent
     assert [notice.id for notice in landing.notices].count("guardian_mocap") == 1
     assert landing.takeover.pose is not None and landing.takeover.pose.position_world_m[2] == STANDING_M
-
-
-@pytest.mark.parametrize("mode", [LAND_MODE, OFFBOARD_MODE])
-def test_without_a_position_or_out_of_offboard_px4_lands_at_once(mode: int) -> None:
-    landing = Landing(AT_A_SURFACE)
-    landing.run(0.6, mode=mode, messages=("attitude",) if mode == OFFBOARD_MODE else ("position", "attitude"))
-    assert not landing.positions
-    assert landing.wire.commands(mavlink.MAV_CMD_NAV_LAND) or mode == LAND_MODE
 
 
 def test_poses_that_the_flight_process_rejected_are_neither_passed_on_nor_evaluated() -> None:

@@ -551,23 +551,6 @@ def test_poses_that_move_are_dragged_unless_the_imu_measures_the_motion(
     assert ("mocap_dragged" in [event.id for event in events]) is not flies
 
 
-def test_fast_flight_and_a_gap_are_no_jump() -> None:
-    """1.5 m/s, and 80 ms without a frame; it ends where it could still stop."""
-
-    def fast(k: int) -> Inputs:
-        t_s = k * TICK_S
-        i = healthy(k)
-        assert i.mocap
-        x = -1.2 + 1.5 * t_s
-        vehicle = put("vehicle", position_world_m=(x, 0.0, 1.0), velocity_world_m_s=(1.5, 0.0, 0.0))(i)
-        return put("mocap", position_world_m=(x + 1e-4 * (k % 3), 0.0, 1.0))(vehicle)
-
-    inputs = [fast(k) for k in range(200)]
-    for k in range(100, 116):
-        inputs[k] = replace(inputs[k], mocap=inputs[99].mocap)
-    assert watched(VEHICLE, inputs, flying()) == []
-
-
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (-1, 0, 0), (0, -1, 0), (0, 0, -1)])
 @pytest.mark.parametrize(("size_m", "trusted"), [(0.09, True), (0.11, False)])
 def test_a_jump_is_one_from_ten_centimetres_on_in_every_direction(
