@@ -173,6 +173,25 @@ def test_a_landing_that_has_begun_is_not_interrupted(action: SafetyAction) -> No
         assert state.aborting and state.supervisor.action is SafetyAction.LAND
 
 
+@pytest.mark.parametrize(
+    ("action", "since_s", "event"),
+    [
+        (SafetyAction.HOLD, 19.9, None),
+        (SafetyAction.HOLD, 20.1, "hold_expired"),
+        (SafetyAction.RETRACT, 11.9, None),
+        (SafetyAction.RETRACT, 12.1, "retract_expired"),
+    ],
+)
+def test_a_hold_or_retract_ends_in_a_landing_although_nothing_else_happens(
+    action: SafetyAction, since_s: float, event: str | None
+) -> None:
+    state = replace(in_plan(), supervisor=SupervisorState(action, "before", healthy().t_s - since_s))
+    state, request = tick(state)
+    assert ids(request) == ([] if event is None else [event])
+    assert state.supervisor.action is (action if event is None else SafetyAction.LAND)
+    assert state.aborting is (event is not None)
+
+
 def test_before_take_off_a_fault_refuses_the_flight_and_the_operators_word_ends_it() -> None:
     armed = replace(P.initial_state(), stage=Stage.OFFBOARD, entered_s=healthy().t_s - 1.0)
     for cause, outcome in (("arm_lost", Outcome.REFUSED), ("operator_land", Outcome.ABORTED)):

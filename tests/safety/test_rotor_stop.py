@@ -91,11 +91,12 @@ def test_a_move_of_more_than_five_centimetres_begins_the_rest_anew() -> None:
 
 
 def test_a_source_that_goes_or_comes_back_begins_the_rest_anew() -> None:
-    def seen_at(t_s: float) -> Inputs:
-        return seen(t_s, LOW_M, mocap=not 12.0 <= t_s < 12.6)
+    def gone(until_s: float) -> Seen:
+        return lambda t_s: seen(t_s, LOW_M, mocap=not 13.0 <= t_s < until_s)
 
-    # Without a fresh pose from 12 s on, again from 12.6 s on; 0.08 s to measure that it does not sink.
-    assert first_s(seen_at, "may_force", until_s=9.0) == pytest.approx(2.6 + 0.08 + 4.0, abs=0.03)
+    # 0.08 s to measure that it does not sink.
+    assert first_s(gone(13.6), "may_force", until_s=9.0) == pytest.approx(3.6 + 0.08 + 4.0, abs=0.03)
+    assert first_s(gone(99.0), "may_force") is None, "motion capture has shown only 3 s of the rest"
 
 
 @pytest.mark.parametrize(
