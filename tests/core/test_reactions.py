@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -21,6 +22,7 @@ from companion.model.types import (
     AutopilotRequest,
     Event,
     FlightMode,
+    OperatorCommand,
     Outcome,
     PhaseKind,
     SafetyAction,
@@ -190,6 +192,28 @@ def test_a_hold_or_retract_ends_in_a_landing_although_nothing_else_happens(
     assert ids(request) == ([] if event is None else [event])
     assert state.supervisor.action is (action if event is None else SafetyAction.LAND)
     assert state.aborting is (event is not None)
+
+
+@pytest.mark.parametrize(
+    ("stage", "waits", "by_others", "called_off"),
+    [
+        (Stage.WAIT, True, False, False),
+        (Stage.READY, True, False, False),
+        (Stage.OFFBOARD, True, False, True),
+        (Stage.WAIT, False, False, True),
+        (Stage.OFFBOARD, False, True, False),
+        (Stage.SPOOL, False, False, False),
+    ],
+)
+def test_a_hold_before_take_off_calls_it_off_unless_the_flight_waits_for_its_start(
+    stage: Stage, waits: bool, by_others: bool, called_off: bool
+) -> None:
+    before = replace(in_plan(), stage=stage, entered_s=healthy().t_s, armed_by_others=by_others)
+    held = replace(put("status", armed=False)(healthy()), command=OperatorCommand.HOLD)
+    parameters = dataclasses.replace(P, waits_for_start=waits)
+    waiting = replace(before.waiting, tare_start_s=healthy().t_s)
+    _, request = tick(replace(before, waiting=waiting), parameters=parameters, inputs=held, airborne=False)
+    assert ("called_off" in ids(request)) is called_off
 
 
 def test_before_take_off_a_fault_refuses_the_flight_and_the_operators_word_ends_it() -> None:
