@@ -124,6 +124,7 @@ def test_on_the_ground_only_a_share_of_the_vertical_force_is_commanded() -> None
     found = sent((5.0, 5.0, WEIGHT_N), scale=0.4)
     assert found.force_world_n == pytest.approx((0.0, 0.0, 0.4 * WEIGHT_N))
     assert found.roll_pitch_yaw_rad == pytest.approx((0.0, 0.0, 0.7))
+    assert sent((0.0, 0.0, WEIGHT_N), scale=0.01).collective_n == pytest.approx(0.01 * WEIGHT_N), "from zero on"
 
 
 def test_the_tilt_filter_is_the_second_order_system_of_its_bandwidth_and_damping() -> None:
