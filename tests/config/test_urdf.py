@@ -53,8 +53,9 @@ def problem(folder: Path, text: str, base: str | None = None, tip: str | None = 
     with pytest.raises(ConfigError) as caught:
         read_urdf(path, base, tip)
     (line,) = caught.value.lines
-    assert line.startswith(f"{path}:")
-    return line.removeprefix(f"{path}:")
+    found = re.fullmatch(re.escape(str(path)) + r":(\d+):\d+: (.*)", line)
+    assert found, line
+    return f"{found[1]}: {found[2]}"
 
 
 def without(chain: ArmChain) -> ArmChain:
@@ -133,6 +134,7 @@ def second_branch() -> str:
 
 
 INERTIA = 'ixx="7.342e-05" iyy="8.577e-05" izz="4.896e-05"'
+TURRET = f'<mass value="0.190"/>\n      <inertia {INERTIA} ixy="0" ixz="0" iyz="0"/>'
 YAW = '<joint name="yaw" type="revolute">'
 AXIS = '<axis xyz="0 0 1"/>'
 
@@ -156,7 +158,39 @@ DAMAGED = {
     "another format": ("<sdf/>", "1: expected a <robot> element, got <sdf>"),
     "entities": ('<!DOCTYPE r [<!ENTITY a "b">]><robot/>', "1: expected no <!DOCTYPE>"),
     "unknown encoding": ('<?xml version="1.0" encoding="nonsense"?><robot/>', "1: not XML: "),
-    "xacro": ('<robot xmlns:xacro="http://x"><xacro:macro/></robot>', "1: <xacro:macro>: expected plain URDF; convert it"),
+    "xacro": ('<robot xmlns:xacro="http://x"><xacro:macro/></robot>', "1: <xacro:macro> is not expanded; expected plain URDF"),
+    "xacro in a link": (
+        edited('<mass value="0.190"/>', '<xacro:rod_inertial mass="0.35"/>'), r"31: <xacro:rod_inertial> is not expanded"
+    ),
+    "misspelled origin": (
+        edited('<origin xyz="0 0 -0.008"/>', '<orgin xyz="0 0 -0.008"/>'),
+        r"24: <joint>: unknown element <orgin>; did you mean <origin>\?",
+    ),
+    "Axis": (edited(AXIS, '<Axis xyz="0 0 1"/>'), r"25: <joint>: unknown element <Axis>; did you mean <axis>\?"),
+    "misspelled joint": (edited("</robot>", "<jiont/></robot>"), r"\d+: <robot>: unknown element <jiont>; did you mean <joint>\?"),
+    "a loop of Drake's": (edited("</robot>", '<loop_joint name="l"/></robot>'), r"\d+: <robot>: unknown element <loop_joint>"),
+    "misspelled rpy": (
+        edited('<origin xyz="0 0 -0.008"/>', '<origin xyz="0 0 -0.008" ryp="0 1 0"/>'),
+        r"24: <origin>: unknown attribute ryp; did you mean rpy\?",
+    ),
+    "attribute of another format": (edited(AXIS, '<axis xyz="0 0 1" frame="w"/>'), r"25: <axis>: unknown attribute frame; known: xyz"),
+    "degrees": (
+        edited('<origin xyz="0 0 -0.008"/>', '<origin xyz="0 0 -0.008" rpy="0 90 0"/>'),
+        r'24: <origin>: rpy: expected radians, at most 2 pi, got "0 90 0"',
+    ),
+    "two origins": (edited(AXIS, AXIS + "<origin/>"), r"25: <joint>: a second <origin>, expected one"),
+    "rpy and quaternion": (
+        edited('<origin xyz="0 0 -0.008"/>', '<origin rpy="0 0 1" quat_xyzw="0 0 0 1"/>'),
+        "24: <origin>: expected rpy or quat_xyzw, got both",
+    ),
+    "quaternion of norm 2": (
+        edited('<origin xyz="0 0 -0.008"/>', '<origin quat_xyzw="0 0 0 2"/>'),
+        "24: <origin>: quat_xyzw: expected a quaternion of norm 1, got norm 2",
+    ),
+    "a frame that moves alone": (
+        edited(TURRET, '<mass value="1e-9"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>'),
+        r'28: link "turret" moves but has no <inertial> with a mass',
+    ),
     "no link": ("<robot/>", r"1: expected one link that is no joint's child, got none"),
     "no joint": ('<robot><link name="a"/></robot>', "1: no revolute or continuous joint moves a link of the arm"),
     "same name": (edited('name="turret"', 'name="plate"'), r'28: link "plate" is defined twice'),
@@ -196,6 +230,27 @@ def test_a_damaged_or_unsuitable_file_gives_one_line(tmp_path: Path, name: str) 
     assert re.match(expected, found), found
 
 
+@pytest.mark.parametrize("mass", ["0", "1e-9"])
+def test_a_fixed_link_without_mass_is_a_frame(tmp_path: Path, mass: str) -> None:
+    inertial = f'<inertial><mass value="{mass}"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>'
+    text = edited('<link name="net"/>', f'<link name="net">{inertial}</link>')
+    assert chain_of(vehicle_of(tmp_path, text)) == chain_of(vehicle_of(tmp_path, TEXT))
+
+
+def test_a_rotation_may_be_a_quaternion(tmp_path: Path) -> None:
+    text = edited('rpy="0 1.5707963267948966 0"', 'quat_xyzw="0 0.70710678 0 0.70710678"')
+    np.testing.assert_allclose(
+        vehicle_of(tmp_path, text).arm.tip_rpy_deg, vehicle_of(tmp_path, TEXT).arm.tip_rpy_deg, atol=1e-6
+    )
+
+
+def test_elements_that_are_not_read_and_extensions_may_contain_anything(tmp_path: Path) -> None:
+    extra = '<transmission><joint name="yaw"><hardwareInterface/></joint></transmission><drake:frame/>'
+    text = edited("</robot>", f'{extra}<gazebo reference="net"><mu1>0.2</mu1></gazebo></robot>')
+    text = text.replace("<robot ", '<robot version="1.2" xmlns:drake="http://drake.mit.edu" ')
+    assert chain_of(vehicle_of(tmp_path, text)) == chain_of(vehicle_of(tmp_path, TEXT))
+
+
 def test_no_damage_to_a_file_raises_anything_but_a_config_error(tmp_path: Path) -> None:
     draw = random.Random(3)
     path = tmp_path / "arm.urdf"
@@ -233,7 +288,7 @@ def test_the_vehicle_file_names_the_line_of_the_urdf_key(tmp_path: Path) -> None
     with pytest.raises(ConfigError) as caught:
         vehicle_of(tmp_path, "<robot>")
     (line,) = caught.value.lines
-    assert re.match(r".*vehicle\.yaml:\d+:\d+: arm\.urdf: .*arm\.urdf:1: not XML: ", line)
+    assert re.match(r".*vehicle\.yaml:\d+:\d+: arm\.urdf: .*arm\.urdf:1:\d+: not XML: ", line)
     with pytest.raises(ConfigError, match=r"arm\.urdf: .*missing\.urdf: not readable: No such file"):
         load_vehicle(vehicle_file(tmp_path, {"urdf": "missing.urdf", "joints": JOINTS}))
     (tmp_path / "arm.urdf").write_text(TEXT, encoding="utf-8")
