@@ -20,7 +20,7 @@ from companion.io.protocols import DeviceError
 from companion.io.px4.transfer import Comparison, Difference, WriteResult, compare, write
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.px4 import params_file
-from companion.px4.params_file import PACKAGED, Value, value_text
+from companion.px4.params_file import PACKAGED, VEHICLE_ID, ParamsFile, skipped_lines, value_text
 from companion.runtime.clock import flight_clock
 from companion.runtime.console import print_error
 
@@ -69,10 +69,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Compare PX4's parameters with the file, write the differences if requested, and print the result; return the exit code.
 
     Raises:
-        ConfigError: the parameter file, the vehicle file or --address is invalid.
+        ConfigError: the parameter file, the vehicle file or --address is invalid, or the parameters are of another vehicle.
     """
     path = arguments.file or PACKAGED
-    wanted = params_file.read(path)
+    file = params_file.read(path)
     if arguments.address is None:
         device = load_vehicle(arguments.vehicle).devices.autopilot
     else:
@@ -81,19 +81,23 @@ def run(arguments: argparse.Namespace) -> int:
         except ValidationError as error:
             raise ConfigError([f"--address {arguments.address}: {error.errors()[0]['msg']}"]) from None
     try:
-        return asyncio.run(_run(arguments, wanted, device, path.name))
+        return asyncio.run(_run(arguments, file, device, path))
     except DeviceError as error:
         print_error(error)
         return EXIT_REFUSED
 
 
-async def _run(arguments: argparse.Namespace, wanted: dict[str, Value], device: AutopilotDevice, source: str) -> int:
-    from companion.io.px4.driver import (
-        MavsdkAutopilot,  # MAVSDK's library is slow to load, so not every command imports it
-    )
+async def _run(arguments: argparse.Namespace, file: ParamsFile, device: AutopilotDevice, path: Path) -> int:
+    # MAVSDK's library is slow to load, so not every command imports it
+    from companion.io.px4.driver import MavsdkAutopilot
+    from companion.io.px4.params import ALWAYS_THERE
 
     async with MavsdkAutopilot(device, flight_clock()) as autopilot:
-        comparison = compare(wanted, await autopilot.read_params(wanted))
+        names = {name: None for values in file.values.values() for name in values}
+        found = await autopilot.read_params([*names, ALWAYS_THERE])
+        system = int(found.get(ALWAYS_THERE, VEHICLE_ID))
+        wanted, skipped = file.of_vehicle(system)
+        comparison = compare(wanted, found, skipped)
         if not arguments.write or not comparison.differences:
             _print(arguments, comparison, None, None)
             return EXIT_OK if comparison.same else EXIT_REFUSED
@@ -103,7 +107,7 @@ async def _run(arguments: argparse.Namespace, wanted: dict[str, Value], device: 
             )
             return EXIT_REFUSED
         backup = arguments.backup or Path(f"px4_{time_stamp()}.params")
-        problem = _back_up(backup, comparison.differences, await autopilot.firmware(), source)
+        problem = _back_up(backup, comparison.differences, await autopilot.firmware(), path.name, system)
         if problem is not None:
             print_error(problem)
             return EXIT_BAD_INPUT
@@ -119,10 +123,11 @@ async def _armed(autopilot: MavsdkAutopilot) -> bool:
     return status.armed
 
 
-def _back_up(path: Path, differences: Sequence[Difference], firmware: str, source: str) -> str | None:
+def _back_up(path: Path, differences: Sequence[Difference], firmware: str, source: str, system: int) -> str | None:
     """Save the old values; return why nothing may be written, or None if they are saved."""
     heading = [f"Values, before writing, of the parameters that {source} changes, read from {firmware}.", ""]
-    text = params_file.text({difference.name: difference.px4 for difference in differences}, heading)
+    values = {difference.name: difference.px4 for difference in differences}
+    text = params_file.text(values, heading, vehicle_id=system)
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
@@ -163,6 +168,10 @@ def jsonable(comparison: Comparison, result: WriteResult | None, backup: Path | 
         "differs": [{"name": d.name, "px4": d.px4, "file": d.file, "reboot": d.reboot} for d in comparison.differences],
         "absent": list(comparison.absent),
         "absent_port": list(comparison.absent_port),
+        "skipped": [
+            {"vehicle": vehicle, "component": component, "names": names}
+            for (vehicle, component), names in comparison.skipped.items()
+        ],
         "measured": [{"name": d.name, "px4": d.px4, "file": d.file} for d in comparison.measured],
         **done,
     }
@@ -181,6 +190,7 @@ def lines(comparison: Comparison, result: WriteResult | None) -> list[str]:
         f"{d.name:16}  {value_text(d.px4):>12}, measured for each vehicle and left unchanged (the file has {value_text(d.file)})"
         for d in comparison.measured
     ]
+    shown += [f"skipped, because it is not this vehicle's PX4: {line}" for line in skipped_lines(comparison.skipped)]
     if result is None:
         shown.append("nothing differs" if comparison.same else f"{differ} differ")
         return shown

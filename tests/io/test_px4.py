@@ -459,6 +459,22 @@ def test_a_silent_px4_does_not_pass_for_one_without_parameters(monkeypatch: pyte
     asyncio.run(fly())
 
 
+def test_a_whole_export_with_unknown_names_is_read_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each group of eight unknown names takes 0.4 s, and all of them longer than the deadline for one answer."""
+    monkeypatch.setattr(autopilot_params, "ASKS", 1)
+    monkeypatch.setattr(autopilot_params, "READ_DEADLINE_S", 2.0)
+
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            peer.params = PARAMS | {f"P_{number}": number for number in range(300)}
+            unknown = [f"NO_{number}" for number in range(autopilot_params.WINDOW * 8)]
+            async with edge(port) as autopilot:
+                assert await autopilot.read_params([*unknown, *peer.params]) == peer.params
+
+    asyncio.run(fly())
+
+
 def test_a_parameter_is_written_and_read_back() -> None:
     async def fly() -> None:
         port = free_udp_port()

@@ -62,7 +62,7 @@ def test_diff_write_diff_on_the_stub(
             assert found["reboot"] == ["EKF2_HGT_REF"]
             assert stub.params.revision == revision + len(SPOILED), "only what differed was written"
             assert all(stub.params[name] == single(file_values()[name]) for name in SPOILED)
-            assert params_file.read(backup) == SPOILED
+            assert params_file.read(backup).values == {1: SPOILED}
 
             assert await run("--diff") == EXIT_OK
             assert "nothing differs" in capsys.readouterr().out
@@ -108,6 +108,29 @@ def test_a_name_that_px4_does_not_have_is_not_all_written(tmp_path: Path, capsys
         assert params(port, "--write", str(path), "--backup", str(tmp_path / "old.params")) == EXIT_REFUSED
         assert "NO_SUCH_ONE       PX4 does not have this parameter" in capsys.readouterr().out
         assert peer.params["COM_RC_IN_MODE"] == 3
+
+
+def test_only_the_rows_of_this_px4_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, backup = tmp_path / "mine.params", tmp_path / "old.params"
+    path.write_text(
+        "7\t1\tCOM_RC_IN_MODE\t3\t6\n7\t124\tSDLOG_MODE\t3\t6\n1\t1\tMPC_THR_HOVER\t0.9\t9\n", encoding="utf-8"
+    )
+    port = free_udp_port()
+    with Px4Peer(port) as peer:
+        peer.params["MAV_SYS_ID"] = 7
+        assert params(port, "--write", str(path), "--backup", str(backup)) == EXIT_OK
+        said = capsys.readouterr().out
+        assert [message.param_id for message in peer.of("PARAM_SET")] == ["COM_RC_IN_MODE"]
+        assert "skipped, because it is not this vehicle's PX4: vehicle 1, component 1: MPC_THR_HOVER" in said
+        assert "skipped, because it is not this vehicle's PX4: vehicle 7, component 124: SDLOG_MODE" in said
+        assert params_file.read(backup).values == {7: {"COM_RC_IN_MODE": 4}}, "the backup can be restored"
+
+        peer.params["MAV_SYS_ID"] = 8
+        assert params(port, "--write", str(path), "--backup", str(tmp_path / "older")) == EXIT_BAD_INPUT
+        assert (
+            "expected parameters of vehicle 8 (MAV_SYS_ID of this PX4), found those of vehicle 7, 1"
+            in capsys.readouterr().err
+        )
 
 
 def test_another_type_than_px4s_is_reported_and_not_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -36,21 +36,57 @@ VALUES = st.integers(-(2**31), 2**31 - 1) | st.floats(width=32, allow_nan=False,
 
 
 def test_a_file_of_qgroundcontrol_is_read() -> None:
-    entries = params_file.parse(QGROUNDCONTROL, "qgc.params")
-    assert {entry.name: entry.value for entry in entries} == {
+    values = params_file.parse(QGROUNDCONTROL, "qgc.params").values[1]
+    assert values == {
         "BAT1_V_CHARGED": params_file.single(4.05),
         "CAL_GYRO0_ID": 1310988,
         "COM_FLTMODE6": -1,
         "EKF2_EVP_NOISE": params_file.single(0.01),
     }
-    assert [type(entry.value) for entry in entries] == [float, int, int, float]
-    assert [entry.line for entry in entries] == [8, 9, 10, 12]
+    assert [type(value) for value in values.values()] == [float, int, int, float]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufeff# Onboard parameters\r\n1\t1\tEKF2_EV_DELAY\t25.0\t9\r\n",
+        "1\t1\tEKF2_EV_DELAY\t                   25.0\t9\n",
+        "1 1 EKF2_EV_DELAY   25.0 9\n",
+        "1,1,EKF2_EV_DELAY,25.0,9\n1, 124, EKF2_EV_DELAY, 5.0, 9",
+        "# a line separator\u2028 in a comment\n1\t1\tEKF2_EV_DELAY\t25.0\t9\t\n",
+    ],
+    ids=["byte order mark", "padded cells", "spaces", "commas", "line separator"],
+)
+def test_columns_are_read_as_other_tools_write_them(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "other.params"
+    path.write_bytes(text.encode())
+    assert params_file.read(path).values == {1: {"EKF2_EV_DELAY": 25.0}}
+
+
+def test_parameters_of_other_components_and_vehicles_are_skipped_by_name() -> None:
+    """A CAN node's names may be lower case and repeated, and its types are others."""
+    text = "1\t1\tA\t2.0\t9\n1\t124\tA\t25.0\t9\n1\t125\tgps_type\t1\t2\n2\t1\tA\t3.0\t9\n2\t1\tB\t1\t6\n"
+    values, skipped = params_file.parse(text, "mine.params").of_vehicle(1)
+    assert values == {"A": 2.0}
+    assert params_file.skipped_lines(skipped) == [
+        "vehicle 2, component 1: A, B", "vehicle 1, component 124: A", "vehicle 1, component 125: gps_type",
+    ]  # fmt: skip
+
+
+def test_a_file_of_another_vehicle_or_component_is_refused_by_name() -> None:
+    with pytest.raises(
+        ConfigError, match=r"mine\.params: expected parameters of vehicle 3 .*, found those of vehicle 2;"
+    ):
+        params_file.parse("2\t1\tA\t2.0\t9\n", "mine.params").of_vehicle(3)
+    with pytest.raises(ConfigError, match=r"mine\.params: expected .*, found vehicle 1, component 50: MC_ROLLRATE_P"):
+        params_file.parse("1\t50\tMC_ROLLRATE_P\t    0.12\t9\n", "mine.params")
 
 
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("1 1 EKF2_EV_CTRL 11 6", "found 1; separate them with tabs, not spaces"),
+        ("EKF2_EV_CTRL 11", "expected 5 fields (vehicle, component, name, value, type), found 2"),
+        ("1\t1\tEKF2_EVP_NOISE\t0,1\t9", "EKF2_EVP_NOISE: expected a number (type 9), found '0,1'"),
         ("1\t1\tEKF2_EV_CTRL\t11", "expected 5 fields"),
         ("0\t1\tEKF2_EV_CTRL\t11\t6", "a vehicle id from 1 to 255, found '0'"),
         ("1\tx\tEKF2_EV_CTRL\t11\t6", "a component id from 1 to 255, found 'x'"),
@@ -82,7 +118,8 @@ def test_every_mistake_is_reported_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "said"), [(b"# nothing\n", "expected parameters, found none"), (b"\xff\xfe", "expected UTF-8 text")]
+    ("content", "said"),
+    [(b"# nothing\n", "expected parameters of .*, found none"), (b"\xff\xfe", "expected UTF-8 text")],
 )
 def test_a_file_without_parameters_is_refused(tmp_path: Path, content: bytes, said: str) -> None:
     path = tmp_path / "odd.params"
@@ -99,7 +136,7 @@ def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
 @given(st.dictionaries(NAMES, VALUES, min_size=1))
 def test_what_is_written_reads_back_equal(values: dict[str, float | int]) -> None:
     text = params_file.text(values, ["a heading", ""], {name: [f"about {name}"] for name in values})
-    read = {entry.name: entry.value for entry in params_file.parse(text, "x")}
+    read = params_file.parse(text, "x").values[1]
     assert list(read) == list(values)
     for name, value in values.items():
         assert type(read[name]) is type(value)
@@ -121,7 +158,7 @@ def test_the_published_file_is_the_table() -> None:
     """Made by `python -m tools.docs.px4 .`."""
     text = published.indoor_mocap_text()
     assert (CONFIGS / "indoor_mocap.params").read_text(encoding="utf-8") == text
-    assert params_file.read(CONFIGS / "indoor_mocap.params") == pytest.approx(file_values())
+    assert params_file.read(CONFIGS / "indoor_mocap.params").values[1] == pytest.approx(file_values())
     for wanted in WANTED:
         assert (wanted.name in file_values()) is (wanted.file and wanted.value is not None)
         if wanted.name in file_values():
@@ -129,7 +166,10 @@ def test_the_published_file_is_the_table() -> None:
 
 
 def test_the_pilots_radio_is_switched_off_by_a_file_of_its_own() -> None:
-    assert params_file.read(CONFIGS / "no_radio.params") == {"COM_RC_IN_MODE": 4}
+    own = params_file.read(CONFIGS / "no_radio.params")
+    assert own.of_vehicle(1) == own.of_vehicle(7) == ({"COM_RC_IN_MODE": 4}, {}), (
+        "the project's own files are for any vehicle"
+    )
     assert "COM_RC_IN_MODE" not in file_values()
     assert (CONFIGS / "no_radio.params").read_text(encoding="utf-8") == published.no_radio_text()
     assert BY_NAME["COM_RC_IN_MODE"].value == 4

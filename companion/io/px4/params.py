@@ -33,6 +33,7 @@ ANSWER_S = 0.4
 ASKS = 4
 """A name counts as absent after this many requests without an answer while PX4 answers others."""
 READ_DEADLINE_S = 10.0
+"""Longest time in which PX4 answers no further name; a whole export has 900."""
 ALWAYS_THERE = "MAV_SYS_ID"
 """Parameter that every PX4 has. Its answer shows that PX4 has received the requests sent before."""
 
@@ -57,9 +58,14 @@ class ParamQueries:
         self._alive_sent_s = -math.inf
 
     @property
+    def settled(self) -> int:
+        """Return the number of names that are answered or absent."""
+        return len(self.answered) + len(self.absent)
+
+    @property
     def done(self) -> bool:
         """Return whether every name is answered or absent."""
-        return len(self.answered) + len(self.absent) == len(self._names)
+        return self.settled == len(self._names)
 
     def due(self, now_s: float) -> list[str]:
         """Return the names to request at `now_s`, with ALWAYS_THERE last if PX4 must show that it still answers."""
@@ -122,7 +128,7 @@ class ParamTransfer:
         """Return values by name, int or float as PX4 stores them; names that PX4 does not have are left out.
 
         Raises:
-            DeviceError: an invalid name, or no answer within the deadline.
+            DeviceError: an invalid name, or no further answer within the deadline.
         """
         wanted = tuple(dict.fromkeys(names))
         for name in wanted:
@@ -144,8 +150,12 @@ class ParamTransfer:
 
         handle = self._direct.subscribe_message("PARAM_VALUE", arrived)
         try:
-            async with asyncio.timeout(READ_DEADLINE_S):
+            async with asyncio.timeout(READ_DEADLINE_S) as deadline:
+                settled = 0
                 while not queries.done:
+                    if queries.settled > settled:
+                        settled = queries.settled
+                        deadline.reschedule(loop.time() + READ_DEADLINE_S)
                     for name in queries.due(self._clock()):
                         self._ask(name)
                     changed.clear()
@@ -154,7 +164,7 @@ class ParamTransfer:
                             await changed.wait()
         except TimeoutError:
             expected = f"PX4's parameters ({len(wanted)} names, the first {wanted[0]})"
-            found = f"{len(queries.answered)} within {READ_DEADLINE_S:g} s"
+            found = f"{len(queries.answered)}, and no other within {READ_DEADLINE_S:g} s"
             raise device_error(self._address, expected, found, "check the link") from None
         finally:
             self._direct.unsubscribe_message(handle)

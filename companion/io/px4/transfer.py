@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from companion.io.protocols import DeviceError
@@ -61,6 +61,9 @@ class Comparison:
     measured: tuple[Difference, ...] = ()
     """Values that differ from the file's because they are measured on each installation. They are kept; this is not an error."""
 
+    skipped: Mapping[tuple[int, int], list[str]] = field(default_factory=dict)
+    """Names in the file that are not of this PX4, by vehicle and component id."""
+
     @property
     def same(self) -> bool:
         """Return whether PX4 has the file's values."""
@@ -76,7 +79,9 @@ class WriteResult:
     """Reason why writing ended early, as one line; None if everything was written and read back."""
 
 
-def compare(wanted: Mapping[str, Value], found: Mapping[str, Value]) -> Comparison:
+def compare(
+    wanted: Mapping[str, Value], found: Mapping[str, Value], skipped: Mapping[tuple[int, int], list[str]] | None = None
+) -> Comparison:
     """Compare a file's values with PX4's. Pure."""
     differences: list[Difference] = []
     measured: list[Difference] = []
@@ -92,7 +97,7 @@ def compare(wanted: Mapping[str, Value], found: Mapping[str, Value]) -> Comparis
                 (measured if _is_measured(difference) else differences).append(difference)
         elif name not in BY_NAME or not BY_NAME[name].only:
             absent.append(name)
-    return Comparison(tuple(differences), tuple(absent), tuple(absent_port), tuple(measured))
+    return Comparison(tuple(differences), tuple(absent), tuple(absent_port), tuple(measured), skipped or {})
 
 
 def _is_measured(difference: Difference) -> bool:
