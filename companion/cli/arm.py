@@ -1,4 +1,4 @@
-"""`companion arm scan|setup|zero|jog|friction`: commission the arm."""
+"""`companion arm scan|setup|zero|jog|friction|reboot`: commission the arm."""
 
 from __future__ import annotations
 
@@ -53,6 +53,12 @@ def add_parser(commands: Any) -> None:
         help="measure torque constant and friction of every joint",
         description="Sweep each joint slowly in both directions about the hanging pose, and fit its torque constant and "
         "its dry and viscous friction, with gravity as the reference torque. The arm must hang freely.",
+    )  # fmt: skip
+    add_tool(
+        parts, "reboot", _TOOLS, write="",
+        help="reboot the servos, which clears hardware errors",
+        description="Reboot every servo of the arm: torque goes off, so that the arm drops, and hardware errors are cleared. "
+        "Remove the cause first. Exit 0: no servo has an error; 3: an error remains or a servo does not answer.",
     )  # fmt: skip
 
 

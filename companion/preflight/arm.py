@@ -237,7 +237,7 @@ def _states(states: Sequence[ArmState], vehicle: Vehicle, *, temperatures_unknow
     errors = [reduce(or_, servo) for servo in zip(*(state.hardware_error for state in states), strict=True)]
     named = error_text(errors)
     if named:
-        yield ERROR.bad(named, "none", "remove the cause, then cycle the servos' power")
+        yield ERROR.bad(named, "none", "remove the cause, then run companion arm reboot")
     elif any(error & WATCHDOG_ERROR for error in errors):
         fix = "check for a loose cable or supply, and for a computer that stalls"
         yield ERROR.doubtful("a bus watchdog tripped", "none", fix)

@@ -13,10 +13,11 @@ from companion.cli.main import main
 from companion.commissioning.arm import scan as arm_scan
 from companion.commissioning.arm.scan import judge, scan
 from companion.config.loader import load_vehicle
-from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
-from tests.commissioning.arm_rig import FILES, HAND, SHIPPED, bad_ids, bench, keys, rig, row_of
+from tests.commissioning.arm_rig import FILES, HAND, SHIPPED, Rig, bad_ids, bench, keys, rig, row_of, served
+from tests.support import sandbox_in
 
 OUT_OF_THE_BOX = {
     f"arm.scan.joint{n}.{name}" for n in (1, 2) for name in ("return_delay_time", "operating_mode")
@@ -163,6 +164,16 @@ def test_doubled_friction_and_a_weaker_motor_are_measured(tmp_path: Path) -> Non
         assert arm.torque_per_amp_nm_a == pytest.approx(1.3 / 1.1, rel=0.05)
         assert arm.joint_friction_nm == pytest.approx(0.08, abs=0.02)
         one.assert_check_passes_the_arm()
+
+
+def test_an_overload_is_cleared_by_a_reboot_that_somebody_agreed_to(tmp_path: Path) -> None:
+    servos = [ServoModel(joint.servo_id) for joint in load_vehicle(SHIPPED).arm.joints]
+    servos[1].trip_overload()
+    with sandbox_in(tmp_path) as sandbox, served(ServoBus(servos)) as port:
+        one = Rig(sandbox, port, SHIPPED)
+        assert one.run("reboot").code == EXIT_ABORTED, "there is no terminal to ask at"
+        code, found = one.json("reboot", "--yes")
+    assert (code, [(servo["before"], servo["after"]) for servo in found["servos"]]) == (EXIT_OK, [(0, 0), (32, 0)])
 
 
 def test_an_adapter_with_the_factory_latency_timer_is_found(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from companion.model.observations import ServoReport
 from companion.model.servos import WATCHDOG_ERROR, ServoName
 from companion.model.types import ArmState
 from companion.runtime.clock import flight_clock
+from sitl.servo import registers as reg
 from sitl.servo.bus import ServoBus
 from sitl.servo.kinds import KINDS
 from sitl.servo.model import ServoModel
@@ -487,6 +488,30 @@ def test_hardware_error_at_start_is_named_and_not_rebooted() -> None:
     text = refused(servos)
     assert "servo 12 (joint 2): reports a hardware error: overload (hardware error status (register 70) = 32)" in text
     assert register(servos[1], 70) == 0x20
+
+
+@pytest.mark.parametrize(
+    ("register", "value", "named"),
+    [
+        (
+            reg.HOMING_OFFSET,
+            512,
+            "homing offset (register 20) is 512, expected 0, because the vehicle file's zero_count",
+        ),
+        (reg.DRIVE_MODE, 1, "drive mode (register 10) is 1, expected 0, because the vehicle file's sign"),
+        (reg.SECONDARY_ID, 11, "secondary id (register 12) is 11, expected 255, because it would follow another servo"),
+        (reg.PWM_LIMIT, 300, "PWM limit (register 36) is 300, expected 885, because a lower limit gives less torque"),
+        (reg.SHUTDOWN, 0x14, "shutdown (register 63) is 20, expected 52, because overheating, shock and overload"),
+    ],
+)
+def test_eeprom_that_changes_a_meaning_is_refused_at_every_start(
+    register: reg.Register, value: int, named: str
+) -> None:
+    servos = new_servos()
+    servos[1].write(register.address, register.encode(value))
+    text = refused(servos)
+    assert f"servo 12 (joint 2): {named}" in text
+    assert text.endswith("; run companion arm setup")
 
 
 def test_joint_outside_its_walls_is_refused() -> None:

@@ -1,1 +1,1 @@
-"""Commissioning of the arm. `tools` runs `companion arm scan|setup|zero|jog|friction`; `bus` accesses the registers of any servo."""
+"""Commissioning of the arm. `tools` runs `companion arm scan|setup|zero|jog|friction|reboot`; `bus` accesses registers of any servo."""

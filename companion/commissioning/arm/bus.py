@@ -26,14 +26,9 @@ FACTORY_BAUD: Final = 57600
 
 ID = Register(7, 1, "id")
 BAUD = Register(8, 1, "baud rate")
-DRIVE_MODE = Register(10, 1, "drive mode")
-SHADOW_ID = Register(12, 1, "secondary id")
-HOMING_OFFSET = Register(20, 4, "homing offset", signed=True)
-PWM_LIMIT = Register(36, 2, "PWM limit")
 MAX_POSITION_LIMIT = Register(48, 4, "max position limit")
 MIN_POSITION_LIMIT = Register(52, 4, "min position limit")
 STARTUP = Register(60, 1, "startup configuration")
-SHUTDOWN = Register(63, 1, "shutdown")
 LED = Register(65, 1, "LED")
 
 PING_BYTES: Final = 14
@@ -136,6 +131,18 @@ class ServoTalk:
                 break
         self._check(servo_id, f"reading {register}", result, error)
         return int.from_bytes(bytes(data), "little", signed=register.signed)
+
+    def reboot(self, servo_id: int) -> None:
+        """Restart a servo and wait until it answers again: its torque is off, its errors are cleared unless their cause persists.
+
+        Raises:
+            DeviceError: the servo does not answer.
+        """
+        with self._named(f"reboot of servo {servo_id}"):
+            result, error = self._protocol.reboot(self._port, servo_id)
+        self._check(servo_id, "reboot", result, error)
+        if not self.answers(servo_id):
+            raise self._error(servo_id, "does not answer after its reboot; cycle its power")
 
     def write(self, servo_id: int, register: Register, value: int, *, read_back: bool = True) -> None:
         """Write a register and read it back. The request is repeated if a packet was lost or corrupted.

@@ -191,7 +191,7 @@ class Motion:
             if error & WATCHDOG_ERROR:
                 return f"{name}: the bus watchdog tripped: this computer was too busy, or a cable is loose"
             if error:
-                return f"{name}: hardware error: {hardware_error_text(error)}; remove the cause, then cycle the servos' power"
+                return f"{name}: hardware error: {hardware_error_text(error)}; remove the cause, then run companion arm reboot"
             if state.temperature_c[joint] >= safety.servo_warn_c:
                 return f"{name}: {state.temperature_c[joint]:.0f} degC; let the arm cool down"
             if abs(math.degrees(state.velocity_rad_s[joint])) > RUNAWAY_DEG_S:

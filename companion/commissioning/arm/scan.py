@@ -218,7 +218,7 @@ def _states(servos: Sequence[FoundServo], vehicle: Vehicle) -> list[Row]:
             not any(errors),
             _each(servos, [hardware_error_text(error) for error in errors]),
             "none",
-            "remove the cause, then cycle the servos' power",
+            "remove the cause, then run companion arm reboot",
         ),
         WATCHDOG.row(
             not tripped,

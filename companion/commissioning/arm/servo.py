@@ -17,16 +17,13 @@ from companion.model.servos import COUNTS_PER_TURN, ServoKind, kind_of
 from companion.preflight.arm import MODES
 
 SETTINGS: Final = (
-    bus.ID, bus.BAUD, dxl.RETURN_DELAY, bus.DRIVE_MODE, dxl.OPERATING_MODE, bus.SHADOW_ID, bus.HOMING_OFFSET, bus.PWM_LIMIT,
-    dxl.CURRENT_LIMIT, bus.MAX_POSITION_LIMIT, bus.MIN_POSITION_LIMIT, bus.STARTUP, bus.SHUTDOWN, dxl.TORQUE_ENABLE,
+    bus.ID, bus.BAUD, dxl.RETURN_DELAY, dxl.DRIVE_MODE, dxl.OPERATING_MODE, dxl.SECONDARY_ID, dxl.HOMING_OFFSET, dxl.PWM_LIMIT,
+    dxl.CURRENT_LIMIT, bus.MAX_POSITION_LIMIT, bus.MIN_POSITION_LIMIT, bus.STARTUP, dxl.SHUTDOWN, dxl.TORQUE_ENABLE,
     dxl.STATUS_RETURN_LEVEL, dxl.HARDWARE_ERROR, dxl.BUS_WATCHDOG, dxl.PRESENT_POSITION, dxl.PRESENT_VOLTAGE,
     dxl.PRESENT_TEMPERATURE,
 )  # fmt: skip
 """Registers that are read from every servo."""
 CURRENT_RESERVE: Final = 1.1
-SHUTDOWN_BITS: Final = 0b00110100
-"""Overheating, electrical shock, overload: factory value of register 63."""
-NO_SHADOW: Final = 255
 _DRIVE_REVERSE: Final = 1
 
 
@@ -74,11 +71,11 @@ class FoundServo:
         return about | {
             "return_delay_us": value(dxl.RETURN_DELAY) * dxl.RETURN_DELAY_UNIT_US,
             "operating_mode": value(dxl.OPERATING_MODE),
-            "drive_mode": value(bus.DRIVE_MODE),
-            "shadow_id": None if value(bus.SHADOW_ID) > 252 else value(bus.SHADOW_ID),
-            "homing_offset_counts": value(bus.HOMING_OFFSET),
+            "drive_mode": value(dxl.DRIVE_MODE),
+            "shadow_id": None if value(dxl.SECONDARY_ID) > 252 else value(dxl.SECONDARY_ID),
+            "homing_offset_counts": value(dxl.HOMING_OFFSET),
             "current_limit_counts": value(dxl.CURRENT_LIMIT),
-            "pwm_limit_counts": value(bus.PWM_LIMIT),
+            "pwm_limit_counts": value(dxl.PWM_LIMIT),
             "position_limit_counts": [value(bus.MIN_POSITION_LIMIT), value(bus.MAX_POSITION_LIMIT)],
             "watchdog": _watchdog_text(value(dxl.BUS_WATCHDOG)),
             "torque_on": bool(value(dxl.TORQUE_ENABLE)),
@@ -131,15 +128,11 @@ def settings(servo: FoundServo, index: int, arm: Arm, device: ArmDevice) -> list
     rows: list[tuple[Register, int, Callable[[int], str], str]] = [
         (dxl.RETURN_DELAY, 0, lambda v: f"{v * delay} us", "the factory setting of 500 us per servo takes a fifth of a control tick"),
         (dxl.OPERATING_MODE, dxl.MODE_CURRENT, _mode_text, "the companion commands currents"),
-        (bus.DRIVE_MODE, 0, _drive_text, "the vehicle file's sign gives the servo's direction"),
-        (bus.HOMING_OFFSET, 0, str, "the vehicle file's zero_count gives the zero"),
-        (bus.SHADOW_ID, NO_SHADOW, lambda v: "none" if v > 252 else str(v), "it would follow another servo's commands"),
+        *((register, wanted, _SHOWN.get(register, str), why) for register, wanted, why in dxl.REQUIRED),
         (dxl.CURRENT_LIMIT, wanted_limit, str, f"torque_max_nm {joint.torque_max_nm:g} needs {needed}"),
-        (bus.PWM_LIMIT, 885, str, "a lower limit gives less torque at speed"),
         (bus.MIN_POSITION_LIMIT, 0, str, "the companion itself enforces the joint limits"),
         (bus.MAX_POSITION_LIMIT, COUNTS_PER_TURN - 1, str, "the companion itself enforces the joint limits"),
         (bus.STARTUP, 0, str, "no torque at power-on"),
-        (bus.SHUTDOWN, SHUTDOWN_BITS, lambda v: f"0x{v:02x}", "overheating, shock and overload switch the torque off"),
         (bus.ID, joint.servo_id, str, "the vehicle file's servo_id"),
         (bus.BAUD, bus.BAUDS.index(device.baud), baud_text, "the vehicle file's devices.arm.baud"),
     ]  # fmt: skip
@@ -214,6 +207,13 @@ def _mode_text(mode: int) -> str:
 
 def _drive_text(mode: int) -> str:
     return f"{mode} ({'reverse' if mode & _DRIVE_REVERSE else 'normal'})"
+
+
+_SHOWN: Final[dict[Register, Callable[[int], str]]] = {
+    dxl.DRIVE_MODE: _drive_text,
+    dxl.SECONDARY_ID: lambda value: "none" if value > 252 else str(value),
+    dxl.SHUTDOWN: lambda value: f"0x{value:02x}",
+}
 
 
 def _watchdog_text(value: int) -> str:

@@ -241,7 +241,7 @@ def _set_up(session: Session, wanted: SetupPlan) -> Done:
     session.say("reading back")
     lines = _left(vehicle, wanted)
     right = not lines and not wanted.absent
-    if any(setting.register in (bus.DRIVE_MODE, bus.HOMING_OFFSET) for one in needed for setting in one.writes):
+    if any(setting.register in (dxl.DRIVE_MODE, dxl.HOMING_OFFSET) for one in needed for setting in one.writes):
         lines.append("a servo's direction or zero has changed: run companion arm zero")
     return Done(wanted, "written", (*lines, *(["all settings are written and read back"] if right else [])), right)
 

@@ -1,4 +1,4 @@
-"""`companion arm scan|setup|zero|jog|friction`: commissioning of the arm, from new servos to measured parameters."""
+"""`companion arm scan|setup|zero|jog|friction|reboot`: commissioning of the arm, from new servos to measured parameters."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from companion.commissioning.arm import scan as arm_scan
 from companion.commissioning.arm import setup as arm_setup
-from companion.commissioning.arm.bus import BAUDS
+from companion.commissioning.arm.bus import BAUDS, ServoTalk
 from companion.commissioning.arm.drive import Driven, Leader, drive
 from companion.commissioning.arm.friction import Estimate, fit
 from companion.commissioning.arm.jog import ByKeys
@@ -21,7 +21,9 @@ from companion.commissioning.arm.zero_session import hold
 from companion.commissioning.tool import ARM, Cancelled, Report, Session, Tool
 from companion.config.document import ConfigError
 from companion.config.vehicle import Vehicle
+from companion.io.dynamixel.registers import HARDWARE_ERROR
 from companion.model.check_row import Level
+from companion.model.servos import hardware_error_text
 from companion.runtime.terminal import Bars, pressed, raw_keys
 
 
@@ -186,10 +188,34 @@ def _value(estimate: Estimate | None, unit: str) -> str:
     return "not determined" if estimate is None else f"{estimate.text(3)} {unit}"
 
 
+def _reboot(session: Session) -> list[tuple[str, int, int]]:
+    """Reboot all servos; return name and hardware error before and afterwards of each."""
+    if not session.confirm("the servos' torque goes off and the arm drops; reboot them?"):
+        raise Cancelled("no servo was rebooted")
+    device, errors = session.vehicle.arm_device, []
+    with ServoTalk(device.servo_port) as talk:
+        talk.open(device.baud)
+        for number, joint in enumerate(session.vehicle.arm.joints, 1):
+            before = talk.read(joint.servo_id, HARDWARE_ERROR)
+            talk.reboot(joint.servo_id)
+            name = f"servo {joint.servo_id} (joint {number})"
+            errors.append((name, before, talk.read(joint.servo_id, HARDWARE_ERROR)))
+    return errors
+
+
+def _judge_reboot(errors: list[tuple[str, int, int]], vehicle: Vehicle) -> Report:
+    lines = [f"{n}: hardware error {hardware_error_text(a)} -> {hardware_error_text(b)}" for n, a, b in errors]
+    left = any(after for _, _, after in errors)
+    advice = ["an error that remains still has its cause: check supply, temperature and load"] if left else []
+    data = {"servos": [{"name": name, "before": before, "after": after} for name, before, after in errors]}
+    return Report((), data, lines, advice=advice, ok=not left)
+
+
 TOOLS: Final[Mapping[str, Tool[Any]]] = {
     "scan": Tool("arm scan", ARM, _scan, _judge_scan, servos_only=True),
     "setup": Tool("arm setup", ARM, arm_setup.set_up, arm_setup.judge, servos_only=True),
     "zero": Tool("arm zero", ARM, _zero, _judge_zero, servos_only=True),
     "jog": Tool("arm jog", ARM, _jog, _judge_jog),
+    "reboot": Tool("arm reboot", ARM, _reboot, _judge_reboot, servos_only=True),
     "friction": Tool("arm friction", ARM, _sweep, _judge_sweep, servos_only=True),
 }

@@ -48,9 +48,9 @@ def _ready(talk: ServoTalk, servo_id: int) -> None:
         fix = "find it with companion arm scan, and correct it with companion arm setup"
         raise DeviceError(f"{name} does not answer at {talk.baud} baud; {fix}")
     talk.write(servo_id, dxl.TORQUE_ENABLE, 0)
-    drive, offset = talk.read(servo_id, bus.DRIVE_MODE), talk.read(servo_id, bus.HOMING_OFFSET)
+    drive, offset = talk.read(servo_id, dxl.DRIVE_MODE), talk.read(servo_id, dxl.HOMING_OFFSET)
     if drive or offset:
-        found = f"{bus.DRIVE_MODE} is {drive} and {bus.HOMING_OFFSET} {offset}, expected 0 and 0"
+        found = f"{dxl.DRIVE_MODE} is {drive} and {dxl.HOMING_OFFSET} {offset}, expected 0 and 0"
         raise DeviceError(f"{name}: {found}; run companion arm setup first, because it would change the zero")
 
 

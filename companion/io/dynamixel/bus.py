@@ -215,8 +215,16 @@ class ArmBus:
                 "servo",
                 joint.servo_id,
                 f"reports a hardware error: {hardware_error_text(errors)} ({dxl.HARDWARE_ERROR} = {errors}); "
-                "remove the cause, then reboot it or cycle its power",
+                "remove the cause, then run companion arm reboot",
             )
+        for register, wanted, why in dxl.REQUIRED:
+            found = self._read(joint, register)
+            more = (
+                register == dxl.SHUTDOWN and found & wanted == wanted
+            )  # the 330 models leave the factory with one more
+            if found != wanted and not more:
+                text = f"{register} is {found}, expected {wanted}, because {why}; run companion arm setup"
+                raise self._error("servo", joint.servo_id, text)
 
     def _set_up(self, joint: Joint, torque_per_amp_nm_a: float) -> JointScale:
         self._write(joint, dxl.TORQUE_ENABLE, 0)

@@ -51,8 +51,13 @@ class Register:
 MODEL = Register(0, 2, "model number")
 FIRMWARE = Register(6, 1, "firmware version")
 RETURN_DELAY = Register(9, 1, "return delay time")
+DRIVE_MODE = Register(10, 1, "drive mode")
 OPERATING_MODE = Register(11, 1, "operating mode")
+SECONDARY_ID = Register(12, 1, "secondary id")
+HOMING_OFFSET = Register(20, 4, "homing offset", signed=True)
+PWM_LIMIT = Register(36, 2, "PWM limit")
 CURRENT_LIMIT = Register(38, 2, "current limit")
+SHUTDOWN = Register(63, 1, "shutdown")
 TORQUE_ENABLE = Register(64, 1, "torque enable")
 STATUS_RETURN_LEVEL = Register(68, 1, "status return level")
 HARDWARE_ERROR = Register(70, 1, "hardware error status")
@@ -65,6 +70,15 @@ PRESENT_VOLTAGE = Register(144, 2, "present input voltage")
 PRESENT_TEMPERATURE = Register(146, 1, "present temperature")
 INDIRECT_ADDRESS_1 = 168
 INDIRECT_DATA_1 = 224
+REQUIRED: Final = (
+    (DRIVE_MODE, 0, "the vehicle file's sign gives the servo's direction"),
+    (HOMING_OFFSET, 0, "the vehicle file's zero_count gives the zero"),
+    (SECONDARY_ID, 255, "it would follow another servo's commands"),
+    (PWM_LIMIT, 885, "a lower limit gives less torque at speed"),
+    (SHUTDOWN, 0b00110100, "overheating, shock and overload switch the torque off"),
+)
+"""EEPROM settings, with their reason, that `companion arm setup` writes and every start of the arm verifies: other values change what
+is read or commanded."""
 
 # The one block that is read in every cycle. A small byte follows every signed value, so that FF FF FD never occurs in an
 # answer: once it has removed a stuffed byte, dynamixel-sdk 4.1.0 also removes one from a later FF FD FD, which is data.
