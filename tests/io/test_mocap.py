@@ -6,6 +6,7 @@ What the client makes of datagrams: test_natnet_client.py.
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import logging
 import socket
 import struct
@@ -325,6 +326,16 @@ def test_body_never_seen_lists_the_others() -> None:
             text = await refusal(mocap(device_for(server, rigid_body_id=7), body_timeout_s=2.0))
             assert "rigid body id 7 was never seen within 2 s" in text
             assert '1 "quad", 4 "wand"' in text
+
+    asyncio.run(run())
+
+
+def test_two_bodies_with_one_streaming_id() -> None:
+    async def run() -> None:
+        twin = dataclasses.replace(STRANGER, id=1)
+        async with NatNetServer(bodies=[(1, "quad")]) as server, streaming(server, POSE, twin):
+            text = await refusal(mocap(device_for(server)))
+            assert 'two rigid bodies have the streaming id 1 "quad"; give each its own id in Motive' in text
 
     asyncio.run(run())
 

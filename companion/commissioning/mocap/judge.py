@@ -196,7 +196,7 @@ def judge(watched: Watched, vehicle: Vehicle) -> tuple[list[Row], dict[Location,
     rows = [
         _server(info, f"{info.application} {version}, NatNet {info.version}, {watched.route.transport}"),
         _network(watched.route),
-        _own(seen, device.rigid_body_id, watched.moving, changes),
+        _own(seen, len(frames), device.rigid_body_id, watched.moving, changes),
     ]
     t = timing(frames)
     if t is None:
@@ -252,13 +252,16 @@ def _poses(frames: Sequence[FrameSeen], own_id: int, up_axis: str) -> list[Mocap
     return poses
 
 
-def _own(seen: Sequence[BodyMotion], own_id: int, moving: bool, changes: dict[Location, Data]) -> Row:
+def _own(seen: Sequence[BodyMotion], frames: int, own_id: int, moving: bool, changes: dict[Location, Data]) -> Row:
     streamed = {body.id: body for body in seen if body.frames}
     moved = [body for body in streamed.values() if body.moved_m >= MOVED_MIN_M] if moving else []
     read = ", ".join(
         body.label + (f" moved {100.0 * body.moved_m:.0f} cm" if moving else "") for body in streamed.values()
     )
     read = read or "no rigid body is streamed"
+    if any(body.frames > frames for body in streamed.values()):
+        twice = ", ".join(body.label for body in streamed.values() if body.frames > frames)
+        return OWN.bad(f"two rigid bodies with {twice}", "one body per id", "give each its own streaming id in Motive")
     key: Location = ("devices", "mocap", "rigid_body_id")
     if len(moved) == 1 and moved[0].id != own_id:
         changes[key] = moved[0].id

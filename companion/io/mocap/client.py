@@ -55,7 +55,7 @@ class NatNetClient:
         self.out_of_order = 0
         self.malformed = 0
         self.problem: str | None = None
-        """Why the newest rejected datagram was rejected; None if none was."""
+        """What was wrong with the newest datagram that was rejected or is ambiguous; None if none was."""
 
     def requests(self, now_s: float) -> list[bytes]:
         """Return the datagrams to send to the server now; call it again after `request_period_s`."""
@@ -158,7 +158,14 @@ class NatNetClient:
         self._last_number = frame.number
         self._last_frame_s = self._heard_s = arrived_s
         self.body_ids = frame.body_ids
+        if self.is_ambiguous:
+            self.problem = f"two rigid bodies have the streaming id {self._body_id}; the first one is used"
         return frame
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Return whether the newest frame has two bodies with the vehicle's streaming id."""
+        return self.body_ids is not None and self.body_ids.count(self._body_id) > 1
 
     def _reject(self, bad: Malformed) -> None:
         self.malformed += 1

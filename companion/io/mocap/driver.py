@@ -246,9 +246,13 @@ class NatNetMocap:
         try:
             async with asyncio.timeout(self._body_timeout_s):
                 await self._receiving.wait()
-            return
         except TimeoutError:
             pass
+        else:
+            if self._client.is_ambiguous and self._on_frame is None:
+                text = f"two rigid bodies have the streaming id {self._label(device.rigid_body_id)}; give each its own id in Motive"
+                raise DeviceError(f"{self._where}: {text}")
+            return
         within = f"within {self._body_timeout_s:g} s"
         ids = self._client.body_ids
         if ids is None:
@@ -298,7 +302,7 @@ class NatNetMocap:
             self._send(client.requests(self._clock()))
         if client.problem != self._logged:
             self._logged = client.problem
-            _LOG.warning("%s: a datagram was rejected: %s", self._where, client.problem)
+            _LOG.warning("%s: problem with a datagram: %s", self._where, client.problem)
         self._keep_alive = asyncio.get_running_loop().call_later(client.request_period_s, self._keep_connected)
 
     def _drain(self, readable: socket.socket) -> None:
