@@ -4,6 +4,7 @@ documented.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from companion.model.check_row import Level, Row
@@ -65,3 +66,13 @@ class Check:
     @property
     def _level(self) -> Level:
         return Level.WARN if self.warns else Level.REFUSE
+
+
+def longest_unchanged_s(readings: Iterable[tuple[float, object]]) -> float:
+    """Return the longest time in which a sensor repeated one value to the last bit, s, given stamps and values in their order."""
+    longest_s, since_s, before = 0.0, 0.0, None
+    for stamp_s, value in readings:
+        if value != before:
+            since_s, before = stamp_s, value
+        longest_s = max(longest_s, stamp_s - since_s)
+    return longest_s

@@ -15,7 +15,7 @@ from companion.model.check_row import Row
 from companion.model.observations import ForceStream, Observations
 from companion.model.types import ForceSample, Joints, Quat, Vec3
 from companion.preflight.arm import usb_latency
-from companion.preflight.checks import Check
+from companion.preflight.checks import Check, longest_unchanged_s
 
 DEVICE = Check(
     "force.device",
@@ -57,6 +57,12 @@ STILL = Check(
     "drifts less than `safety.force_drift_n`",
     "a tare taken while the net is touched is wrong for the whole flight",
 )
+STUCK = Check(
+    "force.stuck",
+    "force sensor alive",
+    "the same reading for at most `safety.force_stuck_s`",
+    "a stuck sensor, or one that streams zeros, reports plausible values and measures nothing",
+)
 USB = Check(
     "force.usb_latency",
     "force sensor's USB latency timer",
@@ -64,7 +70,7 @@ USB = Check(
     "samples arrive in bursts, up to 16 ms late",
     warns=True,
 )
-CHECKS = (DEVICE, RATE, CHECKSUMS, NOISE, OVERLOAD, TARE, STILL, USB)
+CHECKS = (DEVICE, RATE, CHECKSUMS, NOISE, OVERLOAD, TARE, STILL, STUCK, USB)
 
 _OBSERVED = (
     "a momentum observer estimates the force: gusts are part of it, payloads below 0.1 kg and a force on the empty net are not "
@@ -130,6 +136,7 @@ def stream_rows(
         if pose is not None:
             yield _tare(tare_bias_n(samples, vehicle, *pose), tool, device)
         yield _still(samples, vehicle)
+        yield stuck_row(samples, vehicle)
 
 
 def _rate(rate_hz: float, device: ForceDevice) -> Row:
@@ -189,6 +196,14 @@ def _still(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
     read, wanted = f"drifts by {drift_n:.2f} N", f"{limit_n:g} N"
     fix = "do not touch the net; let the sensor warm up for a few minutes"
     return STILL.row(drift_n <= limit_n, read, wanted, fix)
+
+
+def stuck_row(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
+    """Return the row on the longest time with an unchanged reading."""
+    longest_s = longest_unchanged_s((one.stamp_s, (one.force_sensor_n, one.torque_sensor_nm)) for one in samples)
+    limit_s = vehicle.safety.force_stuck_s
+    read = f"the same reading for {longest_s:.2f} s at most"
+    return STUCK.row(longest_s <= limit_s, read, f"{limit_s:g} s", "power-cycle the sensor; check its cable")
 
 
 def mean_force_n(samples: Sequence[ForceSample]) -> Vec3:

@@ -12,7 +12,7 @@ from companion.config.vehicle import Vehicle
 from companion.model.check_row import Row
 from companion.model.observations import MocapStream, Observations
 from companion.model.types import MocapPose
-from companion.preflight.checks import Check
+from companion.preflight.checks import Check, longest_unchanged_s
 
 DEVICE = Check("mocap.device", "motion capture", "the server answers and streams", "PX4 needs it for its position")
 NOT_CHECKED = (
@@ -50,6 +50,12 @@ TRACKED = Check(
     "in every frame; refused below 95 %",
     "a body that is lost on the ground will be lost in flight: PX4 then drifts",
 )
+FROZEN = Check(
+    "mocap.frozen",
+    "pose changes",
+    "the same pose for at most 1 s",
+    "cameras at rest measure a little noise: a pose that is the same to the last bit is not measured",
+)
 BODY = Check(
     "mocap.body",
     "rigid body",
@@ -71,12 +77,13 @@ CLOCK = Check(
     "diverging clocks, or a server that stalls and catches up, make every age wrong",
     warns=True,
 )
-CHECKS = (DEVICE, RATE, JITTER, LATENCY, LOST, TRACKED, BODY, ERROR, CLOCK)
+CHECKS = (DEVICE, RATE, JITTER, LATENCY, LOST, TRACKED, FROZEN, BODY, ERROR, CLOCK)
 
 RATE_GOOD = 0.9
 GAP_GOOD_S = 0.05
 LOST_GOOD, LOST_MAX = 0.005, 0.05
 TRACKED_MIN = 0.95
+FROZEN_MAX_S = 1.0
 ERROR_GOOD_M = 0.002
 CLOCK_GOOD, WANDER_GOOD_S = 0.01, 0.020
 
@@ -98,6 +105,7 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     yield _latency(o.mocap, vehicle)
     yield _lost(stream)
     yield _tracked(o.mocap)
+    yield _frozen(o.mocap)
     yield _body(stream, vehicle)
     yield _error(o.mocap)
     yield _clock(o.mocap, vehicle)
@@ -144,6 +152,13 @@ def _tracked(poses: tuple[MocapPose, ...]) -> Row:
     read = f"{share:.1%} of the frames"
     fix = "clean or move the markers, make sure that the cameras can see them, calibrate the volume"
     return TRACKED.graded(share == 1.0, share >= TRACKED_MIN, read, "all", fix)
+
+
+def _frozen(poses: tuple[MocapPose, ...]) -> Row:
+    longest_s = longest_unchanged_s((one.stamp_s, (one.position_world_m, one.attitude_wxyz)) for one in poses)
+    read, wanted = f"the same pose for {longest_s:.2f} s at most", f"{FROZEN_MAX_S:g} s"
+    fix = "Motive is paused, in edit mode or plays a take, or its smoothing holds the pose: restart live streaming"
+    return FROZEN.row(longest_s <= FROZEN_MAX_S, read, wanted, fix)
 
 
 def _body(stream: MocapStream, vehicle: Vehicle) -> Row:

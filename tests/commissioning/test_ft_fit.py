@@ -12,6 +12,7 @@ from companion.commissioning.force_torque.fit import WeightFit
 from companion.config.loader import load_vehicle
 from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.types import ForceSample, Joints, Quat, Vec3
+from companion.preflight import force as preflight
 from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
 from companion.sitl_config.world import World
 from sitl.world.handling import HungWeight
@@ -136,9 +137,9 @@ def test_drift_is_reported_with_its_error() -> None:
 def test_a_sensor_that_repeats_itself_is_stuck() -> None:
     rng = np.random.default_rng(4)
     alive = rng.normal(0.0, 0.05, (600, 3))
-    assert ft_fit.stuck_row(stream(alive), VEHICLE).ok
+    assert preflight.stuck_row(stream(alive), VEHICLE).ok
     alive[200:280] = alive[200]
-    row = ft_fit.stuck_row(stream(alive), VEHICLE)
+    row = preflight.stuck_row(stream(alive), VEHICLE)
     assert not row.ok
     assert "0.39 s" in row.read or "0.40 s" in row.read
 

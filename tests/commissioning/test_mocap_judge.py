@@ -36,8 +36,8 @@ Judged = tuple[list[Row], dict[Location, Data]]
 Place = Callable[[float], Vec3]
 
 
-def still(_: float) -> Vec3:
-    return (0.0, 0.0, 0.3)
+def still(t_s: float) -> Vec3:
+    return (1e-5 * math.sin(700.0 * t_s), 0.0, 0.3)
 
 
 def carried(t_s: float) -> Vec3:
@@ -99,6 +99,12 @@ def test_a_version_that_no_sdk_describes_is_reported() -> None:
     later = judged(frames(), info=replace(INFO, natnet_version=(4, 9, 0, 0)))
     assert bad(later) == {"mocap.server"} and "NatNet 4.4" in later[0][0].wanted
     assert later[0][0].level is Level.WARN
+
+
+def test_two_bodies_with_one_streaming_id_are_reported() -> None:
+    found = judged([replace(frame, bodies=frame.bodies * 2) for frame in frames()])
+    (row,) = [row for row in found[0] if row.id == "mocap.own"]
+    assert not row.ok and row.read == 'two rigid bodies with id 1 "quad"'
 
 
 def test_lost_frames_are_counted_by_their_numbers() -> None:

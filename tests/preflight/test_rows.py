@@ -167,6 +167,10 @@ CASES = {
     "not always tracked": Case(
         "mocap.tracked", "99.9%", "markers", {"mocap": (replace(r.mocap()[0], tracking_valid=False), *r.mocap()[1:])}, WARN
     ),
+    "a pose that is the same to the last bit": Case(
+        "mocap.frozen", "for 5.00 s", "Motive is paused",
+        {"mocap": r.mocap(position_world_m=(-1.0, 0.0, 0.3), attitude_wxyz=(1.0, 0.0, 0.0, 0.0))},
+    ),
     "another body": Case("mocap.body", "others: 2, 7", "disable the others", {"mocap_stream": r.stream(other_bodies=(2, 7))}, WARN),
     "bent markers": Case("mocap.error", "4.0 mm", "calibrate", {"mocap": r.mocap(marker_error_m=0.004)}, WARN),
     "stalling server": Case("mocap.clock", "jitter", "stalls", {"mocap": unsteady_clock()}, WARN),
@@ -185,7 +189,7 @@ CASES = {
     "low supply": Case("arm.voltage", "12.1 V and 9.6 V", "12 V", {"servos": r.servos(voltage_v=9.6)}),
     "warm": Case("arm.temperature", "66 degC", "cool", {"arm": r.arm(temperature_c=(30.0, 66.0))}, WARN),
     "hot": Case("arm.temperature", "76 degC", "cool", {"arm": r.arm(temperature_c=(76.0, 40.0))}),
-    "servo error": Case("arm.error", "servo 2: overload", "power", {"arm": r.arm(hardware_error=(0, 32))}),
+    "servo error": Case("arm.error", "servo 2: overload", "companion arm reboot", {"arm": r.arm(hardware_error=(0, 32))}),
     "do not touch": Case("arm.error", "watchdog", "loose cable", {"arm": r.arm(hardware_error=(128, 0))}, WARN),
     "beyond a wall": Case(
         "arm.angles", "(30, 140)", "zero_count", {"arm": r.arm(angle_rad=(math.radians(30), r.ARM_RAD[1]))}, also=("mission.arm",)
@@ -219,6 +223,10 @@ CASES = {
     "noisy": Case("force.noise", "N (one sigma)", "ground", {"force": r.force(noise_n=0.7)}, WARN),
     "very noisy": Case("force.noise", "N (one sigma)", "ground", {"force": r.force(noise_n=5.0)}),
     "overloaded": Case("force.overload", "1 of 1000", "remove the load", {"force": r.force(overload=True)}),
+    "a force sensor that streams zeros": Case(
+        "force.stuck", "for 5.", "power-cycle",
+        {"force": tuple(replace(sample, force_sensor_n=(0.0, 0.0, 0.0)) for sample in r.force())},
+    ),
     "leaning": Case("force.tare", "(13.7", "free the net", {"force": r.force(bias_n=14.0)}, WARN),
     "leaning hard": Case("force.tare", "(29.7", "net_mass_kg", {"force": r.force(bias_n=30.0)}),
     "touched": Case("force.still", "drifts by 2.", "touch", {"force": r.force(drift_n=3.0)}),

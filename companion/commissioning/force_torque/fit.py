@@ -6,7 +6,6 @@ Frames: the last link's tip (x outwards; for a planar arm, y along the joint axe
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -27,7 +26,6 @@ from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
 from companion.preflight.checks import Check
 from companion.preflight.hand_test.motion import angle_rad
 
-STUCK = Check("ft.stuck", "force sensor alive", why="a stuck sensor reports plausible values and measures nothing")
 WEIGHT = Check("ft.weight", "known weight", why="scale and direction remain unknown")
 SCALE = Check("ft.scale", "force sensor scale", why="the controller would respond to the wrong force")
 DIRECTION = Check(
@@ -143,18 +141,6 @@ def as_json(fit: WeightFit) -> dict[str, Any]:
     """Return the fit's part of the JSON document; N and degrees."""
     numbers = {key: getattr(fit, key) for key in ("expected_n", "measured_n", "scale", "off_deg", "rest_deg")}
     return {**numbers, "sensor_rpy_deg": list(fit.rpy_deg), "certain": not fit.others}
-
-
-def stuck_row(samples: Sequence[ForceSample], vehicle: Vehicle) -> Row:
-    """Return the row on the longest time with an unchanged reading."""
-    longest_s, since_s = 0.0, samples[0].stamp_s
-    for before, now in itertools.pairwise(samples):
-        same = (before.force_sensor_n, before.torque_sensor_nm) == (now.force_sensor_n, now.torque_sensor_nm)
-        since_s = since_s if same else now.stamp_s
-        longest_s = max(longest_s, now.stamp_s - since_s)
-    limit_s = vehicle.safety.force_stuck_s
-    read = f"the same reading for {longest_s:.2f} s at most"
-    return STUCK.row(longest_s <= limit_s, read, f"{limit_s:g} s", "power-cycle the sensor; check its cable")
 
 
 @dataclass(frozen=True, slots=True)

@@ -142,7 +142,7 @@ def judge(seen: Watched, vehicle: Vehicle) -> Report:
 
 
 def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
-    """Return the preflight's rows, and the row on whether the readings change."""
+    """Return the preflight's rows."""
     samples, tool = seen.empty, tool_of(vehicle)
     duration_s = samples[-1].stamp_s - samples[0].stamp_s
     bias_fix = (
@@ -156,7 +156,6 @@ def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
                 seen.stream, samples, duration_s, vehicle, force_device(vehicle), (IDENTITY_QUAT, seen.arm_rad)
             )
         ),
-        ft_fit.stuck_row(samples, vehicle),
         usb_latency(preflight.USB, seen.usb_latency_ms),
     ]
 
@@ -215,7 +214,7 @@ def judge_drift(seen: Tared, vehicle: Vehicle) -> Report:
     fix = "leave it powered for 20 minutes and repeat; keep it away from sunlight and from the heat of the motors"
     read = f"{worst_n:.2f} N per minute on the worst axis"
     rows.append(DRIFT.row(worst_n <= DRIFT_WARN_N_MIN, read, f"{DRIFT_WARN_N_MIN:g} N per minute", fix))
-    rows.append(ft_fit.stuck_row(seen.samples, vehicle))
+    rows.append(preflight.stuck_row(seen.samples, vehicle))
     x, y, z = bias_n = tare_bias_n(seen.first, vehicle, IDENTITY_QUAT, seen.arm_rad)
     net_kg = tool_of(vehicle).beyond_sensor_kg
     data = {
