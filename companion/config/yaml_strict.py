@@ -1,13 +1,15 @@
 """Strict YAML: the 1.2 core schema, no duplicate keys, and the origin of every value.
 
 PyYAML implements YAML 1.1, where `1e3` is text, `on` is true, `12:30` is 750 and a duplicate key overwrites the first. Here, scalars
-follow the core schema of YAML 1.2 (section 10.3.2); duplicate keys, aliases and tags are rejected.
+follow the core schema of YAML 1.2 (section 10.3.2), and only line feed and carriage return end a line; duplicate keys, aliases and tags
+are rejected.
 """
 
 from __future__ import annotations
 
 import functools
 import re
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -38,6 +40,11 @@ _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _INFINITE = re.compile(r"[-+]?\.(inf|Inf|INF)")
 _NAN = re.compile(r"\.(nan|NaN|NAN)")
 _HALF_CHARACTER = "an escape (\\uD800 to \\uDFFF) for half a character; write the character itself"
+_UNBROKEN = str.maketrans("\x85\u2028\u2029", "\U0001fffe\U0001ffff\U0002fffe")
+"""Characters that end a line in YAML 1.1 but not in 1.2, where a comment may contain them; PyYAML sees noncharacters instead."""
+_RESTORED = {hidden: shown for shown, hidden in _UNBROKEN.items()}
+_STRANGE_SPACE = re.compile(r"^[ \-]*(?:\w+:)?([\u00a0\u1680\u2000-\u200b\u202f\u205f\u3000])", re.MULTILINE)
+"""A space other than U+0020 in an indentation or after the colon of a key, where it looks right and is text."""
 _DIGITS_MAX = 400  # Python refuses to convert integers of more than 4300 digits with a different exception.
 
 
@@ -137,6 +144,11 @@ def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
             return fixed or Origin(document.source)
         return Origin(document.source, mark.line + 1, mark.column + 1)
 
+    strange = _STRANGE_SPACE.search(text)
+    if strange is not None:
+        start, name = strange.start(1), unicodedata.name(strange[1]).lower()
+        mark = yaml.Mark("", start, text.count("\n", 0, start), start - text.rfind("\n", 0, start) - 1, None, 0)
+        raise ConfigError([f"{origin(mark)}: not YAML: {name} (U+{ord(strange[1]):04X}); write an ordinary space"])
     try:
         node = _composed(text)
     except yaml.reader.ReaderError as error:
@@ -156,7 +168,7 @@ def _composed(text: str) -> yaml.Node | None:
     Raises:
         yaml.YAMLError: the text is not YAML.
     """
-    loader = StrictLoader(text)
+    loader = StrictLoader(text.translate(_UNBROKEN))
     try:
         return loader.get_single_node()
     except (ValueError, OverflowError) as error:  # PyYAML converts "\\U0011FFFF" and %YAML 1.999... without a check
@@ -186,7 +198,7 @@ class _Builder:
         if isinstance(node, yaml.SequenceNode):
             return [self.build(item, (*location, index)) for index, item in enumerate(node.value)]
         assert isinstance(node, yaml.ScalarNode)
-        text: str = node.value
+        text: str = node.value.translate(_RESTORED)
         if not _is_unicode(text):
             self._refuse(RANK_VALUE, node.start_mark, location, _HALF_CHARACTER)
             return None
@@ -204,7 +216,7 @@ class _Builder:
             if not isinstance(key_node, yaml.ScalarNode):
                 self._refuse(RANK_KEY, key_node.start_mark, location, "a key must be plain text")
                 continue
-            key: str = key_node.value
+            key: str = key_node.value.translate(_RESTORED)
             if key == "<<" and key_node.style is None:
                 self._refuse(
                     RANK_KEY, key_node.start_mark, location, "merge keys (<<) are not accepted; write the keys out"

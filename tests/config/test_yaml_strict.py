@@ -61,6 +61,9 @@ BAD = [
     ("a: " + "[" * 5000 + "]" * 5000, ["f.yaml:1:35: not YAML: nested more than 32 levels deep"]),
     ("a: " + "9" * 5000, ["f.yaml:1:4: a: a number with 5000 digits; at most 400 are accepted"]),
     ("a: \x07\n", ["f.yaml:1:4: not YAML: control character U+0007 is not allowed"]),
+    ("a:\n\u00a0 b: 1\n", ["f.yaml:2:1: not YAML: no-break space (U+00A0); write an ordinary space"]),
+    ("a:\n  - b:\u00a01\n", ["f.yaml:2:7: not YAML: no-break space (U+00A0); write an ordinary space"]),
+    ("a:\n  \u3000b: 1\n", ["f.yaml:2:3: not YAML: ideographic space (U+3000); write an ordinary space"]),
     ("- 1\n", ["f.yaml:1:1: expected a mapping (key: value) at the top level, got a list"]),
     ("just text\n", ["f.yaml:1:1: expected a mapping (key: value) at the top level, got a single value"]),
     ("", ["f.yaml: is empty"]),
@@ -81,6 +84,15 @@ def test_refused_text_is_reported_in_one_line_per_problem(tmp_path: Path, text: 
     assert len(found) == 1
     assert "\n" not in found[0]
     assert lines is None or found == lines
+
+
+@pytest.mark.parametrize("character", ["\x85", "\u2028", "\u2029"])
+def test_a_separator_of_yaml_1_1_ends_neither_a_comment_nor_a_line(tmp_path: Path, character: str) -> None:
+    path = tmp_path / "f.yaml"
+    path.write_text(f"a: 1  # copied{character}b: 2\nc: 'x{character}y\u00a0'\nc: 3\n", encoding="utf-8")
+    document = read_document(path, "f.yaml")
+    assert document.data == {"a": 1, "c": f"x{character}y\u00a0"}
+    assert [str(problem.origin) for problem in document.problems] == ["f.yaml:3:1"]
 
 
 def test_every_duplicate_is_reported(tmp_path: Path) -> None:
