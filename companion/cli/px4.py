@@ -9,11 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import ValidationError
-
 from companion.cli.options import time_stamp
 from companion.config.devices import AutopilotDevice
 from companion.config.document import ConfigError
+from companion.config.link_address import parse_address
 from companion.config.loader import load_vehicle
 from companion.config.shipped import DEFAULT_VEHICLE
 from companion.io.protocols import DeviceError
@@ -77,9 +76,10 @@ def run(arguments: argparse.Namespace) -> int:
         device = load_vehicle(arguments.vehicle).devices.autopilot
     else:
         try:
-            device = AutopilotDevice(address=arguments.address)
-        except ValidationError as error:
-            raise ConfigError([f"--address {arguments.address}: {error.errors()[0]['msg']}"]) from None
+            parse_address(arguments.address)
+        except ValueError as error:
+            raise ConfigError([f"--address: {error}"]) from None
+        device = AutopilotDevice(address=arguments.address)
     try:
         return asyncio.run(_run(arguments, file, device, path))
     except DeviceError as error:

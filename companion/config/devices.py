@@ -8,12 +8,13 @@ from pydantic import Field, JsonValue, model_validator
 
 from companion.config.base import Location, Model, Positive, refuse
 from companion.config.device_plugins import DYNAMIXEL, EXTERNAL, NATNET, RFT60
+from companion.config.link_address import Ipv4Address, MulticastGroup, Px4Address
 
 
 class AutopilotDevice(Model):
     """PX4 over MAVLink."""
 
-    address: str
+    address: Px4Address
     """Address of the link, such as udpin://0.0.0.0:14540 or serial:///dev/ttyAMA0:921600."""
     discovery_timeout_s: Positive = 10.0
     setpoint_path: Literal["direct", "offboard"] = "direct"
@@ -40,10 +41,10 @@ class MocapDevice(Model):
     external: another program feeds PX4 with poses, the companion reads none, and the other keys have no effect."""
     server: str = ""
     """Address of the computer that runs Motive or the other system; required unless `type` is external."""
-    interface: str = ANY_INTERFACE
+    interface: Ipv4Address = ANY_INTERFACE
     """This computer's address on the camera network. Without `--sitl`, `fly` and `check` refuse 0.0.0.0 (all networks)."""
     transport: Literal["multicast", "unicast"] = "multicast"
-    multicast_group: str = "239.255.42.99"
+    multicast_group: MulticastGroup = "239.255.42.99"
     command_port: Annotated[int, Field(gt=0, le=65535)] = 1510
     data_port: Annotated[int, Field(gt=0, le=65535)] = 1511
     natnet_version: NatNetVersion | None = None

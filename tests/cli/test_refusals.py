@@ -75,10 +75,6 @@ class Wrong:
 
 
 WRONG = {
-    "malformed autopilot address": Wrong(
-        r"^autopilot here:14540: expected an address like udpin://.*; correct devices\.autopilot\.address$",
-        {"autopilot": {"address": "here:14540"}},
-    ),
     "autopilot on a serial port that is not there": Wrong(
         r"^autopilot serial:///dev/ttyNONE:921600: expected the serial port /dev/ttyNONE, found No such file.*; plug",
         {"autopilot": {"address": "serial:///dev/ttyNONE:921600"}},

@@ -56,10 +56,10 @@ def test_more_latency_is_found_and_written(sandbox: Sandbox) -> None:
 
 def test_without_px4_it_says_so(sandbox: Sandbox) -> None:
     with World(sandbox) as world:
-        address = {"address": "udpin://127.0.0.1:0"}
+        address = {"address": "serial:///dev/ttyNONE:921600"}
         ended = run_here("latency", "--vehicle", VEHICLE, *world.addresses(autopilot=address))
     assert ended.code == EXIT_REFUSED
-    assert "a port from 1 to 65535" in ended.out
+    assert "the serial port /dev/ttyNONE, found No such file" in ended.out
     assert "Traceback" not in ended.err
 
 

@@ -14,6 +14,7 @@ import yaml
 
 from companion.config.controller import LAWS, AdaptiveConfig
 from companion.config.document import ConfigError
+from companion.config.link_address import parse_address
 from companion.config.loader import PRESETS, FlightConfig, load_vehicle, logged_flight
 from companion.sitl_config.loader import SitlConfig, load_sitl, load_world
 from tests.machines import overrides_with_joints
@@ -184,6 +185,10 @@ def test_bad_mission_file(project: Path, old: str, new: str, expected: list[str]
 
 BAD_VEHICLE = [
     ("servo_id: 2", "servo_id: 1", ["arm.joints[1].servo_id: joint 1 has the servo id 1 too; give each servo its own id"]),
+    ("address: serial:///dev/ttyAMA0:921600", "address: /dev/ttyAMA0:921600", ["udpin://0.0.0.0:14540, udpout://HOST:PORT, tcpout://HOST:PORT or serial:///dev/ttyAMA0:921600, got '/dev/ttyAMA0:921600'"]),
+    ("address: serial:///dev/ttyAMA0:921600", "address: udpin://0.0.0.0:145400", ["autopilot.address: expected a port from 1 to 65535, got 145400"]),
+    ("interface: 0.0.0.0", "interface: eth0", ["mocap.interface: expected an IPv4 address such as 192.168.1.20, got 'eth0'"]),
+    ("multicast_group: 239.255.42.99", "multicast_group: 192.168.1.5", ["mocap.multicast_group: expected a multicast group, from 224.0.0.0 to 239.255.255.255, got 192.168.1.5"]),
     ("watchdog_ms: 100", "watchdog_ms: 90", ["watchdog_ms: must be a multiple of 20 ms (the register's unit), got 90 ms"]),
     ("sign: -1", "sign: 0", ["sign: expected one of -1, 1, got 0"]),
     ("baud: 3000000", "baud: 9600", ["baud: expected one of 57600, 115200, 1000000, 2000000, 3000000, 4000000, got 9600"]),
@@ -202,6 +207,17 @@ BAD_VEHICLE = [
     ("safety:", "computer:\n  cpus: [2, 3, 2]\nsafety:", ["computer.cpus: expected each core once, got 2 twice in [2, 3, 2]"]),
     ("safety:", "computer:\n  cpus: [-1]\nsafety:", ["computer.cpus[0]: expected a whole number from 0 to 1023, got -1"]),
 ]  # fmt: skip
+
+
+@pytest.mark.parametrize("address", ["14540", "udp://:14540", "udpin://0.0.0.0", "serial:///dev/ttyAMA0", "tcp://a:b"])
+def test_an_address_of_another_form_names_the_good_ones(address: str) -> None:
+    with pytest.raises(ValueError, match=r"expected an address like udpin://0\.0\.0\.0:14540"):
+        parse_address(address)
+
+
+def test_the_path_of_a_serial_port_may_contain_colons() -> None:
+    parts = parse_address("serial:///dev/serial/by-path/platform-xhci-hcd.1-usb-0:1:1.0-port0:921600")
+    assert (parts.host, parts.port) == ("/dev/serial/by-path/platform-xhci-hcd.1-usb-0:1:1.0-port0", 921600)
 
 
 def test_a_pose_is_refused_without_an_arm() -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import datetime
 import os
 import shutil
+import socket
 import stat
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,7 @@ from companion.config.ground import Ground
 from companion.ground.broker import setup as broker_setup
 from companion.ground.broker.certificates import certificate_hosts, make_authority, make_server
 from companion.ground.protocol.keys import load_login, load_operators
+from companion.model.exit_codes import EXIT_REFUSED
 from tests.broker import loopback_broker
 from tests.ground.test_broker import WANTED, Site, running
 from tests.support import free_port
@@ -283,3 +286,35 @@ def test_check_says_why_it_does_not_get_in(
     assert told("http://here").startswith("2 ")
     assert told(plain, "--vehicle", "#").startswith("2 --vehicle '#'")
     assert told(plain, "--login", str(tmp_path / "none.yaml")).startswith("2 ")
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (
+            b"HTTP/1.1 400 Bad Request\r\n\r\n",
+            "no MQTT broker answers: the server at this port ended the connection without an MQTT 5 answer",
+        ),
+        (b"", "no MQTT broker answers: the server at this port ended the connection without an MQTT 5 answer"),
+        (b"\x20\x02\x00\x01", "Unsupported protocol version; it speaks MQTT 3.1.1 only, expected MQTT 5"),
+        (b"\x20\x03\x00\x89\x00", "the broker refuses the connection without a login: Server busy\n"),
+    ],
+    ids=["web server", "silent", "MQTT 3.1.1", "busy"],
+)
+def test_what_is_no_broker_of_mqtt_5_is_not_a_matter_of_the_login(
+    capsys: pytest.CaptureFixture[str], answer: bytes, said: str
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            server.accept()[0].close()  # the probe
+            with server.accept()[0] as connected:
+                connected.recv(1000)
+                connected.sendall(answer)
+
+        serving = threading.Thread(target=serve)
+        serving.start()
+        assert main(["broker", "check", f"mqtt://127.0.0.1:{server.getsockname()[1]}"]) == EXIT_REFUSED
+        serving.join()
+    text = capsys.readouterr().err
+    assert said in text and "--login" not in text

@@ -633,15 +633,6 @@ def test_busy_port_is_refused_even_though_mavsdk_would_share_it() -> None:
         assert f"port {port} to be free, found another program" in asyncio.run(refused(f"udpin://127.0.0.1:{port}"))
 
 
-@pytest.mark.parametrize("address", ["14540", "udp://:14540", "udpin://0.0.0.0", "serial:///dev/ttyAMA0", "tcp://a:b"])
-def test_bad_address_syntax_names_the_good_one(address: str) -> None:
-    assert "udpin://0.0.0.0:14540" in asyncio.run(refused(address))
-
-
-def test_port_out_of_range_is_refused() -> None:
-    assert "a port from 1 to 65535, found 99999" in asyncio.run(refused("udpin://127.0.0.1:99999"))
-
-
 def test_an_address_of_another_machine_is_refused() -> None:
     assert "a local address in 192.0.2.1" in asyncio.run(refused("udpin://192.0.2.1:14540"))  # TEST-NET-1
 

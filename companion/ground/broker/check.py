@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import aiomqtt
 
 from companion.ground.protocol.access import BrokerAccess
-from companion.ground.protocol.connection import Connection, error_text, reason_code
+from companion.ground.protocol.connection import Connection, error_text, reason_code, remedy
 from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, Topic, vehicle_of
 from companion.runtime.tasks import until_first
 
@@ -96,9 +96,10 @@ async def _try_topics(access: BrokerAccess, name: str) -> tuple[set[Topic], set[
             await client.open()
         except aiomqtt.MqttError as error:
             login = "without a login" if access.username is None else f"as {access.username}"
-            text = f"the broker refuses the connection {login}: {error_text(error)}; see --login"
-            if reason_code(error) is None:
-                text = f"the broker does not answer: {error_text(error)}; for a TLS port use mqtts://"
+            code = reason_code(error)
+            text = f"no MQTT broker answers: {error_text(error)}; for a TLS port use mqtts://"
+            if code is not None:
+                text = f"the broker refuses the connection {login}: {code}{remedy(code)}"
             raise CheckError(f"{access.address}: {text}") from None
         try:
             await until_first(client.wait_broken(), try_all())

@@ -25,6 +25,9 @@ KEEPALIVE_S = 5
 """Keep-alive: after 1.5 times this without a message the broker publishes the last will (MQTT 5, 3.1.2.10)."""
 OnMessage = Callable[[str, bytes, bool], None]
 """Callback for a message, called in the event loop with topic, payload and retained flag; must not raise."""
+_UNSUPPORTED_VERSION = 132
+_LOGIN_REFUSED = (134, 135, 140)
+"""CONNACK reason codes: bad user name or password, not authorized, bad authentication method."""
 _SSL_SOURCE = re.compile(r" \(_ssl\.c:\d+\)$")
 
 
@@ -160,10 +163,13 @@ class Connection(aiomqtt.Client):
     def _on_disconnect(
         self, client: Any, userdata: Any, flags: Any, reason_code: ReasonCode, properties: Any = None
     ) -> None:
-        if (
-            not self._connected.cancelled()
-        ):  # aiomqtt asks a cancelled attempt for its exception, which raises CancelledError
-            super()._on_disconnect(client, userdata, flags, reason_code, properties)
+        if self._connected.cancelled():
+            return  # aiomqtt asks a cancelled attempt for its exception, which raises CancelledError
+        if not self._connected.done():  # aiomqtt waits for its timeout, and names that
+            self._connected.set_exception(
+                aiomqtt.MqttError("the server at this port ended the connection without an MQTT 5 answer")
+            )
+        super()._on_disconnect(client, userdata, flags, reason_code, properties)
 
     def _on_message(self, client: Any, userdata: Any, message: MQTTMessage) -> None:
         with contextlib.suppress(UnicodeDecodeError):
@@ -180,6 +186,13 @@ def reason_code(error: aiomqtt.MqttError) -> ReasonCode | None:
     cause = error.__cause__ if isinstance(error.__cause__, aiomqtt.MqttError) else error
     code = getattr(cause, "rc", None)
     return code if isinstance(code, ReasonCode) else None
+
+
+def remedy(code: ReasonCode) -> str:
+    """Return what to do about a refused connection, as the end of a message; empty if the reason code says all."""
+    if code.value == _UNSUPPORTED_VERSION:
+        return "; it speaks MQTT 3.1.1 only, expected MQTT 5: use Mosquitto 1.6 or later"
+    return "; see --login" if code.value in _LOGIN_REFUSED else ""
 
 
 def error_text(error: aiomqtt.MqttError) -> str:

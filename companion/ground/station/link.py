@@ -10,7 +10,7 @@ from typing import NoReturn
 import aiomqtt
 
 from companion.ground.protocol.access import BrokerAccess
-from companion.ground.protocol.connection import Connection, OnMessage, error_text, reason_code
+from companion.ground.protocol.connection import Connection, OnMessage, error_text, reason_code, remedy
 from companion.ground.protocol.messages import MESSAGE_MAX_BYTES
 
 ANSWER_S = 2.0
@@ -109,7 +109,7 @@ class Link:
         code = reason_code(error)
         if code is not None and not self._was_connected and code.value in _PERMANENT_REASON_CODES:
             login = f"the login {self._access.username!r}" if self._access.username else "a connection without login"
-            raise BrokerRefused(f"{self._access.address}: the broker refuses {login}: {code}; see --login") from None
+            raise BrokerRefused(f"{self._access.address}: the broker refuses {login}: {code}{remedy(code)}") from None
         if "CERTIFICATE_VERIFY_FAILED" in str(error) and not self._was_connected:
             text = f"the broker's certificate is not trusted ({error_text(error)}); give its CA certificate: --ca FILE"
             raise BrokerRefused(f"{self._access.address}: {text}") from None

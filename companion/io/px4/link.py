@@ -15,11 +15,10 @@ from typing import Any
 from mavsdk import Autopilot as AutopilotKind
 from mavsdk import Mavsdk, log_subscribe, log_unsubscribe
 
+from companion.config.link_address import parse_address
 from companion.io.protocols import DeviceError
-from companion.io.px4.wire import OpenWire, open_wire, parse_address
+from companion.io.px4.wire import OpenWire, open_wire
 from companion.runtime.clock import Clock
-
-_FORMS = "udpin://0.0.0.0:14540, udpout://HOST:PORT, tcpout://HOST:PORT or serial:///dev/ttyAMA0:921600"
 
 _native_log = logging.getLogger("companion.mavsdk")
 _log_lock = threading.Lock()
@@ -38,22 +37,14 @@ def no_heartbeat(address: str, timeout_s: float) -> DeviceError:
 
 
 def check_address(address: str) -> None:
-    """Check the address before MAVSDK uses it, because MAVSDK shares a busy UDP port silently and reports invalid ones without a
-    reason.
+    """Check that a serial port exists and is accessible.
 
     Raises:
-        DeviceError: the syntax or the port is invalid, the local address is busy or not one of this computer, or the serial port is
-            missing or not accessible.
+        DeviceError: the serial port is missing or not accessible.
     """
-    try:
-        parts = parse_address(address)
-    except ValueError:
-        fix = "correct devices.autopilot.address"
-        raise device_error(address, f"an address like {_FORMS}", "something else", fix) from None
+    parts = parse_address(address)
     if parts.serial:
         _check_serial(address, parts.host)
-    elif not 0 < parts.port <= 65535:
-        raise device_error(address, "a port from 1 to 65535", str(parts.port), "correct devices.autopilot.address")
 
 
 def _check_serial(address: str, path: str) -> None:
