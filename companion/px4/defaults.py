@@ -91,6 +91,7 @@ PX4_DEFAULTS: Mapping[str, float | int] = {
     "MAV_SYS_ID": 1,
     "MAV_TYPE": 2,
     "MC_AIRMODE": 0,
+    "MC_BAT_SCALE_EN": 0,
     "MC_PITCHRATE_D": 0.003,
     "MC_PITCHRATE_I": 0.2,
     "MC_PITCHRATE_K": 1.0,

@@ -322,6 +322,13 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             file=False,
         ),
         Wanted(
+            "MC_BAT_SCALE_EN",
+            0,
+            "if 1, PX4 scales every thrust by the battery's voltage, while the companion corrects the same sag by its estimate of the "
+            "hover thrust: the two fight",
+            _WARN,
+        ),
+        Wanted(
             "COM_SPOOLUP_TIME",
             1.0,
             "time after arming for which PX4 limits the thrust, s, while the companion spools up",

@@ -48,6 +48,7 @@ SPOILED = [
     ("MPC_THR_HOVER", 0.2, True, "companion hover fit"),
     ("CA_ROTOR_COUNT", 6, True, "select the machine's airframe in QGroundControl"),
     ("BAT_CRIT_THR", 0.25, False, "set BAT_CRIT_THR to 0.1"),
+    ("MC_BAT_SCALE_EN", 1, False, "set MC_BAT_SCALE_EN to 0"),
 ]
 
 
