@@ -53,3 +53,12 @@ def test_no_process_of_a_flight_imports_an_extra(module: str) -> None:
     program = f"import sys; sys.modules.update(dict.fromkeys({EXTRAS!r})); import {module}"
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
+
+
+def test_the_version_is_printed_without_loading_what_flies() -> None:
+    program = "import sys; from companion.cli.main import main\ntry: main(['--version'])\nfinally: print(*sys.modules)"
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    loaded = set(ended.stdout.split())
+    assert "companion.cli.main" in loaded
+    assert loaded.isdisjoint({"pydantic", "yaml", "rich", "msgspec", "numpy", "companion.config", "companion.model"})

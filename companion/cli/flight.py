@@ -1,0 +1,263 @@
+"""`companion fly|check|sitl`, which load a mission, and the small commands `schema` and `replay`."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import math
+import os
+import socket
+import sys
+from pathlib import Path
+from typing import Any
+
+from companion.cli.options import (
+    MISSION_HELP,
+    MISSION_OR_DEFAULT_HELP,
+    add_law,
+    add_seed,
+    add_world,
+    time_stamp,
+)
+from companion.cli.planning_progress import PlanningProgress
+from companion.cli.schema import schema_json
+from companion.config.document import ConfigError
+from companion.config.ground import FOXGLOVE_DEFAULT, listen_address
+from companion.config.loader import FlightConfig
+from companion.config.shipped import DEFAULT_MISSION
+from companion.mission.check import check_mission
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
+from companion.runtime.console import print_error, terminal_console
+from companion.sitl_config.loader import COMMAND_LINE_WORLD, DEFAULT_WORLD, SitlConfig, load_sitl
+
+
+def add_parser(commands: Any) -> None:
+    """Add the commands to the sub-parsers of `companion`."""
+    fly = commands.add_parser("fly", help="fly a mission", description="Fly a mission, on the vehicle or in SITL.")
+    _add_flight_options(fly)
+    fly.add_argument(
+        "--sitl", metavar="stub|px4", help="fly in the simulated world: with the PX4 stub, or with a real PX4 (SITL)"
+    )
+    fly.add_argument(
+        "--speed",
+        metavar="FACTOR|max",
+        help="with --sitl: simulated seconds in a second at most (default: 1; a busy computer takes longer)",
+    )
+    fly.add_argument(
+        "--real-time",
+        action="store_true",
+        help="with --sitl: on the computer's clock, as on the vehicle, to measure latency and jitter",
+    )
+    fly.add_argument("--out", metavar="DIR", help="folder for log and report (default: flights/TIME-MISSION)")
+    fly.add_argument(
+        "--no-report", action="store_true", help="write only log and summary; companion report writes the rest"
+    )
+    fly.add_argument(
+        "--mqtt", metavar="URL|off", help="broker for telemetry and commands (default: the vehicle file's)"
+    )
+    fly.add_argument(
+        "--qgroundcontrol",
+        metavar="ADDRESS",
+        help="forward MAVLink to a ground station, e.g. udpout://192.168.1.20:14550",
+    )
+    fly.add_argument(
+        "--foxglove",
+        metavar="HOST:PORT",
+        help=f"show the flight live in Foxglove, which opens ws://HOST:PORT (without a value: {FOXGLOVE_DEFAULT})",
+    )
+    fly.add_argument(
+        "--wait-for-start",
+        action="store_true",
+        help="when ready, wait on the ground until an operator commands start",
+    )
+    fly.set_defaults(run=_fly)
+
+    check = commands.add_parser(
+        "check",
+        help="run all preflight checks: devices, PX4's parameters, frames, mission; nothing moves",
+        description="Run every check that a flight runs before it arms. Exit code 0: the vehicle may fly, 3: it may not.",
+    )
+    _add_flight_options(check, mission_default=True)
+    check.add_argument(
+        "--sitl",
+        metavar="stub|px4",
+        help="check the simulated world's devices, with the PX4 stub or a real PX4",
+    )
+    check.add_argument("--hand", action="store_true", help="also run the guided hand test, which a new set-up requires")
+    check.add_argument("--json", action="store_true", help="print only the rows, as JSON")
+    check.add_argument("--plan-only", action="store_true", help="check only the mission, without devices")
+    check.set_defaults(run=_check)
+
+    schema = commands.add_parser("schema", help="print the JSON Schema of a file, for editors")
+    schema.add_argument("kind", choices=("mission", "vehicle", "controller", "world"))
+    schema.set_defaults(run=lambda a: print(schema_json(a.kind)) or EXIT_OK)
+
+    sitl = commands.add_parser("sitl", help="run only the simulated world, for QGroundControl or your own script")
+    _add_flight_options(sitl, mission_default=True)
+    sitl.add_argument("--px4", action="store_true", help="use a real PX4 (SITL) instead of the stub")
+    sitl.set_defaults(run=_sitl)
+
+    replay = commands.add_parser(
+        "replay", help="run the core again on a log's inputs; exit 0 if every output is bit-identical"
+    )
+    replay.add_argument("log", type=Path)
+    replay.set_defaults(run=_replay)
+
+
+def _add_flight_options(parser: argparse.ArgumentParser, mission_default: bool = False) -> None:
+    if mission_default:
+        parser.add_argument("mission", nargs="?", default=DEFAULT_MISSION, help=MISSION_OR_DEFAULT_HELP)
+    else:
+        parser.add_argument("mission", help=MISSION_HELP)
+    parser.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
+    add_law(parser)
+    parser.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="e.g. world.payload_kg=0.3"
+    )
+    add_world(parser)
+    add_seed(parser)
+
+
+def _load(arguments: argparse.Namespace, *, hardware: bool) -> SitlConfig:
+    for name, path in (("MISSION", arguments.mission), ("--vehicle", arguments.vehicle)):
+        if path is not None and not path.strip():
+            raise ConfigError([f"companion {arguments.command}: {name}: expected the name of a file, got an empty one"])
+    return load_sitl(
+        arguments.mission,
+        arguments.vehicle,
+        arguments.controller,
+        arguments.preset,
+        arguments.overrides,
+        hardware=hardware,
+        # Nothing of a world is read on hardware, and drawing one takes NumPy.
+        world=DEFAULT_WORLD if hardware and arguments.world == COMMAND_LINE_WORLD else arguments.world,
+    )
+
+
+def _problems(config: FlightConfig) -> list[str]:
+    with PlanningProgress() as progress:
+        return check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases, progress=progress)
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from companion.cli import check as check_command  # imports MAVSDK
+
+    if arguments.sitl not in (None, "stub", "px4"):
+        print_error(f"companion check: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
+        return EXIT_BAD_INPUT
+    hardware = arguments.sitl is None and not arguments.plan_only
+    return check_command.run(arguments, _load(arguments, hardware=hardware), _problems)
+
+
+def _fly(arguments: argparse.Namespace) -> int:
+    from companion.cli.campaign import why_unusable
+    from companion.launcher.run import run_flight
+
+    if arguments.sitl not in (None, "stub", "px4"):
+        print_error(f"companion fly: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
+        return EXIT_BAD_INPUT
+    speed = _speed(arguments)
+    if speed is not None and not speed > 0.0:
+        return EXIT_BAD_INPUT
+    if arguments.out is not None and not arguments.out.strip():
+        print_error("companion fly: --out: expected the name of a folder, got an empty one")
+        return EXIT_BAD_INPUT
+    if arguments.mqtt is not None:
+        off = arguments.mqtt == "off"
+        arguments.overrides += ["vehicle.ground.mqtt=null"] if off else [f"vehicle.ground.mqtt.url={arguments.mqtt}"]
+    if arguments.qgroundcontrol is not None:
+        arguments.overrides += [f"vehicle.ground.qgroundcontrol={arguments.qgroundcontrol}"]
+    if arguments.foxglove is not None:
+        arguments.overrides += [f"vehicle.ground.foxglove={arguments.foxglove}"]
+    if arguments.wait_for_start:
+        arguments.overrides += ["mission.start.takeoff=by_operator"]
+    config = _load(arguments, hardware=arguments.sitl is None)
+    problems = _no_server(config) or [*_problems(config), *_start_impossible(config)]
+    if problems:
+        for line in problems:
+            print_error(line)
+        return EXIT_BAD_INPUT
+    out = Path(arguments.out) if arguments.out else Path("flights") / f"{time_stamp()}-{config.mission.name}"
+    problem = why_unusable(out, "flight.mcap")
+    if problem is not None:
+        print_error(f"companion fly: --out {out}: {problem}")
+        return EXIT_BAD_INPUT
+    return run_flight(
+        config, out, sitl=arguments.sitl, console=terminal_console(), report=not arguments.no_report, speed=speed
+    )
+
+
+def _speed(arguments: argparse.Namespace) -> float | None:
+    """Return the speed of a flight in simulated time, or None for one in real time; 0 if the options are invalid, after a line."""
+    given = arguments.speed
+    problem = None
+    if (given is not None or arguments.real_time) and arguments.sitl is None:
+        option = "--speed" if given is not None else "--real-time"
+        problem = (
+            f"{option}: expected only with --sitl, because a vehicle flies in real time; add --sitl or leave it out"
+        )
+    elif given is not None and arguments.real_time:
+        problem = f"--speed {given}: expected not together with --real-time, which flies on the computer's clock; leave one out"
+    if problem is None and (given is None or given == "max"):
+        return None if arguments.real_time or arguments.sitl is None else math.inf if given else 1.0
+    if problem is None:
+        try:
+            speed = float(given)
+        except ValueError:
+            speed = math.nan
+        if 0.0 < speed < math.inf:
+            return speed
+        problem = f"--speed {given}: expected a number above 0, such as 0.25, or max"
+    print_error(f"companion fly: {problem}")
+    return 0.0
+
+
+def _no_server(config: FlightConfig) -> list[str]:
+    """Return one line on why the Foxglove server cannot start; an empty list if it can."""
+    address = config.vehicle.ground.foxglove
+    if address is None:
+        return []
+    host, port = listen_address(address)
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as server:
+            server.setsockopt(
+                socket.SOL_SOCKET, socket.SO_REUSEADDR, 1
+            )  # as the real one: ended connections do not matter
+            server.bind((host, port))
+    except OSError as error:
+        why = "another program uses the port" if error.errno == errno.EADDRINUSE else error.strerror
+        return [f"vehicle.ground.foxglove (--foxglove) is {address}, but {why}; give another: --foxglove HOST:PORT"]
+    return []
+
+
+def _start_impossible(config: FlightConfig) -> list[str]:
+    """Return one line on why a flight with `--wait-for-start` could never be started; an empty list if it could."""
+    if config.mission.start.takeoff != "by_operator":
+        return []
+    mqtt = config.vehicle.ground.mqtt
+    if mqtt is None:
+        why = "vehicle.ground.mqtt is null"
+    elif not mqtt.commands:
+        why = "vehicle.ground.mqtt.commands is false"
+    elif not (mqtt.address.tls or mqtt.address.loopback):
+        why = f"vehicle.ground.mqtt.url is {mqtt.url}, and commands are not accepted over an unencrypted connection to another computer"
+    else:
+        return []
+    return [f"mission.start.takeoff is by_operator (--wait-for-start), but start could not be commanded: {why}"]
+
+
+def _sitl(arguments: argparse.Namespace) -> int:
+    config = _load(arguments, hardware=False)
+    # The world replaces this process, so that signals reach it directly and it cannot outlive a parent.
+    file = os.memfd_create("sitl-config", 0)
+    os.write(file, config.model_dump_json().encode())
+    command = [sys.executable, "-P", "-m", "sitl", "--config", f"/proc/self/fd/{file}"]
+    if arguments.px4:
+        command += ["--px4", str((Path("flights") / f"{time_stamp()}-sitl" / "px4").resolve())]
+    os.execv(sys.executable, command)
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    from companion.analysis import replay
+
+    return replay.run(arguments.log)
