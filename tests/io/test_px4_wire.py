@@ -174,6 +174,17 @@ def test_serial() -> None:
         assert b"".join(received(wire)) == heartbeat()
 
 
+def test_a_serial_port_that_px4_does_not_drain_holds_nobody_up() -> None:
+    """Flow control, or USB whose other end has stopped: pyserial would retry for ever."""
+    with serial_line() as (_, port), opened(f"serial://{port}:57600") as wire:
+        taken = 0
+        while wire.send(heartbeat()):
+            taken += 1
+            assert taken < 100_000, "the line takes everything"
+        assert taken > 0
+        assert not wire.send(heartbeat())
+
+
 def test_a_serial_port_that_another_process_holds_is_not_opened() -> None:
     with serial_line() as (_, port):
         with opened(f"serial://{port}:921600"), pytest.raises(OSError, match="exclusively"):

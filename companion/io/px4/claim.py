@@ -9,13 +9,13 @@ from collections.abc import AsyncIterator
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.config.link_address import parse_address
 from companion.io.px4.frames import autopilot_heartbeat
 from companion.io.px4.link import (
     bind_alone,
     device_error,
     no_heartbeat,
 )
+from companion.px4.link_address import parse_address
 
 Peer = tuple[str, int]
 """IPv4 address and UDP port."""

@@ -15,9 +15,9 @@ from typing import Any
 from mavsdk import Autopilot as AutopilotKind
 from mavsdk import Mavsdk, log_subscribe, log_unsubscribe
 
-from companion.config.link_address import parse_address
 from companion.io.protocols import DeviceError
 from companion.io.px4.wire import OpenWire, open_wire
+from companion.px4.link_address import parse_address
 from companion.runtime.clock import Clock
 
 _native_log = logging.getLogger("companion.mavsdk")

@@ -7,22 +7,17 @@ import ctypes
 import errno
 import logging
 import os
-import re
 import socket
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 from companion.io.arrival import STAMP_ROOM_BYTES, arrived_s, stamp_arrivals
 from companion.io.px4.frames import autopilot_heartbeat
+from companion.px4.link_address import parse_address
 from companion.runtime.clock import Clock
 
 _LOG = logging.getLogger(__name__)
-_KINDS, _PORTS = "udpin|udpout|tcpout", "serial|serial_flowcontrol"
-_ADDRESS = re.compile(
-    rf"(?P<net>{_KINDS})://(?P<host>[^:/?]+):(?P<port>\d+)|(?P<serial>{_PORTS})://(?P<path>/[^:]+):(?P<baud>\d+)"
-)
 _MAX_BYTES = 65535
 ROUND_DATAGRAMS = 200
 """Most datagrams read in one call, so that a flood from PX4's own address does not hold up a tick; PX4 sends some 600 per second."""
@@ -33,37 +28,6 @@ _ANY_PEER = bytes(16)
 """A sockaddr of family AF_UNSPEC."""
 
 _libc = ctypes.CDLL(None, use_errno=True)
-
-
-@dataclass(frozen=True, slots=True)
-class AddressParts:
-    """Parts of an address."""
-
-    kind: str
-    """udpin, udpout, tcpout, serial or serial_flowcontrol."""
-    host: str
-    """Host, or the path of the device on a serial link."""
-    port: int
-    """Port, or the baud rate on a serial link."""
-
-    @property
-    def serial(self) -> bool:
-        """Return whether the link is a serial port."""
-        return self.kind in ("serial", "serial_flowcontrol")
-
-
-def parse_address(address: str) -> AddressParts:
-    """Return the parts of an address.
-
-    Raises:
-        ValueError: the address has none of the known forms.
-    """
-    match = _ADDRESS.fullmatch(address)
-    if match is None:
-        raise ValueError(f"{address!r}: expected {_KINDS}://HOST:PORT or {_PORTS}:///dev/NAME:BAUD")
-    if match["serial"]:
-        return AddressParts(match["serial"], match["path"], int(match["baud"]))
-    return AddressParts(match["net"], match["host"], int(match["port"]))
 
 
 class Wire(Protocol):
@@ -263,9 +227,11 @@ class SerialWire(_ChannelWire):
         super().__init__(self._port, clock)
 
     def send(self, data: bytes) -> bool:
-        """Write as many bytes as the port accepts."""
+        """Write as many bytes as the port accepts, without waiting. While PX4 does not drain the port, pyserial's `write` would retry for
+        ever.
+        """
         with contextlib.suppress(OSError):
-            return bool(self._port.write(data) == len(data))
+            return os.write(self._port.fileno(), data) == len(data)
         return False
 
     def receive(self) -> list[tuple[float, bytes]]:
