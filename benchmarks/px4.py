@@ -93,7 +93,17 @@ def fly(case: Case, world: str, autopilot: str, run: int, folder: Path) -> None:
     """Fly once, unless the folder holds the flight already."""
     if (folder / "summary.json").exists():
         return
-    command = [sys.executable, "-m", "companion", "fly", str(MISSION), f"--sitl={autopilot}", "--real-time", "--out", str(folder)]
+    command = [
+        sys.executable,
+        "-m",
+        "companion",
+        "fly",
+        str(MISSION),
+        f"--sitl={autopilot}",
+        "--real-time",
+        "--out",
+        str(folder),
+    ]
     command += ["--world", world, "--seed", str(run), "--set", *case.overrides]
     folder.parent.mkdir(parents=True, exist_ok=True)
     with open(folder.with_name(f"{folder.name}.txt"), "wb") as output:

@@ -39,7 +39,19 @@ class NoFlight(Exception):
 def start_hover(folder: Path, hover_s: float, broker_url: str, *, report: bool = True) -> subprocess.Popen[bytes]:
     """Start `companion fly` in its own process group, with its output in fly.txt and its files in flight/ in the folder."""
     command = [
-        *(sys.executable, "-m", "companion", "fly", str(MISSION), "--sitl", "--real-time", "--world", "ideal", "--mqtt", broker_url),
+        *(
+            sys.executable,
+            "-m",
+            "companion",
+            "fly",
+            str(MISSION),
+            "--sitl",
+            "--real-time",
+            "--world",
+            "ideal",
+            "--mqtt",
+            broker_url,
+        ),
         *("--out", str(folder / "flight"), *([] if report else ["--no-report"])),
         *set_options(**LIMITS),
         *set_options(**{"mission.phases[1].duration_s": hover_s, "world.battery_life_s": BATTERY_MARGIN * hover_s}),

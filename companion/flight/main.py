@@ -49,7 +49,7 @@ from companion.model.types import (
 from companion.recorder.client import RecorderProcess, epoch_offset_ns
 from companion.runtime import ipc, simulated_time
 from companion.runtime.clock import Clock, clock_origin_s, flight_clock
-from companion.runtime.event_loop import run
+from companion.runtime.event_loop import run, start_over
 from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime, collect_no_garbage
 from companion.safety.rules import REATTACHED
 
@@ -102,7 +102,7 @@ class Flight:
             ticker: Ticker | SimulatedTicker = in_real_time
         else:
             if not self._devices.found_armed:
-                await simulated.begin(SIMULATED_START_S)
+                await start_over(simulated, SIMULATED_START_S)
             ticker = self._slow = SimulatedTicker(self._period_s, self._clock)
         self._devices.autopilot.start_sums()
         if self._devices.force is not None:

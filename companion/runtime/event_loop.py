@@ -17,6 +17,7 @@ from companion.runtime.simulated_time import SimulatedTime
 
 _T = TypeVar("_T")
 
+_LOOK_S = 0.002
 _RECENT_S = 0.001
 """Longer than a tick's first round, which takes 0.1 to 0.5 ms, depending on the computer."""
 
@@ -110,6 +111,14 @@ def time_stands() -> contextlib.AbstractContextManager[None]:
     """Return a context in which simulated time stands, for a wait for a thread of this process. In real time it does nothing."""
     loop = asyncio.get_running_loop()
     return loop.time_stands() if isinstance(loop, SimulatedLoop) else contextlib.nullcontext()
+
+
+async def start_over(simulated: SimulatedTime, after_s: float) -> None:
+    """Ask the world to start over, at time zero, and wait until `after_s` of the new time."""
+    simulated.begins = True
+    await asyncio.sleep(_LOOK_S)
+    while simulated.now() < after_s - 1e-9:  # noqa: ASYNC110 - time jumps, and timers with it
+        await asyncio.sleep(_LOOK_S if simulated.now() < 0.0 else after_s - simulated.now())
 
 
 def process_loop() -> asyncio.AbstractEventLoop:

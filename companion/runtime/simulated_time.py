@@ -9,7 +9,6 @@ Grants and reports are packets on a SOCK_SEQPACKET pair for each process. If the
 
 from __future__ import annotations
 
-import asyncio
 import ctypes
 import mmap
 import os
@@ -25,8 +24,6 @@ GRANT: Final = struct.Struct("<Q")
 REPORT: Final = struct.Struct("<QdQB")
 """Number of the newest grant, `wake_s`, bytes written to the servo bus, `Flags`."""
 _PAGE_BYTES: Final = 24
-
-_LOOK_S: Final = 0.002
 
 
 class Flags:
@@ -181,13 +178,6 @@ class SimulatedTime:
             self._channel.send(REPORT.pack(self._grant, wake_s, self.bus_bytes, flags))
         except OSError:  # the world has ended, or does not read because it does not wait for this process
             _ = self.lost
-
-    async def begin(self, after_s: float) -> None:
-        """Ask the world to start over, at time zero, and wait until `after_s` of the new time; for a process with an event loop."""
-        self.begins = True
-        await asyncio.sleep(_LOOK_S)
-        while self.now() < after_s - 1e-9:  # noqa: ASYNC110 - time jumps, and timers with it
-            await asyncio.sleep(_LOOK_S if self.now() < 0.0 else after_s - self.now())
 
     def take_grants(self) -> bool:
         """Read the grants that have arrived; return whether there was one."""

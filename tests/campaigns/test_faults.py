@@ -278,7 +278,7 @@ def test_what_a_dead_recorder_did_not_log_is_in_the_summary_all_the_same(tmp_pat
         "action": "warn",
         "text": "x",
     }
-    _, made = _summary(load_sitl(CATCH), FlightResult(Outcome.COMPLETED, events=(told,)), tmp_path)
+    _, made = _summary(load_sitl(CATCH), FlightResult(Outcome.COMPLETED, events=(told,)), tmp_path, None)
     assert made["events"] == [told]
 
 

@@ -161,11 +161,11 @@ def test_a_hold_that_nobody_may_end_yet() -> None:
 
 
 def test_a_resume_while_a_cause_stands_that_came_during_the_hold_is_refused() -> None:
-    change = off_its_way(7.0, 99.0, 0.7)
-    flown = commanded((6.5, HOLD), (8.0, RESUME), change=change, sets=FORGIVING, until_s=8.6)
+    change = off_its_way(9.2, 99.0, 0.7)
+    flown = commanded((8.7, HOLD), (10.2, RESUME), change=change, sets=FORGIVING, until_s=10.8)
     assert flown.effects[0] == (True, "holding")
     assert flown.effects[1][1].startswith("resume refused: ")
-    assert flown.at(8.5).action is SafetyAction.HOLD
+    assert flown.at(10.7).action is SafetyAction.HOLD
 
 
 # A jump of pose and estimate together is no finding of the ones that watch for jumps; 0.8 m off would be a landing.
@@ -179,7 +179,7 @@ FORGIVING = (
 
 def test_commands_while_it_goes_back_along_the_tether() -> None:
     flown = commanded(
-        (7.0, HOLD), (7.1, RESUME), (7.3, LAND), sets=(*TAUT, "vehicle.safety.retract_max_s=20"), until_s=8.0
+        (9.2, HOLD), (9.3, RESUME), (9.5, LAND), sets=(*TAUT, "vehicle.safety.retract_max_s=20"), until_s=10.2
     )
     assert flown.effects[:2] == [
         (False, "HOLD rejected: the vehicle is in RETRACT and will land"),
@@ -189,7 +189,7 @@ def test_commands_while_it_goes_back_along_the_tether() -> None:
 
 
 def test_too_low_to_hold_and_in_the_missions_own_landing() -> None:
-    flown = commanded((3.9, HOLD), until_s=4.5)
+    flown = commanded((6.1, HOLD), until_s=6.7)
     assert flown.effects == [(True, "too low to hold: landing")]
     begin_s = times_of(ordinary())["land"]
     flown = commanded((begin_s + 0.2, HOLD), (begin_s + 0.4, RESUME), sets=LOW)
@@ -209,7 +209,7 @@ def test_nothing_is_done_against_a_pilot() -> None:
 
 def test_commands_while_px4_lands_on_its_own() -> None:
     blind = ("world.faults=[{kind: mocap_loss, t_s: 5.7}]",)
-    flown = commanded((8.0, LAND), (8.1, ABORT), (8.2, HOLD), (8.3, RESUME), (8.4, START), sets=blind, until_s=9.0)
+    flown = commanded((9.2, LAND), (9.3, ABORT), (9.4, HOLD), (9.5, RESUME), (9.6, START), sets=blind, until_s=10.2)
     assert flown.effects[:2] == [(True, "recorded; PX4's own landing continues")] * 2
     assert [accepted for accepted, _ in flown.effects[2:]] == [False, False, False]
     assert all("PX4 is landing on its own" in text for _, text in flown.effects[2:])

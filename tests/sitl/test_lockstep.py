@@ -154,12 +154,13 @@ def test_timers_of_the_event_loop_follow_simulated_time(pair: Pair) -> None:
     task = loop.create_task(sleeper())
 
     def world() -> None:
-        """The process has nothing to do until then: it waits for a grant, which a world would send at the end of its step."""
+        """Grant the process an instant after its timer."""
+        time.sleep(0.05)
         pair.keeper.processes["flight"].read()
         pair.keeper.page.now_s = 101.0
         pair.keeper.processes["flight"].grant()
 
-    loop.run_in_executor(None, lambda: (time.sleep(0.05), world()))
+    loop.run_in_executor(None, world)
     loop.run_until_complete(task)
     loop.close()
     assert fired == [101.0]

@@ -90,7 +90,19 @@ class WireFlights:
         begun_s = time.monotonic()
         folder = self._out / f"{number:02d}-{variant.kind}-{phase}"
         faults = f"world.faults={json.dumps([variant.fault(phase)])}"
-        command = [sys.executable, "-P", "-m", "companion", "fly", *self._options, "--sitl", "--speed", "max", "--set", faults]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "companion",
+            "fly",
+            *self._options,
+            "--sitl",
+            "--speed",
+            "max",
+            "--set",
+            faults,
+        ]
         with open(self._out / f"{folder.name}.txt", "wb") as console:
             process = subprocess.Popen(
                 [*command, "--out", str(folder)], stdin=subprocess.DEVNULL, stdout=console, stderr=console
