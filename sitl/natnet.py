@@ -9,7 +9,8 @@ from __future__ import annotations
 import asyncio
 import socket
 import struct
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -71,6 +72,7 @@ class NatNetServer:
         data_port: source port of every frame and destination of multicast frames; 0 for any free one.
         multicast_group: multicast address, or None to stream to unicast clients only.
         bodies: id and name of each rigid body.
+        clock: time that the server lives in, s.
     """
 
     def __init__(
@@ -80,7 +82,9 @@ class NatNetServer:
         data_port: int = 0,
         multicast_group: str | None = None,
         bodies: Sequence[tuple[int, str]] = ((1, "companion"),),
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._clock = clock
         self.version = version
         self.multicast_group = multicast_group
         self.bodies = tuple(bodies)
@@ -94,8 +98,6 @@ class NatNetServer:
         self._clients: dict[tuple[str, int], float] = {}
         """Time at which each unicast client was last heard, by its address."""
         self._number = 0
-        self._now_s = 0.0
-        """Time of the newest frame on the world's clock."""
 
     @property
     def command_port(self) -> int:
@@ -150,8 +152,7 @@ class NatNetServer:
     def start_over(self) -> None:
         """Go on at a frame number that does not depend on the past: world time starts over."""
         self._number += _NUMBERS - self._number % _NUMBERS
-        self._clients = dict.fromkeys(self._clients, 0.0)
-        self._now_s = 0.0
+        self._clients = dict.fromkeys(self._clients, self._clock())
 
     def publish(self, t_s: float, poses: Sequence[BodyPose], exposure_t_s: float | None) -> None:
         """Send one frame to every client; never blocks.
@@ -162,8 +163,7 @@ class NatNetServer:
             exposure_t_s: middle of the cameras' exposure on the same clock, or None if the cameras do not report it.
         """
         self._number += 1
-        self._now_s = t_s
-        oldest_s = t_s - _CLIENT_TIMEOUT_S
+        oldest_s = self._clock() - _CLIENT_TIMEOUT_S
         self._clients = {address: heard_s for address, heard_s in self._clients.items() if heard_s >= oldest_s}
         addresses = list(self._clients)
         if self.multicast_group is not None:
@@ -213,7 +213,7 @@ class NatNetServer:
         if len(datagram) < 4:
             return
         message: int = struct.unpack_from("<H", datagram)[0]
-        now_s = self._now_s
+        now_s = self._clock()
         if message == Message.CONNECT:
             if self.multicast_group is None:
                 self._clients[address] = now_s

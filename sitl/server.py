@@ -221,6 +221,7 @@ class Sitl:
             data_port=self._ports.mocap_data,
             multicast_group=mocap.multicast_group if self._ports.multicast else None,
             bodies=((mocap.rigid_body_id, self._vehicle.name), *self._others),
+            clock=time.monotonic if self._keeper is None else lambda: self.plant.t_s,
         )
 
     def _mocap_settings(self, server: NatNetServer) -> dict[str, Any]:
