@@ -227,9 +227,7 @@ class SerialWire(_ChannelWire):
         super().__init__(self._port, clock)
 
     def send(self, data: bytes) -> bool:
-        """Write as many bytes as the port accepts, without waiting. While PX4 does not drain the port, pyserial's `write` would retry for
-        ever.
-        """
+        """Write as many bytes as the port accepts, without waiting; pyserial's `write` would retry for ever while PX4 does not read."""
         with contextlib.suppress(OSError):
             return os.write(self._port.fileno(), data) == len(data)
         return False
