@@ -17,8 +17,8 @@ from companion.config.shipped import DEFAULT_VEHICLE
 from companion.io.protocols import DeviceError
 from companion.io.px4.transfer import Comparison, Difference, WriteResult, compare, write
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.link_address import parse_address
 from companion.px4 import params_file
-from companion.px4.link_address import parse_address
 from companion.px4.params_file import PACKAGED, VEHICLE_ID, ParamsFile, skipped_lines, value_text
 from companion.runtime.clock import flight_clock
 from companion.runtime.console import print_error

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator
 
-from companion.px4.link_address import parse_address
+from companion.model.link_address import parse_address
 
 
 def _of_px4(address: str) -> str:

@@ -13,6 +13,8 @@ from companion.model.types import PhaseKind
 from companion.sitl_config.faults import CONTACT_PHASES, Fault, FaultKind, FlightPhase
 from companion.sitl_config.loader import SitlConfig
 
+ARMED_SEEN_S = 1.0
+"""Time from arming to the heartbeat that shows it, the next one after that at which the companion commanded it."""
 AFTER_CATCH_S = 0.1
 """Time from the catch to a fault in phase "catch"."""
 REBOOT_ON_GROUND_S = 1.3
@@ -56,7 +58,7 @@ def _timed(fault: Fault, config: SitlConfig) -> Fault:
         return fault.model_copy(update={"after": "press" if t_s else "touch", "t_s": t_s, "phase": None})
     if fault.phase == "catch" and config.world.payload_kg > 0:
         return fault.model_copy(update={"after": "catch", "t_s": AFTER_CATCH_S, "phase": None})
-    t_s = round(SPOOL_S + _plan_time_s(fault.phase, config), 3)
+    t_s = round(ARMED_SEEN_S + SPOOL_S + _plan_time_s(fault.phase, config), 3)
     return fault.model_copy(update={"after": "arming", "t_s": t_s, "phase": None})
 
 

@@ -15,7 +15,7 @@ import yaml
 from companion.config.controller import LAWS, AdaptiveConfig
 from companion.config.document import ConfigError
 from companion.config.loader import PRESETS, FlightConfig, load_vehicle, logged_flight
-from companion.px4.link_address import parse_address
+from companion.model.link_address import parse_address
 from companion.sitl_config.loader import SitlConfig, load_sitl, load_world
 from tests.machines import overrides_with_joints
 

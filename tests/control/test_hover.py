@@ -157,7 +157,7 @@ def test_switched_off_it_stays_at_the_parameter() -> None:
 
 def test_a_catch_without_force_sensor_does_not_move_it() -> None:
     """The sensor dies after the catch: what hangs there can no longer be told from a weak motor."""
-    result = flown(0.0, faults="[{kind: force_loss, t_s: 4.7}]", mission=SHORT_CATCH)
+    result = flown(0.0, faults="[{kind: force_loss, t_s: 5.7}]", mission=SHORT_CATCH)
     lost_s = next(e.t_s for o in result.outputs for e in o.events if e.id == "force_lost")
     later = {o.control.hover_thrust for o in result.outputs if o.control and o.t_s > lost_s + 0.1}
     assert len(later) == 1

@@ -25,7 +25,7 @@ from sitl.fast.loop import FastFlight
 assert main(["check", "--plan-only"]) == 0
 assert main(["init"]) == 0
 assert main(["check", "configs/missions/hover.yaml", "--plan-only"]) == 0
-flown = FastFlight(load_sitl("hover", world="lab")).run(limit_s=0.5)
+flown = FastFlight(load_sitl("hover", world="lab")).run(limit_s=1.0)
 print(companion.__file__, len(flown.outputs))
 """
 

@@ -124,17 +124,17 @@ def test_a_row_is_what_the_flight_was(monkeypatch: pytest.MonkeyPatch) -> None:
         return seen[-1]
 
     monkeypatch.setattr(robustness, "fly_to_end", fly_to_end)
-    flight = {"name": "draw 0", "number": 0, "world": {"payload_kg": 0.25, "setpoint_delay_s": 0.03, "seed": 5}}
+    flight = {"name": "draw 0", "number": 0, "world": {"payload_kg": 0.25, "setpoint_delay_s": 0.03, "seed": 6}}
     row = robustness.fly(SHORT, flight)["row"]
     (whole,) = seen
     flown, world = whole.result, whole.fast.plant.world if whole.fast is not None else None
     assert world is not None
     assert (row["name"], row["number"]) == ("draw 0", 0)
     unchanged = {"throw_velocity_m_s": [-2.0, 0.15, -1.5], "catch_at_m": [0.0, 0.0]}
-    assert row["world"] == {"payload_kg": 0.25, "setpoint_delay_s": 0.03, "seed": 5, **unchanged}
-    assert (row["world_seed"], row["model_error"]) == (5, 0.0)
+    assert row["world"] == {"payload_kg": 0.25, "setpoint_delay_s": 0.03, "seed": 6, **unchanged}
+    assert (row["world_seed"], row["model_error"]) == (6, 0.0)
     knobs = whole.config.world
-    assert (knobs.payload_kg, knobs.setpoint_delay_s, knobs.seed) == (0.25, 0.03, 5)
+    assert (knobs.payload_kg, knobs.setpoint_delay_s, knobs.seed) == (0.25, 0.03, 6)
     assert (row["outcome"], row["why"], row["error"]) == ("completed", None, None)
     assert row["events"] == [event.id for outputs in flown.outputs for event in outputs.events]
     assert (row["thrown"], row["caught"]) == (True, True) == (world.payload.thrown_t_s is not None, flown.caught)

@@ -28,7 +28,7 @@ TO_AND_FRO = (
     f"world.keep_s={KEEP_S}",
 )
 """The short catch, flown there and back: it may be repeated."""
-FIRST_MISSED = "world.faults=[{kind: payload_missed, t_s: 0, duration_s: 6, size: 0.5}]"
+FIRST_MISSED = "world.faults=[{kind: payload_missed, t_s: 0, duration_s: 8.2, size: 0.5}]"
 """The first of its throws goes beside the net."""
 
 

@@ -10,7 +10,7 @@ from companion.mission.check import check_mission
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 
-CATCH_S = 10.5
+CATCH_S = 12.7
 
 
 def test_an_arm_of_four_joints_from_a_urdf_catches_the_payload() -> None:

@@ -38,7 +38,7 @@ ON_WIRES_ONLY = {
 
 TARE_S = 0.1
 """In the fast loop, instead of the flight's second: nothing but noise happens meanwhile."""
-UNTIL_S = EARLY_S, _, _ = 0.15, 1.3, 6.1
+UNTIL_S = EARLY_S, _, _ = 0.65, 3.5, 8.3
 """Flight times in the fast loop: until the servos give torque, until the rotors turn, and including the catch.
 
 A pair flies until its first difference. Shorter flights are tried first, unless other pairs share the usual world.

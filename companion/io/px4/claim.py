@@ -15,7 +15,7 @@ from companion.io.px4.link import (
     device_error,
     no_heartbeat,
 )
-from companion.px4.link_address import parse_address
+from companion.model.link_address import parse_address
 
 Peer = tuple[str, int]
 """IPv4 address and UDP port."""

@@ -17,7 +17,7 @@ from mavsdk import Mavsdk, log_subscribe, log_unsubscribe
 
 from companion.io.protocols import DeviceError
 from companion.io.px4.wire import OpenWire, open_wire
-from companion.px4.link_address import parse_address
+from companion.model.link_address import parse_address
 from companion.runtime.clock import Clock
 
 _native_log = logging.getLogger("companion.mavsdk")

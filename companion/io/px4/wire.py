@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from companion.io.arrival import STAMP_ROOM_BYTES, arrived_s, stamp_arrivals
 from companion.io.px4.frames import autopilot_heartbeat
-from companion.px4.link_address import parse_address
+from companion.model.link_address import parse_address
 from companion.runtime.clock import Clock
 
 _LOG = logging.getLogger(__name__)
