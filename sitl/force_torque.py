@@ -73,7 +73,7 @@ class ForceTorqueServer:
         }
         self._scanner = PacketScanner(rft.COMMAND_BYTES)
         self._pty = PtyLine(self._on_commands)
-        self._pty.arrives_at_once = in_lockstep
+        self._pty.is_counted = in_lockstep
         self._force_n: Vec3 = _ZERO
         self._torque_nm: Vec3 = _ZERO
         self._bias_force_n: Vec3 = _ZERO
@@ -113,6 +113,10 @@ class ForceTorqueServer:
     def start_over(self) -> None:
         """Send the next packet at world time zero: world time starts over."""
         self._due_s = 0.0
+
+    def await_arrival(self) -> None:
+        """Wait until the companion can read what was sent, in a world in lockstep."""
+        self._pty.await_arrival()
 
     def due(self, t_s: float) -> bool:
         """Return whether a packet is due by world time `t_s`."""

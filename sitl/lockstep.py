@@ -7,6 +7,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+import select
 import selectors
 import socket
 import struct
@@ -15,6 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from companion.runtime.simulated_time import GRANT, REPORT, Flags, Page, Report
+from sitl.servo.bus import ServoBus
 
 PATIENCE_S: Final = 2.0
 """Wall time that the world waits for a process before it goes on without it, at the pace of real time: the process hangs."""
@@ -142,7 +144,8 @@ class TimeKeeper:
         self.page = page
         self.processes = {name: Process(channel) for name, channel in channels.items()}
         self._speed = speed
-        self._changed = asyncio.Event()
+        self.bus: ServoBus | None = None
+        """The servo bus, which is served while a process works; None without an arm."""
         self._from: tuple[float, float] | None = None
         """Simulated time and wall time from which the pace is kept."""
 
@@ -162,7 +165,6 @@ class TimeKeeper:
         process.read()
         if process.ended:
             asyncio.get_running_loop().remove_reader(process)
-        self._changed.set()
 
     def do_not_wait_for(self, name: str) -> None:
         """Go on without a process that is known to hang, until it reports again."""
@@ -197,21 +199,24 @@ class TimeKeeper:
         granted = [process for process in processes if process.wants(now_s, data)]
         for process in granted:
             process.grant()
-        await self._reports(processes)
+        self._reports(processes)
         await self._keep_pace(now_s, processes)
 
-    async def _reports(self, processes: Sequence[Process]) -> None:
+    def _reports(self, processes: Sequence[Process]) -> None:
+        """Wait for the reports. Meanwhile only the servo bus is served: a process waits for nothing else at this instant, and each
+        wake-up takes longer than most of the work that follows.
+        """
         deadline_s = math.inf
-        while any(process.busy and process.waited_for for process in processes):
+        served = () if self.bus is None else (self.bus,)
+        while working := [process for process in processes if process.busy and process.waited_for]:
             now_s = time.monotonic()
             deadline_s = min(deadline_s, now_s + PATIENCE_S)
-            self._changed.clear()
-            try:
-                async with asyncio.timeout(deadline_s - now_s):
-                    await self._changed.wait()
-            except TimeoutError:
-                for process in processes:
-                    process.waited_for = process.waited_for and not process.busy
+            ready = select.select((*working, *served), (), (), max(0.0, deadline_s - now_s))[0]
+            for one in ready:
+                self._on_report(one) if isinstance(one, Process) else one.on_readable()
+            if not ready:
+                for process in working:
+                    process.waited_for = False
 
     async def _keep_pace(self, now_s: float, processes: Sequence[Process]) -> None:
         speed = self._speed if all(process.hurried for process in processes) else min(1.0, self._speed)

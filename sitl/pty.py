@@ -28,8 +28,10 @@ class PtyLine:
     """
 
     def __init__(self, on_bytes: Callable[[bytes], None]) -> None:
-        self.arrives_at_once = False
-        """Whether `write` returns only when the companion can read the bytes, for a world in lockstep."""
+        self.is_counted = False
+        """Whether `await_arrival` is called before the companion reads, in a world in lockstep."""
+        self._expected_bytes = 0
+        """Number of bytes that the companion can read once all have arrived."""
         self.path = ""
         """Device that the companion opens; valid while the line is open."""
         self._on_bytes = on_bytes
@@ -48,7 +50,7 @@ class PtyLine:
             tty.setraw(self._companion_fd)
             os.set_blocking(self._device_fd, False)
             self.path = os.ttyname(self._companion_fd)
-            asyncio.get_running_loop().add_reader(self._device_fd, self._on_readable)
+            asyncio.get_running_loop().add_reader(self._device_fd, self.on_readable)
         except BaseException:
             self.close()
             raise
@@ -70,30 +72,38 @@ class PtyLine:
         """
         if self._device_fd < 0:
             return 0
-        waiting = self._waiting() if self.arrives_at_once else _UNREAD_BYTES
+        waiting = max(self._expected_bytes, self._waiting()) if self.is_counted else 0
         try:
             written = os.write(self._device_fd, data)
         except BlockingIOError:
             return len(data)
-        if waiting < _UNREAD_BYTES:
-            self._await_arrival(waiting + written)
+        # A line that nobody reads is full at some point.
+        self._expected_bytes = waiting + written if self.is_counted and waiting < _UNREAD_BYTES else 0
         return len(data) - written
 
     def _waiting(self) -> int:
         """Return the number of bytes that the companion can read."""
         return int(_INT.unpack(fcntl.ioctl(self._companion_fd, termios.FIONREAD, _INT.pack(0)))[0])
 
-    def _await_arrival(self, expected: int) -> None:
-        """Wait until a thread of the kernel has carried the bytes to the companion's end."""
+    def await_arrival(self) -> None:
+        """Wait until a thread of the kernel has carried what was written to the companion's end."""
+        if not self._expected_bytes:
+            return
         deadline_s = time.monotonic() + _ARRIVAL_TIMEOUT_S
-        while self._waiting() < expected and time.monotonic() < deadline_s:
+        while self._waiting() < self._expected_bytes and time.monotonic() < deadline_s:
             select.select((self._companion_fd,), (), (), _ARRIVAL_LOOK_S)
+        self._expected_bytes = 0
+
+    def fileno(self) -> int:
+        """Return the descriptor that is readable when the companion has written; -1 while the line is closed."""
+        return self._device_fd
 
     def speed(self) -> int:
         """Return the line speed that the companion has set, as a termios constant (`termios.B3000000` and so on)."""
         return int(termios.tcgetattr(self._companion_fd)[5])
 
-    def _on_readable(self) -> None:
+    def on_readable(self) -> None:
+        """Read what the companion has written."""
         try:
             data = os.read(self._device_fd, 4096)
         except (BlockingIOError, InterruptedError):

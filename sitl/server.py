@@ -285,15 +285,18 @@ class Sitl:
         assert isinstance(loop, LockstepLoop)
         before_s = 0.0 if self.autopilot.lockstep else BEFORE_S
         keeper.set(before_s + self.plant.t_s)
+        keeper.bus = self.bus
         with keeper.listening():
             while not self._ends:
                 if self.autopilot.lockstep:
                     await self.autopilot.answered()
                 self._sent_frame = False
                 self._step()
+                if self.force is not None:
+                    self.force.await_arrival()
                 await keeper.advance(before_s + self.plant.t_s, self._sent_frame)
                 if self.bus is not None:
-                    await self.bus.take(keeper.bus_bytes, BUS_PATIENCE_S)
+                    self.bus.take(keeper.bus_bytes, BUS_PATIENCE_S)
                 await loop.handle_all()
                 if keeper.begins():
                     plant = self.plant

@@ -51,6 +51,7 @@ from companion.runtime import ipc, simulated_time
 from companion.runtime.clock import Clock, clock_origin_s, flight_clock
 from companion.runtime.event_loop import run, start_over
 from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime, collect_no_garbage
+from companion.runtime.simulated_time import SimulatedTime
 from companion.safety.rules import REATTACHED
 
 STATUS_EVERY = 20
@@ -101,9 +102,7 @@ class Flight:
             self._devices.vision.on_frame = in_real_time.frame
             ticker: Ticker | SimulatedTicker = in_real_time
         else:
-            if not self._devices.found_armed:
-                await start_over(simulated, SIMULATED_START_S)
-            ticker = self._slow = SimulatedTicker(self._period_s, self._clock)
+            ticker = self._slow = await self._in_simulated_time(simulated)
         self._devices.autopilot.start_sums()
         if self._devices.force is not None:
             self._devices.force.read_in_ticks()
@@ -133,6 +132,17 @@ class Flight:
             if isinstance(ticker, Ticker):  # at the end: it wakes the bus thread, which competes for the interpreter
                 self._schedule_read(ticker.due_s)
             tick += 1
+
+    async def _in_simulated_time(self, simulated: SimulatedTime) -> SimulatedTicker:
+        """Let the world start over, and read the joints, which feeds the servos' watchdogs, until every device has sent new data."""
+        if not self._devices.found_armed:
+            await start_over(simulated)
+        ticker = SimulatedTicker(self._period_s, self._clock)
+        while self._clock() < SIMULATED_START_S:
+            await ticker.next()
+            if self._devices.arm is not None:
+                await self._devices.arm.read(JOINT_READ_TIMEOUT_S)
+        return ticker
 
     def _schedule_read(self, due_s: float) -> None:
         """Schedule the read of the joint state for the tick that is due at `due_s`."""

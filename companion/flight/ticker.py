@@ -127,7 +127,7 @@ class SimulatedTicker:
     def __init__(self, period_s: float, clock: Clock) -> None:
         self._period_s = period_s
         self._clock = clock
-        self._due_s = clock()
+        self._due_s = period_s * math.floor(clock() / period_s)
         self._begun_cpu_s = 0.0
         self.skipped = 0
 

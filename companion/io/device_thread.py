@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Final, TypeVar
 
 from companion.io.protocols import DeviceError
+from companion.runtime.event_loop import real_time
 from companion.runtime.native_threads import name_thread
 
 _CLOSE_TIMEOUT_S: Final = 2.0
@@ -56,7 +57,8 @@ class DeviceThread:
         self._thread = threading.Thread(target=self._run, args=(opened,), name=self._name, daemon=True)
         self._thread.start()
         try:
-            await asyncio.wait((opened,), timeout=timeout_s)
+            with real_time():
+                await asyncio.wait((opened,), timeout=timeout_s)
         except BaseException:
             await self.stop()
             raise

@@ -368,6 +368,8 @@ class Launcher:
         if self._time is None:
             return
         now_s, wall_s = self._time.now_s(), time.monotonic()
+        if self._flown_from is None:
+            self._time.restart_pace()
         from_s, from_wall_s = self._flown_from = self._flown_from or (now_s, wall_s)
         if wall_s > from_wall_s:
             self._pace = (now_s - from_s) / (wall_s - from_wall_s)

@@ -36,7 +36,7 @@ class SharedTime:
                 self._channels[name] = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         except (OSError, ValueError) as error:
             raise LaunchError(f"simulated time: no memory or sockets to share: {error}; fly with --real-time") from None
-        self._measured = (time.monotonic(), self._page.now_s)
+        self.restart_pace()
 
     def of_world(self) -> tuple[tuple[str, ...], tuple[int, ...]]:
         """Return the world's arguments, and the descriptors that it inherits."""
@@ -71,13 +71,15 @@ class SharedTime:
         """Return the simulated time."""
         return self._page.now_s
 
+    def restart_pace(self) -> None:
+        """Measure the pace from here."""
+        self._measured = (time.monotonic(), self._page.now_s)
+
     def pace(self) -> float | None:
-        """Return simulated seconds per second since the last measurement; None before `PACE_PERIOD_S` have passed, or if the time has
-        jumped.
-        """
+        """Return simulated seconds per second since the last measurement; None before `PACE_PERIOD_S` have passed."""
         wall_s, now_s = time.monotonic(), self._page.now_s
         begun_wall_s, begun_s = self._measured
         if wall_s - begun_wall_s < PACE_PERIOD_S:
             return None
         self._measured = (wall_s, now_s)
-        return None if begun_s < 0.0 <= now_s else (now_s - begun_s) / (wall_s - begun_wall_s)
+        return (now_s - begun_s) / (wall_s - begun_wall_s)

@@ -142,12 +142,16 @@ class RecorderClient:
         if not self._dead:
             try:
                 data = to_packet(packet)
-                if simulated_time.current() is not None:  # time stands while the recorder makes room
-                    select.select((), (self._socket,), (), _ROOM_TIMEOUT_S)
-                self._socket.send(data)
+                try:
+                    self._socket.send(data)
+                except BlockingIOError:  # full
+                    if simulated_time.current() is None:
+                        raise
+                    select.select((), (self._socket,), (), _ROOM_TIMEOUT_S)  # time stands meanwhile
+                    self._socket.send(data)
                 return True
             except BlockingIOError:
-                pass  # full
+                pass
             except (ValueError, TypeError, OverflowError) as error:  # a value that no record may hold
                 self.error = f"recorder: a record could not be packed: {error}"
             except OSError as error:

@@ -89,13 +89,11 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
 
     def run_in_executor(self, executor: Any, func: Callable[..., _T], *args: Any) -> asyncio.Future[_T]:  # type: ignore[override]
         """Run a call in a thread, in real time: meanwhile the world runs no faster."""
-        self._simulated.threads += 1
+        waits = contextlib.ExitStack()
+        waits.enter_context(real_time())
         future = super().run_in_executor(executor, func, *args)
-        future.add_done_callback(self._thread_is_done)
+        future.add_done_callback(lambda _: waits.close())
         return future
-
-    def _thread_is_done(self, _: asyncio.Future[Any]) -> None:
-        self._simulated.threads -= 1
 
     @contextlib.contextmanager
     def time_stands(self) -> Iterator[None]:
@@ -113,12 +111,28 @@ def time_stands() -> contextlib.AbstractContextManager[None]:
     return loop.time_stands() if isinstance(loop, SimulatedLoop) else contextlib.nullcontext()
 
 
-async def start_over(simulated: SimulatedTime, after_s: float) -> None:
-    """Ask the world to start over, at time zero, and wait until `after_s` of the new time."""
+async def start_over(simulated: SimulatedTime) -> None:
+    """Ask the world to start over, at time zero, and wait until it has, if it can."""
     simulated.begins = True
     await asyncio.sleep(_LOOK_S)
-    while simulated.now() < after_s - 1e-9:  # noqa: ASYNC110 - time jumps, and timers with it
-        await asyncio.sleep(_LOOK_S if simulated.now() < 0.0 else after_s - simulated.now())
+    while simulated.now() < 0.0:  # noqa: ASYNC110 - time jumps, and timers with it
+        await asyncio.sleep(_LOOK_S)
+
+
+@contextlib.contextmanager
+def real_time() -> Iterator[None]:
+    """Let simulated time run no faster than real time while the block waits for a thread that lives on the computer's clock. In real
+    time it does nothing.
+    """
+    simulated = simulated_time.current()
+    if simulated is None:
+        yield
+        return
+    simulated.threads += 1
+    try:
+        yield
+    finally:
+        simulated.threads -= 1
 
 
 def process_loop() -> asyncio.AbstractEventLoop:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import select
 import termios
 from collections.abc import Callable, Iterable
 from typing import Self
@@ -253,7 +254,6 @@ class ServoBus:
     def __init__(self, servos: Iterable[ServoModel], *, wire_time: bool = True, page: Page | None = None) -> None:
         self.line = ServoLine(servos)
         self._page = page
-        self._taken = asyncio.Event()
         self.taken_bytes = 0
         """Bytes of instructions that were read from the line."""
         self.dropped_bytes = 0
@@ -294,7 +294,6 @@ class ServoBus:
             if answer:
                 self._send(answer)
             self.taken_bytes += len(data)
-            self._taken.set()
             if self._page is not None:
                 self._page.bus_answered_bytes = self.taken_bytes
             return
@@ -305,13 +304,18 @@ class ServoBus:
         self._timers = {timer for timer in self._timers if not timer.cancelled() and timer.when() > now_s}
         self._timers.add(loop.call_at(self._line_free_s, self._send, answer))
 
-    async def take(self, count: int, timeout_s: float) -> None:
+    def fileno(self) -> int:
+        """Return the descriptor that is readable when an instruction has arrived."""
+        return self._pty.fileno()
+
+    def on_readable(self) -> None:
+        """Answer the instructions that have arrived."""
+        self._pty.on_readable()
+
+    def take(self, count: int, timeout_s: float) -> None:
         """Wait until `count` bytes of instructions have been read from the line, at most `timeout_s` of wall time."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(timeout_s):
-                while self.taken_bytes < count:
-                    self._taken.clear()
-                    await self._taken.wait()
+        while self.taken_bytes < count and select.select((self._pty,), (), (), timeout_s)[0]:
+            self._pty.on_readable()
 
     def inject(self, noise: bytes) -> None:
         """Send bytes on the line unchanged, for example noise."""

@@ -8,6 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, TypeVar
 
 from companion.io.px4.link import device_error
+from companion.runtime.event_loop import real_time
 
 NATIVE_CALL_DEADLINE_S = 5.0
 """Deadline for a native call. MAVSDK sends a command or parameter request up to six times at intervals of 0.5 s."""
@@ -32,8 +33,9 @@ class NativeCalls:
         future = self._worker.submit(call, *args)
         self._last = future
         try:
-            async with asyncio.timeout(deadline_s):
-                return await asyncio.wrap_future(future)
+            with real_time():
+                async with asyncio.timeout(deadline_s):
+                    return await asyncio.wrap_future(future)
         except TimeoutError:
             found = f"no answer within {deadline_s:g} s"
             raise device_error(self._address, expected, found, "check the link") from None

@@ -19,6 +19,7 @@ from companion.io.protocols import DeviceError
 from companion.io.px4.wire import OpenWire, open_wire
 from companion.model.link_address import parse_address
 from companion.runtime.clock import Clock
+from companion.runtime.event_loop import real_time
 
 _native_log = logging.getLogger("companion.mavsdk")
 _log_lock = threading.Lock()
@@ -120,8 +121,9 @@ async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any
     handle = mavsdk.first_autopilot_async(timeout_s, lambda system: loop.call_soon_threadsafe(resolve, system))
     try:
         # MAVSDK enforces the deadline; this one applies only if MAVSDK hangs.
-        async with asyncio.timeout(timeout_s + 2.0):
-            system = await found
+        with real_time():
+            async with asyncio.timeout(timeout_s + 2.0):
+                system = await found
     except TimeoutError:
         system = None
     finally:
