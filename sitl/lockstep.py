@@ -219,7 +219,9 @@ class TimeKeeper:
                     process.waited_for = False
 
     async def _keep_pace(self, now_s: float, processes: Sequence[Process]) -> None:
-        speed = self._speed if all(process.hurried for process in processes) else min(1.0, self._speed)
+        # Before the flight begins MAVSDK connects, which lives on the computer's clock and is impatient.
+        wanted = max(1.0, self._speed) if now_s < 0.0 else self._speed
+        speed = wanted if all(process.hurried for process in processes) else min(1.0, wanted)
         if math.isinf(speed):
             self._from = None
             return

@@ -172,7 +172,7 @@ def test_a_flight_over_wires_that_is_refused_is_lost_and_says_why(monkeypatch: p
     ]
     for row in found["rows"]:
         assert (
-            f'fly {CATCH} --preset paper --world ideal --sitl --set world.faults=[{{"kind": "{row["fault"]}"'
+            f'fly {CATCH} --preset paper --world ideal --sitl --speed max --set world.faults=[{{"kind": "{row["fault"]}"'
             in row["error"]
         )
     assert len(json.loads(Path("out/faults.json").read_text())["wall_s"]) == 2

@@ -1,7 +1,4 @@
-"""Whole missions over real wires: `companion fly --sitl` as a user runs it, in real time.
-
-Limits are wide enough for a loaded machine; the sharp figures are tested in the fast closed loop.
-"""
+"""Whole missions over real wires: `companion fly --sitl` as a user runs it."""
 
 from __future__ import annotations
 
@@ -14,10 +11,7 @@ import pytest
 
 from companion.analysis.contact import rotor_distance_m
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK
-from sitl.campaigns.flights import row_of
-from sitl.fast.loop import FastFlight
 from tests.core.test_sliding import short_slide
-from tests.flights.test_fast_flights import short
 from tests.support import HOVER, HOVERS_S, SHORT_CATCH, Ended, Sandbox, read_summary, run_here, sandbox_in, set_options
 
 THE_CATCH = pytest.mark.xdist_group("the catch over wires")
@@ -63,7 +57,6 @@ def test_the_catch(the_catch: Flown) -> None:
     assert "world" not in json.loads((the_catch.sandbox.cwd / "out/config.json").read_text(encoding="utf-8"))
     assert summary["autopilot"]["kind"] == "stub"
     assert 2.0 < summary["catch_t_s"] < 4.0
-    # Coarse: the mission is short and the computer busy. Sharp figures are those of the fast loop.
     assert summary["rms"]["post"]["e_p_m"] < 0.06
     assert summary["rms"]["post"]["e_q_deg"] < 8.0
     assert summary["tether"]["min_slack_m"] > 0.25
@@ -84,16 +77,6 @@ def test_it_leaves_a_report_with_its_plots(the_catch: Flown) -> None:
 def test_its_log_replays_bit_for_bit(the_catch: Flown) -> None:
     replayed = run_here("replay", the_catch.sandbox.cwd / "out/flight.mcap")
     assert replayed.code == EXIT_OK, (replayed.out, replayed.err)
-
-
-@THE_CATCH
-def test_the_fast_loop_says_what_the_wires_say(the_catch: Flown) -> None:
-    """Position error after the catch, same mission and seed: near each other on a quiet computer, within this on a busy one."""
-    assert the_catch.ended.code == EXIT_OK, the_catch.ended
-    over_wires_m = the_catch.summary["rms"]["post"]["e_p_m"]
-    config = short(f"world.payload_kg={PAYLOAD_KG}")
-    [row, *_] = row_of(config, FastFlight(config).run(), None)
-    assert 0.7 < over_wires_m / row["rms"]["post"]["e_p_m"] < 4.0
 
 
 def test_a_lost_arm_lands_it_and_another_programs_end_is_found(tmp_path_factory: pytest.TempPathFactory) -> None:
@@ -125,5 +108,4 @@ def test_a_tip_slides_along_a_wall(tmp_path_factory: pytest.TempPathFactory) -> 
     assert ended.code == EXIT_OK, ended
     contact = summary["contact"]
     assert contact["slid_m"] == pytest.approx(0.3, abs=0.03)
-    # Coarse: the computer may be busy.
     assert contact["path_rms_m"] < 0.04 and contact["rms_error_n"] < 1.5

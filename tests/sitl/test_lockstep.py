@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import select
 import socket
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -43,91 +45,84 @@ def pair() -> Iterator[Pair]:
     made.world.close()
 
 
-async def advance(pair: Pair, now_s: float, data: bool = False) -> asyncio.Task[None]:
-    """Begin to advance, as far as the world gets without the process."""
-    task = asyncio.ensure_future(pair.keeper.advance(now_s, data))
-    for _ in range(10):
-        await asyncio.sleep(0)
-    return task
+@contextlib.contextmanager
+def at_work(pair: Pair, wake_s: float, *, first: Callable[[], None] = lambda: None) -> Iterator[list[float]]:
+    """The process meanwhile: it works at the instant that it is granted, and reports. The times at which it did."""
+    worked: list[float] = []
+
+    def work() -> None:
+        select.select((pair.process,), (), (), DEADLINE_S)
+        first()
+        worked.append(pair.process.now())
+        pair.report(wake_s)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        yield worked
+    finally:
+        thread.join()
+
+
+def advance(pair: Pair, now_s: float, *, data: bool = False) -> None:
+    pair.keeper.processes["flight"].read()
+    asyncio.run(pair.keeper.advance(now_s, data))
 
 
 def test_the_world_waits_until_a_process_that_is_due_has_reported(pair: Pair) -> None:
-    async def run() -> None:
-        with pair.keeper.listening():
-            pair.report(1.0)
-            assert (await advance(pair, 0.998)).done(), "nothing is due"
-            at_work = await advance(pair, 1.0)
-            assert not at_work.done()
-            assert pair.process.now() == 1.0
-            pair.report(2.0)
-            await asyncio.wait_for(at_work, DEADLINE_S)
-
-    asyncio.run(run())
+    pair.report(1.0)
+    advance(pair, 0.998)  # nothing is due: it would wait for ever
+    with at_work(pair, 2.0, first=lambda: time.sleep(0.05)) as worked:
+        advance(pair, 1.0)
+        assert worked == [1.0]
 
 
 def test_an_old_report_is_no_answer_to_a_grant(pair: Pair) -> None:
     """A thread woke the process, which reports a second time what it has done before."""
+    pair.report(1.0)
+    advance(pair, 0.998)
 
-    async def run() -> None:
-        with pair.keeper.listening():
-            pair.report(1.0)
-            await advance(pair, 0.998)
-            at_work = await advance(pair, 1.0)
-            pair.process.report(1.0)  # it has not read the grant
-            await asyncio.sleep(0.01)
-            assert not at_work.done()
-            pair.report(2.0)
-            await asyncio.wait_for(at_work, DEADLINE_S)
+    def woken() -> None:
+        pair.process.report(1.0)
+        time.sleep(0.05)
 
-    asyncio.run(run())
+    with at_work(pair, 2.0, first=woken) as worked:
+        advance(pair, 1.0)
+        assert worked == [1.0]
 
 
 def test_a_frame_is_a_reason_to_go_on_unless_the_process_does_not_want_it(pair: Pair) -> None:
-    async def run() -> None:
-        with pair.keeper.listening():
-            pair.report(9.0)
-            await advance(pair, 0.0)
-            at_work = await advance(pair, 1.0, data=True)
-            assert not at_work.done()
-            pair.process.take_grants()
-            pair.process.report(9.0, data=False)
-            await asyncio.wait_for(at_work, DEADLINE_S)
-            assert (await advance(pair, 2.0, data=True)).done()
-
-    asyncio.run(run())
+    pair.report(9.0)
+    advance(pair, 0.0)
+    with at_work(pair, 9.0) as worked:
+        advance(pair, 1.0, data=True)
+        assert worked == [1.0]
+    pair.process.report(9.0, data=False)
+    advance(pair, 2.0, data=True)  # nothing is due
 
 
 def test_a_process_that_hangs_is_no_longer_waited_for_until_it_reports(
     pair: Pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lockstep, "PATIENCE_S", 0.05)
-
-    async def run() -> None:
-        with pair.keeper.listening():
-            pair.report(0.0)
-            await advance(pair, 0.0)
-            await asyncio.wait_for(pair.keeper.advance(0.002, False), DEADLINE_S)
-            assert not pair.keeper.processes["flight"].waited_for
-            pair.report(5.0)
-            await asyncio.sleep(0.01)
-            assert pair.keeper.processes["flight"].waited_for
-            at_work = await advance(pair, 5.0)
-            assert not at_work.done()
-            pair.report(9.0)
-            await asyncio.wait_for(at_work, DEADLINE_S)
-
-    asyncio.run(run())
+    pair.report(0.0)
+    advance(pair, 0.0)
+    assert not pair.keeper.processes["flight"].waited_for
+    pair.report(5.0)
+    with at_work(pair, 9.0) as worked:
+        advance(pair, 4.0)
+        assert pair.keeper.processes["flight"].waited_for
+        advance(pair, 5.0)
+        assert worked == [5.0]
 
 
 def test_a_process_that_ends_is_not_waited_for(pair: Pair) -> None:
-    async def run() -> None:
-        with pair.keeper.listening():
-            pair.report(0.0)
-            at_work = await advance(pair, 0.002)
-            pair.process.close()
-            await asyncio.wait_for(at_work, DEADLINE_S)
-
-    asyncio.run(run())
+    pair.report(0.0)
+    ends = threading.Timer(0.05, pair.process.close)
+    ends.start()
+    advance(pair, 0.002)
+    ends.join()
+    assert pair.keeper.processes["flight"].ended
 
 
 def test_without_a_world_time_follows_the_computers_clock(pair: Pair) -> None:
