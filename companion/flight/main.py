@@ -393,7 +393,9 @@ async def fly(
             flight = Flight(config, devices, recorder, channel, operator, clock, guardian)
             got = _claim_computer(config)
             recorder.client.metadata("realtime", {"got": got})
-            ipc.send(channel, {"type": "started", "recorder_pid": recorder.process.pid, "realtime": got})
+            kind = "real" if simulated_time.current() is None else "simulated"
+            started = {"type": "started", "recorder_pid": recorder.process.pid, "realtime": got, "clock": kind}
+            ipc.send(channel, started)
             try:
                 outcome = await flight.run()
             except Exception:  # after any error the vehicle may be in the air

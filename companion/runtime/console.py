@@ -164,7 +164,8 @@ class FlightDisplay:
         elif kind == "preflight":
             self._preflight(message["rows"])
         elif kind == "started":
-            self._line("real time", message["realtime"], "dim")
+            head = "clock" if message.get("clock") == "simulated" else "real time"
+            self._line(head, message["realtime"], "dim")
         elif kind == "px4":
             self._line("PX4", message["text"], "yellow")
         elif kind == "command":
