@@ -57,6 +57,11 @@ class FlightLog:
     measured: Timing | None = None
     """Timing of all ticks; None if all ticks are kept."""
 
+    @property
+    def clock(self) -> str:
+        """Return the clock that the flight lived on: `simulated` or `real`. In simulated time its latencies are zero."""
+        return self.metadata.get("flight", {}).get("clock", "real")
+
     @staticmethod
     def read(path: Path, *, ticks_max: int | None = None) -> FlightLog:
         """Read a log.

@@ -238,6 +238,8 @@ def _path(log: FlightLog) -> Figure | None:
 
 
 def _timing(log: FlightLog) -> Figure | None:
+    if log.clock == "simulated":
+        return None
     figure = new_figure(5.4)
     panes: dict[str, Any] = figure.subplot_mosaic([["time", "time", "time"], ["late", "joint", "mocap"]])
     late_ms = 1e3 * log.columns.lateness_s

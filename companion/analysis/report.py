@@ -119,13 +119,17 @@ def _results(summary: dict[str, Any], stride: int, catches: bool) -> list[Table]
         ("control loop", f"{_number(loop['rate_hz'], 1)} Hz, {loop['ticks']} ticks, {loop['missed']} missed"),
         ("recorded", f"{recorder['samples']} ticks, {recorder['dropped']} dropped"),
     ]
+    clock = summary["clock"]
+    if clock["kind"] == "simulated":
+        pace = "" if clock["pace"] is None else f", {clock['pace']:.1f} x real time"
+        processes.insert(0, ("clock", f"simulated time{pace}; latencies are zero"))
     if recorder.get("error"):
         processes.append(("recorder", recorder["error"]))
     return [
         _pairs("RMS error", rms, *parts.values()),
         _pairs("Flight", flight),
         *_contact(summary),
-        _pairs("Timing [ms]", timing, "p50", "p99", "max"),
+        *([] if clock["kind"] == "simulated" else [_pairs("Timing [ms]", timing, "p50", "p99", "max")]),
         _pairs("Loop and log", processes),
     ]
 

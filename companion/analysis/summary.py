@@ -85,7 +85,7 @@ def summarise(
     summary = empty_summary(
         outcome=outcome, controller=controller, preset=preset, payload_kg=payload_kg, recorder=recorder or counted
     )
-    summary["clock"]["kind"] = log.metadata.get("flight", {}).get("clock", "real")
+    summary["clock"]["kind"] = log.clock
     if not log.inputs:
         return summary
     caught = metrics.catch_index(log)
