@@ -182,6 +182,10 @@ class TimeKeeper:
             process.begins = False
         return bool(asked)
 
+    def limit_to_real_time(self) -> None:
+        """Never run faster than real time."""
+        self._speed = min(1.0, self._speed)
+
     def set(self, now_s: float) -> None:
         """Set the simulated time, which may jump."""
         self.page.now_s = now_s

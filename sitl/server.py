@@ -283,6 +283,8 @@ class Sitl:
         """Step, let the flight do what it does at this instant, and so on."""
         loop = asyncio.get_running_loop()
         assert isinstance(loop, LockstepLoop)
+        if self.autopilot.lockstep:  # threads of a real PX4 send its telemetry on the computer's clock
+            keeper.limit_to_real_time()
         before_s = 0.0 if self.autopilot.lockstep else BEFORE_S
         keeper.set(before_s + self.plant.t_s)
         keeper.bus = self.bus
