@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -18,14 +17,10 @@ STEP_MS = 1.0
 """The world sends a frame in the next of its steps of 2 ms, and is held up now and then."""
 
 
-def measured(
-    sandbox: Sandbox,
-    *knobs: str,
-    options: tuple[object, ...] = (),
-    run: Callable[..., Ended] = run_here,
-) -> Ended:
+def measured(sandbox: Sandbox, *knobs: str, options: tuple[object, ...] = ()) -> Ended:
+    """In a process of its own, which has real-time priority as in flight."""
     with World(sandbox, overrides=[*TAPPED, *knobs]) as world:
-        return run("latency", "--json", "--vehicle", VEHICLE, *options, *world.addresses())
+        return sandbox.run("latency", "--json", "--vehicle", VEHICLE, *options, *world.addresses())
 
 
 def near(found: dict[str, Any], wanted_ms: float) -> None:
@@ -34,7 +29,7 @@ def near(found: dict[str, Any], wanted_ms: float) -> None:
 
 
 def test_the_stubs_5_ms_are_found(sandbox: Sandbox) -> None:
-    ended = measured(sandbox, options=FEWEST, run=sandbox.run)
+    ended = measured(sandbox, options=FEWEST)
     found = document(ended)
     assert ended.code == EXIT_OK
     near(found, 6.0)
