@@ -122,7 +122,7 @@ def _results(summary: dict[str, Any], stride: int, catches: bool) -> list[Table]
     clock = summary["clock"]
     if clock["kind"] == "simulated":
         pace = "" if clock["pace"] is None else f", {clock['pace']:.1f} x real time"
-        processes.insert(0, ("clock", f"simulated time{pace}; latencies are zero"))
+        processes.insert(0, ("clock", f"simulated{pace}"))
     if recorder.get("error"):
         processes.append(("recorder", recorder["error"]))
     return [
