@@ -17,7 +17,7 @@ from companion.io.force_torque.plugin_driver import open_force
 from companion.io.mocap.plugin_driver import open_mocap
 from companion.io.protocols import Arm, Autopilot, DeviceError, ForceTorque, GroundLink, Mocap
 from companion.io.px4.driver import MavsdkAutopilot
-from companion.io.px4.inbox import ESTIMATOR_RATE_HZ
+from companion.io.px4.streams import ESTIMATOR_RATE_HZ
 from companion.io.qgroundcontrol.station import GroundStation, check_address
 from companion.model.estimator import WATCHED_RATE_HZ
 from companion.model.flight_stage import is_armed

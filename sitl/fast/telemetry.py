@@ -9,8 +9,8 @@ from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.io.px4.delta_velocity import DeltaVelocity
-from companion.io.px4.inbox import ATTITUDE_RATE_HZ, ESTIMATOR_RATE_HZ, IMU_RATE_HZ, LANDED_RATE_HZ, POSITION_RATE_HZ
 from companion.io.px4.messages import battery, estimator_report, heartbeat_state, landed_state
+from companion.io.px4.streams import ATTITUDE_RATE_HZ, ESTIMATOR_RATE_HZ, IMU_RATE_HZ, LANDED_RATE_HZ, POSITION_RATE_HZ
 from companion.model.estimator import WATCHED_RATE_HZ, EstimatorReport
 from companion.model.frames import attitude_enu_flu_from_ned_frd, enu_from_ned, flu_from_frd
 from companion.model.types import (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 import struct
 import sys
@@ -19,6 +18,7 @@ from companion.guardian.link import Link
 from companion.guardian.px4 import Px4State
 from companion.io.px4 import messages
 from companion.io.px4.driver import MavsdkAutopilot
+from companion.io.px4.params import value_of
 from companion.io.px4.wire import UdpWire
 from companion.model.types import FlightMode, VehicleState
 from tests.fuzz.mutate import mutated
@@ -90,9 +90,13 @@ class MavlinkTarget(Target):
             if not isinstance(armed, bool) or not isinstance(mode, FlightMode):
                 raise Wrong(f"heartbeat: {armed}, {mode}")
         elif kind == "COMMAND_ACK":
-            reason = messages.refusal(_fields_json(message))
-            if (reason is None) != (message.result == 0):
-                raise Wrong(f"COMMAND_ACK {message.result}: {reason}")
+            messages.result_text(message.result)
+        elif kind == "AUTOPILOT_VERSION":
+            messages.firmware(message)
+        elif kind == "PARAM_VALUE":
+            name, value = value_of(message)
+            if isinstance(value, int) is (message.param_type == mavlink.MAV_PARAM_TYPE_REAL32):
+                raise Wrong(f"{name}: {value!r} of type {message.param_type}")
         elif kind == "BATTERY_STATUS":
             voltage_v, remaining = messages.battery(message.voltages, message.battery_remaining)
             if (voltage_v is not None and voltage_v <= 0.0) or (remaining is not None and not 0.0 <= remaining <= 1.0):
@@ -217,10 +221,3 @@ def _heartbeat(custom_mode: int) -> Any:
     return mavlink.MAVLink_heartbeat_message(
         mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, flags, custom_mode, 4, 3
     )
-
-
-def _fields_json(message: Any) -> str:
-    """Return the fields as JSON, as MAVSDK's MavlinkDirect delivers them."""
-    fields = message.to_dict()
-    fields["message_name"] = fields.pop("mavpackettype")
-    return json.dumps(fields)

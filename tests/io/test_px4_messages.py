@@ -85,9 +85,8 @@ def test_the_setpoint_keeps_single_precision() -> None:
 
 
 def test_answers_in_words() -> None:
-    assert messages.refusal('{"result":0}') is None
-    assert messages.refusal('{"result":2}') == "denied (MAV_RESULT 2)"
-    assert messages.refusal('{"result":99}') == "unknown result (MAV_RESULT 99)"
+    assert messages.result_text(2) == "denied (MAV_RESULT 2)"
+    assert messages.result_text(99) == "unknown result (MAV_RESULT 99)"
 
 
 def test_a_request_repeated_in_every_tick_is_a_command_every_half_second_until_it_is_answered() -> None:

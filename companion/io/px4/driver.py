@@ -17,24 +17,21 @@ from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import Any, Self
 
-from mavsdk import ComponentType, Configuration, Mavsdk, MavsdkError
-from mavsdk.plugins.info.info import Info
-from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect
-from mavsdk.plugins.param.param import Param
-from mavsdk.plugins.telemetry.telemetry import Telemetry
+from mavsdk import ComponentType, Configuration, Mavsdk
 
 from companion.config.devices import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4 import messages
-from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls
 from companion.io.px4.claim import LinkClaim
 from companion.io.px4.frames import FrameReader, FrameWriter
-from companion.io.px4.inbox import ESTIMATOR_RATE_HZ, Inbox, ask_for_streams, stop_unread_streams
+from companion.io.px4.inbox import Inbox
 from companion.io.px4.link import check_address, device_error, first_autopilot, open_link, quiet_native_log
 from companion.io.px4.origin import ensure_origin
 from companion.io.px4.params import ParamTransfer
+from companion.io.px4.questions import Questions
 from companion.io.px4.requests import RequestQueue
 from companion.io.px4.setpoints import SetpointPath, setpoint_path
+from companion.io.px4.streams import ESTIMATOR_RATE_HZ, ask_for_streams, stop_unread_streams
 from companion.io.px4.wire import OpenWire, UdpWire
 from companion.model.estimator import EstimatorReport
 from companion.model.observations import StateCounts
@@ -48,10 +45,8 @@ from companion.model.types import (
 )
 from companion.runtime.clock import Clock
 
-_CONNECT_DEADLINE_S = 5.0
 _HEARTBEAT_DEADLINE_S = 5.0
 """Deadline for PX4's heartbeat, which is sent once per second."""
-_CLOSE_DEADLINE_S = 4.0
 _PUMP_S, _PUMP_IN_FLIGHT_S = 0.005, 0.05
 """Period at which the link is read while the flight loop does not read it, as at start-up, and at which that is checked otherwise."""
 _RELAY_DATAGRAMS_MAX = 16
@@ -86,7 +81,6 @@ class MavsdkAutopilot:
         self._clock = clock
         self._requests = RequestQueue()
         self._inbox = Inbox(self._requests, self._show_ground_station)
-        self._calls = NativeCalls(device.address)
         self._mavsdk: Any = None
         self._connection: Any = None
         self._wire: OpenWire | None = None
@@ -97,10 +91,8 @@ class MavsdkAutopilot:
         self._pump_timer: asyncio.TimerHandle | None = None
         self._polled_s = -math.inf
         self._restore_log: Callable[[], None] | None = None
-        self._direct: Any = None
         self._setpoints: SetpointPath | None = None
-        self._info: Any = None
-        self._params: ParamTransfer | None = None
+        self._questions: Questions | None = None
         self._open = False
         self._loop: asyncio.AbstractEventLoop | None = None
         self._system_id = 0
@@ -128,30 +120,20 @@ class MavsdkAutopilot:
             await claim.find_px4(self._device.discovery_timeout_s)
             self._writer = FrameWriter(*self._own_ids)
             self._reader = FrameReader(stream=claim.peer is None)
-            self._wire = await self._calls.run(
-                *("the connection to open", _CONNECT_DEADLINE_S, open_link),
-                *(address, claim.peer, self._clock, self._reports.append),
-            )
+            self._wire = await asyncio.to_thread(open_link, address, claim.peer, self._clock, self._reports.append)
             self._pump()
             async with claim.calling(self._own_ids):
                 system = await first_autopilot(self._mavsdk, address, self._device.discovery_timeout_s)
             self._system_id = int(system.get_system_id())
             if isinstance(self._wire, UdpWire):
                 self._wire.system = self._system_id
-            self._direct = MavlinkDirect(system)
             self._setpoints = setpoint_path(self._device.setpoint_path, system, self._send_message)
-            telemetry = Telemetry(system)
-            self._params = ParamTransfer(
-                address, self._clock, self._calls, self._direct, Param(system), self._system_id
-            )
-            self._info = Info(system)
-            streams = (telemetry, self._direct, self._system_id, self._estimator_rate_hz)
-            await ask_for_streams(address, self._calls, *streams)
+            self._questions = questions = Questions(address, self._system_id, self._inbox, self._send_message)
+            await ask_for_streams(questions, self._estimator_rate_hz)
             self._open = True
             await self.ensure_origin()
             if not await self._armed():  # a vehicle in flight does not wait for it
-                link = (address, self._calls, self._direct, self._system_id)
-                await stop_unread_streams(*link, forwarded=self._forwarding)
+                stop_unread_streams(questions, forwarded=self._forwarding)
             claim.refuse_rivals()
         except BaseException:
             await self._close()
@@ -237,7 +219,7 @@ class MavsdkAutopilot:
         LAND never waits for a command of another kind. `take_messages` returns refusals.
         """
         if self._open and self._requests.claim(request, self._clock()):
-            self._send_message(messages.COMMAND_LONG_ID, messages.command_long(request, self._system_id))
+            self._send_message(*messages.command_long(*messages.command(request), self._system_id))
 
     def take_messages(self) -> list[str]:
         """Return, oldest first, all refusals and STATUSTEXTs since the last call, and reports of a new port of PX4 or of a second
@@ -256,7 +238,7 @@ class MavsdkAutopilot:
         Raises:
             DeviceError: an invalid name, or no answer within the deadline.
         """
-        return await self._transfer().read(names)
+        return await self._params().read(names)
 
     async def read_param(self, name: str) -> float | int:
         """Return the value of one PX4 parameter, int or float as PX4 stores it.
@@ -264,7 +246,7 @@ class MavsdkAutopilot:
         Raises:
             DeviceError: no such name, or no answer within the deadline.
         """
-        values = await self._transfer().read([name])
+        values = await self._params().read([name])
         if name not in values:
             fix = "check the name against PX4's version"
             raise device_error(self._device.address, f"PX4's parameter {name}", "no such parameter", fix)
@@ -276,7 +258,7 @@ class MavsdkAutopilot:
         Raises:
             DeviceError: PX4 has no such parameter, its type cannot hold the value, or PX4 refuses the value or keeps a different one.
         """
-        return await self._transfer().write(name, value)
+        return await self._params().write(name, value)
 
     async def ensure_origin(self) -> bool:
         """Set PX4's global origin (`companion.io.px4.origin`) unless it has one or is armed. Return whether PX4 reports an origin.
@@ -286,8 +268,7 @@ class MavsdkAutopilot:
         Raises:
             DeviceError: PX4 does not answer, or sends no heartbeat.
         """
-        self._require_open()
-        return await ensure_origin(self._device.address, self._calls, self._direct, self._system_id, self._armed)
+        return await ensure_origin(self._ask(), self._armed)
 
     def start_sums(self) -> None:
         """Start the sums over PX4's samples, such as the change of velocity, at zero; called when the flight begins."""
@@ -310,20 +291,17 @@ class MavsdkAutopilot:
         Raises:
             DeviceError: no AUTOPILOT_VERSION within the deadline.
         """
-        self._require_open()
-        try:
-            version = await self._calls.run("PX4's version", 2 * NATIVE_CALL_DEADLINE_S, _get_version, self._info)
-        except MavsdkError as error:
-            found = str(error).split(";")[0]
-            fix = "check the link"
-            raise device_error(self._device.address, "PX4's version (AUTOPILOT_VERSION)", found, fix) from None
-        number = f"{version.flight_sw_major}.{version.flight_sw_minor}.{version.flight_sw_patch}"
-        return f"PX4 {number} {version.flight_sw_version_type.name.lower()} (git {version.flight_sw_git_hash or 'unknown'})"
+        question = messages.command_long(messages.REQUEST_MESSAGE, messages.AUTOPILOT_VERSION_ID, 0.0, self._system_id)
+        expected = "PX4's version (AUTOPILOT_VERSION)"
+        return await self._ask().ask(expected, question, messages.AUTOPILOT_VERSION_ID, messages.firmware)
 
-    def _transfer(self) -> ParamTransfer:
+    def _params(self) -> ParamTransfer:
+        return ParamTransfer(self._clock, self._ask())
+
+    def _ask(self) -> Questions:
         self._require_open()
-        assert self._params is not None
-        return self._params
+        assert self._questions is not None
+        return self._questions
 
     def _require_open(self) -> None:
         if not self._open:
@@ -409,13 +387,6 @@ class MavsdkAutopilot:
 
     def _tear_down(self) -> None:
         try:
-            # MAVSDK must not be destroyed under a call that is still inside it.
-            if not self._calls.finish(_CLOSE_DEADLINE_S):
-                _log.error(
-                    "autopilot %s: a call into MAVSDK hangs; it is not closed before the process ends",
-                    self._device.address,
-                )
-                return
             if self._mavsdk is not None:
                 self._mavsdk.destroy()
         except Exception as error:
@@ -423,10 +394,6 @@ class MavsdkAutopilot:
         finally:
             if self._restore_log is not None:
                 self._restore_log()
-
-
-def _get_version(info: Any) -> Any:
-    return info.get_version()
 
 
 __all__ = ["DeviceError", "MavsdkAutopilot"]

@@ -6,32 +6,19 @@ The three fast streams of the vehicle's state are decoded by `companion.io.px4.m
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
-from mavsdk import MavsdkError
-from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkMessage
-from mavsdk.plugins.telemetry.telemetry import Telemetry
 from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.io.px4 import messages
-from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls
 from companion.io.px4.delta_velocity import DeltaVelocity
-from companion.io.px4.link import device_error
 from companion.io.px4.requests import RequestQueue
 from companion.model.estimator import EstimatorReport
 from companion.model.frames import flu_from_frd
 from companion.model.observations import StateCounts
 from companion.model.types import AutopilotStatus, FlightMode, LandedState, Quat, Vec3, VehicleState
-
-POSITION_RATE_HZ = 200.0
-"""Requested rate of LOCAL_POSITION_NED; PX4 delivers about 124 Hz."""
-ATTITUDE_RATE_HZ = 250.0
-"""Requested rate of ATTITUDE_QUATERNION, which also carries the angular rates."""
-IMU_RATE_HZ = 250.0
-LANDED_RATE_HZ = 10.0
-ESTIMATOR_RATE_HZ = 5.0
 
 
 class Inbox:
@@ -55,6 +42,7 @@ class Inbox:
         self._landed = LandedState.UNKNOWN
         self._battery: tuple[float | None, float | None] = (None, None)
         self._decoder = mavlink.MAVLink(None)
+        self._listeners: dict[int, list[Callable[[Any], None]]] = {}
         self._takers: dict[int, Callable[[float, Any], None]] = {
             mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._on_heartbeat,
             mavlink.MAVLINK_MSG_ID_COMMAND_ACK: self._on_ack,
@@ -72,18 +60,32 @@ class Inbox:
         self._delta_velocity_frd = DeltaVelocity()
 
     def take(self, stamp_s: float, message_id: int, frame: bytes) -> None:
-        """Store a message of the autopilot that is not one of `readers`, if the companion reads it.
+        """Store a message of the autopilot that is not one of `readers`, if the companion reads it or somebody listens.
 
         Args:
             stamp_s: arrival on the flight clock.
             message_id: MAVLink message id.
             frame: whole frame with a valid checksum.
         """
-        taker = self._takers.get(message_id)
-        if taker is None:
+        taker, listeners = self._takers.get(message_id), self._listeners.get(message_id)
+        if taker is None and not listeners:
             return
         with contextlib.suppress(mavlink.MAVError):  # a field that pymavlink does not accept
-            taker(stamp_s, self._decoder.decode(bytearray(frame)))
+            message = self._decoder.decode(bytearray(frame))
+            if taker is not None:
+                taker(stamp_s, message)
+            for listener in listeners or ():
+                listener(message)
+
+    @contextlib.contextmanager
+    def listening(self, message_id: int, listener: Callable[[Any], None]) -> Iterator[None]:
+        """While the context is open, call `listener` with each message of this id, as pymavlink decodes it."""
+        listeners = self._listeners.setdefault(message_id, [])
+        listeners.append(listener)
+        try:
+            yield
+        finally:
+            listeners.remove(listener)
 
     def vehicle(self) -> VehicleState | None:
         """Return the latest fused state, or None before position, attitude, rates and IMU have all arrived. Stamps are arrival
@@ -179,61 +181,3 @@ class Inbox:
 
     def _on_status_text(self, stamp_s: float, message: Any) -> None:
         self._requests.hear(message.to_dict(), stamp_s)
-
-
-async def ask_for_streams(
-    address: str,
-    calls: NativeCalls,
-    telemetry: Telemetry,
-    direct: MavlinkDirect,
-    system_id: int,
-    estimator_rate_hz: float = ESTIMATOR_RATE_HZ,
-) -> None:
-    """Request every stream that `Inbox` stores, at its rate.
-
-    Raises:
-        DeviceError: PX4 refused one, or did not answer.
-    """
-
-    def estimator_rate(rate_hz: float) -> None:
-        fields = messages.set_message_interval_json(messages.ESTIMATOR_STATUS_ID, rate_hz, system_id)
-        ack = direct.send_command(MavlinkMessage("COMMAND_LONG", fields_json=fields))
-        reason = messages.refusal(ack.fields_json)
-        if reason is not None:
-            raise _RefusedError(reason)
-
-    for stream, rate_hz, ask in (
-        ("LOCAL_POSITION_NED", POSITION_RATE_HZ, telemetry.set_rate_position_velocity_ned),
-        ("ATTITUDE_QUATERNION", ATTITUDE_RATE_HZ, telemetry.set_rate_attitude_quaternion),
-        ("HIGHRES_IMU", IMU_RATE_HZ, telemetry.set_rate_imu),
-        ("EXTENDED_SYS_STATE", LANDED_RATE_HZ, telemetry.set_rate_landed_state),
-        ("ESTIMATOR_STATUS", estimator_rate_hz, estimator_rate),
-    ):
-        expected = f"PX4 to stream {stream} at {rate_hz:g} Hz"
-        try:
-            await calls.run(expected, NATIVE_CALL_DEADLINE_S, ask, rate_hz)
-        except (MavsdkError, _RefusedError) as error:
-            fix = "check the link's bandwidth (MAV_x_RATE, baud) and that it is an onboard-mode MAVLink instance"
-            raise device_error(address, expected, str(error).split(";")[0], fix) from None
-
-
-async def stop_unread_streams(
-    address: str, calls: NativeCalls, direct: MavlinkDirect, system_id: int, *, forwarded: bool
-) -> None:
-    """Stop the streams of PX4's onboard mode that the companion does not read, 250 messages a second: MAVSDK converts each of them to
-    JSON, read or not. A ground station behind the link reads them: with `forwarded` they get PX4's default rates again.
-
-    PX4 may lack one, and a link that loses these commands costs nothing but processor time, so answers are ignored.
-
-    Raises:
-        DeviceError: a call into MAVSDK hangs.
-    """
-    interval_json = messages.default_message_interval_json if forwarded else messages.stop_message_json
-    for message_id in messages.UNREAD_IDS:
-        command = MavlinkMessage("COMMAND_LONG", fields_json=interval_json(message_id, system_id))
-        with contextlib.suppress(MavsdkError):
-            await calls.run("an answer to SET_MESSAGE_INTERVAL", NATIVE_CALL_DEADLINE_S, direct.send_command, command)
-
-
-class _RefusedError(Exception):
-    """PX4 denied a command; the text is PX4's reason."""

@@ -118,18 +118,15 @@ async def first_autopilot(mavsdk: Mavsdk, address: str, timeout_s: float) -> Any
         if not found.done():
             found.set_result(system)
 
-    handle = mavsdk.first_autopilot_async(timeout_s, lambda system: loop.call_soon_threadsafe(resolve, system))
+    handle = mavsdk.first_autopilot_async(-1.0, lambda system: loop.call_soon_threadsafe(resolve, system))
     try:
-        # MAVSDK enforces the deadline; this one applies only if MAVSDK hangs.
         with real_time():
-            async with asyncio.timeout(timeout_s + 2.0):
+            async with asyncio.timeout(timeout_s):
                 system = await found
     except TimeoutError:
-        system = None
+        raise no_heartbeat(address, timeout_s) from None
     finally:
         mavsdk.cancel_first_autopilot(handle)
-    if system is None:
-        raise no_heartbeat(address, timeout_s)
     kind = system.autopilot_type()
     if kind != AutopilotKind.PX4:
         raise device_error(address, "PX4", kind.name, "connect a PX4 autopilot; companion supports no other autopilot")

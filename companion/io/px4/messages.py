@@ -5,7 +5,6 @@ All frame conversions between companion and PX4 are here: NED/FRD on the wire, w
 
 from __future__ import annotations
 
-import json
 import math
 import struct
 from collections.abc import Mapping, Sequence
@@ -34,18 +33,19 @@ from companion.model.types import (
 
 LOCAL_POSITION_NED_ID, ATTITUDE_QUATERNION_ID, HIGHRES_IMU_ID = 32, 31, 105
 SET_ATTITUDE_TARGET_ID, VISION_POSITION_ESTIMATE_ID = 82, 102
-GPS_GLOBAL_ORIGIN_ID = 49
-ESTIMATOR_STATUS_ID = 230
 UNREAD_IDS = (30, 33, 36, 65, 74, 83, 85, 87, 141, 290, 291, 331)
 """Streams of PX4's onboard mode (mavlink_main.cpp, MAVLINK_MODE_ONBOARD) at 10 Hz and above that the companion does not read:
 ATTITUDE, GLOBAL_POSITION_INT, SERVO_OUTPUT_RAW, RC_CHANNELS, VFR_HUD, ATTITUDE_TARGET, POSITION_TARGET_LOCAL_NED,
 POSITION_TARGET_GLOBAL_INT, ALTITUDE, ESC_INFO, ESC_STATUS, ODOMETRY. TIMESYNC stays, for PX4's clock.
 """
-_REQUEST_MESSAGE, _SET_MESSAGE_INTERVAL = 512, 511
-HEARTBEAT_ID, COMMAND_LONG_ID, COMMAND_ACK_ID = 0, 76, 77
+HEARTBEAT_ID, COMMAND_LONG_ID, COMMAND_ACK_ID, AUTOPILOT_VERSION_ID = 0, 76, 77, 148
+PARAM_REQUEST_READ_ID, PARAM_VALUE_ID, PARAM_SET_ID, SET_GPS_GLOBAL_ORIGIN_ID = 20, 22, 23, 48
+MAV_PARAM_TYPE_INT32, MAV_PARAM_TYPE_REAL32 = 6, 9
 GROUND_STATION_HEARTBEAT = struct.pack("<I5B", 0, 6, 8, 0, 4, 3)
 """Payload of HEARTBEAT: MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, MAV_STATE_ACTIVE."""
-MAV_RESULT_IN_PROGRESS = 5
+MAV_RESULT_ACCEPTED, MAV_RESULT_IN_PROGRESS = 0, 5
+REQUEST_MESSAGE, SET_MESSAGE_INTERVAL = 512, 511
+"""MAV_CMD; the first parameter is a message id."""
 
 MAV_COMP_ID_AUTOPILOT1 = 1
 _MAV_MODE_FLAG_CUSTOM_MODE_ENABLED = 1
@@ -110,6 +110,7 @@ def flight_mode(base_mode: int, custom_mode: int) -> FlightMode:
 
 
 _LOCAL_POSITION, _ATTITUDE, _IMU = struct.Struct("<I6f"), struct.Struct("<I7f"), struct.Struct("<Q3f")
+_PARAM_REQUEST_READ, _GLOBAL_ORIGIN = struct.Struct("<hBB16s"), struct.Struct("<3iB")
 _ATTITUDE_TARGET, _VISION, _COMMAND_LONG = struct.Struct("<I8f3B"), struct.Struct("<Q7f"), struct.Struct("<7fH3B")
 
 
@@ -238,30 +239,31 @@ def command(request: AutopilotRequest) -> tuple[int, float, float]:
     return _COMMANDS[request]
 
 
-def command_long(request: AutopilotRequest, target_system: int) -> bytes:
-    """Return the payload of COMMAND_LONG for a request with the fields of `command`; raises the errors of `command`."""
-    number, param1, param2 = command(request)
-    return _COMMAND_LONG.pack(param1, param2, 0.0, 0.0, 0.0, 0.0, 0.0, number, target_system, MAV_COMP_ID_AUTOPILOT1, 0)
+def command_long(number: int, param1: float, param2: float, target_system: int) -> tuple[int, bytes]:
+    """Return id and payload of COMMAND_LONG with a MAV_CMD and its first two parameters; the others are 0."""
+    payload = _COMMAND_LONG.pack(
+        param1, param2, 0.0, 0.0, 0.0, 0.0, 0.0, number, target_system, MAV_COMP_ID_AUTOPILOT1, 0
+    )
+    return COMMAND_LONG_ID, payload
 
 
-def request_message_json(message_id: int, target_system: int) -> str:
-    """Return COMMAND_LONG MAV_CMD_REQUEST_MESSAGE (512), which requests a message once."""
-    return _command_json(_REQUEST_MESSAGE, float(message_id), 0.0, target_system)
+def param_request_read(name: str, target_system: int) -> tuple[int, bytes]:
+    """Return id and payload of PARAM_REQUEST_READ by name."""
+    return PARAM_REQUEST_READ_ID, _PARAM_REQUEST_READ.pack(-1, target_system, MAV_COMP_ID_AUTOPILOT1, name.encode())
 
 
-def set_message_interval_json(message_id: int, rate_hz: float, target_system: int) -> str:
-    """Return COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL (511), which requests a stream; PX4 expects the interval in us."""
-    return _command_json(_SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate_hz, target_system)
+def param_set(name: str, value: int | float, target_system: int) -> tuple[int, bytes]:
+    """Return id and payload of PARAM_SET; PX4 expects the bytes of an INT32 in place of the float."""
+    kind, wire = (MAV_PARAM_TYPE_INT32, "<iBB16sB") if isinstance(value, int) else (MAV_PARAM_TYPE_REAL32, "<fBB16sB")
+    return PARAM_SET_ID, struct.pack(wire, value, target_system, MAV_COMP_ID_AUTOPILOT1, name.encode(), kind)
 
 
-def stop_message_json(message_id: int, target_system: int) -> str:
-    """Return COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL (511) with interval -1, which stops a stream."""
-    return _command_json(_SET_MESSAGE_INTERVAL, float(message_id), -1.0, target_system)
-
-
-def default_message_interval_json(message_id: int, target_system: int) -> str:
-    """Return COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL (511) with interval 0, which requests PX4's default rate."""
-    return _command_json(_SET_MESSAGE_INTERVAL, float(message_id), 0.0, target_system)
+def set_global_origin(
+    latitude_deg: float, longitude_deg: float, altitude_m: float, target_system: int
+) -> tuple[int, bytes]:
+    """Return id and payload of SET_GPS_GLOBAL_ORIGIN: angles in 1e-7 deg, altitude in mm."""
+    place = round(latitude_deg * 1e7), round(longitude_deg * 1e7), round(altitude_m * 1e3)
+    return SET_GPS_GLOBAL_ORIGIN_ID, _GLOBAL_ORIGIN.pack(*place, target_system)
 
 
 def estimator_report(fields: Mapping[str, Any], stamp_s: float) -> EstimatorReport:
@@ -284,23 +286,16 @@ def estimator_report(fields: Mapping[str, Any], stamp_s: float) -> EstimatorRepo
     )
 
 
-def _command_json(number: int, param1: float, param2: float, target_system: int) -> str:
-    fields: dict[str, float | int] = {
-        "target_system": target_system,
-        "target_component": MAV_COMP_ID_AUTOPILOT1,
-        "command": number,
-        "confirmation": 0,
-        "param1": param1,
-        "param2": param2,
-    }
-    fields.update((f"param{i}", 0.0) for i in range(3, 8))
-    return json.dumps(fields)
+_RELEASES = {0: "dev", 64: "alpha", 128: "beta", 192: "rc", 255: "release"}
 
 
-def refusal(ack_json: str) -> str | None:
-    """Return the reason if a COMMAND_ACK is a refusal, or None if it is an acceptance."""
-    result = int(json.loads(ack_json)["result"])
-    return None if result == 0 else result_text(result)
+def firmware(message: Any) -> str:
+    """Return an AUTOPILOT_VERSION as text: version, FIRMWARE_VERSION_TYPE and the git hash, whose bytes PX4 sends last first."""
+    major, minor, patch, release = int(message.flight_sw_version).to_bytes(4, "big")
+    git = bytes(message.flight_custom_version[::-1])
+    return (
+        f"PX4 {major}.{minor}.{patch} {_RELEASES.get(release, 'unknown')} (git {git.hex() if any(git) else 'unknown'})"
+    )
 
 
 def result_text(result: int) -> str:

@@ -9,38 +9,19 @@ stays off by 488 m. If it is set during fusion, the filter resets and its innova
 
 from __future__ import annotations
 
-import json
 from collections.abc import Awaitable, Callable
-from typing import Any
 
-from mavsdk import MavsdkError
-from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkMessage
+from pymavlink.dialects.v20 import common as mavlink
 
-from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls
-from companion.io.px4.link import device_error
-from companion.io.px4.messages import GPS_GLOBAL_ORIGIN_ID, refusal, request_message_json
+from companion.io.px4 import messages
+from companion.io.px4.questions import Questions
 
 ORIGIN_LATITUDE_DEG = 0.0
 ORIGIN_LONGITUDE_DEG = 0.0
 ORIGIN_ALTITUDE_M = 0.0
 
 
-def set_origin_json(system_id: int) -> str:
-    """Return SET_GPS_GLOBAL_ORIGIN for a system. The altitude is in mm, the angles in 1e-7 deg."""
-    return json.dumps(
-        {
-            "target_system": system_id,
-            "latitude": round(ORIGIN_LATITUDE_DEG * 1e7),
-            "longitude": round(ORIGIN_LONGITUDE_DEG * 1e7),
-            "altitude": round(ORIGIN_ALTITUDE_M * 1e3),
-            "time_usec": 0,
-        }
-    )
-
-
-async def ensure_origin(
-    address: str, calls: NativeCalls, direct: MavlinkDirect, system_id: int, armed: Callable[[], Awaitable[bool]]
-) -> bool:
+async def ensure_origin(questions: Questions, armed: Callable[[], Awaitable[bool]]) -> bool:
     """Set PX4's origin unless it has one or is armed. Return whether PX4 reports an origin.
 
     PX4 reports its origin only while its position is valid, so right after boot, before any vision, the result is False although the
@@ -49,20 +30,18 @@ async def ensure_origin(
     Raises:
         DeviceError: PX4 does not answer at all.
     """
-    if await _has_origin(address, calls, direct, system_id):
+    if await _has_origin(questions):
         return True
     if await armed():
         return False  # moving the origin in flight is worse than having none
-    direct.send_message(MavlinkMessage("SET_GPS_GLOBAL_ORIGIN", fields_json=set_origin_json(system_id)))
-    return await _has_origin(address, calls, direct, system_id)
+    origin = (ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG, ORIGIN_ALTITUDE_M)
+    questions.send(*messages.set_global_origin(*origin, questions.system_id))
+    return await _has_origin(questions)
 
 
-async def _has_origin(address: str, calls: NativeCalls, direct: Any, system_id: int) -> bool:
+async def _has_origin(questions: Questions) -> bool:
     expected = "PX4 to report whether it has a global origin"
-    command = MavlinkMessage("COMMAND_LONG", fields_json=request_message_json(GPS_GLOBAL_ORIGIN_ID, system_id))
-    try:
-        ack = await calls.run(expected, NATIVE_CALL_DEADLINE_S, direct.send_command, command)
-    except MavsdkError as error:
-        raise device_error(address, expected, str(error).split(";")[0], "check the link") from None
+    message_id = float(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
     # PX4 sends the message before it accepts the request, and denies the request if it has no origin.
-    return refusal(ack.fields_json) is None
+    result = await questions.command(expected, messages.REQUEST_MESSAGE, message_id)
+    return result == messages.MAV_RESULT_ACCEPTED

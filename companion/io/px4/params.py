@@ -1,15 +1,13 @@
 """Reads many of PX4's parameters with a window of requests, and writes one value with verification.
 
-PARAM_REQUEST_READ by name is sent through MavlinkDirect, several at a time, because MAVSDK's Param plugin requests them one after
-the other and spends seconds on each name that PX4 does not have (PX4 1.16 does not answer requests for them). A parameter counts as
-absent if PX4 does not answer although it answers requests that were sent later.
+Several PARAM_REQUEST_READ by name are under way at a time, because PX4 1.16 does not answer those for a name that it does not have. A
+parameter counts as absent if PX4 does not answer although it answers requests that were sent later.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import math
 import re
 import struct
@@ -17,12 +15,9 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Any
 
-from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect, MavlinkMessage
-from mavsdk.plugins.param.param import Param, ParamError
-
-from companion.io.px4.calls import NATIVE_CALL_DEADLINE_S, NativeCalls
+from companion.io.px4 import messages
 from companion.io.px4.link import device_error
-from companion.io.px4.messages import MAV_COMP_ID_AUTOPILOT1
+from companion.io.px4.questions import Questions
 from companion.px4.params_file import single
 from companion.runtime.clock import Clock
 
@@ -38,7 +33,8 @@ ALWAYS_THERE = "MAV_SYS_ID"
 """Parameter that every PX4 has. Its answer shows that PX4 has received the requests sent before."""
 
 _NAME = re.compile(r"[A-Z0-9_]{1,16}")
-_REAL32 = 9
+_PAYLOAD = {0xFE: 6, 0xFD: 10}
+"""Offset of the payload in a frame of MAVLink 1 and 2."""
 _INT32_MIN, _INT32_MAX = -(2**31), 2**31 - 1
 
 Value = float | int
@@ -97,32 +93,23 @@ class ParamQueries:
             self.answered.add(name)
 
 
-def value_of(fields: dict[str, Any]) -> tuple[str, Value | None]:
-    """Return the name and the value in a PARAM_VALUE's fields; the value is an int where PX4 stores one.
-
-    PX4 sends the bytes of an INT32 in place of the float. The value is None if those bytes are a NaN (as for small negative
-    numbers), which JSON cannot represent.
+def value_of(message: Any) -> tuple[str, Value]:
+    """Return the name and the value in a PARAM_VALUE; the value is an int where PX4 stores one, whose bytes it sends in place of the
+    float.
     """
-    name, wire = str(fields["param_id"]), fields["param_value"]
-    if wire is None:
-        return name, None
-    if int(fields["param_type"]) == _REAL32:
-        return name, float(wire)
-    return name, int(struct.unpack("<i", struct.pack("<f", wire))[0])
+    frame = message.get_msgbuf()
+    wire = frame[_PAYLOAD[frame[0]] :][:4]  # a float in Python would change the bytes of some integers
+    value: Value = struct.unpack("<f" if message.param_type == messages.MAV_PARAM_TYPE_REAL32 else "<i", wire)[0]
+    return message.param_id, value
 
 
 class ParamTransfer:
     """Reads and writes parameters over an open link."""
 
-    def __init__(
-        self, address: str, clock: Clock, calls: NativeCalls, direct: MavlinkDirect, param: Param, system_id: int
-    ) -> None:
-        self._address = address
+    def __init__(self, clock: Clock, questions: Questions) -> None:
         self._clock = clock
-        self._calls = calls
-        self._direct = direct
-        self._param = param
-        self._system_id = system_id
+        self._questions = questions
+        self._address = questions.address
 
     async def read(self, names: Iterable[str]) -> dict[str, Value]:
         """Return values by name, int or float as PX4 stores them; names that PX4 does not have are left out.
@@ -135,45 +122,35 @@ class ParamTransfer:
             if _NAME.fullmatch(name) is None:
                 expected = "a parameter name with 1 to 16 of the characters A-Z, 0-9 and _"
                 raise device_error(self._address, expected, repr(name), "correct the name")
-        queries, got = ParamQueries(wanted), dict[str, Value | None]()
+        queries, got = ParamQueries(wanted), dict[str, Value]()
         loop, changed = asyncio.get_running_loop(), asyncio.Event()
 
-        def take(fields_json: str) -> None:
-            name, value = value_of(json.loads(fields_json))
+        def take(message: Any) -> None:
+            name, value = value_of(message)
             queries.heard(name, self._clock())
             got[name] = value
             changed.set()
 
-        def arrived(message: Any, _: Any) -> None:
-            if message.component_id == MAV_COMP_ID_AUTOPILOT1:
-                loop.call_soon_threadsafe(take, message.fields_json)
-
-        handle = self._direct.subscribe_message("PARAM_VALUE", arrived)
+        listening = self._questions.inbox.listening(messages.PARAM_VALUE_ID, take)
         try:
-            async with asyncio.timeout(READ_DEADLINE_S) as deadline:
-                settled = 0
-                while not queries.done:
-                    if queries.settled > settled:
-                        settled = queries.settled
-                        deadline.reschedule(loop.time() + READ_DEADLINE_S)
-                    for name in queries.due(self._clock()):
-                        self._ask(name)
-                    changed.clear()
-                    with contextlib.suppress(TimeoutError):  # then check which requests are overdue
-                        async with asyncio.timeout(ANSWER_S / 4):
-                            await changed.wait()
+            with listening:
+                async with asyncio.timeout(READ_DEADLINE_S) as deadline:
+                    settled = 0
+                    while not queries.done:
+                        if queries.settled > settled:
+                            settled = queries.settled
+                            deadline.reschedule(loop.time() + READ_DEADLINE_S)
+                        for name in queries.due(self._clock()):
+                            self._questions.send(*messages.param_request_read(name, self._questions.system_id))
+                        changed.clear()
+                        with contextlib.suppress(TimeoutError):  # then check which requests are overdue
+                            async with asyncio.timeout(ANSWER_S / 4):
+                                await changed.wait()
         except TimeoutError:
             expected = f"PX4's parameters ({len(wanted)} names, the first {wanted[0]})"
             found = f"{len(queries.answered)}, and no other within {READ_DEADLINE_S:g} s"
             raise device_error(self._address, expected, found, "check the link") from None
-        finally:
-            self._direct.unsubscribe_message(handle)
-        values: dict[str, Value] = {}
-        for name in wanted:
-            if name in queries.answered:
-                value = got[name]
-                values[name] = await self._read_int(name) if value is None else value
-        return values
+        return {name: got[name] for name in wanted if name in queries.answered}
 
     async def write(self, name: str, value: Value) -> Value:
         """Write one value, read it back and return the value that PX4 now holds.
@@ -186,15 +163,11 @@ class ParamTransfer:
             fix = "check the name against PX4's version"
             raise device_error(self._address, f"PX4's parameter {name}", "no such parameter", fix)
         wanted = self._storable(name, value, integer=isinstance(before, int))
-        try:
-            setter = self._param.set_param_int if isinstance(wanted, int) else self._param.set_param_float
-            await self._calls.run(
-                f"PX4 to accept {name} = {wanted:g}", 2 * NATIVE_CALL_DEADLINE_S, setter, name, wanted
-            )
-        except ParamError as error:
-            found = error.result.name.lower().replace("_", " ")
-            fix = "check the value's range and the link"
-            raise device_error(self._address, f"PX4 to accept {name} = {wanted:g}", found, fix) from None
+        question = messages.param_set(name, wanted, self._questions.system_id)
+        expected = f"PX4 to accept {name} = {wanted:g}"
+        await self._questions.ask(
+            expected, question, messages.PARAM_VALUE_ID, lambda message: value_of(message)[0] == name or None
+        )
         after = (await self.read([name])).get(name)
         if after != wanted:
             fix = "PX4 clipped or rejected the value; choose one within the parameter's range"
@@ -211,24 +184,3 @@ class ParamTransfer:
         except OverflowError:
             expected = f"a number that fits into single precision for {name}, a REAL32"
             raise device_error(self._address, expected, f"{value}", "correct the value") from None
-
-    def _ask(self, name: str) -> None:
-        fields = {
-            "target_system": self._system_id,
-            "target_component": MAV_COMP_ID_AUTOPILOT1,
-            "param_id": name,
-            "param_index": -1,
-        }
-        # A message that MAVSDK rejects counts as unanswered and is repeated.
-        self._direct.send_message(MavlinkMessage("PARAM_REQUEST_READ", fields_json=json.dumps(fields)))
-
-    async def _read_int(self, name: str) -> Value:
-        """Read an INT32 whose bytes are a NaN through MAVSDK's own plugin."""
-        try:
-            value: Value = await self._calls.run(
-                f"PX4's parameter {name}", 2 * NATIVE_CALL_DEADLINE_S, self._param.get_param_int, name
-            )
-        except ParamError as error:
-            found = error.result.name.lower().replace("_", " ")
-            raise device_error(self._address, f"PX4's parameter {name}", found, "check the link") from None
-        return value
