@@ -28,8 +28,9 @@ _USB_LATENCY_MAX_MS = 4
 _ANSWER_BYTES = packets.STATUS_BYTES + dxl.BLOCK_SIZE
 _ERROR_NUMBER = 0x7F
 _CRC_ERROR = 3
-SETUP_ATTEMPTS = 5
-"""Number of attempts at each read or write during set-up: interference corrupts single packets, and a busy computer delays an answer.
+PING_ATTEMPTS, SETUP_ATTEMPTS = 5, 10
+"""Number of attempts at a ping, and at a read or write during set-up of a servo that has answered one: interference corrupts single
+packets, and a busy computer delays answers.
 """
 
 Counts = tuple[int, ...]
@@ -181,7 +182,7 @@ class ArmBus:
             )
 
     def _check_identity(self, joint: Joint) -> None:
-        for _ in range(SETUP_ATTEMPTS):
+        for _ in range(PING_ATTEMPTS):
             self._check_time()
             self._begin()
             model, result, error = self._protocol.ping(self._port, joint.servo_id)
