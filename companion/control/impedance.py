@@ -1,50 +1,74 @@
-"""The target impedance: its gains and the auxiliary state gamma (paper, eqs. s_general to I_cl).
+"""The target impedance M_d e'' + K_d e' + K_p e = e_tau, one row at a time (paper, eqs. s_general to I_cl).
 
-Corrected as in docs/control-law.md: gamma' = M_d^-1 (e_tau - D gamma) with D = K_d - M_d Phi, gamma(0) = 0.
+All matrices of the paper are diagonal, so each row of chi = [x y z | roll pitch yaw | joints] is a scalar impedance of its own. The
+letters are the paper's; what its printed equations need to hold is corrected as in docs/control-law.md.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from typing import Final
 
 from companion.config.controller import AdaptiveConfig, fitted
-from companion.control.zero_order_hold import HoldTable
-from companion.model.types import Chi
 
 
-class Impedance:
-    """State gamma of the target impedance M_d e'' + K_d e' + K_p e = e_tau.
+class Row:
+    """One row: its gains, its part of the law and its auxiliary state gamma, which starts at 0.
 
     Args:
-        config: M_d, K_d and Phi of each row.
-        joint_count: number of joints.
+        M_d: desired inertia, kg or kg m^2.
+        K_d: desired damping, N s/m or N m s/rad.
+        Phi: K_p = D Phi (eq. gain_cond), 1/s.
+        Lambda: gain of s, in units of K_d.
+        S: weight of the row in the norms; 0 takes it out.
+        robust_scale: factor of the row's robust term.
     """
 
-    def __init__(self, config: AdaptiveConfig, joint_count: int) -> None:
-        rows = 6 + joint_count
-        self.inertia, self.phi = fitted(config.inertia_md, rows), fitted(config.phi, rows)
-        damping_kd = fitted(config.damping_kd, rows)
-        self.d = tuple([kd - md * phi for kd, md, phi in zip(damping_kd, self.inertia, self.phi, strict=True)])
-        rows_of = [(row, self.d[row] / self.inertia[row], self.d[row]) for row in (0, 1, 2, *range(6, rows))]
+    def __init__(self, M_d: float, K_d: float, Phi: float, Lambda: float, S: float, robust_scale: float) -> None:
+        self.M_d: Final = M_d
+        self.D: Final = K_d - M_d * Phi
+        """Damping of gamma; positive by eq. gain_new."""
+        self.Phi = Phi
+        self.Lambda = Lambda
+        self.S_squared: Final = S**2
+        self._robust: Final = S**2 * robust_scale
+        self._dt_s, self._decay, self._growth = -1.0, 0.0, 0.0
+        self.gamma = 0.0
+        self.e = self.e_dot = self.s = 0.0
 
-        def held(dt_s: float) -> tuple[tuple[tuple[int, float, float], ...], tuple[tuple[int, float, float], ...]]:
-            held = []
-            for row, rate, d in rows_of:
-                decay = math.exp(-rate * dt_s)
-                held.append((row, decay, (1.0 - decay) / d))
-            return tuple(held[:3]), tuple(held[3:])
+    def set_error(self, e: float, e_dot: float) -> None:
+        """Set e = chi - chi_d and e', and with them s = e' + Phi e - gamma (eq. s_general)."""
+        self.e = e
+        self.e_dot = e_dot
+        self.s = e_dot + self.Phi * e - self.gamma
 
-        self._held = HoldTable(held)
-        """Number of each row, e^{-M_d^-1 D T} and (1 - e^{-M_d^-1 D T}) / D; first of x, y and z, then of the joints."""
-        self.gamma: Sequence[float] = (0.0,) * rows
+    def tau(self, chi_d_ddot: float, rho_n: float) -> float:
+        """Return M_d (chi_d'' - Phi e') - Lambda s - D gamma + dtau: eqs. tau and del_tau, corrected, without tau_d.
 
-    def advance(self, dt_s: float, e_tau: Sequence[float]) -> Chi:
-        """Integrate gamma over one step with e_tau held (eq. adaptive_1, corrected; exact). The attitude rows stay 0."""
-        g = self.gamma
-        ((_, k0, r0), (_, k1, r1), (_, k2, r2)), joints = self._held[dt_s]
-        grown = [k0 * g[0] + r0 * e_tau[0], k1 * g[1] + r1 * e_tau[1], k2 * g[2] + r2 * e_tau[2], 0.0, 0.0, 0.0]
-        for row, decay, growth in joints:
-            grown.append(decay * g[row] + growth * e_tau[row])
-        self.gamma = gamma = tuple(grown)
-        return gamma
+        Args:
+            chi_d_ddot: acceleration of the reference.
+            rho_n: rho / max(||S s||, varpi), so that dtau = -rho_n S^2 s.
+        """
+        gain_of_s = self.Lambda + rho_n * self._robust
+        return self.M_d * (chi_d_ddot - self.Phi * self.e_dot) - gain_of_s * self.s - self.D * self.gamma
+
+    def chi_star_ddot(self, chi_d_ddot: float, e_tau: float) -> float:
+        """Return the acceleration that the target impedance requests at this instant: chi_d'' - Phi e' + gamma'."""
+        return chi_d_ddot - self.Phi * self.e_dot + (e_tau - self.D * self.gamma) / self.M_d
+
+    def advance(self, dt_s: float, e_tau: float) -> None:
+        """Integrate gamma' = M_d^-1 (e_tau - D gamma) over one step with e_tau held (eq. adaptive_1, corrected; exact)."""
+        if dt_s != self._dt_s:
+            self._dt_s, self._decay = dt_s, math.exp(-self.D / self.M_d * dt_s)
+            self._growth = (1.0 - self._decay) / self.D
+        self.gamma = self._decay * self.gamma + self._growth * e_tau
+
+
+def rows_of(config: AdaptiveConfig, joint_count: int) -> list[Row]:
+    """Return x, y, z, roll, pitch, yaw and one row for each joint."""
+    count = 6 + joint_count
+    lists = (
+        *(config.inertia_md, config.damping_kd, config.phi, config.lambda_gain),
+        *(config.row_weights_s, config.robust_scale),
+    )
+    return [Row(*gains) for gains in zip(*(fitted(gains, count) for gains in lists), strict=True)]

@@ -7,7 +7,7 @@ what the printed form alone does to an otherwise correct law.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,9 +17,10 @@ from msgspec.structs import replace
 
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import FlightConfig, load_flight
-from companion.control.adaptive import Adaptation, AdaptiveController
+from companion.control.adaptation import Adaptation
+from companion.control.adaptive import AdaptiveController
 from companion.control.arm_model import manipulator_of
-from companion.control.impedance import Impedance
+from companion.control.impedance import Row, rows_of
 from companion.control.types import PlantState
 from companion.mission.reference import at_rest
 from companion.model.constants import GRAVITY_M_S2
@@ -67,6 +68,14 @@ def adaptive(config: FlightConfig) -> AdaptiveConfig:
 
 
 INERTIA: Array = np.diag([3.3, 3.2, 3.1, 0.05, 0.03]) + 0.01 * np.ones((5, 5))
+
+
+def advanced(rows: list[Row], gamma: Sequence[float], dt_s: float, e_tau: Sequence[float]) -> list[float]:
+    """gamma after a step of the law's own rows from a given gamma."""
+    for row, start, held in zip(rows, gamma, e_tau, strict=True):
+        row.gamma = start
+        row.advance(dt_s, held)
+    return [row.gamma for row in rows]
 
 
 @dataclass
@@ -190,10 +199,7 @@ def instants(config: FlightConfig, ticks: int = 400) -> list[Instant]:
         gamma_now, e_tau = gamma_before, log.e_tau
 
         def gamma_after(h: float, start: list[float] = gamma_now, held: tuple[float, ...] = e_tau) -> list[float]:
-            impedance = Impedance(law, 2)
-            impedance.gamma = list(start)
-            impedance.advance(h, held)
-            return impedance.gamma
+            return advanced(rows_of(law, 2), start, h, held)
 
         def s_after(
             h: float,
@@ -276,21 +282,19 @@ NOTHING = np.zeros(8)
 PULL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2, -0.3])
 """e_tau on the joints of a 2 N pull on the net."""
 
-GammaLaw = Callable[[Impedance, Array, Array], Array]
+GammaLaw = Callable[[list[Row], Array, Array], Array]
 TauTerm = Callable[[Array, Array], Array]
 RobustTerm = Callable[[float, Array, float], Array]
 
 
-def gamma_corrected(impedance: Impedance, gamma: Array, e_tau: Array) -> Array:
+def gamma_corrected(rows: list[Row], gamma: Array, e_tau: Array) -> Array:
     """Exactly as the law does it."""
-    impedance.gamma = list(gamma.tolist())
-    impedance.advance(DT_S, e_tau.tolist())
-    return np.array(impedance.gamma)
+    return np.array(advanced(rows, gamma.tolist(), DT_S, e_tau.tolist()))
 
 
-def gamma_printed(impedance: Impedance, gamma: Array, e_tau: Array) -> Array:
+def gamma_printed(rows: list[Row], gamma: Array, e_tau: Array) -> Array:
     """gamma' = M_d^-1 (e_tau + D) gamma, e_tau as a diagonal; exact for a held e_tau."""
-    rate = (e_tau + np.array(impedance.d)) / np.array(impedance.inertia)
+    rate = (e_tau + np.array([row.D for row in rows])) / np.array([row.M_d for row in rows])
     out: Array = gamma * np.exp(np.minimum(rate * DT_S, 50.0))
     return out
 
@@ -337,13 +341,17 @@ def fly(
     duration_s: float = 8.0,
 ) -> Flown:
     """Hold a point from an initial error, tau_d = 0, ||.|| over all eight rows as the paper has it; `unknown` is force not in e_tau."""
-    impedance, adaptation = Impedance(law, 2), Adaptation(law)
-    m_d, lam, phi, d = np.array(law.inertia_md), np.array(law.lambda_gain), np.array(law.phi), np.array(impedance.d)
+    law_rows, adaptation = rows_of(law, 2), Adaptation(law)
+    m_d, lam, phi, d = (
+        np.array(law.inertia_md),
+        np.array(law.lambda_gain),
+        np.array(law.phi),
+        np.array([row.D for row in law_rows]),
+    )
     e, rate, gamma, acceleration = start.copy(), np.zeros(8), np.full(8, gamma_start), np.zeros(8)
     rows: list[tuple[Array, Array, Array, list[float], float]] = []
     lost_s = None
     for tick in range(round(duration_s / DT_S)):
-        impedance.gamma = list(gamma.tolist())
         s = rate + phi * e - gamma
         norm, x = float(np.linalg.norm(s)), float(np.linalg.norm([e, rate]))
         regressor = (1.0, x, x * x, min(float(np.linalg.norm(acceleration)), law.acceleration_cap))
@@ -355,7 +363,7 @@ def fly(
             break
         acceleration = (tau + e_tau + unknown) / MASSES
         adaptation.advance(DT_S, norm, regressor, False)
-        gamma = gamma_law(impedance, gamma, e_tau)
+        gamma = gamma_law(law_rows, gamma, e_tau)
         rate = rate + DT_S * acceleration
         e = e + DT_S * rate
     e_rows, s_rows, gamma_rows, h_rows, zeta_rows = (np.array(column) for column in zip(*rows, strict=True))
@@ -383,7 +391,7 @@ def test_adaptive_1_printed_gamma_never_yields_from_zero(table: AdaptiveConfig) 
     printed = fly(table, gamma_law=gamma_printed, e_tau=PULL, start=NOTHING)
     assert not printed.gamma.any()
     corrected = fly(table, e_tau=PULL, start=NOTHING)
-    d = np.array(Impedance(table, 2).d)
+    d = np.array([row.D for row in rows_of(table, 2)])
     np.testing.assert_allclose(corrected.gamma[-1], PULL / d, atol=1e-9)
     np.testing.assert_allclose(corrected.e[-1], PULL / np.array(table.stiffness_kp), atol=1e-3)
 

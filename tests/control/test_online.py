@@ -69,11 +69,12 @@ def test_whatever_happens_bound_tank_and_both_conditions_hold_at_every_tick(
         for _ in range(count):
             before = it.scale
             if it.step(dt_s, row(e), row(v), (rate, rate, 0.0), (0.0, 0.0, force), clipped, tuning):
-                law._scale_gains(it.scale)
+                law.scale_gains(it.scale)
             assert 1.0 / 1.4 - 1e-12 <= it.scale <= 1.4 + 1e-12
             assert 0.0 <= it.tank_j <= TANK_MAX_J
             assert not (clipped and tuning is Tuning.RUN and it.scale > before)
-            for m_d, phi, _, _, d in law._base_gains:
+            for base_row in law._base:
+                m_d, phi, d = base_row.M_d, base_row.Phi, base_row.D
                 k_d, k_p = d + m_d * phi, d * phi
                 assert k_d / m_d > phi  # gain_new
                 assert k_p == pytest.approx((k_d - m_d * phi) * phi, rel=1e-9)  # gain_cond
