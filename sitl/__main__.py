@@ -104,6 +104,12 @@ def _print_message(message: dict[str, Any]) -> None:
         print(f"  t = {message['t_s']:7.2f} s  payload {message['kind']}", flush=True)
     elif message["type"] == "progress":
         print(f"  {message['text']}", file=sys.stderr, flush=True)
+    elif message["type"] == "slipped":
+        print(
+            f"  this computer is busy: the world has paused for {message['slipped_s']:.1f} s in all",
+            file=sys.stderr,
+            flush=True,
+        )
     elif message["type"] == "at_rest":
         print("  disarmed" if message["at_rest"] else "  armed", flush=True)
 

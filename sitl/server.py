@@ -45,6 +45,8 @@ INJECT_RETRY_S = 0.2
 """Time between two searches for the target process of a fault."""
 OTHER_PROCESS_FAULTS: tuple[FaultKind, ...] = ("kill_recorder", "kill_guardian", "disk_full")
 _LEAVE_S = 30.0
+SLIP_REPORTED_S = 0.1
+"""Pause of a world in real time that is reported."""
 
 OnMessage = Callable[[dict[str, Any]], None]
 
@@ -131,7 +133,7 @@ class Sitl:
         self._injected: set[FaultKind] = set()
         self._inject_due_s = 0.0
         self._ports = ports
-        self.slipped_s = 0.0
+        self.slipped_s = self._slip_reported_s = 0.0
         self._origin_s = 0.0
         """World time 0 on the event loop's clock."""
         self._next_frame: asyncio.TimerHandle | None = None
@@ -221,7 +223,7 @@ class Sitl:
             data_port=self._ports.mocap_data,
             multicast_group=mocap.multicast_group if self._ports.multicast else None,
             bodies=((mocap.rigid_body_id, self._vehicle.name), *self._others),
-            clock=time.monotonic if self._keeper is None else lambda: self.plant.t_s,
+            clock=asyncio.get_running_loop().time if self._keeper is None else lambda: self.plant.t_s,
         )
 
     def _mocap_settings(self, server: NatNetServer) -> dict[str, Any]:
@@ -313,6 +315,9 @@ class Sitl:
             if behind_s > CATCH_UP_S:
                 origin_s = self._origin_s = origin_s + behind_s - CATCH_UP_S
                 self.slipped_s += behind_s - CATCH_UP_S
+                if self.slipped_s >= self._slip_reported_s + SLIP_REPORTED_S:
+                    self._slip_reported_s = self.slipped_s
+                    self._on_message({"type": "slipped", "slipped_s": self.slipped_s})
                 self.autopilot.skip(behind_s - CATCH_UP_S)
                 behind_s = CATCH_UP_S
             for _ in range(int(behind_s / PHYSICS_DT_S)):

@@ -341,6 +341,11 @@ class World:
         return sum(message["type"] == "at_rest" and not message["at_rest"] for message in self.messages)
 
     @property
+    def pauses(self) -> int:
+        """How often the world in real time has paused for a tenth of a second, because the computer was busy."""
+        return sum(message["type"] == "slipped" for message in self.messages)
+
+    @property
     def crashes(self) -> int:
         return sum(message["type"] == "event" and message["kind"] == "crashed" for message in self.messages)
 

@@ -133,7 +133,8 @@ class LawConfig(ControllerConfig):
     loop's delay.
     """
     arm_friction_share: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Fraction of the vehicle file's `arm.joint_friction_nm` that is fed forward in the direction of the reference joint rate."""
+    """Fraction of the vehicle file's `arm.joint_friction_nm` that is fed forward in the direction of the requested joint rate:
+    alpha'_d, and in the adaptive law alpha' - s."""
     lateral_force_max_n: Positive = 12.0
     attitude_filter_rad_s: Positive = 30.0
     attitude_filter_damping: Annotated[float, Field(ge=0.5, le=2)] = 1.0
@@ -191,7 +192,7 @@ class AdaptiveConfig(LawConfig):
     stiffness_kp: PositiveRows
     """K_p of the paper; must equal (K_d - M_d Phi) Phi (gain_cond)."""
     row_weights_s: NonNegativeRows
-    """S: weight of each row in ||s||, ||xi|| and ||chi_dd||; 0 masks a row that another loop controls."""
+    """S: weight of each row in ||s||, ||xi|| and ||chi_dd||. Those of the attitude count as 0: PX4 controls it."""
     robust_scale: PositiveRows = (1.0,) * 7
     """Factor on each row of the robust term, -rho S^2 s / max(||S s||, varpi): 1 on the machine of `found_for`."""
     h_initial: Positive4

@@ -37,7 +37,7 @@ class AdaptiveController:
         self._rows = rows = rows_of(config, manipulator.joint_count)
         self._base, self._yaw = rows[:3], rows[5]
         self._controlled = [*rows[:3], *rows[6:]]
-        """All rows but those of the attitude."""
+        """All rows but those of the attitude: yaw's e, e' and s are logged only."""
         self._adaptation = Adaptation(config)
         self._load = LoadAdaptation(config, manipulator)
         self._compliance = config.base_compliance_xyz
@@ -51,12 +51,11 @@ class AdaptiveController:
             else OnlineImpedance(config.online, config.inertia_md[:3], config.lambda_gain[:3], config.phi[:3])
         )
         """Optimisation of the target impedance in flight; None if it is off."""
-        self._varpi = config.boundary_layer
         self._acceleration_cap = config.acceleration_cap
         self._acceleration_cutoff_rad_s = 2.0 * math.pi * config.acceleration_lowpass_hz
         self._acceleration: list[float] | None = None
         """Filtered chi'' of the controlled rows."""
-        self._arm_rate_rad_s: Joints = ()
+        self._arm_rate_before_rad_s: Joints = ()
         self._force = ForceFilter(config.force_lowpass_hz)
         self._desired = DesiredForce(config.desired_force_time_s)
         self._actuation = Actuation(config, vehicle, hover_thrust)
@@ -70,26 +69,29 @@ class AdaptiveController:
         clipped_before = sent.any_clipped
         learn = state.airborne and not clipped_before
         body_x, body_z = axes = body_x_z_axes_world(state.attitude_wxyz)
-        # 1
+        # 1: chi'' and F
         chi_ddot = self._filtered_acceleration(dt_s, state)
         force = self._force.step(dt_s, state.force_ext_world_n)
-        self._compensation.observe(dt_s, state, learn)
-        # 2 to 4
-        self._set_errors(state, reference, math.atan2(body_x[1], body_x[0]))
-        # 5 and 6
+        self._compensation.observe(dt_s, state, learn)  # beyond the paper: disturbance observer
+        # 2 and 4: e, e' and s. 3: e_tau of the base here, of the joints with their torque.
+        yaw_rad = math.atan2(body_x[1], body_x[0])
+        self._set_errors(state, reference, yaw_rad)
+        base_e_tau = self._external_force(force)
+        # 5 and 6: norms, regressor and rho
         norm_s, norm_xi, norm_a = self._norms(chi_ddot)
         b: Vec4 = (1.0, norm_xi, norm_xi * norm_xi, min(norm_a, self._acceleration_cap))
         rho = adaptation.rho(b)
-        rho_n = rho / max(norm_s, self._varpi)
-        # 7
-        base_n = self._base_force(rho_n, reference, force)
-        arm_nm = arm.torque_nm(rho_n, axes, force, self._desired.world_n, state, reference)
-        # 8
+        robust_gain = rho / max(norm_s, adaptation.varpi)  # both cases of del_tau: dtau = -robust_gain S^2 s
+        # 7: tau
+        base_n = self._base_force(robust_gain, reference, force)
+        arm_nm = arm.torque_nm(robust_gain, axes, force, self._desired.world_n, state, reference)
+        # 8: saturation, attitude and thrust
         sent.step(dt_s, base_n, arm_nm, body_z, reference.yaw_rad, vertical_scale)
         self._compensation.remember(sent.force_world_n, force)
-        # 9
+        # 9: H, zeta, loads, gamma and F_d
         adaptation.advance(dt_s, norm_s, b, clipped_before)
-        base_e_tau = self._advance(dt_s, force, state, learn)
+        self._advance(dt_s, base_e_tau, force, state, learn)
+        # The scale of this tick; the new one counts in the next.
         scale = None if self.online is None else self.online.scale
         if self.online is not None:
             self._optimise(self.online, dt_s, state, force)
@@ -126,17 +128,19 @@ class AdaptiveController:
         rates, filtered = state.arm_rate_rad_s, self._acceleration
         if filtered is None:
             filtered = self._acceleration = [*state.acceleration_world_m_s2, *(0.0,) * len(rates)]
-            self._arm_rate_rad_s = rates
-        before = self._arm_rate_rad_s
+            self._arm_rate_before_rad_s = rates
+        before = self._arm_rate_before_rad_s
         for row, sample in enumerate(state.acceleration_world_m_s2):
             filtered[row] += k * (sample - filtered[row])
         for joint, rate in enumerate(rates):
             filtered[3 + joint] += k * ((rate - before[joint]) / dt_s - filtered[3 + joint])
-        self._arm_rate_rad_s = rates
+        self._arm_rate_before_rad_s = rates
         return filtered
 
     def _set_errors(self, state: PlantState, reference: Reference, yaw_rad: float) -> None:
-        """Set e, e' and s of all rows; those of roll and pitch stay 0, because their reference is the law's own output."""
+        """Set e, e' and s of all rows; those of roll and pitch stay 0, because their reference is the law's own output. e' of yaw is
+        the body's rate r less that of the reference.
+        """
         p, p_d = state.position_world_m, reference.position_world_m
         v, v_d = state.velocity_world_m_s, reference.velocity_world_m_s
         for i, row in enumerate(self._base):
@@ -158,32 +162,34 @@ class AdaptiveController:
             a_squared += weight * a * a
         return math.sqrt(s_squared), math.sqrt(xi_squared), math.sqrt(a_squared)
 
-    def _base_force(self, rho_n: float, reference: Reference, force: Vec3) -> Vec3:
+    def _base_force(self, robust_gain: float, reference: Reference, force: Vec3) -> Vec3:
         """Return the force on the base: tau with the adaptive load and the compensation, plus the weight; tau_d of the base is 0."""
         row_x, row_y, row_z = self._base
         x_ddot, y_ddot, z_ddot = reference.acceleration_world_m_s2
         load_x, load_y, load_z = self._load.force_n
         tau = (
-            row_x.tau(x_ddot, rho_n) + load_x,
-            row_y.tau(y_ddot, rho_n) + load_y,
-            row_z.tau(z_ddot, rho_n) + load_z,
+            row_x.tau(x_ddot, robust_gain) + load_x,
+            row_y.tau(y_ddot, robust_gain) + load_y,
+            row_z.tau(z_ddot, robust_gain) + load_z,
         )
         x, y, z = self._compensation.base_force_n(tau, force, reference)
         return (x, y, z + self._weight_n)
 
-    def _advance(self, dt_s: float, force: Vec3, state: PlantState, learn: bool) -> Vec3:
-        """Integrate the loads, gamma and F_d over one step. Return e_tau of the base."""
+    def _external_force(self, force: Vec3) -> Vec3:
+        """Return e_tau of the base: the share of F that it complies with."""
+        (share_x, share_y, share_z), (x, y, z) = self._compliance, force
+        return (share_x * x, share_y * y, share_z * z)
+
+    def _advance(self, dt_s: float, e_tau: Vec3, force: Vec3, state: PlantState, learn: bool) -> None:
+        """Integrate the loads, gamma and F_d over one step."""
         row_x, row_y, row_z = self._base
         if learn and self._load.on:
             self._load.advance_base(dt_s, (row_x.s, row_y.s, row_z.s))
-        (share_x, share_y, share_z), (x, y, z) = self._compliance, force
-        e_tau = (share_x * x, share_y * y, share_z * z)
         row_x.advance(dt_s, e_tau[0])
         row_y.advance(dt_s, e_tau[1])
         row_z.advance(dt_s, e_tau[2])
         self._arm.advance(dt_s, state.arm_rate_rad_s, learn)
         self._desired.advance(dt_s, force)
-        return e_tau
 
     def _optimise(self, online: OnlineImpedance, dt_s: float, state: PlantState, force: Vec3) -> None:
         """Run one tick of the online optimisation, and give the rows of x, y and z the gains that it has found."""

@@ -17,7 +17,7 @@ from companion.model.types import Joints, Matrix, Reference, Vec3
 
 
 class AdaptiveArm:
-    """tau of the joints. What a tick has found is kept until `advance` ends it.
+    """tau of the joints. e_tau, directions and levers of a tick are kept until `advance` ends it.
 
     Args:
         config: configuration of the law.
@@ -38,36 +38,36 @@ class AdaptiveArm:
         self.rows = rows
         self.e_tau: Joints = (0.0,) * len(rows)
         """tau_ext - tau_d of this tick."""
-        self._directions: Joints = self.e_tau
+        self._directions: Joints = (0.0,) * len(rows)
         self._levers_m_s2: Matrix = ()
 
     def torque_nm(
         self,
-        rho_n: float,
+        robust_gain: float,
         axes_world: tuple[Vec3, Vec3],
         force_n: Vec3,
         desired_force_n: Vec3,
         state: PlantState,
         reference: Reference,
     ) -> Joints:
-        """Return tau - tau_d with nominal gravity, plus the configured adaptive load, (M_arm - M_d) alpha*'' + C alpha', and friction
-        in the direction of alpha*'.
+        """Return tau with its -tau_d and nominal gravity, plus the configured adaptive load, (M_arm - M_d) alpha*'' + C alpha', and
+        friction in the direction of alpha*'.
 
-        The star marks what the target impedance requests at this instant: alpha*'' as in `Row.chi_star_ddot`, and alpha*' = alpha'_d -
-        Phi e + gamma = alpha' - s.
+        The star marks the motion with s = 0: alpha*'' of `Row.chi_star_ddot`, and alpha*' = alpha'_d - Phi e + gamma = alpha' - s.
 
         Args:
-            rho_n: as for `Row.tau`.
+            robust_gain: as for `Row.tau`.
             axes_world: x and z axis of the body.
             force_n: filtered external force on the tool, world frame.
             desired_force_n: F_d, world frame.
             state: of this tick.
             reference: of this tick.
         """
+        # The columns of R; then g, F and F_d in body axes.
         (xx, xy, xz), (zx, zy, zz) = axes_world
         yx, yy, yz = zy * xz - zz * xy, zz * xx - zx * xz, zx * xy - zy * xx
-        up_m_s2 = (GRAVITY_M_S2 * xz, GRAVITY_M_S2 * yz, GRAVITY_M_S2 * zz)
-        jacobian, gravity, levers = self._manipulator.joint_terms_and_levers(state.arm_rad, up_m_s2)
+        up_body_m_s2 = (GRAVITY_M_S2 * xz, GRAVITY_M_S2 * yz, GRAVITY_M_S2 * zz)
+        jacobian, gravity, levers = self._manipulator.joint_terms_and_levers(state.arm_rad, up_body_m_s2)
         (fx, fy, fz), (dx, dy, dz) = force_n, desired_force_n
         external = _transposed_times(
             jacobian, xx * fx + xy * fy + xz * fz, yx * fx + yy * fy + yz * fz, zx * fx + zy * fy + zz * fz
@@ -80,7 +80,7 @@ class AdaptiveArm:
         for joint, row in enumerate(self.rows):
             tau_d = desired[joint]
             e_tau.append(external[joint] - tau_d)
-            tau = row.tau(alpha_d_ddot[joint], rho_n) - tau_d
+            tau = row.tau(alpha_d_ddot[joint], robust_gain) - tau_d
             torque.append(tau + gravity[joint] if self._gravity_nominal else tau)
             directions.append(math.tanh((rates[joint] - row.s) / FRICTION_RATE_RAD_S))
         if self._load.on:
@@ -88,6 +88,7 @@ class AdaptiveArm:
                 torque[joint] += load_nm
         if self._dynamics is not None:
             star = [row.chi_star_ddot(alpha_d_ddot[joint], e_tau[joint]) for joint, row in enumerate(self.rows)]
+            # tau contains M_d alpha*'' already: M_arm takes the place of M_d.
             inertial = self._dynamics.arm_torque_nm(state.arm_rad, rates, tuple(star))
             for joint, row in enumerate(self.rows):
                 torque[joint] += inertial[joint] - row.M_d * star[joint]

@@ -25,8 +25,8 @@ class Compensation:
     Args:
         config: configuration of the law.
         vehicle: the nominal vehicle.
-        answered_xyz: fraction of the measured force, per world axis, that the law itself compensates; the observer does not estimate
-            it.
+        answered_xyz: fraction of the measured force, per world axis, that the law yields to or cancels itself; the observer does
+            not estimate it.
         inertia_xy_kg: inertia along x and y that the law imposes on the base, used for the feedforward's lead.
     """
 
@@ -56,8 +56,8 @@ class Compensation:
             self._observer.step(dt_s, self._known_n, state.acceleration_world_m_s2, learn)
 
     def base_force_n(self, wanted_n: Vec3, force: Vec3, reference: Reference) -> Vec3:
-        """Return the desired force with the measured force, the estimated disturbance and the lead compensated, and with the push on a
-        surface, world frame.
+        """Return `wanted_n` less the share of the measured force and the estimated disturbance, plus inertia times lead times jerk, and
+        plus the push on a surface, world frame.
         """
         x, y, z = wanted_n
         f0, f1, f2 = force

@@ -1,13 +1,13 @@
 """Adaptive estimates of loads that are linear in unknown constants, which the paper's norm-bounding gains cannot cancel.
 
-    theta' = Gamma phi' s - nu_theta theta,    each theta_i projected to its bounds
+    theta' = -Gamma Y' s - nu_theta theta,    each theta_i projected to its bounds
 
-phi holds a constant for each of x, y and z (an unknown force: weight, wind, tilt, rotors that lose thrust), the levers of gravity of
-the links (their first moments, payload included), and the commanded direction of motion of each joint (dry friction). tau contains the
-estimated load. With V_theta = (theta - theta*)' Gamma^-1 (theta - theta*) / 2 added to the paper's Lyapunov function, the term s' phi
-(theta* - theta) of V' cancels for constant theta*; leakage, projection and a load that varies leave a bounded remainder, as the leakage
-of H does (eq. adaptive_law_full). s is integrated and not e: at s = 0 the target impedance holds, so a measured force still moves the
-arm according to K_d and K_p.
+Y holds a constant for each of x, y and z (an unknown force: weight, wind, tilt, rotors that lose thrust), the levers of gravity of
+the links (their first moments, payload included), and the commanded direction of motion of each joint (dry friction). tau contains
+the estimated load Y theta. With V_theta = (theta - theta*)' Gamma^-1 (theta - theta*) / 2 added to the paper's Lyapunov function, the
+term s' Y (theta - theta*) of V' cancels for constant theta*; leakage, projection and a load that varies leave a bounded remainder, as
+the leakage of H does (eq. adaptive_law_full). s is integrated and not e: at s = 0 the target impedance holds, so a measured force
+still moves the arm according to K_d and K_p.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ class Estimate:
     """One unknown constant theta, integrated from zero with an exact zero-order hold.
 
     Args:
-        gamma: adaptation rate Gamma; 0 switches the estimate off.
+        rate: Gamma; 0 switches the estimate off.
         leakage: nu_theta, 1/s.
         low, high: bounds of theta.
     """
 
-    def __init__(self, gamma: float, leakage: float, low: float, high: float) -> None:
-        self._gamma: Final = gamma
+    def __init__(self, rate: float, leakage: float, low: float, high: float) -> None:
+        self._rate: Final = rate
         self._leakage: Final = leakage
         self._low: Final = low
         self._high: Final = high
-        self._dt_s, self._decay, self._held_s = -1.0, 0.0, 0.0
+        self._dt_s, self._decay, self._growth_s = -1.0, 0.0, 0.0
         self.theta = 0.0
 
-    def advance(self, dt_s: float, phi_s: float) -> None:
-        """Integrate one step with phi' s held. NaN, from which an estimate could never recover, changes nothing."""
-        if dt_s != self._dt_s:
+    def advance(self, dt_s: float, y_s: float) -> None:
+        """Integrate theta' over one step with Y' s held. NaN, from which an estimate could never recover, changes nothing."""
+        if dt_s != self._dt_s:  # most ticks have the same
             self._dt_s, self._decay = dt_s, math.exp(-self._leakage * dt_s)
-            self._held_s = (1.0 - self._decay) / self._leakage if self._leakage > 0.0 else dt_s
-        new = self._decay * self.theta - self._held_s * self._gamma * phi_s
+            self._growth_s = (1.0 - self._decay) / self._leakage if self._leakage > 0.0 else dt_s
+        new = self._decay * self.theta - self._growth_s * self._rate * y_s
         if self._low <= new <= self._high:
             self.theta = new
         elif new == new:
@@ -75,7 +75,7 @@ class LoadAdaptation:
 
     @property
     def moments_kg_m(self) -> Joints:
-        """Return the estimated first moments of the links about their joints, in addition to the nominal ones."""
+        """Return the estimated first moments of the links about their joints, in addition to those that the law knows."""
         return tuple([estimate.theta for estimate in self._moments])
 
     @property
@@ -104,8 +104,9 @@ class LoadAdaptation:
     def advance_joints(self, dt_s: float, s: Joints, rates: Joints, levers_m_s2: Matrix, directions: Joints) -> None:
         """Integrate moments and frictions over one step with s of the joints held.
 
-        The friction of a joint changes only while the joint turns in the requested direction. At rest static friction takes any value
-        up to its limit, so s contains no information about that limit, and s phi = -s tanh(s / 0.1) would only raise the estimate.
+        The friction of a joint changes only while the joint turns in the requested direction, faster than `FRICTION_RATE_RAD_S`. At
+        rest static friction takes any value up to its limit, so s contains no information about that limit, and s Y = -s tanh(s /
+        0.1) would only raise the estimate.
 
         Args:
             dt_s: step.
@@ -113,8 +114,8 @@ class LoadAdaptation:
             rates: measured rates of the joints, rad/s.
             levers_m_s2, directions: as for `joint_torque_nm` in the same tick.
         """
-        phi_s = self._manipulator.projected_on_moments(levers_m_s2, s)
+        y_s = self._manipulator.projected_on_moments(levers_m_s2, s)
         for joint, direction in enumerate(directions):
-            self._moments[joint].advance(dt_s, phi_s[joint])
+            self._moments[joint].advance(dt_s, y_s[joint])
             if rates[joint] * direction > FRICTION_RATE_RAD_S * abs(direction):
                 self._frictions[joint].advance(dt_s, s[joint] * direction)

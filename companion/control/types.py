@@ -34,8 +34,8 @@ class PlantState(Record, frozen=True, kw_only=True):
     force_ext_world_n: Vec3 | None = None
     """Force on the net, tared, without the net's weight, not filtered; None without a valid sample."""
     airborne: bool = True
-    """Whether only the rotors carry the vehicle. While the ground or a surface may carry a part of it, a law's integrators do not
-    change.
+    """Whether only the rotors carry the vehicle. While the ground or a surface may carry a part of it, what a law integrates
+    to answer a load (adaptive loads, observer, integral of the error) does not change.
     """
     tuning: Tuning = Tuning.FREEZE
     """What a law that optimises its gains in flight may do."""

@@ -407,7 +407,9 @@ class Event(Record, frozen=True, kw_only=True):
 
 
 class ControlLog(Record, frozen=True, kw_only=True):
-    """Quantities that the control law computed in one tick. Vectors of type `Chi` are ordered as chi = [p; q; alpha]."""
+    """Quantities that the control law computed in one tick. Vectors of type `Chi` are ordered as chi = [p; q; alpha]. `sliding` and
+    `rho` are those that made tau; gamma, `h_hat`, `zeta` and the estimated loads are those of the next tick.
+    """
 
     error: Chi
     error_rate: Chi

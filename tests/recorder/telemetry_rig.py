@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import select
 import signal
@@ -19,7 +20,6 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.ground.protocol.commands import make_command
-from companion.ground.protocol.flight_clock import FlightClock
 from companion.ground.protocol.keys import Operator, load_login, new_key, operators_text, write_private
 from companion.ground.protocol.messages import CommandName, Stream, Topic, decode, encode, vehicle_of
 from companion.model.types import Inputs, Outputs, Sent
@@ -32,6 +32,8 @@ Row = tuple[Inputs, Outputs, Sent]
 ROWS: list[Row] = list(synthetic_flight(end_s=21.0))
 ANNA = new_key()
 VEHICLE = "rig-7"
+STREAM_TICKS = 10
+"""Ticks in a period of the stream, 20 Hz."""
 
 
 class Listener:
@@ -47,7 +49,8 @@ class Listener:
         self._client.reconnect_delay_set(min_delay=1, max_delay=1)
         self._changed = threading.Condition()
         self._heard: list[tuple[Topic, bytes, bool]] = []
-        self.clock = FlightClock()
+        self.t_s: float | None = None
+        """Flight clock of the newest stream: it goes with the rig's ticks, not with the computer's clock."""
         self._client.connect("127.0.0.1", port, keepalive=5)
         self._client.loop_start()
 
@@ -64,7 +67,7 @@ class Listener:
         with self._changed:
             self._heard.append((found[1], bytes(message.payload), message.retain))
             if found[1] is Topic.STREAM:
-                self.clock.add(decode(Stream, bytes(message.payload)).t_s, time.monotonic())
+                self.t_s = decode(Stream, bytes(message.payload)).t_s
             self._changed.notify_all()
 
     def of(self, topic: Topic) -> list[bytes]:
@@ -122,17 +125,22 @@ class Flight:
         self._next = until
 
     def wait(self, condition: Callable[[], bool], why: str) -> None:
-        """Send some ticks at a time until the condition holds: the flight reads the recorder's messages only in its ticks."""
+        """Send a tick now and then until the condition holds: the flight reads the recorder's messages in its ticks. The flight's clock
+        goes a hundred times slower than the computer's, so that no command grows old on a busy one.
+        """
+        looks = itertools.count()
 
-        def tick() -> bool:
-            self.fly(self._next + 1)
-            assert self._next < len(ROWS), why
+        def look() -> bool:
+            if next(looks) % 10 == 0:
+                self.fly(self._next + 1)
+                assert self._next < len(ROWS), why
             return condition()
 
-        wait_until(tick, lambda: f"{why}: {self.recorder.client.telemetry_status}")
+        wait_until(look, lambda: f"{why}: {self.recorder.client.telemetry_status}")
 
     def begin(self, listener: Listener) -> None:
         """Send ticks until the ground station sees the flight, so that later messages are received live."""
+        self.fly(self._next + STREAM_TICKS)
         self.wait(lambda: bool(listener.of(Topic.STREAM)), "the ground sees nothing")
 
     def finish(self) -> RecorderReport:
@@ -170,6 +178,5 @@ def log_lines(path: Path) -> list[str]:
 
 
 def command(listener: Listener, name: CommandName, session: str, key: bytes = ANNA, vehicle: str = VEHICLE) -> bytes:
-    now_ms = listener.clock.now_ms(time.monotonic())
-    assert now_ms is not None
-    return encode(make_command(name, vehicle, session, "anna", key, now_ms))
+    assert listener.t_s is not None
+    return encode(make_command(name, vehicle, session, "anna", key, round(listener.t_s * 1e3)))

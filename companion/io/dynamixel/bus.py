@@ -28,9 +28,9 @@ _USB_LATENCY_MAX_MS = 4
 _ANSWER_BYTES = packets.STATUS_BYTES + dxl.BLOCK_SIZE
 _ERROR_NUMBER = 0x7F
 _CRC_ERROR = 3
-PING_ATTEMPTS, SETUP_ATTEMPTS = 5, 10
-"""Number of attempts at a ping, and at a read or write during set-up of a servo that has answered one: interference corrupts single
-packets, and a busy computer delays answers.
+SETUP_ATTEMPTS = 10
+"""Number of attempts at each ping, read or write during set-up: interference corrupts single packets, and a busy computer delays
+answers.
 """
 
 Counts = tuple[int, ...]
@@ -182,7 +182,7 @@ class ArmBus:
             )
 
     def _check_identity(self, joint: Joint) -> None:
-        for _ in range(PING_ATTEMPTS):
+        for _ in range(SETUP_ATTEMPTS):
             self._check_time()
             self._begin()
             model, result, error = self._protocol.ping(self._port, joint.servo_id)
@@ -307,19 +307,20 @@ class ArmBus:
         self._write_bytes(joint, register, list(value.to_bytes(register.size, "little", signed=register.signed)))
 
     def _write_bytes(self, joint: Joint, register: Register, data: list[int]) -> None:
-        """Write and read back; a lost or corrupt packet is repeated, as in `_read_bytes`."""
+        """Write and read back; a lost or corrupt packet is repeated, as in `_read_bytes`, and so is a write without effect."""
+        found = b""
         for _ in range(SETUP_ATTEMPTS):
             self._check_time()
             self._begin()
             result, error = self._protocol.writeTxRx(self._port, joint.servo_id, register.address, len(data), data)
             if _arrived(result, error):
-                break
+                self._check_answer(joint, f"writing {register}", result, error)
+                found = self._read_bytes(joint, register)
+                if found == bytes(data):
+                    return
         self._check_answer(joint, f"writing {register}", result, error)
-        found = self._read_bytes(joint, register)
-        if found != bytes(data):
-            raise self._error(
-                "servo", joint.servo_id, f"{register} reads {found.hex()} after {bytes(data).hex()} was written"
-            )
+        text = f"{register} reads {found.hex()} after {bytes(data).hex()} was written"
+        raise self._error("servo", joint.servo_id, text)
 
     def _try_write(self, servo_id: int, register: Register, value: int) -> None:
         self._begin()
