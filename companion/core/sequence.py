@@ -18,10 +18,11 @@ from companion.model.best_pose import best_pose, pose_used_s
 from companion.model.flight_stage import Stage
 from companion.model.frames import euler_zyx_from_quat
 from companion.model.types import AutopilotRequest, Inputs, Joints, Outcome, PhaseKind, SafetyAction, Severity
-from companion.safety import notices
-from companion.safety.autopilot_landing import FLIPPED, TIPPED
+from companion.safety import notices, rules
+from companion.safety.autopilot_landing import FLIPPED, KILLED, TIPPED
 from companion.safety.mocap import unfused
 from companion.safety.notices import Notice
+from companion.safety.px4 import DISARMED_ABOVE_M
 from companion.safety.rules import CRASHED, PILOT_TOOK_OVER
 
 ARMED_SHOWN_S = 1.5
@@ -279,7 +280,11 @@ def _disarm(t: Transition, elapsed_s: float) -> AutopilotRequest:
 
 def _autopilot_land(t: Transition, _: float) -> AutopilotRequest:
     assert t.state.landing is not None
-    landing, step = t.state.landing.step(t.i)
+    i = t.i
+    if seq.is_killed(i.status) and i.vehicle is not None:
+        if i.vehicle.position_world_m[2] > t.parameters.clearance_m + DISARMED_ABOVE_M:
+            t.finish(Outcome.CRASHED)  # without rotors it falls
+    landing, step = t.state.landing.step(i)
     t.change(landing=landing, zero_thrust=step.zero_thrust)
     if landing.overturned and t.state.outcome is not Outcome.CRASHED:
         _crash(t, step.text or TIPPED)
@@ -298,12 +303,18 @@ def _done(_: Transition, __: float) -> AutopilotRequest:
 
 
 def _left_to_pilot(t: Transition) -> bool:
-    """Return whether a pilot took over before PX4 was disarmed. From then on nothing is sent, and the pilot disarms."""
+    """Return whether a pilot took over, or stopped the rotors by the kill switch, before PX4 was disarmed. From then on nothing is
+    sent, and the pilot disarms.
+    """
     if not seq.flown_by_pilot(t.i.status):
         return False
-    if not any(event.id == PILOT_TOOK_OVER for event in t.events):
+    if seq.is_killed(t.i.status):
+        rule_id, text = rules.KILLED, KILLED
+    else:
+        rule_id = PILOT_TOOK_OVER
         text = "a pilot took over before PX4 was disarmed; the companion sends nothing from now on"
-        t.report_rule(PILOT_TOOK_OVER, SafetyAction.AUTOPILOT_LAND, text)
+    if not any(event.id == rule_id for event in t.events):
+        t.report_rule(rule_id, SafetyAction.AUTOPILOT_LAND, text)
     t.finish(Outcome.ABORTED)
     t.enter(Stage.AUTOPILOT_LAND, pilot_flies=True)
     return True

@@ -74,7 +74,7 @@ class Px4State:
 
     @property
     def pilot(self) -> bool:
-        """Whether PX4 is armed and in a mode that only a pilot selects."""
+        """Whether a pilot has control: PX4 is armed, and in a mode that only a pilot selects or with its rotors killed."""
         return flown_by_pilot(self.status())
 
     def yaw_rad(self) -> float | None:

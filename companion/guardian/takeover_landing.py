@@ -18,6 +18,7 @@ from companion.guardian.link import Link
 from companion.guardian.monitors import PoseFilter
 from companion.guardian.px4 import Px4State
 from companion.guardian.retreat import Retreat
+from companion.model.flight_stage import is_killed
 from companion.model.types import (
     AutopilotRequest,
     AutopilotStatus,
@@ -47,6 +48,7 @@ POSITION_FRESH_S = 0.1
 RETREAT_WAIT_S = 0.3
 """Timeout for PX4's position, from which the way back from a surface begins; it is streamed every 20 ms."""
 LINK_FRESH_S = 2.5
+KILLED = "PX4's kill switch or flight termination has stopped the rotors"
 TOUCH_DOWN = "touchdown"
 """Text of `LandingStep` at touchdown."""
 DISARMED_AFTER_S = 1.5
@@ -242,7 +244,8 @@ class TakeoverLanding:
             self._pilot = True
             self._landing = None
         if self._pilot:
-            text = f"a pilot is flying: {'nothing' if self._external else 'only motion capture'} is sent to PX4"
+            found = KILLED if is_killed(self._px4.status()) else "a pilot is flying"
+            text = f"{found}: {'nothing' if self._external else 'only motion capture'} is sent to PX4"
             self._notify_once(t_s, "guardian_pilot", Severity.WARNING, text)
 
     def _apply(self, t_s: float, status: AutopilotStatus | None, step: LandingStep) -> None:

@@ -60,7 +60,12 @@ PILOT_FLIES = "a pilot flies"
 """Name of the phase in which the companion sends nothing because a pilot has control."""
 PILOT_MODES: Final = frozenset({FlightMode.MANUAL, FlightMode.HOLD, FlightMode.RETURN, FlightMode.TAKEOFF})
 """Modes that only a pilot or one of PX4's failsafes chooses. While a pilot is flying, the companion sends nothing."""
-FAILSAFE_STATES = frozenset({5, 6, 8})
+FLIGHT_TERMINATION: Final = 8
+"""HEARTBEAT.system_status (MAV_STATE_FLIGHT_TERMINATION) while PX4's kill switch is engaged or its flight termination is active: the
+rotors are stopped. After a kill PX4 stays armed, usually in its mode, for COM_KILL_DISARM; a switch that is released before starts the
+rotors again.
+"""
+FAILSAFE_STATES = frozenset({5, 6, FLIGHT_TERMINATION})
 """Values of HEARTBEAT.system_status while a PX4 failsafe is active: MAV_STATE_CRITICAL, EMERGENCY and FLIGHT_TERMINATION."""
 
 
@@ -89,6 +94,13 @@ def chosen_by_pilot(status: AutopilotStatus) -> bool:
     return status.mode in PILOT_MODES and not failsafe_chose(status)
 
 
+def is_killed(status: AutopilotStatus | None) -> bool:
+    """Return whether PX4 reports a stop of the rotors by its kill switch or its flight termination."""
+    return status is not None and status.system_status == FLIGHT_TERMINATION
+
+
 def flown_by_pilot(status: AutopilotStatus | None) -> bool:
-    """Return whether a pilot is flying the vehicle: PX4 is armed and in a mode that a pilot has chosen."""
-    return status is not None and status.armed and chosen_by_pilot(status)
+    """Return whether a pilot has control: PX4 is armed, and in a mode that a pilot has chosen or with its rotors stopped by the kill
+    switch. Nothing is sent to PX4 then.
+    """
+    return status is not None and status.armed and (chosen_by_pilot(status) or is_killed(status))

@@ -40,6 +40,7 @@ PX4_DEFAULTS: Mapping[str, float | int] = {
     "COM_FLTMODE1": -1,
     "COM_FLTT_LOW_ACT": 3,
     "COM_HOME_EN": 1,
+    "COM_KILL_DISARM": 5.0,
     "COM_LOW_BAT_ACT": 0,
     "COM_OBL_RC_ACT": 0,
     "COM_OF_LOSS_T": 1.0,

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from companion.model.best_pose import pose_used_s
-from companion.model.flight_stage import chosen_by_pilot, in_offboard, is_armed, on_ground
+from companion.model.flight_stage import chosen_by_pilot, in_offboard, is_armed, is_killed, on_ground
 from companion.model.types import AutopilotRequest, FlightMode, Inputs
 from companion.safety.rotor_stop import (
     ESTIMATE_TRUSTED_S,
@@ -62,6 +62,7 @@ DRIFT_M_S2 = 0.5
 STANDING_S = 3.0
 TIMEOUT_S = 30.0
 FLIPPED: Final = "flipped: FORCE_DISARM is requested at once"
+KILLED: Final = "PX4's kill switch or flight termination has stopped the rotors; nothing is sent to PX4 any more"
 TIPPED: Final = "tipped over on the floor: FORCE_DISARM is requested at once"
 
 
@@ -183,7 +184,7 @@ class AutopilotLanding:
         if not now.pilot and heard:
             now, takes_over = now._watch_mode(i)
             if takes_over:
-                text = "a pilot took over"
+                text = KILLED if is_killed(i.status) else "a pilot took over"
                 return replace(now, pilot=True), LandingStep(
                     request=AutopilotRequest.NONE, zero_thrust=False, ended=False, landed=False, text=text
                 )
@@ -232,12 +233,12 @@ class AutopilotLanding:
 
     def _watch_mode(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
         """Return whether a pilot has taken over: PX4 is in a manual mode or, after it began to land, in any mode that only a pilot
-        selects.
+        selects, or its rotors were stopped by the kill switch.
         """
         mode = i.status.mode if i.status is not None else FlightMode.UNKNOWN
         now = self if self.was_landing or mode is not FlightMode.LAND else replace(self, was_landing=True)
         chosen = i.status is not None and chosen_by_pilot(i.status)
-        return now, mode is FlightMode.MANUAL or (now.was_landing and chosen)
+        return now, mode is FlightMode.MANUAL or (now.was_landing and chosen) or is_killed(i.status)
 
     def _watch_touchdown(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
         """Detect and handle a touchdown: PX4 is landing, its height shows a vehicle on the ground, and motion capture does not

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from companion.model.flight_stage import chosen_by_pilot, failsafe_chose
+from companion.model.flight_stage import chosen_by_pilot, failsafe_chose, is_killed
 from companion.model.types import AutopilotStatus, FlightMode, Inputs, VehicleState
 from companion.safety.situation import HOLDS, Age, Situation, Values
 
@@ -67,8 +67,9 @@ class Px4Tracker:
                 age_s = imu_s
             self.state_age_s = age_s
             self._compare(v, situation, awake_s, moving)
-        commands = situation.offboard_expected and status is not None and status.mode is not FlightMode.OFFBOARD
-        self.left_offboard = status if commands else None
+        left = situation.offboard_expected and status is not None and status.mode is not FlightMode.OFFBOARD
+        # PX4 reports its flight termination as MANUAL, which no pilot has chosen.
+        self.left_offboard = status if left and not is_killed(status) else None
         self.heartbeat_age_s = self._heartbeat.update(awake_s, status.heartbeat_stamp_s if status else None)
 
     def _compare(self, v: VehicleState, situation: Situation, awake_s: float, moving: bool) -> None:
@@ -98,6 +99,11 @@ def reattached(p: Px4Tracker, _: None) -> Values | None:
     """Fires if PX4 is armed although the companion has not requested it."""
     found = p.situation.found_armed
     return None if found is None else (found,)
+
+
+def killed(p: Px4Tracker, _: None) -> Values | None:
+    """Fires if PX4's kill switch or its flight termination has stopped the rotors."""
+    return HOLDS if is_killed(p.status) else None
 
 
 def px4_rebooted(p: Px4Tracker, _: None) -> Values | None:

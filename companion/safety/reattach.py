@@ -6,7 +6,7 @@ before the companion does. The vehicle never takes off in this case.
 
 from __future__ import annotations
 
-from companion.model.flight_stage import flown_by_pilot, on_ground
+from companion.model.flight_stage import flown_by_pilot, is_killed, on_ground
 from companion.model.types import Inputs
 from companion.safety.rotor_stop import LOW_WITHIN_M, OWN_MODES, fresh_pose
 
@@ -30,6 +30,11 @@ def found_armed(i: Inputs, clearance_m: float) -> tuple[bool, str]:
     height = "unknown height" if height_m is None else f"height {height_m:.2f} m"
     mode = i.status.mode.value.upper() if i.status is not None else "?"
     found = f"({height}, mode {mode}), but not by the companion"
+    if is_killed(i.status):
+        return (
+            True,
+            f"PX4 is armed {found}; its rotors are stopped by the kill switch, so only motion capture is sent to PX4",
+        )
     if flown_by_pilot(i.status):
         return True, f"PX4 is armed {found}; a pilot has chosen the mode, so only motion capture is sent to PX4"
     if stands:

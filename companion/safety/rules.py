@@ -26,6 +26,7 @@ MOCAP_DRAGGED, MOCAP_FROZEN = "mocap_dragged", "mocap_frozen"
 MOCAP_SWAPPED, MOCAP_TWO_STREAMS = "mocap_swapped", "mocap_two_streams"
 REATTACHED: Final = "reattached"
 PILOT_TOOK_OVER: Final = "pilot_took_over"
+KILLED: Final = "killed"
 CRASHED: Final = "crashed"
 OPERATOR_START: Final = "operator_start"
 OPERATOR_RESUME: Final = "operator_resume"
@@ -81,6 +82,12 @@ RULES: tuple[Rule, ...] = (
     ),
     _operator(OperatorCommand.ABORT, "ABORT was commanded", _LAND, _LAND, "abort commanded"),
 
+    Rule(
+        id=KILLED, subject=Subject.PX4,
+        what="PX4's kill switch or its flight termination has stopped the rotors (MAV_STATE_FLIGHT_TERMINATION)",
+        predicate=px4.killed, ground=_PX4_LANDS, air=_PX4_LANDS, pilot_flies=True, severity=Severity.CRITICAL,
+        message="PX4's kill switch or flight termination has stopped the rotors; nothing is sent to PX4 any more",
+    ),
     Rule(
         id=REATTACHED, subject=Subject.PX4,
         what="PX4 was armed without a request from the companion: the companion was started in the air, or a pilot armed it",

@@ -58,6 +58,7 @@ FaultKind = Literal[
     "kill_recorder",
     "kill_guardian",
     "pilot_takeover",
+    "kill_switch",
 ]
 FlightPhase = Literal["ground", "takeoff", "line", "catch", "return", "landing", "touch", "press", "slide", "detach"]
 CONTACT_PHASES: tuple[FlightPhase, ...] = ("touch", "press", "slide", "detach")
@@ -280,6 +281,11 @@ KINDS: dict[FaultKind, Kind] = {
         default=3.0,
         named_by=("pilot_took_over",),
         process=True,
+    ),
+    "kill_switch": Kind(
+        "the pilot stops the rotors by the kill switch and, at the end of the fault, releases it; in the air, the vehicle falls",
+        named_by=("killed",),
+        phases=("ground",),
     ),
 }
 

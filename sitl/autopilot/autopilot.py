@@ -143,6 +143,8 @@ class Px4Stub:
         self.refuses_offboard = False
         """Fault: PX4 leaves OFFBOARD and refuses to enter it."""
         self.refuses_arming = False
+        self.kill_switch = False
+        """Whether the kill switch of the pilot's radio is engaged: the rotors stop at once."""
         self.booted_at_s = 0.0
         """World time of the last boot, at which PX4's own clock starts. PX4 does not run before this time."""
         self.clock_ahead_s = 0.0
@@ -223,10 +225,12 @@ class Px4Stub:
             return self._stopped
         self._choose_target(t_s, estimate)
         if dt_s > 0.0:
-            self.rotors = self._cascade.step(dt_s, estimate, self.target)
+            self.rotors = self._cascade.step(dt_s, estimate, self.target)  # also while killed, as in PX4
             factor = self.params.real("THR_MDL_FAC")
             if factor > 0.0:
                 self.rotors = tuple([motor_signal(command, factor) for command in self.rotors])
+        if self.kill_switch:
+            self.rotors = self._stopped
         return self.rotors
 
     def on_setpoint(self, t_s: float, target: OffboardTarget) -> None:
@@ -410,6 +414,7 @@ class Px4Stub:
             maybe_landed=self.land.maybe_landed,
             setpoint_age_s=None if self._setpoint_at_s is None or self.refuses_offboard else t_s - self._setpoint_at_s,
             setpoint_kind=self._setpoint_kind,
+            killed=self.kill_switch,
         )
 
     def _collect_notices(self) -> None:

@@ -78,6 +78,7 @@ class Commander:
         self.notices: list[Notice] = []
         self._intention_after_disarm = NavState.LOITER
         self._disarm_since_s: float | None = None
+        self._killed_since_s: float | None = None
 
     def command(
         self, t_s: float, command: int, params: tuple[float, float, float, float, float, float, float], health: Health
@@ -139,6 +140,8 @@ class Commander:
 
     def arming_problem(self, health: Health) -> str | None:
         """Return why arming would be refused in the present mode, or None."""
+        if health.killed:
+            return "Kill switch engaged"
         if self.user_intention in PREVENT_ARMING:
             return "Mode not suitable for arming"
         missing = health.missing(self.user_intention, self._offboard_timeout_s())
@@ -163,7 +166,8 @@ class Commander:
         return True
 
     def update(self, t_s: float, health: Health) -> None:
-        """Run one cycle of the commander: take-off detection, failsafe and automatic disarming."""
+        """Run one cycle of the commander: kill switch, take-off detection, failsafe and automatic disarming."""
+        self._watch_kill_switch(t_s, health)
         if not self.armed:
             self.nav_state = self.user_intention if self.nav_state is not NavState.TERMINATION else self.nav_state
             return
@@ -172,6 +176,15 @@ class Commander:
             self._notify(Severity.INFO, "Takeoff detected")
         self._fail_safe(health)
         self._auto_disarm(t_s, health)
+
+    def _watch_kill_switch(self, t_s: float, health: Health) -> None:
+        if health.killed is (self._killed_since_s is None):
+            self._killed_since_s = t_s if health.killed else None
+            severity = Severity.INFO if health.landed or not health.killed else Severity.CRITICAL
+            self._notify(severity, "Kill engaged" if health.killed else "Kill disengaged")
+        killed_s = t_s - self._killed_since_s if self._killed_since_s is not None else -math.inf
+        if self.armed and killed_s >= self._params.real("COM_KILL_DISARM"):
+            self.disarm(landed=True, forced=True, reason="kill-switch")
 
     def _fail_safe(self, health: Health) -> None:
         previous = self.nav_state

@@ -111,6 +111,8 @@ class Health:
     setpoint_age_s: float | None
     """Time since the newest offboard setpoint arrived; None if none has arrived."""
     setpoint_kind: OffboardKind = OffboardKind.ATTITUDE
+    killed: bool = False
+    """Whether the kill switch is engaged."""
 
     def offboard_available(self, timeout_s: float) -> bool:
         """Return whether offboard setpoints are fresh and the estimate that they need is valid (offboardCheck).

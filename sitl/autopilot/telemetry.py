@@ -51,7 +51,7 @@ def heartbeat(stub: Px4Stub) -> Message:
 
 def system_status(stub: Px4Stub) -> int:
     """Return HEARTBEAT.system_status (MAV_STATE), chosen as in HEARTBEAT.hpp of PX4 1.16."""
-    if stub.nav_state is NavState.TERMINATION:
+    if stub.nav_state is NavState.TERMINATION or stub.kill_switch:
         return int(mavlink.MAV_STATE_FLIGHT_TERMINATION)
     if not stub.armed:
         return int(mavlink.MAV_STATE_STANDBY)
@@ -295,8 +295,9 @@ def home_position(stub: Px4Stub) -> Message | None:
 
 
 def servo_output_raw(stub: Px4Stub) -> Message:
-    """Return SERVO_OUTPUT_RAW: 1000 to 2000 us for each of the first eight rotors, or 900 us while disarmed."""
-    pulses = [round(1000 + 1000 * command) if stub.armed else 900 for command in stub.rotors]
+    """Return SERVO_OUTPUT_RAW: 1000 to 2000 us for each of the first eight rotors, or 900 us while disarmed or killed."""
+    turns = stub.armed and not stub.kill_switch
+    pulses = [round(1000 + 1000 * command) if turns else 900 for command in stub.rotors]
     return mavlink.MAVLink_servo_output_raw_message(clock_us(stub) & 0xFFFFFFFF, 0, *[*pulses, *[0] * 8][:8])
 
 

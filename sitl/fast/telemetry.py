@@ -10,7 +10,14 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.io.px4.delta_velocity import DeltaVelocity
 from companion.io.px4.messages import battery, estimator_report, heartbeat_state, landed_state
-from companion.io.px4.streams import ATTITUDE_RATE_HZ, ESTIMATOR_RATE_HZ, IMU_RATE_HZ, LANDED_RATE_HZ, POSITION_RATE_HZ
+from companion.io.px4.streams import (
+    ATTITUDE_RATE_HZ,
+    ESTIMATOR_RATE_HZ,
+    HEARTBEAT_ASK_PERIOD_S,
+    IMU_RATE_HZ,
+    LANDED_RATE_HZ,
+    POSITION_RATE_HZ,
+)
 from companion.model.estimator import WATCHED_RATE_HZ, EstimatorReport
 from companion.model.frames import attitude_enu_flu_from_ned_frd, enu_from_ned, flu_from_frd
 from companion.model.types import (
@@ -78,6 +85,8 @@ class FastTelemetry:
         self._stamp_s = {_POSITION: -math.inf, _ATTITUDE: -math.inf, _IMU: -math.inf}
         """Time of the tick that read the newest data of a stream."""
         self._heartbeat_s = 0.0
+        self._asked_s = -math.inf
+        """Time at which the driver last requested HEARTBEAT."""
         self._vehicle: VehicleState | None = None
 
     def start_sums(self) -> None:
@@ -89,6 +98,9 @@ class FastTelemetry:
         if t_s >= self._px4.booted_at_s:
             for message_id in self._schedule.due(t_s):
                 self._takers[message_id]()
+            if self._heartbeat is not None and self._heartbeat[0] and t_s - self._asked_s >= HEARTBEAT_ASK_PERIOD_S:
+                self._asked_s = t_s
+                self._take_heartbeat()
 
     def vehicle(self, t_s: float) -> VehicleState | None:
         """Return the state that the tick at world time `t_s` reads; None before position, attitude and IMU have all arrived."""

@@ -55,6 +55,7 @@ class Autopilot(Protocol):
 
     refuses_offboard: bool
     refuses_arming: bool
+    kill_switch: bool
 
     def reboot(self, for_s: float) -> None:
         """Restart the autopilot; it runs again after `for_s`."""
@@ -205,6 +206,8 @@ class Faults:
                 px4.refuses_offboard = on
             case "arming_refused":
                 px4.refuses_arming = on
+            case "kill_switch":
+                px4.kill_switch = on
             case "pilot_takeover" if on:
                 px4.pilot_sets_mode(NavState.LOITER)
                 self._pilot_lands_s = t_s + size

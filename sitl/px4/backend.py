@@ -327,6 +327,7 @@ class _Faulty:
 
     refuses_offboard = False
     refuses_arming = False
+    kill_switch = False
 
     def __init__(self, control: ControlLink) -> None:
         self._control = control

@@ -211,3 +211,12 @@ def test_a_pilot_who_flies_is_only_given_motion_capture() -> None:
     assert all(o.attitude is None and o.request is AutopilotRequest.NONE for o in after)
     assert ids(after).count("reattached") == 1
     assert after[-1].outcome is Outcome.ABORTED, "PX4 disarmed"
+
+
+def test_a_vehicle_found_killed_is_only_given_motion_capture() -> None:
+    """PX4 reports the kill for as long as the switch is engaged, and stays armed for COM_KILL_DISARM."""
+    inputs = [found(FlightMode.OFFBOARD, LandedState.IN_AIR, HIGH, tick) for tick in range(100)]
+    inputs = [put("status", system_status=8 if i.tick < 50 else 4)(i) for i in inputs]
+    outputs = stepped(inputs)
+    assert all(o.attitude is None and o.request is AutopilotRequest.NONE for o in outputs)
+    assert {"killed", "reattached"} <= set(ids(outputs))

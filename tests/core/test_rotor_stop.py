@@ -134,6 +134,39 @@ def test_a_pilot_who_takes_over_between_arming_and_take_off_is_not_disarmed(mode
     assert outputs[-1].outcome is None, "it waits for the pilot's own disarm"
 
 
+@pytest.mark.parametrize("phase", ["spool up", "hold", "land", "touchdown", "disarm"])
+def test_after_a_kill_nothing_is_sent_again_even_if_the_switch_is_released(phase: str) -> None:
+    """Setpoints went on at full thrust, and the vehicle jumped when the switch was released."""
+    core, machine, _ = machine_from(phase, system_status=8)
+    outputs = walked(core, machine, 20)
+    machine.system_status = 4
+    outputs += walked(core, machine, 200)
+    assert all(o.attitude is None for o in outputs)
+    assert requests(outputs) == {AutopilotRequest.NONE}
+    assert ids(outputs).count("killed") == 1 and "pilot_took_over" not in ids(outputs)
+    assert outputs[-1].outcome is None, "PX4 disarms"
+    machine.armed = False
+    assert walked(core, machine, 40)[-1].outcome is (Outcome.CRASHED if phase in ("hold", "land") else Outcome.ABORTED)
+
+
+def test_a_kill_during_px4s_landing_ends_the_requests_to_land() -> None:
+    core, machine, _ = machine_from("hold")
+    machine.mode = FlightMode.OTHER
+    assert AutopilotRequest.LAND in requests(walked(core, machine, 20))
+    machine.system_status = 8
+    killed = walked(core, machine, 20)
+    machine.system_status = 4
+    assert requests([*killed, *walked(core, machine, 100)]) == {AutopilotRequest.NONE}
+
+
+@pytest.mark.parametrize("phase", ["wait", "arm"])
+def test_with_the_kill_switch_engaged_it_does_not_take_off(phase: str) -> None:
+    core, machine, _ = machine_from(phase, 1, armed=False, landed=LandedState.ON_GROUND, system_status=8)
+    outputs = walked(core, machine, 120)
+    assert outputs[-1].outcome is Outcome.REFUSED
+    assert "killed" in ids(outputs)
+
+
 def test_landed_just_after_arming_it_ends_only_once_px4_shows_that_it_is_not_armed() -> None:
     """PX4's HEARTBEAT comes once a second: LAND 20 ms after ARM meets a status from before the arming."""
     core, machine, _ = machine_from("arm", 1, landed=LandedState.ON_GROUND, armed=False)

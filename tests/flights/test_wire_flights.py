@@ -10,7 +10,9 @@ from typing import Any
 import pytest
 
 from companion.analysis.contact import rotor_distance_m
+from companion.analysis.log import FlightLog
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK
+from companion.model.types import AutopilotRequest
 from tests.core.test_sliding import short_slide
 from tests.support import HOVER, HOVERS_S, SHORT_CATCH, Ended, Sandbox, read_summary, run_here, sandbox_in, set_options
 
@@ -109,3 +111,22 @@ def test_a_tip_slides_along_a_wall(tmp_path_factory: pytest.TempPathFactory) -> 
     contact = summary["contact"]
     assert contact["slid_m"] == pytest.approx(0.3, abs=0.03)
     assert contact["path_rms_m"] < 0.04 and contact["rms_error_n"] < 1.5
+
+
+def test_a_kill_switch_ends_the_setpoints_and_its_release_moves_nothing(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    """Engaged for a second at full take-off thrust, before the vehicle lifts."""
+    with sandbox_in(tmp_path_factory.mktemp("kill")) as sandbox:
+        options = set_options(**{"world.faults": [{"kind": "kill_switch", "t_s": 2.3, "duration_s": 1.0}]})
+        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *options)
+        sandbox.assert_nobody_left()
+        summary = read_summary(sandbox.cwd / "out")
+        log = FlightLog.read(sandbox.cwd / "out/flight.mcap")
+    assert ended.code == EXIT_ABORTED, ended
+    assert [event["id"] for event in summary["events"]] == ["takeoff", "killed"]
+    killed = next(o.tick for o in log.outputs if any(event.id == "killed" for event in o.events))
+    after = [o for o in log.outputs if o.tick >= killed]
+    assert all(o.attitude is None and o.request is AutopilotRequest.NONE for o in after)
+    heights_m = [i.vehicle.position_world_m[2] for i in log.inputs if i.tick >= killed and i.vehicle is not None]
+    assert max(heights_m) - heights_m[0] < 0.03

@@ -176,6 +176,22 @@ def test_a_pilot_who_takes_over_from_the_guardian_is_respected(tmp_path: Path) -
         assert len(rig.peer.commands(NAV_LAND)) == before
 
 
+def test_after_a_kill_the_guardian_sends_no_command_and_no_setpoint(tmp_path: Path) -> None:
+    """The mode stays OFFBOARD; a LAND would start the rotors when the switch is released."""
+    with Rig(tmp_path) as rig:
+        rig.beat_until_ready()
+        rig.peer.system_status = mavlink.MAV_STATE_FLIGHT_TERMINATION
+        rig.flight.kill()
+        wait_until(lambda: "guardian_pilot" in rig.events, rig.log.read_text)
+        rig.peer.system_status = mavlink.MAV_STATE_ACTIVE
+        rig.peer.wait_for("VISION_POSITION_ESTIMATE", 100)
+        rig.peer.base_mode &= ~mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+        assert rig.guardian.wait(DEADLINE_S) == 0
+        assert rig.peer.commands(NAV_LAND) == rig.peer.commands(ARM_DISARM) == []
+        assert rig.peer.of("SET_ATTITUDE_TARGET") == []
+        assert "kill switch" in rig.log.read_text()
+
+
 def test_a_hold_by_px4s_own_failsafe_is_no_pilot_and_is_landed(tmp_path: Path) -> None:
     with Rig(tmp_path) as rig:
         rig.beat_until_ready()

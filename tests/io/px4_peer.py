@@ -38,7 +38,7 @@ class Px4Peer:
         self.base_mode = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         self.custom_mode = 3 << 16
         self.beating = True
-        self._beat_period_s = beat_period_s
+        self.beat_period_s = beat_period_s
         self.origin: Any = True
         """True: there was one from the start. None: there is none. Else the SET_GPS_GLOBAL_ORIGIN that was taken."""
         self.params = dict(PARAMS)
@@ -53,6 +53,7 @@ class Px4Peer:
         self.system_status = mavlink.MAV_STATE_ACTIVE
         self.acks: dict[int, int | None] = {}
         """MAV_CMD to MAV_RESULT, accepted where absent; None: no answer at all."""
+        self.heartbeats_on_request = False
         self.working_on: list[Any] = []
         """Commands that were answered with IN_PROGRESS; the answer is repeated at 10 Hz."""
         self.asked_interval_us: dict[int, float] = {}
@@ -117,11 +118,11 @@ class Px4Peer:
             self._socket.sendto(message.pack(self._out), self.remote)
 
     def _run(self) -> None:
-        beat_s = stream_s = 0.0
+        beaten_s = stream_s = 0.0
         while not self._stop.is_set():
             now_s = time.monotonic()
-            if self.beating and now_s >= beat_s:
-                beat_s = now_s + self._beat_period_s
+            if self.beating and now_s >= beaten_s + self.beat_period_s:
+                beaten_s = now_s
                 self._say_slow()
             if self.beating and now_s >= stream_s:
                 stream_s = now_s + 0.02
@@ -163,6 +164,8 @@ class Px4Peer:
             self._say_ack(message, result)
         if result == mavlink.MAV_RESULT_IN_PROGRESS:
             self.working_on.append(message)
+        if message.command == mavlink.MAV_CMD_REQUEST_MESSAGE and message.param1 == 0 and self.heartbeats_on_request:
+            self._say_heartbeat()
         if message.command == mavlink.MAV_CMD_REQUEST_MESSAGE and message.param1 == 148:
             version, git = 0x011001FF, list(bytes.fromhex("efcdab8967452301"))
             self.say(mavlink.MAVLink_autopilot_version_message(0, version, 0, 0, 0, git, [0] * 8, [0] * 8, 0, 0, 0))
@@ -199,16 +202,19 @@ class Px4Peer:
         with self._changed:
             for command in self.working_on:
                 self._say_ack(command, mavlink.MAV_RESULT_IN_PROGRESS)
-        self.say(
-            mavlink.MAVLink_heartbeat_message(
-                mavlink.MAV_TYPE_QUADROTOR, self.autopilot, self.base_mode, self.custom_mode, self.system_status, 3
-            )
-        )
+        self._say_heartbeat()
         self.say(mavlink.MAVLink_extended_sys_state_message(0, self.landed))
         if self.estimator is not None and mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS in self.asked_interval_us:
             self.say(mavlink.MAVLink_estimator_status_message(int(time.monotonic() * 1e6), *self.estimator))
         cells = [4000] * 4 + [65535] * 6
         self.say(mavlink.MAVLink_battery_status_message(0, 0, 1, 2000, cells, 100, 0, 0, 77, 0, 0))
+
+    def _say_heartbeat(self) -> None:
+        self.say(
+            mavlink.MAVLink_heartbeat_message(
+                mavlink.MAV_TYPE_QUADROTOR, self.autopilot, self.base_mode, self.custom_mode, self.system_status, 3
+            )
+        )
 
     def _say_fast(self, time_boot_ms: int) -> None:
         if mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED in self.asked_interval_us:

@@ -17,6 +17,7 @@ from companion.io.protocols import DeviceError
 from companion.io.px4 import params as autopilot_params
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.estimator import EstimatorReport
+from companion.model.flight_stage import is_killed
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.types import (
     AttitudeSetpoint,
@@ -230,6 +231,32 @@ def test_status_follows_heartbeat_landed_state_and_battery() -> None:
                     ),
                     "armed, offboard, in air",
                 )
+
+    asyncio.run(fly())
+
+
+def test_the_heartbeat_of_an_armed_px4_is_requested_so_that_a_kill_is_seen_at_once() -> None:
+    """PX4 sends one HEARTBEAT per second and refuses another rate; a kill switch may be released before the next one."""
+
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            async with edge(port) as autopilot:
+                await eventually(lambda: autopilot.vehicle() is not None, "a state")
+                assert not [m for m in peer.commands(512) if m.param1 == 0.0], "nothing is asked while it is disarmed"
+                peer.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+                peer.heartbeats_on_request = True
+                await eventually(lambda: autopilot.vehicle() is not None and armed(autopilot), "armed")
+                peer.beat_period_s = math.inf
+                peer.system_status = mavlink.MAV_STATE_FLIGHT_TERMINATION
+                await eventually(lambda: autopilot.vehicle() is not None and killed(autopilot), "the kill")
+
+    def armed(autopilot: MavsdkAutopilot) -> bool:
+        status = autopilot.status()
+        return status is not None and status.armed
+
+    def killed(autopilot: MavsdkAutopilot) -> bool:
+        return is_killed(autopilot.status())
 
     asyncio.run(fly())
 

@@ -177,6 +177,7 @@ FAULTS: dict[str, Fault] = {
     "heartbeat_lost": Fault(stopped("status")),
     "px4_rebooted": Fault(put("vehicle", boot_s=2.0), also=frozenset({"link_late"})),
     "link_late": Fault(slow_link),
+    "killed": Fault(put("status", system_status=8)),
     "reattached": Fault(situation=lambda: flying(found_armed=FOUND)),
     "px4_disarmed": Fault(put("status", armed=False)),
     "pilot_took_over": Fault(put("status", mode=FlightMode.MANUAL)),
@@ -266,6 +267,11 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "operator_start": (NOMINAL, NOMINAL, 0.015),
     "operator_land": (LAND, LAND, 0.015),
     "operator_abort": (LAND, LAND, 0.015),
+    "killed": (
+        PX4_LANDS,
+        PX4_LANDS,
+        0.015,
+    ),  # nothing is sent after it: what would be, would act when the switch is released
     "reattached": (LAND, PX4_LANDS, 0.000),  # on the ground it is disarmed; in the air nobody else lands it
     "mocap_lost": (PX4_LANDS, PX4_LANDS, 0.220),  # PX4's estimate holds for 4.5 s, the companion has none
     "mocap_invalid": (PX4_LANDS, PX4_LANDS, 0.210),
@@ -359,7 +365,7 @@ def severity_of(rule_id: str, action: SafetyAction, *, airborne: bool) -> Severi
     if rule_id.startswith("operator_"):
         return Severity.INFO
     ends_the_mission = airborne and action in (RETRACT, LAND, PX4_LANDS, TERMINATE)
-    return Severity.CRITICAL if ends_the_mission or rule_id == "reattached" else Severity.WARNING
+    return Severity.CRITICAL if ends_the_mission or rule_id in ("killed", "reattached") else Severity.WARNING
 
 
 def test_every_rule_has_its_fault() -> None:

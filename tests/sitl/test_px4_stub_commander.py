@@ -265,3 +265,18 @@ def test_a_mode_command_made_of_nan_is_denied() -> None:
 
 def test_unknown_commands_are_unsupported() -> None:
     assert ask(commander(), 31000) is Result.UNSUPPORTED
+
+
+def test_a_kill_disarms_after_com_kill_disarm_and_forbids_arming() -> None:
+    it = flying(NavState.OFFBOARD)
+    killed = replace(FLYING, killed=True)
+    it.update(1.0, killed)
+    it.update(5.9, killed)
+    assert it.armed
+    it.update(5.95, FLYING)
+    it.update(6.1, killed)
+    it.update(11.0, killed)
+    assert it.armed, "the time counts from the last kill"
+    it.update(11.2, killed)
+    assert not it.armed
+    assert it.arming_problem(replace(GOOD, killed=True)) == "Kill switch engaged"

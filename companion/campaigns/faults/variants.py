@@ -93,6 +93,7 @@ VARIANTS: tuple[Variant, ...] = (
     *_durations("kill_recorder", None),
     *_durations("kill_guardian", None),
     *_sizes("pilot_takeover", 3.0),
+    *_durations("kill_switch", None),
 )
 """Faults of a campaign in the fast loop, each in every phase of its kind."""
 

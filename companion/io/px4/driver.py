@@ -31,7 +31,7 @@ from companion.io.px4.params import ParamTransfer
 from companion.io.px4.questions import Questions
 from companion.io.px4.requests import RequestQueue
 from companion.io.px4.setpoints import SetpointPath, setpoint_path
-from companion.io.px4.streams import ESTIMATOR_RATE_HZ, ask_for_streams, stop_unread_streams
+from companion.io.px4.streams import ESTIMATOR_RATE_HZ, HEARTBEAT_ASK_PERIOD_S, ask_for_streams, stop_unread_streams
 from companion.io.px4.wire import OpenWire, UdpWire
 from companion.model.estimator import EstimatorReport
 from companion.model.observations import StateCounts
@@ -89,7 +89,7 @@ class MavsdkAutopilot:
         self._readers = self._inbox.readers
         self._relay: socket.socket | None = None
         self._pump_timer: asyncio.TimerHandle | None = None
-        self._polled_s = -math.inf
+        self._polled_s = self._asked_s = -math.inf
         self._restore_log: Callable[[], None] | None = None
         self._setpoints: SetpointPath | None = None
         self._questions: Questions | None = None
@@ -173,6 +173,7 @@ class MavsdkAutopilot:
         are arrival times.
         """
         self._poll()
+        self._ask_for_heartbeat()
         return self._inbox.vehicle()
 
     def status(self) -> AutopilotStatus | None:
@@ -318,6 +319,16 @@ class MavsdkAutopilot:
         status = self._inbox.status()
         if self._open and status is not None and not status.armed:
             self._send_message(messages.HEARTBEAT_ID, messages.GROUND_STATION_HEARTBEAT)
+
+    def _ask_for_heartbeat(self) -> None:
+        """Request HEARTBEAT from an armed PX4, which refuses another rate than one per second: a kill or a pilot's mode must be seen
+        sooner.
+        """
+        status, now_s = self._inbox.status(), self._clock()
+        if self._open and status is not None and status.armed and now_s - self._asked_s >= HEARTBEAT_ASK_PERIOD_S:
+            self._asked_s = now_s
+            heartbeat = float(messages.HEARTBEAT_ID)
+            self._send_message(*messages.command_long(messages.REQUEST_MESSAGE, heartbeat, 0.0, self._system_id))
 
     def _pump(self) -> None:
         """Read the link regularly while the flight loop does not."""

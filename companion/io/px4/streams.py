@@ -15,6 +15,8 @@ ATTITUDE_RATE_HZ = 250.0
 IMU_RATE_HZ = 250.0
 LANDED_RATE_HZ = 10.0
 ESTIMATOR_RATE_HZ = 5.0
+HEARTBEAT_ASK_PERIOD_S = 0.1
+"""Period at which HEARTBEAT, which PX4 sends once per second, is requested while PX4 is armed."""
 _DEFAULT_RATE, _STOP = 0.0, -1.0
 """Intervals of MAV_CMD_SET_MESSAGE_INTERVAL."""
 
