@@ -15,6 +15,8 @@ from companion.safety.situation import HOLDS, Age, Situation, Values
 DISARMED_ABOVE_M = 0.15
 """Margin over standing height below which PX4's own disarm after a landing is not a fault."""
 CLOCK_BACK_S: Final = 1.0
+BATTERY_SILENT_S: Final = 10.0
+"""Max age of a battery's newest BATTERY_STATUS, which PX4 sends every 2 s: a charge that is not known is not taken for a full one."""
 LAG_FORGOTTEN_S_PER_S: Final = 0.05
 """Rate at which a lasting lag is reduced, because it is an offset between the clocks."""
 
@@ -41,6 +43,8 @@ class Px4Tracker:
         self.situation = Situation(False, False, None)
         self.state_age_s = self.heartbeat_age_s = 0.0
         """Age of the oldest of position, attitude and IMU sample; `heartbeat_age_s` is the age of the newest heartbeat."""
+        self.battery_age_s = 0.0
+        """Time since the last report of the battery that has been silent for the longest time; 0 before the first report."""
         self.lag_s = 0.0
         """Lag of PX4's state beyond the smallest one seen; 0 without PX4's clock."""
         self.rebooted_s: float | None = None
@@ -67,6 +71,8 @@ class Px4Tracker:
                 age_s = imu_s
             self.state_age_s = age_s
             self._compare(v, situation, awake_s, moving)
+        reported_s = status.battery_stamp_s if status is not None else None
+        self.battery_age_s = i.t_s - reported_s if reported_s is not None else 0.0
         left = situation.offboard_expected and status is not None and status.mode is not FlightMode.OFFBOARD
         # PX4 reports its flight termination as MANUAL, which no pilot has chosen.
         self.left_offboard = status if left and not is_killed(status) else None
@@ -159,6 +165,11 @@ def battery_below(p: Px4Tracker, remaining_min: float) -> Values | None:
     """Fires if the remaining charge, 0 to 1, is below the threshold."""
     remaining = p.status.battery_remaining if p.status is not None else None
     return (remaining, remaining_min) if remaining is not None and remaining < remaining_min else None
+
+
+def battery_silent(p: Px4Tracker, _: None) -> Values | None:
+    """Fires if a battery has not been reported for longer than `BATTERY_SILENT_S`."""
+    return (BATTERY_SILENT_S,) if p.battery_age_s > BATTERY_SILENT_S else None
 
 
 def battery_voltage(p: Px4Tracker, voltage_min_v: float | None) -> Values | None:

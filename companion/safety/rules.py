@@ -227,6 +227,11 @@ RULES: tuple[Rule, ...] = (
         thresholds=("battery_min",), hold_time=1.0, ground=_LAND, air=_LAND, message="battery at {:.0%} (limit {:.0%})",
     ),
     Rule(
+        id="battery_silent", subject=Subject.PX4, what="a battery is not reported any more, so that its charge is unknown",
+        predicate=px4.battery_silent, ground=_LAND, air=_LAND,
+        message="no BATTERY_STATUS of a battery for more than {:.0f} s: its charge is unknown",
+    ),
+    Rule(
         id="battery_voltage", subject=Subject.PX4, what="voltage too low", predicate=px4.battery_voltage,
         thresholds=("battery_voltage_min_v",), hold_time=2.0, ground=_LAND, air=_LAND,
         message="battery at {:.1f} V (limit {:.1f} V)",

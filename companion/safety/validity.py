@@ -138,6 +138,7 @@ def _status_is_valid(s: AutopilotStatus) -> bool:
     voltage, remaining = s.battery_voltage_v, s.battery_remaining
     return (
         _stamp(s.heartbeat_stamp_s)
+        and (s.battery_stamp_s is None or _stamp(s.battery_stamp_s))
         and (voltage is None or -OUT_OF_RANGE < voltage < OUT_OF_RANGE)
         and (remaining is None or -OUT_OF_RANGE < remaining < OUT_OF_RANGE)
     )

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.io.px4.delta_velocity import DeltaVelocity
-from companion.io.px4.messages import battery, estimator_report, heartbeat_state, landed_state
+from companion.io.px4.messages import Batteries, estimator_report, heartbeat_state, landed_state
 from companion.io.px4.streams import (
     ATTITUDE_RATE_HZ,
     ESTIMATOR_RATE_HZ,
@@ -78,7 +78,7 @@ class FastTelemetry:
         self._imu: tuple[Vec3, float | None, Vec3, int] = (_ZERO, None, _ZERO, 0)
         self._heartbeat: tuple[bool, FlightMode, int] | None = None
         self._landed = LandedState.UNKNOWN
-        self._battery: tuple[float | None, float | None] = (None, None)
+        self._batteries = Batteries()
         self._estimator: EstimatorReport | None = None
         self._unread: set[int] = set()
         """Streams that have sent since the last tick."""
@@ -137,7 +137,7 @@ class FastTelemetry:
         if math.isnan(self._heartbeat_s):
             self._heartbeat_s = t_s
         armed, mode, system_status = self._heartbeat
-        voltage_v, remaining = self._battery
+        voltage_v, remaining, battery_stamp_s = self._batteries.worst()
         return AutopilotStatus(
             heartbeat_stamp_s=self._heartbeat_s,
             armed=armed,
@@ -145,6 +145,7 @@ class FastTelemetry:
             landed=self._landed,
             battery_voltage_v=voltage_v,
             battery_remaining=remaining,
+            battery_stamp_s=battery_stamp_s,
             system_status=system_status,
         )
 
@@ -190,8 +191,7 @@ class FastTelemetry:
 
     def _take_battery(self) -> None:
         self._px4.battery = self._measured_battery()
-        message = telemetry.battery_status(self._px4)
-        self._battery = battery(message.voltages, message.battery_remaining)
+        self._batteries.take(self._px4.t_s, telemetry.battery_status(self._px4))
 
     def _take_estimator(self) -> None:
         message = telemetry.estimator_status(self._px4)

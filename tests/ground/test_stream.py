@@ -347,6 +347,7 @@ def test_a_light_warns_from_half_its_limit_on(name_aged: tuple[str, Callable[[fl
         ("battery", {"status__battery_remaining": 0.25}, HealthLevel.WARN, "25 %"),
         ("battery", {"status__battery_remaining": 0.15}, HealthLevel.BAD, "15 %"),
         ("battery", {"status__battery_voltage_v": 13.0}, HealthLevel.BAD, "13.0 V"),
+        ("battery", {"status__battery_stamp_s": -10.5}, HealthLevel.BAD, "not reported for"),
         (
             "battery",
             {"status__battery_voltage_v": None, "status__battery_remaining": None},

@@ -22,6 +22,7 @@ from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.types import (
     AttitudeSetpoint,
     AutopilotRequest,
+    AutopilotStatus,
     FlightMode,
     LandedState,
     MocapPose,
@@ -231,6 +232,34 @@ def test_status_follows_heartbeat_landed_state_and_battery() -> None:
                     ),
                     "armed, offboard, in air",
                 )
+
+    asyncio.run(fly())
+
+
+def test_of_two_batteries_the_worst_counts_and_one_that_falls_silent_has_an_age() -> None:
+    """The full battery masked the empty one, and the last report of a battery counted for ever."""
+
+    async def fly() -> None:
+        port = free_udp_port()
+        with Px4Peer(port) as peer:
+            async with edge(port) as autopilot:
+                cells = [3500] * 4 + [65535] * 6
+                empty = mavlink.MAVLink_battery_status_message(1, 0, 1, 2000, cells, 100, 0, 0, 12, 0, 0)
+                peer.say(empty)
+                await eventually(lambda: read(autopilot).battery_remaining == 0.12, "the empty battery")
+                await eventually(lambda: silent_s(autopilot) > 0.5, "the full one, sent every 0.1 s, hides the silence")
+                assert (read(autopilot).battery_voltage_v, read(autopilot).battery_remaining) == (14.0, 0.12)
+                peer.say(empty)
+                await eventually(lambda: silent_s(autopilot) < 0.5, "it is heard again")
+
+    def read(autopilot: MavsdkAutopilot) -> AutopilotStatus:
+        status = autopilot.status()
+        assert status is not None
+        return status
+
+    def silent_s(autopilot: MavsdkAutopilot) -> float:
+        status = read(autopilot)
+        return status.heartbeat_stamp_s - (status.battery_stamp_s or -math.inf)
 
     asyncio.run(fly())
 

@@ -68,6 +68,21 @@ def test_an_unheard_of_landed_state_is_unknown() -> None:
     assert messages.landed_state(17) is LandedState.UNKNOWN
 
 
+def test_of_several_batteries_the_worst_known_value_counts() -> None:
+    batteries = messages.Batteries()
+    assert batteries.worst() == (None, None, None)
+    for stamp_s, id_, cell_mv, percent in (
+        (1.0, 0, 4000, 90),
+        (2.0, 1, 3500, -1),
+        (3.0, 2, 65535, 40),
+        (4.0, 0, 3900, 80),
+    ):
+        cells = [cell_mv] * 4 + [65535] * 6
+        message = mavlink.MAVLink_battery_status_message(id_, 0, 1, 2000, cells, 100, 0, 0, percent, 0, 0)
+        batteries.take(stamp_s, message)
+    assert batteries.worst() == pytest.approx((14.0, 0.4, 2.0))
+
+
 def test_battery_that_the_autopilot_does_not_know_is_none() -> None:
     assert messages.battery([15200, *[65535] * 9], 40) == pytest.approx((15.2, 0.4))
     assert messages.battery([3800] * 4 + [65535] * 6, 40) == pytest.approx((15.2, 0.4))

@@ -184,6 +184,7 @@ FAULTS: dict[str, Fault] = {
     "offboard_left": Fault(put("status", mode=FlightMode.LAND)),
     "battery_warn": Fault(put("status", battery_remaining=0.25)),
     "battery_low": Fault(put("status", battery_remaining=0.1), also=frozenset({"battery_warn"})),
+    "battery_silent": Fault(lambda i: put("status", battery_stamp_s=i.t_s - 10.1)(i)),
     "battery_voltage": Fault(put("status", battery_voltage_v=13.0)),
     "arm_lost": Fault(stopped("arm")),
     "arm_read_failures": Fault(put("arm", read_failures=5)),
@@ -298,6 +299,7 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "px4_disarmed": (None, PX4_LANDS, 0.015),  # on the ground PX4 may disarm
     "battery_warn": (WARN, WARN, 1.015),
     "battery_low": (LAND, LAND, 1.015),
+    "battery_silent": (LAND, LAND, 0.015),  # its charge may be anything
     "battery_voltage": (LAND, LAND, 2.015),
     "arm_lost": (LAND, LAND, 0.120),  # a limp or unknown arm swings; the vehicle still flies
     "arm_read_failures": (WARN, WARN, 0.015),
@@ -348,7 +350,7 @@ READS = """
     mocap_dragged 91 40; mocap_slow 31 50; mocap_late 80 50; mocap_too_late 200 120; estimate_disagrees 0.34 0.30;
     yaw_disagrees 20 15; estimator_silent 0.25; vision_rejected 1.2 1; px4_rebooted 2.0; link_late 92 70;
     vehicle_state_lost 0.25; heartbeat_lost 2.5; px4_disarmed 1.00; battery_warn 25 30; battery_low 10 20;
-    battery_voltage 13.0 13.2; arm_lost 0.10; arm_read_failures 5; torque_refused 0.0; servo_error 70 2;
+    battery_silent 10; battery_voltage 13.0 13.2; arm_lost 0.10; arm_read_failures 5; torque_refused 0.0; servo_error 70 2;
     joint_jump 2 29; servo_warm 68 65; servo_hot 76 75; servo_overload -2.5 0.1; joint_rate 0 745 700;
     joint_beyond_limit 180 57 5; joint_far_beyond_limit 115 -25 15; force_lost 0.25; force_overload 1 -1 0;
     force_drift 3.3 0.0 0.0 2.0; loop_late 205 50; loop_stalled 1005 300; tilt 45 40; crashed 120;

@@ -17,6 +17,7 @@ from companion.model.listing import listed
 from companion.model.servos import WATCHDOG_ERROR
 from companion.model.types import Inputs, Outputs, PhaseKind
 from companion.safety.arm import error_text
+from companion.safety.px4 import BATTERY_SILENT_S
 
 DEVICE_NAMES = (
     "PX4", "estimate", "motion capture", "arm", "force sensor", "loop", "recorder", "guardian", "battery", "tether",
@@ -201,6 +202,9 @@ class HealthEvaluator:
         parts += [f"{remaining * 100:.0f} %"] if remaining is not None else []
         if not parts:
             return HealthLevel.OFF, "not reported by PX4"
+        stamp_s = status.battery_stamp_s if status is not None else None
+        if stamp_s is not None and snapshot.inputs.t_s - stamp_s > BATTERY_SILENT_S:
+            return HealthLevel.BAD, f"not reported for {snapshot.inputs.t_s - stamp_s:.0f} s"
         empty = remaining is not None and not remaining >= s.battery_min
         if voltage_v is not None and s.battery_voltage_min_v is not None:
             empty = empty or not voltage_v >= s.battery_voltage_min_v

@@ -40,14 +40,14 @@ class Inbox:
         self._estimator: EstimatorReport | None = None
         self._positions = self._attitudes = self._imus = 0
         self._landed = LandedState.UNKNOWN
-        self._battery: tuple[float | None, float | None] = (None, None)
+        self._batteries = messages.Batteries()
         self._decoder = mavlink.MAVLink(None)
         self._listeners: dict[int, list[Callable[[Any], None]]] = {}
         self._takers: dict[int, Callable[[float, Any], None]] = {
             mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._on_heartbeat,
             mavlink.MAVLINK_MSG_ID_COMMAND_ACK: self._on_ack,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._on_landed,
-            mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: self._on_battery,
+            mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: self._batteries.take,
             mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: self._on_estimator,
             mavlink.MAVLINK_MSG_ID_STATUSTEXT: self._on_status_text,
         }
@@ -116,7 +116,7 @@ class Inbox:
         if self._heartbeat is None:
             return None
         stamp_s, armed, mode, system_status = self._heartbeat
-        voltage_v, remaining = self._battery
+        voltage_v, remaining, battery_stamp_s = self._batteries.worst()
         return AutopilotStatus(
             heartbeat_stamp_s=stamp_s,
             armed=armed,
@@ -124,6 +124,7 @@ class Inbox:
             landed=self._landed,
             battery_voltage_v=voltage_v,
             battery_remaining=remaining,
+            battery_stamp_s=battery_stamp_s,
             system_status=system_status,
         )
 
@@ -172,9 +173,6 @@ class Inbox:
 
     def _on_landed(self, stamp_s: float, message: Any) -> None:
         self._landed = messages.landed_state(message.landed_state)
-
-    def _on_battery(self, stamp_s: float, message: Any) -> None:
-        self._battery = messages.battery(message.voltages, message.battery_remaining)
 
     def _on_estimator(self, stamp_s: float, message: Any) -> None:
         self._estimator = messages.estimator_report(message.to_dict(), stamp_s)

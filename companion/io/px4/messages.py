@@ -145,6 +145,24 @@ def battery(voltages_mv: Sequence[int], remaining_percent: int) -> tuple[float |
     return voltage_v or None, min(remaining_percent / 100.0, 1.0) if remaining_percent >= 0 else None
 
 
+class Batteries:
+    """The newest BATTERY_STATUS of each battery, by its id. Of several batteries the worst counts."""
+
+    def __init__(self) -> None:
+        self._newest: dict[int, tuple[float, float | None, float | None]] = {}
+
+    def take(self, stamp_s: float, message: Any) -> None:
+        """Store a decoded message that arrived at `stamp_s`."""
+        self._newest[message.id] = (stamp_s, *battery(message.voltages, message.battery_remaining))
+
+    def worst(self) -> tuple[float | None, float | None, float | None]:
+        """Return the lowest voltage (V), the lowest remaining charge (0 to 1) and the oldest arrival; None for what is not known."""
+        newest = self._newest.values()
+        voltages_v = [voltage_v for _, voltage_v, _ in newest if voltage_v is not None]
+        remaining = [share for *_, share in newest if share is not None]
+        return min(voltages_v, default=None), min(remaining, default=None), min((b[0] for b in newest), default=None)
+
+
 def vehicle_state(
     position_stamp_s: float,
     position_ned_m: Vec3,
