@@ -10,7 +10,7 @@ from companion.mission.contact import before_approach_m
 from companion.mission.plan import landing_from
 from companion.mission.retract import inward_only, retract_from
 from companion.model import flight_stage as seq
-from companion.model.flight_stage import Stage
+from companion.model.flight_stage import ROTORS_MAY_START, Stage
 from companion.model.types import OperatorCommand, Outcome, PhaseKind, Reference, SafetyAction, Vec3
 from companion.safety import notices
 from companion.safety.rules import OPERATOR_ABORT, OPERATOR_LAND, OPERATOR_RESUME, RULES
@@ -98,8 +98,9 @@ def _hold_on_ground(t: Transition) -> None:
     """Cancel the take-off. A flight that waits for its start continues to wait."""
     waits = t.parameters.waits_for_start and t.state.stage in (Stage.WAIT, Stage.READY)
     if not waits and not t.state.armed_by_others:
-        text = "hold commanded before take-off; the vehicle stays on the ground"
-        t.report(notices.CALLED_OFF, text)
+        asked = t.state.stage is Stage.ARM
+        where = f"PX4 was asked to arm: {ROTORS_MAY_START}" if asked else "the vehicle stays on the ground"
+        t.report(notices.CALLED_OFF, f"hold commanded before take-off; {where}")
 
 
 def _hold(t: Transition) -> None:

@@ -4,7 +4,7 @@ Pure.
 
 from __future__ import annotations
 
-from companion.model.flight_stage import PILOT_FLIES, Stage
+from companion.model.flight_stage import PILOT_FLIES, ROTORS_MAY_START, Stage
 from companion.model.types import OperatorCommand, Outputs, PhaseKind, SafetyAction
 
 Effect = tuple[bool, str]
@@ -36,11 +36,16 @@ def effect_of(command: OperatorCommand, before: Outputs | None, after: Outputs) 
 
 def _land(before: Outputs | None, after: Outputs) -> Effect:
     if after.phase_kind is PhaseKind.DONE:
-        return True, "not taking off: the start is cancelled"
+        return True, _cancelled(before)
     if before is not None and before.phase == Stage.SPOOL.value:
         return True, "not taking off: the rotors are spooling down"
     landed_already = before is not None and before.action.rank >= SafetyAction.LAND.rank
     return True, "already landing" if landed_already else "landing"
+
+
+def _cancelled(before: Outputs | None) -> str:
+    arming = before is not None and before.phase == Stage.ARM.value
+    return f"not taking off: the start is cancelled{f'; PX4 was asked to arm: {ROTORS_MAY_START}' if arming else ''}"
 
 
 def _abort(before: Outputs | None, after: Outputs) -> Effect:
@@ -50,7 +55,7 @@ def _abort(before: Outputs | None, after: Outputs) -> Effect:
 
 def _hold(before: Outputs | None, after: Outputs) -> Effect:
     if after.phase_kind is PhaseKind.DONE:
-        return True, "not taking off: the start is cancelled"
+        return True, _cancelled(before)
     if after.phase_kind is PhaseKind.GROUND:
         return True, "the vehicle stays on the ground until start is commanded"
     if before is not None and before.phase == Stage.SPOOL.value:

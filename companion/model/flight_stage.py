@@ -56,6 +56,8 @@ LIFTING = frozenset({Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN, Stage.AUTOPILOT_L
 DISARMING = frozenset({Stage.DISARM, Stage.STAND_DOWN})
 COMMANDING = frozenset({Stage.ARM, Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN})
 """Stages in which the companion commands the vehicle, so that PX4 must be in OFFBOARD."""
+ROTORS_MAY_START = "its rotors may start until it is disarmed, keep away"
+"""Part of the answer to a command that ends a flight while PX4 arms, which HEARTBEAT shows up to a second later."""
 PILOT_FLIES = "a pilot flies"
 """Name of the phase in which the companion sends nothing because a pilot has control."""
 PILOT_MODES: Final = frozenset({FlightMode.MANUAL, FlightMode.HOLD, FlightMode.RETURN, FlightMode.TAKEOFF})

@@ -180,6 +180,8 @@ class AutopilotStatus(Record, frozen=True, kw_only=True):
     """
     system_status: int | None = None
     """HEARTBEAT.system_status (MAV_STATE); None in older logs."""
+    radio: bool | None = None
+    """Whether PX4 receives a pilot's radio or joystick (SYS_STATUS); None if unknown, as in the fast loop and in older logs."""
 
 
 class MocapPose(Record, frozen=True, kw_only=True):

@@ -14,11 +14,13 @@ from companion.config.vehicle import Vehicle
 from companion.model.check_row import Row
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.estimator import EstimatorReport
+from companion.model.flight_stage import is_killed
 from companion.model.frames import wrap_rad, yaw_from_quat
 from companion.model.observations import Observations
 from companion.model.types import FlightMode, MocapPose, VehicleState
 from companion.preflight.checks import Check
 from companion.px4.required import HOVER as HOVER_PARAM
+from companion.px4.required import KILL_CHANNEL, NO_RADIO, RADIO
 from companion.safety.mocap import FUSED_WITHIN_M, FUSED_WITHIN_RAD
 
 DEVICE = Check("px4.device", "PX4", "the link opens and PX4 answers", "the flight needs PX4")
@@ -69,13 +71,19 @@ BATTERY = Check(
     "at least `safety.battery_warn` of charge and `safety.battery_voltage_min_v`",
     "below `safety.battery_min` the vehicle lands at once",
 )
+KILL_SWITCH = Check(
+    "px4.kill_switch",
+    "kill switch",
+    "released; mapped to a channel (`RC_MAP_KILL_SW`) of a radio that PX4 receives, unless `COM_RC_IN_MODE` is 4",
+    "nobody could stop the rotors at once",
+)
 HOVER = Check(
     "px4.hover_thrust",
     "hover thrust",
     "within 15 % of the weight divided by `airframe.thrust_max_n`; refused beyond 35 % (a value from PX4 has its own row)",
     "it determines the thrust in the first second: if it is too high, the vehicle jumps; if too low, it does not take off",
 )
-CHECKS = (DEVICE, HEARTBEAT, DISARMED, RATES, LAG, VISION, AGREES, STEADY, BATTERY, HOVER)
+CHECKS = (DEVICE, HEARTBEAT, DISARMED, RATES, LAG, VISION, AGREES, STEADY, BATTERY, KILL_SWITCH, HOVER)
 
 RATE_GOOD_HZ, RATE_MIN_HZ = 80.0, 40.0
 ACCURACY_MAX_M = 0.1
@@ -110,6 +118,8 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
         yield _steady(o.vehicle)
     if o.status:
         yield _battery(o, vehicle)
+        if RADIO in o.params:
+            yield _kill_switch(o, vehicle)
     hover = vehicle.airframe.hover_thrust or o.params.get(HOVER_PARAM)
     if hover is not None:
         yield _hover(float(hover), vehicle)
@@ -275,6 +285,23 @@ def _battery(o: Observations, vehicle: Vehicle) -> Row:
     if remaining is None or (voltage_v is None and voltage_min_v is not None):
         return BATTERY.doubtful(read, wanted, "configure BAT1_SOURCE, BAT1_N_CELLS and the power module in PX4")
     return BATTERY.good(read, wanted)
+
+
+def _kill_switch(o: Observations, vehicle: Vehicle) -> Row:
+    status, channel = o.status[-1], o.params.get(KILL_CHANNEL)
+    wanted = "released, mapped, the radio received"
+    if is_killed(status):
+        return KILL_SWITCH.bad("engaged, or PX4 has terminated a flight", wanted, "release it, or restart PX4")
+    if o.params[RADIO] == NO_RADIO:
+        read = f"none: no radio ({RADIO} is {NO_RADIO})"
+        if vehicle.devices.autopilot.address.startswith("serial"):  # else a simulated vehicle
+            return KILL_SWITCH.doubtful(read, wanted, "fly with a radio whose kill switch a pilot holds")
+        return KILL_SWITCH.good(read, wanted)
+    if not channel:
+        return KILL_SWITCH.bad(f"{KILL_CHANNEL} is 0", wanted, "assign a switch of the radio in QGroundControl")
+    if not status.radio:
+        return KILL_SWITCH.bad(f"channel {channel}; PX4 receives no radio", wanted, "switch the radio on; bind it")
+    return KILL_SWITCH.good(f"channel {channel}; the radio is received", wanted)
 
 
 def _hover(hover: float, vehicle: Vehicle) -> Row:

@@ -155,6 +155,7 @@ PX4_DEFAULTS: Mapping[str, float | int] = {
     "PWM_MAIN_FUNC2": 102,
     "PWM_MAIN_FUNC3": 103,
     "PWM_MAIN_FUNC4": 104,
+    "RC_MAP_KILL_SW": 0,
     "RTL_DESCEND_ALT": 30.0,
     "RTL_RETURN_ALT": 60.0,
     "SDLOG_MODE": 0,

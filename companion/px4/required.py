@@ -19,6 +19,8 @@ HOVER = "MPC_THR_HOVER"
 ROTOR_COUNT = "CA_ROTOR_COUNT"
 RADIO = "COM_RC_IN_MODE"
 NO_RADIO = 4
+KILL_CHANNEL = "RC_MAP_KILL_SW"
+"""Channel of the radio's kill switch; 0 if there is none."""
 _HOVER_OFF_MAX = 0.35
 _ROOM_MARGIN_M = 0.3
 _FAILURE_MARGIN_DEG = 10.0
@@ -231,6 +233,13 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             ok=(0, 1, 2, 3, 4),
             fix="without a radio set 4 (configs/px4/no_radio.params), otherwise the value for this radio",
             file=False,
+        ),
+        Wanted(
+            "COM_KILL_DISARM",
+            0.5,
+            "time from the kill switch until PX4 disarms, s; a switch that is released before starts the rotors again",
+            _WARN,
+            limits=_between(0.0, 1.0),
         ),
         Wanted(
             "NAV_RCL_ACT",

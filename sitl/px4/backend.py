@@ -40,6 +40,7 @@ STUB_ONLY_FAULTS: Mapping[FaultKind, str] = {
     "autopilot_reboot": "restarts PX4 in the middle of a step",
     "offboard_refused": "makes PX4 refuse a mode",
     "arming_refused": "makes PX4 refuse to arm",
+    "kill_switch": "engages a switch of the pilot's radio",
     "battery_sag": "changes what PX4's power module measures",
 }
 """Faults that only the stub can simulate, each with the reason."""

@@ -229,15 +229,20 @@ def times_of(flown: Commanded) -> dict[str, float]:
     return found
 
 
+ARMING = (
+    "not taking off: the start is cancelled; PX4 was asked to arm: its rotors may start until it is disarmed, keep away"
+)
+
+
 @pytest.mark.parametrize(
     ("phase", "command", "text"),
     [
         ("wait", HOLD, "not taking off: the start is cancelled"),
         ("offboard", HOLD, "not taking off: the start is cancelled"),
-        ("arm", HOLD, "not taking off: the start is cancelled"),
+        ("arm", HOLD, ARMING),
         ("spool up", HOLD, "not taking off: the rotors are spooling down"),
         ("wait", LAND, "not taking off: the start is cancelled"),
-        ("arm", ABORT, "not taking off: the start is cancelled"),
+        ("arm", ABORT, ARMING),
         ("spool up", LAND, "not taking off: the rotors are spooling down"),
     ],
 )
@@ -246,6 +251,8 @@ def test_called_off_before_it_lifts(phase: str, command: OperatorCommand, text: 
     flown = commanded((begin_s + 0.004, command))
     assert flown.effects == [(True, text)]
     assert flown.outcome is Outcome.ABORTED
+    stays = [event.text for o in flown.outputs for event in o.events if "stays on the ground" in event.text]
+    assert not stays or phase in ("wait", "offboard"), "the rotors may start after it is said"
     assert "takeoff" not in flown.ids
     assert not flown.flight.px4.armed
 

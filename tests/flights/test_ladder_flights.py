@@ -220,7 +220,8 @@ def test_a_pilot_who_takes_over_after_touch_down_is_not_disarmed() -> None:
 def test_released_after_a_kill_on_the_floor_the_vehicle_stays_there(killed_s: float) -> None:
     """Killed while it spools up or just before it lifts, released after a second: it jumped to 0.7 m."""
     fault = f"world.faults=[{{kind: kill_switch, t_s: {killed_s}, duration_s: 1.0}}]"
-    result = FastFlight(load_sitl(HOVER, overrides=[fault])).run()
+    late = "world.px4_params={COM_KILL_DISARM: 5.0}"
+    result = FastFlight(load_sitl(HOVER, overrides=[fault, late])).run()
     begins_s = next(o.t_s for o in result.outputs for event in o.events if event.id == "killed")
     assert all(o.attitude is None for o in result.outputs if o.t_s >= begins_s)
     assert {o.request for o in result.outputs if o.t_s >= begins_s} == {AutopilotRequest.NONE}

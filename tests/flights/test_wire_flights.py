@@ -118,7 +118,8 @@ def test_a_kill_switch_ends_the_setpoints_and_its_release_moves_nothing(
 ) -> None:
     """Engaged for a second at full take-off thrust, before the vehicle lifts."""
     with sandbox_in(tmp_path_factory.mktemp("kill")) as sandbox:
-        options = set_options(**{"world.faults": [{"kind": "kill_switch", "t_s": 2.3, "duration_s": 1.0}]})
+        fault = {"kind": "kill_switch", "t_s": 2.3, "duration_s": 1.0}
+        options = set_options(**{"world.faults": [fault], "world.px4_params": {"COM_KILL_DISARM": 5.0}})
         ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *options)
         sandbox.assert_nobody_left()
         summary = read_summary(sandbox.cwd / "out")

@@ -53,6 +53,7 @@ class Px4Peer:
         self.system_status = mavlink.MAV_STATE_ACTIVE
         self.acks: dict[int, int | None] = {}
         """MAV_CMD to MAV_RESULT, accepted where absent; None: no answer at all."""
+        self.sensors_present = 0
         self.heartbeats_on_request = False
         self.working_on: list[Any] = []
         """Commands that were answered with IN_PROGRESS; the answer is repeated at 10 Hz."""
@@ -206,6 +207,7 @@ class Px4Peer:
         self.say(mavlink.MAVLink_extended_sys_state_message(0, self.landed))
         if self.estimator is not None and mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS in self.asked_interval_us:
             self.say(mavlink.MAVLink_estimator_status_message(int(time.monotonic() * 1e6), *self.estimator))
+        self.say(mavlink.MAVLink_sys_status_message(self.sensors_present, 0, 0, 0, 16000, 100, 77, 0, 0, 0, 0, 0, 0))
         cells = [4000] * 4 + [65535] * 6
         self.say(mavlink.MAVLink_battery_status_message(0, 0, 1, 2000, cells, 100, 0, 0, 77, 0, 0))
 

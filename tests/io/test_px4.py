@@ -220,6 +220,9 @@ def test_status_follows_heartbeat_landed_state_and_battery() -> None:
                 assert (status.armed, status.mode) == (False, FlightMode.MANUAL)
                 assert status.landed is LandedState.ON_GROUND
                 assert (status.battery_voltage_v, status.battery_remaining) == pytest.approx((16.0, 0.77))
+                assert not status.radio
+                peer.sensors_present = mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+                await eventually(lambda: (status := autopilot.status()) is not None and status.radio is True, "a radio")
                 peer.custom_mode = 6 << 16
                 peer.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
                 peer.landed = mavlink.MAV_LANDED_STATE_IN_AIR

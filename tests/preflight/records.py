@@ -39,6 +39,8 @@ PARAMS = {
     **{one.name: one.value for one in required.WANTED if one.value is not None},
     required.HOVER: 0.49,
     required.ROTOR_COUNT: 4,
+    required.RADIO: 0,
+    required.KILL_CHANNEL: 7,
     **geometry_of(load_flight(CATCH).vehicle.airframe),
 }
 FLAGS = 447
@@ -151,6 +153,7 @@ def status(**changes: Any) -> tuple[AutopilotStatus, ...]:
         landed=LandedState.ON_GROUND,
         battery_voltage_v=16.2,
         battery_remaining=0.97,
+        radio=True,
     )
     return (replace(sound, **changes),)
 

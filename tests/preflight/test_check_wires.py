@@ -59,13 +59,23 @@ def test_a_sound_world_may_fly_and_every_row_is_reported(sandbox: Sandbox) -> No
 
 
 def test_a_wrong_setting_refuses_the_check_and_the_flight(sandbox: Sandbox, tmp_path: Path) -> None:
-    """Wrong joint angle, force bias and two parameters of PX4, in the world alone: the companion believes its files."""
+    """Joint angle, force bias, and two parameters and the kill switch of PX4, in the world alone: the companion believes its
+    files.
+    """
     wrong = (
         "mission.start.arm_deg=[140, 120]",
         "world.force_bias_n=[30, 0, 0]",
         "world.px4_params={COM_OBL_RC_ACT: 0, EKF2_EV_CTRL: 0}",
+        "world.faults=[{kind: kill_switch, after: start, t_s: 0}]",
     )
-    expected = {"mission.arm", "force.tare", "px4.param.COM_OBL_RC_ACT", "px4.param.EKF2_EV_CTRL", "px4.vision"}
+    expected = {
+        "mission.arm",
+        "force.tare",
+        "px4.param.COM_OBL_RC_ACT",
+        "px4.param.EKF2_EV_CTRL",
+        "px4.vision",
+        "px4.kill_switch",
+    }
     with sandbox_in(tmp_path / "world") as around, World(around, CATCH, wrong) as world:
         shown = sandbox.run("check", CATCH, *world.addresses())
         assert (shown.code, shown.err) == (EXIT_REFUSED, ""), shown

@@ -120,6 +120,11 @@ CASES = {
     "flat battery": Case("px4.battery", "25%", "charge", {"status": r.status(battery_remaining=0.25)}),
     "battery of other cells": Case("px4.battery", "11.4 V", "cells", {"status": r.status(battery_voltage_v=11.4)}),
     "battery unknown": Case("px4.battery", "97%", "BAT1_N_CELLS", {"status": r.status(battery_voltage_v=None)}, WARN),
+    "killed": Case("px4.kill_switch", "engaged", "release", {"status": r.status(system_status=8)}),
+    "no kill switch": Case("px4.kill_switch", "RC_MAP_KILL_SW is 0", "assign", {"params": {**r.PARAMS, "RC_MAP_KILL_SW": 0}}),
+    "radio off": Case("px4.kill_switch", "receives no radio", "switch the radio on", {"status": r.status(radio=False)}),
+    "radio unknown": Case("px4.kill_switch", "receives no radio", "switch the radio on", {"status": r.status(radio=None)}),
+    "no radio": Case("px4.kill_switch", "COM_RC_IN_MODE is 4", "with a radio", {"params": {**r.PARAMS, "COM_RC_IN_MODE": 4}}, WARN),
     "hover thrust doubtful": Case("px4.hover_thrust", "0.600", "hover fit", {"params": {**r.PARAMS, "MPC_THR_HOVER": 0.6}}, WARN),
     "hover thrust wrong": Case(
         "px4.hover_thrust", "0.750", "MPC_THR_HOVER", {"params": {**r.PARAMS, "MPC_THR_HOVER": 0.75}}, WARN,
@@ -311,7 +316,8 @@ def test_every_row_can_fail() -> None:
 
 
 # What is wrong in one place is reported in one place.
-LONELY = ("old heartbeat", "armed", "slow state", "flat battery", "hover thrust doubtful",
+LONELY = ("killed", "no kill switch", "radio off", "no radio",
+          "old heartbeat", "armed", "slow state", "flat battery", "hover thrust doubtful",
           "a parameter", "lost frames", "another body", "another mode",
           "servo error", "loose cable", "leaning hard", "overloaded", "weak tether", "arm elsewhere", "full disk", "no recorder",
           "memory that may not stay", "cores that are not there",

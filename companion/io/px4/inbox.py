@@ -41,6 +41,7 @@ class Inbox:
         self._positions = self._attitudes = self._imus = 0
         self._landed = LandedState.UNKNOWN
         self._batteries = messages.Batteries()
+        self._radio: bool | None = None
         self._decoder = mavlink.MAVLink(None)
         self._listeners: dict[int, list[Callable[[Any], None]]] = {}
         self._takers: dict[int, Callable[[float, Any], None]] = {
@@ -48,6 +49,7 @@ class Inbox:
             mavlink.MAVLINK_MSG_ID_COMMAND_ACK: self._on_ack,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._on_landed,
             mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: self._batteries.take,
+            mavlink.MAVLINK_MSG_ID_SYS_STATUS: self._on_sys_status,
             mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: self._on_estimator,
             mavlink.MAVLINK_MSG_ID_STATUSTEXT: self._on_status_text,
         }
@@ -126,6 +128,7 @@ class Inbox:
             battery_remaining=remaining,
             battery_stamp_s=battery_stamp_s,
             system_status=system_status,
+            radio=self._radio,
         )
 
     def estimator(self) -> EstimatorReport | None:
@@ -173,6 +176,9 @@ class Inbox:
 
     def _on_landed(self, stamp_s: float, message: Any) -> None:
         self._landed = messages.landed_state(message.landed_state)
+
+    def _on_sys_status(self, stamp_s: float, message: Any) -> None:
+        self._radio = messages.radio_received(message.onboard_control_sensors_present)
 
     def _on_estimator(self, stamp_s: float, message: Any) -> None:
         self._estimator = messages.estimator_report(message.to_dict(), stamp_s)

@@ -50,6 +50,7 @@ REQUEST_MESSAGE, SET_MESSAGE_INTERVAL = 512, 511
 MAV_COMP_ID_AUTOPILOT1 = 1
 _MAV_MODE_FLAG_CUSTOM_MODE_ENABLED = 1
 MAV_MODE_FLAG_SAFETY_ARMED = 128
+_MAV_SYS_STATUS_SENSOR_RC_RECEIVER = 65536
 _PX4_MAIN_MODE_AUTO = 4
 _PX4_MAIN_MODE_OFFBOARD = 6
 # Body rates are not commanded: ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE | PITCH | YAW.
@@ -143,6 +144,11 @@ def battery(voltages_mv: Sequence[int], remaining_percent: int) -> tuple[float |
     """
     voltage_v = sum(cell for cell in voltages_mv if cell != _NO_CELL) * 1e-3
     return voltage_v or None, min(remaining_percent / 100.0, 1.0) if remaining_percent >= 0 else None
+
+
+def radio_received(sensors_present: int) -> bool:
+    """Return whether PX4 receives a pilot's radio or joystick, given SYS_STATUS.onboard_control_sensors_present."""
+    return bool(sensors_present & _MAV_SYS_STATUS_SENSOR_RC_RECEIVER)
 
 
 class Batteries:
