@@ -237,8 +237,8 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "COM_KILL_DISARM",
             0.5,
-            "time from the kill switch until PX4 disarms, s; a switch that is released before starts the rotors again",
-            _WARN,
+            "time from the kill switch until PX4 disarms, s; a switch that is released before starts the rotors again, and PX4's "
+            "own landing, which the fall has misled, may lift the vehicle",
             limits=_between(0.0, 1.0),
         ),
         Wanted(

@@ -41,6 +41,7 @@ SPOILED = [
     ("EKF2_TAU_VEL", 0.25, False, "set EKF2_TAU_VEL to 0.1"),
     ("SYS_HAS_MAG", 1, True, "then reboot PX4"),
     ("COM_OF_LOSS_T", 1.0, True, "set COM_OF_LOSS_T to 0.5"),
+    ("COM_KILL_DISARM", 5.0, True, "set COM_KILL_DISARM to 0.5"),
     ("COM_OBL_RC_ACT", 0, True, "set COM_OBL_RC_ACT to 4"),
     ("NAV_DLL_ACT", 2, True, "set NAV_DLL_ACT to 0"),
     ("RTL_RETURN_ALT", 30.0, True, "set RTL_RETURN_ALT to 1.5"),
