@@ -268,7 +268,7 @@ def test_unknown_commands_are_unsupported() -> None:
 
 
 def test_a_kill_disarms_after_com_kill_disarm_and_forbids_arming() -> None:
-    it = flying(NavState.OFFBOARD)
+    it = flying(NavState.OFFBOARD, COM_KILL_DISARM=5)
     killed = replace(FLYING, killed=True)
     it.update(1.0, killed)
     it.update(5.9, killed)
