@@ -429,6 +429,45 @@ def serial_line() -> Iterator[tuple[int, str]]:
         os.close(far)
 
 
+@contextlib.contextmanager
+def plugged(name: Path, port: str) -> Iterator[str]:
+    """A port under a fixed name, as in /dev/serial/by-id, until it is unplugged; the name."""
+    name.symlink_to(port)
+    try:
+        yield str(name)
+    finally:
+        name.unlink()
+
+
+@contextlib.contextmanager
+def bridged(
+    udp: socket.socket, px4: tuple[str, int], open_stream: Callable[[], int], piece_bytes: int = 4096
+) -> Iterator[None]:
+    """Pass bytes between a stream, given by its descriptor, and PX4's UDP address; to the stream in pieces."""
+    ended = threading.Event()
+
+    def run() -> None:
+        stream = open_stream()
+        os.set_blocking(stream, False)
+        while not ended.is_set():
+            ready = select.select([stream, udp.fileno()], [], [], 0.01)[0]
+            with contextlib.suppress(OSError):  # the companion has closed its end, or does not read
+                if stream in ready:
+                    udp.sendto(os.read(stream, 4096), px4)
+                if udp.fileno() in ready:
+                    data = udp.recv(4096)
+                    for at in range(0, len(data), piece_bytes):
+                        os.write(stream, data[at : at + piece_bytes])
+
+    thread = threading.Thread(target=run, name="bridge")
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join(DEADLINE_S)
+
+
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
     """A port that nobody uses now, at no address of this computer: of TCP, unless the kind says otherwise."""
     with socket.socket(type=kind) as probe:

@@ -25,7 +25,8 @@ from companion.guardian.mocap import MocapClient, MocapProblem, open_client
 from companion.guardian.monitors import StallWatch
 from companion.guardian.settings import Settings, read_settings
 from companion.guardian.takeover_landing import Notice, TakeoverLanding
-from companion.io.px4.wire import Wire, is_udp, open_wire
+from companion.io.px4.wire import OpenWire, is_udp, open_wire
+from companion.io.reopening import Reopening
 from companion.model.codec import to_packet
 from companion.model.packets import LogLine
 from companion.model.types import SafetyAction, Severity
@@ -42,8 +43,6 @@ KILL_TIMEOUT_S = 0.5
 """Timeout for a killed process to end; it takes milliseconds unless a thread is in uninterruptible sleep (state D)."""
 LINK_TIMEOUT_S = 30.0
 """Time after which the guardian gives up opening the link; the vehicle is then lost."""
-REOPEN_PERIOD_S = 0.5
-"""Pause before a lost link (TCP closed, serial port unplugged) is reopened."""
 STATUS_PERIOD_S = 0.5
 ERROR_CHARS, ERRORS_REPORTED_MAX = 300, 20
 _MAX_DATAGRAMS = 512
@@ -133,8 +132,8 @@ class Guardian:
         """Internal errors that have been reported."""
         self._link_reported = False
         """Whether the closed link has been reported."""
-        self._reopen_s = float("-inf")
-        """Earliest `monotonic` at which a lost link is reopened."""
+        self._reopening: Reopening[OpenWire] | None = None
+        """Attempts to open a lost link again; None while it is open."""
         self._silent_s = 0.0
         """Longest silence while the rotors might turn."""
 
@@ -227,32 +226,33 @@ class Guardian:
         """Open the flight process's link; try again while another process holds it. Return None after LINK_TIMEOUT_S."""
         deadline_s = monotonic() + LINK_TIMEOUT_S
         while True:
-            wire = self._try_wire(last)
-            if wire is not None:
+            try:
+                wire = self._open_wire(last)
+            except OSError as error:
+                self._report_no_link(last, error.strerror or str(error))
+            else:
+                self._link_reported = False
                 return Link(wire, (last.own_system, last.own_component), last.autopilot_system)
             if monotonic() > deadline_s:
                 return None
             self._send_status(0)
             simulated_time.wait(select.poll(), PERIOD_S, data=False)
 
-    def _try_wire(self, last: Heartbeat) -> Wire | None:
-        """Open the wire, or return None and report the first failure.
+    def _open_wire(self, last: Heartbeat) -> OpenWire:
+        """Open the wire.
 
         A killed flight process that has not ended runs no code: it neither sends nor reads, so a UDP port is opened although it is
         still bound. A serial port or TCP link is opened only after the process has ended: if it resumed, two readers would share
         the bytes of a serial port.
+
+        Raises:
+            OSError: it cannot be opened now.
         """
         address = self._settings.autopilot_address
-        try:
-            share_port = not self._flight.wait(0.0)
-            if share_port and not is_udp(address):
-                raise OSError(errno.EBUSY, "the killed flight process still holds the link")
-            wire = open_wire(address, last.local_port, last.peer, monotonic, share_port=share_port)
-        except OSError as error:
-            self._report_no_link(last, error.strerror or str(error))
-            return None
-        self._link_reported = False
-        return wire
+        share_port = not self._flight.wait(0.0)
+        if share_port and not is_udp(address):
+            raise OSError(errno.EBUSY, "the killed flight process still holds the link")
+        return open_wire(address, last.local_port, last.peer, monotonic, share_port=share_port)
 
     def _report_no_link(self, last: Heartbeat, found: str) -> None:
         if not self._link_reported:
@@ -262,19 +262,16 @@ class Guardian:
             self._publish(last, Notice(now_s, "guardian_no_link", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
 
     def _restore_link(self, last: Heartbeat, link: Link, landing: TakeoverLanding, waiting: select.poll) -> None:
-        """Close a lost link, because it would end every wait at once, and try to reopen it every REOPEN_PERIOD_S."""
-        now_s = monotonic()
-        if not link.wire.lost or now_s < self._reopen_s:
+        """Close a lost link, because it would end every wait at once, and use it again once it is open again."""
+        if not link.wire.lost:
             return
-        self._reopen_s = now_s + REOPEN_PERIOD_S
-        if not self._link_reported:
+        if self._reopening is None:
             self._report_no_link(last, "the connection has ended")
             waiting.unregister(link.wire.fileno())
             link.wire.close()
-            return
-        wire = self._try_wire(last)
-        if wire is not None:
-            link.wire = wire
+            self._reopening = Reopening("px4 reopening", lambda: self._open_wire(last))
+        elif (wire := self._reopening.take()) is not None:
+            self._reopening, self._link_reported, link.wire = None, False, wire
             waiting.register(wire.fileno(), select.POLLIN)
             landing.link_reopened()
 

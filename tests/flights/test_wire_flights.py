@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import socket
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +16,21 @@ from companion.analysis.log import FlightLog
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK
 from companion.model.types import AutopilotRequest
 from tests.core.test_sliding import short_slide
-from tests.support import HOVER, HOVERS_S, SHORT_CATCH, Ended, Sandbox, read_summary, run_here, sandbox_in, set_options
+from tests.support import (
+    HOVER,
+    HOVERS_S,
+    SHORT_CATCH,
+    Ended,
+    Sandbox,
+    World,
+    bridged,
+    plugged,
+    read_summary,
+    run_here,
+    sandbox_in,
+    serial_line,
+    set_options,
+)
 
 THE_CATCH = pytest.mark.xdist_group("the catch over wires")
 """Tests that look at one flight run in one process."""
@@ -131,3 +147,28 @@ def test_a_kill_switch_ends_the_setpoints_and_its_release_moves_nothing(
     assert all(o.attitude is None and o.request is AutopilotRequest.NONE for o in after)
     heights_m = [i.vehicle.position_world_m[2] for i in log.inputs if i.tick >= killed and i.vehicle is not None]
     assert max(heights_m) - heights_m[0] < 0.03
+
+
+def test_a_serial_link_to_px4_that_comes_back_in_the_air_is_landed_and_not_lost(sandbox: Sandbox) -> None:
+    name = sandbox.tmp.parent / "px4"
+    with World(sandbox, HOVER, ["world.payload_kg=0"]) as world, ExitStack() as stack:
+        px4 = ("127.0.0.1", int(world.devices["autopilot"]["address"].rpartition(":")[2]))
+        udp = stack.enter_context(socket.socket(type=socket.SOCK_DGRAM))
+
+        @contextmanager
+        def cable() -> Iterator[None]:
+            with serial_line() as (far, port), plugged(name, port), bridged(udp, px4, lambda: far):
+                yield
+
+        with cable():
+            addresses = world.addresses(autopilot={"address": f"serial://{name}:921600"})
+            flight = stack.enter_context(sandbox.start("fly", HOVER, "--out", "out", *addresses))
+            flight.wait_for("  hold\n")
+        flight.wait_for("no position, attitude or IMU sample")
+        with cable():
+            ended = flight.end()
+        assert (ended.code, ended.err) == (EXIT_ABORTED, ""), (ended.out, ended.err)
+        assert "the connection has ended" in ended.out and "the connection is open again" in ended.out
+        assert read_summary(sandbox.cwd / "out")["outcome"] == "aborted"  # by the flight, without the guardian
+        assert world.armings == 1 and not world.crashes
+    sandbox.assert_nobody_left()

@@ -7,7 +7,6 @@ import os
 import signal
 import socket
 import time
-import tty
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -20,7 +19,7 @@ from companion.io.mocap.system import MocapSettings
 from companion.model.types import MocapPose
 from sitl.natnet import BodyPose, encode_frame
 from tests.guardian.rig import ARMED, ATTITUDE, DISARMED, LAND_MODE, OFFBOARD_MODE, Cameras, Rig
-from tests.support import DEADLINE_S, wait_until
+from tests.support import DEADLINE_S, plugged, serial_line, wait_until
 
 NAV_LAND = mavlink.MAV_CMD_NAV_LAND
 
@@ -76,17 +75,10 @@ class Px4Cable:
 
     @contextmanager
     def plugged(self) -> Iterator[int]:
-        master, slave = os.openpty()
-        tty.setraw(slave)
-        os.set_blocking(master, False)
-        self._name.unlink(missing_ok=True)
-        self._name.symlink_to(os.ttyname(slave))
-        os.close(slave)
         self.commands.clear()
-        try:
+        with serial_line() as (master, port), plugged(self._name, port):
+            os.set_blocking(master, False)
             yield master
-        finally:
-            os.close(master)
 
     def hears(self, master: int, base_mode: int, custom_mode: int) -> list[int]:
         """Send a HEARTBEAT; return the commands received so far."""

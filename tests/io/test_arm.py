@@ -9,7 +9,7 @@ import os
 import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from sitl.servo import registers as reg
 from sitl.servo.bus import ServoBus
 from sitl.servo.kinds import KINDS
 from sitl.servo.model import ServoModel
+from tests.support import plugged
 
 KT = 1.3
 NM_PER_COUNT = KT * 2.69e-3
@@ -345,6 +346,66 @@ def test_unplugged_port_counts_as_failures_and_leaving_ends() -> None:
     before = set(os.listdir("/proc/self/fd"))
     asyncio.run(asyncio.wait_for(main(), LONG_S))
     assert set(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_port_that_comes_back_under_its_name_is_read_again_and_moves_nothing_by_itself(tmp_path: Path) -> None:
+    async def main() -> None:
+        servos = new_servos()
+        async with AsyncExitStack() as stack:
+            async with ServoBus(servos) as bus:
+                with plugged(tmp_path / "arm", bus.path) as port:
+                    arm = await stack.enter_async_context(DynamixelArm(device_on(port), arm_config(), flight_clock()))
+                    arm.write_torque((0.4, 0.4))
+                    await until(lambda: register(servos[0], 102, 2) != 0)
+            lost = await state_when(arm, lambda s: s.read_failures >= 3)
+            for servo, joint in zip(
+                servos, JOINTS, strict=True
+            ):  # no packet comes, by the servos' time: watchdogs trip
+                servo.update(1.0, shaft_rad(joint, 1.0), 0.0)
+                servo.update(9.0, shaft_rad(joint, 1.0), 0.0)
+            arm.write_torque((0.4, 0.4))
+            async with ServoBus(servos) as bus:
+                with plugged(tmp_path / "arm", bus.path):
+                    back = await state_when(arm, lambda s: s.read_failures == 0)
+                    assert back.hardware_error == (WATCHDOG_ERROR, WATCHDOG_ERROR)
+                    assert back.stamp_s > lost.stamp_s
+                    await state_when(arm, lambda s: s.hardware_error == (0, 0))
+                    assert [register(servo, 102, 2) for servo in servos] == [0, 0], "no torque of before the loss"
+                    arm.write_torque((0.3, 0.3))
+                    await until(lambda: all(register(servo, 102, 2) for servo in servos))
+                    await arm.__aexit__(None, None, None)
+                    assert [register(servo, 64) for servo in servos] == [0, 0]
+
+    asyncio.run(asyncio.wait_for(main(), LONG_S))
+    assert_nothing_left()
+
+
+def test_servos_that_lost_their_power_with_the_port_keep_their_torque_off(tmp_path: Path) -> None:
+    async def main() -> None:
+        servos = new_servos()
+        async with AsyncExitStack() as stack:
+            async with ServoBus(servos) as bus:
+                with plugged(tmp_path / "arm", bus.path) as port:
+                    arm = await stack.enter_async_context(DynamixelArm(device_on(port), arm_config(), flight_clock()))
+            lost = await state_when(arm, lambda s: s.read_failures >= 3)
+            for servo in servos:
+                servo.reboot()
+            async with ServoBus(servos) as bus:
+                with plugged(tmp_path / "arm", bus.path):
+                    arm.write_torque((0.4, 0.4))
+                    await until(lambda: rewritten(arm, servos))
+                    state = await state_when(arm, lambda s: s.read_failures > lost.read_failures + 5)
+                    assert state.stamp_s == lost.stamp_s
+                    assert [register(servo, 64) for servo in servos] == [0, 0]
+
+    asyncio.run(asyncio.wait_for(main(), LONG_S))
+    assert_nothing_left()
+
+
+def rewritten(arm: DynamixelArm, servos: list[ServoModel]) -> bool:
+    """Command a torque; whether its goal has arrived at all servos."""
+    arm.write_torque((0.4, 0.4))
+    return all(register(servo, 102, 2) for servo in servos)
 
 
 def test_cancelled_opening_leaves_nothing_behind() -> None:

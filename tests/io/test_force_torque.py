@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 
 import pytest
@@ -20,7 +20,7 @@ from companion.io.protocols import DeviceError, ForceTorque
 from companion.model.types import ForceSample
 from companion.runtime.clock import flight_clock
 from sitl.force_torque import ForceTorqueServer
-from tests.support import serial_line
+from tests.support import plugged, serial_line
 
 WAIT_S = 20.0
 # 0x55AA and -0x55AB in counts: SOP and EOP in the payload, both ways round.
@@ -288,6 +288,48 @@ def test_port_vanishes_in_flight() -> None:
         await edge.__aexit__(None, None, None)
 
     asyncio.run(run())
+
+
+@pytest.mark.parametrize("in_ticks", [False, True])
+def test_a_port_that_comes_back_under_its_name_is_read_again(tmp_path: Path, in_ticks: bool) -> None:
+    """The second sensor has just got its power: it streams nothing until it is started."""
+
+    async def run() -> None:
+        async with AsyncExitStack() as stack:
+            async with ForceTorqueServer() as server, world(server):
+                with plugged(tmp_path / "force", server.port) as port:
+                    edge = await stack.enter_async_context(driver(port))
+                    if in_ticks:
+                        edge.read_in_ticks()
+            await looked_at(edge, lambda sample: edge.counts().lost is not None)
+            async with ForceTorqueServer() as server, world(server):
+                server.set_wrench((7.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+                with plugged(tmp_path / "force", server.port):
+                    await looked_at(edge, lambda sample: sample.force_sensor_n[0] == 7.0)
+                    assert edge.counts().lost is None
+
+    asyncio.run(run())
+
+
+def test_another_device_under_its_name_is_not_read_as_the_sensor(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with AsyncExitStack() as stack:
+            async with ForceTorqueServer() as server, world(server):
+                with plugged(tmp_path / "force", server.port) as port:
+                    edge = await stack.enter_async_context(driver(port))
+            async with ForceTorqueServer("RFT40-SA01") as server, world(server):
+                with plugged(tmp_path / "force", server.port):
+                    await looked_at(edge, lambda sample: "expected a RFT60-HA01" in (edge.counts().lost or ""))
+                    assert not server.streaming
+
+    asyncio.run(run())
+
+
+async def looked_at(edge: RobotousForceTorque, condition: Callable[[ForceSample], bool]) -> None:
+    """Look at the newest sample, as the ticks do, until the condition holds."""
+    async with asyncio.timeout(WAIT_S):
+        while (sample := edge.latest()) is None or not condition(sample):  # noqa: ASYNC110 - as the ticks do
+            await asyncio.sleep(0.005)
 
 
 # -- what can be wrong ---------------------------------------------------------------------------------------------------------

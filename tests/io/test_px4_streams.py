@@ -4,58 +4,38 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
-import select
 import socket
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from pathlib import Path
 
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
 
 from companion.config.devices import AutopilotDevice
 from companion.io.px4.driver import MavsdkAutopilot
-from companion.model.types import AttitudeSetpoint
+from companion.model.types import AttitudeSetpoint, AutopilotRequest
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import PARAMS, Px4Peer
-from tests.support import DEADLINE_S, eventually, serial_line
+from tests.support import DEADLINE_S, bridged, eventually, plugged, serial_line
 
+LEVEL = AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.5)
 PIECE_BYTES = 17
 """Bytes that a bridge passes at once: no message arrives whole."""
 
 
 @contextmanager
-def bridged(open_stream: Callable[[], int]) -> Iterator[None]:
-    """Pass bytes between a stream, given by its descriptor, and a PX4 peer on UDP."""
-    ended = threading.Event()
-
-    def run(udp: socket.socket, px4: Px4Peer) -> None:
-        stream = open_stream()
-        while not ended.is_set():
-            ready = select.select([stream, udp.fileno()], [], [], 0.01)[0]
-            with contextlib.suppress(OSError):  # the driver has closed its end
-                if stream in ready:
-                    udp.sendto(os.read(stream, 4096), px4.address)
-                if udp.fileno() in ready:
-                    data = udp.recv(4096)
-                    for at in range(0, len(data), PIECE_BYTES):
-                        os.write(stream, data[at : at + PIECE_BYTES])
-
+def peer_behind(open_stream: Callable[[], int]) -> Iterator[Px4Peer]:
+    """A PX4 peer at the end of a stream, given by its descriptor."""
     with closing(socket.socket(type=socket.SOCK_DGRAM)) as udp:
         udp.bind(("127.0.0.1", 0))
-        with Px4Peer(udp.getsockname()[1]) as px4:
-            thread = threading.Thread(target=run, args=(udp, px4), name="bridge")
-            thread.start()
-            try:
-                yield
-            finally:
-                ended.set()
-                thread.join(DEADLINE_S)
+        with Px4Peer(udp.getsockname()[1]) as px4, bridged(udp, px4.address, open_stream, PIECE_BYTES):
+            yield px4
 
 
 @contextmanager
 def serial_link() -> Iterator[str]:
-    with serial_line() as (far, port), bridged(lambda: far):
+    with serial_line() as (far, port), peer_behind(lambda: far):
         yield f"serial://{port}:921600"
 
 
@@ -63,7 +43,7 @@ def serial_link() -> Iterator[str]:
 def tcp_link() -> Iterator[str]:
     with ExitStack() as stack:
         server = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
-        with bridged(lambda: stack.enter_context(server.accept()[0]).fileno()):
+        with peer_behind(lambda: stack.enter_context(server.accept()[0]).fileno()):
             yield f"tcpout://127.0.0.1:{server.getsockname()[1]}"
 
 
@@ -74,12 +54,44 @@ def test_px4_behind_a_stream_of_bytes(link: Callable[[], AbstractContextManager[
         async with MavsdkAutopilot(device, flight_clock()) as autopilot:
             await eventually(lambda: autopilot.vehicle() is not None, "the vehicle's state")
             assert await autopilot.read_param("MPC_THR_HOVER") == PARAMS["MPC_THR_HOVER"]
-            assert autopilot.send_attitude(AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.5))
+            assert autopilot.send_attitude(LEVEL)
             before = autopilot.counts()
             await eventually(lambda: _read(autopilot) > before.attitude + 50, "50 more attitudes")
 
     with link() as address:
         asyncio.run(fly(address))
+
+
+def test_a_serial_port_that_comes_back_under_its_name_is_used_again_and_the_streams_are_requested_again(
+    tmp_path: Path,
+) -> None:
+    async def fly() -> None:
+        device = AutopilotDevice(address=f"serial://{tmp_path / 'px4'}:921600", discovery_timeout_s=DEADLINE_S)
+        async with contextlib.AsyncExitStack() as stack:
+            with px4_cable(tmp_path / "px4"):
+                autopilot = await stack.enter_async_context(MavsdkAutopilot(device, flight_clock()))
+                await eventually(lambda: autopilot.vehicle() is not None, "the vehicle's state")
+            await eventually(lambda: has_hung_up(autopilot), "the loss")
+            before = autopilot.counts()
+            assert not autopilot.send_attitude(LEVEL)
+            with px4_cable(tmp_path / "px4") as px4:  # a restarted end of the link: PX4 has forgotten the rates
+                await eventually(lambda: _read(autopilot) > before.attitude + 50, "50 more attitudes")
+                assert autopilot.send_attitude(LEVEL)
+                await eventually(lambda: bool(px4.of("SET_ATTITUDE_TARGET")), "a setpoint")
+                autopilot.request(AutopilotRequest.LAND)
+                await eventually(lambda: bool(px4.commands(mavlink.MAV_CMD_NAV_LAND)), "LAND")
+
+    asyncio.run(fly())
+
+
+@contextmanager
+def px4_cable(name: Path) -> Iterator[Px4Peer]:
+    with serial_line() as (far, port), plugged(name, port), peer_behind(lambda: far) as px4:
+        yield px4
+
+
+def has_hung_up(autopilot: MavsdkAutopilot) -> bool:
+    return any("the connection has ended" in text for text in autopilot.take_messages())
 
 
 def _read(autopilot: MavsdkAutopilot) -> int:

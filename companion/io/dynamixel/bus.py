@@ -7,8 +7,10 @@ Everything here runs in the bus thread, but for `write_currents`, which the even
 from __future__ import annotations
 
 import contextlib
+import termios
 from collections.abc import Callable
 
+import serial
 from dynamixel_sdk import COMM_SUCCESS, PacketHandler
 
 from companion.config.arm import Arm, Joint
@@ -18,6 +20,7 @@ from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.registers import Block, Register
 from companion.io.dynamixel.scale import RAD_PER_COUNT, JointScale
 from companion.io.protocols import DeviceError
+from companion.io.reopening import Reopening
 from companion.model.observations import ServoReport
 from companion.model.servos import COUNTS_PER_TURN, hardware_error_text, model_text
 from companion.runtime.clock import monotonic
@@ -58,6 +61,8 @@ class ArmBus:
         self._request = packets.sync_read(dxl.INDIRECT_DATA_1, dxl.BLOCK_SIZE, self._ids)
         self._deadline_s = 0.0
         self._watchdog = device.watchdog_ms // dxl.WATCHDOG_UNIT_MS
+        self._reopening: Reopening[serial.Serial] | None = None
+        """Attempts to open the port again after it has hung up; None while it is open."""
         self._touched = False
         self.reports: tuple[ServoReport, ...] = ()
         """Identity and settings of all servos, read back at the end of `open`."""
@@ -97,9 +102,34 @@ class ArmBus:
     def read(self) -> tuple[Block, ...] | None:
         """Perform one sync read. Return None unless every servo answered in time and still has the settings of `open`.
 
+        A port that is gone is opened again, as soon as it is there. Nothing else is done then: a servo that lost its power meanwhile
+        has its torque off and keeps it off, and is not read, because it has lost the settings of `open`.
+
         Raises:
-            OSError: the port is gone.
+            OSError: the port is gone, at the first read that finds it so.
         """
+        if not self._is_open():
+            return None
+        try:
+            return self._read_all()
+        except BlockingIOError:  # it is there, but sends nothing
+            raise
+        except (OSError, termios.error):
+            self._port.closePort()
+            self._reopening = Reopening("arm reopening", lambda: self._port.open_serial(self._device.baud))
+            raise
+
+    def _is_open(self) -> bool:
+        """Return whether the port is open, once it has been opened again."""
+        if self._reopening is not None:
+            opened = self._reopening.take()
+            if opened is None:
+                return False
+            self._reopening = None
+            self._port.use(opened)
+        return True
+
+    def _read_all(self) -> tuple[Block, ...] | None:
         port = self._port
         self._begin()
         port.clearPort()
@@ -128,12 +158,13 @@ class ArmBus:
         return tuple(blocks)
 
     def write_currents(self, counts: Counts) -> None:
-        """Perform one sync write of the goal currents, which has no reply.
+        """Perform one sync write of the goal currents, which has no reply; do nothing while the port is being opened again.
 
         Raises:
             OSError: the port is gone.
         """
-        self._port.writePort(packets.sync_write_int16(dxl.GOAL_CURRENT.address, self._ids, counts))
+        if self._reopening is None:
+            self._port.writePort(packets.sync_write_int16(dxl.GOAL_CURRENT.address, self._ids, counts))
 
     def restart_watchdogs(self) -> None:
         """Clear tripped bus watchdogs and restart them with goal current 0. The next read shows the result.
@@ -152,7 +183,7 @@ class ArmBus:
         self._port.reply_timeout_ms = _FLIGHT_REPLY_TIMEOUT_MS
         self._port.late_reply_ms = 0.0
         try:
-            if self._touched and self._port.is_open:
+            if self._touched and self._is_open() and self._port.is_open:
                 self.write_currents(self._limp)
                 for register in (dxl.TORQUE_ENABLE, dxl.BUS_WATCHDOG):
                     for servo_id in self._ids:
@@ -160,6 +191,8 @@ class ArmBus:
         except Exception:  # a lost port raises any exception of its driver; it must be closed all the same
             pass
         finally:
+            if self._reopening is not None:
+                self._reopening.close()
             with contextlib.suppress(OSError):
                 self._port.closePort()
 
@@ -169,9 +202,6 @@ class ArmBus:
         self._port.baudrate = self._device.baud
         if not self._port.openPort():
             raise self._error("port", None, f"dynamixel-sdk does not know baud rate {self._device.baud}")
-        # A pty or a native UART has no latency timer; only the kernel's value matters.
-        with contextlib.suppress(OSError, ValueError, NotImplementedError):
-            self._port.ser.set_low_latency_mode(True)
         latency_ms = dxl.usb_latency_ms(self._device.port)
         if latency_ms is not None and latency_ms > _USB_LATENCY_MAX_MS:
             raise self._error(

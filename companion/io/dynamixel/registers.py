@@ -6,6 +6,7 @@ The supported baud rates are those of `companion.config.devices.ServoBaud`.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import math
 import os
@@ -191,18 +192,29 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         if self.is_open:
             self.closePort()
         try:
-            self.ser = serial.Serial(
-                self.port_name,
-                cflag_baud,
-                timeout=_POLL_MS * 1e-3,
-                exclusive=True,
-                bytesize=serial.EIGHTBITS,
-            )
+            opened = self.open_serial(cflag_baud)
         except (OSError, ValueError) as error:
             raise DeviceError(f"arm bus {self.port_name}: {_open_failure(self.port_name, error)}") from error
-        self.is_open = True
+        self.use(opened)
         self.tx_time_per_byte = 10_000.0 / self.baudrate
         return True
+
+    def open_serial(self, baud: int) -> serial.Serial:
+        """Return the port, newly opened; `use` takes it into use.
+
+        Raises:
+            OSError: the port does not exist, is busy or not accessible.
+            ValueError: it is not a serial port, or does not support the baud rate.
+        """
+        opened = serial.Serial(self.port_name, baud, timeout=_POLL_MS * 1e-3, exclusive=True, bytesize=serial.EIGHTBITS)
+        # A pty or a native UART has no latency timer; only the kernel's value matters.
+        with contextlib.suppress(OSError, ValueError, NotImplementedError):
+            opened.set_low_latency_mode(True)
+        return opened
+
+    def use(self, opened: serial.Serial) -> None:
+        """Exchange data through an open port from now on."""
+        self.ser, self.is_open, self._arrived = opened, True, b""
 
     def closePort(self) -> None:
         """Close the port. A second call has no effect."""

@@ -18,6 +18,7 @@ from companion.io.force_torque import rft
 from companion.io.force_torque.rft import Command, PacketScanner
 from companion.io.force_torque.samples import SampleStream
 from companion.io.protocols import DeviceError
+from companion.io.reopening import Reopening
 from companion.model.observations import ForceCounts
 from companion.model.types import ForceSample
 from companion.runtime.clock import Clock
@@ -34,7 +35,7 @@ class RobotousForceTorque(SampleStream):
     """RFT60-HA01 in continuous-output mode; implements `companion.io.protocols.ForceTorque`.
 
     The port is read from the event loop: 200 packets/s of 19 bytes need no thread. When the sensor falls silent or the port vanishes,
-    `latest()` becomes stale and nothing is raised.
+    `latest()` becomes stale and nothing is raised. A port that comes back under its name is opened again by `latest()`.
 
     Args:
         device: port, rate and the force above which a sample counts as overloaded.
@@ -54,18 +55,23 @@ class RobotousForceTorque(SampleStream):
         self._answers: dict[int, asyncio.Future[bytes]] = {}
         self._received_bytes = 0
         self._in_ticks = False
+        self._reopening: Reopening[serial.Serial] | None = None
+        """Attempts to open a lost port again; None while it is open."""
+        self._starting: asyncio.Task[None] | None = None
 
     def latest(self) -> ForceSample | None:
         """Return the newest raw sample; never blocks."""
-        if self._in_ticks and self._lost is None:
+        if self._reopening is not None:
+            self._restore(self._reopening)
+        elif self._in_ticks:
             self._on_readable()
         return super().latest()
 
     def read_in_ticks(self) -> None:
         """Read the port in `latest` from now on. The stamp of a sample is then the time of the tick that read it."""
-        if self._serial is not None and self._lost is None:
+        if self._serial is not None:
             asyncio.get_running_loop().remove_reader(self._serial.fileno())
-            self._in_ticks = True
+        self._in_ticks = True
 
     def counts(self) -> ForceCounts:
         """Return the counters, for logs and preflight."""
@@ -82,19 +88,13 @@ class RobotousForceTorque(SampleStream):
         Raises:
             DeviceError: the port does not exist or is in use, the device is silent or is a different one, or no samples arrive.
         """
-        self._serial = self._open()
+        try:
+            self._serial = self._open()
+        except (OSError, ValueError) as error:  # SerialException is an OSError
+            raise DeviceError(f"{self._where}: {self._why_not_open(error)}") from None
         try:
             asyncio.get_running_loop().add_reader(self._serial.fileno(), self._on_readable)
-            self._send(Command.STOP)  # it may still stream from an earlier run and then accepts no other command
-            self.product_name = rft.decode_text(await self._ask(Command.PRODUCT_NAME, repeat_s=_REPEAT_S))
-            if _MODEL not in self.product_name:
-                raise DeviceError(
-                    f'{self._where}: a "{self.product_name}" answers, expected a {_MODEL}-HA01 (other models scale their readings '
-                    "differently); check devices.force.port"
-                )
-            self.firmware = rft.decode_text(await self._ask(Command.FIRMWARE_VERSION))
-            await self._set_rate()
-            self._send(Command.START)
+            await self._start()
             await self._first_samples()
         except BaseException:
             self._shut()
@@ -110,13 +110,8 @@ class RobotousForceTorque(SampleStream):
     # -- opening ---------------------------------------------------------------------------------------------------------------
 
     def _open(self) -> serial.Serial:
-        try:
-            # The last argument sets VMIN to 1: only a lost port then returns an empty read, not one without new bytes.
-            opened = serial.Serial(
-                self._device.port, self._device.baud, timeout=0, exclusive=True, inter_byte_timeout=0
-            )
-        except (OSError, ValueError) as error:  # SerialException is an OSError
-            raise DeviceError(f"{self._where}: {self._why_not_open(error)}") from None
+        # The last argument sets VMIN to 1: only a lost port then returns an empty read, not one without new bytes.
+        opened = serial.Serial(self._device.port, self._device.baud, timeout=0, exclusive=True, inter_byte_timeout=0)
         # USB adapters otherwise delay bytes by up to 16 ms; ports without this setting (a pty) have no such delay.
         with suppress(OSError, ValueError, NotImplementedError):
             opened.set_low_latency_mode(True)
@@ -132,6 +127,19 @@ class RobotousForceTorque(SampleStream):
         if number in (errno.EACCES, errno.EPERM):
             return "no permission; add your user to the dialout group and log in again"
         return f"not usable as a serial port ({error}); set devices.force.port to the sensor's port"
+
+    async def _start(self) -> None:
+        """Identify the sensor, set its rate and start continuous output."""
+        self._send(Command.STOP)  # it may still stream from an earlier run and then accepts no other command
+        self.product_name = rft.decode_text(await self._ask(Command.PRODUCT_NAME, repeat_s=_REPEAT_S))
+        if _MODEL not in self.product_name:
+            raise DeviceError(
+                f'{self._where}: a "{self.product_name}" answers, expected a {_MODEL}-HA01 (other models scale their readings '
+                "differently); check devices.force.port"
+            )
+        self.firmware = rft.decode_text(await self._ask(Command.FIRMWARE_VERSION))
+        await self._set_rate()
+        self._send(Command.START)
 
     async def _set_rate(self) -> None:
         """Read the rate and write it only if it differs: the sensor keeps it in EEPROM."""
@@ -240,20 +248,44 @@ class RobotousForceTorque(SampleStream):
         self._hand_on(sample)
 
     def _lose(self, reason: str) -> None:
-        """Stop reading a lost port (a dead descriptor is always readable) and wake the waiting callers."""
+        """Close a lost port (a dead descriptor is always readable), wake the waiting callers, and let it be opened again."""
         if self._lost is not None or self._serial is None:
             return
         self._lost = f"the port was lost ({reason})"
-        asyncio.get_running_loop().remove_reader(self._serial.fileno())
+        self._close_port()
         _LOG.error("%s: %s", self._where, self._lost)
         self._wake()
+        self._reopening = Reopening("force reopening", self._open)
 
-    def _shut(self) -> None:
-        opened = self._serial
+    def _restore(self, reopening: Reopening[serial.Serial]) -> None:
+        """Start the sensor again once its port is open again: it may have lost its power."""
+        opened = reopening.take()
         if opened is None:
             return
+        _LOG.warning("%s: the port is open again", self._where)
+        self._serial, self._reopening, self._lost = opened, None, None
+        loop = asyncio.get_running_loop()
+        if not self._in_ticks:
+            loop.add_reader(opened.fileno(), self._on_readable)
+        self._starting = loop.create_task(self._start_again())
+
+    async def _start_again(self) -> None:
+        try:
+            await self._start()
+        except DeviceError as error:
+            self._lose(str(error))
+
+    def _close_port(self) -> None:
+        opened, self._serial = self._serial, None
+        if opened is not None:
+            asyncio.get_running_loop().remove_reader(opened.fileno())
+            with suppress(OSError):
+                opened.close()
+
+    def _shut(self) -> None:
+        if self._starting is not None:
+            self._starting.cancel()
+        if self._reopening is not None:
+            self._reopening.close()
         self._send(Command.STOP)
-        asyncio.get_running_loop().remove_reader(opened.fileno())
-        self._serial = None
-        with suppress(OSError):
-            opened.close()
+        self._close_port()

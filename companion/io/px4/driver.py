@@ -32,7 +32,8 @@ from companion.io.px4.questions import Questions
 from companion.io.px4.requests import RequestQueue
 from companion.io.px4.setpoints import SetpointPath, setpoint_path
 from companion.io.px4.streams import ESTIMATOR_RATE_HZ, HEARTBEAT_ASK_PERIOD_S, ask_for_streams, stop_unread_streams
-from companion.io.px4.wire import OpenWire, UdpWire
+from companion.io.px4.wire import OpenWire, UdpWire, open_wire
+from companion.io.reopening import Reopening
 from companion.model.estimator import EstimatorReport
 from companion.model.observations import StateCounts
 from companion.model.types import (
@@ -80,10 +81,15 @@ class MavsdkAutopilot:
         self._forwarding = forwarding
         self._clock = clock
         self._requests = RequestQueue()
-        self._inbox = Inbox(self._requests, self._show_ground_station)
+        self._inbox = Inbox(self._requests, self._after_heartbeat)
         self._mavsdk: Any = None
         self._connection: Any = None
         self._wire: OpenWire | None = None
+        self._reopening: Reopening[OpenWire] | None = None
+        """Attempts to open a lost link again; None while it is open."""
+        self._asks_again = False
+        """Whether the streams must be requested again at the next HEARTBEAT, because the link was lost."""
+        self._asking: asyncio.Task[None] | None = None
         self._reader = FrameReader(stream=False)
         self._writer = FrameWriter(0, 0)
         self._readers = self._inbox.readers
@@ -223,8 +229,8 @@ class MavsdkAutopilot:
             self._send_message(*messages.command_long(*messages.command(request), self._system_id))
 
     def take_messages(self) -> list[str]:
-        """Return, oldest first, all refusals and STATUSTEXTs since the last call, and reports of a new port of PX4 or of a second
-        sender that claims to be PX4.
+        """Return, oldest first, all refusals and STATUSTEXTs since the last call, and reports of a new port of PX4, of a link that hung
+        up or is open again, or of a second sender that claims to be PX4.
         """
         texts = self._requests.take_messages(self._clock())
         if self._reports:
@@ -309,6 +315,31 @@ class MavsdkAutopilot:
             fix = "open it first"
             raise device_error(self._device.address, "an open link", "a closed one", fix)
 
+    def _after_heartbeat(self) -> None:
+        if self._asks_again and self._questions is not None and self._loop is not None:
+            self._asks_again = False
+            self._asking = self._loop.create_task(self._ask_again(self._questions))
+        self._show_ground_station()
+
+    async def _ask_again(self, questions: Questions) -> None:
+        """Request the streams on a link that was lost: PX4 keeps their rates, unless it restarted its end of the link or itself."""
+        try:
+            await ask_for_streams(questions, self._estimator_rate_hz)
+        except DeviceError as error:
+            self._reports.append(str(error))
+
+    def _restore_link(self) -> None:
+        """Close a lost link, and use it again once it is open again."""
+        address, wire = self._device.address, self._wire
+        if self._reopening is None:
+            assert wire is not None
+            wire.close()
+            self._reports.append(f"autopilot {address}: the connection has ended; trying again")
+            self._reopening = Reopening("px4 reopening", lambda: open_wire(address, clock=self._clock))
+        elif (again := self._reopening.take()) is not None:
+            self._reopening, self._wire, self._asks_again = None, again, True
+            self._reports.append(f"autopilot {address}: the connection is open again")
+
     def _show_ground_station(self) -> None:
         """Answer the heartbeat of a disarmed PX4 with that of a ground station, because PX4 reports the
         reasons why it refuses to arm only to a ground station.
@@ -342,6 +373,9 @@ class MavsdkAutopilot:
         """Read what has arrived: decode what the flight uses, and pass everything but the vehicle's state to MAVSDK."""
         self._polled_s = self._clock()
         if self._wire is None:
+            return
+        if self._wire.lost:
+            self._restore_link()
             return
         others: list[bytes] = []
         for arrived_s, data in self._wire.receive():
@@ -387,7 +421,9 @@ class MavsdkAutopilot:
         if self._pump_timer is not None:
             self._pump_timer.cancel()
         wire, self._wire = self._wire, None
-        for held in (wire, self._relay, self._claim):  # from here on nothing can leave
+        if self._asking is not None:
+            self._asking.cancel()
+        for held in (wire, self._reopening, self._relay, self._claim):  # from here on nothing can leave
             if held is not None:
                 held.close()
         if self._connection is not None:
