@@ -24,9 +24,12 @@ FUSED_WITHIN_RAD: Final = math.radians(8.0)
 CONTINUOUS_S: Final = 0.1
 """After a longer gap a pose is compared with PX4's position, not with the previous pose."""
 FORGET_S: Final = 1.0
-"""After a gap this long the next frame is trusted: `mocap_lost` has reported the gap."""
+"""On the ground the next frame is trusted after a gap this long: the vehicle may have been carried."""
 DRIFT_M_S: Final = 0.3
-"""Permitted drift of PX4's position while no pose is trusted, m/s."""
+"""Permitted drift of PX4's position while no pose is trusted, m/s, up to `safety.estimate_disagreement_m`."""
+BLIND_M_S15: Final = 0.2
+"""Permitted error of PX4's position after a time t without a pose, divided by t^1.5: one standard deviation of a position integrated
+from an accelerometer with the noise that EKF2 assumes, 0.35 m/s2 (EKF2_ACC_NOISE), divided by sqrt(3)."""
 RATE_WINDOW_S: Final = 1.0
 
 
@@ -69,6 +72,9 @@ class MocapTracker:
         """The newest frame in which the body was tracked."""
         self._trusted_pose: MocapPose | None = None
         self._trusted_awake_s = -math.inf
+        self._blind_s = 0.0
+        """Longest time without a tracked body since the newest trusted pose. Poses that are rejected do not extend it, so that
+        another body's pose is not trusted in the end."""
         self._same_since_s: float | None = None
         self._moved = False
         self._streams = StreamWatch()
@@ -114,7 +120,7 @@ class MocapTracker:
         if vehicle is not None and vehicle.imu_boot_s is not None:
             self._predict(vehicle, vehicle.imu_boot_s)
         if pose is not None and (self.frame is None or pose.stamp_s != self.frame.stamp_s):
-            self._judge(pose, vehicle, awake_s)
+            self._judge(pose, vehicle, awake_s, situation.airborne)
         self.frame_age_s = awake_s - self._frame_awake_s
         self.trusted_age_s = awake_s - self._trusted_awake_s
         self.frozen = (
@@ -158,7 +164,7 @@ class MocapTracker:
         x, y, z = quat_rotate(vehicle.attitude_wxyz, (x - bx, y - by, z - bz))
         self._inertial.imu(vehicle.imu_stamp_s, dt_s, (x, y, z - GRAVITY_M_S2 * dt_s))
 
-    def _judge(self, pose: MocapPose, vehicle: VehicleState | None, awake_s: float) -> None:
+    def _judge(self, pose: MocapPose, vehicle: VehicleState | None, awake_s: float, airborne: bool) -> None:
         """Evaluate a new frame."""
         before, accepted = self.frame, self._trusted_pose
         if before is None:
@@ -176,16 +182,17 @@ class MocapTracker:
         self.repeats = same and tracked is not None and pose.attitude_wxyz == tracked.attitude_wxyz
         if not pose.tracking_valid:
             return
+        if tracked is not None:
+            self._blind_s = max(self._blind_s, pose.stamp_s - tracked.stamp_s)
         self._tracked = pose
         if not same:
             self._same_since_s, self._moved = None, False
         elif self._same_since_s is None and self.repeats:
             self._same_since_s, self._moved = awake_s, False
-        self.plausible = (
-            accepted is None or vehicle is None or gone_s > FORGET_S or self._follows(accepted, pose, vehicle)
-        )
+        forgotten = gone_s > FORGET_S and not airborne
+        self.plausible = accepted is None or vehicle is None or forgotten or self._follows(accepted, pose, vehicle)
         if self.plausible:
-            self._trusted_pose, self._trusted_awake_s = pose, awake_s
+            self._trusted_pose, self._trusted_awake_s, self._blind_s = pose, awake_s, 0.0
             # mocap_frozen evaluates repeated poses; they are not passed on and are not evidence of motion.
             if not self.repeats:
                 self._against_imu = self._inertial.pose(pose.stamp_s, pose.position_world_m, self._age_s(pose))
@@ -211,7 +218,9 @@ class MocapTracker:
             reference = before.attitude_wxyz
         else:
             px, py, pz = vehicle.position_world_m
-            allowed_m = min(self._s.mocap_jump_m + DRIFT_M_S * dt_s, self._s.estimate_disagreement_m)
+            jump_m = self._s.mocap_jump_m
+            blind_m = jump_m + BLIND_M_S15 * self._blind_s * math.sqrt(self._blind_s)
+            allowed_m = max(min(jump_m + DRIFT_M_S * dt_s, self._s.estimate_disagreement_m), blind_m)
             reference = vehicle.attitude_wxyz
         dx, dy, dz = x - px, y - py, z - pz
         off_m2 = dx * dx + dy * dy + dz * dz

@@ -66,15 +66,18 @@ class Monitors:
         self._awake_s = 0.0
         self._last_t_s: float | None = None
         self._airborne = False
+        self._mocap_timeout_s = vehicle.safety.mocap_timeout_s
         self.trusted: Inputs | None = None
         """Inputs of the last tick without the records that are not trusted; the same object if all are trusted."""
 
     @property
     def mocap_trusted(self) -> bool:
         """Return whether poses may be passed on to PX4. In the air a repeated pose is withheld, long before `mocap_frozen`, because it
-        suggests a vehicle at rest.
+        suggests a vehicle at rest, and so is the first one after a loss, until it has been evaluated: PX4 resets its position to it.
         """
-        return self._mocap.trusted and not (self._mocap.repeats and self._airborne)
+        mocap = self._mocap
+        lost = mocap.frame is not None and mocap.trusted_age_s > self._mocap_timeout_s
+        return mocap.trusted and not (self._airborne and (mocap.repeats or lost))
 
     @property
     def mocap_innovation_m(self) -> float:

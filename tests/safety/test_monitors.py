@@ -504,16 +504,56 @@ def test_motion_capture_that_comes_back_at_its_full_rate_is_not_reported_as_slow
 
 @pytest.mark.parametrize(
     ("gap_s", "off_m", "trusted"),
-    [(0.5, 0.22, True), (0.5, 0.28, False), (0.95, 0.32, False), (0.15, 0.12, True), (0.15, 0.17, False)],
-)
+    [
+        (0.5, 0.22, True), (0.5, 0.28, False), (0.95, 0.32, False), (0.15, 0.12, True), (0.15, 0.17, False),
+        (1.5, 0.45, True), (1.5, 0.49, False), (3.0, 1.12, True), (3.0, 1.16, False),
+    ],
+)  # fmt: skip
 def test_after_a_gap_a_pose_far_from_px4s_position_is_not_passed_on(gap_s: float, off_m: float, trusted: bool) -> None:
-    """0.1 m, and 0.3 m/s for the drift of PX4's position, but 0.3 m at most."""
+    """0.1 m, and 0.3 m/s for the drift of PX4's position, up to 0.3 m; from 1 s on 0.2 m x t^1.5 / s^1.5 in its place."""
+    monitors, ticks = after_a_gap(gap_s, flying())
+    monitors.check(moved("mocap", (0.0, off_m, 0.0))(healthy(ticks)), flying())
+    assert monitors.trusted is not None and (monitors.trusted.mocap is not None) is trusted
+
+
+@pytest.mark.parametrize(("turn_deg", "trusted"), [(18.0, True), (-18.0, True), (22.0, False), (-90.0, False)])
+def test_after_a_long_gap_a_pose_that_has_turned_is_not_passed_on(turn_deg: float, trusted: bool) -> None:
+    monitors, ticks = after_a_gap(2.0, flying())
+    monitors.check(turned("mocap", turn_deg)(healthy(ticks)), flying())
+    assert monitors.mocap_trusted is trusted
+
+
+def test_after_a_long_gap_another_bodys_poses_are_not_trusted_however_long_they_last() -> None:
+    monitors, ticks = after_a_gap(1.5, flying())
+    others = [moved("mocap", (1.0, 0.0, 0.0))(healthy(k)) for k in range(ticks, ticks + 2000)]
+    events = watched(VEHICLE, others, flying(), monitors)
+    assert not monitors.mocap_trusted
+    assert [event.id for event in events if event.id == "mocap_swapped"]
+
+
+@pytest.mark.parametrize("gone", [stopped("mocap"), put("mocap", tracking_valid=False)], ids=["lost", "not tracked"])
+def test_the_first_pose_after_a_loss_is_evaluated_before_it_may_be_passed_on(gone: Change) -> None:
+    """PX4 would reset its position to it."""
+    monitors = Monitors(VEHICLE)
+    watched(VEHICLE, after_a_moment(gone, ticks=201), flying(), monitors)
+    assert not monitors.mocap_trusted
+    monitors.check(healthy(201), flying())
+    assert monitors.mocap_trusted
+
+
+def test_on_the_ground_the_vehicle_may_be_carried_while_it_is_not_seen() -> None:
+    monitors, ticks = after_a_gap(2.0, standing())
+    monitors.check(moved("mocap", (1.5, 0.0, 0.0))(healthy(ticks)), standing())
+    assert monitors.mocap_trusted
+
+
+def after_a_gap(gap_s: float, situation: Situation) -> tuple[Monitors, int]:
+    """Monitors that have seen no frame for a while, and the tick of the next one."""
     monitors = Monitors(VEHICLE)
     ticks = 20 + round(gap_s / TICK_S)
     gone = [replace(healthy(k), mocap=healthy(min(k, 19)).mocap) for k in range(ticks)]
-    watched(VEHICLE, gone, flying(), monitors)
-    monitors.check(moved("mocap", (0.0, off_m, 0.0))(healthy(ticks)), flying())
-    assert monitors.trusted is not None and (monitors.trusted.mocap is not None) is trusted
+    watched(VEHICLE, gone, situation, monitors)
+    return monitors, ticks
 
 
 def test_motion_capture_that_comes_back_slowly_is_reported_with_its_own_rate() -> None:

@@ -295,6 +295,35 @@ def test_a_catch_in_a_drawn_world_is_no_drag() -> None:
     assert "mocap_dragged" not in {event.id for outputs in result.outputs for event in outputs.events}
 
 
+def test_after_a_gap_another_bodys_pose_does_not_reach_px4_which_lands_without_it() -> None:
+    """PX4 would reset its position to the first pose: this flight ended 4 m away, on its tether (laboratory 1)."""
+    faults = ({"kind": "mocap_loss", "duration_s": 1.5}, {"kind": "mocap_swap", "size": 0.8})
+    config = load_sitl(
+        CATCH, overrides=[f"world.faults={json.dumps([{**fault, 'phase': 'line'} for fault in faults])}"], world="lab"
+    )
+    flight = FastFlight(config)
+    result = flight.run()
+    begun_s = flight.faults.begun_s
+    assert begun_s is not None
+    assert "mocap_swapped" in {event.id for outputs in result.outputs for event in outputs.events}
+    assert not result.crashed and not result.armed
+    x, y, _ = next(truth for truth in result.truth if truth.t_s >= begun_s).position_world_m
+    landed_x, landed_y, _ = result.truth[-1].position_world_m
+    assert math.dist((x, y), (landed_x, landed_y)) < 0.6
+
+
+@pytest.mark.parametrize("gap_s", [1.5, 3.0])
+def test_after_a_gap_the_vehicles_own_poses_are_used_again(gap_s: float) -> None:
+    config = with_faults({"kind": "mocap_loss", "phase": "line", "duration_s": gap_s})
+    flight = FastFlight(config)
+    result = flight.run()
+    begun_s = flight.faults.begun_s
+    assert begun_s is not None
+    back = [o.mocap_trusted for o in result.outputs if o.t_s > begun_s + gap_s + 0.1]
+    assert back and all(back)
+    assert not result.crashed and not result.armed
+
+
 def test_a_gap_shorter_than_the_timeout_is_flown_through() -> None:
     row = flown("mocap_loss", "line", None, 0.1)
     assert (row["outcome"], row["action"]) == ("completed", "nominal")
