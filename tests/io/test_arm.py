@@ -355,9 +355,8 @@ def test_a_port_that_comes_back_under_its_name_is_read_again_and_moves_nothing_b
             async with ServoBus(servos) as bus:
                 with plugged(tmp_path / "arm", bus.path) as port:
                     arm = await stack.enter_async_context(DynamixelArm(device_on(port), arm_config(), flight_clock()))
-                    arm.write_torque((0.4, 0.4))
-                    await until(lambda: register(servos[0], 102, 2) != 0)
-            lost = await state_when(arm, lambda s: s.read_failures >= 3)
+                    await until(lambda: rewritten(arm, servos))
+            lost = await state_when(arm, lambda s: bool(arm.problem))
             for servo, joint in zip(
                 servos, JOINTS, strict=True
             ):  # no packet comes, by the servos' time: watchdogs trip
@@ -371,10 +370,9 @@ def test_a_port_that_comes_back_under_its_name_is_read_again_and_moves_nothing_b
                     assert back.stamp_s > lost.stamp_s
                     await state_when(arm, lambda s: s.hardware_error == (0, 0))
                     assert [register(servo, 102, 2) for servo in servos] == [0, 0], "no torque of before the loss"
-                    arm.write_torque((0.3, 0.3))
-                    await until(lambda: all(register(servo, 102, 2) for servo in servos))
+                    await until(lambda: rewritten(arm, servos))
                     await arm.__aexit__(None, None, None)
-                    assert [register(servo, 64) for servo in servos] == [0, 0]
+                    await until(lambda: [register(servo, 64) for servo in servos] == [0, 0])
 
     asyncio.run(asyncio.wait_for(main(), LONG_S))
     assert_nothing_left()
@@ -387,7 +385,7 @@ def test_servos_that_lost_their_power_with_the_port_keep_their_torque_off(tmp_pa
             async with ServoBus(servos) as bus:
                 with plugged(tmp_path / "arm", bus.path) as port:
                     arm = await stack.enter_async_context(DynamixelArm(device_on(port), arm_config(), flight_clock()))
-            lost = await state_when(arm, lambda s: s.read_failures >= 3)
+            lost = await state_when(arm, lambda s: bool(arm.problem))
             for servo in servos:
                 servo.reboot()
             async with ServoBus(servos) as bus:
@@ -403,7 +401,7 @@ def test_servos_that_lost_their_power_with_the_port_keep_their_torque_off(tmp_pa
 
 
 def rewritten(arm: DynamixelArm, servos: list[ServoModel]) -> bool:
-    """Command a torque; whether its goal has arrived at all servos."""
+    """Command a torque, which is withdrawn unless it is renewed; whether its goal has arrived at all servos."""
     arm.write_torque((0.4, 0.4))
     return all(register(servo, 102, 2) for servo in servos)
 
