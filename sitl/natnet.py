@@ -73,6 +73,7 @@ class NatNetServer:
         multicast_group: multicast address, or None to stream to unicast clients only.
         bodies: id and name of each rigid body.
         clock: time that the server lives in, s.
+        stamps: clock of the stamps in frames and in answers to echo requests, s; None for `clock`.
     """
 
     def __init__(
@@ -83,8 +84,10 @@ class NatNetServer:
         multicast_group: str | None = None,
         bodies: Sequence[tuple[int, str]] = ((1, "companion"),),
         clock: Callable[[], float] = time.monotonic,
+        stamps: Callable[[], float] | None = None,
     ) -> None:
         self._clock = clock
+        self._stamps = stamps or clock
         self.version = version
         self.multicast_group = multicast_group
         self.bodies = tuple(bodies)
@@ -220,6 +223,8 @@ class NatNetServer:
             self._reply(Message.SERVER_INFO, self._server_info(), address)
         elif message == Message.KEEP_ALIVE:
             self._clients[address] = now_s
+        elif message == Message.ECHO_REQUEST and len(datagram) >= 12:
+            self._reply(Message.ECHO_RESPONSE, datagram[4:12] + struct.pack("<Q", _ticks(self._stamps())), address)
         elif message == Message.REQUEST_MODELDEF:
             self._reply(Message.MODELDEF, encode_model_definitions(self.version, self.bodies), address)
         elif message == Message.DISCONNECT:

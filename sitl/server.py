@@ -224,7 +224,17 @@ class Sitl:
             multicast_group=mocap.multicast_group if self._ports.multicast else None,
             bodies=((mocap.rigid_body_id, self._vehicle.name), *self._others),
             clock=asyncio.get_running_loop().time if self._keeper is None else lambda: self.plant.t_s,
+            stamps=self._server_clock_s,
         )
+
+    def _server_clock_s(self) -> float:
+        """Return the clock of the motion-capture server, with which `_publish` stamps frames."""
+        now_s = self.plant.t_s if self._keeper is not None else time.monotonic() - self._origin_s
+        return self.faults.server_clock_s(now_s) + self._ahead_s
+
+    @property
+    def _ahead_s(self) -> float:
+        return 0.0 if self.autopilot.lockstep else self.slipped_s
 
     def _mocap_settings(self, server: NatNetServer) -> dict[str, Any]:
         settings: dict[str, Any] = {
@@ -385,8 +395,9 @@ class Sitl:
         body = self._vehicle.devices.mocap.rigid_body_id
         pose = BodyPose(body, frame.position_world_m, frame.attitude_wxyz, frame.valid)
         others = [BodyPose(number, OTHER_PLACE_M, IDENTITY_QUAT) for number, _ in self._others]
-        clock, ahead_s = self.faults.server_clock_s, 0.0 if self.autopilot.lockstep else self.slipped_s
-        self.mocap.publish(clock(t_s) + ahead_s, (*others, pose), clock(frame.exposure_t_s) + ahead_s)
+        clock, ahead_s = self.faults.server_clock_s, self._ahead_s
+        sent_s = t_s - frame.network_s
+        self.mocap.publish(clock(sent_s) + ahead_s, (*others, pose), clock(frame.exposure_t_s) + ahead_s)
 
     def _apply_faults(self) -> None:
         plant = self.plant

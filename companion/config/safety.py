@@ -24,11 +24,10 @@ class Safety(Model):
     mocap_rate_min_hz: Positive = 50.0
     """Rate of poses below which a warning is raised."""
     mocap_latency_warn_s: Positive = 0.05
-    """Time from mid-exposure to transmission, on the server's clock, above which a warning is raised."""
+    """Time from the mid-exposure of a pose to its arrival, the network included, above which a warning is raised."""
     mocap_latency_max_s: Positive = 0.12
-    """Latency above which PX4 lands. PX4 fuses a pose at its arrival time minus EKF2_EV_DELAY, so at 1 m/s a pose that is 0.12 s late
-    is
-    off by 0.11 m, about as much as `mocap_jump_m` allows."""
+    """Latency above which a pose is not passed on and PX4 lands. PX4 fuses a pose at its arrival time minus EKF2_EV_DELAY, so at 1 m/s
+    a pose that is 0.12 s late is off by 0.11 m, about as much as `mocap_jump_m` allows."""
     mocap_jump_m: Positive = 0.10
     """Largest distance between a pose and the position predicted from PX4's velocity; a more distant pose is ignored."""
     mocap_jump_deg: Positive = 20.0

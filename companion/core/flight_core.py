@@ -32,16 +32,19 @@ from companion.model.types import (
     ControlLog,
     Event,
     Inputs,
+    MocapPose,
     Outputs,
     PhaseKind,
     Reference,
     SafetyAction,
     Vec3,
+    VehicleState,
 )
 from companion.safety import notices
 from companion.safety.gate import ARM_FRESH_S, Gate, Refusal
 from companion.safety.governor import Governor
 from companion.safety.monitors import Monitors
+from companion.safety.pose_filter import PoseFilter
 from companion.safety.reattach import found_armed
 from companion.safety.rules import OPERATOR_RESUME
 from companion.safety.situation import Situation
@@ -145,6 +148,16 @@ class FlightCore:
             mocap_innovation_m=self._monitors.mocap_innovation_m,
             contact=state.contact,
         )
+
+    def forwards(self, pose: MocapPose, vehicle: VehicleState | None) -> bool:
+        """Return whether a pose may be passed on to PX4 at its arrival, given PX4's newest state. Changes nothing: the next tick
+        evaluates the pose again, so that a replay needs the inputs of the ticks only.
+        """
+        return self._monitors.forwards(pose, vehicle)
+
+    def pose_filter(self) -> PoseFilter | None:
+        """Return a filter for the poses of a landing without the core; None if no pose may be passed on to PX4."""
+        return self._monitors.pose_filter()
 
     def _dt_s(self, t_s: float) -> float:
         """Return the time since the previous tick, s, limited to the range from `_DT_MIN_S` to `_DT_MAX_S`."""

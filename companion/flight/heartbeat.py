@@ -10,6 +10,7 @@ from companion.mission.contact import way_back_m
 from companion.model.best_pose import best_pose, pose_used_s
 from companion.model.flight_stage import PILOT_FLIES
 from companion.model.types import (
+    IDENTITY_QUAT,
     AutopilotRequest,
     AutopilotStatus,
     ContactMode,
@@ -46,7 +47,7 @@ class Heartbeats:
         merely that a single pose is invalid.
         """
         self._pose_stamp_s = float("-inf")
-        self._position_world_m = (0.0, 0.0, 0.0)
+        self._position_world_m, self._attitude_wxyz = (0.0, 0.0, 0.0), IDENTITY_QUAT
         self._left: tuple[Vec3, Vec3] | None = None
         """Way back from a surface, and where it begins, while a landing or a retract that has replaced the mission may still fly it."""
 
@@ -57,7 +58,8 @@ class Heartbeats:
         self._lands_without_mocap = self._lands_without_mocap or not ids.isdisjoint(_REFUSALS)
         pose_s, pose = pose_used_s(inputs), best_pose(inputs)
         if pose_s is not None and pose is not None and outputs.mocap_trusted:
-            self._pose_stamp_s, self._position_world_m = pose_s, pose.position_world_m
+            self._pose_stamp_s = pose_s
+            self._position_world_m, self._attitude_wxyz = pose.position_world_m, pose.attitude_wxyz
         armed = inputs.status is not None and inputs.status.armed
         # PX4 reports only once a second whether it is armed, so it may be armed as soon as arming is requested.
         may_lift = armed or outputs.request is AutopilotRequest.ARM or outputs.phase_kind in _IN_THE_AIR
@@ -77,6 +79,7 @@ class Heartbeats:
             local_port=link.local_port,
             pose_stamp_s=self._pose_stamp_s,
             position_world_m=self._position_world_m,
+            attitude_wxyz=self._attitude_wxyz,
             peer=link.peer,
             back_world_m=self._back_world_m(outputs.contact),
         )

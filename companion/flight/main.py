@@ -45,6 +45,7 @@ from companion.model.types import (
     SafetyAction,
     Sent,
     Severity,
+    VehicleState,
 )
 from companion.recorder.client import RecorderProcess, epoch_offset_ns
 from companion.runtime import ipc, simulated_time
@@ -85,6 +86,9 @@ class Flight:
         self._operator = operator
         self._clock = clock
         self._core = FlightCore(config)
+        self._vehicle: VehicleState | None = None
+        """PX4's state in the newest tick."""
+        devices.vision.judge = lambda pose: self._core.forwards(pose, self._vehicle)
         self._missed = 0
         self._slow: SimulatedTicker | None = None
         """The ticker of simulated time; None in real time."""
@@ -144,6 +148,13 @@ class Flight:
                 await self._devices.arm.read(JOINT_READ_TIMEOUT_S)
         return ticker
 
+    def judge_without_core(self) -> None:
+        """Judge each pose on PX4's present state, because no tick evaluates it any more."""
+        pose_filter, autopilot = self._core.pose_filter(), self._devices.autopilot
+        self._devices.vision.judge = lambda pose: (
+            pose_filter is not None and pose_filter.check(pose, autopilot.vehicle())
+        )
+
     def _schedule_read(self, due_s: float) -> None:
         """Schedule the read of the joint state for the tick that is due at `due_s`."""
         arm = self._devices.arm
@@ -169,10 +180,10 @@ class Flight:
             guardian_ready=self._guardian.ready if self._guardian is not None else None,
             estimator=devices.autopilot.estimator() if self._external else None,
         )
+        self._vehicle = inputs.vehicle
         outputs = self._core.step(inputs)
         if self._slow is not None:
             await self._slow.computed()
-        devices.vision.open = outputs.mocap_trusted
         core_s = self._clock()
         attitude_sent = devices.autopilot.send_attitude(outputs.attitude)
         setpoint_s = self._clock()
@@ -406,6 +417,7 @@ async def fly(
                     sys.stderr.flush()
                 if guardian is not None and guardian.would_take_over:
                     os._exit(EXIT_INTERNAL)  # end at once: the guardian lands, and this process must not disturb it
+                flight.judge_without_core()
                 outcome = await land_without_core(devices.autopilot, channel, clock, guardian)
             if guardian is not None and outcome is not Outcome.LOST:
                 guardian.goodbye(devices.autopilot.status())

@@ -12,7 +12,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from companion.model.codec import Record, RecordError, from_packet, to_packet
-from companion.model.types import Vec3
+from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 
 HEARTBEAT, RECORDER_CHANNEL, READY, PROBLEM = b"B", b"A", b"R", b"P"
 """Datagram types, given by the first byte."""
@@ -55,6 +55,8 @@ class Heartbeat(Record, frozen=True, kw_only=True):
     """Flight clock of the newest accepted motion-capture pose; -inf if there was none."""
     position_world_m: Vec3
     """Position of the newest accepted pose."""
+    attitude_wxyz: Quat = IDENTITY_QUAT
+    """Attitude of the newest accepted pose."""
     peer: tuple[_Ipv4, _Port] | None = None
     """IPv4 address and UDP port of PX4, confirmed by the flight process; None if the link is not UDP."""
     back_world_m: Vec3 | None = None
@@ -75,5 +77,10 @@ def unpack(datagram: bytes) -> Heartbeat | None:
     except RecordError:
         return None
     times = heartbeat.t_s, heartbeat.origin_s, heartbeat.mission_t_s
-    finite = all(map(math.isfinite, (*times, *heartbeat.position_world_m, *(heartbeat.back_world_m or ()))))
+    finite = all(
+        map(
+            math.isfinite,
+            (*times, *heartbeat.position_world_m, *heartbeat.attitude_wxyz, *(heartbeat.back_world_m or ())),
+        )
+    )
     return heartbeat if finite and not math.isnan(heartbeat.pose_stamp_s) else None

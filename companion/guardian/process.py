@@ -285,6 +285,7 @@ class Guardian:
             last,
             self._settings.clearance_m,
             self._settings.tilt_max_rad,
+            self._settings.pose_limits,
             link,
             monotonic() - last.origin_s,
             lambda notice: self._publish(last, notice),

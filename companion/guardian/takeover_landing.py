@@ -15,7 +15,6 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
-from companion.guardian.monitors import PoseFilter
 from companion.guardian.px4 import Px4State
 from companion.guardian.retreat import Retreat
 from companion.model.flight_stage import is_killed
@@ -30,6 +29,7 @@ from companion.model.types import (
     Severity,
 )
 from companion.safety.autopilot_landing import TIMEOUT_S, AutopilotLanding, LandingStep
+from companion.safety.pose_filter import PoseFilter, PoseLimits
 
 HEARTBEAT_PERIOD_S = 1.0
 ASK_PERIOD_S = 0.1
@@ -85,6 +85,7 @@ class TakeoverLanding:
         last_heartbeat: newest heartbeat of the flight process.
         clearance_m: height of the body's origin when the vehicle rests on the ground.
         tilt_max_rad: `safety.tilt_abort_deg`, in rad.
+        pose_limits: limits of a pose that is sent to PX4.
         link: an open link.
         t_s: current flight clock.
         notify: called with each notice.
@@ -96,6 +97,7 @@ class TakeoverLanding:
         last_heartbeat: Heartbeat,
         clearance_m: float,
         tilt_max_rad: float,
+        pose_limits: PoseLimits,
         link: Link,
         t_s: float,
         notify: Notify,
@@ -108,7 +110,7 @@ class TakeoverLanding:
         self._link = link
         self._notify = notify
         self._px4 = Px4State()
-        self._pose_filter = PoseFilter(last_heartbeat.pose_stamp_s, last_heartbeat.position_world_m)
+        self._pose_filter = PoseFilter(pose_limits, _last_pose(last_heartbeat))
         self._start_s = t_s
         self._spoken_s: float | None = None
         self._pilot = last_heartbeat.pilot
@@ -152,13 +154,14 @@ class TakeoverLanding:
                 text = "the flight process rejected motion capture; no poses are sent to PX4, which lands on its own estimate"
                 self._notify_once(pose.stamp_s, "guardian_mocap", Severity.WARNING, text)
                 continue
-            if not self._pose_filter.check(pose.stamp_s, pose.position_world_m):
-                self._notify_once(
-                    pose.stamp_s,
-                    "guardian_mocap",
-                    Severity.WARNING,
-                    "the motion-capture pose jumped; it is not sent to PX4",
-                )
+            vehicle = self._px4.vehicle()
+            if vehicle is not None and pose.stamp_s - vehicle.position_stamp_s > POSITION_FRESH_S:
+                vehicle = None
+            if not self._pose_filter.check(pose, vehicle):
+                # Until PX4 has sent its position, which takes some tens of milliseconds, a pose after a gap cannot be judged.
+                if vehicle is not None:
+                    text = "the motion-capture pose jumped, repeats or is late; it is not sent to PX4"
+                    self._notify_once(pose.stamp_s, "guardian_mocap", Severity.WARNING, text)
                 continue
             self._link.send_vision(pose)
             self._pose = pose
@@ -306,3 +309,17 @@ class TakeoverLanding:
         if event_id + text not in self._notified:
             self._notified.add(event_id + text)
             self._notify(Notice(t_s, event_id, severity, SafetyAction.AUTOPILOT_LAND, text))
+
+
+def _last_pose(last: Heartbeat) -> MocapPose | None:
+    """Return the newest pose that the flight process accepted; None if there was none."""
+    if last.pose_stamp_s == float("-inf"):
+        return None
+    return MocapPose(
+        stamp_s=last.pose_stamp_s,
+        frame_number=0,
+        position_world_m=last.position_world_m,
+        attitude_wxyz=last.attitude_wxyz,
+        tracking_valid=True,
+        marker_error_m=0.0,
+    )

@@ -32,9 +32,10 @@ ARM_TIMEOUT_S = 1.5
 
 @dataclass(slots=True)
 class VisionFilter:
-    """Forwards motion-capture poses to PX4 while the filter is open; the core closes it while it does not trust the poses."""
+    """Forwards motion-capture poses to PX4. Each is judged before that; until there is a core, every tracked pose is forwarded."""
 
-    open: bool = True
+    judge: Callable[[MocapPose], bool] | None = None
+    """Returns whether a pose may be forwarded."""
     watch: Callable[[MocapPose], None] | None = None
     """Called with every pose on arrival, forwarded or not."""
     on_frame: Callable[[float], None] | None = None
@@ -198,7 +199,7 @@ def _mocap(config: FlightConfig, clock: Clock, available: AvailableDevices) -> M
 
     def forward(pose: MocapPose) -> None:
         autopilot = available.autopilot
-        if autopilot is not None and vision.open and pose.tracking_valid:
+        if autopilot is not None and (pose.tracking_valid if vision.judge is None else vision.judge(pose)):
             autopilot.send_vision(pose)
 
     def on_pose(pose: MocapPose) -> None:

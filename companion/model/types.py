@@ -190,7 +190,8 @@ class MocapPose(Record, frozen=True, kw_only=True):
     stamp_s: float
     """Flight clock at the arrival of the datagram."""
     latency_s: float | None = None
-    """Time from mid-exposure to transmission, measured by the server (NatNet >= 3.0); None if the server does not send it."""
+    """Time from mid-exposure to arrival (NatNet >= 3.0), or to transmission if the server answers no echo requests; None if the server
+    does not stamp exposures."""
     frame_number: int
     position_world_m: Vec3
     attitude_wxyz: Quat

@@ -35,7 +35,8 @@ JITTER = Check(
 LATENCY = Check(
     "mocap.latency",
     "mocap latency",
-    "reported by the server and below `safety.mocap_latency_warn_s`; refused above `safety.mocap_latency_max_s`",
+    "from exposure to arrival; reported by the server and below `safety.mocap_latency_warn_s`; refused above "
+    "`safety.mocap_latency_max_s`",
     "EKF2_EV_DELAY is 5 ms: older poses are fused as if they were current",
 )
 LOST = Check(
@@ -136,7 +137,7 @@ def _latency(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
         )
     high_s = latency_s[int(0.99 * (len(latency_s) - 1))]
     read = f"{latency_s[len(latency_s) // 2] * 1e3:.1f} ms, {high_s * 1e3:.1f} ms at the 99th percentile"
-    fix = "lower Motive's load: fewer markers and bodies, no video, labelled markers off"
+    fix = "lower Motive's load: fewer markers and bodies, no video, labelled markers off; use a cable, not Wi-Fi"
     return LATENCY.graded(high_s <= limit_s, high_s <= worst_s, read, wanted, fix)
 
 

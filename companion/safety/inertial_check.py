@@ -37,9 +37,13 @@ CLOCK_RESTART_S: Final = 0.5
 class RemoteClock:
     """Maps a device's clock to the flight clock. The offset comes from the message with the smallest delay; larger offsets are treated
     as transport delay.
+
+    Args:
+        growth: largest drift between the clocks, s/s: a delay that lasts is forgotten this fast.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, growth: float = CLOCK_GROWTH) -> None:
+        self._growth = growth
         self._offset_s = math.inf
         self._arrived_s = 0.0
 
@@ -51,7 +55,7 @@ class RemoteClock:
             arrived_s: arrival of that message on the flight clock.
         """
         offset_s = arrived_s - remote_s
-        grown_s = self._offset_s + CLOCK_GROWTH * max(0.0, arrived_s - self._arrived_s)
+        grown_s = self._offset_s + self._growth * max(0.0, arrived_s - self._arrived_s)
         self._arrived_s = arrived_s
         self._offset_s = offset_s if offset_s > grown_s + CLOCK_RESTART_S else min(grown_s, offset_s)
         return remote_s + self._offset_s

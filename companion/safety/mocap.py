@@ -16,21 +16,15 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_rotate, wrap_rad
 from companion.model.types import Inputs, MocapPose, Quat, Vec2, VehicleState
 from companion.safety.inertial_check import IMU_LATE_MAX_S, InertialCheck, RemoteClock
+from companion.safety.pose_filter import FORGET_S, PoseFilter, PoseLimits, dot, is_repeated
 from companion.safety.situation import HOLDS, Situation, Values
 from companion.safety.stream_watch import StreamWatch
 
 FUSED_WITHIN_M: Final = 0.10
 FUSED_WITHIN_RAD: Final = math.radians(8.0)
-CONTINUOUS_S: Final = 0.1
-"""After a longer gap a pose is compared with PX4's position, not with the previous pose."""
-FORGET_S: Final = 1.0
-"""On the ground the next frame is trusted after a gap this long: the vehicle may have been carried."""
-DRIFT_M_S: Final = 0.3
-"""Permitted drift of PX4's position while no pose is trusted, m/s, up to `safety.estimate_disagreement_m`."""
-BLIND_M_S15: Final = 0.2
-"""Permitted error of PX4's position after a time t without a pose, divided by t^1.5: one standard deviation of a position integrated
-from an accelerometer with the noise that EKF2 assumes, 0.35 m/s2 (EKF2_ACC_NOISE), divided by sqrt(3)."""
 RATE_WINDOW_S: Final = 1.0
+SERVER_GROWTH: Final = 1e-4
+"""Largest drift of the server's clock, s/s: computers' clocks drift by less."""
 
 
 def unfused(i: Inputs) -> str | None:
@@ -56,6 +50,16 @@ def unfused(i: Inputs) -> str | None:
     )
 
 
+def limits_of(safety: Safety) -> PoseLimits:
+    """Return the limits of a pose that is passed on to PX4."""
+    return PoseLimits(
+        safety.mocap_jump_m,
+        math.radians(safety.mocap_jump_deg),
+        safety.estimate_disagreement_m,
+        max(safety.mocap_latency_warn_s, safety.mocap_latency_max_s),
+    )
+
+
 class MocapTracker:
     """Evaluates each frame once: whether it is trusted, repeats the previous one, and agrees with the IMU.
 
@@ -65,16 +69,9 @@ class MocapTracker:
 
     def __init__(self, safety: Safety) -> None:
         s = self._s = safety
-        self._jump_rad = math.radians(s.mocap_jump_deg)
-        self._jump_cos_half = math.cos(0.5 * self._jump_rad)
+        self._filter = PoseFilter(limits_of(s))
         self._frame_awake_s = -math.inf
-        self._tracked: MocapPose | None = None
-        """The newest frame in which the body was tracked."""
-        self._trusted_pose: MocapPose | None = None
         self._trusted_awake_s = -math.inf
-        self._blind_s = 0.0
-        """Longest time without a tracked body since the newest trusted pose. Poses that are rejected do not extend it, so that
-        another body's pose is not trusted in the end."""
         self._same_since_s: float | None = None
         self._moved = False
         self._streams = StreamWatch()
@@ -83,7 +80,7 @@ class MocapTracker:
         """PX4's state whose IMU samples were used last."""
         self._imu_s = 0.0
         """End of the newest IMU sample on the flight clock."""
-        self._px4_clock, self._server_clock = RemoteClock(), RemoteClock()
+        self._px4_clock, self._server_clock = RemoteClock(), RemoteClock(SERVER_GROWTH)
         self._against_imu = False
         """Whether the newest trusted pose disagrees with the IMU."""
         self._window_awake_s: float | None = None
@@ -99,6 +96,8 @@ class MocapTracker:
         """Deviation of the newest rejected pose: m and deg."""
         self.frozen = False
         """New frames repeat the same pose while the vehicle is moving in the air, for longer than `safety.mocap_frozen_s`."""
+        self.latency_s: float | None = None
+        """Time from the exposure of the newest frame to its arrival; None if it is unknown."""
         self.two_streams = False
         self.dragged = False
         """In the air, while the companion commanded, poses disagreed with the IMU. Latched: the observer soon follows the
@@ -106,7 +105,9 @@ class MocapTracker:
         can be wrong, and PX4 needs the poses."""
         self.rate_hz: float | None = None
         self.compared: tuple[MocapPose, VehicleState] | None = None
-        """A fresh, trusted pose and PX4's state in the air; else None."""
+        """A trusted pose and PX4's state at the same time in the air, the newest such pair; None if there is none within
+        `safety.mocap_timeout_s`. A rejected pose in between does not end the hold time of a disagreement."""
+        self._compared_awake_s = -math.inf
         self.trusted = True
         """Whether poses are trusted: the newest one is plausible, and they are not frozen, dragged or from two servers."""
         self.repeats = False
@@ -133,15 +134,46 @@ class MocapTracker:
         self.dragged = self.dragged or (self._against_imu and situation.airborne and situation.offboard_expected)
         self.trusted = self.plausible and not self.frozen and not self.two_streams and not self.dragged
         self._count(awake_s)
-        self.compared = None
+        if not situation.airborne or awake_s - self._compared_awake_s > s.mocap_timeout_s:
+            self.compared = None
         if pose is not None and vehicle is not None and situation.airborne and self.trusted:
             if pose.tracking_valid and self.frame_age_s < s.mocap_timeout_s:
-                self.compared = (pose, vehicle)
+                self.compared, self._compared_awake_s = (pose, vehicle), awake_s
 
     @property
     def innovation_m(self) -> float:
         """Return the distance between the newest pose and the position predicted from the IMU; 0 while that is not evaluated."""
         return self._inertial.innovation_m
+
+    @property
+    def last_trusted(self) -> MocapPose | None:
+        """Return the newest trusted pose, as if the rejected ones after it had not arrived; None if it is older than
+        `safety.mocap_timeout_s` or the stream is rejected.
+        """
+        rejected = self.frozen or self.two_streams or self.dragged
+        return None if rejected or self.trusted_age_s > self._s.mocap_timeout_s else self._filter.trusted
+
+    def pose_filter(self) -> PoseFilter | None:
+        """Return a filter for a landing without the core; None if the stream is rejected, so that no pose may be passed on."""
+        rejected = self.frozen or self.two_streams or self.dragged
+        return None if rejected else PoseFilter(limits_of(self._s), self._filter.trusted)
+
+    def forwards(self, pose: MocapPose, vehicle: VehicleState | None, *, airborne: bool) -> bool:
+        """Return whether a pose may be passed on to PX4, which need not wait for the next tick. Changes nothing.
+
+        In the air a repeated pose is withheld, long before `mocap_frozen`, because it suggests a vehicle at rest.
+        """
+        frame = self.frame
+        if not pose.tracking_valid or self._filter.is_too_late(pose):
+            return False
+        if frame is None or pose.stamp_s == frame.stamp_s:  # the first, or one that a tick has evaluated
+            return self.trusted and not (self.repeats and airborne)
+        if self.frozen or self.two_streams or self.dragged:
+            return False
+        if airborne and is_repeated(pose, self._filter.tracked):
+            return False
+        forgotten = pose.stamp_s - frame.stamp_s > FORGET_S and not airborne
+        return forgotten or self._filter.deviation(pose, vehicle) is None
 
     def untrusted(self, timeout_s: float) -> bool:
         """Return whether frames are arriving but the last trusted one is older than the timeout."""
@@ -166,73 +198,53 @@ class MocapTracker:
 
     def _judge(self, pose: MocapPose, vehicle: VehicleState | None, awake_s: float, airborne: bool) -> None:
         """Evaluate a new frame."""
-        before, accepted = self.frame, self._trusted_pose
+        before = self.frame
         if before is None:
             self._trusted_awake_s = awake_s  # a stream may begin within a burst of lost frames
         gone_s = awake_s - self._frame_awake_s
         self.frame, self._frame_awake_s = pose, awake_s
+        self._measure_latency(pose)
         self._window_frames += 1
         self._streams.update(pose.frame_number, (pose.position_world_m, pose.attitude_wxyz), awake_s)
         # The gap was reported as a loss; a rate across it does not describe this stream.
         if gone_s > self._s.mocap_timeout_s:
             self._window_awake_s = self.rate_hz = None
         # A frame in which the body is not tracked does not end a freeze: only another pose does.
-        tracked = self._tracked
+        tracked = self._filter.tracked
         same = tracked is not None and pose.position_world_m == tracked.position_world_m
-        self.repeats = same and tracked is not None and pose.attitude_wxyz == tracked.attitude_wxyz
+        self.repeats = is_repeated(pose, tracked)
         if not pose.tracking_valid:
             return
-        if tracked is not None:
-            self._blind_s = max(self._blind_s, pose.stamp_s - tracked.stamp_s)
-        self._tracked = pose
         if not same:
             self._same_since_s, self._moved = None, False
         elif self._same_since_s is None and self.repeats:
             self._same_since_s, self._moved = awake_s, False
-        forgotten = gone_s > FORGET_S and not airborne
-        self.plausible = accepted is None or vehicle is None or forgotten or self._follows(accepted, pose, vehicle)
-        if self.plausible:
-            self._trusted_pose, self._trusted_awake_s, self._blind_s = pose, awake_s, 0.0
+        off = self._filter.evaluate(pose, vehicle, forgotten=gone_s > FORGET_S and not airborne)
+        self.plausible = off is None
+        if off is None:
+            self._trusted_awake_s = awake_s
             # mocap_frozen evaluates repeated poses; they are not passed on and are not evidence of motion.
             if not self.repeats:
                 self._against_imu = self._inertial.pose(pose.stamp_s, pose.position_world_m, self._age_s(pose))
         else:
+            self.off = off
             self._against_imu = False
+
+    def _measure_latency(self, pose: MocapPose) -> None:
+        """Update the latency with a new frame.
+
+        If the pose's latency ends at the transmission, the delay on the network beyond its smallest is added.
+        """
+        self.latency_s = pose.latency_s
+        if pose.exposure_server_s is not None:
+            latency_s = pose.latency_s or 0.0
+            sent_s = self._server_clock.local_s(pose.exposure_server_s + latency_s, pose.stamp_s)
+            self.latency_s = latency_s + pose.stamp_s - sent_s
 
     def _age_s(self, pose: MocapPose) -> float:
         """Return the time from the exposure of a pose to the newest IMU sample, limited; negative if the pose is newer."""
-        latency_s, sent_s = pose.latency_s or 0.0, pose.stamp_s
-        if pose.exposure_server_s is not None:
-            sent_s = self._server_clock.local_s(pose.exposure_server_s + latency_s, sent_s)
-        return min(max(-IMU_LATE_MAX_S, self._imu_s - sent_s + latency_s), self._s.mocap_timeout_s)
-
-    def _follows(self, before: MocapPose, pose: MocapPose, vehicle: VehicleState) -> bool:
-        """Return whether the pose is reachable from the previous pose or from PX4's estimate within the jump limit."""
-        dt_s = pose.stamp_s - before.stamp_s
-        x, y, z = pose.position_world_m
-        if dt_s <= CONTINUOUS_S:
-            vx, vy, vz = vehicle.velocity_world_m_s
-            px, py, pz = before.position_world_m
-            px, py, pz = px + vx * dt_s, py + vy * dt_s, pz + vz * dt_s
-            allowed_m = self._s.mocap_jump_m
-            reference = before.attitude_wxyz
-        else:
-            px, py, pz = vehicle.position_world_m
-            jump_m = self._s.mocap_jump_m
-            blind_m = jump_m + BLIND_M_S15 * self._blind_s * math.sqrt(self._blind_s)
-            allowed_m = max(min(jump_m + DRIFT_M_S * dt_s, self._s.estimate_disagreement_m), blind_m)
-            reference = vehicle.attitude_wxyz
-        dx, dy, dz = x - px, y - py, z - pz
-        off_m2 = dx * dx + dy * dy + dz * dz
-        cos_half = abs(_dot(pose.attitude_wxyz, reference))
-        if off_m2 <= allowed_m * allowed_m and cos_half >= self._jump_cos_half:
-            return True
-        turned_rad = 2.0 * math.acos(min(1.0, cos_half))
-        turnable_rad = self._jump_rad + 1.5 * math.hypot(*vehicle.angular_rate_body_rad_s) * min(dt_s, CONTINUOUS_S)
-        if off_m2 <= allowed_m * allowed_m and turned_rad <= turnable_rad:
-            return True
-        self.off = (math.sqrt(off_m2), math.degrees(turned_rad))
-        return False
+        exposed_s = pose.stamp_s - (self.latency_s or 0.0)
+        return min(max(-IMU_LATE_MAX_S, self._imu_s - exposed_s), self._s.mocap_timeout_s)
 
     def _count(self, awake_s: float) -> None:
         """Count the frames in each `RATE_WINDOW_S`."""
@@ -288,7 +300,7 @@ def mocap_slow(m: MocapTracker, thresholds: Vec2) -> Values | None:
 
 def mocap_late(m: MocapTracker, thresholds: Vec2) -> Values | None:
     """Fires if the latency exceeds the first threshold but not the second."""
-    latency_s = m.pose.latency_s if m.pose is not None else None
+    latency_s = m.latency_s if m.pose is not None else None
     if latency_s is None or not thresholds[0] < latency_s <= thresholds[1]:
         return None
     return (latency_s * 1e3, thresholds[0] * 1e3)
@@ -296,7 +308,7 @@ def mocap_late(m: MocapTracker, thresholds: Vec2) -> Values | None:
 
 def mocap_too_late(m: MocapTracker, thresholds: Vec2) -> Values | None:
     """Fires if the latency exceeds both thresholds."""
-    latency_s = m.pose.latency_s if m.pose is not None else None
+    latency_s = m.latency_s if m.pose is not None else None
     if latency_s is None or not (latency_s > thresholds[0] and latency_s > thresholds[1]):
         return None
     return (latency_s * 1e3, max(thresholds) * 1e3)
@@ -318,14 +330,10 @@ def yaw_disagrees(m: MocapTracker, disagreement_rad: float) -> Values | None:
         return None
     pose, vehicle = m.compared[0].attitude_wxyz, m.compared[1].attitude_wxyz
     # Most ticks need no angles: attitudes that differ by less than the threshold cannot differ by more in yaw, near level.
-    if abs(_dot(vehicle, pose)) >= math.cos(0.4 * disagreement_rad):
+    if abs(dot(vehicle, pose)) >= math.cos(0.4 * disagreement_rad):
         return None
     turned_rad = _yaw_between(vehicle, pose)
     return (math.degrees(turned_rad), math.degrees(disagreement_rad)) if turned_rad > disagreement_rad else None
-
-
-def _dot(a: Quat, b: Quat) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
 
 
 def _yaw_between(a: Quat, b: Quat) -> float:

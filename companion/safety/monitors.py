@@ -10,11 +10,12 @@ from typing import Final
 import msgspec
 
 from companion.config.vehicle import Vehicle
-from companion.model.types import Event, Inputs, VehicleState
+from companion.model.types import Event, Inputs, MocapPose, VehicleState
 from companion.safety.arm import ArmTracker, ForceTracker
 from companion.safety.evaluation import Evaluation
 from companion.safety.flight import FlightTracker
 from companion.safety.mocap import MocapTracker
+from companion.safety.pose_filter import PoseFilter
 from companion.safety.process import ProcessTracker
 from companion.safety.px4 import Px4Tracker
 from companion.safety.rule import Subject
@@ -66,18 +67,21 @@ class Monitors:
         self._awake_s = 0.0
         self._last_t_s: float | None = None
         self._airborne = False
-        self._mocap_timeout_s = vehicle.safety.mocap_timeout_s
         self.trusted: Inputs | None = None
         """Inputs of the last tick without the records that are not trusted; the same object if all are trusted."""
 
     @property
     def mocap_trusted(self) -> bool:
-        """Return whether poses may be passed on to PX4. In the air a repeated pose is withheld, long before `mocap_frozen`, because it
-        suggests a vehicle at rest, and so is the first one after a loss, until it has been evaluated: PX4 resets its position to it.
-        """
-        mocap = self._mocap
-        lost = mocap.frame is not None and mocap.trusted_age_s > self._mocap_timeout_s
-        return mocap.trusted and not (self._airborne and (mocap.repeats or lost))
+        """Return whether the newest pose is trusted and, in the air, does not repeat the one before it."""
+        return self._mocap.trusted and not (self._mocap.repeats and self._airborne)
+
+    def forwards(self, pose: MocapPose, vehicle: VehicleState | None) -> bool:
+        """Return whether a pose that has arrived since the last tick may be passed on to PX4. Changes nothing."""
+        return self._mocap.forwards(pose, vehicle, airborne=self._airborne)
+
+    def pose_filter(self) -> PoseFilter | None:
+        """Return a filter for a landing without the core; None if no pose may be passed on."""
+        return self._mocap.pose_filter()
 
     @property
     def mocap_innovation_m(self) -> float:
@@ -110,7 +114,7 @@ class Monitors:
             self._arm.update(i, awake_s, situation.torque_refused)
             self._force.update(i, situation, awake_s, gap_s, moving)
             if not self._mocap.trusted:
-                i = msgspec.structs.replace(i, mocap=None)
+                i = msgspec.structs.replace(i, mocap=self._mocap.last_trusted)
             if airborne:
                 self._flight.update(i, situation, gap_s)
             if not self._force.trusted:

@@ -21,7 +21,10 @@ FaultKind = Literal[
     "mocap_drag",
     "mocap_swap",
     "mocap_freeze",
+    "mocap_flip",
+    "mocap_flicker",
     "mocap_latency",
+    "mocap_network",
     "mocap_rate",
     "link_loss",
     "link_delay",
@@ -122,8 +125,25 @@ KINDS: dict[FaultKind, Kind] = {
         named_by=_MOCAP_WRONG,
     ),
     "mocap_freeze": Kind("frames continue with the same pose", named_by=(*_MOCAP_WRONG, *_MOCAP_GONE)),
+    "mocap_flip": Kind(
+        what="every second pose is turned about the vertical: the markers fit the body in two ways",
+        size="angle",
+        unit="deg",
+        default=180.0,
+        named_by=_MOCAP_WRONG,
+    ),
+    "mocap_flicker": Kind(
+        what="every second pose is shifted sideways", size="shift", unit="m", default=0.3, named_by=_MOCAP_WRONG
+    ),
+    "mocap_network": Kind(
+        what="frames wait on the network, after the server has stamped them",
+        size="additional delay",
+        unit="s",
+        default=0.15,
+        named_by=("mocap_late", *_MOCAP_GONE, *_MOCAP_WRONG),
+    ),
     "mocap_latency": Kind(
-        what="frames arrive later",
+        what="frames leave the motion-capture computer later",
         size="additional latency",
         unit="s",
         default=0.1,

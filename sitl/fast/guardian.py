@@ -19,6 +19,7 @@ from companion.guardian.monitors import StallWatch
 from companion.guardian.process import PERIOD_S
 from companion.guardian.takeover_landing import Notice, Notify, TakeoverLanding
 from companion.model.types import Event, Inputs, LinkIdentity, MocapPose, Outputs, SafetyAction, Severity
+from companion.safety.mocap import limits_of
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.receive import Receiver
 from sitl.autopilot.streams import Schedule
@@ -169,7 +170,14 @@ class Landing:
         self._link = Link(self._wire, _OWN, beat.autopilot_system)
         clearance_m, tilt_max_rad = vehicle.airframe.ground_clearance_m, math.radians(vehicle.safety.tilt_abort_deg)
         self._landing = TakeoverLanding(
-            beat, clearance_m, tilt_max_rad, self._link, t_s, notify, external=vehicle.devices.mocap.external
+            beat,
+            clearance_m,
+            tilt_max_rad,
+            limits_of(vehicle.safety),
+            self._link,
+            t_s,
+            notify,
+            external=vehicle.devices.mocap.external,
         )
         self._round_s = float("-inf")
 

@@ -16,6 +16,8 @@ from msgspec.structs import replace
 
 from companion.core.flight_core import FlightCore
 from companion.flight.ticker import SIMULATED_START_S
+from companion.io.mocap.client import KEEP_ALIVE_PERIOD_S
+from companion.io.mocap.server_clock import ServerClock
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.frames import (
     attitude_ned_frd_from_enu_flu,
@@ -33,6 +35,7 @@ from companion.model.types import (
     Outputs,
     Quat,
     Vec3,
+    VehicleState,
 )
 from companion.sitl_config.faults import FaultKind
 from companion.sitl_config.loader import SitlConfig
@@ -152,14 +155,15 @@ class FastFlight:
         self._external = vehicle.devices.mocap.external
         """Whether another program feeds PX4 with poses: the companion receives none."""
         self._mocap: MocapPose | None = None
+        self._server_clock, self._echo_due_s = ServerClock(), 0.0
         force = vehicle.devices.force
         self._force_period_s = None if force is None else 1.0 / force.rate_hz
         """Period of the force sensor's samples; None if the vehicle has none."""
         self._force_due_s = 0.0
         self._force: ForceSample | None = None
         self._telemetry = FastTelemetry(self.px4, self.plant.battery, external=self._external)
-        self._trusted = True
-        """Whether the core trusts motion capture; only trusted poses are forwarded to PX4."""
+        self._vehicle: VehicleState | None = None
+        """PX4's state as the core has last received it."""
         self._dropped = 0
 
     def run(self, limit_s: float = 90.0, until_mission_s: float = math.inf) -> FastResult:
@@ -195,7 +199,6 @@ class FastFlight:
                 continue
             inputs = self._inputs(tick)
             outputs = core.step(inputs)
-            self._trusted = outputs.mocap_trusted
             self._carry_out(outputs)
             if guardian is not None:
                 guardian.heartbeat(inputs, outputs)
@@ -285,7 +288,7 @@ class FastFlight:
         pose = self._pose(frame)
         if not self._external:
             self._mocap = pose
-        if self._trusted and pose.tracking_valid:
+        if pose.tracking_valid if self._external else self.core.forwards(pose, self._vehicle):
             position, attitude = ned_from_enu(pose.position_world_m), attitude_ned_frd_from_enu_flu(pose.attitude_wxyz)
             if self.plant.faults is None or self._external:
                 self.px4.on_vision(pose.stamp_s, position, attitude)
@@ -297,11 +300,16 @@ class FastFlight:
 
     def _pose(self, frame: MocapFrame) -> MocapPose:
         t_s = self.plant.world.t_s
-        number, exposure_s, position, attitude, valid = frame
+        number, exposure_s, position, attitude, valid, network_s = frame
         latency_s, exposure_server_s = t_s - exposure_s, exposure_s
         if self.plant.faults is not None:
-            exposure_server_s = self.faults.server_clock_s(exposure_s)
-            latency_s = self.faults.server_clock_s(t_s) - exposure_server_s
+            clock = self.faults.server_clock_s
+            if t_s >= self._echo_due_s:
+                self._echo_due_s = t_s + KEEP_ALIVE_PERIOD_S
+                self._server_clock.echo(t_s, clock(t_s))
+            exposure_server_s = clock(exposure_s)
+            latency_s = clock(t_s - network_s) - exposure_server_s
+            latency_s = self._server_clock.age_s(exposure_server_s, latency_s, t_s)
         return MocapPose(
             stamp_s=t_s,
             latency_s=latency_s,
@@ -326,6 +334,7 @@ class FastFlight:
             if "kill_recorder" in active or "disk_full" in active:
                 self._dropped += 1
             dropped = self._dropped
+        self._vehicle = vehicle
         if self._force is not None and math.isnan(self._force.stamp_s):
             self._force = replace(self._force, stamp_s=t_s)
         land = self._land_at_s is not None and t_s >= self._land_at_s

@@ -16,7 +16,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from companion.config.tether import Tether
-from companion.model.frames import quat_from_euler_zyx, tilt_rad
+from companion.model.frames import quat_from_euler_zyx, quat_multiply, tilt_rad
 from companion.model.types import Quat, Vec3
 from companion.sitl_config.faults import Fault, FaultKind
 from companion.sitl_config.world import World as WorldConfig
@@ -102,6 +102,7 @@ class Faults:
         """Register 70 (hardware error status) of each servo, if the servos have no control tables."""
         self.temperatures_c = [COOL_C] * len(drives)
         self._frozen: tuple[Vec3, Quat] | None = None
+        self._every_second = False
         self._other: tuple[Vec3, Quat] | None = None
         self._stuck: tuple[Vec3, Vec3] | None = None
         self._now_s = self._drag_began_s = 0.0
@@ -279,7 +280,14 @@ class Faults:
             pose = self._frozen
         if self._other is not None:
             pose = self._other
-        shift_m = self.size("mocap_jump") + self.size("mocap_drag") * (self._now_s - self._drag_began_s)
+        self._every_second = not self._every_second
+        if self._every_second:
+            turned_rad, flicker_m = math.radians(self.size("mocap_flip")), self.size("mocap_flicker")
+            if turned_rad:
+                pose = (pose[0], quat_multiply(quat_from_euler_zyx(0.0, 0.0, turned_rad), pose[1]))
+        else:
+            flicker_m = 0.0
+        shift_m = flicker_m + self.size("mocap_jump") + self.size("mocap_drag") * (self._now_s - self._drag_began_s)
         if shift_m:
             (x, y, z), attitude = pose
             pose = ((x + _BESIDE[0] * shift_m, y + _BESIDE[1] * shift_m, z), attitude)

@@ -74,13 +74,15 @@ class _JointServo(NamedTuple):
 
 
 class MocapFrame(NamedTuple):
-    """One motion-capture frame, which is delivered `mocap_latency_s` after its exposure."""
+    """One motion-capture frame, which the server sends `mocap_latency_s` after its exposure."""
 
     number: int
     exposure_t_s: float
     position_world_m: Vec3
     attitude_wxyz: Quat
     valid: bool
+    network_s: float
+    """Time for which the network holds the frame after its transmission."""
 
 
 def _zero_rad(joint: Joint, servo: Servo) -> float:
@@ -174,6 +176,8 @@ class Plant:
         self._mocap_queue: deque[tuple[float, MocapFrame]] = deque()
         self._mocap_next_s = 0.0
         self._mocap_number = 0
+        self._mocap_arrives_s = 0.0
+        """World time at which the newest frame arrives."""
         self.armed_t_s: float | None = None
         self.faults: Faults | None = None
         """Faults of this world; None if there are none."""
@@ -309,27 +313,32 @@ class Plant:
         sent_s = t_s + latency_s
         if self._mocap_errors is not None:
             sent_s = self._mocap_errors.sent_s(sent_s)
+        arrives_s = sent_s
+        if faults is not None:
+            arrives_s = max(
+                sent_s + faults.size("mocap_network"), self._mocap_arrives_s
+            )  # the network keeps their order
+            self._mocap_arrives_s = arrives_s
         self._mocap_queue.append(
             (
-                sent_s,
+                arrives_s,
                 MocapFrame(
                     number=self._mocap_number,
                     exposure_t_s=t_s,
                     position_world_m=position,
                     attitude_wxyz=attitude,
                     valid=valid,
+                    network_s=arrives_s - sent_s,
                 ),
             )
         )
 
     def take_mocap(self) -> list[MocapFrame]:
-        """Return and remove the frames that the motion-capture server has sent by now."""
+        """Return and remove the frames that have arrived by now."""
         return [frame for _, frame in self.mocap_until(self.world.t_s)]
 
     def mocap_until(self, until_s: float) -> list[tuple[float, MocapFrame]]:
-        """Return and remove the frames that the motion-capture server sends until world time `until_s`, each with its transmission
-        time.
-        """
+        """Return and remove the frames that arrive until world time `until_s`, each with its time of arrival."""
         queue, until_s = self._mocap_queue, until_s + 1e-9
         if not queue or queue[0][0] > until_s:
             return []

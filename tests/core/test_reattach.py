@@ -16,11 +16,13 @@ from companion.model.types import (
     FlightMode,
     Inputs,
     LandedState,
+    MocapPose,
     OperatorCommand,
     Outcome,
     Outputs,
     SafetyAction,
     Severity,
+    VehicleState,
 )
 from companion.safety.rotor_stop import DISARM_STILL_S
 from companion.sitl_config.loader import SitlConfig, load_sitl
@@ -140,7 +142,7 @@ class Dies:
     def __init__(self, config: SitlConfig, died_s: float, back_s: float) -> None:
         self._config, self._died_s, self._back_s = config, died_s, back_s
         self._core = FlightCore(config)
-        self._reborn = False
+        self._reborn = self._dead = False
         self._last: Outputs | None = None
 
     def step(self, i: Inputs) -> Outputs:
@@ -148,7 +150,8 @@ class Dies:
             self._last = self._core.step(i)
             return self._last
         assert self._last is not None
-        if i.t_s < self._back_s:
+        self._dead = i.t_s < self._back_s
+        if self._dead:
             return replace(
                 self._last, tick=i.tick, t_s=i.t_s, attitude=None, arm_torque_nm=None, request=AutopilotRequest.NONE,
                 events=(), mocap_trusted=False,
@@ -156,6 +159,9 @@ class Dies:
         if not self._reborn:
             self._core, self._reborn = FlightCore(self._config), True
         return self._core.step(i)
+
+    def forwards(self, pose: MocapPose, vehicle: VehicleState | None) -> bool:
+        return not self._dead and self._core.forwards(pose, vehicle)
 
 
 def flown(died_s: float, back_s: float, change: Change = lambda i: i) -> tuple[FastFlight, FastResult]:

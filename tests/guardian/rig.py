@@ -22,6 +22,7 @@ from companion.config.loader import load_flight
 from companion.guardian import heartbeat
 from companion.guardian.heartbeat import Heartbeat
 from companion.launcher.launcher import replace_device_settings
+from companion.model.frames import attitude_ned_frd_from_enu_flu, ned_from_enu
 from companion.model.packets import LogLine, Packet, read_packet
 from companion.model.types import Quat, Vec3
 from companion.runtime import ipc
@@ -84,7 +85,9 @@ class Cameras:
             self._started.set()
             while not self._stop.is_set():
                 now_s = time.monotonic()
-                server.publish(now_s, (BodyPose(self._body_id, self.position_m, self.attitude, self.tracked),), now_s)
+                x, y, z = self.position_m
+                noisy = (x, y, z + 1e-6 * (server.frame_number % 5))  # no measurement is the same twice
+                server.publish(now_s, (BodyPose(self._body_id, noisy, self.attitude, self.tracked),), now_s)
                 await asyncio.sleep(0.01)
 
 
@@ -101,6 +104,8 @@ class Rig:
         self.peer = Px4Peer(self.port)
         self.peer.base_mode, self.peer.custom_mode = ARMED, OFFBOARD_MODE
         self.peer.landed = mavlink.MAV_LANDED_STATE_IN_AIR
+        self.peer.position_ned_m, self.peer.velocity_ned_m_s = ned_from_enu(POSITION_M), (0.0, 0.0, 0.0)
+        self.peer.attitude_ned_frd = attitude_ned_frd_from_enu_flu(ATTITUDE)
         self.origin_s = time.monotonic() - 10.0
         self.tick = 0
         self.messages: list[ipc.Message] = []
@@ -200,6 +205,7 @@ class Rig:
             local_port=self.port,
             pose_stamp_s=t_s - pose_age_s,
             position_world_m=POSITION_M,
+            attitude_wxyz=ATTITUDE,
             peer=self.peer.address,
         )
         self.beats.send(heartbeat.pack(beat))

@@ -1,4 +1,4 @@
-"""The datagrams between flight and guardian, the stall watch, and the pose filter."""
+"""The datagrams between flight and guardian, and the stall watch."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from companion.guardian import heartbeat
 from companion.guardian.heartbeat import Heartbeat
-from companion.guardian.monitors import PoseFilter, StallWatch
+from companion.guardian.monitors import StallWatch
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 byte = st.integers(0, 255)
@@ -32,6 +32,7 @@ beats = st.builds(
     local_port=st.integers(0, 65535),
     pose_stamp_s=finite | st.just(-math.inf),
     position_world_m=st.tuples(finite, finite, finite),
+    attitude_wxyz=st.tuples(finite, finite, finite, finite),
     peer=st.none() | st.tuples(st.ip_addresses(v=4).map(str), st.integers(1, 65535)),
 )
 
@@ -101,22 +102,6 @@ def test_what_the_guardian_slept_through_proves_nothing() -> None:
     assert not watch.update(10.0, heard=False)
     verdicts = [watch.update(10.0 + 0.01 * k, heard=False) for k in range(1, 20)]
     assert any(verdicts), "but silence while it is awake counts on"
-
-
-def test_an_impossible_pose_is_rejected() -> None:
-    """Half a metre, and 4 m/s since the last accepted pose."""
-    plausible = PoseFilter(10.0, (1.0, 2.0, 1.5))
-    assert plausible.check(10.005, (1.01, 2.0, 1.5))
-    assert not plausible.check(10.010, (1.01 + 0.53, 2.0, 1.5))
-    assert plausible.check(10.015, (1.02, 2.0, 1.5)), "the jump has not become the place to measure from"
-    assert not plausible.check(10.020, (math.nan, 2.0, 1.5))
-    assert not plausible.check(11.015, (1.02 + 4.6, 2.0, 1.5))
-    assert plausible.check(11.015, (1.02 + 4.4, 2.0, 1.5)), "after a gap more is possible"
-    assert plausible.check(11.015, (1.02 + 4.85, 2.0, 1.5))
-
-
-def test_the_first_pose_is_accepted_if_there_was_none() -> None:
-    assert PoseFilter(-math.inf, (0.0, 0.0, 0.0)).check(3.0, (5.0, -7.0, 2.0))
 
 
 @pytest.mark.parametrize("kind", [heartbeat.RECORDER_CHANNEL, heartbeat.READY, heartbeat.PROBLEM])

@@ -11,6 +11,7 @@ import pytest
 from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.config.safety import Safety
 from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
 from companion.guardian.px4 import Px4State
@@ -18,9 +19,11 @@ from companion.guardian.takeover_landing import Notice, TakeoverLanding
 from companion.model.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
 from companion.model.types import LandedState, MocapPose, Quat, Vec3
 from companion.safety.autopilot_landing import TIMEOUT_S
+from companion.safety.mocap import limits_of
 
 STANDING_M, TILT_MAX_RAD = 0.3, math.radians(40.0)
 START_S, STEP_S = 20.0, 0.01
+LIMITS = limits_of(Safety())
 LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
 ON_ITS_BACK = quat_from_euler_zyx(math.pi, 0.0, 0.0)
 ON_ITS_ROTORS = quat_from_euler_zyx(math.radians(-55.0), 0.0, 0.0)
@@ -87,7 +90,7 @@ class Landing:
         self.notices: list[Notice] = []
         self.t_s = START_S
         link = Link(self.wire, (1, 191), 1)
-        self.takeover = TakeoverLanding(last, STANDING_M, TILT_MAX_RAD, link, START_S, self.notices.append)
+        self.takeover = TakeoverLanding(last, STANDING_M, TILT_MAX_RAD, LIMITS, link, START_S, self.notices.append)
 
     def run(
         self,
@@ -117,7 +120,7 @@ class Landing:
             heartbeat = mavlink.MAVLink_heartbeat_message(2, 12, ARMED if armed else DISARMED, mode, 4, 3)
             if mocap:
                 number = round(self.t_s / STEP_S)
-                position: Vec3 = (0.0, 0.0, height_m)
+                position: Vec3 = (1e-6 * (number % 7), 0.0, height_m)  # no measurement is the same twice
                 self.takeover.take_poses(
                     [
                         MocapPose(
@@ -172,7 +175,7 @@ def nan_position(message: Any) -> None:
 )
 def test_px4s_attitude_is_enough_for_a_flip(messages: tuple[str, ...], corrupt: Callable[[Any], None]) -> None:
     landing = Landing(beat())
-    landing.run(1.0, attitude=ON_ITS_BACK, height_m=1.0, messages=messages, corrupt=corrupt)
+    landing.run(1.5, attitude=ON_ITS_BACK, height_m=1.0, messages=messages, corrupt=corrupt)
     assert landing.forced
 
 
@@ -380,6 +383,63 @@ def test_a_pose_that_jumps_is_not_sent_and_is_reported_once() -> None:
     assert len(landing.wire.poses) == sent
     assert [notice.id for notice in landing.notices].count("guardian_mocap") == 1
     assert landing.takeover.pose is not None and landing.takeover.pose.position_world_m[2] == STANDING_M
+
+
+def pose_at(t_s: float, **changes: Any) -> MocapPose:
+    pose = MocapPose(
+        stamp_s=t_s,
+        frame_number=round(t_s * 1e3),
+        position_world_m=(5e-7 + 1e-6 * (round(t_s * 1e3) % 7), 0.0, STANDING_M),
+        attitude_wxyz=LEVEL,
+        tracking_valid=True,
+        marker_error_m=0.0,
+        latency_s=0.005,
+    )
+    return replace(pose, **changes)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"attitude_wxyz": quat_from_euler_zyx(0.0, 0.0, math.pi)},
+        {"position_world_m": (0.3, 0.0, STANDING_M)},
+        {"latency_s": 0.13},
+        {"position_world_m": (0.0, 0.0, 0.0), "tracking_valid": False},
+    ],
+    ids=["turned", "shifted", "too late", "not tracked"],
+)
+def test_it_judges_each_pose_as_the_flight_process_does(bad: dict[str, Any]) -> None:
+    landing = Landing(beat())
+    landing.run(0.3)
+    sent, t_s = len(landing.wire.poses), landing.t_s
+    for k in range(40):
+        landing.takeover.take_poses([pose_at(t_s + 0.01 * k + 0.002, **bad)])
+        landing.takeover.take_poses([pose_at(t_s + 0.01 * k + 0.007)])
+        landing.run(0.01, mocap=False)
+    assert len(landing.wire.poses) == sent + 40
+    assert {(round(m.x, 3), round(m.z, 3), round(m.yaw, 1)) for m in landing.wire.poses[sent:]} == {
+        (0.0, -STANDING_M, round(landing.wire.poses[0].yaw, 1))
+    }
+
+
+def test_a_repeated_pose_is_not_sent() -> None:
+    landing = Landing(beat())
+    landing.run(0.3)
+    sent, pose = len(landing.wire.poses), pose_at(landing.t_s + 0.005)
+    landing.takeover.take_poses([replace(pose, stamp_s=pose.stamp_s + 0.005 * k) for k in range(5)])
+    assert len(landing.wire.poses) == sent + 1
+
+
+def test_the_first_poses_wait_for_px4s_state_to_be_judged() -> None:
+    """A takeover from a hang: the last pose that the flight process accepted is 0.2 s old."""
+    landing = Landing(beat(pose_stamp_s=START_S - 0.2))
+    turned = quat_from_euler_zyx(0.0, 0.0, math.pi)
+    landing.takeover.take_poses([pose_at(START_S, attitude_wxyz=turned)])
+    assert landing.wire.poses == [] and landing.notices == []
+    landing.run(0.05, mocap=False)
+    landing.takeover.take_poses([pose_at(landing.t_s, attitude_wxyz=turned), pose_at(landing.t_s + 0.005)])
+    assert len(landing.wire.poses) == 1
+    assert landing.takeover.pose is not None and landing.takeover.pose.attitude_wxyz == LEVEL
 
 
 def test_poses_that_the_flight_process_rejected_are_neither_passed_on_nor_evaluated() -> None:

@@ -179,3 +179,77 @@ def test_y_up_turns_world_and_body_alike() -> None:
     turned_vector, turned_quat = natnet.z_up_from_y_up(vector, quat)
     expected, _ = natnet.z_up_from_y_up(quat_rotate(quat, vector), quat)
     assert quat_rotate(turned_quat, turned_vector) == pytest.approx(expected)
+
+
+# -- age -----------------------------------------------------------------------------------------------------------------------
+
+
+SERVER_AHEAD_S = 5000.0
+"""The server's clock less this computer's."""
+
+
+def stamped_client() -> NatNetClient:
+    """A client whose server stamps frames with a clock of 10 MHz."""
+    client = NatNetClient(1, "z", "unicast")
+    connection = struct.pack("<QH?4s", 10_000_000, 1511, False, bytes(4))
+    client.receive(natnet.encode_message(Message.SERVER_INFO, server_info()[4:] + connection), 0.0)
+    return client
+
+
+def answer_echo(client: NatNetClient, sent_s: float, received_s: float) -> None:
+    """Let the server receive the client's echo request at `received_s`; both times are this computer's."""
+    (request,) = [r for r in client.requests(sent_s) if natnet.message_id(r) == Message.ECHO_REQUEST]
+    ticks = round((received_s + SERVER_AHEAD_S) * 1e7)
+    client.receive(natnet.encode_message(Message.ECHO_RESPONSE, request[4:] + struct.pack("<Q", ticks)), received_s)
+
+
+def age_s(client: NatNetClient, number: int, exposure_s: float, sent_s: float, arrived_s: float) -> float | None:
+    """Latency of the pose in a frame with these times of this computer."""
+    origin_s = 1000.0  # that of the simulated server's ticks
+    ahead_s = SERVER_AHEAD_S - origin_s
+    frame = client.receive(encode_frame("4.1", number, sent_s + ahead_s, [POSE], exposure_s + ahead_s, {}), arrived_s)
+    assert frame is not None
+    pose = client.pose(frame, arrived_s)
+    assert pose is not None
+    return pose.latency_s
+
+
+def test_the_age_of_a_pose_is_from_exposure_to_arrival() -> None:
+    client = stamped_client()
+    assert age_s(client, 1, 1.0, 1.004, 1.15) == pytest.approx(0.004), "no echo: what the server says"
+    answer_echo(client, 2.0, 2.0002)
+    assert age_s(client, 2, 2.5, 2.504, 2.65) == pytest.approx(0.1502)
+
+
+@pytest.mark.parametrize("request_s", [0.0005, 0.1])
+def test_a_slow_request_makes_no_pose_younger_and_a_fast_one_corrects_it(request_s: float) -> None:
+    client = stamped_client()
+    answer_echo(client, 2.0, 2.0 + request_s)
+    assert age_s(client, 1, 2.5, 2.504, 2.51) == pytest.approx(0.01 + request_s)
+    answer_echo(client, 3.0, 3.0)
+    answer_echo(client, 3.5, 3.5 + request_s)
+    assert age_s(client, 2, 4.0, 4.004, 4.01) == pytest.approx(0.01)
+
+
+def test_an_answer_to_no_request_is_ignored() -> None:
+    client = stamped_client()
+    client.receive(natnet.encode_message(Message.ECHO_RESPONSE, struct.pack("<QQ", 77, 1)), 2.0)
+    client.receive(natnet.encode_message(Message.ECHO_RESPONSE, b"short"), 2.0)
+    assert client.malformed == 1
+    assert age_s(client, 1, 2.5, 2.504, 2.65) == pytest.approx(0.004)
+
+
+def test_a_clock_that_was_set_ahead_needs_a_new_echo() -> None:
+    client = stamped_client()
+    answer_echo(client, 2.0, 2.0)
+    assert age_s(client, 1, 12.0, 12.004, 2.51) == pytest.approx(0.004), "sent 9.5 s after its arrival"
+    assert age_s(client, 2, 2.6, 2.604, 2.75) == pytest.approx(0.004)
+    answer_echo(client, 3.0, 3.0)
+    assert age_s(client, 3, 3.6, 3.604, 3.75) == pytest.approx(0.15)
+
+
+def test_without_answers_the_age_becomes_unknown() -> None:
+    client = stamped_client()
+    answer_echo(client, 2.0, 2.0)
+    assert age_s(client, 1, 11.8, 11.804, 11.9) == pytest.approx(0.1)
+    assert age_s(client, 2, 12.0, 12.004, 12.1) == pytest.approx(0.004)

@@ -14,7 +14,7 @@ import pytest
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
-from companion.model.types import Event, FlightMode, Inputs, OperatorCommand, SafetyAction, Severity
+from companion.model.types import Event, FlightMode, Inputs, MocapPose, OperatorCommand, SafetyAction, Severity
 from companion.safety.arm import error_text
 from companion.safety.mocap import unfused
 from companion.safety.monitors import Monitors
@@ -471,10 +471,77 @@ def test_a_rejected_pose_is_not_passed_on() -> None:
     watched(VEHICLE, [healthy(k) for k in range(3)], flying(), monitors)
     monitors.check(moved("mocap", (0.0, 0.3, 0.0))(healthy(3)), flying())
     assert not monitors.mocap_trusted
-    assert monitors.trusted is not None and monitors.trusted.mocap is None
+    assert monitors.trusted is not None and monitors.trusted.mocap == healthy(2).mocap, "as if it had not arrived"
     monitors.check(healthy(4), flying())
     assert monitors.mocap_trusted
     assert monitors.trusted.mocap is not None
+
+
+def between_ticks(tick: int, change: Change = lambda i: i) -> MocapPose:
+    """A pose that arrives 2 ms after the tick."""
+    pose = change(healthy(tick)).mocap
+    assert pose is not None
+    return replace(pose, stamp_s=pose.stamp_s + 0.002, position_world_m=(*pose.position_world_m[:2], 0.99995))
+
+
+BAD: dict[str, Change] = {
+    "shifted": moved("mocap", (0.0, 0.3, 0.0)),
+    "turned": turned("mocap", 180.0),
+    "too late": put("mocap", latency_s=0.13),
+    "not tracked": put("mocap", tracking_valid=False),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_each_pose_is_judged_before_it_is_passed_on_and_not_by_the_one_before_it(kind: str) -> None:
+    """Frames that start no tick arrive between two of them: the verdict of the tick is that of another pose."""
+    bad, monitors = BAD[kind], Monitors(VEHICLE)
+    watched(VEHICLE, [healthy(k) for k in range(3)], flying(), monitors)
+    vehicle = healthy(2).vehicle
+    assert monitors.forwards(between_ticks(2), vehicle)
+    assert not monitors.forwards(between_ticks(2, bad), vehicle)
+    monitors.check(bad(healthy(3)), flying())
+    assert monitors.forwards(between_ticks(3), vehicle), "a good pose after a bad one"
+    assert not monitors.forwards(between_ticks(3, bad), vehicle)
+    evaluated = bad(healthy(3)).mocap
+    assert evaluated is not None and not monitors.forwards(evaluated, vehicle)
+
+
+def test_judging_a_pose_between_ticks_changes_nothing() -> None:
+    """A replay has the inputs of the ticks only."""
+    asked, unasked = Monitors(VEHICLE), Monitors(VEHICLE)
+    for tick in range(40):
+        i = turned("mocap", 180.0)(healthy(tick)) if tick % 3 == 2 else healthy(tick)
+        assert asked.check(i, flying()) == unasked.check(i, flying())
+        assert asked.mocap_trusted is unasked.mocap_trusted
+        asked.forwards(between_ticks(tick, BAD[("shifted", "turned")[tick % 2]]), i.vehicle)
+
+
+@pytest.mark.parametrize("id_", ["estimate_disagrees", "yaw_disagrees"])
+def test_poses_that_are_rejected_in_between_do_not_restart_the_hold_time_of_a_disagreement(id_: str) -> None:
+    apart = {"estimate_disagrees": moved("vehicle", (0.0, 0.4, 0.0)), "yaw_disagrees": turned("vehicle", 20.0)}[id_]
+
+    def flickering(i: Inputs) -> Inputs:
+        return apart(turned("mocap", 180.0)(i) if i.tick % 2 else i)
+
+    events = watched(VEHICLE, after_a_moment(flickering), flying())
+    reported = [event.t_s - START_S for event in events if event.id == id_]
+    hold_s = next(rule.hold_time for rule in RULES if rule.id == id_)
+    assert isinstance(hold_s, float)
+    assert reported == [pytest.approx(3 * TICK_S + hold_s, abs=3 * TICK_S)]
+
+
+@pytest.mark.parametrize(("late_s", "id_"), [(0.06, "mocap_late"), (0.15, "mocap_too_late")])
+def test_a_delay_that_the_servers_stamps_do_not_contain_is_measured_against_the_least(late_s: float, id_: str) -> None:
+    """A system that answers no echo requests: frames wait on the network from the 100th tick on."""
+
+    def held(i: Inputs) -> Inputs:
+        assert i.mocap is not None and i.mocap.exposure_server_s is not None
+        wait_s = late_s if i.tick >= 100 else 0.0
+        return put("mocap", exposure_server_s=i.mocap.exposure_server_s - wait_s)(i)
+
+    events = watched(VEHICLE, (held(healthy(k)) for k in range(300)), flying())
+    assert [event.id for event in events] == [id_]
 
 
 def test_bad_poses_of_every_kind_in_turn_are_no_motion_capture() -> None:
@@ -512,8 +579,9 @@ def test_motion_capture_that_comes_back_at_its_full_rate_is_not_reported_as_slow
 def test_after_a_gap_a_pose_far_from_px4s_position_is_not_passed_on(gap_s: float, off_m: float, trusted: bool) -> None:
     """0.1 m, and 0.3 m/s for the drift of PX4's position, up to 0.3 m; from 1 s on 0.2 m x t^1.5 / s^1.5 in its place."""
     monitors, ticks = after_a_gap(gap_s, flying())
-    monitors.check(moved("mocap", (0.0, off_m, 0.0))(healthy(ticks)), flying())
-    assert monitors.trusted is not None and (monitors.trusted.mocap is not None) is trusted
+    far = moved("mocap", (0.0, off_m, 0.0))(healthy(ticks))
+    monitors.check(far, flying())
+    assert monitors.trusted is not None and (monitors.trusted.mocap is far.mocap) is trusted
 
 
 @pytest.mark.parametrize(("turn_deg", "trusted"), [(18.0, True), (-18.0, True), (22.0, False), (-90.0, False)])
@@ -536,9 +604,10 @@ def test_the_first_pose_after_a_loss_is_evaluated_before_it_may_be_passed_on(gon
     """PX4 would reset its position to it."""
     monitors = Monitors(VEHICLE)
     watched(VEHICLE, after_a_moment(gone, ticks=201), flying(), monitors)
-    assert not monitors.mocap_trusted
-    monitors.check(healthy(201), flying())
-    assert monitors.mocap_trusted
+    sound = healthy(201)
+    far = moved("mocap", (1.0, 0.0, 0.0))(sound)
+    assert sound.mocap is not None and monitors.forwards(sound.mocap, sound.vehicle)
+    assert far.mocap is not None and not monitors.forwards(far.mocap, far.vehicle)
 
 
 def test_on_the_ground_the_vehicle_may_be_carried_while_it_is_not_seen() -> None:

@@ -32,7 +32,7 @@ EXTERNAL = "vehicle.devices.mocap.type=external"
 def test_poses_reach_px4_on_a_link_of_their_own() -> None:
     async def run() -> None:
         rig = Rig()
-        frame = MocapFrame(7, 0.0, (1.0, 2.0, 3.0), quat_from_euler_zyx(0.1, -0.2, 0.5), True)
+        frame = MocapFrame(7, 0.0, (1.0, 2.0, 3.0), quat_from_euler_zyx(0.1, -0.2, 0.5), True, 0.0)
         async with (
             MavlinkServer(rig.stub, Ports(0, 0), None, Ports(0, 0)) as server,
             ExternalVision(("127.0.0.1", server.vision_port)) as vision,

@@ -15,7 +15,8 @@ from companion.config.document import ConfigError
 from companion.mission.plan import Plan
 from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.model.flight_stage import SPOOL_S
-from companion.model.types import Outcome, SafetyAction
+from companion.model.frames import attitude_ned_frd_from_enu_flu
+from companion.model.types import Outcome, Quat, SafetyAction, Vec3
 from companion.safety.stop import StopModel
 from companion.sitl_config.faults import KINDS, FaultKind, FlightPhase
 from companion.sitl_config.loader import SitlConfig, load_sitl
@@ -261,6 +262,69 @@ def test_a_vehicle_that_px4_lands_with_a_drifting_estimate_is_stopped_when_it_st
     heights_m = [s.q[2] for o, s in zip(result.outputs, result.snapshots, strict=True) if o.t_s >= landed_s]
     assert max(heights_m) < floor_m + 0.02
     assert result.outputs[-1].attitude is not None and result.outputs[-1].attitude.thrust == 0.0
+
+
+class Received:
+    """What PX4 receives of motion capture in a fast flight."""
+
+    def __init__(self, flight: FastFlight) -> None:
+        self.off_m: list[float] = []
+        self.turned_deg: list[float] = []
+        self._flight, self._on_vision = flight, flight.px4.on_vision
+        flight.px4.on_vision = self.on_vision  # type: ignore[method-assign]
+
+    def on_vision(self, t_s: float, position_ned_m: Vec3, attitude_ned_frd: Quat) -> bool:
+        x, y, z, *attitude = self._flight.plant.world.q[0:7]
+        if self._flight.plant.armed_t_s is not None:
+            north, east, down = position_ned_m
+            self.off_m.append(math.dist((east, north, -down), (x, y, z)))
+            true = attitude_ned_frd_from_enu_flu((attitude[0], attitude[1], attitude[2], attitude[3]))
+            same = abs(sum(a * b for a, b in zip(true, attitude_ned_frd, strict=True)))
+            self.turned_deg.append(math.degrees(2.0 * math.acos(min(1.0, same))))
+        return self._on_vision(t_s, position_ned_m, attitude_ned_frd)
+
+
+@pytest.mark.parametrize("kind", ["mocap_flip", "mocap_flicker"])
+@pytest.mark.parametrize(
+    "frames",
+    [{"rate_hz": 100.0}, {"rate_hz": 120.0}, {"rate_hz": 240.0}, {"rate_hz": 200.0, "jitter_s": 0.004}],
+    ids=["100 Hz", "120 Hz", "240 Hz", "4 ms of jitter"],
+)
+def test_of_a_body_that_flickers_px4_gets_the_good_poses_and_no_bad_one(
+    kind: FaultKind, frames: dict[str, float]
+) -> None:
+    """Frames that start no tick: each was forwarded on the verdict of the one before it, so PX4 got the bad ones."""
+    mocap = f"world.mocap={{on: {'true' if 'jitter_s' in frames else 'false'}, "
+    mocap += f"delivery_jitter_s: {frames.get('jitter_s', 0.0)}, pivot_offset_m: [0, 0, 0], body_yaw_deg: 0, "
+    mocap += "body_tilt_deg: [0, 0], lost_share: 0, wobble_m: 0, wobble_deg: 0}"
+    config = load_sitl(
+        SHORT_CATCH,
+        overrides=[
+            f"world.faults=[{{kind: {kind}, phase: takeoff}}]",
+            f"world.mocap_rate_hz={frames['rate_hz']}",
+            mocap,
+        ],
+    )
+    flight = FastFlight(config)
+    received = Received(flight)
+    result = flight.run()
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    assert {event.id for o in result.outputs for event in o.events if event.action is SafetyAction.WARN} == {
+        "mocap_jump"
+    }
+    assert max(received.off_m) < 0.1 and max(received.turned_deg) < 10.0
+    assert len(received.off_m) > 0.4 * frames["rate_hz"] * 0.7 * result.outputs[-1].mission_t_s
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "id_", "most_m"),
+    [(0.06, "mocap_late", 1.0), (0.1, "mocap_late", 1.0), (0.15, "mocap_too_late", 0.6), (0.18, "mocap_too_late", 0.6)],
+)
+def test_a_delay_behind_the_servers_stamp_is_reported_and_ends_well(delay_s: float, id_: str, most_m: float) -> None:
+    """At 0.15 s the vehicle swung by 0.5 m and crashed, at 0.18 s it was lost, and no event named the cause."""
+    row = flown("mocap_network", "line", delay_s)
+    assert row["event"] == id_ and row["detected_s"] < delay_s + 0.25
+    assert good(row) and row["drift_m"] < most_m
 
 
 def test_poses_dragged_at_0_3_m_s_are_found_and_px4_lands_before_they_moved_it_0_6_m() -> None:

@@ -12,12 +12,15 @@ from companion.io.mocap import natnet
 from companion.io.mocap.definitions import parse_model_definitions
 from companion.io.mocap.frames import Frame, RigidBody, parse_frame
 from companion.io.mocap.natnet import OLDEST_VERSION, Malformed, Message, ServerInfo, Version
+from companion.io.mocap.server_clock import ServerClock
 from companion.model.types import MocapPose
 from companion.safety.stream_watch import StreamWatch
 
 SUPPORTED_VERSIONS: Final = "{}.{} or later".format(*OLDEST_VERSION)
 CONNECT_PERIOD_S: Final = 0.25
 KEEP_ALIVE_PERIOD_S: Final = 0.5
+ECHOES_WAITING: Final = 8
+"""Number of newest echo requests whose answers are accepted."""
 RECONNECT_SILENCE_S: Final = 1.0
 """Silence after which a connect request is sent: a restarted server knows its clients only after a new one."""
 
@@ -38,6 +41,10 @@ class NatNetClient:
         self._unicast = transport == "unicast"
         self._application = application
         self._streams = StreamWatch()
+        self._clock = ServerClock()
+        self._token = 0
+        self._echo_sent_s: dict[int, float] = {}
+        """Time at which each of the newest unanswered echo requests was sent, by its token."""
         self._last_number: int | None = None
         self._last_frame_s = 0.0
         self._heard_s = -math.inf
@@ -66,6 +73,12 @@ class NatNetClient:
             requests.append(natnet.encode_connect(self._application))
         if self._unicast:
             requests.append(natnet.encode_request(Message.KEEP_ALIVE))
+        if self.info is None or not self.info.clock_frequency_hz:
+            return requests
+        self._token += 1
+        self._echo_sent_s = {token: s for token, s in self._echo_sent_s.items() if token > self._token - ECHOES_WAITING}
+        self._echo_sent_s[self._token] = now_s
+        requests.append(natnet.encode_echo_request(self._token))
         return requests
 
     @property
@@ -89,6 +102,8 @@ class NatNetClient:
             return self._receive_frame(datagram, arrived_s)
         if message == Message.SERVER_INFO:
             self._receive_info(datagram, arrived_s)
+        elif message == Message.ECHO_RESPONSE:
+            self._receive_echo(datagram)
         elif message == Message.MODELDEF and self.version is not None:
             definitions = parse_model_definitions(datagram, self.version)
             if isinstance(definitions, Malformed):
@@ -118,7 +133,7 @@ class NatNetClient:
             position_m, quat_wxyz = natnet.z_up_from_y_up(position_m, quat_wxyz)
         return MocapPose(
             stamp_s=stamp_s,
-            latency_s=frame.latency_s,
+            latency_s=frame.age_s,
             frame_number=frame.number,
             position_world_m=position_m,
             attitude_wxyz=quat_wxyz,
@@ -142,6 +157,17 @@ class NatNetClient:
         if self.version is None:
             self.problem = f"the server speaks NatNet {info.version}, expected {SUPPORTED_VERSIONS}"
 
+    def _receive_echo(self, datagram: bytes) -> None:
+        answer = natnet.parse_echo_response(datagram)
+        if isinstance(answer, Malformed):
+            self._reject(answer)
+            return
+        token, ticks = answer
+        sent_s = self._echo_sent_s.pop(token, None)
+        frequency_hz = self.info.clock_frequency_hz if self.info is not None else None
+        if sent_s is not None and frequency_hz:
+            self._clock.echo(sent_s, ticks / frequency_hz)
+
     def _receive_frame(self, datagram: bytes, arrived_s: float) -> Frame | None:
         if self.version is None or self.info is None:
             return None
@@ -160,7 +186,9 @@ class NatNetClient:
         self.body_ids = frame.body_ids
         if self.is_ambiguous:
             self.problem = f"two rigid bodies have the streaming id {self._body_id}; the first one is used"
-        return frame
+        if frame.latency_s is None or frame.exposure_s is None:
+            return frame
+        return frame._replace(age_s=self._clock.age_s(frame.exposure_s, frame.latency_s, arrived_s))
 
     @property
     def is_ambiguous(self) -> bool:

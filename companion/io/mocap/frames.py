@@ -62,6 +62,8 @@ class Frame(NamedTuple):
     body: RigidBody | None
     """The requested rigid body; None if it is not in this frame."""
     body_ids: tuple[int, ...]
+    age_s: float | None = None
+    """Time from mid-exposure to arrival, which the client adds."""
 
 
 def parse_frame(datagram: Buffer, version: Version, body_id: int, clock_frequency_hz: int | None) -> Frame | Malformed:

@@ -36,6 +36,8 @@ class Message(IntEnum):
     MESSAGE_STRING = 8
     DISCONNECT = 9
     KEEP_ALIVE = 10
+    ECHO_REQUEST = 12
+    ECHO_RESPONSE = 13
     UNRECOGNIZED_REQUEST = 100
 
 
@@ -55,6 +57,8 @@ VEC3_BYTES: Final = 12
 _HEADER = struct.Struct("<HH")
 _SENDER = struct.Struct("<256s4s4s")
 _CONNECTION = struct.Struct("<QH?4s")
+_ECHO_REQUEST = struct.Struct("<Q")
+_ECHO_RESPONSE = struct.Struct("<QQ")
 _CONNECT_OPTIONS_BYTES = 6  # subscribedDataOnly, BitstreamVersion[4] (0.0.0.0: the server's own), terminator
 
 
@@ -112,6 +116,22 @@ def encode_connect(application: str = "companion") -> bytes:
     """Return a NAT_CONNECT datagram: sSender and connection options that request the server's own bitstream version."""
     sender = _SENDER.pack(application.encode()[: MAX_NAME_BYTES - 1], bytes(4), bytes((4, 1, 0, 0)))
     return encode_message(Message.CONNECT, sender + bytes(_CONNECT_OPTIONS_BYTES))
+
+
+def encode_echo_request(token: int) -> bytes:
+    """Return a NAT_ECHOREQUEST; the server repeats the token (u64) in its answer."""
+    return encode_message(Message.ECHO_REQUEST, _ECHO_REQUEST.pack(token))
+
+
+def parse_echo_response(datagram: Buffer) -> tuple[int, int] | Malformed:
+    """Parse NAT_ECHORESPONSE: the token of the request, and the server's clock at its reception, in ticks."""
+    payload = payload_of(datagram, Message.ECHO_RESPONSE)
+    if isinstance(payload, Malformed):
+        return payload
+    if len(payload) < _ECHO_RESPONSE.size:
+        return Malformed(f"echo response of {len(payload)} bytes, expected {_ECHO_RESPONSE.size}")
+    token, ticks = _ECHO_RESPONSE.unpack_from(payload)
+    return token, ticks
 
 
 def is_newer(number: int, last_number: int | None, silence_s: float) -> bool:
