@@ -15,6 +15,7 @@ from companion.analysis.contact import rotor_distance_m
 from companion.analysis.log import FlightLog
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK
 from companion.model.types import AutopilotRequest
+from companion.model.frames import euler_zyx_from_quat
 from tests.core.test_sliding import short_slide
 from tests.support import (
     HOVER,
@@ -115,6 +116,29 @@ def test_a_lost_arm_lands_it_and_another_programs_end_is_found(tmp_path_factory:
     assert summary["latency_ms"]["mocap_to_setpoint"]["p99"] is None
     distance_m = rotor_distance_m(summary)
     assert distance_m is not None and 50.0 < distance_m < 51.0
+
+
+def test_a_body_that_flickers_is_flown_through_and_poses_that_wait_on_the_network_land_it(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    """Frames at 120 Hz start no tick; every second pose is turned by 180 deg for a second. Then frames wait behind Motive's stamp."""
+    with sandbox_in(tmp_path_factory.mktemp("flickers")) as sandbox:
+        faults = [
+            {"kind": "mocap_flip", "t_s": HOVERS_S, "duration_s": 1.0},
+            {"kind": "mocap_network", "t_s": HOVERS_S + 1.2, "size": 0.15},
+        ]
+        options = {"world.faults": faults, "world.mocap_rate_hz": 120.0}
+        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *set_options(**options))
+        sandbox.assert_nobody_left()
+        summary = read_summary(sandbox.cwd / "out")
+        log = FlightLog.read(sandbox.cwd / "out/flight.mcap")
+    assert ended.code == EXIT_ABORTED, ended
+    wanted = ["mocap_jump", "mocap_too_late"]
+    assert [event["id"] for event in summary["events"] if event["id"].startswith("mocap")][:2] == wanted
+    yaws_rad = [euler_zyx_from_quat(i.vehicle.attitude_wxyz)[2] for i in log.inputs if i.vehicle is not None]
+    assert max(yaws_rad) - min(yaws_rad) < 0.2, "PX4 got none of the turned poses"
+    late_s = [i.mocap.latency_s for i in log.inputs if i.mocap is not None and i.mocap.latency_s is not None]
+    assert max(late_s) == pytest.approx(0.155, abs=0.01), "the log has the age at arrival"
 
 
 def test_a_tip_slides_along_a_wall(tmp_path_factory: pytest.TempPathFactory) -> None:
