@@ -124,9 +124,8 @@ def test_the_latency_contains_the_delay_on_the_network() -> None:
     async def run() -> None:
         inbox = Inbox()
         async with NatNetServer() as server, streaming(server, POSE, held_s=0.15), mocap(device_for(server), inbox):
-            pose = await inbox.next()
-            while pose.latency_s is None or pose.latency_s < 0.15:
-                pose = await inbox.next()
+            latencies_s = [(await inbox.next()).latency_s or 0.0 for _ in range(300)]
+            assert max(latencies_s) >= 0.15
 
     asyncio.run(run())
 
