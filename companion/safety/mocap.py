@@ -71,7 +71,11 @@ class MocapTracker:
         s = self._s = safety
         self._filter = PoseFilter(limits_of(s))
         self._frame_awake_s = -math.inf
-        self._trusted_awake_s = -math.inf
+        self._trusted_awake_s = self._timely_awake_s = self._awake_s = -math.inf
+        self._timely: MocapPose | None = None
+        """The newest trusted pose that was not too late."""
+        self.too_late = False
+        """Whether the newest tracked pose is so late that it counts as not received."""
         self._same_since_s: float | None = None
         self._moved = False
         self._streams = StreamWatch()
@@ -116,6 +120,7 @@ class MocapTracker:
     def update(self, i: Inputs, situation: Situation, awake_s: float, moving: bool) -> None:
         """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle is moving."""
         pose, vehicle, s = i.mocap, i.vehicle, self._s
+        self._awake_s = awake_s
         self.pose = pose
         self._moved = self._moved or moving
         if vehicle is not None and vehicle.imu_boot_s is not None:
@@ -136,7 +141,7 @@ class MocapTracker:
         self._count(awake_s)
         if not situation.airborne or awake_s - self._compared_awake_s > s.mocap_timeout_s:
             self.compared = None
-        if pose is not None and vehicle is not None and situation.airborne and self.trusted:
+        if pose is not None and vehicle is not None and situation.airborne and self.trusted and not self.too_late:
             if pose.tracking_valid and self.frame_age_s < s.mocap_timeout_s:
                 self.compared, self._compared_awake_s = (pose, vehicle), awake_s
 
@@ -147,11 +152,11 @@ class MocapTracker:
 
     @property
     def last_trusted(self) -> MocapPose | None:
-        """Return the newest trusted pose, as if the rejected ones after it had not arrived; None if it is older than
+        """Return the newest pose that was trusted and not too late, as if those after it had not arrived; None if it is older than
         `safety.mocap_timeout_s` or the stream is rejected.
         """
         rejected = self.frozen or self.two_streams or self.dragged
-        return None if rejected or self.trusted_age_s > self._s.mocap_timeout_s else self._filter.trusted
+        return None if rejected or self._awake_s - self._timely_awake_s > self._s.mocap_timeout_s else self._timely
 
     def pose_filter(self) -> PoseFilter | None:
         """Return a filter for a landing without the core; None if the stream is rejected, so that no pose may be passed on."""
@@ -219,10 +224,13 @@ class MocapTracker:
             self._same_since_s, self._moved = None, False
         elif self._same_since_s is None and self.repeats:
             self._same_since_s, self._moved = awake_s, False
+        self.too_late = self._filter.is_too_late(pose)
         off = self._filter.evaluate(pose, vehicle, forgotten=gone_s > FORGET_S and not airborne)
         self.plausible = off is None
         if off is None:
             self._trusted_awake_s = awake_s
+            if not self.too_late:
+                self._timely, self._timely_awake_s = pose, awake_s
             # mocap_frozen evaluates repeated poses; they are not passed on and are not evidence of motion.
             if not self.repeats:
                 self._against_imu = self._inertial.pose(pose.stamp_s, pose.position_world_m, self._age_s(pose))

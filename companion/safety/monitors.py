@@ -72,8 +72,9 @@ class Monitors:
 
     @property
     def mocap_trusted(self) -> bool:
-        """Return whether the newest pose is trusted and, in the air, does not repeat the one before it."""
-        return self._mocap.trusted and not (self._mocap.repeats and self._airborne)
+        """Return whether the newest pose is trusted, not too late and, in the air, does not repeat the one before it."""
+        mocap = self._mocap
+        return mocap.trusted and not mocap.too_late and not (mocap.repeats and self._airborne)
 
     def forwards(self, pose: MocapPose, vehicle: VehicleState | None) -> bool:
         """Return whether a pose that has arrived since the last tick may be passed on to PX4. Changes nothing."""
@@ -113,7 +114,7 @@ class Monitors:
             self._px4.update(i, situation, awake_s, moving)
             self._arm.update(i, awake_s, situation.torque_refused)
             self._force.update(i, situation, awake_s, gap_s, moving)
-            if not self._mocap.trusted:
+            if not self._mocap.trusted or self._mocap.too_late:
                 i = msgspec.structs.replace(i, mocap=self._mocap.last_trusted)
             if airborne:
                 self._flight.update(i, situation, gap_s)

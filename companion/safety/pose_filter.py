@@ -82,8 +82,8 @@ class PoseFilter:
         return pose.latency_s is not None and pose.latency_s > self._limits.latency_max_s
 
     def deviation(self, pose: MocapPose, vehicle: VehicleState | None) -> Vec2 | None:
-        """Return None if the pose is reachable, else how far it is from the expected one, in m and deg. Changes nothing. Arguments as for
-        `evaluate`.
+        """Return None if the pose is reachable, else how far it is from the expected one, in m and deg. Changes nothing. Arguments as
+        for `evaluate`.
         """
         before, limits = self.trusted, self._limits
         if before is None:

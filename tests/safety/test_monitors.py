@@ -507,6 +507,20 @@ def test_each_pose_is_judged_before_it_is_passed_on_and_not_by_the_one_before_it
     assert evaluated is not None and not monitors.forwards(evaluated, vehicle)
 
 
+def test_a_pose_that_is_too_late_counts_as_not_received() -> None:
+    """PX4 lands on its own estimate then, and what it does shows more than a pose that PX4 does not get."""
+    monitors = Monitors(VEHICLE)
+    watched(VEHICLE, [healthy(k) for k in range(3)], flying(), monitors)
+    late = put("mocap", latency_s=0.13)
+    monitors.check(late(healthy(3)), flying())
+    assert not monitors.mocap_trusted
+    assert monitors.trusted is not None and monitors.trusted.mocap == healthy(2).mocap
+    watched(VEHICLE, [late(healthy(k)) for k in range(4, 50)], flying(), monitors)
+    assert monitors.trusted.mocap is None
+    monitors.check(healthy(50), flying())
+    assert monitors.mocap_trusted and monitors.trusted.mocap is not None
+
+
 def test_judging_a_pose_between_ticks_changes_nothing() -> None:
     """A replay has the inputs of the ticks only."""
     asked, unasked = Monitors(VEHICLE), Monitors(VEHICLE)

@@ -140,13 +140,13 @@ class HealthEvaluator:
         text = f"{_age_text(age_s)}{rate}"
         if not mocap.tracking_valid:
             return HealthLevel.BAD, "rigid body not tracked"
+        if not late_s <= s.mocap_latency_max_s:
+            return HealthLevel.BAD, f"{late_s * 1e3:.0f} ms late"
         light = _level_by_age(age_s, s.mocap_timeout_s)
         if not snapshot.outputs.mocap_trusted and light is not HealthLevel.BAD:
             return HealthLevel.BAD, "rejected: poses jump or are frozen"
-        if not late_s <= s.mocap_latency_max_s:
-            return HealthLevel.BAD, f"{late_s * 1e3:.0f} ms late by Motive's clock"
         if light is HealthLevel.OK and late_s > s.mocap_latency_warn_s:
-            return HealthLevel.WARN, f"{late_s * 1e3:.0f} ms late by Motive's clock"
+            return HealthLevel.WARN, f"{late_s * 1e3:.0f} ms late"
         if light is HealthLevel.OK and rate_hz is not None and rate_hz < s.mocap_rate_min_hz:
             return HealthLevel.WARN, text
         return light, text
