@@ -316,6 +316,15 @@ def test_of_a_body_that_flickers_px4_gets_the_good_poses_and_no_bad_one(
     assert len(received.off_m) > 0.4 * frames["rate_hz"] * 0.7 * result.outputs[-1].mission_t_s
 
 
+def test_the_guardian_passes_on_none_of_the_bad_poses_either() -> None:
+    faults = [{"kind": "mocap_flip", "phase": "line"}, {"kind": "kill_flight", "phase": "line"}]
+    flight = FastFlight(with_faults(*faults, mission=SHORT_CATCH))
+    received = Received(flight)
+    result = flight.run()
+    assert result.guardian_landed and not result.crashed
+    assert max(received.turned_deg) < 10.0
+
+
 @pytest.mark.parametrize(
     ("delay_s", "id_", "most_m"),
     [(0.06, "mocap_late", 1.0), (0.1, "mocap_late", 1.0), (0.15, "mocap_too_late", 0.6), (0.18, "mocap_too_late", 0.6)],
