@@ -14,8 +14,8 @@ import pytest
 from companion.analysis.contact import rotor_distance_m
 from companion.analysis.log import FlightLog
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK
-from companion.model.types import AutopilotRequest
 from companion.model.frames import euler_zyx_from_quat
+from companion.model.types import AutopilotRequest
 from tests.core.test_sliding import short_slide
 from tests.support import (
     HOVER,
