@@ -44,6 +44,8 @@ ESTIMATE_TRUSTED_S = 4.2
 STATE_FRESH_S = 0.3
 FLIPPED_TILT_RAD = math.radians(70.0)
 FLIPPED_HOLD_S: Final = 0.3
+FLIPPED_POSE_S: Final = 0.03
+"""Age above which a pose neither confirms nor contradicts a flip: it stands for newer ones that were rejected (`MocapTracker`)."""
 TIPPED_HOLD_S: Final = 0.5
 _UPRIGHT_MIN_M_S2 = GRAVITY_M_S2 * math.cos(FLIPPED_TILT_RAD)
 """Specific force along body z; a vehicle that rests or hovers with less tilt measures more."""
@@ -78,7 +80,7 @@ def seems_flipped(i: Inputs) -> bool:
     if not _tilted_by_px4(i, FLIPPED_TILT_RAD):
         return False
     pose = fresh_pose(i)
-    if pose is not None:
+    if pose is not None and i.t_s - pose.stamp_s < FLIPPED_POSE_S:
         return tilt_rad(pose.attitude_wxyz) > FLIPPED_TILT_RAD
     vehicle = i.vehicle
     fresh = vehicle is not None and i.t_s - vehicle.imu_stamp_s < STATE_FRESH_S

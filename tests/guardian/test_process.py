@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.guardian.heartbeat import PROBLEM, READY
 from companion.launcher.guardian_process import outcome_of
-from companion.model.frames import ned_from_enu, wrap_rad
+from companion.model.frames import attitude_enu_flu_from_ned_frd, ned_from_enu, wrap_rad
 from companion.model.types import Outcome
 from tests.guardian.rig import DISARMED, HOLD_MODE, LAND_MODE, OWN_IDS, POSITION_M, Rig
 from tests.support import DEADLINE_S, wait_until
@@ -220,7 +220,8 @@ def test_a_flipped_vehicle_is_disarmed_by_force_again_and_again(tmp_path: Path, 
         rig.beat_until_ready()
         rig.peer.custom_mode = LAND_MODE
         if not contradicted:
-            rig.peer.attitude_ned_frd = rig.cameras.attitude = (0.0, 1.0, 0.0, 0.0)
+            rig.peer.attitude_ned_frd = (0.0, 1.0, 0.0, 0.0)
+            rig.cameras.attitude = attitude_enu_flu_from_ned_frd(rig.peer.attitude_ned_frd)
         rig.flight.kill()
         if contradicted:
             rig.peer.wait_for("VISION_POSITION_ESTIMATE", 5)
