@@ -189,6 +189,7 @@ def test_a_long_log_loads_in_pieces(browser: Any, stub: MonitorStub) -> None:
     """
     with watching(browser, stub, settle=loaded, script=watch) as page:
         assert page.tab.evaluate("percents.size") >= 10
+        assert page.tab.inner_text("#replay-now") == "0:00.0 / 5:00.0"
         page.tab.keyboard.press("End")
         assert shown_s(page) == pytest.approx(0.05 * (count - 1), abs=0.1)
 

@@ -103,6 +103,7 @@ export class Replay {
     this.vehicle.load(streams);
     if (first && streams.length > 0) this.seek(streams[0].t_s);
     this._range();
+    this._show();
     this._notify(`Loading ${this.name}: ${Math.round((100 * this.vehicle.records.length) / count)} %`);
   }
 
