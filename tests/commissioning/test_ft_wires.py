@@ -59,7 +59,7 @@ def test_tare_shows_the_drift_and_writes_to_the_sensor_only_when_asked(
 ) -> None:
     monkeypatch.setattr("companion.cli.ft.number", lambda *_: float)  # five seconds are the least that it takes
     with World(sandbox, overrides=["world.force_bias_n=[30,0,0]"]) as world:
-        words = ["ft", "tare", "--seconds", 1, "--json", "--vehicle", VEHICLE, *world.addresses()]
+        words = ["ft", "tare", "--seconds", 2, "--json", "--vehicle", VEHICLE, *world.addresses()]
         unasked = run_here(*words, "--sensor")
         zeroed = json.loads(run_here(*words, "--sensor", "--yes").out)
         cleared = json.loads(run_here(*words, "--clear", "--yes").out)

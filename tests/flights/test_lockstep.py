@@ -56,7 +56,7 @@ def test_beside_busy_programs_it_repeats_itself_bit_for_bit(
 ) -> None:
     log, _ = flown
     words = ("fly", SHORT_CATCH, "--sitl", "--world", "lab", "--seed", "1", "--out", "out", "--speed", "3")
-    with busy_programs(2 * len(os.sched_getaffinity(0))), sandbox_in(tmp_path / "again") as sandbox:
+    with busy_programs(len(os.sched_getaffinity(0))), sandbox_in(tmp_path / "again") as sandbox:
         ended = sandbox.run(*words)
         assert ended.code == EXIT_OK, ended
         again = FlightLog.read(sandbox.cwd / "out/flight.mcap")
