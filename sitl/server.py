@@ -46,7 +46,7 @@ INJECT_RETRY_S = 0.2
 OTHER_PROCESS_FAULTS: tuple[FaultKind, ...] = ("kill_recorder", "kill_guardian", "disk_full")
 _LEAVE_S = 30.0
 SLIP_REPORTED_S = 0.1
-"""Pause of a world in real time that is reported."""
+"""A world in real time reports its pauses each time that they have grown by this much."""
 
 OnMessage = Callable[[dict[str, Any]], None]
 

@@ -37,7 +37,7 @@ def law(**changes: Any) -> AdaptiveConfig:
 
 
 class Arm:
-    """Two joints with an estimated load, and what they were asked for in this tick."""
+    """Two joints with an estimated load; it keeps levers and requested rates from the torque of a tick to its end."""
 
     def __init__(self, load: LoadAdaptation) -> None:
         self.load = load

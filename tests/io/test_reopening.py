@@ -45,7 +45,7 @@ def test_it_is_attempted_until_it_opens_and_handed_over_once() -> None:
     wait_until(taken(reopening, found), lambda: "not open")
     assert found[-1] is port and reopening.take() is None
     reopening.close()
-    assert not port.closed, "it belongs to whoever took it"
+    assert not port.closed, "the caller that took it closes it"
 
 
 def test_a_device_that_opens_after_the_end_is_closed() -> None:

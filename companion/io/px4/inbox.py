@@ -62,7 +62,7 @@ class Inbox:
         self._delta_velocity_frd = DeltaVelocity()
 
     def take(self, stamp_s: float, message_id: int, frame: bytes) -> None:
-        """Store a message of the autopilot that is not one of `readers`, if the companion reads it or somebody listens.
+        """Store a message of the autopilot that is not one of `readers`, if the companion reads it or a question waits for it.
 
         Args:
             stamp_s: arrival on the flight clock.
