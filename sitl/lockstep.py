@@ -19,7 +19,10 @@ from companion.runtime.simulated_time import GRANT, REPORT, Flags, Page, Report
 from sitl.servo.bus import ServoBus
 
 PATIENCE_S: Final = 2.0
-"""Wall time that the world waits for a process before it goes on without it, at the pace of real time: the process hangs."""
+"""Wall time that the world waits for a process before it goes on without it, at the pace of real time: the process hangs. It is
+counted in pieces of `_LOOK_S` that the world itself has run: a computer that stands still stops both.
+"""
+_LOOK_S: Final = 0.1
 CATCH_UP_S: Final = 0.03
 """A world that is further behind its pace does not catch up."""
 _EPSILON_S: Final = 1e-9
@@ -210,17 +213,17 @@ class TimeKeeper:
         """Wait for the reports. Meanwhile only the servo bus is served: a process waits for nothing else at this instant, and each
         wake-up takes longer than most of the work that follows.
         """
-        deadline_s = math.inf
+        waited_s = 0.0
         served = () if self.bus is None else (self.bus,)
         while working := [process for process in processes if process.busy and process.waited_for]:
-            now_s = time.monotonic()
-            deadline_s = min(deadline_s, now_s + PATIENCE_S)
-            ready = select.select((*working, *served), (), (), max(0.0, deadline_s - now_s))[0]
+            ready = select.select((*working, *served), (), (), _LOOK_S)[0]
             for one in ready:
                 self._on_report(one) if isinstance(one, Process) else one.on_readable()
             if not ready:
-                for process in working:
-                    process.waited_for = False
+                waited_s += _LOOK_S
+                if waited_s >= PATIENCE_S:
+                    for process in working:
+                        process.waited_for = False
 
     async def _keep_pace(self, now_s: float, processes: Sequence[Process]) -> None:
         # Before the flight begins MAVSDK connects, which lives on the computer's clock and is impatient.

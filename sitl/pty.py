@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Final
 
 _INT: Final = struct.Struct("i")
-_ARRIVAL_TIMEOUT_S: Final = 0.2
+_ARRIVAL_TIMEOUT_S: Final = 1.0
 _ARRIVAL_LOOK_S: Final = 0.0005
 _UNREAD_BYTES: Final = 1024
 """Number of waiting bytes from which nobody reads the line."""

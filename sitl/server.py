@@ -39,7 +39,7 @@ from sitl.world.world import PHYSICS_DT_S
 COURSE_PERIOD_S, FRAMES_PERIOD_S = 0.01, 0.5
 BEFORE_S = -3600.0
 """Simulated time when a world in lockstep starts; it jumps to zero when the flight begins."""
-BUS_PATIENCE_S = 0.2
+BUS_PATIENCE_S = 1.0
 """Wall time that bytes take at most from the companion's end of a serial line to the world's."""
 INJECT_RETRY_S = 0.2
 """Time between two searches for the target process of a fault."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import io
+import itertools
 import json
 import math
 import os
@@ -468,11 +469,35 @@ def bridged(
         thread.join(DEADLINE_S)
 
 
+def _port_range() -> Iterator[int]:
+    """Ports of this process alone, again and again, below those that the kernel gives to whoever asks for any: between the choice of
+    a port and its use nobody else is given it.
+    """
+    for slot in itertools.count():
+        claim = socket.socket(socket.AF_UNIX)
+        try:
+            claim.bind(f"\0ports of the tests {slot}")
+            break
+        except OSError:
+            claim.close()
+    first = 20_000 + _PORTS_EACH * (slot % (12_000 // _PORTS_EACH))
+    try:
+        yield from itertools.cycle(range(first, first + _PORTS_EACH))
+    finally:
+        claim.close()
+
+
+_PORTS_EACH = 400
+_ports = _port_range()
+
+
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
     """A port that nobody uses now, at no address of this computer: of TCP, unless the kind says otherwise."""
-    with socket.socket(type=kind) as probe:
-        probe.bind(("", 0))
-        return int(probe.getsockname()[1])
+    while True:
+        port = next(_ports)
+        with socket.socket(type=kind) as probe, contextlib.suppress(OSError):
+            probe.bind(("", port))
+            return port
 
 
 def free_udp_port() -> int:
