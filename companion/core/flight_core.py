@@ -140,6 +140,7 @@ class FlightCore:
             request=request.autopilot,
             action=state.supervisor.action,
             events=tuple(events),
+            active=self._monitors.active(),
             control=command.log,
             outcome=state.over,
             mocap_trusted=self._monitors.mocap_trusted,

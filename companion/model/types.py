@@ -414,6 +414,15 @@ class Event(Record, frozen=True, kw_only=True):
     text: str
 
 
+class ActiveRule(Record, frozen=True, kw_only=True):
+    """A rule of `companion.safety.rules` that has raised its event, and held within the last second."""
+
+    id: str
+    action: SafetyAction
+    text: str
+    """The rule's message, with its newest values."""
+
+
 class ControlLog(Record, frozen=True, kw_only=True):
     """Quantities that the control law computed in one tick. Vectors of type `Chi` are ordered as chi = [p; q; alpha]. `sliding` and
     `rho` are those that made tau; gamma, `h_hat`, `zeta` and the estimated loads are those of the next tick.
@@ -505,6 +514,8 @@ class Outputs(Record, frozen=True, kw_only=True):
     request: AutopilotRequest
     action: SafetyAction
     events: tuple[Event, ...]
+    active: tuple[ActiveRule, ...] | None = None
+    """The active rules, whose events were raised in this tick or before; None if there is none, and in older logs."""
     control: ControlLog | None = None
     outcome: Outcome | None = None
     """Outcome of the flight; None until it has ended."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from companion.config.vehicle import Vehicle
 from companion.model.negative_zero import without_negative_zero
-from companion.model.types import Event, SafetyAction
+from companion.model.types import ActiveRule, Event, SafetyAction
 from companion.safety.rule import Repeat, Rule, Subject, hold_time_s, thresholds_of
 from companion.safety.rules import RULES
 from companion.safety.situation import Values
@@ -49,12 +49,17 @@ class Evaluation:
 
     def standing(self) -> str | None:
         """Return the message of the active rule with the most severe action, or None if no active rule requires HOLD or more."""
-        gravest: SafetyAction | None = None
-        text = None
-        for action, _, rule, values in self._active.values():
-            if action.rank >= SafetyAction.HOLD.rank and (gravest is None or action.rank > gravest.rank):
-                gravest, text = action, rule.message.format(*values)
-        return text
+        holding = [row for row in self.active() or () if row.action.rank >= SafetyAction.HOLD.rank]
+        return max(holding, key=lambda row: row.action.rank).text if holding else None
+
+    def active(self) -> tuple[ActiveRule, ...] | None:
+        """Return the active rules, the oldest first; None if there is none."""
+        if not self._active:
+            return None
+        return tuple(
+            ActiveRule(id=id_, action=action, text=_text(rule, values))
+            for id_, (action, _, rule, values) in self._active.items()
+        )
 
     def events(self, t_s: float, airborne: bool, waiting: bool) -> tuple[Event, ...]:
         """Evaluate the rules of this tick and return the new events.
@@ -88,8 +93,7 @@ class Evaluation:
             elif t_s - since_s >= self._hold_time_s[id_]:
                 last_s = math.inf if rule.repeat is Repeat.NEVER else t_s
                 self._active[id_] = (action, last_s, rule, values)
-                text = without_negative_zero(rule.message.format(*values))
-                events.append(Event(t_s=t_s, id=id_, severity=severity, action=action, text=text))
+                events.append(Event(t_s=t_s, id=id_, severity=severity, action=action, text=_text(rule, values)))
         if self._active:
             self._expire(t_s)
         return tuple(events)
@@ -98,3 +102,7 @@ class Evaluation:
         for id_, (_, last_s, rule, _) in list(self._active.items()):
             if t_s - last_s > QUIET_S or rule.repeat is Repeat.AT_ONCE:
                 del self._active[id_]
+
+
+def _text(rule: Rule, values: Values) -> str:
+    return without_negative_zero(rule.message.format(*values))

@@ -10,7 +10,7 @@ from typing import Final
 import msgspec
 
 from companion.config.vehicle import Vehicle
-from companion.model.types import Event, Inputs, MocapPose, VehicleState
+from companion.model.types import ActiveRule, Event, Inputs, MocapPose, VehicleState
 from companion.safety.arm import ArmTracker, ForceTracker
 from companion.safety.evaluation import Evaluation
 from companion.safety.flight import FlightTracker
@@ -92,6 +92,10 @@ class Monitors:
     def forget(self) -> None:
         """Make all active rules raise their events again, because a HOLD was ended."""
         self._evaluation.forget()
+
+    def active(self) -> tuple[ActiveRule, ...] | None:
+        """Return the active rules, as of the last tick; None if there is none."""
+        return self._evaluation.active()
 
     def standing(self) -> str | None:
         """Return the message of the most severe active rule, as of the last tick; None if no active rule requires HOLD or more."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from enum import Enum
+from enum import Enum, StrEnum
 from typing import Any
 
 from companion.config.vehicle import Vehicle
@@ -26,6 +26,36 @@ class Subject(Enum):
     PROCESS = "process"
     FLIGHT = "flight"
     TETHER = "tether"
+
+
+class Lamp(StrEnum):
+    """A health lamp of the ground station, in display order."""
+
+    FLIGHT = "flight"
+    PX4 = "PX4"
+    ESTIMATE = "estimate"
+    MOCAP = "motion capture"
+    ARM = "arm"
+    FORCE = "force sensor"
+    LOOP = "loop"
+    RECORDER = "recorder"
+    GUARDIAN = "guardian"
+    BATTERY = "battery"
+    TETHER = "tether"
+
+
+_LAMPS: Mapping[Subject, Lamp] = {
+    Subject.INPUTS: Lamp.PX4,
+    Subject.OPERATOR: Lamp.FLIGHT,
+    Subject.MOCAP: Lamp.MOCAP,
+    Subject.VISION: Lamp.ESTIMATE,
+    Subject.PX4: Lamp.PX4,
+    Subject.ARM: Lamp.ARM,
+    Subject.FORCE: Lamp.FORCE,
+    Subject.PROCESS: Lamp.LOOP,
+    Subject.FLIGHT: Lamp.FLIGHT,
+    Subject.TETHER: Lamp.TETHER,
+}
 
 
 class Repeat(Enum):
@@ -70,6 +100,13 @@ class Rule:
     repeat: Repeat = Repeat.AFTER_QUIET
     while_waiting: bool = False
     """Whether the rule is also evaluated while inputs are still missing on the ground."""
+    on_lamp: Lamp | None = None
+    """Lamp that shows the rule while it is active; None means that of its subject."""
+
+    @property
+    def lamp(self) -> Lamp:
+        """Return the lamp that shows the rule while it is active."""
+        return self.on_lamp or _LAMPS[self.subject]
 
     def verdict(self, airborne: bool) -> tuple[SafetyAction, Severity]:
         """Return the action and the severity of the event; the action is NOMINAL if the rule is not evaluated."""

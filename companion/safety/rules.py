@@ -11,7 +11,7 @@ from typing import Final
 from companion.model.types import OperatorCommand, SafetyAction, Severity
 from companion.safety import arm, flight, mocap, process, px4, vision
 from companion.safety.process import commanded
-from companion.safety.rule import Repeat, Rule, Subject
+from companion.safety.rule import Lamp, Repeat, Rule, Subject
 from companion.safety.validity import invalid
 
 _NOMINAL: Final = SafetyAction.NOMINAL
@@ -33,11 +33,11 @@ OPERATOR_RESUME: Final = "operator_resume"
 OPERATOR_LAND, OPERATOR_ABORT = "operator_land", "operator_abort"
 
 
-def _invalid(id_: str, field: str, what: str, message: str) -> Rule:
+def _invalid(id_: str, field: str, what: str, message: str, on_lamp: Lamp) -> Rule:
     """Return the rule for an invalid record, which counts as not received; a separate rule covers its loss."""
     return Rule(
         id=id_, subject=Subject.INPUTS, what=what, predicate=invalid(field), ground=_WARN, air=_WARN, message=message,
-        while_waiting=True,
+        while_waiting=True, on_lamp=on_lamp,
     )  # fmt: skip
 
 
@@ -54,23 +54,23 @@ def _operator(
 RULES: tuple[Rule, ...] = (
     _invalid(
         "vehicle_not_finite", "vehicle", "PX4's state has a non-finite or out-of-range value, or an invalid attitude",
-        "PX4's state is invalid and is ignored: {}",
+        "PX4's state is invalid and is ignored: {}", Lamp.PX4,
     ),
     _invalid(
         "mocap_not_finite", "mocap", "a pose has a non-finite or out-of-range value, or an invalid attitude",
-        "the motion-capture pose is invalid and is ignored: {}",
+        "the motion-capture pose is invalid and is ignored: {}", Lamp.MOCAP,
     ),
     _invalid(
         "arm_not_finite", "arm", "a joint state has a non-finite or out-of-range value",
-        "the joint state is invalid and is ignored: {}",
+        "the joint state is invalid and is ignored: {}", Lamp.ARM,
     ),
     _invalid(
         "force_not_finite", "force", "a force sample has a non-finite or out-of-range value",
-        "the force sample is invalid and is ignored: {}",
+        "the force sample is invalid and is ignored: {}", Lamp.FORCE,
     ),
     _invalid(
         "status_not_finite", "status", "PX4's status has a non-finite or out-of-range value",
-        "PX4's status is invalid and is ignored: {}",
+        "PX4's status is invalid and is ignored: {}", Lamp.PX4,
     ),
 
     _operator(OperatorCommand.HOLD, "HOLD was commanded", None, _HOLD, "hold commanded"),
@@ -151,12 +151,12 @@ RULES: tuple[Rule, ...] = (
         ground=_PX4_LANDS, air=_PX4_LANDS, message="motion capture is {:.0f} ms late (limit {:.0f} ms)",
     ),
     Rule(
-        id="estimate_disagrees", subject=Subject.MOCAP, what="PX4's position disagrees with motion capture",
+        id="estimate_disagrees", subject=Subject.MOCAP, on_lamp=Lamp.ESTIMATE, what="PX4's position disagrees with motion capture",
         predicate=mocap.estimate_disagrees, thresholds=("estimate_disagreement_m",), hold_time=0.2, ground=None,
         air=_PX4_LANDS, message="PX4's position is {:.2f} m from motion capture (limit {:.2f} m)",
     ),
     Rule(
-        id="yaw_disagrees", subject=Subject.MOCAP, what="PX4's yaw disagrees with motion capture",
+        id="yaw_disagrees", subject=Subject.MOCAP, on_lamp=Lamp.ESTIMATE, what="PX4's yaw disagrees with motion capture",
         predicate=mocap.yaw_disagrees, thresholds=("yaw_disagreement_deg",), hold_time=0.5, ground=None, air=_PX4_LANDS,
         message="PX4's yaw is {:.0f} deg from motion capture (limit {:.0f} deg)",
     ),
@@ -188,7 +188,8 @@ RULES: tuple[Rule, ...] = (
         message="messages from PX4 are {:.0f} ms late (limit {:.0f} ms)",
     ),
     Rule(
-        id="estimate_frozen", subject=Subject.PX4, what="new positions from PX4 repeat the same values although the vehicle is moving",
+        id="estimate_frozen", subject=Subject.PX4, on_lamp=Lamp.ESTIMATE,
+        what="new positions from PX4 repeat the same values although the vehicle is moving",
         predicate=px4.estimate_frozen, hold_time="vehicle_timeout_s", ground=None, air=_PX4_LANDS,
         message="PX4 repeats the same position and velocity although the vehicle is moving",
     ),
@@ -218,21 +219,22 @@ RULES: tuple[Rule, ...] = (
         message="PX4 reports that it is disarmed, at a height of {:.2f} m",
     ),
     Rule(
-        id="battery_warn", subject=Subject.PX4, what="remaining charge low", predicate=px4.battery_below,
+        id="battery_warn", subject=Subject.PX4, on_lamp=Lamp.BATTERY, what="remaining charge low", predicate=px4.battery_below,
         thresholds=("battery_warn",), hold_time=1.0, ground=_WARN, air=_WARN,
         message="battery at {:.0%} (limit {:.0%})",
     ),
     Rule(
-        id="battery_low", subject=Subject.PX4, what="remaining charge too low", predicate=px4.battery_below,
+        id="battery_low", subject=Subject.PX4, on_lamp=Lamp.BATTERY, what="remaining charge too low", predicate=px4.battery_below,
         thresholds=("battery_min",), hold_time=1.0, ground=_LAND, air=_LAND, message="battery at {:.0%} (limit {:.0%})",
     ),
     Rule(
-        id="battery_silent", subject=Subject.PX4, what="a battery is not reported any more, so that its charge is unknown",
+        id="battery_silent", subject=Subject.PX4, on_lamp=Lamp.BATTERY,
+        what="a battery is not reported any more, so that its charge is unknown",
         predicate=px4.battery_silent, ground=_LAND, air=_LAND,
         message="no BATTERY_STATUS of a battery for more than {:.0f} s: its charge is unknown",
     ),
     Rule(
-        id="battery_voltage", subject=Subject.PX4, what="voltage too low", predicate=px4.battery_voltage,
+        id="battery_voltage", subject=Subject.PX4, on_lamp=Lamp.BATTERY, what="voltage too low", predicate=px4.battery_voltage,
         thresholds=("battery_voltage_min_v",), hold_time=2.0, ground=_LAND, air=_LAND,
         message="battery at {:.1f} V (limit {:.1f} V)",
     ),
@@ -331,11 +333,11 @@ RULES: tuple[Rule, ...] = (
         message="no control tick for {:.0f} ms (limit {:.0f} ms)",
     ),
     Rule(
-        id="recorder_drops", subject=Subject.PROCESS, what="the recorder is dropping samples",
+        id="recorder_drops", subject=Subject.PROCESS, on_lamp=Lamp.RECORDER, what="the recorder is dropping samples",
         predicate=process.recorder_drops, ground=_WARN, air=_WARN, message="the recorder is dropping samples",
     ),
     Rule(
-        id="guardian_lost", subject=Subject.PROCESS, what="the guardian is dead or cannot take over",
+        id="guardian_lost", subject=Subject.PROCESS, on_lamp=Lamp.GUARDIAN, what="the guardian is dead or cannot take over",
         predicate=process.guardian_lost, ground=_LAND, air=_WARN, message="the guardian is dead or cannot take over",
     ),
 

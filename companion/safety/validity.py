@@ -7,12 +7,14 @@ from typing import Any, Final
 
 import msgspec
 
+from companion.model.listing import listed
 from companion.model.types import ArmState, AutopilotStatus, ForceSample, Inputs, MocapPose, Quat, Vec3, VehicleState
 from companion.safety.situation import Values
 
 OUT_OF_RANGE: Final = 1.0e4
 """Largest permitted value; no valid quantity reaches it in any unit."""
 _STAMP_MAX_S: Final = 1.0e9
+_NOT_CHECKED: Final = ("marker_error_m", "asked_s", "written_s")
 
 
 class InputFilter:
@@ -64,9 +66,22 @@ def invalid(field: str) -> Callable[[InputFilter, None], Values | None]:
     """Return the predicate that holds if this field of the inputs was invalid."""
 
     def predicate(f: InputFilter, _: None) -> Values | None:
-        return (f.invalid[field],) if field in f.invalid else None
+        return (_fault_of(f.invalid[field]),) if field in f.invalid else None
 
     return predicate
+
+
+def _fault_of(record: Any) -> str:
+    """Return the name and the value of the first field of an invalid record that is not valid."""
+    for name in record.__struct_fields__:
+        if name in _NOT_CHECKED:
+            continue
+        value = getattr(record, name)
+        limit = _STAMP_MAX_S if name.endswith("_s") and isinstance(value, float) else OUT_OF_RANGE
+        numbers = [one for one in (value if isinstance(value, tuple) else (value,)) if isinstance(one, float)]
+        if not all(-limit < one < limit for one in numbers) or (name == "attitude_wxyz" and not _is_rotation(value)):
+            return f"{name} = {listed(numbers, '.6g')}"
+    return "a field is out of range"
 
 
 # Chained comparisons: NaN fails them all. They are written out because a call in every tick costs more than the comparisons.

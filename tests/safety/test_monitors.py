@@ -457,6 +457,7 @@ def test_a_value_that_is_no_number_is_reported_and_its_record_counts_as_missing(
     value = bad if index is None else (*value[:index], bad, *value[index + 1 :])
     events = monitors.check(put(part, **{name: value})(healthy(2)), flying())
     assert [(event.id, event.action) for event in events] == [(f"{part}_not_finite", SafetyAction.WARN)]
+    assert f"ignored: {name} = " in events[0].text and f"{bad:g}" in events[0].text and len(events[0].text) < 120
     assert monitors.trusted is not None and getattr(monitors.trusted, part) is None
     good = healthy(3)
     assert monitors.check(good, flying()) == ()

@@ -1,8 +1,4 @@
-"""Health of each device according to the limits in the vehicle file, with the measured value. Pure.
-
-The limits are those of the safety monitors (`companion.safety.rules`): a value for which they land the vehicle or disable a device
-is BAD, one that causes a warning is WARN. The health is for display only; the monitors act on their own.
-"""
+"""Health lamps: each is the gravest active rule that it shows (`companion.safety.rules`), or its measured value. Pure."""
 
 from __future__ import annotations
 
@@ -14,15 +10,11 @@ from companion.ground.protocol.messages import DeviceHealth, HealthLevel
 from companion.model.estimator import EstimatorReport
 from companion.model.frames import wrap_rad, yaw_from_quat
 from companion.model.listing import listed
-from companion.model.servos import WATCHDOG_ERROR
-from companion.model.types import Inputs, Outputs, PhaseKind
-from companion.safety.arm import error_text
-from companion.safety.px4 import BATTERY_SILENT_S
+from companion.model.types import ActiveRule, Inputs, Outputs, PhaseKind, SafetyAction
+from companion.safety.rule import Lamp
+from companion.safety.rules import RULES
 
-DEVICE_NAMES = (
-    "PX4", "estimate", "motion capture", "arm", "force sensor", "loop", "recorder", "guardian", "battery", "tether",
-)  # fmt: skip
-"""Devices in display order."""
+_LAMP_OF = {rule.id: rule.lamp for rule in RULES}
 UNKNOWN_S = -math.inf
 
 
@@ -32,7 +24,6 @@ class WorstAges:
 
     vehicle_s: float = UNKNOWN_S
     """Age of the oldest of position, attitude and IMU sample from PX4."""
-    heartbeat_s: float = UNKNOWN_S
     mocap_s: float = UNKNOWN_S
     """Time since the datagram arrived."""
     arm_s: float = UNKNOWN_S
@@ -45,8 +36,6 @@ class WorstAges:
         if v is not None:
             oldest_s = min(v.position_stamp_s, v.attitude_stamp_s, v.imu_stamp_s)
             self.vehicle_s = max(self.vehicle_s, t_s - oldest_s)
-        if i.status is not None:
-            self.heartbeat_s = max(self.heartbeat_s, t_s - i.status.heartbeat_stamp_s)
         if i.mocap is not None:
             self.mocap_s = max(self.mocap_s, t_s - i.mocap.stamp_s)
         if i.arm is not None:
@@ -79,42 +68,52 @@ class Snapshot:
 
 
 class HealthEvaluator:
-    """Evaluates the health of all devices against the limits in a vehicle file."""
+    """Evaluates all lamps.
+
+    Args:
+        vehicle: its devices and the ages at which a rule would fire; half of such an age is a warning.
+    """
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._s = vehicle.safety
         self._tether = vehicle.tether
         self._external = vehicle.devices.mocap.external
         self._has_arm = bool(vehicle.arm.joints)
-        self._force_device = vehicle.devices.force
+        self._has_force_sensor = vehicle.devices.force is not None
         self._no_force = "momentum observer" if vehicle.force_source == OBSERVER else "none on this vehicle"
 
     def evaluate(self, snapshot: Snapshot) -> tuple[DeviceHealth, ...]:
-        """Return the health of all devices, in the order of `DEVICE_NAMES`."""
-        judged = (
-            self._px4(snapshot),
-            self._estimate(snapshot),
-            self._mocap(snapshot),
-            self._arm(snapshot),
-            self._force(snapshot),
-            self._loop(snapshot),
-            _recorder(snapshot),
-            _guardian(snapshot),
-            self._battery(snapshot),
-            self._tether_health(snapshot),
-        )
-        return tuple(DeviceHealth(name, light, text) for name, (light, text) in zip(DEVICE_NAMES, judged, strict=True))
+        """Return all lamps, in the order of `Lamp`."""
+        measured = {
+            Lamp.FLIGHT: _flight(snapshot),
+            Lamp.PX4: self._px4(snapshot),
+            Lamp.ESTIMATE: self._estimate(snapshot),
+            Lamp.MOCAP: self._mocap(snapshot),
+            Lamp.ARM: self._arm(snapshot),
+            Lamp.FORCE: self._force(snapshot),
+            Lamp.LOOP: _loop(snapshot),
+            Lamp.RECORDER: _recorder(snapshot),
+            Lamp.GUARDIAN: _guardian(snapshot),
+            Lamp.BATTERY: _battery(snapshot),
+            Lamp.TETHER: self._tether_health(snapshot),
+        }
+        gravest: dict[Lamp, ActiveRule] = {}
+        for rule in snapshot.outputs.active or ():
+            lamp = _LAMP_OF.get(rule.id, Lamp.FLIGHT)
+            if lamp not in gravest or rule.action.rank > gravest[lamp].action.rank:
+                gravest[lamp] = rule
+        return tuple(DeviceHealth(lamp, *_worse(*measured[lamp], gravest.get(lamp))) for lamp in Lamp)
 
     def _px4(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
-        status, ages, s = snapshot.inputs.status, snapshot.ages, self._s
-        if status is None and snapshot.inputs.vehicle is None:
-            return HealthLevel.OFF, "nothing received yet"
-        mode = f"{status.mode.value.upper()}, {'armed' if status.armed else 'disarmed'}" if status else "no heartbeat"
-        if status is None or ages.heartbeat_s > s.heartbeat_timeout_s:
-            return HealthLevel.BAD, f"no heartbeat for {ages.heartbeat_s:.1f} s" if status else mode
+        status, age_s = snapshot.inputs.status, snapshot.ages.vehicle_s
+        if status is None:
+            if snapshot.inputs.vehicle is None:
+                return HealthLevel.OFF, "nothing received yet"
+            return HealthLevel.BAD, "no heartbeat"
+        mode = f"{status.mode.value.upper()}, {'armed' if status.armed else 'disarmed'}"
         if snapshot.inputs.vehicle is None:
             return HealthLevel.WARN, f"no state yet, {mode}"
-        return _level_by_age(ages.vehicle_s, s.vehicle_timeout_s), f"{_age_text(ages.vehicle_s)}, {mode}"
+        return _level_by_age(age_s, self._s.vehicle_timeout_s), f"{_age_text(age_s)}, {mode}"
 
     def _estimate(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
         i, s, ages = snapshot.inputs, self._s, snapshot.ages
@@ -130,86 +129,35 @@ class HealthEvaluator:
         return _level_by_ratio(ratio), f"{apart_m * 100:.1f} cm, {turned_deg:.1f} deg from motion capture"
 
     def _mocap(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
-        mocap, s, rate_hz = snapshot.inputs.mocap, self._s, snapshot.mocap_rate_hz
+        mocap, age_s, rate_hz = snapshot.inputs.mocap, snapshot.ages.mocap_s, snapshot.mocap_rate_hz
         if self._external:
             return HealthLevel.OFF, "another program feeds PX4"
         if mocap is None:
             return HealthLevel.OFF, "no pose yet"
-        age_s, late_s = snapshot.ages.mocap_s, mocap.latency_s or 0.0
-        rate = f", {rate_hz:.0f} Hz" if rate_hz is not None else ""
-        text = f"{_age_text(age_s)}{rate}"
         if not mocap.tracking_valid:
             return HealthLevel.BAD, "rigid body not tracked"
-        if not late_s <= s.mocap_latency_max_s:
-            return HealthLevel.BAD, f"{late_s * 1e3:.0f} ms late"
-        light = _level_by_age(age_s, s.mocap_timeout_s)
-        if not snapshot.outputs.mocap_trusted and light is not HealthLevel.BAD:
-            return HealthLevel.BAD, "rejected: poses jump or are frozen"
-        if light is HealthLevel.OK and late_s > s.mocap_latency_warn_s:
-            return HealthLevel.WARN, f"{late_s * 1e3:.0f} ms late"
-        if light is HealthLevel.OK and rate_hz is not None and rate_hz < s.mocap_rate_min_hz:
-            return HealthLevel.WARN, text
-        return light, text
+        if not snapshot.outputs.mocap_trusted:
+            return HealthLevel.BAD, "poses are rejected"
+        rate = f", {rate_hz:.0f} Hz" if rate_hz is not None else ""
+        return _level_by_age(age_s, self._s.mocap_timeout_s), f"{_age_text(age_s)}{rate}"
 
     def _arm(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
-        arm, s, age_s = snapshot.inputs.arm, self._s, snapshot.ages.arm_s
+        arm, age_s = snapshot.inputs.arm, snapshot.ages.arm_s
         if not self._has_arm:
             return HealthLevel.OFF, "none on this vehicle"
         if arm is None:
             return HealthLevel.OFF, "no joint state yet"
-        hottest_c = max(arm.temperature_c)
         text = f"{_age_text(age_s)}, {listed(arm.temperature_c, '.0f', ' / ')} degC"
-        if any(error & ~WATCHDOG_ERROR for error in arm.hardware_error):
-            return HealthLevel.BAD, error_text(arm.hardware_error)
-        if hottest_c >= s.servo_max_c:
-            return HealthLevel.BAD, text
-        light = _level_by_age(age_s, s.arm_timeout_s)
-        if light is HealthLevel.OK and any(arm.hardware_error):
-            return HealthLevel.WARN, "the bus watchdog had switched torque off; it is on again"
-        if light is HealthLevel.OK and arm.read_failures >= s.arm_read_failures_max:
-            return HealthLevel.WARN, f"{arm.read_failures} bus cycles without an answer"
-        return HealthLevel.WARN if light is HealthLevel.OK and hottest_c >= s.servo_warn_c else light, text
+        return _level_by_age(age_s, self._s.arm_timeout_s), text
 
     def _force(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
-        force, age_s, device = snapshot.inputs.force, snapshot.ages.force_s, self._force_device
-        if device is None:
+        force, age_s = snapshot.inputs.force, snapshot.ages.force_s
+        if not self._has_force_sensor:
             return HealthLevel.OFF, self._no_force
         if force is None:
             return HealthLevel.OFF, "no sample yet"
-        size_n = math.hypot(*force.force_sensor_n)
-        light = _level_by_age(age_s, self._s.force_timeout_s)
-        if light is HealthLevel.OK and (force.overload or not size_n <= device.force_max_n):
-            return HealthLevel.WARN, f"overloaded: {size_n:.0f} N"
-        return light, f"{_age_text(age_s)}, {size_n:.1f} N"
-
-    def _loop(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
-        late_s, s = snapshot.ages.lateness_s, self._s
-        light = (
-            HealthLevel.BAD
-            if late_s > s.loop_stalled_s
-            else HealthLevel.WARN
-            if late_s > s.loop_late_s
-            else HealthLevel.OK
-        )
-        missed = f"{snapshot.missed} ticks missed" if snapshot.missed else "no tick missed"
-        return light, f"{late_s * 1e3:.1f} ms late at worst, {missed}"
-
-    def _battery(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
-        status, s = snapshot.inputs.status, self._s
-        voltage_v = status.battery_voltage_v if status is not None else None
-        remaining = status.battery_remaining if status is not None else None
-        parts = [f"{voltage_v:.1f} V"] if voltage_v is not None else []
-        parts += [f"{remaining * 100:.0f} %"] if remaining is not None else []
-        if not parts:
-            return HealthLevel.OFF, "not reported by PX4"
-        stamp_s = status.battery_stamp_s if status is not None else None
-        if stamp_s is not None and snapshot.inputs.t_s - stamp_s > BATTERY_SILENT_S:
-            return HealthLevel.BAD, f"not reported for {snapshot.inputs.t_s - stamp_s:.0f} s"
-        empty = remaining is not None and not remaining >= s.battery_min
-        if voltage_v is not None and s.battery_voltage_min_v is not None:
-            empty = empty or not voltage_v >= s.battery_voltage_min_v
-        warn = remaining is not None and remaining < s.battery_warn
-        return HealthLevel.BAD if empty else HealthLevel.WARN if warn else HealthLevel.OK, ", ".join(parts)
+        text = f"{_age_text(age_s)}, {math.hypot(*force.force_sensor_n):.1f} N"
+        return _level_by_age(age_s, self._s.force_timeout_s), text
 
     def _tether_health(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
         state, tether = snapshot.outputs.tether, self._tether
@@ -217,22 +165,43 @@ class HealthEvaluator:
             return HealthLevel.OFF, "none on this vehicle"
         if state is None:
             return HealthLevel.OFF, "not measured"
-        left = f"{state.slack_m:.2f} m left"
-        if state.separated:
-            return HealthLevel.BAD, "no longer holds the vehicle"
-        if state.snagged:
-            return HealthLevel.BAD, f"snagged: pulls with {state.pull_n:.0f} N, {left}"
-        if state.taut:
-            return HealthLevel.BAD, f"taut: pulls with {state.pull_n:.0f} N, {left}"
-        if snapshot.outputs.phase_kind in (PhaseKind.GROUND, PhaseKind.DONE):
-            return HealthLevel.OK, left
-        if not state.stop_slack_m >= self._s.tether_stop_slack_min_m:
-            return HealthLevel.BAD, f"{left}, {state.stop_slack_m:.2f} m where it could stop"
-        if abs(state.turns) > tether.turns_max:
-            return HealthLevel.BAD, f"wound: {state.turns:+.1f} turns, {left}"
-        if state.clearance_m < tether.clearance_min_m:
-            return HealthLevel.WARN, f"{state.clearance_m * 100:.0f} cm from the rotors or the arm, {left}"
-        return HealthLevel.WARN if state.stop_slack_m < tether.margin_m else HealthLevel.OK, left
+        near = _flies(snapshot.outputs) and state.stop_slack_m < tether.margin_m
+        return HealthLevel.WARN if near else HealthLevel.OK, f"{state.slack_m:.2f} m left"
+
+
+def _flies(outputs: Outputs) -> bool:
+    return outputs.phase_kind not in (PhaseKind.GROUND, PhaseKind.DONE)
+
+
+def _worse(level: HealthLevel, text: str, rule: ActiveRule | None) -> tuple[HealthLevel, str]:
+    """Return what the lamp shows: the rule, unless the measurement is worse or there is no rule."""
+    if rule is None or (level is HealthLevel.BAD and rule.action.rank < SafetyAction.HOLD.rank):
+        return level, text
+    return (HealthLevel.BAD if rule.action.rank >= SafetyAction.HOLD.rank else HealthLevel.WARN), rule.text
+
+
+def _flight(snapshot: Snapshot) -> tuple[HealthLevel, str]:
+    outputs = snapshot.outputs
+    if not _flies(outputs):
+        return HealthLevel.OFF, "on the ground"
+    return (
+        HealthLevel.OK,
+        f"{math.hypot(*outputs.control.error[0:3]):.2f} m off the reference" if outputs.control else "",
+    )
+
+
+def _loop(snapshot: Snapshot) -> tuple[HealthLevel, str]:
+    missed = f"{snapshot.missed} ticks missed" if snapshot.missed else "no tick missed"
+    return HealthLevel.OK, f"{snapshot.ages.lateness_s * 1e3:.1f} ms late at worst, {missed}"
+
+
+def _battery(snapshot: Snapshot) -> tuple[HealthLevel, str]:
+    status = snapshot.inputs.status
+    voltage_v = status.battery_voltage_v if status is not None else None
+    remaining = status.battery_remaining if status is not None else None
+    parts = [f"{voltage_v:.1f} V"] if voltage_v is not None else []
+    parts += [f"{remaining * 100:.0f} %"] if remaining is not None else []
+    return (HealthLevel.OK, ", ".join(parts)) if parts else (HealthLevel.OFF, "not reported by PX4")
 
 
 def _external_vision(report: EstimatorReport | None) -> tuple[HealthLevel, str]:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from companion.ground.protocol.messages import Presence, Stream
+from companion.ground.protocol.messages import HealthLevel, Presence, Stream
 from tests.ground.monitor_stub import (
     BROKER,
     NAME,
@@ -81,7 +81,10 @@ def test_values_are_those_of_the_newest_record(page: Page) -> None:
 def test_every_light_of_the_vehicle_is_shown_with_its_state(watched: Page, newest: Callable[[Stream], Message]) -> None:
     watched.show(newest(in_flight()))
     rows = watched.tab.locator("#light-list li")
-    shown = [(rows.nth(k).get_attribute("data-light"), rows.nth(k).locator(".text").inner_text()) for k in range(10)]
+    shown = [
+        (rows.nth(k).get_attribute("data-light"), rows.nth(k).locator(".text").inner_text())
+        for k in range(rows.count())
+    ]
     assert shown == [(light.light.value, light.text) for light in in_flight().lights]
 
 
@@ -204,8 +207,6 @@ def test_the_last_will_of_an_older_session_does_not_hide_a_flight(page: Page) ->
         ({"action": "land"}, "LANDING", "warn"),
         ({"kind": "landing"}, "LANDING", "ok"),
         ({"action": "terminate"}, "TERMINATED", "bad"),
-        ({"e_p_m": 0.5}, "FLYING", "warn"),
-        ({"e_p_m": 0.9}, "FLYING", "bad"),
     ],
 )
 def test_the_word_says_what_it_does_and_how_grave_that_is(
@@ -216,19 +217,16 @@ def test_the_word_says_what_it_does_and_how_grave_that_is(
 
 
 @pytest.mark.parametrize(
-    ("slack_m", "taut", "snagged", "level"),
-    [(1.0, False, False, "ok"), (0.2, False, False, "warn"), (0.03, True, False, "bad"), (1.0, False, True, "bad")],
+    ("tile", "lamp"), [("tether", "tether"), ("error", "flight"), ("battery", "battery"), ("latency", "loop")]
 )
-def test_tether_slack_shows_in_its_colour(
-    watched: Page, newest: Callable[[Stream], Message], slack_m: float, taut: bool, snagged: bool, level: str
+@pytest.mark.parametrize("level", [HealthLevel.OK, HealthLevel.WARN, HealthLevel.BAD])
+def test_a_figure_has_the_colour_of_its_lamp(
+    watched: Page, newest: Callable[[Stream], Message], tile: str, lamp: str, level: HealthLevel
 ) -> None:
-    tether = in_flight().tether
-    assert tether is not None
-    view = replace(tether, slack_m=slack_m, stop_slack_m=slack_m, taut=taut, snagged=snagged)
-    watched.show(newest(in_flight(tether=view)))
-    assert watched.figure("tether") == f"{slack_m:.2f}"
-    assert watched.tab.get_attribute(".tile:first-child", "data-level") == level
-    assert watched.body("level") == level
+    lights = tuple(replace(light, light=level) if light.name == lamp else light for light in in_flight().lights)
+    watched.show(newest(in_flight(lights=lights)))
+    assert watched.tab.get_attribute(f".tile:has([data-figure={tile}])", "data-level") == level.value
+    assert watched.body("level") == level.value
 
 
 def test_a_vehicle_without_tether_and_net_is_drawn_without_them(stub: MonitorStub, shared: Page) -> None:

@@ -2,22 +2,20 @@
 
 import { byId, make, setData, setText } from "./dom.js";
 import { fixed, NOTHING, norm, quantity, readable } from "./format.js";
-import { tetherLevel, trackingLevel } from "./verdict.js";
-
-const levelOf = (stream, name) => stream?.lights?.find((light) => light.name.toLowerCase().includes(name))?.light ?? "unknown";
+import { lampLevel } from "./verdict.js";
 
 /** The tiles: name, unit, decimals, and a function of (stream, scene) that returns value, note and level. */
 const TILES = [
   {
     id: "tether", title: "Tether slack", unit: "m", digits: 2,
     read: (s, scene) => ({
-      value: s.tether?.slack_m, level: tetherLevel(s.tether, scene),
+      value: s.tether?.slack_m, level: lampLevel(s, "tether"),
       note: s.tether ? `margin ${quantity(scene?.tether_margin_m, 2, "m")}` : scene && !scene.anchor_world_m ? "no tether" : "not known",
     }),
   },
   {
     id: "error", title: "Error", unit: "m", digits: 3,
-    read: (s, scene) => ({ value: s.e_p_m, level: trackingLevel(s.e_p_m, scene), note: scene ? `warn at ${quantity(scene.tracking_warn_m, 2, "m")}` : "" }),
+    read: (s, scene) => ({ value: s.e_p_m, level: lampLevel(s, "flight"), note: scene ? `warn at ${quantity(scene.tracking_warn_m, 2, "m")}` : "" }),
   },
   {
     id: "height", title: "Height", unit: "m", digits: 2,
@@ -27,12 +25,12 @@ const TILES = [
     id: "battery", title: "Battery", unit: "%", digits: 0,
     read: (s) => ({
       value: typeof s.battery_remaining === "number" ? s.battery_remaining * 100 : null,
-      level: levelOf(s, "battery"), note: quantity(s.battery_v, 1, "V"),
+      level: lampLevel(s, "battery"), note: quantity(s.battery_v, 1, "V"),
     }),
   },
   {
     id: "latency", title: "Latency", unit: "ms", digits: 1,
-    read: (s) => ({ value: s.timing.mocap_to_setpoint_ms, level: levelOf(s, "loop"), note: "mocap to PX4" }),
+    read: (s) => ({ value: s.timing.mocap_to_setpoint_ms, level: lampLevel(s, "loop"), note: "mocap to PX4" }),
   },
 ];
 

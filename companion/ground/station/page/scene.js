@@ -5,7 +5,7 @@ import { colours, levelColour } from "./colours.js";
 import { fitCanvas } from "./dom.js";
 import { fixed, quantity } from "./format.js";
 import { add, circle, hanging, LEVEL, mix, rotate } from "./geometry.js";
-import { tetherLevel } from "./verdict.js";
+import { lampLevel } from "./verdict.js";
 import { drawForce, drawGhost, drawMachine, drawShadow } from "./machine.js";
 import { Renderer } from "./renderer.js";
 
@@ -91,7 +91,7 @@ function drawRoom(renderer, { min, max }) {
 function drawReach(renderer, scene, stream, position) {
   const [ax, ay, az] = scene.anchor_world_m;
   const reach = scene.tether_length_m - scene.tether_margin_m;
-  const colour = levelColour(tetherLevel(stream?.tether, scene));
+  const colour = levelColour(lampLevel(stream, "tether"));
   const heights = [[scene.room_min_world_m[2], 0.45]];
   if (position) heights.push([position[2] + scene.attachment_body_m[2], 0.8]);
   for (const [z, alpha] of heights) {
@@ -130,9 +130,9 @@ const attachment = (scene, position, attitude) => add(position, rotate(attitude,
 
 function drawTether(renderer, scene, stream, position, attitude) {
   const end = attachment(scene, position, attitude);
-  const level = tetherLevel(stream.tether, scene);
+  const level = lampLevel(stream, "tether");
   // A taut tether is drawn straight, whatever its nominal length.
-  const points = level === "bad" ? [scene.anchor_world_m, end] : hanging(scene.anchor_world_m, end, scene.tether_length_m, scene.room_min_world_m[2]);
+  const points = stream.tether?.taut || stream.tether?.snagged ? [scene.anchor_world_m, end] : hanging(scene.anchor_world_m, end, scene.tether_length_m, scene.room_min_world_m[2]);
   renderer.line(points, colours.card, { width: 5.5, alpha: 0.7 });
   renderer.line(points, levelColour(level), { width: level === "bad" ? 4 : 2.8 });
 }
@@ -140,7 +140,7 @@ function drawTether(renderer, scene, stream, position, attitude) {
 function drawSlack(renderer, scene, stream, position, attitude) {
   const { tether } = stream;
   if (!tether) return;
-  const level = tetherLevel(tether, scene);
+  const level = lampLevel(stream, "tether");
   const word = tether.snagged ? "SNAGGED · " : tether.taut ? "TAUT · " : "";
   const end = attachment(scene, position, attitude);
   const [from, to] = [renderer.camera.project(scene.anchor_world_m), renderer.camera.project(end)];

@@ -1,6 +1,6 @@
 // Assessment of a vehicle's state for the top bar: status word, reason, level, age. Pure.
 
-import { age, quantity, readable } from "./format.js";
+import { age, readable } from "./format.js";
 
 /** Age at which data is stale. The page updates every 100 ms, so the banner appears within 0.5 s of the last message. */
 export const STALE_AFTER_S = 0.4;
@@ -15,19 +15,10 @@ const ACTIONS = {
 };
 const KINDS = { ground: "GROUND", takeoff: "TAKE-OFF", flight: "FLYING", landing: "LANDING", done: "LANDED" };
 
-/** Level of the tether: bad when taut or snagged, warn within the margin. */
-export function tetherLevel(tether, scene) {
-  if (!tether) return "unknown";
-  if (tether.taut || tether.snagged || tether.slack_m <= 0) return "bad";
-  const margin = scene?.tether_margin_m ?? 0;
-  return tether.slack_m < margin || tether.stop_slack_m < margin ? "warn" : "ok";
-}
-
-/** Level of ||e_p|| against the vehicle's own limits. */
-export function trackingLevel(e_p_m, scene) {
-  if (typeof e_p_m !== "number" || !scene) return "unknown";
-  if (e_p_m >= scene.tracking_abort_m) return "bad";
-  return e_p_m >= scene.tracking_warn_m ? "warn" : "ok";
+/** Level of a health lamp: that of the gravest rule of the vehicle's that is active, or of what it measures. */
+export function lampLevel(stream, name) {
+  const level = stream?.lights?.find((light) => light.name === name)?.light;
+  return level === undefined || level === "off" ? "unknown" : level;
 }
 
 /** The worse of two levels. */
@@ -104,9 +95,8 @@ function assessReplay(vehicle) {
   return { ...rest, ...assessStream(vehicle) };
 }
 
-function assessStream({ stream, scene }) {
+function assessStream({ stream }) {
   const acting = ACTIONS[stream.action];
-  const airborne = stream.kind === "takeoff" || stream.kind === "flight" || stream.kind === "landing";
   const onGround = stream.kind === "ground" || stream.kind === "done";
   let word = KINDS[stream.kind] ?? readable(stream.kind).toUpperCase();
   let level = stream.action === "warn" ? "warn" : "ok";
@@ -118,26 +108,11 @@ function assessStream({ stream, scene }) {
   }
   if (stream.waits_for_start) reasons.push("ready: waits for START");
   if (onGround && stream.armed) reasons.push("rotors are armed");
-  const found = problems(stream, scene, airborne);
-  for (const item of found) level = worse(level, item.level);
-  found.sort((a, b) => RANK[b.level] - RANK[a.level]);
-  return { word, level, why: [...found.map((item) => item.text), ...reasons].slice(0, 3).join(" · ") || "all is well" };
-}
-
-function problems(stream, scene, airborne) {
   const found = [];
   for (const light of stream.lights ?? []) {
     if (light.light === "warn" || light.light === "bad") found.push({ level: light.light, text: `${light.name}: ${light.text}` });
   }
-  const tether = tetherLevel(stream.tether, scene);
-  const reported = found.some((item) => item.text.startsWith("tether"));
-  if (airborne && !reported && (tether === "warn" || tether === "bad")) {
-    const how = stream.tether.snagged ? "tether snagged" : stream.tether.taut ? "tether taut" : "little tether left";
-    found.push({ level: tether, text: `${how}, slack ${quantity(stream.tether.slack_m, 2, "m")}` });
-  }
-  const tracking = trackingLevel(stream.e_p_m, scene);
-  if (airborne && (tracking === "warn" || tracking === "bad")) {
-    found.push({ level: tracking, text: `${quantity(stream.e_p_m, 2, "m")} off the reference` });
-  }
-  return found;
+  for (const item of found) level = worse(level, item.level);
+  found.sort((a, b) => RANK[b.level] - RANK[a.level]);
+  return { word, level, why: [...found.map((item) => item.text), ...reasons].slice(0, 3).join(" · ") || "all is well" };
 }
