@@ -22,6 +22,7 @@ from sitl.servo.model import ServoModel
 from sitl.servo.protocol import ALERT, Instruction, fast_status, packet, status
 from tests.fuzz.mutate import mutated
 from tests.fuzz.target import Endless, Target, Wrong, one_line
+from tests.support import DEADLINE_S
 
 IDS = (11, 12)
 _WATCHDOG_MS = 100
@@ -284,7 +285,7 @@ class DynamixelWireTarget(Target):
             await asyncio.sleep(0)  # the request is on its way now, its answer is not
             self._bus.inject(noise)
             await reading
-        async with asyncio.timeout(30.0):
+        async with asyncio.timeout(DEADLINE_S):
             while (state := await arm.read(1.0)) is None or state.read_failures:
                 pass
         if arm.problem:

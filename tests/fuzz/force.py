@@ -16,10 +16,10 @@ from companion.io.force_torque.rft import RATE_CODES, Command, Wrench
 from sitl.force_torque import ForceTorqueServer
 from tests.fuzz.mutate import mutated
 from tests.fuzz.target import Target, Wrong, one_line
+from tests.support import DEADLINE_S
 
 _SIZE_MAX_BYTES = 3000
 """A pty buffers 4095 bytes."""
-_DEADLINE_S = 20.0
 _ASKED = (Command.PRODUCT_NAME, Command.FIRMWARE_VERSION, Command.SET_RATE, Command.GET_RATE)
 _MARK_N = 20.0
 """Force of the last valid packet after an input; the two before it carry another one."""
@@ -42,7 +42,7 @@ class ForceTarget(Target):
         # The last samples of the stream may be under way still: they must not be taken for the answer to an input.
         self._sensor.inject(b"".join(self._marks))
         while (sample := self._edge.latest()) is None or sample.force_sensor_n[0] != _MARK_N:
-            if not select.select([self._fd], [], [], _DEADLINE_S)[0]:
+            if not select.select([self._fd], [], [], DEADLINE_S)[0]:
                 raise TimeoutError("the pty did not deliver")
             self._edge._on_readable()
         return self
@@ -84,7 +84,7 @@ class ForceTarget(Target):
         sent = data + b"".join(self._marks)
         self._sensor.inject(sent)
         while edge._received_bytes - received < len(sent):
-            if not select.select([self._fd], [], [], _DEADLINE_S)[0]:
+            if not select.select([self._fd], [], [], DEADLINE_S)[0]:
                 raise TimeoutError("the pty did not deliver")
             edge._on_readable()
             if edge._lost is not None:

@@ -24,11 +24,10 @@ from companion.model.types import FlightMode, VehicleState
 from tests.fuzz.mutate import mutated
 from tests.fuzz.target import Target, Wrong, one_line
 from tests.io.px4_peer import Px4Peer
-from tests.support import free_udp_port
+from tests.support import DEADLINE_S, free_udp_port
 
 _SIZE_MAX_BYTES = 1500
 _HEADER_BYTES, _CRC_BYTES, _STX = 10, 2, 0xFD
-_DEADLINE_S = 30.0
 
 
 class MemoryWire(UdpWire):
@@ -129,7 +128,7 @@ class MavlinkWireTarget(Target):
         port = free_udp_port()
         self._peer = Px4Peer(port)
         self._peer.__enter__()
-        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=_DEADLINE_S)
+        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
         self._edge = MavsdkAutopilot(device, time.monotonic)
         self._loop.run_until_complete(self._edge.__aenter__())
         self._peer.beating = False
@@ -154,7 +153,7 @@ class MavlinkWireTarget(Target):
         peer._socket.sendto(data, peer.remote)
         self._offboard = not self._offboard
         expected = FlightMode.OFFBOARD if self._offboard else FlightMode.HOLD
-        deadline_s = time.monotonic() + _DEADLINE_S
+        deadline_s = time.monotonic() + DEADLINE_S
         heartbeat = _heartbeat(6 << 16 if self._offboard else 4 << 16 | 3 << 24)
         # The parser may take the first ones for the rest of a damaged message.
         while (status := edge.status()) is None or status.mode != expected:

@@ -21,13 +21,13 @@ from sitl.natnet import BodyPose, NatNetServer, encode_frame, encode_model_defin
 from tests.fuzz.mutate import mutated
 from tests.fuzz.target import Target, Wrong, one_line
 from tests.io.natnet_bytes import LATER, all_definitions, full_frame, numbers
+from tests.support import DEADLINE_S
 
 VERSIONS = ("3.0", "4.1", "4.0", "4.2", LATER)
 """One version of each layout. Kept inputs name them by their place."""
 _BODY_ID = 1
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 _DATAGRAM_MAX_BYTES = 60_000
-_DELIVERY_DEADLINE_S = 20.0
 _FRESH = 0x80
 """Bit of an input's first byte: the driver knows no server yet. The lower bits select the version."""
 
@@ -91,7 +91,7 @@ class _Rig:
             "rigid_body_id": _BODY_ID,
             "up_axis": "y" if version == "3.0" else "z",
         }
-        deadline_s = _DELIVERY_DEADLINE_S
+        deadline_s = DEADLINE_S
         rig.edge = NatNetMocap(
             MocapDevice.model_validate(fields), rig.clock, rig.on_pose, connect_timeout_s=deadline_s, body_timeout_s=deadline_s
         )  # fmt: skip
@@ -176,7 +176,7 @@ class _Rig:
 
     def _wait(self) -> bool:
         """Wait for a datagram; return False if none arrived."""
-        return bool(select.select([self.socket], [], [], _DELIVERY_DEADLINE_S)[0])
+        return bool(select.select([self.socket], [], [], DEADLINE_S)[0])
 
     def _take_what_waits(self) -> None:
         """Read the last frames of the server that the driver connected to."""

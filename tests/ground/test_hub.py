@@ -16,6 +16,7 @@ from companion.ground.station.hub import FRESH_S, OUTBOX_MAX, TOO_SLOW, Hub, Out
 from companion.ground.station.vehicles import LIVE_S, VEHICLES_MAX, ReceivedRecord, VehicleTracker
 from companion.ground.station.web_guard import MESSAGES_BURST, RateLimiter, host_allowed, origin_allowed, same_token
 from tests.ground.vehicle import ack_of, flight, state_of
+from tests.support import DEADLINE_S
 
 SESSION = "s1"
 
@@ -28,7 +29,7 @@ def took(outbox: Outbox) -> list[Any]:
     """Return the content of an outbox."""
 
     async def take() -> list[str]:
-        async with asyncio.timeout(10.0):
+        async with asyncio.timeout(DEADLINE_S):
             return await outbox.take()
 
     return [json.loads(text) for text in asyncio.run(take())]

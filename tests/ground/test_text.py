@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+import math
 import os
 import pty
 import re
@@ -34,6 +35,7 @@ from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, played
 from tests.ground.vehicle import flight, played_vehicle, state_of
 from tests.support import ROOT
 
+AGAIN_S = 5.0
 AROUND = StationStatus("connected to mqtt://127.0.0.1:1883", True, "anna", None)
 
 
@@ -151,9 +153,15 @@ class Terminal:
     def press(self, keys: str) -> None:
         os.write(self.ours, keys.encode())
 
-    async def shows(self, text: str) -> None:
-        """Wait until text is drawn; earlier output does not count."""
+    async def shows(self, text: str, *, on: str = "") -> None:
+        """Wait until text is drawn; earlier output does not count. The keys `on` are pressed now, and again after `AGAIN_S`: a command
+        that has waited for a core for too long is refused.
+        """
+        pressed_s = -math.inf
         while text not in plain(self._screen):
+            if on and time.monotonic() - pressed_s > AGAIN_S:
+                self.press(on)
+                pressed_s = time.monotonic()
             self._screen += (await asyncio.to_thread(os.read, self.ours, 65536)).decode("utf-8", "replace")
         self._screen = ""
 
@@ -215,14 +223,12 @@ async def test_it_shows_commands_and_leaves_the_terminal_as_it_was(broker: Broke
     async with played_vehicle(broker.port, OPERATORS) as vehicle, terminal_at(broker, tmp_path) as terminal:
         await terminal.shows("FLYING")
         for key, name in (("h", "hold"), ("L", "land"), ("a", "abort")):
-            terminal.press(key)
-            await terminal.shows(f"rig: {name}: {name}: done (anna)")
+            await terminal.shows(f"rig: {name}: {name}: done (anna)", on=key)
         terminal.press("s")
         await terminal.shows("start? press s again")
         terminal.press("r")
         await terminal.shows("resume? press r again")
-        terminal.press("r")
-        await terminal.shows("rig: resume: resume: done (anna)")
+        await terminal.shows("rig: resume: resume: done (anna)", on="rr")
         # One whose answer is late is sent again.
         assert list(dict.fromkeys(heard.command.value for heard in vehicle.accepted)) == [
             "hold",
@@ -258,13 +264,11 @@ async def test_the_next_vehicle(broker: Broker, tmp_path: Path) -> None:
     ):
         await terminal.shows("n: next of one, two")
         await terminal.shows("FLYING")  # a vehicle whose stream has not come yet gets no commands
-        terminal.press("h")
-        await terminal.shows(": hold: hold: done (anna)")
+        await terminal.shows(": hold: hold: done (anna)", on="h")
         first, second = (one, two) if one.accepted else (two, one)
         terminal.press("n")
         await terminal.shows(f"{second.name}   FLYING")
-        terminal.press("h")
-        await terminal.shows(f"{second.name}: hold: hold: done (anna)")
+        await terminal.shows(f"{second.name}: hold: hold: done (anna)", on="h")
         for vehicle in (first, second):  # a HOLD whose answer is late is sent again
             assert {heard.command for heard in vehicle.accepted} == {CommandName.HOLD}
 

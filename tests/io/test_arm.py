@@ -32,7 +32,7 @@ from sitl.servo import registers as reg
 from sitl.servo.bus import ServoBus
 from sitl.servo.kinds import KINDS
 from sitl.servo.model import ServoModel
-from tests.support import plugged
+from tests.support import DEADLINE_S, plugged
 
 KT = 1.3
 NM_PER_COUNT = KT * 2.69e-3
@@ -41,8 +41,6 @@ JOINTS = (
     Joint(servo_id=12, sign=1, zero_count=1024, angle_deg=(-150, 150), torque_max_nm=1.5),
 )
 START_DEG = (165.0, 140.0)
-LONG_S = 30.0
-"""No test measures time: this only ends a run that hangs."""
 
 
 def arm_config(*joints: Joint, torque_per_amp_nm_a: float | None = KT) -> ArmConfig:
@@ -95,7 +93,7 @@ async def flying_arm(**device: Any) -> AsyncIterator[Setup]:
 def fly(scenario: Callable[[Setup], Awaitable[None]], **device: Any) -> None:
     async def main() -> None:
         async with flying_arm(**device) as setup:
-            await asyncio.wait_for(scenario(setup), LONG_S)
+            await asyncio.wait_for(scenario(setup), DEADLINE_S)
 
     asyncio.run(main())
     assert_nothing_left()
@@ -311,7 +309,7 @@ def test_leaving_lets_go_of_the_arm() -> None:
                 pass  # closed and unlocked
             return setup.servos
 
-    servos = asyncio.run(asyncio.wait_for(main(), LONG_S))
+    servos = asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
     for servo in servos:
         assert (register(servo, 102, 2), register(servo, 64), register(servo, 98)) == (0, 0, 0)
     assert_nothing_left()
@@ -329,7 +327,7 @@ def test_leaving_a_dead_bus_is_quiet_and_ends() -> None:
             await arm.__aexit__(None, None, None)
             assert_nothing_left()
 
-    asyncio.run(asyncio.wait_for(main(), LONG_S))
+    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
 
 
 def test_unplugged_port_counts_as_failures_and_leaving_ends() -> None:
@@ -344,7 +342,7 @@ def test_unplugged_port_counts_as_failures_and_leaving_ends() -> None:
         assert_nothing_left()
 
     before = set(os.listdir("/proc/self/fd"))
-    asyncio.run(asyncio.wait_for(main(), LONG_S))
+    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
     assert set(os.listdir("/proc/self/fd")) == before
 
 
@@ -374,7 +372,7 @@ def test_a_port_that_comes_back_under_its_name_is_read_again_and_moves_nothing_b
                     await arm.__aexit__(None, None, None)
                     await until(lambda: [register(servo, 64) for servo in servos] == [0, 0])
 
-    asyncio.run(asyncio.wait_for(main(), LONG_S))
+    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
     assert_nothing_left()
 
 
@@ -396,7 +394,7 @@ def test_servos_that_lost_their_power_with_the_port_keep_their_torque_off(tmp_pa
                     assert state.stamp_s == lost.stamp_s
                     assert [register(servo, 64) for servo in servos] == [0, 0]
 
-    asyncio.run(asyncio.wait_for(main(), LONG_S))
+    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
     assert_nothing_left()
 
 
@@ -420,7 +418,7 @@ def test_cancelled_opening_leaves_nothing_behind() -> None:
                 pass
         return servos
 
-    servos = asyncio.run(asyncio.wait_for(main(), LONG_S))
+    servos = asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
     assert [register(servo, 64) for servo in servos] == [0, 0]
 
 
@@ -434,7 +432,7 @@ def test_other_baud_rates_work(baud: int) -> None:
         ):
             await state_when(arm, lambda s: s.read_failures == 0)
 
-    asyncio.run(asyncio.wait_for(main(), LONG_S))
+    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
 
 
 # --- refusals -------------------------------------------------------------------------------------------------------------
@@ -537,7 +535,7 @@ def test_three_models_on_one_bus_are_each_driven_in_their_own_units() -> None:
             assert state.torque_nm == pytest.approx(sent_nm, rel=1e-9)
             assert state.angle_rad == pytest.approx((0.5, 0.5, 0.5), abs=0.002)
 
-    asyncio.run(asyncio.wait_for(main(), LONG_S))
+    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
     assert_nothing_left()
 
 
@@ -604,7 +602,7 @@ def test_servos_left_in_odd_states_are_taken_over() -> None:
                 assert [register(servo, a) for a in (9, 11, 64, 68, 98)] == [0, 0, 1, 2, 5]
                 assert register(servo, 102, 2) == 0
 
-    asyncio.run(asyncio.wait_for(main(), LONG_S))
+    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
 
 
 def test_noise_on_the_line_costs_reads_not_the_thread() -> None:
@@ -666,7 +664,7 @@ def test_a_read_begins_at_its_time_or_when_it_is_wanted() -> None:
         assert state.written_s < state.asked_s
         assert await setup.arm.read(0.0) is state
         setup.arm.begin_read(setup.clock() + 3600.0)
-        wanted = await setup.arm.read(LONG_S)
+        wanted = await setup.arm.read(DEADLINE_S)
         assert wanted is not None
         assert wanted.stamp_s > state.stamp_s
 
@@ -717,5 +715,5 @@ def test_the_edge_shows_both_servos_as_it_left_them() -> None:
             )
             assert (second.servo_id, second.current_limit_counts, second.voltage_v) == (12, 900, 12.0)
 
-    asyncio.run(asyncio.wait_for(main(), LONG_S))
+    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
     assert_nothing_left()

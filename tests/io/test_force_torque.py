@@ -20,9 +20,8 @@ from companion.io.protocols import DeviceError, ForceTorque
 from companion.model.types import ForceSample
 from companion.runtime.clock import flight_clock
 from sitl.force_torque import ForceTorqueServer
-from tests.support import plugged, serial_line
+from tests.support import DEADLINE_S, plugged, serial_line
 
-WAIT_S = 20.0
 # 0x55AA and -0x55AB in counts: SOP and EOP in the payload, both ways round.
 AWKWARD = Wrench(
     force_n=(0x55AA / 50, -0x55AB / 50, 0x5555 / 50),
@@ -113,7 +112,7 @@ def device_on(port: str, **changes: object) -> ForceDevice:
     return ForceDevice.model_validate({"port": port} | changes)
 
 
-def driver(port: str, answer_timeout_s: float = WAIT_S, **changes: object) -> RobotousForceTorque:
+def driver(port: str, answer_timeout_s: float = DEADLINE_S, **changes: object) -> RobotousForceTorque:
     return RobotousForceTorque(device_on(port, **changes), flight_clock(), answer_timeout_s=answer_timeout_s)
 
 
@@ -137,7 +136,7 @@ async def world(server: ForceTorqueServer) -> AsyncIterator[None]:
 
 async def sample_with(edge: RobotousForceTorque, force_x_n: float) -> ForceSample:
     """The first sample that shows a force."""
-    async with asyncio.timeout(WAIT_S):
+    async with asyncio.timeout(DEADLINE_S):
         while True:
             for sample in await edge.tare_samples(0.005):
                 if sample.force_sensor_n[0] == force_x_n:
@@ -162,7 +161,7 @@ def test_samples_arrive_quantised() -> None:
                 server.set_wrench((5.0, 0.0, 0.0), (0.0, 0.0, 0.0))
                 later = await sample_with(edge, 5.0)
                 assert later.stamp_s >= sample.stamp_s
-            async with asyncio.timeout(WAIT_S):
+            async with asyncio.timeout(DEADLINE_S):
                 while server.streaming:  # noqa: ASYNC110 - the STOP is read by another task, no event to wait for
                     await asyncio.sleep(0.001)
 
@@ -261,7 +260,7 @@ def test_in_flight_the_ticks_read_the_port() -> None:
                 edge.read_in_ticks()
                 server.set_wrench((5.0, 0.0, 0.0), (0.0, 0.0, 0.0))
                 before = edge.counts().samples
-                async with asyncio.timeout(WAIT_S):
+                async with asyncio.timeout(DEADLINE_S):
                     while (sample := edge.latest()) is None or sample.force_sensor_n[0] != 5.0:  # noqa: ASYNC110 - as the ticks do
                         await asyncio.sleep(0.005)
                 assert edge.counts().samples > before
@@ -327,7 +326,7 @@ def test_another_device_under_its_name_is_not_read_as_the_sensor(tmp_path: Path)
 
 async def looked_at(edge: RobotousForceTorque, condition: Callable[[ForceSample], bool]) -> None:
     """Look at the newest sample, as the ticks do, until the condition holds."""
-    async with asyncio.timeout(WAIT_S):
+    async with asyncio.timeout(DEADLINE_S):
         while (sample := edge.latest()) is None or not condition(sample):  # noqa: ASYNC110 - as the ticks do
             await asyncio.sleep(0.005)
 
@@ -437,7 +436,7 @@ class Line:
 
     async def receive(self, count: int) -> list[bytes]:
         found: list[bytes] = []
-        async with asyncio.timeout(WAIT_S):
+        async with asyncio.timeout(DEADLINE_S):
             while len(found) < count:
                 await asyncio.sleep(0.001)
                 found += self.read()
@@ -482,7 +481,7 @@ def test_frames_follow_the_world_clock() -> None:
             with Line(server) as line:
                 server.tick(0.0)
                 await line.send(Command.START)
-                async with asyncio.timeout(WAIT_S):
+                async with asyncio.timeout(DEADLINE_S):
                     while not server.streaming:  # noqa: ASYNC110 - the server reads in a callback
                         await asyncio.sleep(0.001)
                 for k in range(201):  # 0.2 s of world time, however long it takes
@@ -510,7 +509,7 @@ def test_nobody_reads() -> None:
         async with ForceTorqueServer() as server:
             with Line(server) as line:
                 await line.send(Command.START)
-                async with asyncio.timeout(WAIT_S):
+                async with asyncio.timeout(DEADLINE_S):
                     while not server.streaming:  # noqa: ASYNC110 - the server reads in a callback
                         await asyncio.sleep(0.001)
                 for k in range(20_000):

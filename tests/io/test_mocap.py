@@ -26,11 +26,11 @@ from companion.model.types import MocapPose
 from companion.runtime.clock import flight_clock
 from sitl.natnet import BodyPose, NatNetServer
 from tests.io.natnet_bytes import LATER, VERSIONS
+from tests.support import DEADLINE_S
 
 GROUP = "239.255.42.99"
 POSE = BodyPose(1, (-1.25, 0.5, 1.0), (0.5, -0.5, 0.5, 0.5), error_m=0.00025)
 STRANGER = BodyPose(4, (3.0, 3.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-WAIT_S = 20.0
 Transport = Literal["multicast", "unicast"]
 
 
@@ -75,7 +75,7 @@ class Inbox:
         self.queue.put_nowait(pose)
 
     async def next(self) -> MocapPose:
-        return await asyncio.wait_for(self.queue.get(), WAIT_S)
+        return await asyncio.wait_for(self.queue.get(), DEADLINE_S)
 
     def clear(self) -> None:
         while not self.queue.empty():
@@ -83,10 +83,10 @@ class Inbox:
 
 
 def mocap(
-    device: MocapDevice, on_pose: Callable[[MocapPose], None] | None = None, body_timeout_s: float = WAIT_S
+    device: MocapDevice, on_pose: Callable[[MocapPose], None] | None = None, body_timeout_s: float = DEADLINE_S
 ) -> NatNetMocap:
     return NatNetMocap(
-        device, flight_clock(), on_pose or Inbox(), connect_timeout_s=WAIT_S, body_timeout_s=body_timeout_s
+        device, flight_clock(), on_pose or Inbox(), connect_timeout_s=DEADLINE_S, body_timeout_s=body_timeout_s
     )
 
 
@@ -201,7 +201,7 @@ async def quiet_after_opening(
 
 async def until(condition: Callable[[], bool]) -> None:
     """Wait for something that a socket callback does."""
-    async with asyncio.timeout(WAIT_S):
+    async with asyncio.timeout(DEADLINE_S):
         while not condition():  # noqa: ASYNC110 - datagrams set no event
             await asyncio.sleep(0.001)
 
@@ -212,7 +212,7 @@ def test_newest_of_the_waiting_frames_wins() -> None:
         async with quiet_after_opening(inbox) as (server, edge):
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as witness:
                 witness.bind(("127.0.0.1", 0))
-                witness.settimeout(WAIT_S)
+                witness.settimeout(DEADLINE_S)
                 witness.sendto(natnet.encode_connect(), ("127.0.0.1", server.command_port))
                 await until(lambda: len(server.unicast_clients) == 2)
                 inbox.clear()

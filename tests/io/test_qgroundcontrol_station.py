@@ -46,9 +46,8 @@ from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import POSITION_NED_M, Px4Peer
 from tests.io.qgroundcontrol_peer import GroundPeer
 from tests.io.stub_rig import standing_stub
-from tests.support import CATCH, eventually, free_udp_port
+from tests.support import CATCH, DEADLINE_S, eventually, free_udp_port
 
-DEADLINE_S = 30.0
 LEVEL = AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.2)
 HOLD_MODE = (4 << 16) | (3 << 24)
 PILOT_MODE = 3 << 16

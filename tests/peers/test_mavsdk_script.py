@@ -13,10 +13,9 @@ import pytest
 from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
 from tests.sitl.px4_rig import Rig
-from tests.support import free_udp_port
+from tests.support import DEADLINE_S, free_udp_port
 
 SCRIPT = Path(__file__).with_name("mavsdk_mission.py")
-DEADLINE_S = 150.0
 
 
 async def fly_script(rig: Rig) -> tuple[int, list[dict[str, Any]], str, float]:

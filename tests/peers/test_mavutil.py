@@ -10,8 +10,7 @@ from pymavlink import mavutil
 
 from sitl.autopilot.mavlink import MavlinkServer, Ports
 from tests.sitl.px4_rig import Rig
-
-DEADLINE_S = 30.0
+from tests.support import DEADLINE_S
 
 
 def ground_script(connection: Any) -> dict[str, Any]:
@@ -46,7 +45,7 @@ def test_mavutil_sees_the_heartbeat_and_reads_every_parameter() -> None:
                 async with asyncio.TaskGroup() as group:
                     group.create_task(rig.fly(server, stop))
                     try:
-                        seen = await asyncio.wait_for(asyncio.to_thread(ground_script, connection), 3 * DEADLINE_S)
+                        seen = await asyncio.wait_for(asyncio.to_thread(ground_script, connection), DEADLINE_S)
                     finally:
                         stop.set()
             finally:

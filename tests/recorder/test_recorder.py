@@ -35,9 +35,9 @@ from companion.model.types import (
     Severity,
 )
 from companion.recorder.client import RecorderClient, RecorderProcess, epoch_offset_ns
+from tests.support import DEADLINE_S
 
 EPOCH_NS = 1_700_000_000_000_000_000
-DEADLINE_S = 60.0
 
 
 def tick(k: int, text: str = "") -> tuple[Inputs, Outputs, Sent]:
@@ -221,6 +221,7 @@ sys.path.insert(0, sys.argv[2])
 from pathlib import Path
 from companion.recorder.client import RecorderProcess
 from tests.recorder.test_recorder import tick, EPOCH_NS
+from tests.support import DEADLINE_S
 recorder = RecorderProcess.start(Path(sys.argv[1]), config_json="{}", epoch_offset_ns=EPOCH_NS, deadline_s=60.0)
 print(recorder.process.pid, flush=True)
 k = 0

@@ -19,6 +19,7 @@ from companion.io.mocap.natnet import Malformed, Message
 from companion.model.types import Quat
 from sitl.natnet import CLOCK_FREQUENCY_HZ, BodyPose, NatNetServer, encode_frame, encode_model_definitions
 from tests.io.natnet_bytes import LATER, VERSIONS, full_frame, numbers
+from tests.support import DEADLINE_S
 
 NAMES = {1: "quad", 5: "ball"}
 TURNED: Quat = (0.5, -0.5, 0.5, 0.5)
@@ -188,7 +189,7 @@ class Client:
         self._socket.sendto(datagram, self._server)
 
     async def receive(self, expected: Message) -> bytes:
-        datagram = await asyncio.wait_for(asyncio.get_running_loop().sock_recv(self._socket, 65535), 10.0)
+        datagram = await asyncio.wait_for(asyncio.get_running_loop().sock_recv(self._socket, 65535), DEADLINE_S)
         assert natnet.message_id(datagram) == expected
         return datagram
 

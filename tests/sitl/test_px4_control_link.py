@@ -25,10 +25,9 @@ from sitl.px4.parameters import parameters, rotor_geometry
 from sitl.px4.process import Instance
 from sitl.px4.relay import Relay
 from tests.sitl.px4_rig import Rig
+from tests.support import DEADLINE_S
 
 VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
-
-DEADLINE_S = 20.0
 
 
 @contextlib.asynccontextmanager

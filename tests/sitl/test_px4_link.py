@@ -14,8 +14,8 @@ from sitl.autopilot.types import ImuSample
 from sitl.px4 import hil_link as px4_link
 from sitl.px4.hil_link import HilSensors, Px4Error, SimulatorLink, field_frd_gauss, pressure_hpa
 from tests.sitl.px4_peer import Answer, LockstepPeer
+from tests.support import DEADLINE_S
 
-DEADLINE_S = 20.0
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 PERIOD_S = 0.004
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from sitl.autopilot.params import Value
 from sitl.px4.hil_link import Px4Error
 from sitl.px4.parameter_file import NAME, decode, restore, stored
+from tests.support import DEADLINE_S
 
-DEADLINE_S = 20.0
 NAMES = st.text("ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_", min_size=1, max_size=16)
 VALUES = st.one_of(st.integers(-(2**31), 2**31 - 1), st.floats(allow_nan=False, allow_infinity=False))
 

@@ -15,8 +15,7 @@ from sitl.autopilot.types import ImuSample
 from sitl.px4.hil_link import HilSensors, Px4Error, SimulatorLink
 from sitl.px4.process import Installation, Instance, Px4Process, find
 from tests.sitl import px4_peer
-
-DEADLINE_S = 20.0
+from tests.support import DEADLINE_S
 
 
 def installed(folder: Path, script: str = "") -> Path:

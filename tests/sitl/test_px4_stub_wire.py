@@ -12,8 +12,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.autopilot.mavlink import LinkError, MavlinkServer, Ports
 from tests.sitl.px4_rig import Rig
-
-DEADLINE_S = 10.0
+from tests.support import DEADLINE_S
 
 
 class Peer:

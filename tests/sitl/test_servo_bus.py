@@ -15,6 +15,7 @@ from sitl.servo.bus import ServoBus, ServoLine
 from sitl.servo.model import RAD_PER_COUNT, ServoModel
 from sitl.servo.protocol import HEADER, Instruction, PacketParser, StatusError, packet, status, stuff, unstuff
 from tests.sitl.test_servo_model import get
+from tests.support import DEADLINE_S
 
 AMP = 2.69e-3
 
@@ -222,7 +223,7 @@ async def _wait_for_bytes(fd: int, size: int) -> bytes:
         ready = loop.create_future()
         loop.add_reader(fd, ready.set_result, None)
         try:
-            await asyncio.wait_for(ready, 20.0)
+            await asyncio.wait_for(ready, DEADLINE_S)
         finally:
             loop.remove_reader(fd)
         data += os.read(fd, size - len(data))
