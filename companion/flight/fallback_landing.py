@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import socket
 from typing import Protocol
 
 from companion.config.loader import FlightConfig
 from companion.flight.heartbeat import FlightGuard
 from companion.model.flight_stage import flown_by_pilot
-from companion.model.types import AttitudeSetpoint, AutopilotRequest, AutopilotStatus, Outcome
+from companion.model.types import AutopilotRequest, AutopilotStatus, Outcome
 from companion.runtime import ipc
 from companion.runtime.clock import Clock
 
@@ -28,9 +27,6 @@ class Lander(Protocol):
 
     def status(self) -> AutopilotStatus | None:
         """Return the latest status."""
-
-    def send_attitude(self, setpoint: AttitudeSetpoint | None) -> bool:
-        """Send a setpoint; None stops the setpoints."""
 
     def request(self, request: AutopilotRequest) -> None:
         """Start a request."""
@@ -50,9 +46,6 @@ async def land_without_core(
     Returns:
         ABORTED once PX4 has disarmed, LOST if it does not disarm within `LANDING_TIMEOUT_S`.
     """
-    # MAVSDK's Offboard plugin would keep repeating the last setpoint, and PX4's own failsafe would never act.
-    with contextlib.suppress(Exception):  # LAND must be requested after any error
-        autopilot.send_attitude(None)
     start_s = clock()
     while clock() - start_s < LANDING_TIMEOUT_S:
         now = autopilot.status()

@@ -160,12 +160,12 @@ def assert_stopped_as_modelled(sandbox: Sandbox, kind: str) -> None:
 
 
 @faults("kill_flight", "hold_gil", on_stub="hold_gil")
-def test_through_mavsdks_offboard_plugin_the_guardian_lands_as_well(
+def test_with_setpoints_straight_onto_the_link_the_guardian_lands_as_well(
     sandbox: Sandbox, autopilot: str, kind: str
 ) -> None:
-    """The other setpoint path, whose thread repeats the last setpoint for as long as the process lives and the interpreter is free."""
+    """The other setpoint path, without MAVSDK's Offboard plugin."""
     fault = f"world.faults=[{{kind: {kind}, after: catch, t_s: 0.1}}]"
-    path = "vehicle.devices.autopilot.setpoint_path=offboard"
+    path = "vehicle.devices.autopilot.setpoint_path=direct"
     ended = sandbox.run("fly", SHORT_CATCH, f"--sitl={autopilot}", "--out", "out", "--set", fault, path)
     sandbox.assert_nobody_left()
     assert_landed_by_the_guardian(sandbox, ended, kind)

@@ -90,32 +90,40 @@ async def counted(peer: Px4Peer, for_s: float) -> int:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_what_a_caller_who_falls_silent_leaves_behind(way: Way) -> None:
-    """The difference between the two ways, and why the first is the default."""
+def test_each_setpoint_leaves_once_and_a_caller_who_falls_silent_leaves_nothing_behind(way: Way) -> None:
+    """A thread of the plugin repeats the last one at 20 Hz: PX4's failsafe would not see that the flight loop hangs."""
 
     async def fly() -> None:
         port = free_udp_port()
         with Px4Peer(port) as peer:
             async with edge(port, way) as autopilot:
                 await fly_in_offboard(peer, autopilot)
-                assert (await counted(peer, 1.0) > 0) is (way == "offboard")
+                assert await counted(peer, 1.0) == 0
+                for k in range(10):
+                    assert autopilot.send_attitude(AttitudeSetpoint(LEVEL.attitude_wxyz, 0.1 + 0.05 * k))
+                await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET", 11)
+                assert autopilot.send_attitude(None) is False
+                assert await counted(peer, 0.5) == 0
+                sent = [target.thrust for target in peer.of("SET_ATTITUDE_TARGET")]
+                assert sent == pytest.approx([LEVEL.thrust] + [0.1 + 0.05 * k for k in range(10)])
             assert await counted(peer, 0.5) == 0, "the edge is left"
 
     asyncio.run(fly())
 
 
-def test_a_flight_loop_that_wants_silence_ends_the_plugins_repeating() -> None:
-    """A pilot flies, or PX4 lands: the core has no setpoint, and the last one must not be repeated."""
+def test_what_the_plugin_does_not_send_in_time_leaves_straight_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("companion.io.px4.setpoints.PLUGIN_MAX_S", 0.0)
 
     async def fly() -> None:
         port = free_udp_port()
         with Px4Peer(port) as peer:
             async with edge(port, "offboard") as autopilot:
                 await fly_in_offboard(peer, autopilot)
-                assert autopilot.send_attitude(None) is False
-                assert await counted(peer, 1.0) == 0
-                assert autopilot.send_attitude(LEVEL), "and it can begin again"
-                assert await counted(peer, 1.0) > 0
+                for _ in range(20):
+                    assert autopilot.send_attitude(LEVEL)
+                    await asyncio.sleep(0.02)
+                await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET", 21)
+            assert peer.packets_so_far() and len(peer.of("SET_ATTITUDE_TARGET")) == 21
 
     asyncio.run(fly())
 

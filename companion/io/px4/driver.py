@@ -23,7 +23,7 @@ from companion.config.devices import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4 import messages
 from companion.io.px4.claim import LinkClaim
-from companion.io.px4.frames import FrameReader, FrameWriter
+from companion.io.px4.frames import FrameReader, FrameWriter, frames
 from companion.io.px4.inbox import Inbox
 from companion.io.px4.link import check_address, device_error, first_autopilot, open_link, quiet_native_log
 from companion.io.px4.origin import ensure_origin
@@ -133,7 +133,8 @@ class MavsdkAutopilot:
             self._system_id = int(system.get_system_id())
             if isinstance(self._wire, UdpWire):
                 self._wire.system = self._system_id
-            self._setpoints = setpoint_path(self._device.setpoint_path, system, self._send_message)
+            path = self._device.setpoint_path
+            self._setpoints = setpoint_path(path, system, self._send_message, self._send_frame)
             self._questions = questions = Questions(address, self._system_id, self._inbox, self._send_message)
             await ask_for_streams(questions, self._estimator_rate_hz)
             self._open = True
@@ -410,11 +411,18 @@ class MavsdkAutopilot:
     def _send_message(self, message_id: int, payload: bytes) -> bool:
         return self._wire is not None and self._wire.send(self._writer.frame(message_id, payload))
 
-    def _send_for_mavsdk(self, data: bytes, *_: Any) -> None:
-        """Send what MAVSDK sends, in a thread of MAVSDK."""
+    def _send_frame(self, frame: bytes) -> bool:
         wire = self._wire
-        if wire is not None:
-            wire.send(self._writer.numbered(bytes(data)))
+        return wire is not None and wire.send(self._writer.numbered(frame))
+
+    def _send_for_mavsdk(self, data: bytes, *_: Any) -> None:
+        """Send what MAVSDK sends, in a thread of MAVSDK; setpoints only as their path wants."""
+        frame = bytes(data)
+        found = next(frames(frame), None)
+        if found is None or found.message_id != messages.SET_ATTITUDE_TARGET_ID:
+            self._send_frame(frame)
+        elif self._setpoints is not None:
+            self._setpoints.pass_on(frame)
 
     async def _close(self) -> None:
         self._open = False

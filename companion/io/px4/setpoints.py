@@ -1,20 +1,26 @@
-"""The two paths of attitude setpoints: straight onto the link (the default) and through MAVSDK's Offboard plugin.
+"""The two paths of attitude setpoints: through MAVSDK's Offboard plugin (the default) and straight onto the link.
 
-Both send SET_ATTITUDE_TARGET once per call. They differ when the caller falls silent; decision 1 (docs/decisions) explains the default.
+Both send SET_ATTITUDE_TARGET once per call, and nothing when the caller is silent; decision 1 (docs/decisions) compares them.
 """
 
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable
-from typing import Any, Literal, Protocol
+from typing import Any, Final, Literal, Protocol
 
 from mavsdk import MavsdkError
 from mavsdk.plugins.offboard.offboard import Attitude, Offboard
 
 from companion.io.px4 import messages
 from companion.model.types import AttitudeSetpoint
+from companion.runtime import simulated_time
 
+PLUGIN_MAX_S: Final = 0.002
+"""Time after which a setpoint that the plugin has not sent is written straight onto the link."""
+_PLUGIN_MAX_SIMULATED_S: Final = 2.0
+"""The same if the flight lives in simulated time, which stands meanwhile."""
 _log = logging.getLogger(__name__)
 
 
@@ -31,18 +37,26 @@ class SetpointPath(Protocol):
     def stop(self) -> None:
         """Stop sending until the next `send`."""
 
+    def pass_on(self, frame: bytes) -> None:
+        """Take a SET_ATTITUDE_TARGET that MAVSDK sends; called in a thread of MAVSDK."""
 
-def setpoint_path(kind: Literal["direct", "offboard"], system: Any, send: Callable[[int, bytes], bool]) -> SetpointPath:
+
+def setpoint_path(
+    kind: Literal["offboard", "direct"],
+    system: Any,
+    send: Callable[[int, bytes], bool],
+    write: Callable[[bytes], bool],
+) -> SetpointPath:
     """Return the path that `devices.autopilot.setpoint_path` selects.
 
     Args:
         kind: the path.
         system: the MAVSDK system.
         send: sends a message, given by id and payload; returns whether it was sent.
+        write: sends a frame of MAVSDK's; returns whether it was sent.
     """
-    if kind == "offboard":
-        return OffboardSetpoints(system)
-    return DirectSetpoints(send, int(system.get_system_id()))
+    direct = DirectSetpoints(send, int(system.get_system_id()))
+    return OffboardSetpoints(system, write, direct) if kind == "offboard" else direct
 
 
 class DirectSetpoints:
@@ -62,32 +76,58 @@ class DirectSetpoints:
     def stop(self) -> None:
         """Do nothing, because this path sends nothing by itself."""
 
+    def pass_on(self, frame: bytes) -> None:
+        """Do nothing: MAVSDK sends no setpoint on this path."""
+
 
 class OffboardSetpoints:
     """Setpoints through the Offboard plugin, which takes Euler angles and does not check values.
 
-    A thread of the plugin repeats the last setpoint at 20 Hz until PX4's heartbeat shows a mode other than OFFBOARD, the plugin is
-    destroyed or the process dies. PX4's offboard-loss failsafe therefore does not detect that Python hangs; the guardian does, and
-    kills the process. The plugin's own `start` and `stop` are never used: the request queue changes modes, and `stop` would command
-    HOLD.
+    A thread of MAVSDK sends them, and another one repeats the last setpoint at 20 Hz when the caller is silent. Everything that MAVSDK
+    sends passes through the driver, which lets one setpoint leave for each call of `send`. So nothing is repeated, and PX4's
+    offboard-loss failsafe triggers if the companion hangs. The plugin's own `start` and `stop` are never used: the request queue
+    changes modes, and `stop` would command HOLD.
+
+    Args:
+        system: the MAVSDK system.
+        write: sends a frame of MAVSDK's; returns whether it was sent.
+        direct: sends what the plugin has not sent in time.
     """
 
-    def __init__(self, system: Any) -> None:
+    def __init__(self, system: Any, write: Callable[[bytes], bool], direct: DirectSetpoints) -> None:
         self._system = system
+        self._write = write
+        self._direct = direct
         self._plugin: Any = None
+        self._lock = threading.Lock()
+        self._wanted = self._sent = False
+        self._left = threading.Event()
+        self._max_s = PLUGIN_MAX_S if simulated_time.current() is None else _PLUGIN_MAX_SIMULATED_S
 
     def send(self, setpoint: AttitudeSetpoint, t_s: float) -> bool:
-        """Send roll, pitch, yaw and thrust, stamped by MAVSDK."""
-        del t_s
+        """Send roll, pitch, yaw and thrust, stamped by MAVSDK, and wait until they have left."""
         attitude = Attitude(*messages.attitude_target_deg(setpoint), setpoint.thrust)
         if self._plugin is None:
             self._plugin = Offboard(self._system)
+        self._left.clear()
+        self._wanted = True
         try:
             self._plugin.set_attitude(attitude)
         except MavsdkError as error:
-            _log.debug("SET_ATTITUDE_TARGET not sent: %s", error)
-            return False
-        return True
+            _log.debug("SET_ATTITUDE_TARGET not sent by MAVSDK: %s", error)
+        else:
+            self._left.wait(self._max_s)
+        with self._lock:
+            late, self._wanted = self._wanted, False
+        return self._direct.send(setpoint, t_s) if late else self._sent
+
+    def pass_on(self, frame: bytes) -> None:
+        """Send the frame if `send` waits for one; called in a thread of MAVSDK."""
+        with self._lock:
+            if not self._wanted:
+                return
+            self._wanted, self._sent = False, self._write(frame)
+        self._left.set()
 
     def stop(self) -> None:
         """Destroy the plugin, so that its thread stops repeating the last setpoint."""
