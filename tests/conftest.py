@@ -81,3 +81,12 @@ def _nothing_is_hoarded(request: pytest.FixtureRequest) -> Iterator[None]:
     for shared in vars(request.module).values():
         if isinstance(shared, functools._lru_cache_wrapper) and shared.__module__ == request.module.__name__:
             shared.cache_clear()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Let one worker run the tests that share a fixture of their module, so that it is made once."""
+    for item in items:
+        fixtures = item._fixtureinfo.name2fixturedefs.values() if isinstance(item, pytest.Function) else ()
+        if any(fixture.scope == "module" for (*_, fixture) in fixtures) and not item.get_closest_marker("xdist_group"):
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))

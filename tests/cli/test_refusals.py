@@ -25,7 +25,6 @@ from companion.runtime.clock import flight_clock
 from companion.runtime.event_loop import run
 from tests.support import CATCH, Ended, Sandbox, World, read_summary, sandbox_in, serial_line, set_options
 
-SHARED = pytest.mark.xdist_group("the world that refuses")
 """Tests that share one world run in one process."""
 QUICK = {"discovery_timeout_s": 1.0}
 
@@ -137,7 +136,6 @@ def refused_at_opening(world: World, *options: str) -> str:
         return line
 
 
-@SHARED
 @pytest.mark.parametrize("case", WRONG)
 def test_names(world: World, case: str) -> None:
     wrong = WRONG[case]
@@ -150,7 +148,6 @@ def assert_one_line(ended: Ended, pattern: str) -> None:
     assert re.search(pattern, ended.err_lines[0]), (pattern, ended.err)
 
 
-@SHARED
 def test_refuses_an_autopilot_address_on_which_nobody_speaks(sandbox: Sandbox, world: World) -> None:
     with closing(udp_port()) as nobody:
         autopilot = {"address": f"udpout://127.0.0.1:{nobody.getsockname()[1]}", **QUICK}
@@ -160,7 +157,6 @@ def test_refuses_an_autopilot_address_on_which_nobody_speaks(sandbox: Sandbox, w
     )
 
 
-@SHARED
 def test_names_a_busy_udp_port(world: World) -> None:
     with closing(udp_port()) as busy:
         port = busy.getsockname()[1]
@@ -171,7 +167,6 @@ def test_names_a_busy_udp_port(world: World) -> None:
     )
 
 
-@SHARED
 @pytest.mark.parametrize(
     ("device", "refusal"),
     [
@@ -185,7 +180,6 @@ def test_names_a_port_that_another_program_holds(world: World, device: str, refu
     assert re.search(refusal, line)
 
 
-@SHARED
 @pytest.mark.parametrize(
     ("device", "refusal"),
     [
@@ -199,7 +193,6 @@ def test_names_a_device_that_is_silent(world: World, device: str, refusal: str) 
     assert re.search(refusal.replace("PORT", port), line)
 
 
-@SHARED
 def test_names_a_silent_mocap_server(world: World) -> None:
     with closing(udp_port()) as silent:
         port = silent.getsockname()[1]
@@ -209,7 +202,6 @@ def test_names_a_silent_mocap_server(world: World) -> None:
     )
 
 
-@SHARED
 def test_refuses_a_start_other_than_the_missions_though_it_refused_before(
     sandbox: Sandbox, world: World, tmp_path: Path
 ) -> None:

@@ -22,8 +22,6 @@ from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EX
 from tests.commissioning.arm_rig import FILES, HAND, Rig, rig
 from tests.support import DEADLINE_S
 
-pytestmark = pytest.mark.xdist_group("an arm that somebody holds")
-
 
 @pytest.fixture(scope="module")
 def held(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:

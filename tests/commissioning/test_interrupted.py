@@ -13,8 +13,6 @@ from companion.model.exit_codes import EXIT_ABORTED
 from tests.commissioning.test_mocap_wires import VEHICLE
 from tests.support import CATCH, DEADLINE_S, Running, Sandbox, World, sandbox_in
 
-pytestmark = pytest.mark.xdist_group("tools that are interrupted")
-
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:

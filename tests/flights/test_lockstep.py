@@ -20,7 +20,6 @@ from sitl.fast.loop import FastFlight
 from tests.flights.test_guardian import hooked
 from tests.support import HOVER, SHORT_CATCH, Sandbox, read_summary, run_here, sandbox_in, set_options
 
-ONE_FLIGHT = pytest.mark.xdist_group("the flight in lockstep")
 FLOAT32 = 1e-6
 """Rounding of positions, attitudes and forces on the wires, with what the flight makes of it within some seconds."""
 APART_M = 0.005
@@ -50,7 +49,6 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FlightLog,
         yield FlightLog.read(out / "flight.mcap"), config
 
 
-@ONE_FLIGHT
 def test_beside_busy_programs_it_repeats_itself_bit_for_bit(
     flown: tuple[FlightLog, SitlConfig], tmp_path: Path
 ) -> None:
@@ -79,7 +77,6 @@ def difference(one: Sequence[float], other: Sequence[float]) -> float:
     return max(abs(a - b) for a, b in zip(one, other, strict=True))
 
 
-@ONE_FLIGHT
 def test_it_is_the_flight_of_the_fast_loop(flown: tuple[FlightLog, SitlConfig]) -> None:
     """Tick by tick: equal to the rounding of the wires until the first count differs, and then by millimetres."""
     log, config = flown

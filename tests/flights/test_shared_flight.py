@@ -18,8 +18,6 @@ from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from tests.plugins.installed import write_distribution
 from tests.support import HOVER, ROOT, Ended, Sandbox, read_summary, run_here, sandbox_in, set_options
 
-pytestmark = pytest.mark.xdist_group("the shared flight")
-
 
 @dataclass(frozen=True)
 class Flown:

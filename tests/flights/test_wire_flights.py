@@ -33,7 +33,6 @@ from tests.support import (
     set_options,
 )
 
-THE_CATCH = pytest.mark.xdist_group("the catch over wires")
 """Tests that look at one flight run in one process."""
 PAYLOAD_KG = 0.2
 LANDS_S = 0.5
@@ -64,7 +63,6 @@ def the_catch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
         yield Flown(sandbox, ended)
 
 
-@THE_CATCH
 def test_the_catch(the_catch: Flown) -> None:
     ended, summary = the_catch.ended, the_catch.summary
     assert (ended.code, ended.err) == (EXIT_OK, ""), ended
@@ -85,14 +83,12 @@ def test_the_catch(the_catch: Flown) -> None:
     assert [event["id"] for event in summary["events"] if event["id"] in wanted] == wanted
 
 
-@THE_CATCH
 def test_it_leaves_a_report_with_its_plots(the_catch: Flown) -> None:
     out = the_catch.sandbox.cwd / "out"
     assert (out / "report.html").stat().st_size > 50_000
     assert len(list(out.glob("*.png"))) >= 4
 
 
-@THE_CATCH
 def test_its_log_replays_bit_for_bit(the_catch: Flown) -> None:
     replayed = run_here("replay", the_catch.sandbox.cwd / "out/flight.mcap")
     assert replayed.code == EXIT_OK, (replayed.out, replayed.err)

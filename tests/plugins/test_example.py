@@ -21,7 +21,6 @@ from tests.plugins.installed import on_path
 from tests.support import ROOT, SHORT_CATCH
 
 EXAMPLE = ROOT / "examples" / "law"
-pytestmark = pytest.mark.xdist_group("the example of a control law")
 """One process, and so pip, once."""
 FILES = ("pyproject.toml", "lab_lqr/__init__.py", "lab_lqr/files/controllers/lqr_tuned.yaml", "test_lab_lqr.py")
 

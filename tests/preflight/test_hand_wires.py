@@ -30,8 +30,6 @@ from tests.io.stub_rig import standing_stub
 from tests.io.test_px4_stub import companion
 from tests.support import CATCH, DEADLINE_S, Sandbox, World, free_udp_port, sandbox_in
 
-pytestmark = pytest.mark.xdist_group("the world with a hand")
-
 FIRST_ROUND_S = 8.0
 """A test that is ready later waits on the floor for the next round, 24 s after the first."""
 
