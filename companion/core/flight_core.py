@@ -21,6 +21,7 @@ from companion.core.sequence import missing_inputs
 from companion.core.sliding import within_friction
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters, event_of
+from companion.core.verdict import verdict_of
 from companion.mission.contact import along, sensed_n
 from companion.mission.plan import Plan
 from companion.model import flight_stage as seq
@@ -33,6 +34,7 @@ from companion.model.types import (
     Event,
     Inputs,
     MocapPose,
+    OperatorCommand,
     Outputs,
     PhaseKind,
     Reference,
@@ -59,6 +61,7 @@ _PLAN: Final = Stage.PLAN
 _SPOOL: Final = Stage.SPOOL
 _TOUCHDOWN: Final = Stage.TOUCHDOWN
 _SLIDE: Final = ContactMode.SLIDE
+_NO_COMMAND: Final = OperatorCommand.NONE
 _NO_ERROR: Vec3 = (0.0, 0.0, 0.0)
 
 
@@ -102,7 +105,8 @@ class FlightCore:
         t_s, dt_s = inputs.t_s, self._dt_s(inputs.t_s)
         observed, observation = self._observe(inputs, dt_s)
         i = observation.inputs
-        state, request = transition(self._parameters, self._state, observed, observation)
+        before = self._state
+        state, request = transition(self._parameters, before, observed, observation)
         self._state = state
         self._carry_out(request, i)
         reference, command = self._command(dt_s, i)
@@ -140,6 +144,7 @@ class FlightCore:
             request=request.autopilot,
             action=state.supervisor.action,
             events=tuple(events),
+            verdict=None if i.command is _NO_COMMAND else verdict_of(i.command, before, state, request.events, t_s),
             active=self._monitors.active(),
             control=command.log,
             outcome=state.over,

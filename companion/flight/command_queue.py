@@ -89,13 +89,17 @@ class Operator:
     def next(self) -> Turn:
         """Return the command of this tick.
 
-        A landing requested by the launcher or a signal stays requested. A command from the ground station lasts one tick. If it
+        A landing requested by the launcher or a signal stays requested, and every other command is refused. A command from the ground
+        station lasts one tick. If it
         repeats the previous one, it is delayed by a tick, because the core counts rising edges. A RESUME that names a hold other
         than the active one is refused.
         """
         waiting = self._waiting
         if self._land.is_set():
-            return Turn(OperatorCommand.LAND, waiting.pop(0) if waiting else None)
+            asked = waiting.pop(0) if waiting else None
+            if asked is None or asked.command in (OperatorCommand.LAND, OperatorCommand.ABORT):
+                return Turn(OperatorCommand.LAND, asked)
+            return Turn(OperatorCommand.LAND, asked, f"{asked.command.value} refused: a landing was commanded before")
         if not waiting or waiting[0].command is self._given:
             self._given = OperatorCommand.NONE
             return Turn(OperatorCommand.NONE, None)

@@ -22,7 +22,7 @@ from companion.config.device_plugins import BUILT_IN
 from companion.config.loader import FlightConfig
 from companion.config.vehicle import Vehicle
 from companion.core.flight_core import FlightCore
-from companion.flight.command_effect import effect_of
+from companion.core.verdict import sentence_of
 from companion.flight.command_queue import Operator, StartCancelled
 from companion.flight.fallback_landing import land_without_core, unflown
 from companion.flight.heartbeat import FlightGuard
@@ -111,7 +111,6 @@ class Flight:
         if self._devices.force is not None:
             self._devices.force.read_in_ticks()
         tick = 0
-        before: Outputs | None = None
         if self._devices.ground is not None:
             self._tell_forwarding(self._clock(), self._devices.ground.line)
         if isinstance(ticker, Ticker):
@@ -121,8 +120,7 @@ class Flight:
             turn = self._operator.next()
             inputs, outputs, sent = await self._tick(tick, now.start_s, now.lateness_s, turn.command)
             if turn.asked is not None:
-                self._answer(turn.asked, turn.refused, before, outputs)
-            before = outputs
+                self._answer(turn.asked, turn.refused, outputs)
             self._missed += now.lateness_s > self._period_s
             self._report(tick, outputs, sent)
             if self._devices.ground is not None:
@@ -211,10 +209,12 @@ class Flight:
                 self._tell_asker(asked, False, why, outputs)
         return inputs, outputs, sent
 
-    def _answer(self, asked: GroundCommand, refused: str | None, before: Outputs | None, after: Outputs) -> None:
-        """Report the effect of a command to its sender, the log and the launcher."""
-        effect = (False, refused) if refused is not None else effect_of(asked.command, before, after)
-        self._tell_asker(asked, *effect, after)
+    def _answer(self, asked: GroundCommand, refused: str | None, outputs: Outputs) -> None:
+        """Report the verdict on a command to its sender, the log and the launcher."""
+        if refused is not None:
+            self._tell_asker(asked, False, refused, outputs)
+        elif (verdict := outputs.verdict) is not None:
+            self._tell_asker(asked, verdict.accepted, sentence_of(verdict, asked.command), outputs)
 
     def _tell_asker(self, asked: GroundCommand, accepted: bool, text: str, after: Outputs) -> None:
         about = (asked.nonce, asked.operator, asked.command)

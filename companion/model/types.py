@@ -16,6 +16,7 @@ from enum import Enum
 
 from companion.model.codec import Record
 from companion.model.estimator import EstimatorReport
+from companion.model.verdict import Verdict
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
@@ -514,6 +515,8 @@ class Outputs(Record, frozen=True, kw_only=True):
     request: AutopilotRequest
     action: SafetyAction
     events: tuple[Event, ...]
+    verdict: Verdict | None = None
+    """What becomes of `Inputs.command`; None without a command, and in older logs."""
     active: tuple[ActiveRule, ...] | None = None
     """The active rules, whose events were raised in this tick or before; None if there is none, and in older logs."""
     control: ControlLog | None = None

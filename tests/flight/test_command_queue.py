@@ -171,4 +171,4 @@ def test_the_launchers_landing_stays_and_commands_are_still_answered(
 
     assert asyncio.run(heard()) == [LAND] * 5
     operator.ask(asked(RESUME))
-    assert operator.next() == Turn(LAND, asked(RESUME)[0])
+    assert operator.next() == Turn(LAND, asked(RESUME)[0], "resume refused: a landing was commanded before")

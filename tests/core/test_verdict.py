@@ -10,9 +10,12 @@ from functools import cache
 import msgspec
 import pytest
 
+from companion.config.loader import load_flight
 from companion.core.flight_core import FlightCore
-from companion.flight.command_effect import Effect, effect_of
+from companion.core.transition import Parameters
+from companion.core.verdict import sentence_of, verdict_of
 from companion.model.codec import differences
+from companion.model.flight_stage import Stage
 from companion.model.types import (
     FlightMode,
     Inputs,
@@ -25,7 +28,7 @@ from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from tests.flights.test_ladder_flights import TAUT
 from tests.safety.healthy import put
-from tests.support import LOW_HOVER
+from tests.support import HOVER, LOW_HOVER
 
 HOLD, RESUME, LAND, ABORT, START = (
     OperatorCommand.HOLD,
@@ -45,7 +48,7 @@ class Commanded:
     inputs: list[Inputs]
     outputs: list[Outputs]
     flight: FastFlight
-    effects: list[Effect] = field(default_factory=list)
+    effects: list[tuple[bool, str]] = field(default_factory=list)
 
     @property
     def ids(self) -> list[str]:
@@ -84,8 +87,9 @@ def commanded(
     flown = Commanded(result.inputs, result.outputs, flight)
     for k, i in enumerate(result.inputs):
         if i.command is not OperatorCommand.NONE:
-            before = result.outputs[k - 1] if k else None
-            flown.effects.append(effect_of(i.command, before, result.outputs[k]))
+            verdict = result.outputs[k].verdict
+            assert verdict is not None
+            flown.effects.append((verdict.accepted, sentence_of(verdict, i.command)))
     assert len(flown.effects) == len(script), "the flight was over before a command came"
     return flown
 
@@ -119,13 +123,13 @@ def test_hold_resume_hold_resume_land() -> None:
         (True, "holding"),
         (True, "already holding"),
         (True, "continuing"),
-        (False, "nothing to resume: not holding"),
+        (False, "resume refused: not holding"),
         (True, "holding"),
         (True, "continuing"),
         (True, "landing"),
         (True, "already landing"),
-        (False, "hold rejected: the vehicle is landing"),
-        (False, "nothing to resume: the vehicle is landing"),
+        (False, "hold refused: the vehicle is landing"),
+        (False, "resume refused: the vehicle is landing"),
         (False, "start refused: already in the air"),
     ]
     asked = [id_ for id_ in flown.ids if id_.startswith("operator_")]
@@ -182,8 +186,8 @@ def test_commands_while_it_goes_back_along_the_tether() -> None:
         (9.2, HOLD), (9.3, RESUME), (9.5, LAND), sets=(*TAUT, "vehicle.safety.retract_max_s=20"), until_s=10.2
     )
     assert flown.effects[:2] == [
-        (False, "HOLD rejected: the vehicle is in RETRACT and will land"),
-        (False, "nothing to resume: the vehicle is returning along the tether and will land"),
+        (False, "hold refused: the vehicle is returning along the tether and will land"),
+        (False, "resume refused: the vehicle is returning along the tether and will land"),
     ]
     assert flown.effects[2] == (True, "landing")
 
@@ -193,7 +197,7 @@ def test_too_low_to_hold_and_in_the_missions_own_landing() -> None:
     assert flown.effects == [(True, "too low to hold: landing")]
     begin_s = times_of(ordinary())["land"]
     flown = commanded((begin_s + 0.2, HOLD), (begin_s + 0.4, RESUME), sets=LOW)
-    assert flown.effects == [(False, "hold rejected: the vehicle is landing"), (True, "the landing continues")]
+    assert flown.effects == [(False, "hold refused: the vehicle is landing"), (True, "the landing continues")]
     assert flown.outcome is Outcome.COMPLETED
 
 
@@ -202,7 +206,10 @@ def test_nothing_is_done_against_a_pilot() -> None:
         return put("status", mode=FlightMode.MANUAL)(i) if i.t_s >= 7.0 else i
 
     flown = commanded((7.5, HOLD), (7.6, RESUME), (7.7, LAND), (7.8, ABORT), (7.9, START), change=change, until_s=9.0)
-    assert flown.effects == [(False, "a pilot has control: nothing is sent")] * 5
+    assert flown.effects == [
+        (False, f"{name} refused: a pilot has control; nothing is sent")
+        for name in ("hold", "resume", "land", "abort", "start")
+    ]
     assert flown.at(7.5).phase == "a pilot flies"
     assert all(o.attitude is None for o in flown.outputs if o.t_s > 7.1)
 
@@ -268,7 +275,7 @@ def test_a_flight_that_takes_off_by_itself_needs_no_start() -> None:
         (False, "start refused: this flight takes off by itself as soon as it is ready"),
         *[(True, "already taking off")] * 3,
     ]
-    assert flown.effects[1::2] == [(False, "nothing to resume: on the ground")] * 4
+    assert flown.effects[1::2] == [(False, "resume refused: on the ground")] * 4
     assert flown.outcome is Outcome.COMPLETED
 
 
@@ -370,10 +377,11 @@ def test_armed_by_somebody_else_while_it_waits_it_is_not_flown() -> None:
 
 
 def test_after_the_flight_nothing_is_to_be_done() -> None:
-    over = ordinary().outputs[-1]
-    assert [effect_of(command, over, over) for command in (LAND, HOLD, RESUME, START)] == [
+    over = msgspec.structs.replace(Parameters.of(load_flight(HOVER)).initial_state(), stage=Stage.DONE)
+    verdicts = [(command, verdict_of(command, over, over, (), 0.0)) for command in (LAND, HOLD, RESUME, START)]
+    assert [(verdict.accepted, sentence_of(verdict, command)) for command, verdict in verdicts] == [
         (True, "already down"),
-        (False, "hold rejected: the flight is over"),
-        (False, "nothing to resume: the flight is over"),
+        (False, "hold refused: the flight is over"),
+        (False, "resume refused: the flight is over"),
         (False, "start refused: the flight is over"),
     ]
