@@ -355,7 +355,7 @@ READS = """
     joint_beyond_limit 180 57 5; joint_far_beyond_limit 115 -25 15; force_lost 0.25; force_overload 1 -1 0;
     force_drift 3.3 0.0 0.0 2.0; loop_late 205 50; loop_stalled 1005 300; tilt 45 40; crashed 120;
     too_fast 2.1 2.0; climbs_too_fast 1.6 1.5; sinks_too_fast 1.6 1.5; geofence_left -1.90 0.00 1.00;
-    geofence_near 2.26 0.00 1.00; tracking_warn 0.50 0.45; tracking_hold 0.70 0.60; tracking_error 1.20 0.80;
+    geofence_near 2.29 0.00 1.00; tracking_warn 0.50 0.45; tracking_hold 0.70 0.60; tracking_error 1.20 0.80;
     thrust_saturated 54 1.0; contact_force_high 15.0 12.0; tether_short 0.05 0.10; tether_taut 1.20 0;
     tether_snagged 0 1.20; tether_near 0.00 0.01; tether_wound 1.6 1.5; tether_separated 1.80
 """
@@ -721,7 +721,7 @@ def test_at_every_wall_the_fence_is_where_the_rotors_leave_the_room(axis: int, s
         inputs = after_a_moment(at(*place, *velocity), ticks=60, sound=0)
         return [event.id for event in watched(VEHICLE, inputs, flying())]
 
-    stop_m = 0.5 * (0.18 + 0.6 + 0.5 / 16.0)  # docs/safety.md: 0.5 m/s; reaction, LAND's stop point, braking
+    stop_m = 0.5 * (0.21 + 0.6 + 0.5 / 16.0)  # docs/safety.md: 0.5 m/s; reaction, LAND's stop point, braking
     assert found(-0.01, 0.0) == []
     assert found(0.01, 0.0) == ["geofence_left", "geofence_near"]
     assert found(-stop_m - 0.01, 0.5) == []
