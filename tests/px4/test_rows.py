@@ -11,6 +11,7 @@ from companion.config.devices import AutopilotDevice
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
+from companion.flight.startup import changed_since
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.check_row import Level, Row
 from companion.preflight.evaluation import param_names
@@ -187,6 +188,24 @@ def test_a_wrong_parameter_over_real_mavlink_gives_its_row() -> None:
 
     found = {row.title for row in asyncio.run(read()) if not row.ok}
     assert found == {"EKF2_EV_CTRL", "COM_OBL_RC_ACT", "COM_OF_LOSS_T", "rotors in PX4"}
+
+
+def test_a_parameter_that_changes_while_the_flight_waits_refuses_the_start_until_it_is_set_back() -> None:
+    async def answers() -> list[str]:
+        port = free_udp_port()
+        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+        said = []
+        async with standing_stub(port), MavsdkAutopilot(device, flight_clock()) as autopilot:
+            checked = await autopilot.read_params(param_names(vehicle()))
+            before = checked["COM_OBL_RC_ACT"]
+            for value in (before, 6, before):
+                await autopilot.write_param("COM_OBL_RC_ACT", value)
+                said.append(await changed_since(checked, autopilot))
+        return said
+
+    first, changed, back = asyncio.run(answers())
+    assert (first, back) == ("", "")
+    assert "COM_OBL_RC_ACT is 6, was 4" in changed and changed.startswith("start refused: ")
 
 
 @pytest.mark.parametrize(
