@@ -313,7 +313,11 @@ def px4_by_hand(number: int, rootfs: Path) -> Iterator[subprocess.Popen[bytes]]:
 def test_a_px4_started_by_hand_that_comes_late_flies(tmp_path: Path, autopilot: str) -> None:
     """Ended when the world asks for it, started once more in the same folder."""
     (tmp_path / "sitecustomize.py").write_text(_OLD_WORLD, encoding="utf-8")
-    by_hand = {VARIABLE: "", "PATH": str(tmp_path / "empty"), "PYTHONPATH": str(tmp_path)}
+    by_hand = {
+        VARIABLE: "",
+        "PATH": str(tmp_path / "empty"),
+        "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}",
+    }
     with Instance.claim() as free:
         number = free.number  # the world will find the same
     with sandbox_in(tmp_path / "sandbox", by_hand) as sandbox:
@@ -325,8 +329,12 @@ def test_a_px4_started_by_hand_that_comes_late_flies(tmp_path: Path, autopilot: 
                 px4.wait(DEADLINE_S)
             with px4_by_hand(number, tmp_path / "rootfs"):
                 ended = running.end()
+                again = sandbox.run("fly", HOVER, f"--sitl={autopilot}", "--out", "again")
         sandbox.assert_nobody_left()
     assert ended.code == EXIT_OK, (ended.out, ended.err)
+    assert again.code == EXIT_REFUSED and len(again.err_lines) == 1, (again.out, again.err)
+    assert f"found instance {number} still running after a flight" in again.err
+    assert f"start it again with `PX4_SIM_MODEL={MODEL} px4 -i {number}`" in again.err
 
 
 def test_a_name_that_is_no_px4_refuses_the_flight_in_one_line(tmp_path: Path) -> None:
