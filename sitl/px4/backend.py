@@ -25,7 +25,15 @@ from sitl.px4.control_link import ControlLink, Version, same
 from sitl.px4.hil_link import HilSensors, Px4Error, SimulatorLink
 from sitl.px4.parameter_file import restore, stored
 from sitl.px4.parameters import BEFORE_BOOT, parameters
-from sitl.px4.process import HOW_TO_GET_IT, Installation, Instance, Px4Process, find, flown_instance, how_to_start_it
+from sitl.px4.process import (
+    HOW_TO_GET_IT,
+    Installation,
+    Instance,
+    Px4Process,
+    abandoned_instance,
+    find,
+    how_to_start_it,
+)
 from sitl.px4.relay import Relay
 from sitl.udp import Address
 from sitl.world.world import World
@@ -78,8 +86,7 @@ class RealPx4:
         progress: called with each progress message, one line for the user.
 
     Raises:
-        Px4Error: the world needs the stub, PX4_SITL does not name a program, no instance number is free, or the PX4 that was started
-            by hand has flown already.
+        Px4Error: the world needs the stub, PX4_SITL does not name a program, or no instance number is free.
     """
 
     lockstep = True
@@ -91,11 +98,6 @@ class RealPx4:
         self._folder = folder
         self._progress = progress
         self._installation: Installation | None = find()
-        if self._installation is None and (number := flown_instance()) is not None:
-            raise Px4Error(
-                f"PX4: expected one that has not flown yet, found instance {number} still running after a flight; its clock cannot go "
-                f"back: stop it, start it again with {how_to_start_it(number)} and run this command again"
-            )
         self._instance = Instance.claim()
         self._link = SimulatorLink(self._instance.simulator, HilSensors(config.seed), airframe.rotor_layout.count)
         self._control = ControlLink(self._instance, airframe.battery_cells)
@@ -206,6 +208,11 @@ class RealPx4:
         await self._control.await_heartbeat()
 
     def _how(self) -> str:
+        if (number := abandoned_instance()) is not None:
+            return (
+                f"instance {number} runs without a simulator: one that has flown must be started again, because its clock cannot go "
+                f"back; stop it, start it with {how_to_start_it(number)} and run this command again"
+            )
         return f"{HOW_TO_GET_IT}; or start PX4 by hand with {how_to_start_it(self.number)} and run this command again"
 
     async def _write_parameters(self, wanted: Mapping[str, Value]) -> dict[str, Value]:

@@ -172,7 +172,7 @@ class Instance:
         self.close()
 
 
-def flown_instance() -> int | None:
+def abandoned_instance() -> int | None:
     """Return the first instance whose PX4 runs without a simulator, or None. A new PX4 opens its links only when it has found one."""
     for number in INSTANCES:
         with (

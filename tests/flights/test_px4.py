@@ -333,8 +333,8 @@ def test_a_px4_started_by_hand_that_comes_late_flies(tmp_path: Path, autopilot: 
         sandbox.assert_nobody_left()
     assert ended.code == EXIT_OK, (ended.out, ended.err)
     assert again.code == EXIT_REFUSED and len(again.err_lines) == 1, (again.out, again.err)
-    assert f"found instance {number} still running after a flight" in again.err
-    assert f"start it again with `PX4_SIM_MODEL={MODEL} px4 -i {number}`" in again.err
+    assert f"instance {number} runs without a simulator: one that has flown must be started again" in again.err
+    assert f"start it with `PX4_SIM_MODEL={MODEL} px4 -i {number}`" in again.err
 
 
 def test_a_name_that_is_no_px4_refuses_the_flight_in_one_line(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from sitl.px4.backend import STUB_ONLY_FAULTS, refuse_stub_only_settings
 from sitl.px4.control_link import ControlLink, same
 from sitl.px4.hil_link import Px4Error
 from sitl.px4.parameters import parameters, rotor_geometry
-from sitl.px4.process import Instance, flown_instance, how_to_start_it
+from sitl.px4.process import Instance, abandoned_instance, how_to_start_it
 from sitl.px4.relay import Relay
 from tests.sitl.px4_rig import Rig
 
@@ -151,10 +151,10 @@ def test_a_battery_of_the_world_takes_the_place_of_px4s_own() -> None:
 def test_a_px4_started_by_hand_that_still_runs_after_its_flight_is_found() -> None:
     with Instance.claim() as instance, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind(instance.onboard_address)
-        assert flown_instance() != instance.number, "its world is there: it flies"
+        assert abandoned_instance() != instance.number, "its world is there: it flies"
         instance.simulator.close()
-        assert flown_instance() == instance.number
-    assert flown_instance() != instance.number
+        assert abandoned_instance() == instance.number
+    assert abandoned_instance() != instance.number
     assert "make" in how_to_start_it(0) and "px4 -i 3`" in how_to_start_it(3) and "make" not in how_to_start_it(3)
 
 
