@@ -307,6 +307,8 @@ def px4_by_hand(number: int, rootfs: Path) -> Iterator[subprocess.Popen[bytes]]:
             yield process
         finally:
             process.kill()
+            for left in (f"/tmp/px4_lock-{number}", f"/tmp/px4-sock-{number}"):
+                Path(left).unlink(missing_ok=True)
 
 
 @pytest.mark.parametrize("autopilot", [pytest.param("px4", marks=REAL)])
