@@ -150,7 +150,7 @@ async def _look(
 ) -> list[Row]:
     clock, sitl = flight_clock(), arguments.sitl is not None
     async with open_available(config, clock, lambda device: line(f"opening: {device}")) as devices:
-        rows = await preflight.preflight(
+        rows, _ = await preflight.preflight(
             devices, config, clock, out=Path("flights"), progress=line, known=known, sitl=sitl
         )
         if arguments.hand:

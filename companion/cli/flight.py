@@ -118,7 +118,7 @@ def _add_flight_options(parser: argparse.ArgumentParser, mission_default: bool =
     add_seed(parser)
 
 
-def _load(arguments: argparse.Namespace, *, hardware: bool) -> SitlConfig:
+def _load(arguments: argparse.Namespace, *, hardware: bool, real_px4: bool = False) -> SitlConfig:
     for name, path in (("MISSION", arguments.mission), ("--vehicle", arguments.vehicle)):
         if path is not None and not path.strip():
             raise ConfigError([f"companion {arguments.command}: {name}: expected the name of a file, got an empty one"])
@@ -131,6 +131,7 @@ def _load(arguments: argparse.Namespace, *, hardware: bool) -> SitlConfig:
         hardware=hardware,
         # Nothing of a world is read on hardware, and drawing one takes NumPy.
         world=DEFAULT_WORLD if hardware and arguments.world == COMMAND_LINE_WORLD else arguments.world,
+        real_px4=real_px4,
     )
 
 
@@ -146,7 +147,9 @@ def _check(arguments: argparse.Namespace) -> int:
         print_error(f"companion check: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
         return EXIT_BAD_INPUT
     hardware = arguments.sitl is None and not arguments.plan_only
-    return check_command.run(arguments, _load(arguments, hardware=hardware), _problems)
+    return check_command.run(
+        arguments, _load(arguments, hardware=hardware, real_px4=arguments.sitl == "px4"), _problems
+    )
 
 
 def _fly(arguments: argparse.Namespace) -> int:
@@ -171,7 +174,7 @@ def _fly(arguments: argparse.Namespace) -> int:
         arguments.overrides += [f"vehicle.ground.foxglove={arguments.foxglove}"]
     if arguments.wait_for_start:
         arguments.overrides += ["mission.start.takeoff=by_operator"]
-    config = _load(arguments, hardware=arguments.sitl is None)
+    config = _load(arguments, hardware=arguments.sitl is None, real_px4=arguments.sitl == "px4")
     problems = _no_server(config) or [*_problems(config), *_start_impossible(config)]
     if problems:
         for line in problems:
@@ -247,7 +250,7 @@ def _start_impossible(config: FlightConfig) -> list[str]:
 
 
 def _sitl(arguments: argparse.Namespace) -> int:
-    config = _load(arguments, hardware=False)
+    config = _load(arguments, hardware=False, real_px4=arguments.px4)
     # The world replaces this process, so that signals reach it directly and it cannot outlive a parent.
     file = os.memfd_create("sitl-config", 0)
     os.write(file, config.model_dump_json().encode())

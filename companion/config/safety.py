@@ -117,8 +117,8 @@ class Safety(Model):
     """Smallest tether slack at the position where the vehicle is predicted to stop."""
 
     # Reactions
-    react_time_s: NonNegative = 0.18
-    """Time from a fault to PX4's LAND mode; 0.07 to 0.18 s were measured with the guardian."""
+    react_time_s: NonNegative = 0.21
+    """Time from a fault to PX4's LAND mode. With the guardian and PX4 1.16.1, 0.07 to 0.21 s were measured."""
     stop_deceleration_m_s2: Positive = 2.0
     """Deceleration with which the governor stops the reference. Stopping distances assume the slower of this stop and a stop in PX4's
     LAND mode from the same speed."""

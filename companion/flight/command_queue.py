@@ -6,10 +6,10 @@ import asyncio
 import contextlib
 import signal
 import socket
-from collections.abc import Coroutine, Iterable, Iterator
+from collections.abc import Callable, Coroutine, Iterable, Iterator
 from typing import Any, NamedTuple, TypeVar
 
-from companion.model.types import GroundCommand, OperatorCommand, Outputs, SafetyAction
+from companion.model.types import GroundCommand, OperatorCommand, Outputs, PhaseKind, SafetyAction
 from companion.runtime import ipc
 
 WAITING_MAX = 32
@@ -67,6 +67,9 @@ class Operator:
         self._waiting: list[GroundCommand] = []
         self._given = OperatorCommand.NONE
         self._holds = 0
+        self.recheck: Callable[[], Coroutine[Any, Any, str]] | None = None
+        """Awaited before a START is passed on; returns why it is refused, or an empty text. None after the rotors have started."""
+        self._checking: asyncio.Task[str] | None = None
         self.hold: int | None = None
         """Number of the active hold, as in `Sent.hold`; None if the vehicle does not hold."""
 
@@ -80,6 +83,7 @@ class Operator:
                 why = f"a {asked.command.value} was commanded later"
                 dropped += [Dropped(one, why) for one in self._waiting if one.command not in _STOPS]
                 self._waiting = [one for one in self._waiting if one.command in _STOPS]
+                self._checking = None
             self._waiting.append(asked)
         self._waiting.sort(key=lambda asked: _GRAVEST_FIRST[asked.command])
         dropped += [Dropped(one, "too many commands at once") for one in self._waiting[WAITING_MAX:]]
@@ -92,7 +96,7 @@ class Operator:
         A landing requested by the launcher or a signal stays requested, and every other command is refused. A command from the ground
         station lasts one tick. If it
         repeats the previous one, it is delayed by a tick, because the core counts rising edges. A RESUME that names a hold other
-        than the active one is refused.
+        than the active one is refused. A START on the ground waits for the result of `recheck`.
         """
         waiting = self._waiting
         if self._land.is_set():
@@ -103,6 +107,14 @@ class Operator:
         if not waiting or waiting[0].command is self._given:
             self._given = OperatorCommand.NONE
             return Turn(OperatorCommand.NONE, None)
+        if waiting[0].command is OperatorCommand.START and self.recheck is not None:
+            checking = self._checking = self._checking or asyncio.ensure_future(self.recheck())
+            self._given = OperatorCommand.NONE
+            if not checking.done():
+                return Turn(OperatorCommand.NONE, None)
+            self._checking = None
+            if text := checking.result():
+                return Turn(OperatorCommand.NONE, waiting.pop(0), text)
         asked = waiting.pop(0)
         if asked.command is OperatorCommand.RESUME and self.hold is not None and asked.hold != self.hold:
             self._given = OperatorCommand.NONE
@@ -120,6 +132,8 @@ class Operator:
             command: command of the tick.
             outputs: the core's outputs of the tick.
         """
+        if outputs.phase_kind is not PhaseKind.GROUND:
+            self.recheck = None
         if outputs.action is not SafetyAction.HOLD:
             self.hold = None
         elif self.hold is None or command is OperatorCommand.HOLD:

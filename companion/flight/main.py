@@ -15,6 +15,7 @@ import signal
 import socket
 import sys
 import traceback
+from functools import partial
 from pathlib import Path
 
 from companion import plugins
@@ -26,7 +27,7 @@ from companion.core.verdict import sentence_of
 from companion.flight.command_queue import Operator, StartCancelled
 from companion.flight.fallback_landing import land_without_core, unflown
 from companion.flight.heartbeat import FlightGuard
-from companion.flight.startup import Checked, Refused, check_before_flight, with_hover_thrust
+from companion.flight.startup import Checked, Refused, changed_since, check_before_flight, with_hover_thrust
 from companion.flight.ticker import SIMULATED_START_S, SimulatedTicker, Ticker
 from companion.guardian.client import GuardianClient
 from companion.io.devices import Devices, open_devices
@@ -398,6 +399,7 @@ async def fly(
                 recorder.client.metadata("autopilot", {"firmware": await devices.autopilot.firmware()})
             if checked is not None:
                 checked.log_to(recorder.client)
+                operator.recheck = partial(changed_since, checked.params, devices.autopilot)
             guardian = FlightGuard(client, devices.autopilot.identity(), origin_s) if client is not None else None
             if client is not None:
                 client.share_recorder(recorder.client.fileno())

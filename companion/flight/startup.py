@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from companion.model.check_row import Row, refusals
 from companion.model.observations import Observations
 from companion.model.types import Vec3
 from companion.preflight import run as preflight
+from companion.preflight.px4 import text_of
 from companion.recorder.client import RecorderClient
 from companion.runtime import ipc
 from companion.runtime.clock import Clock
@@ -39,6 +41,8 @@ class Checked:
     plan: Plan
     """Plan from the mission's start pose."""
     rows: tuple[Row, ...]
+    params: Mapping[str, float | int]
+    """Values of PX4's parameters by name."""
 
     def log_to(self, recorder: RecorderClient) -> None:
         """Send the planned path and the preflight to the log and the ground stations."""
@@ -70,7 +74,7 @@ async def check_before_flight(
     # A path takes seconds to plan, once in a process: here, while motion capture keeps flowing.
     plan = await asyncio.to_thread(Plan.build, config.mission, config.vehicle)
     known = Observations(start_s=0.0, duration_s=0.0, mission_s=plan.duration_s)
-    rows = await preflight.preflight(devices, config, clock, out=out, progress=report, known=known, sitl=sitl)
+    rows, params = await preflight.preflight(devices, config, clock, out=out, progress=report, known=known, sitl=sitl)
     ipc.send(channel, {"type": "preflight", "rows": [row.as_json() for row in rows]})
     try:
         preflight.write(rows, out)
@@ -80,7 +84,26 @@ async def check_before_flight(
         ) from None
     if refused := refusals(rows):
         raise Refused([row.line() for row in refused])
-    return Checked(plan, tuple(rows))
+    return Checked(plan, tuple(rows), params)
+
+
+async def changed_since(checked: Mapping[str, float | int], autopilot: Autopilot) -> str:
+    """Return why a START is refused: the PX4 parameters that no longer have the values of the preflight. Empty if all have them."""
+    try:
+        now = await autopilot.read_params(checked)
+    except DeviceError as error:
+        return f"start refused: {error}"
+    changed = [
+        f"{name} is {text_of(now.get(name))}, was {text_of(value)}"
+        for name, value in checked.items()
+        if text_of(now.get(name)) != text_of(value)
+    ]
+    if not changed:
+        return ""
+    return (
+        f"start refused: PX4's parameters have changed since the preflight: {'; '.join(changed)}; set them back, or start companion "
+        "again, so that the preflight checks them"
+    )
 
 
 async def with_hover_thrust(config: FlightConfig, autopilot: Autopilot) -> FlightConfig:

@@ -10,10 +10,8 @@ from companion.model.check_row import Level, Row
 from companion.preflight.checks import Check
 from companion.px4.required import ROTOR_COUNT, WANTED, Value, Wanted
 from companion.px4.rotors import differences
+from companion.px4.versions import KNOWN_GOOD, OLDEST, varies
 
-KNOWN_GOOD = ((1, 16), (1, 18))
-"""Versions with which missions have been flown, in simulation."""
-OLDEST = (1, 15)
 ROTORS = Check(
     "px4.rotors",
     "rotors in PX4",
@@ -89,7 +87,7 @@ def _param_rows(params: Mapping[str, Value], vehicle: Vehicle) -> Iterator[Row]:
         check = Check(PARAM_ID + wanted.name, wanted.name, why=wanted.why, warns=wanted.level is Level.WARN)
         if value is not None:
             yield check.row(wanted.accepts(value, vehicle), text_of(value), text, fix_of(wanted))
-        elif not wanted.only:
+        elif not varies(wanted.name):
             fix = "check the firmware: PX4 1.16 and 1.18 have this parameter"
             yield check.doubtful("PX4 does not have this parameter", text, fix)
 

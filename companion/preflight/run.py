@@ -34,8 +34,9 @@ async def preflight(
     progress: Progress,
     known: Observations,
     sitl: bool,
-) -> list[Row]:
-    """Observe the open devices and evaluate the data, with the priority and on the cores of a flight.
+) -> tuple[list[Row], dict[str, float | int]]:
+    """Observe the open devices and evaluate the data, with the priority and on the cores of a flight. Return the rows, and the values
+    of PX4's parameters that were read.
 
     Args:
         devices, config, clock, out, progress, known: arguments of `companion.preflight.observe.observe`.
@@ -58,7 +59,7 @@ async def preflight(
         progress=progress,
         known=known,
     )
-    return evaluation.rows(seen, config)
+    return evaluation.rows(seen, config), dict(seen.params)
 
 
 def _hand_test(config: FlightConfig, natnet_version: str) -> tuple[str, str]:

@@ -1,7 +1,7 @@
 """Parameters of the simulated PX4: names, types (int for INT32, float for REAL32) and the defaults of PX4 1.16.
 
 The airframe and calibration parameters have the values of a quadrotor that has been set up. The names in `world.px4_params` are checked
-against this table.
+against this table if the stub flies.
 """
 
 from __future__ import annotations

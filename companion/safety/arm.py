@@ -16,6 +16,9 @@ from companion.safety.situation import HOLDS, Age, Situation, Values
 
 AT_LIMIT: Final = 0.97
 """Fraction of the torque limit at which a joint counts as being at its limit."""
+REFUSED_MAX_S: Final = 0.1
+"""Time without usable joint torques after which the vehicle lands. `REFUSED_FORGOTTEN` of the time with usable ones is taken off."""
+REFUSED_FORGOTTEN: Final = 0.25
 DRIFT_TIME_S: Final = 1.0
 """Time constant of the mean force."""
 _NO_FORCE: Vec3 = (0.0, 0.0, 0.0)
@@ -39,12 +42,20 @@ class ArmTracker:
         self.age_s = 0.0
         self.hottest_c = -math.inf
         """Temperature of the hottest servo; -inf without a joint state."""
-        self.torque_refused: str | None = None
-        """Why the law's joint torques were not sent in the last tick; None if they were."""
+        self.torque_refused = ""
+        """Why the law's joint torques were not sent when that last happened; empty before."""
+        self.refused_s = 0.0
+        """Time in which the law's joint torques were not sent, less `REFUSED_FORGOTTEN` of the time in which they were."""
+        self._awake_s = 0.0
 
     def update(self, i: Inputs, awake_s: float, torque_refused: str | None = None) -> None:
         """Update with the inputs of one tick."""
-        self.torque_refused = torque_refused
+        dt_s, self._awake_s = awake_s - self._awake_s, awake_s
+        if torque_refused is not None:
+            self.torque_refused = torque_refused
+            self.refused_s = min(self.refused_s + dt_s, 2.0 * REFUSED_MAX_S)
+        elif self.refused_s > 0.0:
+            self.refused_s -= REFUSED_FORGOTTEN * dt_s
         arm = self.arm = i.arm
         self.age_s = self._age.update(awake_s, arm.stamp_s if arm else None)
         self.before, self.hottest_c = None, -math.inf
@@ -67,8 +78,8 @@ def arm_read_failures(a: ArmTracker, failures_max: int) -> Values | None:
 
 
 def torque_refused(a: ArmTracker, _: None) -> Values | None:
-    """Fires if the law's joint torques were not sent."""
-    return (a.torque_refused,) if a.torque_refused is not None else None
+    """Fires if the law's joint torques were too often not sent, in a row or not."""
+    return (a.torque_refused,) if a.refused_s >= REFUSED_MAX_S else None
 
 
 def servo_error(a: ArmTracker, _: None) -> Values | None:

@@ -10,6 +10,7 @@ from typing import Final
 
 from companion.model.flight_stage import chosen_by_pilot, failsafe_chose, is_killed
 from companion.model.types import AutopilotStatus, FlightMode, Inputs, VehicleState
+from companion.safety.inertial_check import CLOCK_GROWTH
 from companion.safety.situation import HOLDS, Age, Situation, Values
 
 DISARMED_ABOVE_M = 0.15
@@ -17,8 +18,8 @@ DISARMED_ABOVE_M = 0.15
 CLOCK_BACK_S: Final = 1.0
 BATTERY_SILENT_S: Final = 10.0
 """Max age of a battery's newest BATTERY_STATUS, which PX4 sends every 2 s: a charge that is not known is not taken for a full one."""
-LAG_FORGOTTEN_S_PER_S: Final = 0.05
-"""Rate at which a lasting lag is reduced, because it is an offset between the clocks."""
+LAG_FORGOTTEN_S_PER_S: Final = CLOCK_GROWTH
+"""Rate at which a lasting lag is reduced, because two clocks drift apart; a queue that fills more slowly is not detected."""
 
 
 class Px4Tracker:

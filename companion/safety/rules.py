@@ -251,8 +251,9 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         id="torque_refused", subject=Subject.ARM,
-        what="the control law's joint torques are not finite or not one per joint, so that none are sent and the arm is limp",
-        predicate=arm.torque_refused, hold_time=0.1, ground=_LAND, air=_PX4_LANDS,
+        what="the control law's joint torques are not finite or not one per joint, so that none are sent and the arm is limp, "
+        "for 0.1 s; ticks with usable torques count backwards, at a quarter",
+        predicate=arm.torque_refused, ground=_LAND, air=_PX4_LANDS,
         message="the arm is limp, because the control law's torques are unusable: {}",
     ),
     Rule(

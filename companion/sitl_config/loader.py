@@ -51,6 +51,7 @@ def load_sitl(
     *,
     hardware: bool = False,
     world: str = DEFAULT_WORLD,
+    real_px4: bool = False,
 ) -> SitlConfig:
     """Read all files, apply the overrides, draw the world and check the result.
 
@@ -58,6 +59,7 @@ def load_sitl(
 
     Args:
         world: name of a built-in world, or path of a file.
+        real_px4: whether a real PX4 flies, which may have parameters that the stub does not have.
 
     Raises:
         ConfigError: the files have problems; the exception has one message per problem.
@@ -72,7 +74,7 @@ def load_sitl(
     try:
         vehicle = flight.vehicle if flight is not None else None
         joints, rotors = (len(vehicle.arm.joints), vehicle.airframe.rotor_layout.count) if vehicle else (0, 0)
-        simulated = load_world(overrides, world, joints, rotors)
+        simulated = load_world(overrides, world, joints, rotors, real_px4=real_px4)
     except ConfigError as error:
         lines += [line for line in error.lines if line not in lines]
     if flight is None or simulated is None:
@@ -103,7 +105,12 @@ def _faults_of_absent_parts(world: World, vehicle: Vehicle) -> Iterator[str]:
 
 
 def load_world(
-    overrides: Sequence[str] = (), world: str = DEFAULT_WORLD, joints: int = 0, rotors: int = 0
+    overrides: Sequence[str] = (),
+    world: str = DEFAULT_WORLD,
+    joints: int = 0,
+    rotors: int = 0,
+    *,
+    real_px4: bool = False,
 ) -> tuple[World, Laboratory]:
     """Return a simulated world, drawn from its seed, and the laboratory from which it was drawn.
 
@@ -112,6 +119,7 @@ def load_world(
         world: name of a built-in world, or path of a file.
         joints: number of joints of the arm. A list with one value for each joint that is shorter is extended by its last value.
         rotors: number of rotors. A list with one value for each rotor that is shorter starts again from its beginning.
+        real_px4: as in `load_sitl`.
 
     Raises:
         ConfigError: the world has problems; the exception has one message per problem.
@@ -121,7 +129,10 @@ def load_world(
     repeat_for_joints(document, joints)
     repeat_for_rotors(document, rotors)
     ranges = take_ranges(document)
-    return check_world(document, ranges, _seed_of(document.data)), Laboratory(name=world, ranges=ranges)
+    drawn = check_world(document, ranges, _seed_of(document.data))
+    if not real_px4 and (unknown := drawn.unknown_to_the_stub()):
+        raise ConfigError(unknown)
+    return drawn, Laboratory(name=world, ranges=ranges)
 
 
 def _extended(document: Document) -> Document:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
@@ -39,20 +40,21 @@ def _each_axis_once(names: tuple[str, str, str]) -> tuple[str, str, str]:
     return names
 
 
-def _px4_has_them(params: dict[str, float]) -> dict[str, float]:
+def _px4_can_hold_them(params: dict[str, float]) -> dict[str, float]:
     for name, value in params.items():
-        if name not in PX4_DEFAULTS:
-            close = nearest(name, [known.lower() for known in PX4_DEFAULTS])
-            hint = f" (did you mean {close.upper()}?)" if close else ""
-            raise ValueError(f"the simulated PX4 has no parameter {json.dumps(name)}{hint}")
-        if isinstance(PX4_DEFAULTS[name], int) and value != int(value):
+        if re.fullmatch("[A-Z0-9_]{1,16}", name) is None:
+            raise ValueError(
+                f"expected a parameter name with 1 to 16 of the characters A-Z, 0-9 and _, got {json.dumps(name)}"
+            )
+        integer = isinstance(PX4_DEFAULTS.get(name), int)
+        if integer and value != int(value):
             raise ValueError(f"expected a whole number for {name}, an INT32, got {value:g}")
-        if abs(value) >= (2**31 if isinstance(PX4_DEFAULTS[name], int) else REAL32_MAX):
+        if abs(value) >= (2**31 if integer else REAL32_MAX):
             raise ValueError(f"{name} cannot hold {value:g}")
     return params
 
 
-Px4Params = Annotated[dict[str, float], AfterValidator(_px4_has_them)]
+Px4Params = Annotated[dict[str, float], AfterValidator(_px4_can_hold_them)]
 SignedAxes = Annotated[tuple[SignedAxis, SignedAxis, SignedAxis], AfterValidator(_each_axis_once)]
 
 
@@ -179,7 +181,7 @@ class World(Model):
     hand_tap_n: Positive = 30.0
     """Peak force of a tap."""
     px4_params: Px4Params = Field(default={})
-    """PX4 parameters by name; they override the parameters of the simulated vehicle."""
+    """PX4 parameters by name; they override the parameters of the simulated vehicle. The stub has fewer of them than a real PX4."""
     faults: tuple[Fault, ...] = ()
     surfaces: Annotated[tuple[Surface, ...], Field(max_length=8)] = ()
     """Surfaces that the tip of the arm can touch. Touching one with a rotor is a crash."""
@@ -209,8 +211,20 @@ class World(Model):
         return self.px4_params.get("THR_MDL_FAC", self.rotors.thr_mdl_fac if self.rotors.on else 0.0)
 
     def overridden_px4_params(self) -> dict[str, float | int]:
-        """Return `px4_params` in PX4's types."""
+        """Return `px4_params` in PX4's types, or as float where only a real PX4 knows the type."""
         return {
-            name: int(value) if isinstance(PX4_DEFAULTS[name], int) else value
+            name: int(value) if isinstance(PX4_DEFAULTS.get(name), int) else value
             for name, value in self.px4_params.items()
         }
+
+    def unknown_to_the_stub(self) -> list[str]:
+        """Return one message for each of `px4_params` that the stub does not have."""
+        lines = []
+        for name in self.px4_params:
+            if name not in PX4_DEFAULTS:
+                close = nearest(name, [known.lower() for known in PX4_DEFAULTS])
+                hint = f" (did you mean {close.upper()}?)" if close else ""
+                lines.append(
+                    f"world.px4_params: the simulated PX4 has no parameter {json.dumps(name)}{hint}; a real one may (--sitl=px4)"
+                )
+        return lines

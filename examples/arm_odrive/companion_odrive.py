@@ -50,13 +50,10 @@ class ODriveArm:
 
     options = ODriveOptions
     product_name = "ODrive"
+    watchdog = "the ODrives' own watchdogs, as set with odrivetool (not read)"
 
     def __init__(self, options: ODriveOptions, device: ArmDevice, joints: Sequence[Joint]) -> None:
-        if 1e3 * options.watchdog_timeout_s > device.watchdog_ms:
-            raise ValueError(f"watchdog_timeout_s is longer than devices.arm.watchdog_ms ({device.watchdog_ms} ms)")
-        self.watchdog = (
-            f"the ODrives' own watchdogs, {1e3 * options.watchdog_timeout_s:g} ms as set with odrivetool (not read)"
-        )
+        self.watchdog_ms = 1e3 * options.watchdog_timeout_s
         self._nodes = [joint.servo_id for joint in joints]
         self._gear = options.gear_ratio
         self._reply_timeout_s = options.reply_timeout_s

@@ -13,18 +13,19 @@ from collections.abc import Iterator, Mapping
 
 from companion.px4.defaults import PX4_DEFAULTS as PX4_DEFAULTS
 from companion.px4.params_file import single
-from companion.px4.required import BY_NAME, simulated_values
+from companion.px4.required import simulated_values
+from companion.px4.versions import has
 
 MAV_PARAM_TYPE_INT32 = 6
 MAV_PARAM_TYPE_REAL32 = 9
 HASH_CHECK = "_HASH_CHECK"
-VERSION = "1.16"
+VERSION = (1, 16)
 """PX4 version from which the names and defaults come."""
 
 Value = int | float
 
 VEHICLE_DEFAULTS: Mapping[str, Value] = {
-    **{name: value for name, value in simulated_values().items() if BY_NAME[name].only in ("", VERSION)},
+    **{name: value for name, value in simulated_values().items() if has(name, VERSION)},
     "BAT1_CAPACITY": 5200.0,
     "MPC_TKO_SPEED": 0.6,
     "MPC_XY_CRUISE": 1.0,

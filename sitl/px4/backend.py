@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.config.airframe import Airframe
+from companion.px4.versions import varies
 from companion.sitl_config.faults import FaultKind
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.autopilot import Battery
@@ -23,8 +24,16 @@ from sitl.faults.injector import Autopilot as FaultyAutopilot
 from sitl.px4.control_link import ControlLink, Version, same
 from sitl.px4.hil_link import HilSensors, Px4Error, SimulatorLink
 from sitl.px4.parameter_file import restore, stored
-from sitl.px4.parameters import BEFORE_BOOT, VERSION_DEPENDENT, parameters
-from sitl.px4.process import HOW_TO_GET_IT, HOW_TO_START_IT, MODEL, Installation, Instance, Px4Process, find
+from sitl.px4.parameters import BEFORE_BOOT, parameters
+from sitl.px4.process import (
+    HOW_TO_GET_IT,
+    Installation,
+    Instance,
+    Px4Process,
+    abandoned_instance,
+    find,
+    how_to_start_it,
+)
 from sitl.px4.relay import Relay
 from sitl.udp import Address
 from sitl.world.world import World
@@ -159,7 +168,7 @@ class RealPx4:
         if self._process is None:
             self._progress(
                 f"px4 was not found; waiting up to {BY_HAND_DEADLINE_S:g} s on TCP {self._link.port} for a PX4 that is started by "
-                f"hand with {self._by_hand()}"
+                f"hand with {how_to_start_it(self.number)}"
             )
         await self._boot(BOOT_DEADLINE_S if self._process is not None else BY_HAND_DEADLINE_S)
         self._version = await self._control.version()
@@ -174,7 +183,7 @@ class RealPx4:
                 raise Px4Error(
                     f"PX4: expected the parameters to survive a restart, found {', '.join(left)} changed; {fix}"
                 )
-        await self._control.write(self._config.overridden_px4_params())
+        await self._write_parameters(self._config.overridden_px4_params())
         await self._control.request_mode_stream()
         self._flies = True
 
@@ -199,15 +208,18 @@ class RealPx4:
         await self._control.await_heartbeat()
 
     def _how(self) -> str:
-        return f"{HOW_TO_GET_IT}; or start PX4 by hand with {self._by_hand()} and run this command again"
-
-    def _by_hand(self) -> str:
-        return HOW_TO_START_IT.format(model=MODEL, number=self.number)
+        if (number := abandoned_instance()) is not None:
+            return (
+                f"instance {number} runs without a simulator: one that has flown must be started again, because its clock cannot go "
+                f"back; stop it, start it with {how_to_start_it(number)} and run this command again"
+            )
+        return f"{HOW_TO_GET_IT}; or start PX4 by hand with {how_to_start_it(self.number)} and run this command again"
 
     async def _write_parameters(self, wanted: Mapping[str, Value]) -> dict[str, Value]:
         """Write the parameters that differ from the wanted values and return those that were written, in PX4's types."""
         have = await self._control.read(wanted)
-        absent = [name for name in wanted if name not in have and name not in VERSION_DEPENDENT]
+        asked = self._config.px4_params
+        absent = [name for name in wanted if name not in have and (name in asked or not varies(name))]
         if absent:
             raise Px4Error(
                 f"PX4 {self._version}: expected the parameter {absent[0]}, found no parameter with this name"

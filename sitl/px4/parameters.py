@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 
 from companion.config.airframe import Airframe
-from companion.px4.required import WANTED, simulated_values
+from companion.px4.required import simulated_values
 from companion.px4.rotors import geometry_of
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.params import PX4_DEFAULTS, VEHICLE_DEFAULTS, Value, mav_type
@@ -29,9 +29,6 @@ SIMULATED_MOCAP: Mapping[str, Value] = {"EKF2_EV_DELAY": 10.0}
 """Delay from exposure to fusion in ms, measured on PX4 1.16.1: 5 ms of latency, the delay of the links, and half a period each of
 lockstep and EKF2. The stub has only the latency, for which the 5 ms in configs/px4/indoor_mocap.params are correct.
 """
-
-VERSION_DEPENDENT = frozenset(wanted.name for wanted in WANTED if wanted.only)
-"""Names of the parameters that not every PX4 version has."""
 
 _GAINS = (
     "MC_ROLL_P", "MC_PITCH_P", "MC_YAW_P", "MC_YAW_WEIGHT", "MC_ROLLRATE_MAX", "MC_PITCHRATE_MAX", "MC_YAWRATE_MAX", "MC_YAWRATE_P",
@@ -76,7 +73,9 @@ def parameters(airframe: Airframe, config: WorldConfig, hover_command: float) ->
         "THR_MDL_FAC": config.thr_mdl_fac,
         "MPC_THR_HOVER": hover_command * (1.0 + config.hover_thrust_error),
         "SIM_BAT_ENABLE": int(not config.battery.on),  # with this effect the world sends the battery's state
-        "SIM_BAT_DRAIN": config.battery_life_s,
+        "SIM_BAT_DRAIN": 0.0
+        if config.battery.on
+        else config.battery_life_s,  # the same for a PX4 without SIM_BAT_ENABLE
         "SIM_BAT_MIN_PCT": 0.0,
         "BAT1_N_CELLS": airframe.battery_cells,
         **config.overridden_px4_params(),

@@ -34,17 +34,18 @@ HOST = "127.0.0.1"
 HOW_TO_GET_IT = (
     "set PX4_SITL to the build folder of PX4 (make px4_sitl_default none in PX4-Autopilot), or install the px4 package"
 )
-HOW_TO_START_IT = (
-    "`PX4_SIM_MODEL={model} px4 -i {number}` (always in the same folder, because PX4 stores its parameters there) or "
-    "`PX4_SIM_MODEL={model} make px4_sitl_default none`"
-)
-"""The two commands that start a PX4 by hand."""
 _SIMULATOR, _ONBOARD, _ONBOARD_OWN, _GROUND_OWN = 4560, 14540, 14580, 18570
 _CAMERA, _CAMERA_OWN, _GIMBAL_OWN = 14030, 14280, 13030
 _LOG = "px4.log"
 _TAIL_BYTES = 20000
 _libc = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG = 1
+
+
+def how_to_start_it(number: int) -> str:
+    """Return the commands that start a PX4 of this instance by hand; `make` starts instance 0 only."""
+    by_make = f" or `PX4_SIM_MODEL={MODEL} make px4_sitl_default none`" if number == 0 else ""
+    return f"`PX4_SIM_MODEL={MODEL} px4 -i {number}` (always in the same folder, because PX4 stores its parameters there){by_make}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +172,25 @@ class Instance:
         self.close()
 
 
+def abandoned_instance() -> int | None:
+    """Return the first instance whose PX4 runs without a simulator, or None. A new PX4 opens its links only when it has found one."""
+    for number in INSTANCES:
+        with (
+            socket.socket(socket.AF_INET, socket.SOCK_STREAM) as simulator,
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link,
+        ):
+            simulator.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                simulator.bind((HOST, _SIMULATOR + number))
+            except OSError:
+                continue  # it flies, in another world
+            try:
+                link.bind((HOST, _ONBOARD_OWN + number))
+            except OSError:
+                return number
+    return None
+
+
 class Px4Process:
     """A running PX4.
 
@@ -241,10 +261,9 @@ class Px4Process:
         if self.running:
             self._process.kill()
         self._process.wait()
-        if self._process.returncode != 0:
-            for name in (f"/tmp/px4_lock-{self._number}", f"/tmp/px4-sock-{self._number}"):
-                with contextlib.suppress(OSError):
-                    os.unlink(name)
+        for name in (f"/tmp/px4_lock-{self._number}", f"/tmp/px4-sock-{self._number}"):
+            with contextlib.suppress(OSError):
+                os.unlink(name)
 
     def _last_error_line(self) -> str:
         said = _tail(self.log)

@@ -6,6 +6,7 @@ import asyncio
 import socket
 from collections.abc import Iterator
 
+import msgspec
 import pytest
 
 from companion.flight.command_queue import WAITING_MAX, Operator, StartCancelled, Turn
@@ -108,6 +109,41 @@ def test_a_resume_ends_the_hold_that_it_names_and_no_other(
     assert operator.next() == Turn(RESUME, resume(2)), "nothing stands: the core says so"
     assert operator.judged(RESUME, in_tick(SafetyAction.LAND)) is None
     assert operator.judged(NONE, in_tick(SafetyAction.HOLD)) == 3
+
+
+async def _turns(operator: Operator, ticks: int = 6) -> list[Turn]:
+    turns = []
+    for _ in range(ticks):
+        turns.append(operator.next())
+        await asyncio.sleep(0)
+    return turns
+
+
+@pytest.mark.parametrize("why", ["", "start refused: PX4's parameters have changed"])
+def test_a_start_waits_until_px4s_parameters_are_read_again(
+    launcher_and_operator: tuple[socket.socket, Operator], why: str
+) -> None:
+    _, operator = launcher_and_operator
+    reads = []
+
+    async def recheck() -> str:
+        reads.append(operator)
+        await asyncio.sleep(0)
+        return why
+
+    operator.recheck = recheck
+    (start,) = asked(START)
+    for _ in range(2):  # again after a refusal: they may have been set back
+        operator.ask([start])
+        first, *later = asyncio.run(_turns(operator))
+        assert first == Turn(NONE, None)
+        assert [turn for turn in later if turn.asked] == [Turn(NONE, start, why) if why else Turn(START, start)]
+    assert len(reads) == 2
+    operator.ask([start, *asked(HOLD)])
+    assert [turn.command for turn in asyncio.run(_turns(operator)) if turn.asked] == [HOLD], "no START after the HOLD"
+    operator.judged(NONE, msgspec.structs.replace(in_tick(SafetyAction.NOMINAL), phase_kind=PhaseKind.FLIGHT))
+    operator.ask([start])
+    assert operator.next() == Turn(START, start), "in the air nothing is read: the core refuses it"
 
 
 def test_a_resume_that_comes_right_behind_a_hold_does_not_undo_it(

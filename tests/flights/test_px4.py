@@ -50,10 +50,10 @@ LINE_TO_THE_WALL = (
     "mission.limits.speed_max_m_s=1.2",
     "mission.limits.acceleration_max_m_s2=1.2",
     "mission.phases=[{type: takeoff, height_m: 1.0, duration_s: 3.0}, "
-    "{type: line, to_m: [1.5, 0, 1.0], duration_s: 6.5}, {type: land, speed_m_s: 0.35}]",
+    "{type: line, to_m: [1.5, 0, 1.0], duration_s: 6.7}, {type: land, speed_m_s: 0.35}]",
 )
-"""Rotors 0.25 m from the wall at its end; 0.2 s less and the mission check refuses it."""
-NEAREST_STOP_S = 10.0
+"""Rotors 0.25 m from the wall at its end; 0.1 s less and the mission check refuses it."""
+NEAREST_STOP_S = 10.1
 """After arming, on that line: the predicted stop is nearest to the wall."""
 ENDED = {
     "kill_flight": "flight: the flight process was ended by SIGKILL",
@@ -307,13 +307,19 @@ def px4_by_hand(number: int, rootfs: Path) -> Iterator[subprocess.Popen[bytes]]:
             yield process
         finally:
             process.kill()
+            for left in (f"/tmp/px4_lock-{number}", f"/tmp/px4-sock-{number}"):
+                Path(left).unlink(missing_ok=True)
 
 
 @pytest.mark.parametrize("autopilot", [pytest.param("px4", marks=REAL)])
 def test_a_px4_started_by_hand_that_comes_late_flies(tmp_path: Path, autopilot: str) -> None:
     """Ended when the world asks for it, started once more in the same folder."""
     (tmp_path / "sitecustomize.py").write_text(_OLD_WORLD, encoding="utf-8")
-    by_hand = {VARIABLE: "", "PATH": str(tmp_path / "empty"), "PYTHONPATH": str(tmp_path)}
+    by_hand = {
+        VARIABLE: "",
+        "PATH": str(tmp_path / "empty"),
+        "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}",
+    }
     with Instance.claim() as free:
         number = free.number  # the world will find the same
     with sandbox_in(tmp_path / "sandbox", by_hand) as sandbox:
@@ -325,8 +331,12 @@ def test_a_px4_started_by_hand_that_comes_late_flies(tmp_path: Path, autopilot: 
                 px4.wait(DEADLINE_S)
             with px4_by_hand(number, tmp_path / "rootfs"):
                 ended = running.end()
+                again = sandbox.run("fly", HOVER, f"--sitl={autopilot}", "--out", "again")
         sandbox.assert_nobody_left()
     assert ended.code == EXIT_OK, (ended.out, ended.err)
+    assert again.code == EXIT_REFUSED and len(again.err_lines) == 1, (again.out, again.err)
+    assert f"instance {number} runs without a simulator: one that has flown must be started again" in again.err
+    assert f"start it with `PX4_SIM_MODEL={MODEL} px4 -i {number}`" in again.err
 
 
 def test_a_name_that_is_no_px4_refuses_the_flight_in_one_line(tmp_path: Path) -> None:

@@ -450,7 +450,7 @@ def test_statustexts_become_lines_each_reported_once() -> None:
                 )
             assert said == [
                 "critical: Arming denied: Resolve system health failures first",
-                "critical: Preflight Fail: heading estimate not stable",
+                "critical: Preflight Fail: heading estimate not stable (PX4 does not arm while this holds)",
                 "critical: exactly fifty characters, which may be a beginning",
             ]
 

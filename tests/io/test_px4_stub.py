@@ -21,7 +21,7 @@ from companion.model.types import (
 )
 from companion.runtime.clock import Clock, flight_clock
 from tests.io.stub_rig import standing_stub
-from tests.support import free_udp_port
+from tests.support import eventually, free_udp_port
 
 POSITION_WORLD_M = (-1.0, 0.5, 0.25)
 YAW_RAD = 0.4
@@ -209,5 +209,24 @@ def test_the_streams_come_as_fast_as_they_were_asked() -> None:
                     await asyncio.sleep(0.001)
             # PX4's default for HIGHRES_IMU is 50 Hz; loose, as the machine may be loaded.
             assert min(b - a for a, b in zip(sorted(stamps), sorted(stamps)[1:], strict=False)) < 0.015
+
+    asyncio.run(fly())
+
+
+def test_a_flight_begins_with_no_change_of_velocity_from_before_it() -> None:
+    """The first tick read the sum of the seconds before it, the second one the new sum: a kick of -38 m/s, and `mocap_dragged`."""
+
+    async def fly() -> None:
+        port = free_udp_port()
+        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+        async with standing_stub(port), MavsdkAutopilot(device, flight_clock()) as autopilot:
+
+            def climbed_m_s() -> float:
+                state = autopilot.vehicle()
+                return state.delta_velocity_body_m_s[2] if state and state.delta_velocity_body_m_s else 0.0
+
+            await eventually(lambda: climbed_m_s() > 10.0, "a second of gravity")
+            autopilot.start_sums()
+            assert climbed_m_s() < 1.0
 
     asyncio.run(fly())

@@ -17,9 +17,18 @@ def said(text: str, identity: int = 0, chunk: int = 0, severity: int = CRITICAL)
 
 
 def test_a_short_text_is_reported_at_once_and_without_its_tab() -> None:
-    assert Texts().take(said("Preflight Fail: no heading reference\t"), 0.0) == [
-        "critical: Preflight Fail: no heading reference"
-    ]
+    assert Texts().take(said("no heading reference\t"), 0.0) == ["critical: no heading reference"]
+
+
+@pytest.mark.parametrize(
+    ("text", "meaning"),
+    [
+        ("Preflight Fail: Yaw estimate error\t", "PX4 does not arm while this holds"),
+        ("Failsafe activated\t", "a warning as long as PX4 stays in OFFBOARD; if it leaves it, an event follows"),
+    ],
+)
+def test_a_text_that_looks_worse_than_it_is_is_explained_beside_it(text: str, meaning: str) -> None:
+    assert Texts().take(said(text), 0.0) == [f"critical: {text.strip()} ({meaning})"]
 
 
 @pytest.mark.parametrize("identity", [0, 1, 65535])

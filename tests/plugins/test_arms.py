@@ -57,7 +57,7 @@ class Options(Model):
     angles: list[float] = [0.5, -0.25]
 
 class Steady:
-    options, product_name, watchdog = Options, "Steady 1.0", "a relay after 0.1 s"
+    options, product_name, watchdog, watchdog_ms = Options, "Steady 1.0", "a relay", 100
     made = []
     def __init__(self, options, device, joints):
         self.left, self.angles, self.calls, self.written = options.after, options.angles, [], []
@@ -91,6 +91,10 @@ class Faulty(Steady):
     def later(self): return [MotorState(0.5, 0.0, 0.0, None, "over\\ncurrent"), MotorState(-0.25, 0.0, 0.0)]
 class Unwatched(Steady):
     watchdog = " "
+class Patient(Steady):
+    watchdog_ms = 101.0
+class Timeless(Steady):
+    watchdog_ms = math.nan
 class Absent(Steady):
     def open(self): raise ConnectionError("no motor\\nanswers")
 class Unmade(Steady):
@@ -103,8 +107,8 @@ class NoOptions(Steady):
 class Stays(Steady):
     def close(self): time.sleep(3.0)
 '''
-NAMES = ("Steady", "Raising", "Unwritable", "Nan", "Short", "Wrong", "Slow", "Faulty", "Unwatched", "Absent", "Unmade", "NoOff",
-         "NoOptions", "Stays")  # fmt: skip
+NAMES = ("Steady", "Raising", "Unwritable", "Nan", "Short", "Wrong", "Slow", "Faulty", "Unwatched", "Patient", "Timeless", "Absent",
+         "Unmade", "NoOff", "NoOptions", "Stays")  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -286,6 +290,8 @@ def test_an_arm_where_there_is_none_breaks_the_contract() -> None:
         ("wrong", r"cannot be opened: TypeError: read\(\) returned \(0.5, -0.25\), expected a list of MotorState"),
         ("slow", r"\(lab-arm 1.0\): read\(\) and write_torque\(\) take \d+\.\d ms or more \(limit 5 ms, one tick\)"),
         ("unwatched", "its attribute 'watchdog' does not state what makes the arm limp when the companion dies"),
+        ("patient", r"'watchdog_ms' is 101, expected above 0 and at most devices.arm.watchdog_ms \(100 ms\)"),
+        ("timeless", r"'watchdog_ms' is nan, expected above 0"),
         ("nowhere", "arm 'nowhere': is not installed; installed: dynamixel, absent, faulty, "),
     ],
 )  # fmt: skip
@@ -423,7 +429,7 @@ def test_an_odrive_turns_into_a_joint(monkeypatch: pytest.MonkeyPatch) -> None:
             async with PluginArm(odrive(), ODRIVE_ARM, flight_clock()) as arm:
                 assert arm.statement == ArmStatement(
                     "ODrive, firmware 0.6.10 and 0.6.10",
-                    "the ODrives' own watchdogs, 100 ms as set with odrivetool (not read)",
+                    "the ODrives' own watchdogs, as set with odrivetool (not read), after 100 ms",
                 )
                 state = arm.latest()
                 assert state is not None and motors.states == {3: 8, 5: 8}
@@ -448,7 +454,7 @@ def test_an_odrive_that_is_silent_or_has_a_slow_watchdog_is_refused(monkeypatch:
 
     with odrives(monkeypatch) as motors:
         slow = asyncio.run(refused(odrive(watchdog_timeout_s=0.2)))
-        assert "watchdog_timeout_s is longer than devices.arm.watchdog_ms (100 ms)" in slow
+        assert "'watchdog_ms' is 200, expected above 0 and at most devices.arm.watchdog_ms (100 ms)" in slow
         motors.silent = True
         monkeypatch.setattr("companion_odrive._START_TIMEOUT_S", 0.05)
         assert "no answer from nodes [3, 5] within 50 ms" in asyncio.run(refused(odrive()))

@@ -246,7 +246,7 @@ CASES = {
     "arm elsewhere": Case("mission.arm", "(150, 140)", "by hand", {"arm": r.arm(angle_rad=(math.radians(150), r.ARM_RAD[1]))}),
     "near the wall": Case("mission.room", "(-1.00,", "further in", {}, vehicle={"room.x_m": (-1.3, 2.2)}),
     "patient guardian": Case(
-        "mission.takeover", "0.18 s", "raise safety.react_time_s", {}, WARN, vehicle={"safety.guardian_timeout_s": 0.3}
+        "mission.takeover", "0.21 s", "raise safety.react_time_s", {}, WARN, vehicle={"safety.guardian_timeout_s": 0.11}
     ),
     "little disk": Case("machine.disk", "40 MB", "--out", {"machine": r.machine(disk_free_bytes=40_000_000)}, WARN),
     "full disk": Case("machine.disk", "20 MB", "delete", {"machine": r.machine(disk_free_bytes=20_000_000)}),

@@ -11,6 +11,7 @@ from companion.config.devices import AutopilotDevice
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
+from companion.flight.startup import changed_since
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.check_row import Level, Row
 from companion.preflight.evaluation import param_names
@@ -18,10 +19,12 @@ from companion.preflight.px4 import firmware_row, rows
 from companion.px4.defaults import PX4_DEFAULTS
 from companion.px4.required import HOVER, ROTOR_COUNT, WANTED, file_values, simulated_values
 from companion.px4.rotors import geometry_of
+from companion.px4.versions import has
 from companion.runtime.clock import flight_clock
 from companion.sitl_config.loader import load_world
 from companion.sitl_config.world import World
 from sitl.autopilot.backend import stub_of
+from sitl.px4.parameters import parameters
 from tests.io.stub_rig import standing_stub
 from tests.support import free_udp_port
 
@@ -167,7 +170,7 @@ def test_types_and_names_are_those_of_px4() -> None:
         if wanted.value is not None:
             assert wanted.accepts(wanted.value, vehicle()), wanted.name
     assert {wanted.name for wanted in WANTED if wanted.name not in PX4_DEFAULTS} == {
-        wanted.name for wanted in WANTED if wanted.hardware or wanted.only == "1.18"
+        wanted.name for wanted in WANTED if wanted.hardware or not has(wanted.name, (1, 17))
     }
 
 
@@ -189,6 +192,24 @@ def test_a_wrong_parameter_over_real_mavlink_gives_its_row() -> None:
     assert found == {"EKF2_EV_CTRL", "COM_OBL_RC_ACT", "COM_OF_LOSS_T", "rotors in PX4"}
 
 
+def test_a_parameter_that_changes_while_the_flight_waits_refuses_the_start_until_it_is_set_back() -> None:
+    async def answers() -> list[str]:
+        port = free_udp_port()
+        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+        said = []
+        async with standing_stub(port), MavsdkAutopilot(device, flight_clock()) as autopilot:
+            checked = await autopilot.read_params(param_names(vehicle()))
+            before = checked["COM_OBL_RC_ACT"]
+            for value in (before, 6, before):
+                await autopilot.write_param("COM_OBL_RC_ACT", value)
+                said.append(await changed_since(checked, autopilot))
+        return said
+
+    first, changed, back = asyncio.run(answers())
+    assert (first, back) == ("", "")
+    assert "COM_OBL_RC_ACT is 6, was 4" in changed and changed.startswith("start refused: ")
+
+
 @pytest.mark.parametrize(
     ("override", "said"),
     [
@@ -201,6 +222,37 @@ def test_a_wrong_parameter_that_px4_cannot_have_is_refused(override: str, said: 
     with pytest.raises(ConfigError) as caught:
         load_world([f"world.px4_params={override}"])
     assert said in caught.value.lines[0]
+
+
+def test_a_parameter_that_only_a_real_px4_has_is_left_to_it() -> None:
+    override = "world.px4_params={MC_REF_W_N: 100}"
+    with pytest.raises(ConfigError, match=r"the simulated PX4 has no parameter \"MC_REF_W_N\".*--sitl=px4"):
+        load_world([override])
+    world, _ = load_world([override], real_px4=True)
+    assert world.overridden_px4_params() == {"MC_REF_W_N": 100.0}
+    with pytest.raises(ConfigError, match=r'expected a parameter name .* got "ekf2"'):
+        load_world(["world.px4_params={ekf2: 1}"], real_px4=True)
+
+
+@pytest.mark.parametrize(
+    ("release", "absent"),
+    [
+        *(((1, minor), {"SENS_GPS0_DELAY", "SENS_GPS1_DELAY", "MC_REF_W_N"}) for minor in (15, 16, 17)),
+        ((1, 18), {"EKF2_GPS_DELAY", "SIM_BAT_ENABLE"}),
+    ],
+)
+def test_each_version_has_its_own_parameters_and_none_of_another_is_missed(
+    release: tuple[int, int], absent: set[str]
+) -> None:
+    """As read in the sources of 1.15.4, 1.16.1 and 1.17, and seen with 1.18."""
+    simulated = parameters(vehicle().airframe, World(), 0.5)
+    assert {name for name in {*file_values(), *simulated} if not has(name, release)} == absent
+    assert wrong({name: value for name, value in good().items() if name not in absent}) == []
+
+
+def test_1_18s_reference_model_as_it_comes_is_warned_of() -> None:
+    (row,) = wrong({**good(), "MC_REF_W_N": 50.0})
+    assert (row.title, row.level) == ("MC_REF_W_N", Level.WARN) and "set MC_REF_W_N to 200" in row.fix
 
 
 def test_wrong_parameters_come_in_px4s_types() -> None:

@@ -22,7 +22,7 @@ from sitl.px4.backend import STUB_ONLY_FAULTS, refuse_stub_only_settings
 from sitl.px4.control_link import ControlLink, same
 from sitl.px4.hil_link import Px4Error
 from sitl.px4.parameters import parameters, rotor_geometry
-from sitl.px4.process import Instance
+from sitl.px4.process import Instance, abandoned_instance, how_to_start_it
 from sitl.px4.relay import Relay
 from tests.sitl.px4_rig import Rig
 from tests.support import DEADLINE_S
@@ -141,8 +141,20 @@ def test_every_other_fault_is_flown() -> None:
 
 
 def test_a_battery_of_the_world_takes_the_place_of_px4s_own() -> None:
-    assert parameters(VEHICLE.airframe, World(), 0.5)["SIM_BAT_ENABLE"] == 1
-    assert parameters(VEHICLE.airframe, World(battery=BatteryConfig(on=True)), 0.5)["SIM_BAT_ENABLE"] == 0
+    own = parameters(VEHICLE.airframe, World(battery_life_s=600.0), 0.5)
+    assert (own["SIM_BAT_ENABLE"], own["SIM_BAT_DRAIN"]) == (1, 600.0)
+    worlds = parameters(VEHICLE.airframe, World(battery=BatteryConfig(on=True)), 0.5)
+    assert (worlds["SIM_BAT_ENABLE"], worlds["SIM_BAT_DRAIN"]) == (0, 0.0), "the second for 1.18, which lacks the first"
+
+
+def test_a_px4_started_by_hand_that_still_runs_after_its_flight_is_found() -> None:
+    with Instance.claim() as instance, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        link.bind(instance.onboard_address)
+        assert abandoned_instance() != instance.number, "its world is there: it flies"
+        instance.simulator.close()
+        assert abandoned_instance() == instance.number
+    assert abandoned_instance() != instance.number
+    assert "make" in how_to_start_it(0) and "px4 -i 3`" in how_to_start_it(3) and "make" not in how_to_start_it(3)
 
 
 def test_the_battery_is_sent_as_one_of_px4s_own_system() -> None:

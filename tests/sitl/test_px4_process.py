@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import signal
 import socket
@@ -88,10 +89,15 @@ def test_it_runs_in_its_folder_and_ends_when_asked(tmp_path: Path) -> None:
                             t_s += 0.004
                             link.send(ImuSample(t_s, (0.0, 0.0, 0.0), (0.0, 0.0, -9.81)), 0.3, (1.0, 0.0, 0.0, 0.0))
                             await link.await_lockstep(0.004)
+                    left = f"/tmp/px4-sock-{instance.number}"  # PX4 leaves it there also at an orderly end
+                    with contextlib.suppress(FileExistsError):
+                        os.symlink("nowhere", left)
                     process.terminate()
                     assert await process.await_end(DEADLINE_S)
                 finally:
                     process.kill()
+        with pytest.raises(FileNotFoundError):
+            os.lstat(left)
         log = (tmp_path / "scratch" / "px4.log").read_text()
         assert f"instance {instance.number}, start scripts {tmp_path / 'build' / 'etc'}" in log
 

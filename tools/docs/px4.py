@@ -12,6 +12,7 @@ from pathlib import Path
 from companion.preflight.px4 import text_of
 from companion.px4 import params_file
 from companion.px4.required import GROUPS, NO_RADIO, RADIO, file_values
+from companion.px4.versions import varies, which
 from tools.docs.tables import written
 
 NO_RADIO_FILE = "no_radio.params"
@@ -29,10 +30,10 @@ def indoor_mocap_text() -> str:
             above = ["", f"== {title} =="] if index == 0 else []
             reboot = " Takes effect after a reboot." if wanted.reboot else ""
             also = f" Accepted: {wanted.text()}." if wanted.ok or wanted.limits else ""
-            only = f" PX4 {wanted.only} only." if wanted.only else ""
+            only = f" PX4 {which(wanted.name)}." if varies(wanted.name) else ""
             comments[wanted.name] = above + textwrap.wrap(f"{wanted.name}: {wanted.why}.{also}{reboot}{only}", _WIDTH)
     heading = [
-        "PX4 1.16 and 1.18, for a quadrotor that flies indoors on motion capture, without GPS.",
+        "PX4 1.15 to 1.18, for a quadrotor that flies indoors on motion capture, without GPS.",
         "",
         "Load it in QGroundControl (Vehicle setup > Parameters > Tools > Load from file), or with",
         "companion px4 params --write, which writes only values that differ and saves the old values in a file.",
@@ -67,7 +68,7 @@ def table_markdown() -> str:
             if not wanted.file and wanted.value is not None:
                 value += " without a radio"
             reboot = "yes" if wanted.reboot else ""
-            name = f"`{wanted.name}` ({wanted.only} only)" if wanted.only else f"`{wanted.name}`"
+            name = f"`{wanted.name}` ({which(wanted.name)})" if varies(wanted.name) else f"`{wanted.name}`"
             lines.append(f"| {name} | {value} | {wanted.text()} | {wanted.level.value} | {reboot} | {wanted.why} |")
         lines.append("")
     return "\n".join(lines).rstrip()

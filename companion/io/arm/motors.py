@@ -40,7 +40,9 @@ class ArmMotors(Protocol):
     product_name: str
     """Model and firmware as the motors report them, once they are open."""
     watchdog: str
-    """What makes the arm limp when the companion dies, and when; the preflight shows it. An empty text refuses the flight."""
+    """What makes the arm limp when the companion dies; the preflight shows it. An empty text refuses the flight."""
+    watchdog_ms: float
+    """Time after the last command until it does, once the motors are open. More than `device.watchdog_ms` refuses the flight."""
 
     def __init__(self, options: Any, device: ArmDevice, joints: Sequence[Joint]) -> None: ...
 

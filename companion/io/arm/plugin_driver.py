@@ -70,11 +70,17 @@ class PluginArm(ThreadedArm[tuple[MotorState, ...], Joints]):
                 self._motors.open()
                 states = checked(self._motors.read(), len(self._joints))
                 product, watchdog = str(self._motors.product_name), str(self._motors.watchdog).strip()
+                watchdog_ms = float(self._motors.watchdog_ms)
             except Exception as error:
                 raise plugin.error(f"cannot be opened: {one_line(error)}") from error
             if not watchdog:
                 raise plugin.error(
                     "its attribute 'watchdog' does not state what makes the arm limp when the companion dies"
+                )
+            if not 0.0 < watchdog_ms <= self._device.watchdog_ms:
+                raise plugin.error(
+                    f"its attribute 'watchdog_ms' is {watchdog_ms:g}, expected above 0 and at most devices.arm.watchdog_ms "
+                    f"({self._device.watchdog_ms} ms); set the motors' watchdog, or correct the vehicle file"
                 )
             self._zeros_rad = [
                 zero_rad + _turns_rad(joint, zero_rad, state.angle_rad)
@@ -88,7 +94,7 @@ class PluginArm(ThreadedArm[tuple[MotorState, ...], Joints]):
             raise DeviceError(
                 f"{plugin}: read() and write_torque() take {took_s * 1e3:.1f} ms or more (limit {TICK_PERIOD_S * 1e3:g} ms, one tick)"
             )
-        self._statement = ArmStatement(product, watchdog)
+        self._statement = ArmStatement(product, f"{watchdog}, after {watchdog_ms:g} ms")
 
     def _trial_s(self) -> float:
         """Return the duration of one cycle with torque 0."""

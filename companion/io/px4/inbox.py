@@ -58,8 +58,11 @@ class Inbox:
         self._vehicle: VehicleState | None = None
 
     def start_sums(self) -> None:
-        """Start the integral of the specific force at zero; called when the flight begins."""
-        self._delta_velocity_frd = DeltaVelocity()
+        """Start the integral of the specific force at zero, also that of the newest sample; called when the flight begins."""
+        self._delta_velocity_frd, self._vehicle_key = DeltaVelocity(), None
+        if self._imu is not None:
+            stamp_s, force_m_s2, boot_s, _, _ = self._imu
+            self._imu = (stamp_s, force_m_s2, boot_s, (0.0, 0.0, 0.0), 0)
 
     def take(self, stamp_s: float, message_id: int, frame: bytes) -> None:
         """Store a message of the autopilot that is not one of `readers`, if the companion reads it or a question waits for it.

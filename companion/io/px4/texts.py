@@ -19,6 +19,11 @@ SAME_TEXT_S = 10.0
 """Time during which a repeated line is not reported again."""
 _SEVERITIES = ("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug")
 _LEAST_SEVERE = _SEVERITIES.index("notice")
+_MEANINGS = {
+    "Preflight Fail": "PX4 does not arm while this holds",
+    "Failsafe activated": "a warning as long as PX4 stays in OFFBOARD; if it leaves it, an event follows",
+}
+"""Texts of PX4 that look worse than they are, by their beginning."""
 
 
 @dataclass(slots=True)
@@ -80,4 +85,5 @@ class Texts:
         if parts is None or parts.severity > _LEAST_SEVERE:
             return []
         text = "".join(c if c.isprintable() else "?" for c in " ".join(parts.text.split()))
-        return self.once(f"{_SEVERITIES[parts.severity]}: {text}", now_s) if text else []
+        meaning = next((f" ({meaning})" for start, meaning in _MEANINGS.items() if text.startswith(start)), "")
+        return self.once(f"{_SEVERITIES[parts.severity]}: {text}{meaning}", now_s) if text else []

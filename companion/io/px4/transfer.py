@@ -11,6 +11,7 @@ from companion.model.types import AutopilotStatus
 from companion.px4.defaults import PX4_DEFAULTS
 from companion.px4.params_file import Value, same
 from companion.px4.required import BY_NAME, NO_VEHICLE
+from companion.px4.versions import varies
 
 
 class ParamLink(Protocol):
@@ -55,7 +56,7 @@ class Comparison:
 
     differences: tuple[Difference, ...]
     absent: tuple[str, ...]
-    """Parameters in the file that PX4 does not have, except those of another version of PX4 (`Wanted.only`)."""
+    """Parameters in the file that PX4 does not have, except those that only some versions of PX4 have."""
     absent_port: tuple[str, ...]
     """Absent parameters of a serial port that this PX4 does not have (a simulator, or a board without TELEM2). This is not an error."""
     measured: tuple[Difference, ...] = ()
@@ -95,7 +96,7 @@ def compare(
             if not same(value, found[name]):
                 difference = Difference(name, found[name], value)
                 (measured if _is_measured(difference) else differences).append(difference)
-        elif name not in BY_NAME or not BY_NAME[name].only:
+        elif not varies(name):
             absent.append(name)
     return Comparison(tuple(differences), tuple(absent), tuple(absent_port), tuple(measured), skipped or {})
 
