@@ -42,7 +42,7 @@ class Monitors:
         self._mocap = MocapTracker(vehicle.safety)
         self._px4 = Px4Tracker(vehicle.airframe.ground_clearance_m)
         self._arm = ArmTracker()
-        self._force = ForceTracker(vehicle.safety.force_stuck_s)
+        self._force = ForceTracker(vehicle.safety.force_stuck_s, vehicle.safety.force_disagreement_n)
         self._process = ProcessTracker()
         self._flight = FlightTracker(vehicle)
         trackers: dict[Subject, object] = {

@@ -9,7 +9,7 @@ import math
 from typing import Final
 
 from companion.model.flight_stage import chosen_by_pilot, failsafe_chose, is_killed
-from companion.model.types import AutopilotStatus, FlightMode, Inputs, VehicleState
+from companion.model.types import AutopilotStatus, FlightMode, Inputs, Vec2, VehicleState
 from companion.safety.situation import HOLDS, Age, Situation, Values
 
 DISARMED_ABOVE_M = 0.15
@@ -17,8 +17,9 @@ DISARMED_ABOVE_M = 0.15
 CLOCK_BACK_S: Final = 1.0
 BATTERY_SILENT_S: Final = 10.0
 """Max age of a battery's newest BATTERY_STATUS, which PX4 sends every 2 s: a charge that is not known is not taken for a full one."""
-LAG_FORGOTTEN_S_PER_S: Final = 0.05
-"""Rate at which a lasting lag is reduced, because it is an offset between the clocks."""
+LAG_FORGOTTEN_S_PER_S: Final = 0.005
+"""Rate at which a lasting lag is reduced, because it is an offset between the clocks: 50 times the drift between two crystals, for a
+simulation that falls behind the computer's clock."""
 
 
 class Px4Tracker:
@@ -115,6 +116,11 @@ def killed(p: Px4Tracker, _: None) -> Values | None:
 def px4_rebooted(p: Px4Tracker, _: None) -> Values | None:
     """Fires if PX4's clock has stepped back."""
     return None if p.rebooted_s is None else (p.rebooted_s,)
+
+
+def link_slow(p: Px4Tracker, thresholds: Vec2) -> Values | None:
+    """Fires if the lag of PX4's state exceeds the first threshold but not the second."""
+    return (p.lag_s * 1e3, thresholds[0] * 1e3) if thresholds[0] < p.lag_s <= thresholds[1] else None
 
 
 def link_late(p: Px4Tracker, lag_max_s: float) -> Values | None:

@@ -14,10 +14,20 @@ import pytest
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
-from companion.model.types import Event, FlightMode, Inputs, MocapPose, OperatorCommand, SafetyAction, Severity
+from companion.model.types import (
+    ControlLog,
+    Event,
+    FlightMode,
+    Inputs,
+    MocapPose,
+    OperatorCommand,
+    SafetyAction,
+    Severity,
+)
 from companion.safety.arm import error_text
 from companion.safety.mocap import unfused
 from companion.safety.monitors import Monitors
+from companion.safety.oscillation import Oscillation
 from companion.safety.rule import Rule, Subject
 from companion.safety.rules import RULES
 from companion.safety.situation import Situation
@@ -25,6 +35,7 @@ from tests.safety.healthy import (
     SLOW,
     START_S,
     TICK_S,
+    ZERO8,
     Change,
     after_a_moment,
     control,
@@ -149,6 +160,25 @@ def estimator(**fields: float) -> Change:
     return lambda i: put("estimator", **fields)(fed_by_another(i))
 
 
+class Swinging(Situation):
+    """The position error swings by 0.24 m to and fro, twice a second: it is read twice in each tick."""
+
+    _reads = 0
+
+    @property
+    def control(self) -> ControlLog:
+        self._reads += 1
+        error_m = 0.12 * math.sin(2.0 * math.tau * self._reads * 0.5 * TICK_S)
+        return control(error=(error_m, *ZERO8[1:]))
+
+    @control.setter
+    def control(self, _: ControlLog) -> None: ...
+
+
+def swinging() -> Situation:
+    return Swinging(**{name: getattr(flying(), name) for name in ("airborne", "offboard_expected", "tracking_error_m")})
+
+
 FAULTS: dict[str, Fault] = {
     "estimator_silent": Fault(lambda i: replace(i, estimator=fed_by_another(healthy()).estimator)),
     "vision_lost": Fault(estimator(flags=0b1111)),
@@ -176,6 +206,7 @@ FAULTS: dict[str, Fault] = {
     "estimate_frozen": Fault(frozen_values("vehicle", "position_world_m", "velocity_world_m_s")),
     "heartbeat_lost": Fault(stopped("status")),
     "px4_rebooted": Fault(put("vehicle", boot_s=2.0), also=frozenset({"link_late"})),
+    "link_slow": Fault(lambda i: put("vehicle", boot_s=i.t_s - 0.03)(i)),
     "link_late": Fault(slow_link),
     "killed": Fault(put("status", system_status=8)),
     "reattached": Fault(situation=lambda: flying(found_armed=FOUND)),
@@ -204,11 +235,17 @@ FAULTS: dict[str, Fault] = {
     "force_overload": Fault(put("force", overload=True)),
     "force_stuck": Fault(frozen_values("force", "force_sensor_n", "torque_sensor_nm")),
     "force_drift": Fault(situation=lambda: flying(control=control(force_ext_world_n=(3.5, 0.0, 0.0)))),
+    "force_disagrees": Fault(
+        situation=lambda: flying(
+            control=control(force_ext_world_n=(0.0, 0.0, 1.5)), disturbance_world_n=(0.0, 0.0, -1.5)
+        )
+    ),
     "loop_late": Fault(),
     "loop_stalled": Fault(),
     "recorder_drops": Fault(lambda i: replace(i, recorder_dropped=3)),
     "guardian_lost": Fault(lambda i: replace(i, guardian_ready=False)),
     "tilt": Fault(leaning(45.0), sound=0),
+    "oscillates": Fault(put("vehicle", angular_rate_body_rad_s=(0.0, 0.4, 0.0)), situation=swinging),
     "crashed": Fault(leaning(120.0), sound=0, also=frozenset({"tilt"})),
     "tracking_warn": Fault(situation=lambda: flying(tracking_error_m=0.5)),
     "tracking_hold": Fault(situation=lambda: flying(tracking_error_m=0.7), also=frozenset({"tracking_warn"})),
@@ -290,6 +327,7 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "vision_lost": (PX4_LANDS, PX4_LANDS, 0.015),
     "vision_rejected": (None, WARN, 0.220),  # vision_lost follows if it lasts
     "px4_rebooted": (PX4_LANDS, PX4_LANDS, 0.015),
+    "link_slow": (WARN, WARN, 0.170),  # the law still has a margin
     "link_late": (PX4_LANDS, PX4_LANDS, 0.170),
     "estimate_frozen": (None, PX4_LANDS, 0.270),
     "vehicle_state_lost": (PX4_LANDS, PX4_LANDS, 0.270),
@@ -317,11 +355,13 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "force_overload": (WARN, WARN, 0.015),
     "force_stuck": (None, WARN, 0.275),
     "force_drift": (None, WARN, 2.850),
+    "force_disagrees": (None, WARN, 0.545),  # the law flies on without it
     "loop_late": (WARN, WARN, 0.215),
     "loop_stalled": (LAND, LAND, 1.015),  # the next stall may be longer
     "recorder_drops": (WARN, WARN, 0.015),
     "guardian_lost": (LAND, WARN, 0.015),  # in the air it is no reason to land; a flight does not begin without it
     "tilt": (None, PX4_LANDS, 0.105),  # the law has lost control; on the ground a vehicle may stand on a slope
+    "oscillates": (None, PX4_LANDS, 0.985),  # the law is unstable: its hold and its landing would swing too
     "crashed": (None, TERMINATE, 0.300),  # the rotors must stop
     "too_fast": (None, HOLD, 0.105),  # stopping is enough
     "climbs_too_fast": (None, LAND, 0.105),
@@ -348,12 +388,13 @@ in s, its event must come. Written from the hazards, not from the table of the r
 READS = """
     reattached 1.00; mocap_lost 0.20; mocap_invalid 0.20; mocap_swapped 0.30 0; mocap_jump 0.40 0;
     mocap_dragged 91 40; mocap_slow 31 50; mocap_late 80 50; mocap_too_late 200 120; estimate_disagrees 0.34 0.30;
-    yaw_disagrees 20 15; estimator_silent 0.25; vision_rejected 1.2 1; px4_rebooted 2.0; link_late 92 70;
+    yaw_disagrees 20 15; estimator_silent 0.25; vision_rejected 1.2 1; px4_rebooted 2.0; link_slow 29 20; link_late 99 35;
     vehicle_state_lost 0.25; heartbeat_lost 2.5; px4_disarmed 1.00; battery_warn 25 30; battery_low 10 20;
     battery_silent 10; battery_voltage 13.0 13.2; arm_lost 0.10; arm_read_failures 5; torque_refused 0.0; servo_error 70 2;
     joint_jump 2 29; servo_warm 68 65; servo_hot 76 75; servo_overload -2.5 0.1; joint_rate 0 745 700;
     joint_beyond_limit 180 57 5; joint_far_beyond_limit 115 -25 15; force_lost 0.25; force_overload 1 -1 0;
-    force_drift 3.3 0.0 0.0 2.0; loop_late 205 50; loop_stalled 1005 300; tilt 45 40; crashed 120;
+    force_drift 3.3 0.0 0.0 2.0; force_disagrees 0.0 0.0 0.8 0.0 0.0 -0.8;
+    oscillates 0.10 18; loop_late 205 50; loop_stalled 1005 300; tilt 45 40; crashed 120;
     too_fast 2.1 2.0; climbs_too_fast 1.6 1.5; sinks_too_fast 1.6 1.5; geofence_left -1.90 0.00 1.00;
     geofence_near 2.26 0.00 1.00; tracking_warn 0.50 0.45; tracking_hold 0.70 0.60; tracking_error 1.20 0.80;
     thrust_saturated 54 1.0; contact_force_high 15.0 12.0; tether_short 0.05 0.10; tether_taut 1.20 0;
@@ -965,3 +1006,32 @@ def test_every_threshold_of_the_table_is_one_that_runs(rule: Rule) -> None:
         assert expected is not None
         until = inputs[: expected + 1]
         assert any(reported(scaled(key, factor, machine), until) != expected for factor in (1e-3, 1e3, -1e3)), key
+
+
+SWING_M = VEHICLE.safety.oscillation_m
+
+
+@pytest.mark.parametrize(
+    ("error_m", "rate_rad_s", "oscillates"),
+    [
+        (lambda t_s: 0.55 * SWING_M * math.sin(3.0 * t_s), 0.4, True),
+        (lambda t_s: 0.3 + 0.55 * SWING_M * math.sin(3.0 * t_s), 0.4, True),  # about another place, in wind
+        (lambda t_s: 0.45 * SWING_M * math.sin(3.0 * t_s), 0.4, False),
+        (lambda t_s: 0.55 * SWING_M * math.sin(3.0 * t_s), 0.2, False),  # the reference wanders, not the vehicle
+        (lambda t_s: 3.0 * SWING_M * math.exp(-2.0 * t_s) * math.sin(3.0 * t_s), 0.4, False),  # a blow that dies out
+        (lambda t_s: 0.55 * SWING_M * math.sin(0.9 * t_s), 0.4, False),  # drifting air
+    ],
+)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_only_swings_that_last_are_an_oscillation(
+    error_m: Callable[[float], float], rate_rad_s: float, oscillates: bool, axis: int
+) -> None:
+    watch = Oscillation(SWING_M)
+    found = []
+    for k in range(2000):
+        error, rate = [0.0, 0.0], [0.0, 0.0]
+        error[axis], rate[1 - axis] = error_m(k * TICK_S), rate_rad_s
+        watch.update(k * TICK_S, TICK_S, (error[0], error[1]), (rate[0], rate[1]))
+        found.append(watch.rate_rad_s is not None)
+    assert any(found) is oscillates
+    assert not any(found[:400]), "not before two periods, of 2.1 s each"
