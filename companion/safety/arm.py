@@ -27,6 +27,8 @@ CHANGE_MIN_N: Final = 0.5
 CHANGE_SHARE: Final = 0.6
 """Smallest unexplained part of the measured change: a sensor's scale and mounting explain less."""
 CHANGE_HOLD_S: Final = 0.3
+CHANGE_ABOVE_M: Final = 0.1
+"""Height above standing height from which the floor does not carry the vehicle."""
 CHANGE_AGE_MAX_S: Final = 0.05
 """Age of a sample from which there is no measured force to compare."""
 _NO_FORCE: Vec3 = (0.0, 0.0, 0.0)
@@ -195,10 +197,12 @@ class ForceTracker:
         stuck_s: hold time after which samples that repeat themselves count as lost, `safety.force_stuck_s`.
         disagreement_n: threshold of the change of the measured force that the vehicle's motion does not show,
             `safety.force_disagreement_n`.
+        clearance_m: height of the body's origin when the vehicle is on the ground.
     """
 
-    def __init__(self, stuck_s: float, disagreement_n: float) -> None:
+    def __init__(self, stuck_s: float, disagreement_n: float, clearance_m: float) -> None:
         self._stuck_s, self._disagreement_n = stuck_s, disagreement_n
+        self._low_m = clearance_m + CHANGE_ABOVE_M
         self._measured, self._felt = _Change(), _Change()
         self._off_s = 0.0
         self.off_n: tuple[Vec3, Vec3] | None = None
@@ -233,7 +237,8 @@ class ForceTracker:
             self.mean_n, self._measured, self._felt = _NO_FORCE, _Change(), _Change()
             return
         measured_n = control.force_measured_world_n or control.force_ext_world_n
-        if felt_n is None or self.age_s > CHANGE_AGE_MAX_S:
+        low = i.vehicle is None or i.vehicle.position_world_m[2] < self._low_m
+        if low or felt_n is None or self.age_s > CHANGE_AGE_MAX_S:
             self._measured, self._felt = _Change(), _Change()
         elif self.trusted:
             self._disagree(dt_s, self._measured.update(dt_s, measured_n), self._felt.update(dt_s, felt_n))

@@ -147,6 +147,8 @@ def test_a_force_sensor_with_wrong_axes_is_reported_at_the_catch_and_not_used(ax
     result = flight.run(until_mission_s=9.0)
     assert result.caught
     assert event_ids(result) == ["takeoff", "force_disagrees"]
+    last = result.outputs[-1].control
+    assert last is not None and last.force_ext_world_n == (0.0, 0.0, 0.0), "the law still uses it"
 
 
 def test_a_delay_that_makes_the_control_law_swing_is_reported_and_px4_lands() -> None:

@@ -50,6 +50,11 @@ from tests.safety.healthy import (
 
 VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
 EXTERNAL = load_vehicle("configs/vehicles/tarot650_2r.yaml", overrides=["vehicle.devices.mocap.type=external"])
+NO_INERTIAL = load_vehicle(
+    "configs/vehicles/tarot650_2r.yaml",
+    overrides=["vehicle.safety.mocap_inertial_m=9", "vehicle.safety.mocap_jump_m=1"],
+)
+"""For positions that move although the IMU rests."""
 replace = msgspec.structs.replace
 NAN = math.nan
 RULE = {rule.id: rule for rule in RULES}
@@ -1035,3 +1040,38 @@ def test_only_swings_that_last_are_an_oscillation(
         found.append(watch.rate_rad_s is not None)
     assert any(found) is oscillates
     assert not any(found[:400]), "not before two periods, of 2.1 s each"
+
+
+@pytest.mark.parametrize(("late_s", "id_"), [(0.01, None), (0.03, "link_slow"), (0.06, "link_late")])
+@pytest.mark.parametrize("offset_m", [(0.0, 0.0, 0.0), (0.05, -0.03, 0.02)])
+def test_a_link_that_was_always_slow_is_found_when_the_vehicle_moves(
+    late_s: float, id_: str | None, offset_m: tuple[float, float, float]
+) -> None:
+    """PX4's position is where the vehicle was on the way there and back; a wrong pivot makes no difference."""
+
+    def flies(i: Inputs) -> Inputs:
+        now_s = i.t_s - START_S
+
+        def at_m(t_s: float) -> float:
+            return 0.3 * math.sin(1.5 * t_s)
+
+        x, y, z = offset_m
+        px4 = put("vehicle", position_world_m=(x + at_m(now_s - 2.0 * late_s), y, 1.0 + z))
+        speed = put("vehicle", velocity_world_m_s=(0.45 * math.cos(1.5 * (now_s - 2.0 * late_s)), 0.0, 0.0))
+        return put("mocap", position_world_m=(at_m(now_s), 0.0, 1.0))(speed(px4(i)))
+
+    events = watched(NO_INERTIAL, [flies(healthy(k)) for k in range(1000)], flying())
+    assert [event.id for event in events] == ([id_] if id_ else [])
+
+
+def test_the_lag_is_not_measured_with_poses_that_are_not_trusted_or_repeat() -> None:
+    """A pose that stays behind a moving vehicle looks like a lag that is negative or large."""
+
+    def lost(i: Inputs) -> Inputs:
+        t_s = i.t_s - START_S
+        moving = put("vehicle", velocity_world_m_s=(0.4 * math.sin(2.0 * t_s), 0.0, 0.0))
+        shift_m = 0.09 * math.sin(2.0 * t_s)
+        return replace(moved("vehicle", (-shift_m, 0.0, 0.0))(moving(i)), mocap=healthy(3).mocap)
+
+    events = watched(NO_INERTIAL, after_a_moment(lost), flying())
+    assert {event.id for event in events} == {"mocap_lost"}
