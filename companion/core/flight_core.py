@@ -184,7 +184,7 @@ class FlightCore:
             self._tether_watched = stage not in seq.BEFORE_LIFT
             situation.found_armed = None
         situation.tracking_error_m = self._control.tracking_error_m if stage is _PLAN else None
-        situation.control = self._log
+        situation.control, situation.disturbance_world_n = self._log, self._control.disturbance_world_n
         contact = self._state.contact
         situation.contact_n = (
             max(contact.force_n, sensed_n(contact)) if contact is not None and contact.touches else None

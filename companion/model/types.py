@@ -487,7 +487,7 @@ class TetherState(Record, frozen=True, kw_only=True):
     pull_n: float
     """Low-pass-filtered force toward the anchor that is not due to the rotors, gravity or the tool; 0 if unknown, never negative."""
     taut: bool
-    """Whether the slack is used up or the tension increases with the range."""
+    """Whether the slack is used up."""
     snagged: bool
     """Whether there is tension, toward the anchor or sideways, although there is slack."""
     separated: bool

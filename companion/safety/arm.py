@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+from companion.model.algebra import dot, minus, plus, scaled
 from companion.model.listing import listed
 from companion.model.servos import WATCHDOG_ERROR, hardware_error_text
 from companion.model.types import ArmState, ForceSample, Inputs, Joints, Vec2, Vec3
@@ -21,6 +22,18 @@ REFUSED_MAX_S: Final = 0.1
 REFUSED_FORGOTTEN: Final = 0.25
 DRIFT_TIME_S: Final = 1.0
 """Time constant of the mean force."""
+CHANGE_TIME_S: Final = (0.5, 5.0)
+"""Time constants of the two low-pass filters whose difference is the change of a force: a payload or a shifted zero, but not steady
+wind or a wrong hover thrust."""
+CHANGE_MIN_N: Final = 0.5
+"""Change of the measured force below which it has no direction that could be judged."""
+CHANGE_SHARE: Final = 0.6
+"""Smallest unexplained part of the measured change: a sensor's scale and mounting explain less."""
+CHANGE_HOLD_S: Final = 0.3
+CHANGE_ABOVE_M: Final = 0.1
+"""Height above standing height from which the floor does not carry the vehicle."""
+CHANGE_AGE_MAX_S: Final = 0.05
+"""Age of a sample from which there is no measured force to compare."""
 _NO_FORCE: Vec3 = (0.0, 0.0, 0.0)
 
 
@@ -168,15 +181,44 @@ def joint_beyond_limit(a: ArmTracker, thresholds: tuple[float, tuple[Vec2, ...]]
     return (listed(map(math.degrees, angles_rad), ".0f"), math.degrees(beyond_rad))
 
 
+def _lowpassed(mean_n: Vec3, force_n: Vec3, gain: float) -> Vec3:
+    return plus(mean_n, scaled(minus(force_n, mean_n), gain))
+
+
+class _Change:
+    """Change of a force, N: its low-pass-filtered value minus its slow mean."""
+
+    __slots__ = ("_fast_n", "_slow_n")
+
+    def __init__(self) -> None:
+        self._fast_n, self._slow_n = _NO_FORCE, _NO_FORCE
+
+    def update(self, dt_s: float, force_n: Vec3) -> Vec3:
+        """Update with the force of one tick and return its change."""
+        fast_s, slow_s = CHANGE_TIME_S
+        fx, fy, fz = self._fast_n = _lowpassed(self._fast_n, force_n, dt_s / (fast_s + dt_s))
+        sx, sy, sz = self._slow_n = _lowpassed(self._slow_n, force_n, dt_s / (slow_s + dt_s))
+        return (fx - sx, fy - sy, fz - sz)
+
+
 class ForceTracker:
     """Tracks the samples of the force-torque sensor.
 
     Args:
         stuck_s: hold time after which samples that repeat themselves count as lost, `safety.force_stuck_s`.
+        disagreement_n: threshold of the change of the measured force that the vehicle's motion does not show,
+            `safety.force_disagreement_n`.
+        clearance_m: height of the body's origin when the vehicle is on the ground.
     """
 
-    def __init__(self, stuck_s: float) -> None:
-        self._stuck_s = stuck_s
+    def __init__(self, stuck_s: float, disagreement_n: float, clearance_m: float) -> None:
+        self._stuck_s, self._disagreement_n = stuck_s, disagreement_n
+        self._low_m = clearance_m + CHANGE_ABOVE_M
+        self._measured, self._felt = _Change(), _Change()
+        self._off_s = 0.0
+        self.off_n: tuple[Vec3, Vec3] | None = None
+        """Changes of the measured force and of the force that moves the vehicle, when they first disagreed in this flight; the samples
+        are not passed on from then on."""
         self._age = Age()
         self._before: ForceSample | None = None
         self._same_since_s: float | None = None
@@ -185,10 +227,14 @@ class ForceTracker:
         self.age_s = 0.0
         self.stuck = False
         """Whether samples repeat themselves although the vehicle is moving."""
-        self.trusted = True
-        """Whether samples are passed on; False while they repeat themselves."""
+        self._repeats = False
         self.mean_n: Vec3 = _NO_FORCE
         """Low-passed external force in the world frame while the controller flies with an empty net; else 0."""
+
+    @property
+    def trusted(self) -> bool:
+        """Return whether samples are passed on: not while they repeat themselves, nor after they disagreed with the motion."""
+        return not self._repeats and self.off_n is None
 
     def update(self, i: Inputs, situation: Situation, awake_s: float, dt_s: float, moving: bool) -> None:
         """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle is moving."""
@@ -197,14 +243,31 @@ class ForceTracker:
         self.stuck = False
         if force is not None:
             self._compare(force, situation, awake_s, moving)
-        control = situation.control
-        if control is None or situation.caught or situation.contact_n is not None or not situation.airborne:
-            self.mean_n = _NO_FORCE
+        control, felt_n = situation.control, situation.disturbance_world_n
+        if control is None or situation.contact_n is not None or not situation.airborne:
+            self.mean_n, self._measured, self._felt = _NO_FORCE, _Change(), _Change()
             return
-        mx, my, mz = self.mean_n
-        x, y, z = control.force_measured_world_n or control.force_ext_world_n
-        k = dt_s / DRIFT_TIME_S
-        self.mean_n = (mx + k * (x - mx), my + k * (y - my), mz + k * (z - mz))
+        measured_n = control.force_measured_world_n or control.force_ext_world_n
+        low = i.vehicle is None or i.vehicle.position_world_m[2] < self._low_m
+        if low or felt_n is None or self.age_s > CHANGE_AGE_MAX_S:
+            self._measured, self._felt = _Change(), _Change()
+        elif self.trusted:
+            self._disagree(dt_s, self._measured.update(dt_s, measured_n), self._felt.update(dt_s, felt_n))
+        if situation.caught:
+            self.mean_n = _NO_FORCE
+        else:
+            self.mean_n = _lowpassed(self.mean_n, measured_n, dt_s / DRIFT_TIME_S)
+
+    def _disagree(self, dt_s: float, measured_n: Vec3, felt_n: Vec3) -> None:
+        """Compare the two changes along the measured one."""
+        size_n = math.sqrt(dot(measured_n, measured_n))
+        if size_n > CHANGE_MIN_N:
+            off_n = size_n - dot(measured_n, felt_n) / size_n
+            self._off_s = self._off_s + dt_s if off_n > max(self._disagreement_n, CHANGE_SHARE * size_n) else 0.0
+            if self._off_s > CHANGE_HOLD_S:
+                self.off_n = (measured_n, felt_n)
+        else:
+            self._off_s = 0.0
 
     def _compare(self, force: ForceSample, situation: Situation, awake_s: float, moving: bool) -> None:
         before = self._before
@@ -215,13 +278,13 @@ class ForceTracker:
                 or force.torque_sensor_nm != before.torque_sensor_nm
                 or not situation.airborne
             ):
-                self._same_since_s, self.trusted = None, True
+                self._same_since_s, self._repeats = None, False
             elif self._same_since_s is None:
                 self._same_since_s, self._moved = awake_s, False
         if self._same_since_s is not None:
             self._moved = self._moved or moving
             if self._moved and awake_s - self._same_since_s > self._stuck_s:
-                self.stuck, self.trusted = True, False
+                self.stuck, self._repeats = True, True
 
 
 def force_lost(f: ForceTracker, timeout_s: float) -> Values | None:
@@ -246,3 +309,8 @@ def force_drift(f: ForceTracker, drift_n: float) -> Values | None:
     """Fires if the mean force on an empty net exceeds the threshold."""
     x, y, z = f.mean_n
     return (x, y, z, drift_n) if x * x + y * y + z * z > drift_n * drift_n else None
+
+
+def force_disagrees(f: ForceTracker, _: None) -> Values | None:
+    """Fires if the measured force has changed in a way that the vehicle's motion does not show."""
+    return None if f.off_n is None else (*f.off_n[0], *f.off_n[1])

@@ -13,6 +13,7 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import tilt_rad
 from companion.model.types import ControlLog, Inputs, TetherState, VehicleState
 from companion.safety.governor import BODY_TOP_M
+from companion.safety.oscillation import Oscillation
 from companion.safety.rotor_stop import FLIPPED_TILT_RAD, seems_flipped
 from companion.safety.situation import Situation, Values
 from companion.safety.stop import StopModel
@@ -41,6 +42,8 @@ class FlightTracker:
         )
         """Range of x and y, and largest z, of a vehicle whose rotors are in the room, with the tolerance."""
         self._stop = StopModel(vehicle.safety)
+        self.oscillation_m = vehicle.safety.oscillation_m
+        self.oscillation = Oscillation(self.oscillation_m)
         self._inputs: Inputs | None = None
         self.vehicle: VehicleState | None = None
         self.tilt_rad = 0.0
@@ -65,7 +68,13 @@ class FlightTracker:
         self.tracking_error_m = situation.tracking_error_m
         self.tether = situation.tether
         self.contact_n = situation.contact_n
-        self._count_saturation(situation.control, dt_s)
+        control = situation.control
+        self._count_saturation(control, dt_s)
+        if control is None or vehicle is None or self.tracking_error_m is None:
+            self.oscillation.rate_rad_s = None
+        else:
+            e, w = control.error, vehicle.angular_rate_body_rad_s
+            self.oscillation.update(i.t_s, dt_s, (e[0], e[1]), (w[0], w[1]))
 
     def _count_saturation(self, control: ControlLog | None, dt_s: float) -> None:
         self.vertical_n = None
@@ -94,6 +103,12 @@ class FlightTracker:
 def tilt(f: FlightTracker, tilt_max_rad: float) -> Values | None:
     """Fires if PX4's tilt exceeds the threshold."""
     return (math.degrees(f.tilt_rad), math.degrees(tilt_max_rad)) if f.tilt_rad > tilt_max_rad else None
+
+
+def oscillates(f: FlightTracker, _: None) -> Values | None:
+    """Fires if the position error and the tilt oscillate."""
+    rate_rad_s = f.oscillation.rate_rad_s
+    return None if rate_rad_s is None else (f.oscillation_m, math.degrees(rate_rad_s))
 
 
 def crashed(f: FlightTracker, _: None) -> Values | None:

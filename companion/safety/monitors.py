@@ -42,7 +42,9 @@ class Monitors:
         self._mocap = MocapTracker(vehicle.safety)
         self._px4 = Px4Tracker(vehicle.airframe.ground_clearance_m)
         self._arm = ArmTracker()
-        self._force = ForceTracker(vehicle.safety.force_stuck_s)
+        self._force = ForceTracker(
+            vehicle.safety.force_stuck_s, vehicle.safety.force_disagreement_n, vehicle.airframe.ground_clearance_m
+        )
         self._process = ProcessTracker()
         self._flight = FlightTracker(vehicle)
         trackers: dict[Subject, object] = {
@@ -115,7 +117,8 @@ class Monitors:
             self._mocap.update(i, situation, awake_s, moving)
             if self._vision is not None:
                 self._vision.update(i, awake_s)
-            self._px4.update(i, situation, awake_s, moving)
+            seen = i.mocap if self._mocap.trusted and not self._mocap.too_late else None
+            self._px4.update(i, situation, awake_s, moving, seen)
             self._arm.update(i, awake_s, situation.torque_refused)
             self._force.update(i, situation, awake_s, gap_s, moving)
             if not self._mocap.trusted or self._mocap.too_late:

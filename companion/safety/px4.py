@@ -8,9 +8,11 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from companion.model.algebra import minus
 from companion.model.flight_stage import chosen_by_pilot, failsafe_chose, is_killed
-from companion.model.types import AutopilotStatus, FlightMode, Inputs, VehicleState
+from companion.model.types import AutopilotStatus, FlightMode, Inputs, MocapPose, Vec2, VehicleState
 from companion.safety.inertial_check import CLOCK_GROWTH
+from companion.safety.motion_lag import MotionLag
 from companion.safety.situation import HOLDS, Age, Situation, Values
 
 DISARMED_ABOVE_M = 0.15
@@ -20,6 +22,8 @@ BATTERY_SILENT_S: Final = 10.0
 """Max age of a battery's newest BATTERY_STATUS, which PX4 sends every 2 s: a charge that is not known is not taken for a full one."""
 LAG_FORGOTTEN_S_PER_S: Final = CLOCK_GROWTH
 """Rate at which a lasting lag is reduced, because two clocks drift apart; a queue that fills more slowly is not detected."""
+GAP_MAX_S: Final = 0.05
+"""Longest time step of the measurement of the lag; a longer gap between two poses counts as this."""
 
 
 class Px4Tracker:
@@ -47,7 +51,10 @@ class Px4Tracker:
         self.battery_age_s = 0.0
         """Time since the last report of the battery that has been silent for the longest time; 0 before the first report."""
         self.lag_s = 0.0
-        """Lag of PX4's state beyond the smallest one seen; 0 without PX4's clock."""
+        """Lag of PX4's state: beyond the smallest one seen, by PX4's clock, or by the vehicle's motion, whichever is larger."""
+        self._motion = MotionLag()
+        self._pose_s = 0.0
+        """Stamp of the newest pose that was compared with PX4's position."""
         self.rebooted_s: float | None = None
         """PX4's clock in the tick in which it stepped back."""
         self.repeats = False
@@ -55,8 +62,18 @@ class Px4Tracker:
         self.left_offboard: AutopilotStatus | None = None
         """PX4's status if PX4 has left OFFBOARD without a request; else None."""
 
-    def update(self, i: Inputs, situation: Situation, awake_s: float, moving: bool) -> None:
-        """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle is moving."""
+    def update(
+        self, i: Inputs, situation: Situation, awake_s: float, moving: bool, pose: MocapPose | None = None
+    ) -> None:
+        """Update with the inputs of one tick.
+
+        Args:
+            i: inputs.
+            situation: activity of the core.
+            awake_s: awake time of this process.
+            moving: True if PX4's velocity or rates show that the vehicle is moving.
+            pose: the newest pose of motion capture, if it is trusted.
+        """
         v = self.vehicle = i.vehicle
         status = self.status = i.status
         self.lag_s, self.rebooted_s, self.repeats = 0.0, None, False
@@ -72,6 +89,11 @@ class Px4Tracker:
                 age_s = imu_s
             self.state_age_s = age_s
             self._compare(v, situation, awake_s, moving)
+            if situation.airborne:
+                if pose is not None and pose.tracking_valid and pose.stamp_s > self._pose_s:
+                    dt_s, self._pose_s = min(GAP_MAX_S, pose.stamp_s - self._pose_s), pose.stamp_s
+                    self._motion.update(dt_s, minus(v.position_world_m, pose.position_world_m), v.velocity_world_m_s)
+                self.lag_s = max(self.lag_s, self._motion.one_way_s)
         reported_s = status.battery_stamp_s if status is not None else None
         self.battery_age_s = i.t_s - reported_s if reported_s is not None else 0.0
         left = situation.offboard_expected and status is not None and status.mode is not FlightMode.OFFBOARD
@@ -116,6 +138,11 @@ def killed(p: Px4Tracker, _: None) -> Values | None:
 def px4_rebooted(p: Px4Tracker, _: None) -> Values | None:
     """Fires if PX4's clock has stepped back."""
     return None if p.rebooted_s is None else (p.rebooted_s,)
+
+
+def link_slow(p: Px4Tracker, thresholds: Vec2) -> Values | None:
+    """Fires if the lag of PX4's state exceeds the first threshold but not the second."""
+    return (p.lag_s * 1e3, thresholds[0] * 1e3) if thresholds[0] < p.lag_s <= thresholds[1] else None
 
 
 def link_late(p: Px4Tracker, lag_max_s: float) -> Values | None:

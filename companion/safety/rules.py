@@ -183,6 +183,11 @@ RULES: tuple[Rule, ...] = (
         message="PX4 restarted: its clock went back to {:.1f} s",
     ),
     Rule(
+        id="link_slow", subject=Subject.PX4, what="PX4's state is delayed, at the cost of the control loop's stability margin",
+        predicate=px4.link_slow, thresholds=("link_lag_warn_s", "link_lag_max_s"), hold_time=0.15, ground=_WARN, air=_WARN,
+        message="messages from PX4 are {:.0f} ms late (limit {:.0f} ms)",
+    ),
+    Rule(
         id="link_late", subject=Subject.PX4, what="PX4's state is delayed: its lag on PX4's clock exceeds the smallest lag seen",
         predicate=px4.link_late, thresholds=("link_lag_max_s",), hold_time=0.15, ground=_PX4_LANDS, air=_PX4_LANDS,
         message="messages from PX4 are {:.0f} ms late (limit {:.0f} ms)",
@@ -322,6 +327,14 @@ RULES: tuple[Rule, ...] = (
         predicate=arm.force_drift, thresholds=("force_drift_n",), hold_time=2.0, ground=None, air=_WARN,
         message="the force sensor measures {:.1f}, {:.1f}, {:.1f} N on an empty net (limit {:.1f} N)",
     ),
+    Rule(
+        id="force_disagrees", subject=Subject.FORCE,
+        what="the measured force changes and the vehicle's motion shows another change: a wrong sign, exchanged axes or a shifted "
+        "zero; from then on the samples count as lost",
+        predicate=arm.force_disagrees, tracked_by=("force_disagreement_n",), ground=None, air=_WARN, repeat=Repeat.NEVER,
+        message="the force sensor measures a change of {:.1f}, {:.1f}, {:.1f} N, the vehicle's motion shows {:.1f}, {:.1f}, {:.1f} N: "
+        "wrong axes or a shifted zero; the controller flies without the force",
+    ),
 
     Rule(
         id="loop_late", subject=Subject.PROCESS, what="a control tick was late", predicate=process.loop_late,
@@ -345,6 +358,12 @@ RULES: tuple[Rule, ...] = (
     Rule(
         id="tilt", subject=Subject.FLIGHT, what="tilted too far", predicate=flight.tilt, thresholds=("tilt_abort_deg",),
         hold_time=0.1, ground=None, air=_PX4_LANDS, message="tilt {:.0f} deg (limit {:.0f} deg)",
+    ),
+    Rule(
+        id="oscillates", subject=Subject.FLIGHT,
+        what="the position error and the tilt swing to and fro: the control loop is unstable, for example because of a delay",
+        predicate=flight.oscillates, tracked_by=("oscillation_m",), ground=None, air=_PX4_LANDS,
+        message="the vehicle swings to and fro by more than {:.2f} m, tilting at {:.0f} deg/s: the control loop is unstable",
     ),
     Rule(
         id=CRASHED, subject=Subject.FLIGHT,
@@ -411,8 +430,8 @@ RULES: tuple[Rule, ...] = (
         message="the vehicle would stop with {:.2f} m of tether left (limit {:.2f} m)",
     ),
     Rule(
-        id="tether_taut", subject=Subject.TETHER, what="the tether pulls, or no slack is left", predicate=flight.tether_taut,
-        tracked_by=("tether.taut_slack_m", "tether.pull_min_n"), hold_time=0.05, ground=None, air=_RETRACT,
+        id="tether_taut", subject=Subject.TETHER, what="no slack is left", predicate=flight.tether_taut,
+        tracked_by=("tether.taut_slack_m",), hold_time=0.05, ground=None, air=_RETRACT,
         message="the tether is taut: {:.2f} m left, tension {:.0f} N",
     ),
     Rule(

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from companion.model.types import ControlLog, TetherState
+from companion.model.types import ControlLog, TetherState, Vec3
 
 Values = tuple[object, ...]
 """Values for a rule's message, returned by a predicate whose condition holds."""
@@ -26,6 +26,8 @@ class Situation:
     """Distance from the reference; None while no plan is flown."""
     control: ControlLog | None = None
     """Log record of the control law in the last tick; None while the law is not active."""
+    disturbance_world_n: Vec3 | None = None
+    """Force on the vehicle other than rotor thrust and weight, from its motion; None on the ground."""
     caught: bool = False
     """A payload is on board."""
     tether: TetherState | None = None

@@ -166,7 +166,7 @@ class TetherWatch:
             hanging = (xx * hx + yx * hy + zx * down, xy * hx + yy * hy + zy * down, xz * hx + yz * hy + zz * down)
 
         pull = self._pull
-        pull.update(dt_s, (ux, uy, uz), range_m, disturbance_world_n, tool_force_world_n)
+        pull.update(dt_s, (ux, uy, uz), velocity_world_m_s, disturbance_world_n, tool_force_world_n)
         used_up = slack <= self._taut_slack_m
         about_anchor = self._about_anchor.update(-lx, -ly)
         about_vehicle = self._about_vehicle.update(straight[0] * range_m, straight[1] * range_m)
@@ -178,7 +178,7 @@ class TetherWatch:
             clearance_m=self._clearance.least_m(straight, hanging, arm_rad),
             turns=about_anchor if abs(about_anchor) >= abs(about_vehicle) else about_vehicle,
             pull_n=max(0.0, pull.pull_n),
-            taut=used_up or (pull.pulling and pull.growing),
+            taut=used_up,
             snagged=(pull.pulling or pull.sideways) and not used_up,
             separated=slack < -self._separation_m and not pull.pulling,
             vehicle_turns=0.0,

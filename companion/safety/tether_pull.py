@@ -5,6 +5,10 @@ is wind, errors of the thrust model, and the tether. Errors of the thrust lie al
 vertical part of the residual has less weight than the horizontal part: the pull is the weighted least-squares fit of a force along
 the line. For the same reason a payload is not mistaken for the tether when the force sensor is lost: it only pulls down, whereas a
 pull along the line also has a horizontal part.
+
+Two facts distinguish the tether from wind. At the take-off the tether is slack, so that the mean residual, followed slowly, is wind and
+model error, and only what exceeds it can be a pull. And a line that pulls holds the vehicle: one that moves along the force, in either
+direction, is not held.
 """
 
 from __future__ import annotations
@@ -27,15 +31,14 @@ SIDEWAYS_N: Final = 6.0
 """A horizontal residual of this size in any direction means that something other than the anchor holds the vehicle."""
 _FLAT: Final = 1.0 / HORIZONTAL_N**2
 _STEEP: Final = 1.0 / VERTICAL_N**2
-GROWTH_S: Final = 0.3
-GROWTH_N_PER_M: Final = 10.0
-"""Slope of the pull over the range (the distance to the anchor) from which the line counts as tightening."""
-GROWTH_SPREAD_M2: Final = 1e-6
-"""Below this variance of the range no slope can be estimated."""
+AMBIENT_S: Final = 5.0
+"""Time constant of the mean residual that is not a pull."""
+FREE_M: Final = 0.15
+"""Distance moved along a force, or against it, that shows that no line exerts it: a stiff one yields by a few centimetres."""
 
 
 class PullEstimate:
-    """Estimates the pull from the low-passed residual and decides, with hysteresis, whether the tether pulls, tightens or is snagged.
+    """Estimates the pull from the low-passed residual and decides, with hysteresis, whether the tether pulls.
 
     Args:
         tether: thresholds and time constants.
@@ -43,16 +46,14 @@ class PullEstimate:
 
     __slots__ = (
         "_after_s",
-        "_cov",
+        "_ambient",
         "_f",
         "_filter_s",
+        "_learned_s",
         "_min_n",
-        "_pull_mean",
+        "_moved_m",
         "_pull_s",
-        "_range_mean",
         "_side_s",
-        "_var",
-        "growing",
         "pull_n",
         "pulling",
         "sideways",
@@ -66,28 +67,30 @@ class PullEstimate:
 
     def forget(self) -> None:
         """Discard the estimate."""
-        self._f: Vec3 | None = None
+        self._f: Vec3 = (0.0, 0.0, 0.0)
+        self._ambient: Vec3 = (0.0, 0.0, 0.0)
+        """Mean residual while nothing pulls."""
+        self._learned_s = 0.0
         self._pull_s = self._side_s = 0.0
-        self._range_mean = self._pull_mean = self._cov = self._var = 0.0
+        self._moved_m = 0.0
+        """Distance that the vehicle has moved along the present pull."""
         self.pull_n = 0.0
         self.pulling = False
         """Whether there is a pull towards the anchor."""
         self.sideways = False
         """Whether there is a horizontal pull in any direction."""
-        self.growing = False
-        """Whether the present pull has grown with the range."""
 
     def update(
         self,
         dt_s: float,
         towards_anchor: Vec3,
-        range_m: float,
+        velocity_world_m_s: Vec3,
         disturbance_world_n: Vec3 | None,
         tool_force_world_n: Vec3 | None,
     ) -> None:
         """Update the pull; `towards_anchor` is the unit vector from the attachment to the anchor; forces are in the world frame, N."""
         if disturbance_world_n is None:
-            if self._f is not None:
+            if self._learned_s > 0.0:
                 self.forget()
             return
         rx, ry, rz = disturbance_world_n
@@ -95,30 +98,22 @@ class PullEstimate:
             rx -= tool_force_world_n[0]
             ry -= tool_force_world_n[1]
             rz -= tool_force_world_n[2]
-        before = self._f
-        if before is None:
-            # Not the newest sample, which is mostly noise.
-            before = (0.0, 0.0, 0.0)
-            self._range_mean = range_m
+        ax, ay, az = self._ambient
+        rx, ry, rz = rx - ax, ry - ay, rz - az
+        if self._pull_s == 0.0 and self._side_s == 0.0:
+            self._moved_m = 0.0
+            self._learned_s = min(AMBIENT_S, self._learned_s + dt_s)
+            gain = dt_s / self._learned_s if self._learned_s > 0.0 else 0.0
+            self._ambient = (ax + gain * rx, ay + gain * ry, az + gain * rz)
         gain = dt_s / (self._filter_s + dt_s)
-        fx = before[0] + gain * (rx - before[0])
-        fy = before[1] + gain * (ry - before[1])
-        fz = before[2] + gain * (rz - before[2])
-        self._f = (fx, fy, fz)
+        fx, fy, fz = self._f
+        fx, fy, fz = self._f = (fx + gain * (rx - fx), fy + gain * (ry - fy), fz + gain * (rz - fz))
         ux, uy, uz = towards_anchor
         weight = (ux * ux + uy * uy) * _FLAT + uz * uz * _STEEP
         if weight <= 0.0:
             return  # at the anchor: no direction
         pull = ((ux * fx + uy * fy) * _FLAT + uz * fz * _STEEP) / weight
         self.pull_n = pull
-
-        gain = dt_s / (GROWTH_S + dt_s)
-        d_range, d_pull = range_m - self._range_mean, pull - self._pull_mean
-        self._range_mean += gain * d_range
-        self._pull_mean += gain * d_pull
-        keep = 1.0 - gain
-        self._cov = keep * (self._cov + gain * d_range * d_pull)
-        self._var = keep * (self._var + gain * d_range * d_range)
 
         least = max(self._min_n, CERTAIN / math.sqrt(weight))
         self._pull_s = self._pull_s + dt_s if pull > (RELEASE * least if self.pulling else least) else 0.0
@@ -127,5 +122,10 @@ class PullEstimate:
         limit = RELEASE * SIDEWAYS_N if self.sideways else SIDEWAYS_N
         self._side_s = self._side_s + dt_s if side_2 > limit * limit else 0.0
         self.sideways = self._side_s > 0.0 and (self.sideways or self._side_s >= self._after_s)
-        grows = self._var > GROWTH_SPREAD_M2 and self._cov > GROWTH_N_PER_M * self._var
-        self.growing = self.pulling and (self.growing or grows)
+        if self._pull_s > 0.0 or self._side_s > 0.0:
+            vx, vy, vz = velocity_world_m_s
+            self._moved_m += dt_s * (vx * fx + vy * fy + vz * fz) / math.sqrt(side_2 + fz * fz)
+            if not (self.pulling or self.sideways or -FREE_M < self._moved_m < FREE_M):
+                self._ambient = (ax + fx, ay + fy, az + fz)
+                self._f, self.pull_n = (0.0, 0.0, 0.0), 0.0
+                self._pull_s = self._side_s = 0.0

@@ -162,7 +162,7 @@ KINDS: dict[FaultKind, Kind] = {
         size="delay in each direction",
         unit="s",
         default=0.05,
-        named_by=("link_late", *_PX4_GONE, *_MOCAP_WRONG, "gate"),
+        named_by=("link_slow", "link_late", "oscillates", *_PX4_GONE, *_MOCAP_WRONG, "gate"),
     ),
     "autopilot_reboot": Kind(
         what="PX4 reboots: it is disarmed, the rotors stop and its clock restarts at zero; in the air, the vehicle falls",
@@ -206,7 +206,15 @@ KINDS: dict[FaultKind, Kind] = {
         size="shift of each axis",
         unit="N",
         default=4.0,
-        named_by=("force_drift", "force_overload", "tether_snagged", "tether_taut", "catch", *_CONTACT_ENDS),
+        named_by=(
+            "force_disagrees",
+            "force_drift",
+            "force_overload",
+            "tether_snagged",
+            "tether_taut",
+            "catch",
+            *_CONTACT_ENDS,
+        ),
         signed=True,
     ),
     "motor_weak": Kind(

@@ -31,6 +31,9 @@ class FastLink:
         self._in_flight: deque[tuple[float, Callable[[], None]]] = deque()
         self._received: deque[tuple[VehicleState | None, AutopilotStatus | None]] = deque(maxlen=MEMORY)
         """States that PX4 sent in the last ticks, newest first."""
+        self._behind = 0
+        """Delay of the state received last, in ticks: while the delay grows nothing arrives, because messages keep their order."""
+        self._last: tuple[VehicleState | None, AutopilotStatus | None] = (None, None)
 
     @property
     def alive(self) -> bool:
@@ -68,16 +71,20 @@ class FastLink:
             state = received[0][0]
         received.appendleft((state, status))
         delay_s = self._faults.size("link_delay")
-        if not delay_s:
-            return state, status
-        state, status = received[min(len(received) - 1, round(delay_s / self._tick_s))]
-        if state is not None:  # stamps are arrival times
+        behind = min(len(received) - 1, round(delay_s / self._tick_s))
+        if behind > self._behind:
+            self._behind += 1
+            return self._last
+        self._behind = behind
+        state, status = received[behind]
+        if state is not None and delay_s:  # stamps are arrival times
             state = replace(
                 state,
                 position_stamp_s=state.position_stamp_s + delay_s,
                 attitude_stamp_s=state.attitude_stamp_s + delay_s,
                 imu_stamp_s=state.imu_stamp_s + delay_s,
             )
-        if status is not None:
+        if status is not None and delay_s:
             status = replace(status, heartbeat_stamp_s=status.heartbeat_stamp_s + delay_s)
-        return state, status
+        self._last = (state, status)
+        return self._last

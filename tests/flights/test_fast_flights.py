@@ -9,7 +9,7 @@ import pytest
 
 from companion.control.hover_thrust import AIRBORNE_M
 from companion.model.frames import tilt_rad
-from companion.model.types import Outcome, PhaseKind
+from companion.model.types import Outcome, PhaseKind, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from tests.support import SHORT_CATCH
@@ -126,6 +126,38 @@ def test_without_force_sensor_the_mission_goes_on() -> None:
     result = FastFlight(short("world.faults=[{kind: force_loss, t_s: 3.2}]")).run()
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     assert "force_lost" in event_ids(result)
+
+
+@pytest.mark.parametrize(
+    "axes",
+    [(1, 2, -3), (-1, -2, 3), (-1, 2, -3), (1, -2, -3), (3, 2, 1)],
+    ids=lambda axes: "".join(map("{:+}".format, axes)),
+)
+def test_a_force_sensor_with_wrong_axes_is_reported_at_the_catch_and_not_used(axes: tuple[int, ...]) -> None:
+    """The signs of its axes, or their order. The arm is unfolded: the payload's weight has a part along x and one along z."""
+    flight = FastFlight(configured())
+    measure = flight.plant.force_torque
+
+    def turned() -> tuple[Vec3, Vec3]:
+        force_n, torque_nm = measure()
+        x, y, z = (math.copysign(1.0, axis) * force_n[abs(axis) - 1] for axis in axes)
+        return (x, y, z), torque_nm
+
+    flight.plant.force_torque = turned  # type: ignore[method-assign]
+    result = flight.run(until_mission_s=9.0)
+    assert result.caught
+    assert event_ids(result) == ["takeoff", "force_disagrees"]
+    last = result.outputs[-1].control
+    assert last is not None and last.force_ext_world_n == (0.0, 0.0, 0.0), "the law still uses it"
+
+
+def test_a_delay_that_makes_the_control_law_swing_is_reported_and_px4_lands() -> None:
+    """Of the setpoints alone, so that nothing that arrives is late."""
+    result = FastFlight(configured("world.setpoint_delay_s=0.11")).run()
+    assert result.outputs[-1].outcome is Outcome.ABORTED
+    assert event_ids(result)[:2] == ["takeoff", "oscillates"]
+    assert not result.crashed
+    assert max(tilt_rad(t.attitude_wxyz) for t in result.truth) < math.radians(25)
 
 
 @pytest.mark.parametrize("at_s", [0.5, 2.2, 3.8, 5.0, 8.0])

@@ -14,10 +14,20 @@ import pytest
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
-from companion.model.types import Event, FlightMode, Inputs, MocapPose, OperatorCommand, SafetyAction, Severity
+from companion.model.types import (
+    ControlLog,
+    Event,
+    FlightMode,
+    Inputs,
+    MocapPose,
+    OperatorCommand,
+    SafetyAction,
+    Severity,
+)
 from companion.safety.arm import error_text
 from companion.safety.mocap import unfused
 from companion.safety.monitors import Monitors
+from companion.safety.oscillation import Oscillation
 from companion.safety.rule import Rule, Subject
 from companion.safety.rules import RULES
 from companion.safety.situation import Situation
@@ -25,6 +35,7 @@ from tests.safety.healthy import (
     SLOW,
     START_S,
     TICK_S,
+    ZERO8,
     Change,
     after_a_moment,
     control,
@@ -39,6 +50,11 @@ from tests.safety.healthy import (
 
 VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
 EXTERNAL = load_vehicle("configs/vehicles/tarot650_2r.yaml", overrides=["vehicle.devices.mocap.type=external"])
+NO_INERTIAL = load_vehicle(
+    "configs/vehicles/tarot650_2r.yaml",
+    overrides=["vehicle.safety.mocap_inertial_m=9", "vehicle.safety.mocap_jump_m=1"],
+)
+"""For positions that move although the IMU rests."""
 replace = msgspec.structs.replace
 NAN = math.nan
 RULE = {rule.id: rule for rule in RULES}
@@ -149,6 +165,25 @@ def estimator(**fields: float) -> Change:
     return lambda i: put("estimator", **fields)(fed_by_another(i))
 
 
+class Swinging(Situation):
+    """The position error swings by 0.24 m to and fro, twice a second: it is read twice in each tick."""
+
+    _reads = 0
+
+    @property
+    def control(self) -> ControlLog:
+        self._reads += 1
+        error_m = 0.12 * math.sin(2.0 * math.tau * self._reads * 0.5 * TICK_S)
+        return control(error=(error_m, *ZERO8[1:]))
+
+    @control.setter
+    def control(self, _: ControlLog) -> None: ...
+
+
+def swinging() -> Situation:
+    return Swinging(**{name: getattr(flying(), name) for name in ("airborne", "offboard_expected", "tracking_error_m")})
+
+
 FAULTS: dict[str, Fault] = {
     "estimator_silent": Fault(lambda i: replace(i, estimator=fed_by_another(healthy()).estimator)),
     "vision_lost": Fault(estimator(flags=0b1111)),
@@ -176,6 +211,7 @@ FAULTS: dict[str, Fault] = {
     "estimate_frozen": Fault(frozen_values("vehicle", "position_world_m", "velocity_world_m_s")),
     "heartbeat_lost": Fault(stopped("status")),
     "px4_rebooted": Fault(put("vehicle", boot_s=2.0), also=frozenset({"link_late"})),
+    "link_slow": Fault(lambda i: put("vehicle", boot_s=i.t_s - 0.03)(i)),
     "link_late": Fault(slow_link),
     "killed": Fault(put("status", system_status=8)),
     "reattached": Fault(situation=lambda: flying(found_armed=FOUND)),
@@ -204,11 +240,17 @@ FAULTS: dict[str, Fault] = {
     "force_overload": Fault(put("force", overload=True)),
     "force_stuck": Fault(frozen_values("force", "force_sensor_n", "torque_sensor_nm")),
     "force_drift": Fault(situation=lambda: flying(control=control(force_ext_world_n=(3.5, 0.0, 0.0)))),
+    "force_disagrees": Fault(
+        situation=lambda: flying(
+            control=control(force_ext_world_n=(0.0, 0.0, 1.5)), disturbance_world_n=(0.0, 0.0, -1.5)
+        )
+    ),
     "loop_late": Fault(),
     "loop_stalled": Fault(),
     "recorder_drops": Fault(lambda i: replace(i, recorder_dropped=3)),
     "guardian_lost": Fault(lambda i: replace(i, guardian_ready=False)),
     "tilt": Fault(leaning(45.0), sound=0),
+    "oscillates": Fault(put("vehicle", angular_rate_body_rad_s=(0.0, 0.4, 0.0)), situation=swinging),
     "crashed": Fault(leaning(120.0), sound=0, also=frozenset({"tilt"})),
     "tracking_warn": Fault(situation=lambda: flying(tracking_error_m=0.5)),
     "tracking_hold": Fault(situation=lambda: flying(tracking_error_m=0.7), also=frozenset({"tracking_warn"})),
@@ -290,6 +332,7 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "vision_lost": (PX4_LANDS, PX4_LANDS, 0.015),
     "vision_rejected": (None, WARN, 0.220),  # vision_lost follows if it lasts
     "px4_rebooted": (PX4_LANDS, PX4_LANDS, 0.015),
+    "link_slow": (WARN, WARN, 0.170),  # the law still has a margin
     "link_late": (PX4_LANDS, PX4_LANDS, 0.170),
     "estimate_frozen": (None, PX4_LANDS, 0.270),
     "vehicle_state_lost": (PX4_LANDS, PX4_LANDS, 0.270),
@@ -317,11 +360,13 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "force_overload": (WARN, WARN, 0.015),
     "force_stuck": (None, WARN, 0.275),
     "force_drift": (None, WARN, 2.850),
+    "force_disagrees": (None, WARN, 0.545),  # the law flies on without it
     "loop_late": (WARN, WARN, 0.215),
     "loop_stalled": (LAND, LAND, 1.015),  # the next stall may be longer
     "recorder_drops": (WARN, WARN, 0.015),
     "guardian_lost": (LAND, WARN, 0.015),  # in the air it is no reason to land; a flight does not begin without it
     "tilt": (None, PX4_LANDS, 0.105),  # the law has lost control; on the ground a vehicle may stand on a slope
+    "oscillates": (None, PX4_LANDS, 0.985),  # the law is unstable: its hold and its landing would swing too
     "crashed": (None, TERMINATE, 0.300),  # the rotors must stop
     "too_fast": (None, HOLD, 0.105),  # stopping is enough
     "climbs_too_fast": (None, LAND, 0.105),
@@ -348,12 +393,13 @@ in s, its event must come. Written from the hazards, not from the table of the r
 READS = """
     reattached 1.00; mocap_lost 0.20; mocap_invalid 0.20; mocap_swapped 0.30 0; mocap_jump 0.40 0;
     mocap_dragged 91 40; mocap_slow 31 50; mocap_late 80 50; mocap_too_late 200 120; estimate_disagrees 0.34 0.30;
-    yaw_disagrees 20 15; estimator_silent 0.25; vision_rejected 1.2 1; px4_rebooted 2.0; link_late 100 70;
+    yaw_disagrees 20 15; estimator_silent 0.25; vision_rejected 1.2 1; px4_rebooted 2.0; link_slow 30 20; link_late 100 35;
     vehicle_state_lost 0.25; heartbeat_lost 2.5; px4_disarmed 1.00; battery_warn 25 30; battery_low 10 20;
     battery_silent 10; battery_voltage 13.0 13.2; arm_lost 0.10; arm_read_failures 5; torque_refused 0.0; servo_error 70 2;
     joint_jump 2 29; servo_warm 68 65; servo_hot 76 75; servo_overload -2.5 0.1; joint_rate 0 745 700;
     joint_beyond_limit 180 57 5; joint_far_beyond_limit 115 -25 15; force_lost 0.25; force_overload 1 -1 0;
-    force_drift 3.3 0.0 0.0 2.0; loop_late 205 50; loop_stalled 1005 300; tilt 45 40; crashed 120;
+    force_drift 3.3 0.0 0.0 2.0; force_disagrees 0.0 0.0 0.8 0.0 0.0 -0.8;
+    oscillates 0.10 18; loop_late 205 50; loop_stalled 1005 300; tilt 45 40; crashed 120;
     too_fast 2.1 2.0; climbs_too_fast 1.6 1.5; sinks_too_fast 1.6 1.5; geofence_left -1.90 0.00 1.00;
     geofence_near 2.29 0.00 1.00; tracking_warn 0.50 0.45; tracking_hold 0.70 0.60; tracking_error 1.20 0.80;
     thrust_saturated 54 1.0; contact_force_high 15.0 12.0; tether_short 0.05 0.10; tether_taut 1.20 0;
@@ -853,7 +899,7 @@ def test_a_link_that_was_always_slow_is_the_clocks_difference() -> None:
 
 
 @pytest.mark.parametrize(
-    ("growth", "told"), [(0.0005, []), (0.04, ["link_late"])], ids=["clocks that drift", "a queue that fills"]
+    ("growth", "told"), [(0.0005, []), (0.04, ["link_slow", "link_late"])], ids=["clocks that drift", "a queue that fills"]
 )
 def test_a_lag_that_grows_faster_than_clocks_drift_apart_is_reported(growth: float, told: list[str]) -> None:
     """At the former rate of forgetting, 50 ms/s, a link that queued 40 ms more each second was never late."""
@@ -988,3 +1034,67 @@ def test_every_threshold_of_the_table_is_one_that_runs(rule: Rule) -> None:
         assert expected is not None
         until = inputs[: expected + 1]
         assert any(reported(scaled(key, factor, machine), until) != expected for factor in (1e-3, 1e3, -1e3)), key
+
+
+SWING_M = VEHICLE.safety.oscillation_m
+
+
+@pytest.mark.parametrize(
+    ("error_m", "rate_rad_s", "oscillates"),
+    [
+        (lambda t_s: 0.55 * SWING_M * math.sin(3.0 * t_s), 0.4, True),
+        (lambda t_s: 0.3 + 0.55 * SWING_M * math.sin(3.0 * t_s), 0.4, True),  # about another place, in wind
+        (lambda t_s: 0.45 * SWING_M * math.sin(3.0 * t_s), 0.4, False),
+        (lambda t_s: 0.55 * SWING_M * math.sin(3.0 * t_s), 0.2, False),  # the reference wanders, not the vehicle
+        (lambda t_s: 3.0 * SWING_M * math.exp(-2.0 * t_s) * math.sin(3.0 * t_s), 0.4, False),  # a blow that dies out
+        (lambda t_s: 0.55 * SWING_M * math.sin(0.9 * t_s), 0.4, False),  # drifting air
+    ],
+)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_only_swings_that_last_are_an_oscillation(
+    error_m: Callable[[float], float], rate_rad_s: float, oscillates: bool, axis: int
+) -> None:
+    watch = Oscillation(SWING_M)
+    found = []
+    for k in range(2000):
+        error, rate = [0.0, 0.0], [0.0, 0.0]
+        error[axis], rate[1 - axis] = error_m(k * TICK_S), rate_rad_s
+        watch.update(k * TICK_S, TICK_S, (error[0], error[1]), (rate[0], rate[1]))
+        found.append(watch.rate_rad_s is not None)
+    assert any(found) is oscillates
+    assert not any(found[:400]), "not before two periods, of 2.1 s each"
+
+
+@pytest.mark.parametrize(("late_s", "id_"), [(0.01, None), (0.03, "link_slow"), (0.06, "link_late")])
+@pytest.mark.parametrize("offset_m", [(0.0, 0.0, 0.0), (0.05, -0.03, 0.02)])
+def test_a_link_that_was_always_slow_is_found_when_the_vehicle_moves(
+    late_s: float, id_: str | None, offset_m: tuple[float, float, float]
+) -> None:
+    """PX4's position is where the vehicle was on the way there and back; a wrong pivot makes no difference."""
+
+    def flies(i: Inputs) -> Inputs:
+        now_s = i.t_s - START_S
+
+        def at_m(t_s: float) -> float:
+            return 0.3 * math.sin(1.5 * t_s)
+
+        x, y, z = offset_m
+        px4 = put("vehicle", position_world_m=(x + at_m(now_s - 2.0 * late_s), y, 1.0 + z))
+        speed = put("vehicle", velocity_world_m_s=(0.45 * math.cos(1.5 * (now_s - 2.0 * late_s)), 0.0, 0.0))
+        return put("mocap", position_world_m=(at_m(now_s), 0.0, 1.0))(speed(px4(i)))
+
+    events = watched(NO_INERTIAL, [flies(healthy(k)) for k in range(1000)], flying())
+    assert [event.id for event in events] == ([id_] if id_ else [])
+
+
+def test_the_lag_is_not_measured_with_poses_that_are_not_trusted_or_repeat() -> None:
+    """A pose that stays behind a moving vehicle looks like a lag that is negative or large."""
+
+    def lost(i: Inputs) -> Inputs:
+        t_s = i.t_s - START_S
+        moving = put("vehicle", velocity_world_m_s=(0.4 * math.sin(2.0 * t_s), 0.0, 0.0))
+        shift_m = 0.09 * math.sin(2.0 * t_s)
+        return replace(moved("vehicle", (-shift_m, 0.0, 0.0))(moving(i)), mocap=healthy(3).mocap)
+
+    events = watched(NO_INERTIAL, after_a_moment(lost), flying())
+    assert {event.id for event in events} == {"mocap_lost"}

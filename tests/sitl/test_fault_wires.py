@@ -125,6 +125,23 @@ def test_over_a_slow_link_everything_comes_in_order_and_that_much_later(flight: 
     assert all(at_s - sent_s == pytest.approx(0.05) for sent_s, at_s in arrived)
 
 
+def test_a_link_that_slows_down_in_flight_brings_nothing_twice(flight: FastFlight) -> None:
+    """Its messages keep their order: for as long as the delay grows, the last word stays."""
+    world, link = flight.plant.world, FastLink(flight.faults, flight.plant.world, flight.px4, TICK_PERIOD_S)
+    heard: list[float | None] = []
+    for tick in range(60):
+        world.t_s = t_s = round(tick * TICK_PERIOD_S, 4)
+        if tick == 20:
+            flight.faults.active["link_delay"] = Fault(kind="link_delay", t_s=0.0, size=0.05)
+        if tick == 40:
+            flight.faults.active.clear()
+        state, _ = link.receive(*at_rest(t_s))
+        assert state is not None
+        heard.append(state.boot_s)
+    ticks = [round(boot_s / TICK_PERIOD_S) for boot_s in heard if boot_s is not None]
+    assert ticks == [*range(20), *[19] * 10, *range(20, 30), *range(40, 60)]
+
+
 def test_over_a_dead_link_nothing_comes_and_the_last_word_stays(flight: FastFlight) -> None:
     world, link = flight.plant.world, FastLink(flight.faults, flight.plant.world, flight.px4, TICK_PERIOD_S)
     last = link.receive(*at_rest(0.0))

@@ -200,7 +200,7 @@ def test_without_faults_the_flight_is_the_same_to_the_last_bit() -> None:
     [
         ("mocap_swap", "catch", 1.0, None, "landed", "mocap_jump", "autopilot_land"),
         ("mocap_latency", "line", 0.2, None, "landed", "mocap_lost", "autopilot_land"),
-        ("link_delay", "line", 0.15, None, "landed", "link_late", "autopilot_land"),
+        ("link_delay", "line", 0.08, None, "landed", "link_late", "autopilot_land"),
         ("offboard_refused", "landing", None, None, "landed", "offboard_left", "autopilot_land"),
         ("arming_refused", "ground", None, None, "refused", "arming_refused", "nominal"),
         ("servo_overload", "line", None, None, "landed", "servo_error", "land"),

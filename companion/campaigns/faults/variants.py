@@ -64,7 +64,7 @@ VARIANTS: tuple[Variant, ...] = (
     *_sizes("mocap_network", 0.06, 0.1, 0.15, 0.18),
     *_sizes("mocap_rate", 60.0, 5.0),
     *_durations("link_loss", 0.1, 0.5, None),
-    *_sizes("link_delay", 0.03, 0.15),
+    *_sizes("link_delay", 0.005, 0.015, 0.03, 0.04, 0.05, 0.07, 0.15),
     *_sizes("autopilot_reboot", 2.0),
     *_durations("offboard_refused", None),
     *_durations("arming_refused", None),
