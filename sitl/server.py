@@ -413,6 +413,7 @@ class Sitl:
         self.autopilot.set_link(down, self.faults.size("link_delay"))
         if self.bus is not None:
             self.bus.damaged = self.faults.packet_lost
+            self.bus.answers_late_s = self.faults.size("bus_delay")
         if self.force is not None:
             self.force.silent = plant.fault("force_loss") is not None
         fault = plant.fault("servo_loss")

@@ -175,7 +175,7 @@ def _fly(arguments: argparse.Namespace) -> int:
     if arguments.wait_for_start:
         arguments.overrides += ["mission.start.takeoff=by_operator"]
     config = _load(arguments, hardware=arguments.sitl is None, real_px4=arguments.sitl == "px4")
-    problems = _no_server(config) or [*_problems(config), *_start_impossible(config)]
+    problems = _no_server(config) or [*_problems(config), *_start_impossible(config), *_no_bus_time(config, speed)]
     if problems:
         for line in problems:
             print_error(line)
@@ -213,6 +213,12 @@ def _speed(arguments: argparse.Namespace) -> float | None:
         problem = f"--speed {given}: expected a number above 0, such as 0.25, or max"
     print_error(f"companion fly: {problem}")
     return 0.0
+
+
+def _no_bus_time(config: SitlConfig, speed: float | None) -> list[str]:
+    if speed is None or all(fault.kind != "bus_delay" for fault in config.world.faults):
+        return []
+    return ["world.faults: bus_delay: the servo bus takes no time in simulated time; add --real-time"]
 
 
 def _no_server(config: FlightConfig) -> list[str]:

@@ -14,6 +14,7 @@ from companion.control.arm_model import manipulator_of
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.force_observer import ForceObserver
 from companion.control.hover_thrust import HoverThrust, off_the_ground
+from companion.control.joint_prediction import JointPrediction
 from companion.control.online import OnlineImpedance
 from companion.control.sensing import CatchDetector, ForceSensing, MeanAcceleration, ObservedCatchDetector
 from companion.control.slide import Slide
@@ -59,6 +60,7 @@ class VehicleControl:
         self._thrust_sent = 0.0
         self._force_timeout_s = vehicle.safety.force_timeout_s
         self._arm_hold = ArmHold(vehicle)
+        self._joints = JointPrediction(vehicle)
         self._sensing = ForceSensing(vehicle.tool, manipulator_of(vehicle))
         self._slide = Slide(vehicle)
         self._acceleration = MeanAcceleration()
@@ -147,14 +149,19 @@ class VehicleControl:
         if i.arm is None or i.vehicle is None:
             return None
         target, still = self._arm_target_rad or i.arm.angle_rad, (0.0,) * len(i.arm.angle_rad)
-        return self._arm_hold.torque_nm(i.arm.angle_rad, i.arm.velocity_rad_s, target, still, i.vehicle.attitude_wxyz)
+        angles, rates = self._joints.now(i.t_s, i.arm)
+        torque = self._arm_hold.torque_nm(angles, rates, target, still, i.vehicle.attitude_wxyz)
+        self._joints.sent(i.t_s, torque)
+        return torque
 
     def fly(self, i: Inputs, dt_s: float, reference: Reference, vertical_scale: float) -> Command:
         """Run one tick of the control law. `vertical_scale` is as in `Controller.step`."""
         vehicle, arm = i.vehicle, i.arm
         if vehicle is None:
             return Command()
-        arm_rad = arm.angle_rad if arm is not None else reference.arm_rad
+        arm_rad, arm_rate_rad_s = reference.arm_rad, reference.arm_rate_rad_s
+        if arm is not None:
+            arm_rad, arm_rate_rad_s = self._joints.now(i.t_s, arm)
         self._arm_target_rad = arm_rad
         force = None
         if i.force is not None and i.t_s - i.force.stamp_s <= self._force_timeout_s:
@@ -169,7 +176,7 @@ class VehicleControl:
             attitude_wxyz=vehicle.attitude_wxyz,
             angular_rate_body_rad_s=vehicle.angular_rate_body_rad_s,
             arm_rad=arm_rad,
-            arm_rate_rad_s=arm.velocity_rad_s if arm is not None else reference.arm_rate_rad_s,
+            arm_rate_rad_s=arm_rate_rad_s,
             force_ext_world_n=_used(force, pressing) if self._observer is None else None,
             airborne=airborne,
             tuning=self.tuning if airborne else Tuning.FREEZE,
@@ -199,6 +206,7 @@ class VehicleControl:
             torque = self._slide.torque_nm(dt_s, torque, state, reference.slide_world_n, pressing, force)
             friction = None if force is None else across(force, pressing)
             attitude = self._slide.attitude(dt_s, attitude, state, reference, friction)
+        self._joints.sent(i.t_s, torque)
         if self._observer is not None:
             observed = self._observer.force_n
             log = msgspec.structs.replace(log, force_observed_world_n=observed, force_measured_world_n=force)
@@ -237,12 +245,14 @@ class VehicleControl:
         self._known_n = (x, y, z - weight_n)
         self.disturbance_world_n = self._pull.step(dt_s, self._known_n, state.acceleration_world_m_s2, learn=True)
 
-    def catch_s(self, t_s: float, log: ControlLog) -> float | None:
-        """Return the time of the impact in the tick that confirms a catch, and None in every other tick."""
+    def catch_s(self, t_s: float, log: ControlLog, arm_swings: bool) -> float | None:
+        """Return the time of the impact in the tick that confirms a catch, and None in every other tick. An arm that swings strikes the
+        sensor by itself, and confirms none.
+        """
         observed = log.force_observed_world_n
         if not self._has_net or not self._catch.update(t_s, log.force_ext_world_n if observed is None else observed):
             return None
-        if self.tether_pulls:
+        if self.tether_pulls or arm_swings:
             self._catch.reject()
         return self._catch.caught_s
 

@@ -330,7 +330,8 @@ class FlightCore:
         return z_m - self._vehicle.tip_radius_m > -self._vehicle.airframe.ground_clearance_m
 
     def _watch_for_catch(self, t_s: float, log: ControlLog, events: list[Event]) -> None:
-        caught_s, start_s = self._control.catch_s(t_s, log), self._state.mission_start_s
+        caught_s = self._control.catch_s(t_s, log, self._monitors.arm_swings)
+        start_s = self._state.mission_start_s
         if caught_s is not None and start_s is not None:
             self._situation.caught = True
             text = f"payload caught at t = {caught_s - start_s:.2f} s"

@@ -28,7 +28,7 @@ from companion.flight.command_queue import Operator, StartCancelled
 from companion.flight.fallback_landing import land_without_core, unflown
 from companion.flight.heartbeat import FlightGuard
 from companion.flight.startup import Checked, Refused, changed_since, check_before_flight, with_hover_thrust
-from companion.flight.ticker import SIMULATED_START_S, SimulatedTicker, Ticker
+from companion.flight.ticker import JOINT_LEAD_MAX_S, SIMULATED_START_S, SimulatedTicker, Ticker
 from companion.guardian.client import GuardianClient
 from companion.io.devices import Devices, open_devices
 from companion.io.protocols import DeviceError
@@ -59,7 +59,6 @@ from companion.safety.rules import REATTACHED
 STATUS_EVERY = 20
 JOINT_READ_TIMEOUT_S = 0.002
 """Timeout for the joint read, measured from the start of the tick; the read begins earlier."""
-JOINT_LEAD_MAX_S = 0.003
 JOINT_MARGIN_S = 0.0001
 """Planned time between the arrival of the joint state and the start of the tick, so that the state is neither late nor stale."""
 

@@ -24,6 +24,8 @@ SIMULATED_START_S = 0.5
 """Time from the beginning of a simulated flight to its first tick: every device has sent new data by then."""
 STEP_S = 0.002
 """Step of simulated time: a tick that starts that much after its deadline is not late."""
+JOINT_LEAD_MAX_S = 0.003
+"""Longest time before a tick at which the read of its joint state begins."""
 _SLOW_TICKS = 4
 
 

@@ -223,6 +223,11 @@ class ArmState(Record, frozen=True, kw_only=True):
     asked_s: float | None = None
     """Flight clock at which the bus thread began this read."""
 
+    @property
+    def measured_s(self) -> float:
+        """Flight clock at which the joints were where this state says: the servos measure when they are asked."""
+        return self.stamp_s if self.asked_s is None else self.asked_s
+
 
 class ForceSample(Record, frozen=True, kw_only=True):
     """One sample of the force-torque sensor in the sensor frame, before tare and gravity compensation."""

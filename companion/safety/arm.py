@@ -10,9 +10,11 @@ from collections.abc import Sequence
 from typing import Final
 
 from companion.model.algebra import dot, minus, plus, scaled
+from companion.model.constants import TICK_PERIOD_S
 from companion.model.listing import listed
 from companion.model.servos import WATCHDOG_ERROR, hardware_error_text
 from companion.model.types import ArmState, ForceSample, Inputs, Joints, Vec2, Vec3
+from companion.safety.joint_swing import JointSwing
 from companion.safety.situation import HOLDS, Age, Situation, Values
 
 AT_LIMIT: Final = 0.97
@@ -20,6 +22,15 @@ AT_LIMIT: Final = 0.97
 REFUSED_MAX_S: Final = 0.1
 """Time without usable joint torques after which the vehicle lands. `REFUSED_FORGOTTEN` of the time with usable ones is taken off."""
 REFUSED_FORGOTTEN: Final = 0.25
+LATE_S: Final = 0.005
+"""Age beyond which a joint state counts as late. Torques are computed for the angles and rates predicted from it
+(`companion.control.joint_prediction`), whose margin is used up at 20 ms."""
+MISSING_S: Final = 0.05
+"""Age beyond which a joint state is missing and not late: `arm_read_failures` and `arm_lost` report that."""
+LATE_SHARE: Final = 0.08
+"""Share of ticks with a late joint state from which the bus counts as late."""
+LATE_TIME_S: Final = 1.0
+"""Time constant of that share."""
 DRIFT_TIME_S: Final = 1.0
 """Time constant of the mean force."""
 CHANGE_TIME_S: Final = (0.5, 5.0)
@@ -53,6 +64,12 @@ class ArmTracker:
         self.before: ArmState | None = None
         """Previous joint state; None if this tick has no new one."""
         self.age_s = 0.0
+        self.late_share = 0.0
+        """Low-passed share of ticks whose joint state was late."""
+        self._late_s = 0.0
+        self.swing: tuple[int, float, float] | None = None
+        """Number of a joint that swings, its frequency in Hz and its rate amplitude in rad/s; None if none does."""
+        self._swing = JointSwing()
         self.hottest_c = -math.inf
         """Temperature of the hottest servo; -inf without a joint state."""
         self.torque_refused = ""
@@ -77,6 +94,21 @@ class ArmTracker:
             newest, self._newest = self._newest, arm
             if newest is not None and arm.stamp_s > newest.stamp_s:
                 self.before = newest
+                self._swing.update(arm)
+            age_s = i.t_s - arm.measured_s
+            if age_s <= MISSING_S:
+                self._update_lateness(age_s)
+        self.swing = self._swing.swinging(i.t_s)
+
+    @property
+    def late_s(self) -> float:
+        """Return the mean age of the late joint states of the last second."""
+        return self._late_s / self.late_share if self.late_share > 0.0 else 0.0
+
+    def _update_lateness(self, age_s: float) -> None:
+        late, k = age_s > LATE_S, TICK_PERIOD_S / LATE_TIME_S
+        self.late_share += k * (late - self.late_share)
+        self._late_s += k * (late * age_s - self._late_s)
 
 
 def arm_lost(a: ArmTracker, timeout_s: float) -> Values | None:
@@ -88,6 +120,21 @@ def arm_read_failures(a: ArmTracker, failures_max: int) -> Values | None:
     """Fires if consecutive bus cycles without an answer have reached the limit."""
     arm = a.arm
     return (arm.read_failures,) if arm is not None and arm.read_failures >= failures_max else None
+
+
+def joint_states_late(a: ArmTracker, _: None) -> Values | None:
+    """Fires if too many ticks use a late joint state."""
+    if a.late_share < LATE_SHARE:
+        return None
+    return (100.0 * a.late_share, LATE_S * 1e3, a.late_s * 1e3, 100.0 * LATE_SHARE)
+
+
+def joint_swings(a: ArmTracker, _: None) -> Values | None:
+    """Fires if a joint swings."""
+    if a.swing is None:
+        return None
+    joint, frequency_hz, rate_rad_s = a.swing
+    return (joint, frequency_hz, math.degrees(rate_rad_s))
 
 
 def torque_refused(a: ArmTracker, _: None) -> Values | None:

@@ -87,6 +87,11 @@ class Monitors:
         return self._mocap.pose_filter()
 
     @property
+    def arm_swings(self) -> bool:
+        """Return whether a joint of the arm swings."""
+        return self._arm.swing is not None
+
+    @property
     def mocap_innovation_m(self) -> float:
         """Return the distance between the newest pose and the position predicted from the IMU; 0 while that is not evaluated."""
         return self._mocap.innovation_m

@@ -255,6 +255,21 @@ RULES: tuple[Rule, ...] = (
         message="{} bus cycles without an answer",
     ),
     Rule(
+        id="joint_states_late", subject=Subject.ARM, what="joint states are late: a slow adapter, a busy bus or a busy computer",
+        predicate=arm.joint_states_late, ground=_WARN, air=_WARN,
+        message="in {:.0f} % of the ticks the joint state is older than {:.0f} ms, {:.0f} ms in the mean (limit {:.0f} %); check the "
+        "adapter's latency timer and the computer's load",
+    ),
+    Rule(
+        id="joint_swings", subject=Subject.ARM, what="a joint swings: its rate turns three times in 0.5 s, by 2 rad/s and more",
+        predicate=arm.joint_swings, ground=_WARN, air=_WARN,
+        message="joint {} swings at {:.0f} Hz with {:.0f} deg/s; no catch is detected meanwhile",
+    ),
+    Rule(
+        id="joint_swings_on", subject=Subject.ARM, what="a joint goes on swinging", predicate=arm.joint_swings, hold_time=1.5,
+        ground=_LAND, air=_LAND, message="joint {} goes on swinging at {:.0f} Hz with {:.0f} deg/s",
+    ),
+    Rule(
         id="torque_refused", subject=Subject.ARM,
         what="the control law's joint torques are not finite or not one per joint, so that none are sent and the arm is limp, "
         "for 0.1 s; ticks with usable torques count backwards, at a quarter",

@@ -36,6 +36,7 @@ FaultKind = Literal[
     "servo_hot",
     "servo_angle",
     "bus_noise",
+    "bus_delay",
     "force_loss",
     "force_stuck",
     "force_bias",
@@ -199,6 +200,13 @@ KINDS: dict[FaultKind, Kind] = {
         default=0.3,
         named_by=_ARM_GONE,
     ),
+    "bus_delay": Kind(
+        what="the servos' answers arrive later, as behind a USB adapter with a long latency timer",
+        size="additional delay",
+        unit="s",
+        default=0.01,
+        named_by=("joint_states_late", "joint_swings", "joint_swings_on", *_ARM_GONE),
+    ),
     "force_loss": Kind("the force sensor stops sending", named_by=("force_lost", "contact_lost")),
     "force_stuck": Kind("the force sensor repeats its last reading", named_by=("force_stuck", "contact_lost")),
     "force_bias": Kind(
@@ -324,7 +332,7 @@ def absent_part(kind: FaultKind, vehicle: Vehicle) -> str | None:
         return "devices.force"
     if kind.startswith("tether_") and vehicle.tether is None:
         return "tether"
-    if (kind.startswith("servo_") or kind == "bus_noise") and not vehicle.arm.joints:
+    if kind.startswith(("servo_", "bus_")) and not vehicle.arm.joints:
         return "arm"
     if kind.startswith("payload_") and not vehicle.has_net:
         return "tool (a net)"

@@ -8,11 +8,14 @@ from msgspec.structs import replace
 
 from companion.config.arm import Joint
 from companion.config.vehicle import Vehicle
+from companion.flight.ticker import JOINT_LEAD_MAX_S
 from companion.io.dynamixel.registers import joint_scale
 from companion.io.dynamixel.scale import JointScale
+from companion.model.constants import TICK_PERIOD_S
 from companion.model.servos import WATCHDOG_ERROR
 from companion.model.types import ArmState, Joints
 from sitl.faults.injector import COOL_C, Faults
+from sitl.force_torque import TIME_EPSILON_S
 from sitl.servo import registers as reg
 from sitl.servo.bus import ServoLine
 from sitl.servo.drive import MODE_CURRENT, ServoDrive
@@ -78,6 +81,11 @@ class FastBus:
         self._healthy, self._cool = (0,) * len(drives), (COOL_C,) * len(drives)
         self._goal_s = 0.0
         self._arm: ArmState | None = None
+        self._read: ArmState | None = None
+        """Joint state whose answer is on its way; None if no read is in progress."""
+        self._next_read_s = 0.0
+        self._waiting_counts: Sequence[int] | None = None
+        """Currents that wait for the end of the read."""
         for drive in drives:
             drive.mode, drive.torque_on = MODE_CURRENT, True
             drive.set_goal_current(0, at_once=True)
@@ -87,11 +95,37 @@ class FastBus:
         """Return the joint state of this tick. If the read fails, return the last state with one more read failure; None if the bus
         set-up failed.
         """
-        if self._arm is None or self._faults is None or not self._read_fails(self._faults):
+        if self._read is not None or (self._arm is not None and self._delay_s):
+            self._next_read_s = t_s + TICK_PERIOD_S - JOINT_LEAD_MAX_S
+        elif self._arm is None or self._faults is None or not self._read_fails(self._faults):
             self._arm = self._state(t_s)
         else:
-            self._arm = replace(self._arm, read_failures=self._arm.read_failures + 1)
+            self._arm = self._one_more_failure()
         return self._arm
+
+    def _one_more_failure(self) -> ArmState:
+        assert self._arm is not None
+        return replace(self._arm, read_failures=self._arm.read_failures + 1)
+
+    @property
+    def _delay_s(self) -> float:
+        return 0.0 if self._faults is None else self._faults.size("bus_delay")
+
+    def step(self, t_s: float) -> None:
+        """Do what the bus thread does while answers are delayed: begin a read before the tick, take its answer, and send currents when
+        no read is in progress. Call it in every step of a world with faults.
+        """
+        arm, faults = self._read, self._faults
+        if arm is None and self._arm is not None and self._delay_s and t_s >= self._next_read_s:
+            arm = self._read = self._state(t_s)
+        if arm is not None and faults is not None and t_s >= arm.stamp_s + self._delay_s - TIME_EPSILON_S:
+            failed = self._read_fails(faults)
+            new = replace(arm, stamp_s=t_s, asked_s=arm.stamp_s)
+            self._arm = self._one_more_failure() if failed else new
+            self._read, waiting = None, self._waiting_counts
+            if waiting is not None:
+                self._waiting_counts = None
+                self._set(faults, waiting)
 
     def keep_alive(self, t_s: float) -> None:
         """Do what the bus thread does while the flight process stalls: feed the watchdogs and set stale currents to zero."""
@@ -107,7 +141,10 @@ class FastBus:
             self._goal_s = t_s
             counts = [scale.current_counts(nm) for scale, nm in zip(self._scales, torque_nm, strict=True)]
             if faults is None or not faults.packet_lost():
-                self._set(faults, counts)
+                if self._read is None:
+                    self._set(faults, counts)
+                else:
+                    self._waiting_counts = counts
         elif faults is not None and t_s - self._goal_s > self._watchdog_s and not faults.packet_lost():
             # As the bus thread does with a stale goal; a servo that is lost has its own watchdog.
             self._set(faults, [0] * len(self._drives))

@@ -218,6 +218,8 @@ class FastFlight:
         """Advance the world by a step, and let motion capture and PX4 send what is due."""
         plant = self.plant
         plant.step(self.px4.armed)
+        if plant.faults is not None:
+            self._bus.step(plant.world.t_s)
         for frame in plant.take_mocap()[-1:]:  # of frames that wait, the driver delivers the newest
             self._deliver(frame)
         if self._force_period_s is not None and plant.world.t_s >= self._force_due_s - TIME_EPSILON_S:

@@ -260,6 +260,8 @@ class ServoBus:
         """Bytes of answers that were dropped because the line was not read."""
         self.damaged: Callable[[], bool] = lambda: False
         """Fault: called at every instruction; returns whether noise corrupts it."""
+        self.answers_late_s = 0.0
+        """Fault: additional delay of every answer; not in simulated time, in which a transmission takes no time."""
         self._wire_time = wire_time
         self._pty = PtyLine(self._on_bytes)
         self._last_byte_s = 0.0
@@ -300,7 +302,7 @@ class ServoBus:
         if not answer:
             return
         on_wire_s = (len(data) + len(answer)) * _BITS_PER_BYTE / baud_bps
-        self._line_free_s = max(now_s, self._line_free_s) + on_wire_s + delay_s
+        self._line_free_s = max(now_s, self._line_free_s) + on_wire_s + delay_s + self.answers_late_s
         self._timers = {timer for timer in self._timers if not timer.cancelled() and timer.when() > now_s}
         self._timers.add(loop.call_at(self._line_free_s, self._send, answer))
 

@@ -264,3 +264,9 @@ def test_the_plan_check_shows_where_each_pose_puts_the_net(capsys: pytest.Captur
     assert main(["check", "hover", "--plan-only", "--set", *straight]) == EXIT_OK
     line = "pose unfolded, 90, 0 deg: the net is +0.00 m forward, +0.00 m left and -0.47 m up from the body origin"
     assert line in capsys.readouterr().out
+
+
+def test_a_delay_of_the_servo_bus_is_refused_in_simulated_time(companion: Command) -> None:
+    ended = companion(*FLY, "--set", "world.faults=[{kind: bus_delay, t_s: 1.0}]")
+    assert ended.code == EXIT_BAD_INPUT
+    assert "bus_delay: the servo bus takes no time in simulated time; add --real-time" in ended.err

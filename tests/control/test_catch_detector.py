@@ -8,7 +8,10 @@ from collections.abc import Callable
 import pytest
 
 from companion.control.sensing import CatchDetector, ObservedCatchDetector
+from companion.control.vehicle_control import VehicleControl
 from companion.model.types import Vec3
+from companion.sitl_config.loader import load_sitl
+from tests.safety.healthy import control as log_of
 
 DT_S = 0.005
 G_M_S2 = 9.81
@@ -48,6 +51,16 @@ class Net:
 
 
 EMPTY: Vec3 = (0.05, -0.03, 0.04)
+
+
+@pytest.mark.parametrize("swings", [False, True])
+def test_an_arm_that_swings_confirms_no_catch(swings: bool) -> None:
+    config = load_sitl("configs/missions/catch.yaml", overrides=["vehicle.airframe.hover_thrust=0.5"])
+    control, caught = VehicleControl(config.flight), []
+    for tick in range(600):
+        force = EMPTY if tick < 200 else (-6.0, 0.5, -9.0) if tick < 208 else (0.0, 0.0, -1.96)
+        caught.append(control.catch_s(tick * DT_S, log_of(force_ext_world_n=force), swings))
+    assert [caught_s for caught_s in caught if caught_s is not None] == ([] if swings else [200 * DT_S])
 
 
 @pytest.mark.parametrize("payload_kg", [0.05, 0.1, 0.2, 0.3, 0.6])

@@ -184,6 +184,10 @@ def swinging() -> Situation:
     return Swinging(**{name: getattr(flying(), name) for name in ("airborne", "offboard_expected", "tracking_error_m")})
 
 
+def swinging_joint(i: Inputs) -> Inputs:
+    return put("arm", velocity_rad_s=(0.7 + 1.5 * math.sin(math.tau * 16.0 * (i.t_s - START_S)), 0.0))(i)
+
+
 FAULTS: dict[str, Fault] = {
     "estimator_silent": Fault(lambda i: replace(i, estimator=fed_by_another(healthy()).estimator)),
     "vision_lost": Fault(estimator(flags=0b1111)),
@@ -224,6 +228,9 @@ FAULTS: dict[str, Fault] = {
     "battery_voltage": Fault(put("status", battery_voltage_v=13.0)),
     "arm_lost": Fault(stopped("arm")),
     "arm_read_failures": Fault(put("arm", read_failures=5)),
+    "joint_states_late": Fault(lambda i: put("arm", stamp_s=i.t_s - 0.012)(i)),
+    "joint_swings": Fault(swinging_joint, also=frozenset({"joint_swings_on"})),
+    "joint_swings_on": Fault(swinging_joint, also=frozenset({"joint_swings"})),
     "torque_refused": Fault(situation=lambda: flying(torque_refused="joint torque (nan, 0.0) is not finite")),
     "servo_error": Fault(put("arm", hardware_error=(0, 32))),
     "arm_let_go": Fault(put("arm", hardware_error=(0x80, 0))),
@@ -346,6 +353,9 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "battery_voltage": (LAND, LAND, 2.015),
     "arm_lost": (LAND, LAND, 0.120),  # a limp or unknown arm swings; the vehicle still flies
     "arm_read_failures": (WARN, WARN, 0.015),
+    "joint_states_late": (WARN, WARN, 0.095),  # the law predicts what has happened since
+    "joint_swings": (WARN, WARN, 0.195),
+    "joint_swings_on": (LAND, LAND, 1.695),
     "torque_refused": (LAND, PX4_LANDS, 0.105),  # the law itself computes nonsense: not even its landing can be trusted
     "servo_error": (LAND, LAND, 0.015),
     "arm_let_go": (WARN, WARN, 0.015),  # its torque is on again
@@ -395,7 +405,8 @@ READS = """
     mocap_dragged 91 40; mocap_slow 31 50; mocap_late 80 50; mocap_too_late 200 120; estimate_disagrees 0.34 0.30;
     yaw_disagrees 20 15; estimator_silent 0.25; vision_rejected 1.2 1; px4_rebooted 2.0; link_slow 30 20; link_late 100 35;
     vehicle_state_lost 0.25; heartbeat_lost 2.5; px4_disarmed 1.00; battery_warn 25 30; battery_low 10 20;
-    battery_silent 10; battery_voltage 13.0 13.2; arm_lost 0.10; arm_read_failures 5; torque_refused 0.0; servo_error 70 2;
+    battery_silent 10; battery_voltage 13.0 13.2; arm_lost 0.10; arm_read_failures 5; joint_states_late 8 5 12 8;
+    joint_swings 1 16 86; joint_swings_on 1 16 86; torque_refused 0.0; servo_error 70 2;
     joint_jump 2 29; servo_warm 68 65; servo_hot 76 75; servo_overload -2.5 0.1; joint_rate 0 745 700;
     joint_beyond_limit 180 57 5; joint_far_beyond_limit 115 -25 15; force_lost 0.25; force_overload 1 -1 0;
     force_drift 3.3 0.0 0.0 2.0; force_disagrees 0.0 0.0 0.8 0.0 0.0 -0.8;
@@ -899,7 +910,9 @@ def test_a_link_that_was_always_slow_is_the_clocks_difference() -> None:
 
 
 @pytest.mark.parametrize(
-    ("growth", "told"), [(0.0005, []), (0.04, ["link_slow", "link_late"])], ids=["clocks that drift", "a queue that fills"]
+    ("growth", "told"),
+    [(0.0005, []), (0.04, ["link_slow", "link_late"])],
+    ids=["clocks that drift", "a queue that fills"],
 )
 def test_a_lag_that_grows_faster_than_clocks_drift_apart_is_reported(growth: float, told: list[str]) -> None:
     """At the former rate of forgetting, 50 ms/s, a link that queued 40 ms more each second was never late."""

@@ -66,6 +66,18 @@ def test_the_garbage_collector_is_left_as_it_was(on: bool) -> None:
     assert gc.isenabled() is on
 
 
+def test_answers_that_come_10_ms_late_do_not_make_the_arm_swing() -> None:
+    late = "world.faults=[{kind: bus_delay, after: start, t_s: 0.6, size: 0.01}]"
+    result = FastFlight(load_sitl("configs/missions/catch.yaml", world="lab", overrides=("world.seed=2003", late))).run(
+        9.6
+    )
+    ages_s = [i.t_s - i.arm.measured_s for i in result.inputs[-200:] if i.arm is not None]
+    assert all(0.0099 < age_s < 0.0201 for age_s in ages_s)
+    assert [event.id for o in result.outputs for event in o.events if event.id.startswith("joint_")] == [
+        "joint_states_late"
+    ]
+
+
 def test_the_arm_delay_delays_the_currents_and_nothing_else() -> None:
     prompt, late = flown(), flown("world.arm_delay_s=0.01")
     assert late.outputs[-1].outcome is Outcome.COMPLETED

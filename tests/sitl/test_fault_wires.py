@@ -60,6 +60,27 @@ def test_a_damaged_instruction_is_heard_by_nobody() -> None:
     assert answer == status(1, 0, ServoModel(1).read(0, 6)), "and the answer to it came first"
 
 
+def test_a_delayed_answer_comes_that_much_later() -> None:
+    delay_s = 0.03
+
+    async def scenario() -> float:
+        async with ServoBus([ServoModel(1)]) as bus:
+            bus.answers_late_s = delay_s
+            fd = os.open(bus.path, os.O_RDWR | os.O_NOCTTY)
+            try:
+                speed = termios.tcgetattr(fd)
+                speed[4] = speed[5] = termios.B3000000
+                termios.tcsetattr(fd, termios.TCSANOW, speed)
+                asked_s = asyncio.get_running_loop().time()
+                os.write(fd, packet(1, bytes((2, 0, 0, 6, 0))))
+                await _read(fd, len(status(1, 0, bytes(6))))
+                return asyncio.get_running_loop().time() - asked_s
+            finally:
+                os.close(fd)
+
+    assert asyncio.run(scenario()) >= delay_s
+
+
 async def _read(fd: int, size: int) -> bytes:
     loop = asyncio.get_running_loop()
     data = b""

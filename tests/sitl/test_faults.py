@@ -206,6 +206,7 @@ def test_without_faults_the_flight_is_the_same_to_the_last_bit() -> None:
         ("servo_overload", "line", None, None, "landed", "servo_error", "land"),
         ("servo_angle", "line", 40.0, None, "landed", "joint_jump", "land"),
         ("bus_noise", "takeoff", 0.6, None, "completed", "arm_read_failures", "warn"),
+        ("bus_delay", "takeoff", 0.01, None, "completed", "joint_states_late", "warn"),
         ("force_stuck", "line", None, None, "completed", "force_stuck", "warn"),
         ("battery_sag", "line", 4.0, None, "landed", "battery_voltage", "land"),
         ("kill_recorder", "landing", None, None, "completed", "recorder_drops", "warn"),

@@ -73,6 +73,7 @@ VARIANTS: tuple[Variant, ...] = (
     *_sizes("servo_hot", 70.0, 85.0),
     *_sizes("servo_angle", 10.0, 40.0),
     *_sizes("bus_noise", 0.1, 0.6),
+    *_sizes("bus_delay", 0.002, 0.004, 0.006, 0.008, 0.01, 0.012),
     *_durations("force_loss", 0.2, None),
     *_durations("force_stuck", None),
     *_sizes("force_bias", 2.0, 10.0),
