@@ -5,21 +5,25 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.config.loader import load_flight
 from companion.config.safety import Safety
 from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
 from companion.guardian.px4 import Px4State
+from companion.guardian.settings import read_settings
 from companion.guardian.takeover_landing import Notice, TakeoverLanding
 from companion.model.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
 from companion.model.types import LandedState, MocapPose, Quat, Vec3
 from companion.safety.autopilot_landing import TIMEOUT_S
 from companion.safety.mocap import limits_of
+from tests.support import HOVER
 
 STANDING_M, TILT_MAX_RAD = 0.3, math.radians(40.0)
 START_S, STEP_S = 20.0, 0.01
@@ -383,6 +387,19 @@ def test_a_pose_that_jumps_is_not_sent_and_is_reported_once() -> None:
     assert len(landing.wire.poses) == sent
     assert [notice.id for notice in landing.notices].count("guardian_mocap") == 1
     assert landing.takeover.pose is not None and landing.takeover.pose.position_world_m[2] == STANDING_M
+
+
+def test_its_settings_are_those_of_the_flight(tmp_path: Path) -> None:
+    changed = ["mocap_jump_m=0.17", "mocap_jump_deg=31", "estimate_disagreement_m=0.42", "mocap_latency_max_s=0.13"]
+    changed += ["mocap_latency_warn_s=0.06", "tilt_abort_deg=37", "guardian_timeout_s=0.15"]
+    config = load_flight(HOVER, overrides=[f"vehicle.safety.{one}" for one in changed])
+    path = tmp_path / "config.json"
+    path.write_text(config.model_dump_json(), encoding="utf-8")
+    settings, vehicle = read_settings(path), config.vehicle
+    assert settings.pose_limits == (0.17, math.radians(31.0), 0.42, 0.13) == limits_of(vehicle.safety)
+    assert (settings.tilt_max_rad, settings.timeout_s) == (math.radians(37.0), 0.15)
+    assert settings.clearance_m == vehicle.airframe.ground_clearance_m
+    assert settings.autopilot_address == vehicle.devices.autopilot.address
 
 
 def pose_at(t_s: float, **changes: Any) -> MocapPose:
