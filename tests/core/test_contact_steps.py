@@ -288,3 +288,15 @@ def test_from_a_point_it_moves_back_and_gives_up_if_the_points_lie_on_no_plane(
     assert ids(request) == (["surface_missing"] if touched == 3 else [])
     assert (state.contact.push_n < push_n) is (push_n > 0.0)
     assert (state.contact.offset_m < 0.3) is (push_n == 0.0 and touched == 1)
+
+
+def test_the_last_point_completes_the_surface() -> None:
+    points = tuple(TouchedPoint(NOW_S - 9.0, tip, 1.0) for tip in ((1.5, 0.1, 1.0), (1.5, -0.1, 1.0)))
+    held = contact(ContactMode.PRESS, 0.91, touches=1, wanted_n=1.0, force_n=1.0, mean_tip_m=(1.5, 0.0, 1.2))
+    held = replace(held, samples=10**6)
+    for before, complete in ((points[:1], False), (points, True)):
+        state, _ = tick(
+            at_plan(IN_APPROACH, replace(held, points=before)), parameters=FACING, force_world_n=(-1.0, 0.0, 0.0),
+            dt_s=DT_S,
+        )  # fmt: skip
+        assert state.contact is not None and (state.contact.surface is not None) is complete
