@@ -249,4 +249,12 @@ def test_armed_by_others_and_unseen_by_motion_capture_px4s_height_counts_for_not
     state, _ = after(state, "reattached", SafetyAction.AUTOPILOT_LAND, armed_by_others=True, inputs=unseen)
     assert state.stage is Stage.AUTOPILOT_LAND and state.landing is not None
     assert state.landing.pose_s == state.landing.stop.pose_s == -math.inf
-    assert state.landing.stop.flipped_since_s is None
+
+
+def test_armed_by_others_a_flip_is_not_taken_as_known_from_before() -> None:
+    """Its rotors are stopped after 0.3 s, as in every other landing."""
+    over = {"attitude_wxyz": (0.0, 1.0, 0.0, 0.0), "specific_force_body_m_s2": (0.0, 0.0, 0.0)}
+    i = replace(put("vehicle", **over)(healthy()), mocap=None)
+    state = replace(P.initial_state(), entered_s=healthy().t_s)
+    _, request = after(state, "reattached", SafetyAction.AUTOPILOT_LAND, armed_by_others=True, inputs=i)
+    assert request.autopilot is AutopilotRequest.LAND
