@@ -2,7 +2,8 @@
 
 `python -m tools.mutants` judges a random sample; cosmic-ray finds the places and writes the mutants. Each package of `PACKAGES` is
 judged by the tests in the folder of the same name, on a copy of the repository in build/. A mutant that exceeds the timeout counts as
-killed. A survivor is a missing test, or equivalent: no input makes it behave differently.
+killed. A survivor is a missing test, or equivalent: no input makes it behave differently. Those found so far are in
+`tools/equivalent_mutants.txt`, each with the reason below it.
 
 Not mutated are annotations, imports, asserts, decorators and the options of a class, which no flight reaches, and `<` for `<=`: a
 measured value equals its limit only by chance.
@@ -72,6 +73,12 @@ THIRD_PARTY = (
 )
 """Imported once; the tests of each mutant run in a fork."""
 TIMEOUT_FACTOR, TIMEOUT_MORE_S = 2.0, 30.0
+EQUIVALENT: Final = frozenset(
+    line
+    for line in (ROOT / "tools/equivalent_mutants.txt").read_text(encoding="utf-8").splitlines()
+    if line.startswith("companion/")
+)
+"""Mutants that no test can kill: the file, and the line before and after."""
 Span = tuple[tuple[int, int], tuple[int, int]]
 """First and last position of a piece of source text: line from 1, column from 0."""
 
@@ -236,6 +243,12 @@ def survivor(mutant: Mutant, operator: Any, files: list[str], timeout_s: float) 
     return f"{mutant.place} {before.strip()}  ->  {after.strip()}"
 
 
+def without_line(alive: str) -> str:
+    """Return a survivor without the number of its line, which changes."""
+    path, _, rest = alive.partition(":")
+    return f"{path}:{rest.partition(':')[2]}"
+
+
 def _write(path: Path, text: str) -> None:
     """Write a module. Its bytecode goes: a change within a second that keeps the length would not be noticed."""
     path.write_text(text, encoding="utf-8")
@@ -294,18 +307,20 @@ def judge(args: argparse.Namespace, found: dict[str, Any]) -> int:
             return 1
         timeout_s = TIMEOUT_FACTOR * (time.monotonic() - begin_s) + TIMEOUT_MORE_S
         seconds = json.loads(durations.read_text(encoding="utf-8"))
-        killed = 0
+        killed = equivalent = 0
         for mutant in chosen:
             alive = survivor(mutant, found[mutant.operator], in_order(mutant, seconds), timeout_s)
             killed += alive is None
-            if alive is not None:
+            if alive is not None and without_line(alive) in EQUIVALENT:
+                equivalent += 1
+            elif alive is not None:
                 print(f"survived: {alive}", flush=True)
-        share = 100.0 * killed / max(1, len(chosen))
-        rows.append((package, total, len(chosen), killed, len(chosen) - killed, share))
-        print(f"{package}: {killed} of {len(chosen)} killed, {time.monotonic() - begin_s:.0f} s", flush=True)
-    print("\n| package | mutants | sample | killed | survived | killed % |\n|---|---|---|---|---|---|")
+        count = len(chosen) - equivalent
+        rows.append((package, total, len(chosen), killed, equivalent, count - killed, 100.0 * killed / max(1, count)))
+        print(f"{package}: {killed} of {count} killed, {time.monotonic() - begin_s:.0f} s", flush=True)
+    print("\n| package | mutants | sample | killed | equivalent | survived | killed % |\n|---|---|---|---|---|---|---|")
     for row in rows:
-        print("| {} | {} | {} | {} | {} | {:.0f} |".format(*row))
+        print("| {} | {} | {} | {} | {} | {} | {:.0f} |".format(*row))
     return 0
 
 

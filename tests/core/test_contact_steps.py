@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -14,7 +15,7 @@ from companion.mission import contact as c
 from companion.mission.active_plan import Course
 from companion.mission.plan import Plan
 from companion.model.flight_stage import Stage
-from companion.model.types import ContactMode, ContactState, Inputs, Outcome, Vec3
+from companion.model.types import ContactMode, ContactState, Inputs, Outcome, TouchedPoint, Vec3
 from tests.core.test_reactions import ids, tick
 from tests.safety.healthy import healthy, put
 
@@ -87,7 +88,9 @@ def test_a_contact_begins_with_its_approach_and_the_rest_of_a_failed_one_is_skip
     ("since_s", "mode"), [(0.99, ContactMode.WEIGH), (1.01, ContactMode.APPROACH)], ids=["weighing", "weighed"]
 )
 def test_the_force_is_averaged_for_a_second_before_the_approach(since_s: float, mode: ContactMode) -> None:
-    assert mode_of(step(at_plan(IN_APPROACH, contact(ContactMode.WEIGH, since_s)))[0]) is mode
+    state, _ = step(at_plan(IN_APPROACH, contact(ContactMode.WEIGH, since_s)))
+    assert mode_of(state) is mode
+    assert plan_s(state) == pytest.approx(IN_APPROACH)
 
 
 def test_the_plan_waits_before_the_end_of_the_approach() -> None:
@@ -192,11 +195,13 @@ def test_a_press_without_contact_for_a_second_waits_half_a_second_and_approaches
     assert mode_of(state) is ContactMode.LOST and ids(request) == ["contact_interrupted"]
     assert mode_of(step(pressing(beyond_s=0.996), 0.4)[0]) is ContactMode.PRESS, "above a third of the touch"
     for since_s, mode in ((0.49, ContactMode.LOST), (0.51, ContactMode.APPROACH)):
-        lost = at_plan(IN_PRESS, contact(ContactMode.LOST, since_s, touches=1, push_n=3.0), PRESS)
+        slid = replace(PRESSING.shift, to_m=(0.0, 0.0, -0.5), length_m=0.5, way_m=0.1)
+        lost = at_plan(IN_PRESS, contact(ContactMode.LOST, since_s, touches=1, push_n=3.0, shift=slid), PRESS)
         state, _ = step(lost)
         assert mode_of(state) is mode and state.contact is not None
         assert state.contact.push_n == pytest.approx(3.0 - 15.0 * DT_S)
         assert state.contact.touches == 1
+        assert state.contact.shift.rate_m_s == 0.0
 
 
 def test_a_detach_releases_the_force_first_then_moves_back_and_ends_with_its_phase() -> None:
@@ -227,14 +232,71 @@ def test_after_a_failed_contact_the_rest_is_skipped_and_the_plan_goes_on_where_i
 
 @pytest.mark.parametrize("force_n", [4.9, 5.0])
 def test_the_tip_beside_its_point_is_reported_once_the_force_is_reached(force_n: float) -> None:
-    def seen(first_rad: float) -> list[str]:
+    def seen(first_rad: float) -> list[tuple[str, str]]:
         i: Inputs = put("arm", angle_rad=(first_rad, PLAN.reference(IN_PRESS).arm_rad[1]))(healthy())
         reference = PLAN.reference(IN_PRESS)
         level = {"position_world_m": reference.position_world_m, "attitude_wxyz": (1.0, 0.0, 0.0, 0.0)}
         there = put("mocap", **level)(put("vehicle", **level)(i))
         state = pressing(wanted_n=4.999 if force_n == 5.0 else 4.9, offset_m=0.0)
-        return ids(step(state, 5.0, inputs=there)[1])
+        return [(event.id, event.text) for event in step(state, 5.0, inputs=there)[1].events]
 
     straight = PLAN.reference(IN_PRESS).arm_rad[0]
+    text = "the tool presses 21 cm beside the point of the mission (limit 5 cm)"
     assert seen(straight) == []
-    assert seen(straight + 0.3) == (["contact_beside"] if force_n == 5.0 else [])
+    assert seen(straight + 0.3) == ([("contact_beside", text)] if force_n == 5.0 else [])
+
+
+FACING = Parameters.of(load_flight("configs/missions/press.yaml"))
+"""Three light touches, 0.2 m apart, find the normal of the wall first."""
+
+
+def test_the_points_to_touch_lie_right_and_up_of_the_direction() -> None:
+    begun = c.begun(NOW_S - 1.1, (0.48, 0.36, -0.8), (0.0, 0.0, 0.0))
+    state, _ = tick(at_plan(IN_APPROACH, begun), parameters=FACING, force_world_n=(0.0, 0.0, 0.0), dt_s=DT_S)
+    assert state.contact is not None and state.contact.mode is ContactMode.SHIFT
+    right, up, low_m = (0.6, -0.8, 0.0), (0.64, 0.48, 0.6), 0.2 / math.sqrt(12.0)
+    first = tuple(-0.1 * r - low_m * u for r, u in zip(right, up, strict=True))
+    assert state.contact.shift.to_m == pytest.approx(first)
+
+
+@pytest.mark.parametrize(
+    ("since_s", "force_n", "samples", "points"),
+    [(0.39, 1.0, 7, 0), (0.41, 1.0, 8, 0), (0.41, 0.2, 7, 0), (0.89, 1.0, 8, 0), (0.91, 1.0, 0, 1)],
+)
+def test_a_point_is_averaged_for_half_a_second_after_it_has_settled_for_0_4_s(
+    since_s: float, force_n: float, samples: int, points: int
+) -> None:
+    held = contact(ContactMode.PRESS, since_s, touches=1, wanted_n=1.0, force_n=force_n, samples=7)
+    state, _ = tick(at_plan(IN_APPROACH, held), parameters=FACING, force_world_n=(-force_n, 0.0, 0.0), dt_s=DT_S)
+    assert state.contact is not None
+    assert (state.contact.samples, len(state.contact.points)) == (samples, points)
+    assert state.contact.mode is (ContactMode.BACK if points else ContactMode.PRESS)
+
+
+@pytest.mark.parametrize(
+    ("touched", "push_n", "mode"),
+    [(1, 0.0, ContactMode.BACK), (1, 1.0, ContactMode.BACK), (3, 0.0, ContactMode.LEAVE)],
+    ids=["moves back", "releases first", "no plane"],
+)
+def test_from_a_point_it_moves_back_and_gives_up_if_the_points_lie_on_no_plane(
+    touched: int, push_n: float, mode: ContactMode
+) -> None:
+    points = (TouchedPoint(NOW_S - 1.0, (1.0, 0.0, 1.0), 1.0),) * touched
+    back = contact(ContactMode.BACK, 0.5, points=points, offset_m=0.3, touched_offset_m=0.3, push_n=push_n)
+    state, request = tick(at_plan(IN_APPROACH, back), parameters=FACING, force_world_n=(0.0, 0.0, 0.0), dt_s=DT_S)
+    assert state.contact is not None and state.contact.mode is mode
+    assert ids(request) == (["surface_missing"] if touched == 3 else [])
+    assert (state.contact.push_n < push_n) is (push_n > 0.0)
+    assert (state.contact.offset_m < 0.3) is (push_n == 0.0 and touched == 1)
+
+
+def test_the_last_point_completes_the_surface() -> None:
+    points = tuple(TouchedPoint(NOW_S - 9.0, tip, 1.0) for tip in ((1.5, 0.1, 1.0), (1.5, -0.1, 1.0)))
+    held = contact(ContactMode.PRESS, 0.91, touches=1, wanted_n=1.0, force_n=1.0, mean_tip_m=(1.5, 0.0, 1.2))
+    held = replace(held, samples=10**6)
+    for before, complete in ((points[:1], False), (points, True)):
+        state, _ = tick(
+            at_plan(IN_APPROACH, replace(held, points=before)), parameters=FACING, force_world_n=(-1.0, 0.0, 0.0),
+            dt_s=DT_S,
+        )  # fmt: skip
+        assert state.contact is not None and (state.contact.surface is not None) is complete

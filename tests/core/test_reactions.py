@@ -118,7 +118,13 @@ def touching(towards: Vec3) -> FlightState:
 
 @pytest.mark.parametrize(
     ("towards", "retracts"),
-    [((0.0, -1.0, 0.0), False), ((0.6, -0.8, 0.0), False), ((0.0, 1.0, 0.0), True), (None, True)],
+    [
+        ((0.0, -1.0, 0.0), False),
+        ((0.6, -0.8, 0.0), False),
+        ((0.8, -0.6, 0.0), False),
+        ((0.0, 1.0, 0.0), True),
+        (None, True),
+    ],
 )
 def test_no_retract_leads_through_the_surface_between_vehicle_and_anchor(towards: Vec3 | None, retracts: bool) -> None:
     state = in_plan() if towards is None else touching(towards)
@@ -194,6 +200,20 @@ def test_a_hold_or_retract_ends_in_a_landing_although_nothing_else_happens(
     assert state.aborting is (event is not None)
 
 
+@pytest.mark.parametrize(("standing", "resumed"), [(None, True), ("too little tether left", False)])
+def test_a_resume_ends_a_hold_unless_a_rule_still_requires_one(standing: str | None, resumed: bool) -> None:
+    held = in_plan()
+    assert held.course is not None
+    supervisor = SupervisorState(SafetyAction.HOLD, "operator_hold", healthy().t_s - 5.0)
+    held = replace(held, supervisor=supervisor, course=held.course.hold(healthy().t_s - 5.0))
+    assert not tick(held)[1].resumed
+    state, request = after(held, "operator_resume", SafetyAction.NOMINAL, standing=standing)
+    assert request.resumed is resumed
+    assert state.course is not None and state.course.held is not resumed
+    refused = [event for event in request.events if event.id == "resume_refused"]
+    assert [(event.text, event.severity) for event in refused] == ([] if resumed else [(standing, Severity.WARNING)])
+
+
 @pytest.mark.parametrize(
     ("stage", "waits", "by_others", "called_off"),
     [
@@ -229,3 +249,12 @@ def test_armed_by_others_and_unseen_by_motion_capture_px4s_height_counts_for_not
     state, _ = after(state, "reattached", SafetyAction.AUTOPILOT_LAND, armed_by_others=True, inputs=unseen)
     assert state.stage is Stage.AUTOPILOT_LAND and state.landing is not None
     assert state.landing.pose_s == state.landing.stop.pose_s == -math.inf
+
+
+def test_armed_by_others_a_flip_is_not_taken_as_known_from_before() -> None:
+    """Its rotors are stopped after 0.3 s, as in every other landing."""
+    over = {"attitude_wxyz": (0.0, 1.0, 0.0, 0.0), "specific_force_body_m_s2": (0.0, 0.0, 0.0)}
+    i = replace(put("vehicle", **over)(healthy()), mocap=None)
+    state = replace(P.initial_state(), entered_s=healthy().t_s)
+    _, request = after(state, "reattached", SafetyAction.AUTOPILOT_LAND, armed_by_others=True, inputs=i)
+    assert request.autopilot is AutopilotRequest.LAND

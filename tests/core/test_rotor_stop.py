@@ -52,6 +52,13 @@ def ids(outputs: list[Outputs]) -> list[str]:
     return [event.id for o in outputs for event in o.events]
 
 
+def test_a_device_that_falls_silent_in_the_air_is_reported() -> None:
+    """Only on the ground a device that has sent nothing is waited for without an event."""
+    core, machine, _ = machine_from("hold")
+    silent = [core.step(msgspec.structs.replace(machine.tick(), arm=None)) for _ in range(20)]
+    assert "arm_lost" in ids(silent)
+
+
 segments = st.lists(
     st.fixed_dictionaries(
         {

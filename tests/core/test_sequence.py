@@ -9,14 +9,26 @@ from typing import Any
 import msgspec
 import pytest
 
-from companion.core.flight_state import FlightState
+from companion.core.flight_state import FlightState, Tare
 from companion.core.sequence import missing_inputs
 from companion.mission.active_plan import Course
 from companion.mission.plan import Plan
-from companion.model.flight_stage import Stage
-from companion.model.types import AutopilotRequest, FlightMode, Inputs, LandedState, Outcome, PhaseKind
+from companion.mission.settled import SettledEstimate
+from companion.model.flight_stage import PILOT_FLIES, Stage
+from companion.model.types import (
+    AutopilotRequest,
+    Event,
+    FlightMode,
+    Inputs,
+    LandedState,
+    Outcome,
+    PhaseKind,
+    SafetyAction,
+    Severity,
+)
 from companion.safety.autopilot_landing import AutopilotLanding
 from companion.safety.rotor_stop import RotorStop
+from companion.safety.touchdown import Sinking
 from tests.core.test_reactions import CONFIG, P, ids, in_plan, tick
 from tests.safety.healthy import fed_by_another, healthy, put
 from tests.safety.test_monitors import EXTERNAL
@@ -126,8 +138,9 @@ def test_not_armed_is_believed_1_5_s_after_the_last_request_to_arm(requested_s: 
 @pytest.mark.parametrize(("late_s", "lands"), [(4.9, False), (5.1, True)])
 def test_a_plan_that_ends_without_touchdown_is_landed_by_px4_after_five_seconds(late_s: float, lands: bool) -> None:
     plan_s = Plan.build(CONFIG.mission, CONFIG.vehicle).duration_s
-    state, request = tick(in_plan(plan_s + late_s))
+    state, request = tick(in_plan(plan_s + late_s), pose_s=NOW_S - 1.0)
     assert (state.stage is Stage.AUTOPILOT_LAND) is lands
+    assert not lands or (state.landing is not None and state.landing.pose_s == NOW_S), "that of this tick"
     assert ids(request) == (["no_touchdown"] if lands else [])
     assert state.outcome is (Outcome.ABORTED if lands else None)
 
@@ -191,6 +204,115 @@ def test_missing_inputs_refuse_the_flight_after_15_s_and_a_flight_that_was_ready
     apart = put("mocap", position_world_m=(0.2, 0.0, 1.0))(healthy())
     _, request = tick(in_stage(Stage.WAIT, elapsed_s), inputs=apart, airborne=False)
     assert ids(request) == (["vision_not_fused"] if refused else [])
+
+
+def ready(i: Inputs, *, looked_s: float = 0.05, tared_s: float = 0.5) -> FlightState:
+    """Ready, looked at the position and began the tare this long ago; PX4 has followed motion capture for 1.2 s."""
+    settled = SettledEstimate()
+    for k in range(1, 121):
+        assert i.vehicle is not None
+        settled = settled.take(NOW_S - 0.01 * k, i.vehicle, i.mocap)
+    settled = dataclasses.replace(settled, since_s=NOW_S - 1.2)
+    waiting = replace(
+        P.initial_state().waiting, was_ready=True, looked_s=NOW_S - looked_s, tare_start_s=NOW_S - tared_s
+    )
+    return in_stage(Stage.READY, 5.0, waiting=replace(waiting, settled=settled), plan=None, course=None)
+
+
+def at_start(x_m: float = -1.0) -> Inputs:
+    """On the ground at the mission's start, or beside it, with the arm folded."""
+    level = {"position_world_m": (x_m, 0.0, 0.3), "attitude_wxyz": (1.0, 0.0, 0.0, 0.0)}
+    i = put("mocap", **level)(put("vehicle", **level)(px4(OTHER, armed=False, landed=True)))
+    return put("arm", angle_rad=P.fold_rad)(i)
+
+
+START = Event(t_s=NOW_S, id="operator_start", severity=Severity.INFO, action=SafetyAction.NOMINAL, text="")
+
+
+@pytest.mark.parametrize(
+    ("x_m", "looked_s", "events", "next_", "reported"),
+    [
+        (-1.0, 0.15, [], Stage.READY, []),
+        (-1.0, 0.05, [START], Stage.OFFBOARD, ["operator_start"]),
+        (-0.7, 0.05, [], Stage.READY, []),  # it is looked at ten times a second
+        (-0.7, 0.15, [], Stage.WAIT, ["not_ready"]),
+        (-0.7, 0.05, [START], Stage.WAIT, ["operator_start", "not_ready", "start_declined"]),
+    ],
+)
+def test_a_ready_flight_takes_off_on_command_and_waits_again_when_it_is_moved(
+    x_m: float, looked_s: float, events: list[Event], next_: Stage, reported: list[str]
+) -> None:
+    i = at_start(x_m)
+    waits = dataclasses.replace(P, waits_for_start=True)
+    state, request = tick(ready(i, looked_s=looked_s), *events, parameters=waits, inputs=i, airborne=False)
+    assert (state.stage, ids(request)) == (next_, reported)
+    assert all(isinstance(event.severity, Severity) for event in request.events)
+    assert (state.plan is not None) is (next_ is Stage.OFFBOARD)
+
+
+def test_a_ready_flight_with_an_unsettled_estimate_or_a_lost_input_waits_again() -> None:
+    i = at_start()
+    begun = ready(i, looked_s=0.15)
+    waiting = replace(begun.waiting, settled=SettledEstimate())
+    for state, inputs in ((replace(begun, waiting=waiting), i), (begun, replace(i, force=None))):
+        after, request = tick(state, inputs=inputs, airborne=False)
+        assert (after.stage, ids(request)) == (Stage.WAIT, ["not_ready"])
+        assert after.waiting.tare_start_s is None
+
+
+@pytest.mark.parametrize(
+    ("tared_s", "steps"), [(0.99, [Tare.COLLECT]), (1.01, [Tare.COLLECT, Tare.FINISH, Tare.BEGIN])]
+)
+def test_the_tare_of_a_ready_flight_is_renewed_every_second(tared_s: float, steps: list[Tare]) -> None:
+    i = at_start()
+    state, request = tick(ready(i, tared_s=tared_s), inputs=i, airborne=False)
+    assert list(request.tare) == steps
+    assert state.waiting.tare_start_s == (NOW_S if Tare.BEGIN in steps else NOW_S - tared_s)
+
+
+def in_landing(outcome: Outcome = Outcome.ABORTED, **begun: Any) -> FlightState:
+    landing = AutopilotLanding.begin(
+        NOW_S - 2.0, P.clearance_m, P.tilt_max_rad, **{"pilot": False, "pose_s": NOW_S, **begun}
+    )
+    return in_stage(Stage.AUTOPILOT_LAND, 2.0, landing=landing, outcome=outcome)
+
+
+@pytest.mark.parametrize(("height_m", "outcome"), [(0.46, Outcome.CRASHED), (0.44, Outcome.ABORTED)])
+def test_a_kill_in_the_air_is_a_crash(height_m: float, outcome: Outcome) -> None:
+    there = {"position_world_m": (0.0, 0.0, height_m)}
+    killed = put("status", system_status=8)(put("mocap", **there)(put("vehicle", **there)(healthy())))
+    assert tick(in_landing(), inputs=killed)[0].outcome is outcome
+
+
+@pytest.mark.parametrize(("before", "reported"), [(Outcome.ABORTED, "crashed"), (Outcome.CRASHED, "autopilot_landing")])
+def test_a_flipped_vehicle_is_reported_as_a_crash_once(before: Outcome, reported: str) -> None:
+    over = {"attitude_wxyz": (0.0, 1.0, 0.0, 0.0)}
+    state, request = tick(
+        in_landing(before, flipped=True), inputs=put("mocap", **over)(put("vehicle", **over)(healthy()))
+    )
+    assert (request.autopilot, state.outcome, ids(request)) == (FORCE_DISARM, Outcome.CRASHED, [reported])
+    assert request.events[0].severity is Severity.CRITICAL
+
+
+def test_a_touchdown_under_px4_is_no_critical_event() -> None:
+    state = in_landing()
+    assert state.landing is not None
+    landing = dataclasses.replace(state.landing, landing_since_s=NOW_S - 2.0)
+    low = dataclasses.replace(landing.height, since_s=NOW_S - 1.0)
+    sinking = Sinking()
+    for k in range(40):
+        sinking = sinking.update(NOW_S - 0.2 + 0.005 * k, on_floor(NOW_S - 0.2 + 0.005 * k).mocap)
+    landing = dataclasses.replace(landing, height=low, sinking=sinking)
+    i = put("status", mode=FlightMode.LAND)(on_floor(NOW_S))
+    state, request = tick(replace(state, landing=landing), inputs=i)
+    assert [(event.id, event.severity) for event in request.events] == [("autopilot_landing", Severity.INFO)]
+    assert state.zero_thrust
+
+
+def test_a_pilot_flies_only_while_px4_lands_or_is_flown() -> None:
+    flown = in_landing(pilot=True)
+    assert flown.pilot_flies and not replace(flown, stage=Stage.DONE).pilot_flies
+    assert flown.phase(NOW_S)[0] == PILOT_FLIES
 
 
 @pytest.mark.parametrize("before", [Outcome.ABORTED, Outcome.CRASHED])

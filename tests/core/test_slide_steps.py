@@ -75,6 +75,22 @@ def test_the_way_leads_from_where_the_tip_is_by_that_of_the_mission() -> None:
     assert SLIDING.shift.from_m == pytest.approx((0.0, 0.0, 0.0))
 
 
+def test_a_slanted_way_from_where_the_last_one_ended_is_followed_without_lag_or_turn() -> None:
+    """On a wall right and up are -y and z: by 0.3 m to the right and 0.4 m down, from (0.01, 0.1, 0.2); half of it is done."""
+    from_m = (0.01, 0.1, 0.2)
+    moved = replace(SLIDING, shift=replace(SLIDING.shift, from_m=from_m, to_m=from_m, way_m=0.0, length_m=0.0))
+    slanted = sliding.begun(moved, PHASE.model_copy(update={"by_m": (0.3, -0.4)}))
+    assert sliding.way(slanted) == pytest.approx((0.0, -0.6, -0.8))
+    half = replace(slanted, mode=ContactMode.SLIDE, shift=replace(slanted.shift, way_m=0.25, rate_m_s=0.05))
+    step_m = 0.05 * DT_S
+    contact, _, _ = step(half, (0.01, 0.1 - 0.15 - 0.6 * step_m, 0.2 - 0.2 - 0.8 * step_m))
+    assert (contact.lag_m, contact.steer_rad) == pytest.approx((0.0, 0.0), abs=1e-6)
+    contact, _, _ = step(half, (0.01, 0.1 - 0.15 + 0.6 * 0.02, 0.2 - 0.2 + 0.8 * 0.02))
+    assert contact.lag_m == pytest.approx(0.02 + step_m, abs=1e-6)
+    force_n = 30.0 * contact.lag_m + contact.lag_integral_n
+    assert contact.slide_world_n == pytest.approx((0.0, -0.6 * force_n, -0.8 * force_n))
+
+
 def test_a_slide_begins_once_the_force_is_reached_and_its_path_where_the_tip_is() -> None:
     contact, _, _ = step(pressing(wanted_n=2.9), (0.0, 0.03, 0.02))
     assert contact.mode is ContactMode.PRESS and contact.slide_world_n == (0.0, 0.0, 0.0)

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import msgspec
 import pytest
 
 from companion.core import flight_core
+from companion.core.contact import force_on_tool_n
 from companion.core.flight_state import FlightState, Observation, Request
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters
 from companion.mission.active_plan import Course
 from companion.mission.plan import Plan
 from companion.model.flight_stage import Stage
-from companion.model.types import Event, Outcome
+from companion.model.types import Event, Outcome, Outputs
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from tests.support import SHORT_CATCH
@@ -43,8 +45,21 @@ def test_a_value_deep_in_the_state_is_compared() -> None:
     assert plain(state) != before
 
 
+def assert_observes_the_tick_before(outputs: list[Outputs], observations: list[Observation]) -> None:
+    """What the control law and the governor made of the last tick is what the next transition reacts to."""
+    for (before, _), (_, o) in itertools.pairwise(zip(outputs, observations, strict=False)):
+        log = before.control
+        assert (o.force_world_n is None) is (log is None)
+        if log is not None:
+            assert (*o.position_error_m, o.yaw_error_rad) == (*log.error[:3], log.error[5])
+            assert o.force_world_n == force_on_tool_n(log)
+        if before.reference is not None:
+            assert o.reference is before.reference
+        assert o.dt_s == pytest.approx(o.inputs.t_s - before.t_s)
+
+
 def test_a_transition_done_twice_gives_the_same_and_leaves_its_arguments_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    stages, ticks = set(), 0
+    stages, ticks, observations = set(), 0, []
 
     def twice(
         parameters: Parameters, state: FlightState, events: tuple[Event, ...], observation: Observation
@@ -52,6 +67,7 @@ def test_a_transition_done_twice_gives_the_same_and_leaves_its_arguments_alone(m
         nonlocal ticks
         ticks += 1
         stages.add(state.stage)
+        observations.append(observation)
         before = plain(state) if ticks % 20 == 0 else None
         first = transition(parameters, state, events, observation)
         if before is not None:
@@ -61,10 +77,9 @@ def test_a_transition_done_twice_gives_the_same_and_leaves_its_arguments_alone(m
 
     monkeypatch.setattr(flight_core, "transition", twice)
     landing = ("world.faults=[{kind: mocap_loss, phase: line}]",)
-    outcomes = [
-        FastFlight(load_sitl(SHORT_CATCH, overrides=overrides)).run().outputs[-1].outcome for overrides in ((), landing)
-    ]
-    assert outcomes == [Outcome.COMPLETED, Outcome.ABORTED]
+    outputs = [FastFlight(load_sitl(SHORT_CATCH, overrides=overrides)).run().outputs for overrides in ((), landing)]
+    assert [flown[-1].outcome for flown in outputs] == [Outcome.COMPLETED, Outcome.ABORTED]
+    assert_observes_the_tick_before(outputs[0], observations)
     assert stages >= {
         Stage.WAIT,
         Stage.OFFBOARD,

@@ -80,6 +80,11 @@ def test_a_problem_ends_readiness_and_is_reported(pair: Pair) -> None:
         asyncio.run(client.wait_ready(-1.0))
 
 
+def test_a_guardian_that_says_nothing_is_reported_as_silent(pair: Pair) -> None:
+    with pytest.raises(DeviceError, match=r"guardian: not ready within -1 s: it has sent no message; see guardian.log"):
+        asyncio.run(pair[0].wait_ready(-1.0))
+
+
 def test_the_next_message_is_read_when_it_is_due(pair: Pair, clock: Clock) -> None:
     client, guardian = pair
     guardian.send(heartbeat.READY)

@@ -59,6 +59,7 @@ def test_nothing_that_comes_in_raises(datagram: bytes) -> None:
         *({name: bad} for name in ("t_s", "origin_s", "mission_t_s") for bad in (math.nan, math.inf)),
         {"pose_stamp_s": math.nan},
         {"position_world_m": (0.0, -math.inf, 0.0)},
+        {"back_world_m": (0.0, 0.0, math.nan)},
         {"own_system": 256},
         {"local_port": -1},
         {"peer": ("example.com", 14580)},

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,8 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.guardian.heartbeat import PROBLEM, READY
+from companion.guardian.heartbeat import MAX_BYTES, PROBLEM, READY
+from companion.guardian.process import HeartbeatReceiver, main
 from companion.launcher.guardian_process import outcome_of
 from companion.model.frames import attitude_enu_flu_from_ned_frd, ned_from_enu, wrap_rad
 from companion.model.types import Outcome
@@ -336,3 +338,20 @@ def test_an_error_of_its_own_is_reported_and_the_landing_goes_on(
         assert len(errors) == 1, "told once"
         assert errors[0] == f"an error in {where} (ZeroDivisionError: a bug); the landing continues"
         assert "Traceback" in rig.log.read_text()
+
+
+@pytest.mark.parametrize("missing", ["--config", "--heartbeats", "--channel", "--pidfd"])
+def test_without_one_of_its_arguments_it_does_not_start(missing: str, capsys: pytest.CaptureFixture[str]) -> None:
+    given = [
+        word for name in ("--config", "--heartbeats", "--channel", "--pidfd") if name != missing for word in (name, "0")
+    ]
+    with pytest.raises(SystemExit) as ended:
+        main(given)
+    assert ended.value.code == 2 and missing in capsys.readouterr().err
+
+
+def test_a_long_problem_is_cut_to_one_datagram() -> None:
+    flight, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with flight, ours:
+        HeartbeatReceiver(ours).send_status("x" * 2000)
+        assert flight.recv(4096) == PROBLEM + b"x" * (MAX_BYTES - 1)

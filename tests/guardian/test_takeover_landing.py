@@ -5,21 +5,27 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.config.loader import load_flight
 from companion.config.safety import Safety
 from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
 from companion.guardian.px4 import Px4State
+from companion.guardian.retreat import Retreat
+from companion.guardian.settings import read_settings
 from companion.guardian.takeover_landing import Notice, TakeoverLanding
 from companion.model.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
 from companion.model.types import LandedState, MocapPose, Quat, Vec3
 from companion.safety.autopilot_landing import TIMEOUT_S
 from companion.safety.mocap import limits_of
+from tests.safety.healthy import healthy
+from tests.support import HOVER
 
 STANDING_M, TILT_MAX_RAD = 0.3, math.radians(40.0)
 START_S, STEP_S = 20.0, 0.01
@@ -157,6 +163,7 @@ def test_on_the_floor_level_setpoints_without_thrust_are_streamed_at_50_hz_at_th
     found = [m for m in landing.wire.sent if m.get_type() == "SET_ATTITUDE_TARGET"]
     level = attitude_ned_frd_from_enu_flu(quat_from_euler_zyx(0.0, 0.0, yaw_rad))
     assert {(m.target_system, m.target_component, m.type_mask, m.thrust) for m in found} == {(1, 1, 7, 0.0)}
+    assert {(m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate) for m in found} == {(0.0, 0.0, 0.0)}
     assert all(m.q == pytest.approx(level, abs=1e-6) for m in found)
     ms = [m.time_boot_ms for m in found]
     assert {b - a for a, b in itertools.pairwise(ms)} <= {19, 20, 21, 29, 30, 31}
@@ -234,7 +241,7 @@ def test_tipped_over_on_the_floor_it_is_disarmed_by_force() -> None:
     landing.run(0.4, attitude=ON_ITS_ROTORS, height_m=0.45)
     assert not landing.forced
     landing.run(0.4, attitude=ON_ITS_ROTORS, height_m=0.45)
-    assert landing.forced
+    assert landing.forced and landing.takeover.overturned
     assert "tipped over on the floor: FORCE_DISARM is requested at once" in [notice.text for notice in landing.notices]
 
 
@@ -248,6 +255,27 @@ def test_from_a_surface_the_vehicle_moves_back_before_px4_is_told_to_land() -> N
     assert {round(m.z, 6) for m in landing.positions} == {-1.1}
     assert {round(m.yaw, 6) for m in landing.positions} == {round(0.5 * math.pi, 6)}
     assert landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)
+
+
+def test_the_way_back_leads_straight_to_its_end_and_its_rates_are_those_of_its_positions() -> None:
+    vehicle, way, step_s = healthy().vehicle, (-0.3, 0.1, 0.05), 1e-4
+    assert vehicle is not None
+    retreat = Retreat.begin(5.0, vehicle, way)
+    for share in (0.1, 0.37, 0.5, 0.81):
+        t_s = 5.0 + share * retreat.duration_s
+        a, b, c = (retreat.setpoint(t_s + k * step_s) for k in (-1, 0, 1))
+        assert a is not None and b is not None and c is not None
+        for axis in range(3):
+            before_m, now_m, after_m = (s.position_world_m[axis] for s in (a, b, c))
+            assert b.velocity_world_m_s[axis] == pytest.approx((after_m - before_m) / (2.0 * step_s), abs=1e-6)
+            curved = (after_m - 2.0 * now_m + before_m) / step_s**2
+            assert b.acceleration_world_m_s2[axis] == pytest.approx(curved, abs=1e-4)
+            gone = (now_m - vehicle.position_world_m[axis]) / way[axis]
+            assert gone == pytest.approx((b.position_world_m[0] - vehicle.position_world_m[0]) / way[0])
+    last = retreat.setpoint(5.0 + 0.9999 * retreat.duration_s)
+    assert last is not None
+    assert last.position_world_m == pytest.approx([p + w for p, w in zip(vehicle.position_world_m, way, strict=True)])
+    assert retreat.setpoint(5.0 + 1.0001 * retreat.duration_s) is None
 
 
 AT_A_SURFACE = replace(beat(), back_world_m=(-0.3, 0.0, 0.0))
@@ -345,6 +373,16 @@ def test_requests_are_repeated_at_their_rates() -> None:
     assert len(landing.wire.commands(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)) == 10, "PX4 may have restarted"
 
 
+def test_messages_are_numbered_and_unused_fields_are_zero() -> None:
+    landing = Landing(replace(beat(), back_world_m=(-0.3, 0.0, 0.0)))
+    landing.run(0.5, mode=OFFBOARD_MODE, height_m=1.1)
+    assert landing.positions and {m.yaw_rate for m in landing.positions} == {0.0}
+    numbers = [m.get_seq() for m in landing.wire.sent]
+    assert numbers == list(range(len(numbers)))
+    commands = [m for m in landing.wire.sent if m.get_type() == "COMMAND_LONG"]
+    assert {(m.param3, m.param4, m.param5, m.param6, m.param7, m.confirmation) for m in commands} == {(0.0,) * 6}
+
+
 def test_px4s_mode_is_awaited_for_0_15_s_before_it_is_told_to_land() -> None:
     landing = Landing(beat())
     landing.run(0.15, height_m=1.0, beating=False)
@@ -373,6 +411,16 @@ def test_what_does_not_land_is_given_up_after_four_attempts_and_a_silent_one_aft
     landing.run(2.0, height_m=2.0, beating=beating)
     assert landing.takeover.landed is False
     assert landing.notices[-1].id == "guardian_lost_vehicle"
+    assert landing.notices[-1].text == "the landing could not be confirmed"
+
+
+@pytest.mark.parametrize(("silent_s", "landed"), [(2.4, None), (2.6, False), (TIMEOUT_S, False)])
+def test_a_px4_that_was_heard_in_the_last_2_5_s_is_landed_again(silent_s: float, landed: bool | None) -> None:
+    landing = Landing(beat())
+    landing.run(TIMEOUT_S - silent_s + 0.1, height_m=2.0, beating=silent_s < TIMEOUT_S)
+    landing.run(silent_s, height_m=2.0, beating=False)
+    landing.run(0.1, height_m=2.0, beating=False)
+    assert landing.takeover.landed is landed
 
 
 def test_a_pose_that_jumps_is_not_sent_and_is_reported_once() -> None:
@@ -383,6 +431,19 @@ def test_a_pose_that_jumps_is_not_sent_and_is_reported_once() -> None:
     assert len(landing.wire.poses) == sent
     assert [notice.id for notice in landing.notices].count("guardian_mocap") == 1
     assert landing.takeover.pose is not None and landing.takeover.pose.position_world_m[2] == STANDING_M
+
+
+def test_its_settings_are_those_of_the_flight(tmp_path: Path) -> None:
+    changed = ["mocap_jump_m=0.17", "mocap_jump_deg=31", "estimate_disagreement_m=0.42", "mocap_latency_max_s=0.13"]
+    changed += ["mocap_latency_warn_s=0.06", "tilt_abort_deg=37", "guardian_timeout_s=0.15"]
+    config = load_flight(HOVER, overrides=[f"vehicle.safety.{one}" for one in changed])
+    path = tmp_path / "config.json"
+    path.write_text(config.model_dump_json(), encoding="utf-8")
+    settings, vehicle = read_settings(path), config.vehicle
+    assert settings.pose_limits == (0.17, math.radians(31.0), 0.42, 0.13) == limits_of(vehicle.safety)
+    assert (settings.tilt_max_rad, settings.timeout_s) == (math.radians(37.0), 0.15)
+    assert settings.clearance_m == vehicle.airframe.ground_clearance_m
+    assert settings.autopilot_address == vehicle.devices.autopilot.address
 
 
 def pose_at(t_s: float, **changes: Any) -> MocapPose:

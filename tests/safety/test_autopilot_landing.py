@@ -116,6 +116,20 @@ def test_it_asks_for_land_until_touchdown_then_takes_offboard_back_with_zero_thr
     assert landing.step(seen(4.0, 0.31, armed=False)).ended
 
 
+@pytest.mark.parametrize(("elapsed_s", "ended"), [(0.49, False), (0.51, True)])
+def test_disarmed_in_the_first_half_second_does_not_end_the_landing(elapsed_s: float, ended: bool) -> None:
+    """PX4 reports it once a second: the report may be older than the landing."""
+    assert Landing(pilot=False).step(seen(elapsed_s, 1.0, armed=False)).ended is ended
+
+
+def test_px4s_word_that_it_stands_is_believed_after_the_first_second() -> None:
+    """Until then it may be that of before the flight."""
+    landing = Landing(pilot=False)
+    steps = {k: landing.step(seen(0.01 * k, 0.31, landed=LandedState.ON_GROUND)) for k in range(1, 110)}
+    first = next(k for k, step in steps.items() if step.request is AutopilotRequest.DISARM)
+    assert 0.01 * first == pytest.approx(1.0, abs=0.02)
+
+
 def test_a_height_that_nobody_can_vouch_for_is_no_touchdown() -> None:
     """Without vision for longer than PX4's height holds, thrust is not cut on its word."""
     landing = Landing(pilot=False)
@@ -165,6 +179,8 @@ def test_an_impact_after_which_the_descent_does_not_resume_is_a_touchdown(drift_
     "up_m_s",
     [
         lambda t_s: 0.0,  # it brakes, and has not begun to descend
+        lambda t_s: -0.2 if t_s < 1.5 else 0.0,  # slower than any descent of PX4
+        lambda t_s: 0.05,  # the estimate drifts up
         lambda t_s: -0.7,
         lambda t_s: -0.7 + min(0.3, max(0.0, t_s - 1.5)),  # PX4 descends more slowly near the floor
         lambda t_s: -0.7 + (t_s > 1.5) * 0.3 * math.exp(4.0 * (1.5 - t_s)),  # a bump, and PX4 descends as before

@@ -30,6 +30,7 @@ def vehicle() -> Vehicle:
         (AttitudeSetpoint((NAN, 0.0, 0.0, 1.0), 0.5), "setpoint not finite"),
         (AttitudeSetpoint(LEVEL, math.inf), "setpoint not finite"),
         (AttitudeSetpoint((0.9, 0.0, 0.0, 0.0), 0.5), "no rotation"),
+        (AttitudeSetpoint((1.01, 0.0, 0.0, 0.0), 0.5), "no rotation"),
         (AttitudeSetpoint((0.0, 0.0, 0.0, 0.0), 0.5), "no rotation"),
         (AttitudeSetpoint(LEVEL, 1.0001), "thrust"),
         (AttitudeSetpoint(LEVEL, -0.0001), "thrust"),

@@ -16,7 +16,7 @@ from companion.config.loader import FlightConfig, load_flight
 from companion.mission.plan import Plan
 from companion.mission.reference import at_rest
 from companion.model.types import Reference, TetherState, Vec3
-from companion.safety.governor import Governed, Governor, SafeSet
+from companion.safety.governor import Governed, Governor, SafeSet, _share_within
 from tests.support import tether_of
 
 DT_S = 0.005
@@ -91,7 +91,7 @@ def test_committed_missions_pass_untouched(mission: str) -> None:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize(
     ("jump_m", "faster", "why"),
-    [(0.0019, 0.0, ()), (0.0021, 0.0, ("acceleration",)), (0.0, 0.99, ()), (0.0, 1.01, ("acceleration",))],
+    [(0.0019, 0.0, ()), (0.0021, 0.0, ("acceleration",)), (0.0, 1.0, ()), (0.0, 1.01, ("acceleration",))],
 )
 def test_a_reference_that_jumps_by_2_mm_or_accelerates_beyond_the_limit_is_constrained(
     axis: int, jump_m: float, faster: float, why: tuple[str, ...]
@@ -106,7 +106,7 @@ def test_a_reference_that_jumps_by_2_mm_or_accelerates_beyond_the_limit_is_const
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.6, 0.0, -0.8)])
 def test_a_reference_faster_than_the_mission_may_fly_is_constrained(direction: Vec3) -> None:
-    for share, why in ((0.999, ()), (1.001, ("speed",))):
+    for share, why in ((1.0, ()), (1.001, ("speed",))):
         g = governor()
         speed_m_s = share * g.speed_max_m_s
         v = (speed_m_s * direction[0], speed_m_s * direction[1], speed_m_s * direction[2])
@@ -253,6 +253,21 @@ def test_a_motion_that_begins_outside_begins_at_the_nearest_corner_of_reach_and_
             assert within.breach_tether_m(begun) <= CLOSE and within.breach_walls_m(begun) <= CLOSE
             if within.holds((x, y, z)):
                 assert begun == (x, y, z)
+
+
+@pytest.mark.parametrize(
+    ("inside", "p", "share"),
+    [
+        ((0.0, 0.0, 0.0), (4.0, 0.0, 0.0), 0.5),
+        ((1.0, 0.0, 0.0), (-5.0, 0.0, 0.0), 0.5),
+        ((0.0, 0.0, 0.0), (1.0, 1.0, 0.0), 1.0),
+        ((2.1, 0.0, 0.0), (3.0, 0.0, 0.0), 0.0),
+        ((2.0, 0.0, 0.0), (3.0, 0.0, 0.0), 0.0),
+        ((1.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.0),
+    ],
+)
+def test_a_segment_is_followed_as_far_as_it_stays_in_the_ball(inside: Vec3, p: Vec3, share: float) -> None:
+    assert _share_within(inside, p, (0.0, 0.0, 0.0), 2.0) == pytest.approx(share)
 
 
 def test_along_the_edge_it_slides() -> None:

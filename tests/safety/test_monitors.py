@@ -477,6 +477,12 @@ def test_vision_that_has_never_been_fused_is_not_lost() -> None:
     assert watched(EXTERNAL, [estimator(flags=0b1111)(healthy(k)) for k in range(100)], standing()) == []
 
 
+def test_the_estimators_last_report_counts_until_the_next_one_comes() -> None:
+    rejected = estimator(position_horizontal_ratio=1.2)
+    inputs = [rejected(healthy(k)) if k < 5 else replace(healthy(k), mocap=None, estimator=None) for k in range(70)]
+    assert [event.id for event in watched(EXTERNAL, inputs, flying())] == ["vision_rejected", "estimator_silent"]
+
+
 def test_what_was_a_warning_on_the_ground_is_judged_anew_in_the_air() -> None:
     monitors = Monitors(VEHICLE)
     no_force = [replace(healthy(k), force=None) for k in range(400)]
@@ -563,6 +569,18 @@ def test_each_pose_is_judged_before_it_is_passed_on_and_not_by_the_one_before_it
     assert not monitors.forwards(between_ticks(3, bad), vehicle)
     evaluated = bad(healthy(3)).mocap
     assert evaluated is not None and not monitors.forwards(evaluated, vehicle)
+
+
+@pytest.mark.parametrize("id_", ["mocap_frozen", "mocap_two_streams", "mocap_dragged"])
+def test_of_a_stream_that_is_rejected_no_pose_is_passed_on_or_used(id_: str) -> None:
+    monitors, inputs = Monitors(VEHICLE), stream(id_)
+    until = next(k for k, i in enumerate(inputs) if any(e.id == id_ for e in monitors.check(i, flying())))
+    last = inputs[until].mocap
+    assert last is not None and monitors.pose_filter() is None
+    x, y, z = last.position_world_m
+    another = replace(last, stamp_s=last.stamp_s + 0.002, position_world_m=(x, y, z + 1e-4))
+    assert not monitors.forwards(another, inputs[until].vehicle)
+    assert monitors.trusted is not None and monitors.trusted.mocap is None
 
 
 def test_a_pose_that_is_too_late_counts_as_not_received() -> None:
@@ -682,10 +700,15 @@ def test_the_first_pose_after_a_loss_is_evaluated_before_it_may_be_passed_on(gon
     assert far.mocap is not None and not monitors.forwards(far.mocap, far.vehicle)
 
 
-def test_on_the_ground_the_vehicle_may_be_carried_while_it_is_not_seen() -> None:
-    monitors, ticks = after_a_gap(2.0, standing())
-    monitors.check(moved("mocap", (1.5, 0.0, 0.0))(healthy(ticks)), standing())
-    assert monitors.mocap_trusted
+@pytest.mark.parametrize(("gap_s", "trusted"), [(0.9, False), (1.1, True)])
+def test_on_the_ground_the_vehicle_may_be_carried_while_it_is_not_seen_for_a_second(
+    gap_s: float, trusted: bool
+) -> None:
+    monitors, ticks = after_a_gap(gap_s, standing())
+    carried = moved("mocap", (1.5, 0.0, 0.0))(healthy(ticks))
+    assert carried.mocap is not None and monitors.forwards(carried.mocap, carried.vehicle) is trusted
+    monitors.check(carried, standing())
+    assert monitors.mocap_trusted is trusted
 
 
 def after_a_gap(gap_s: float, situation: Situation) -> tuple[Monitors, int]:
@@ -765,6 +788,24 @@ def test_a_pose_is_compared_with_where_px4s_velocity_has_carried_the_last_one(co
     assert monitors.mocap_trusted
 
 
+@pytest.mark.parametrize(
+    ("height_m", "situation", "reported"),
+    [
+        (0.46, flying(), True),
+        (0.44, flying(), False),
+        (1.0, flying(offboard_expected=False), False),
+        (1.0, flying(airborne=False), False),
+    ],
+)
+def test_disarmed_is_reported_only_high_in_the_air_and_while_the_companion_flies(
+    height_m: float, situation: Situation, reported: bool
+) -> None:
+    """It stands at 0.3 m; from 0.15 m above that it flies."""
+    disarmed = both(at(0.0, 0.0, height_m), put("status", armed=False))
+    found = [event.id for event in watched(VEHICLE, after_a_moment(disarmed, ticks=20, sound=0), situation)]
+    assert ("px4_disarmed" in found) is reported
+
+
 # -- the room --------------------------------------------------------------------------------------------------------
 
 WALLS = [(0, 1, 1.81), (0, -1, 1.81), (1, 1, 1.41), (1, -1, 1.41), (2, 1, 2.15)]
@@ -817,6 +858,13 @@ def test_what_flickers_is_not_reported_in_every_tick() -> None:
     assert len(watched(VEHICLE, after_a_moment(now_and_then), flying())) == 1
 
 
+def test_what_ends_before_its_hold_time_begins_it_anew() -> None:
+    def low_twice(i: Inputs) -> Inputs:
+        return put("status", battery_remaining=0.25)(i) if 100 <= i.tick < 280 or 300 <= i.tick < 480 else i
+
+    assert watched(VEHICLE, after_a_moment(low_twice), flying()) == []
+
+
 def test_what_comes_back_after_a_while_is_reported_again() -> None:
     def twice(i: Inputs) -> Inputs:
         return put("arm", read_failures=6)(i) if i.tick in (100, 500) else i
@@ -842,6 +890,15 @@ def test_what_stands_is_known_until_it_was_gone_for_a_second() -> None:
     assert "outside the room" in (monitors.standing() or "")
     watched(VEHICLE, [healthy(k) for k in range(295, 310)], flying(), monitors)
     assert monitors.standing() is None
+
+
+@pytest.mark.parametrize("first_s", [0.0, 0.3])
+def test_of_several_that_stand_the_gravest_is_named(first_s: float) -> None:
+    """The arm is lost before or after the vehicle comes near the wall."""
+    monitors, near = Monitors(VEHICLE), at(1.6, 0.0, 1.0, vx=0.8)
+    lost = [i if i.t_s - START_S < first_s else stopped("arm")(i) for i in map(healthy, range(120))]
+    watched(VEHICLE, [i if i.t_s - START_S < 0.3 - first_s else near(i) for i in lost], flying(), monitors)
+    assert "joint state" in (monitors.standing() or "")
 
 
 def test_a_warning_and_peoples_own_words_are_no_reason_to_hold() -> None:
@@ -1013,6 +1070,12 @@ def scaled(key: str, factor: float, machine: Vehicle = VEHICLE) -> Vehicle:
     for step in reversed(section.split(".")[1:]):
         changed = machine.devices.model_copy(update={step: changed})
     return machine.model_copy(update={section.partition(".")[0]: changed})
+
+
+def test_a_vehicle_state_that_is_missing_shows_no_motion() -> None:
+    machine = scaled("climb_max_m_s", 1e-3, scaled("sink_max_m_s", 1e-3))
+    events = watched(machine, [replace(healthy(k), vehicle=None) for k in range(200)], flying())
+    assert [event.id for event in events] == ["vehicle_state_lost"]
 
 
 ELSEWHERE = {

@@ -30,6 +30,7 @@ DOWN: Joints = (math.radians(90.0), 0.0)
 DT_S = 0.005
 ANCHOR: Vec3 = (0.0, -1.2, 0.0)
 LENGTH_M = 3.0
+STEPS_M = [0.001 * step for step in range(2000)]
 
 
 @cache
@@ -501,8 +502,10 @@ def test_an_arm_that_leaves_its_plane_is_a_ball_about_its_first_joint() -> None:
     reach_m = 0.4 + yaws.tip_radius_m
     away = judge.least_m((0.0, 1.0, 0.0), None, (2.0, 1.0))
     assert away == pytest.approx(min(math.hypot(0.8, 0.05) - reach_m, 0.8 - yaws.airframe.radius_m))
-    # The line passes 0.05 m above the shoulder.
-    assert judge.least_m((0.0, -1.0, 0.0), None, (2.0, 1.0)) == pytest.approx(0.05 - reach_m)
+    # The shoulder is 0.05 m below the origin.
+    for ray in ((0.0, -1.0, 0.0), (0.36, -0.8, -0.48)):
+        nearest_m = min(math.dist((0.0, 0.0, -0.05), (s * ray[0], 0.8 + s * ray[1], s * ray[2])) for s in STEPS_M)
+        assert judge.least_m(ray, None, (2.0, 1.0)) == pytest.approx(nearest_m - reach_m, abs=1e-5)
     assert not clearance(
         vehicle("vehicle.tether.attachment_body_m=[0, 0.3, 0]", "vehicle.arm.joints[0].axis=[0, 0, 1]")
     ).judges_arm

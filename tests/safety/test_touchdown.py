@@ -143,6 +143,13 @@ def test_the_descent_is_measured_over_the_last_0_15_s_of_poses() -> None:
         assert sinking.update(1.285, gone) == Sinking()
 
 
+def test_the_descent_of_uneven_poses_is_measured_up_to_the_newest() -> None:
+    sinking = Sinking()
+    for t_s, height_m in ((0.0, 2.0), (0.105, 1.0), (0.25, 1.0), (0.26, 1.0)):
+        sinking = sinking.update(t_s, pose_at(t_s, height_m))
+    assert sinking.speed_m_s == 0.0
+
+
 def test_height_counts_once_it_has_been_low_and_still_above_the_reference_for_0_35_s() -> None:
     for height_m, up_m_s, below_m, stands in (
         (0.41, 0.0, 0.06, True),
