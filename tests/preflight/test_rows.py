@@ -172,6 +172,10 @@ CASES = {
     "not always tracked": Case(
         "mocap.tracked", "99.9%", "markers", {"mocap": (replace(r.mocap()[0], tracking_valid=False), *r.mocap()[1:])}, WARN
     ),
+    "a gap that a flight bears, in a short watch": Case(
+        "mocap.tracked", "85.0%", "markers",
+        {"mocap": tuple(replace(p, tracking_valid=i >= 30) for i, p in enumerate(r.mocap()[:200]))}, WARN,
+    ),
     "a pose that is the same to the last bit": Case(
         "mocap.frozen", "for 5.00 s", "Motive is paused",
         {"mocap": r.mocap(position_world_m=(-1.0, 0.0, 0.3), attitude_wxyz=(1.0, 0.0, 0.0, 0.0))},
