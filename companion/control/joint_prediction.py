@@ -52,8 +52,10 @@ class JointPrediction:
         return tuple(angles), tuple(rates)
 
     def sent(self, t_s: float, torque_nm: Joints | None) -> None:
-        """Remember the torques commanded at time `t_s`; None if the arm gets none, which ends all knowledge of them."""
-        if torque_nm is None or not math.isfinite(sum(torque_nm)):
+        """Remember the torques commanded at time `t_s`; None if the arm gets none. These and unusable ones
+        end all knowledge of what was commanded.
+        """
+        if torque_nm is None or len(torque_nm) != len(self._armatures_kg_m2) or not math.isfinite(sum(torque_nm)):
             self._sent.clear()
             self._mean_nm = None
             return

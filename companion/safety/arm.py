@@ -33,7 +33,8 @@ LATE_TIME_S: Final = 1.0
 """Time constant of that share."""
 DRIFT_TIME_S: Final = 1.0
 """Time constant of the mean force."""
-CHANGE_TIME_S: Final = (0.5, 5.0)
+CHANGE_SHORT_S: Final = 0.5
+CHANGE_LONG_S: Final = 5.0
 """Time constants of the two low-pass filters whose difference is the change of a force: a payload or a shifted zero, but not steady
 wind or a wrong hover thrust."""
 CHANGE_MIN_N: Final = 0.5
@@ -242,7 +243,7 @@ class _Change:
 
     def update(self, dt_s: float, force_n: Vec3) -> Vec3:
         """Update with the force of one tick and return its change."""
-        fast_s, slow_s = CHANGE_TIME_S
+        fast_s, slow_s = CHANGE_SHORT_S, CHANGE_LONG_S
         fx, fy, fz = self._fast_n = _lowpassed(self._fast_n, force_n, dt_s / (fast_s + dt_s))
         sx, sy, sz = self._slow_n = _lowpassed(self._slow_n, force_n, dt_s / (slow_s + dt_s))
         return (fx - sx, fy - sy, fz - sz)

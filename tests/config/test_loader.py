@@ -254,7 +254,7 @@ BAD_OVERRIDES = [
     ("world.payload_kg=.nan", "--set world.payload_kg: expected a number from 0 to 2, got .nan"),
     ("world.payload_kg=.inf", "--set world.payload_kg: expected a number from 0 to 2, got .inf"),
     ("world.seed=1.5", "--set world.seed: expected a whole number >= 0, got 1.5"),
-    ("world.faults=[{kind: mocap_los, t_s: 5}]", '--set world.faults: faults[0].kind: expected one of 47 names ("mocap_loss", "mocap_occluded", "mocap_jump", ...), got "mocap_los" (did you mean mocap_loss?)'),
+    ("world.faults=[{kind: mocap_los, t_s: 5}]", '--set world.faults: faults[0].kind: expected one of 48 names ("mocap_loss", "mocap_occluded", "mocap_jump", ...), got "mocap_los" (did you mean mocap_loss?)'),
     ("world.throw_velocity_m_s=[1, 2", "--set world.throw_velocity_m_s: not YAML: expected ',' or ']', but got '<stream end>' while parsing a flow sequence"),
     ("world.wind_m_s={a: 1, a: 2}", "--set world.wind_m_s: a: duplicate key, already given; remove one of the two"),
     ("vehicle.safty.mocap_timeout_s=0.2", "--set vehicle.safty.mocap_timeout_s: safty: unknown key; did you mean safety?"),

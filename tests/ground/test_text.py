@@ -9,6 +9,7 @@ import math
 import os
 import pty
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -33,9 +34,11 @@ from companion.ground.station.vehicles import Vehicle, VehicleTracker
 from tests.broker import Broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, played
 from tests.ground.vehicle import flight, played_vehicle, state_of
-from tests.support import ROOT
+from tests.support import DEADLINE_S, ROOT
 
 AGAIN_S = 5.0
+SCREEN_CHARACTERS = 30_000
+"""Two or three pictures of the terminal: to search all that was ever drawn takes longer and longer."""
 AROUND = StationStatus("connected to mqtt://127.0.0.1:1883", True, "anna", None)
 
 
@@ -157,12 +160,15 @@ class Terminal:
         """Wait until text is drawn; earlier output does not count. The keys `on` are pressed now, and again after `AGAIN_S`: a command
         that has waited for a core for too long is refused.
         """
-        pressed_s = -math.inf
+        pressed_s, end_s = -math.inf, time.monotonic() + 0.5 * DEADLINE_S
         while text not in plain(self._screen):
+            assert time.monotonic() < end_s, f"{text!r} is not drawn: {plain(self._screen)}"
             if on and time.monotonic() - pressed_s > AGAIN_S:
                 self.press(on)
                 pressed_s = time.monotonic()
-            self._screen += (await asyncio.to_thread(os.read, self.ours, 65536)).decode("utf-8", "replace")
+            if (await asyncio.to_thread(select.select, [self.ours], [], [], 1.0))[0]:
+                drawn = os.read(self.ours, 65536).decode("utf-8", "replace")
+                self._screen = (self._screen + drawn)[-SCREEN_CHARACTERS:]
         self._screen = ""
 
     async def ended(self) -> int:

@@ -168,7 +168,12 @@ OF_DEVICES = (
 )
 """How settings begin that are tried on the wires: those of the devices, and some that show that `Plant` and `Faults` get theirs."""
 SENT = [
-    pair for pair in PAIRS if pair.setting.startswith(OF_DEVICES) and pair.acts < 2 and "surfaces" not in pair.usual
+    pair
+    for pair in PAIRS
+    if pair.setting.startswith(OF_DEVICES)
+    and pair.setting != "faults.kind bus_delay"  # it delays answers, which are not timed here: test_fault_wires.py
+    and pair.acts < 2
+    and "surfaces" not in pair.usual
 ]
 """Both loops give the world's settings as a whole to one `Plant` and one `Faults`: what these do is seen in the fast loop."""
 
