@@ -15,6 +15,7 @@ from msgspec.structs import replace
 from companion.config.ground import topic_name
 from companion.config.loader import FlightConfig
 from companion.ground.protocol.commands import Accepted, Verifier
+from companion.ground.protocol.flight_clock import FlightClock
 from companion.ground.protocol.messages import (
     VERSION,
     Ack,
@@ -90,8 +91,7 @@ class TelemetrySession:
         self._config = config
         self._verifier = verifier
         self._stream = StreamBuilder(config, session)
-        self._clock_s = math.inf
-        """CLOCK_MONOTONIC minus flight clock: the smallest difference seen, from the packet with the shortest delay."""
+        self._clock = FlightClock()
         self._tick_s: float | None = None
         """CLOCK_MONOTONIC of the newest tick."""
         self._new_ticks = False
@@ -141,7 +141,7 @@ class TelemetrySession:
 
     def flight_s(self, now_s: float) -> float | None:
         """Return the flight clock at a CLOCK_MONOTONIC time, or None before the first tick."""
-        return None if self._clock_s == math.inf else now_s - self._clock_s
+        return self._clock.now_s(now_s)
 
     def last_will(self) -> bytes:
         """Return the state that the broker publishes if this process disappears."""
@@ -267,7 +267,7 @@ class TelemetrySession:
         self._new_ticks = True
         self._tick_s = received_s
         if math.isfinite(inputs.t_s):
-            self._clock_s = min(self._clock_s, received_s - inputs.t_s)
+            self._clock.add(inputs.t_s, received_s)
         if outputs.outcome is not None:
             self._outcome = outputs.outcome
 

@@ -98,9 +98,7 @@ def test_the_catch_is_started_watched_held_let_go_on_and_landed_from_the_ground(
         page_at(address) as page,
     ):
         options = set_options(**{"vehicle.ground.mqtt.url": broker.url, **ROOM})
-        with sandbox.start(
-            "fly", CATCH, "--sitl", "--wait-for-start", "--speed", 0.4, "--out", "out", *options
-        ) as flight:
+        with sandbox.start("fly", CATCH, "--sitl", "--wait-for-start", "--out", "out", *options) as flight:
             flight.wait_for("take off with: companion command start")
             refused = commanded(sandbox, broker.url, "resume")
             assert refused.code == EXIT_REFUSED and "resume refused: on the ground" in refused.err, refused

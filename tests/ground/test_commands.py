@@ -422,6 +422,19 @@ def test_flight_clock_follows_the_fastest_message() -> None:
     assert clock.now_ms(60.25) == 20_500, "it goes on when nothing is heard"
 
 
+@pytest.mark.parametrize("pace", [0.1, 0.4, 1.0, 3.0])
+def test_vehicle_and_ground_that_listen_for_long_agree_on_the_flight_clock_at_any_pace(pace: float) -> None:
+    """A command of a flight slower than real time was called stale: the vehicle's estimate went on with the computer's clock."""
+    vehicle, ground = FlightClock(), FlightClock()
+    for k in range(6000):
+        now_s = 0.01 * k
+        vehicle.add(pace * now_s, now_s)
+        if k % 5 == 0:
+            ground.add(pace * now_s, now_s + 0.02)
+    estimates = vehicle.now_s(60.0), ground.now_s(60.0)
+    assert estimates[0] == pytest.approx(estimates[1], abs=0.1 * max(1.0, pace))
+
+
 def test_flight_clock_forgets_what_was_long_ago() -> None:
     """A vehicle's clock that runs slower than the local one is followed."""
     clock = FlightClock()

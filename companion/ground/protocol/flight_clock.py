@@ -1,4 +1,4 @@
-"""A ground station's estimate of a vehicle's flight clock, used to date commands. Pure."""
+"""Estimate of a vehicle's flight clock from what the vehicle has sent, to date commands and to judge their age. Pure."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections import deque
 
 
 class FlightClock:
-    """Estimates the flight clock of one session on a ground station. A new session needs a new instance. A message carries the
-    flight clock at which it was sent, so the estimate is late, never early. Of the recent messages, the one with the largest
-    difference from the local clock had the shortest delay and sets the estimate.
+    """Estimates the flight clock of one session. A new session needs a new instance. A message carries the flight clock at which it was
+    sent, so the estimate is late, never early. Of the recent messages, the one with the largest difference from the local clock had the
+    shortest delay and sets the estimate. If simulated time runs slower than the local clock, it is early by what time loses in `WINDOW_S`.
     """
 
     WINDOW_S = 10.0
@@ -21,7 +21,7 @@ class FlightClock:
         """Add the time of one message.
 
         Args:
-            t_s: `Stream.t_s`.
+            t_s: flight clock.
             monotonic_s: local monotonic clock at receipt, s.
         """
         difference_s = t_s - monotonic_s
@@ -32,6 +32,11 @@ class FlightClock:
         while samples[0][0] < monotonic_s - self.WINDOW_S:
             samples.popleft()
 
+    def now_s(self, monotonic_s: float) -> float | None:
+        """Return the current flight clock, s; None before the first message. The clock continues while the vehicle is silent."""
+        return None if not self._samples else monotonic_s + self._samples[0][1]
+
     def now_ms(self, monotonic_s: float) -> int | None:
-        """Return the current flight clock, ms; None before the first message. The clock continues while the vehicle is silent."""
-        return None if not self._samples else int((monotonic_s + self._samples[0][1]) * 1000.0)
+        """Return the current flight clock, ms, as `now_s` does."""
+        now_s = self.now_s(monotonic_s)
+        return None if now_s is None else int(now_s * 1000.0)
