@@ -8,8 +8,8 @@ from collections import deque
 class FlightClock:
     """Estimates the flight clock of one session. A new session needs a new instance. A message carries the flight clock at which it was
     sent, so the estimate is late, never early. Of the recent messages, the one with the largest difference from the local clock had the
-    shortest delay and sets the estimate. If simulated time runs slower than the local clock, it is early by what simulated time loses in
-    `WINDOW_S`.
+    shortest delay and sets the estimate. If simulated time runs slower than the local clock, it is early by what simulated time loses
+    in `WINDOW_S`.
     """
 
     WINDOW_S = 10.0
