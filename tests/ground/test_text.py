@@ -135,14 +135,14 @@ class Terminal:
     def __init__(self, broker: Broker, keys: Path, *more: str) -> None:
         self.ours, theirs = pty.openpty()
         self._screen = ""
-        termios.tcsetwinsize(theirs, (40, 140))
+        termios.tcsetwinsize(theirs, (24, 80))  # as low as terminals are
         self.before = termios.tcgetattr(theirs)
         self._theirs = theirs
         command = [sys.executable, "-m", "companion", "monitor", "--text", "--broker", broker.url]
         self.process = subprocess.Popen(
             [*command, "--operators", str(keys), *more],
             cwd=ROOT,
-            env={**os.environ, "TERM": "xterm-256color"},
+            env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "", "LINES": ""},
             stdin=theirs,
             stdout=theirs,
             stderr=theirs,

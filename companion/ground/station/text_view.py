@@ -106,12 +106,15 @@ def status_line(vehicle: Vehicle, now_s: float) -> str:
 
 
 def render(vehicle: Vehicle | None, now_s: float, station: StationStatus) -> RenderableType:
-    """Return the whole display."""
+    """Return the whole display. A terminal that is too low cuts off its end: lamps and events."""
     parts: list[RenderableType] = []
+    details: list[RenderableType] = []
     if vehicle is None:
         parts.append(Text("no vehicle yet", style="dim"))
     else:
-        parts += [_head(vehicle, now_s), *_body(vehicle, stale(vehicle, now_s) or vehicle.ended), *_events(vehicle)]
+        old = stale(vehicle, now_s) or vehicle.ended
+        parts += [_head(vehicle, now_s), *_body(vehicle, old)]
+        details = [Text(), *_lights(vehicle, old), *_events(vehicle)]
     parts += [Text(), _keys(station)]
     parts += [Text(f"  {printable(notice.text)}", style=notice.style) for notice in station.notices[-NOTICES_SHOWN:]]
     parts.append(Text(printable(station.broker), style="dim" if station.connected else _ALARM))
@@ -119,7 +122,7 @@ def render(vehicle: Vehicle | None, now_s: float, station: StationStatus) -> Ren
         parts.append(Text(f"{station.rejected} messages at the broker were rejected", style="yellow"))
     if station.others:
         parts.append(Text(f"n: next of {', '.join(map(printable, station.others))}", style="dim"))
-    return Group(*parts)
+    return Group(*parts, *details)
 
 
 def _head(vehicle: Vehicle, now_s: float) -> RenderableType:
@@ -156,11 +159,17 @@ def _body(vehicle: Vehicle, old: bool) -> list[RenderableType]:
     figures = Text("   ".join(_figures(stream)), style=style)
     if stream.tether is not None and (stream.tether.taut or stream.tether.snagged):
         figures.append("   TETHER " + ("SNAGGED" if stream.tether.snagged else "TAUT"), style=_ALARM)
+    return [course, figures, Text(_timing(stream), style=style)]
+
+
+def _lights(vehicle: Vehicle, old: bool) -> list[RenderableType]:
+    if vehicle.stream is None:
+        return []
     lights = Table.grid(padding=(0, 3))
-    cells = [_light(light.name, light.light, light.text, old) for light in stream.lights]
+    cells = [_light(light.name, light.light, light.text, old) for light in vehicle.stream.lights]
     for index in range(0, len(cells), 2):
         lights.add_row(*cells[index : index + 2])
-    return [course, figures, Text(_timing(stream), style=style), Text(), lights]
+    return [lights]
 
 
 def _light(name: str, light: HealthLevel, text: str, old: bool) -> Text:
