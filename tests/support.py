@@ -470,8 +470,8 @@ def bridged(
 
 
 def _port_range() -> Iterator[int]:
-    """Ports of this process alone, again and again, below those that the kernel gives to whoever asks for any: between the choice of
-    a port and its use nobody else is given it.
+    """Yield the ports of a range that belongs to this process, endlessly. The range lies below the kernel's ephemeral ports, so that no
+    other socket takes a port between its choice and its use.
     """
     for slot in itertools.count():
         claim = socket.socket(socket.AF_UNIX)

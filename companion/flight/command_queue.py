@@ -94,9 +94,8 @@ class Operator:
         """Return the command of this tick.
 
         A landing requested by the launcher or a signal stays requested, and every other command is refused. A command from the ground
-        station lasts one tick. If it
-        repeats the previous one, it is delayed by a tick, because the core counts rising edges. A RESUME that names a hold other
-        than the active one is refused. A START on the ground waits for the result of `recheck`.
+        station lasts one tick. If it repeats the previous one, it is delayed by a tick, because the core counts rising edges. A RESUME
+        that names a hold other than the active one is refused. A START on the ground waits for the result of `recheck`.
         """
         waiting = self._waiting
         if self._land.is_set():

@@ -38,7 +38,7 @@ from tests.support import DEADLINE_S, ROOT
 
 AGAIN_S = 5.0
 SCREEN_CHARACTERS = 30_000
-"""Two or three pictures of the terminal: to search all that was ever drawn takes longer and longer."""
+"""The newest output, two or three screens, in which a text is searched: all output would take longer and longer."""
 AROUND = StationStatus("connected to mqtt://127.0.0.1:1883", True, "anna", None)
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
+from collections.abc import Iterator
 from typing import Literal, get_args
 
 import pytest
 
 from companion.config.devices import AutopilotDevice
 from companion.io.px4.driver import MavsdkAutopilot
+from companion.io.px4.setpoints import DirectSetpoints, OffboardSetpoints
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import AttitudeSetpoint, FlightMode, Vec3
 from companion.runtime.clock import flight_clock
@@ -126,6 +129,27 @@ def test_what_the_plugin_does_not_send_in_time_leaves_straight_and_once(monkeypa
             assert peer.packets_so_far() and len(peer.of("SET_ATTITUDE_TARGET")) == 21
 
     asyncio.run(fly())
+
+
+def test_a_setpoint_that_the_link_does_not_take_counts_as_not_sent() -> None:
+    """After one that was sent: by a full buffer, and by an error in MAVSDK's thread."""
+    results: Iterator[bool | OSError] = iter([True, OSError("gone"), True, False])
+
+    def write(frame: bytes) -> bool:
+        result = next(results)
+        if isinstance(result, OSError):
+            raise result
+        return result
+
+    class Plugin:
+        def set_attitude(self, attitude: object) -> None:
+            with contextlib.suppress(OSError):
+                path.pass_on(b"")
+
+    direct = DirectSetpoints(lambda number, payload: True, 1)
+    path = OffboardSetpoints(None, write, direct)
+    path._plugin = Plugin()
+    assert [path.send(LEVEL, 0.0) for _ in range(4)] == [True, False, True, False]
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -126,8 +126,11 @@ class OffboardSetpoints:
         with self._lock:
             if not self._wanted:
                 return
-            self._wanted, self._sent = False, self._write(frame)
-        self._left.set()
+            self._wanted = self._sent = False
+            try:
+                self._sent = self._write(frame)
+            finally:
+                self._left.set()
 
     def stop(self) -> None:
         """Destroy the plugin, so that its thread stops repeating the last setpoint."""
