@@ -141,7 +141,7 @@ class TelemetrySession:
 
     def flight_s(self, now_s: float) -> float | None:
         """Return the flight clock at a CLOCK_MONOTONIC time, or None before the first tick."""
-        return self._clock.now_s(now_s)
+        return self._clock.now_s(now_s, self._state.simulated)
 
     def last_will(self) -> bytes:
         """Return the state that the broker publishes if this process disappears."""

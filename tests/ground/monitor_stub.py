@@ -177,9 +177,7 @@ class MonitorStub:
         self._do(self._stop())
 
     def hang_up(self) -> None:
-        """Forget the received messages and close all connections."""
-        with self._change:
-            self._heard.clear()  # first: a page that connects anew may speak at once
+        """Close all connections and forget what came over them, also what is still under way. A page may connect anew at once."""
         self._do(self._hang_up())
 
     def send(self, *messages: Message) -> None:
@@ -217,7 +215,11 @@ class MonitorStub:
         self.port = self._runner.addresses[0][1]
 
     async def _hang_up(self) -> None:
-        for socket in list(self._sockets):
+        async with self._greeted:
+            closing, self._sockets = self._sockets, []
+            with self._change:
+                self._heard.clear()
+        for socket in closing:
             await socket.close()
 
     async def _stop(self) -> None:
@@ -241,12 +243,13 @@ class MonitorStub:
             self._sockets.append(socket)
         try:
             async for received in socket:
-                if received.type is WSMsgType.TEXT:
+                if received.type is WSMsgType.TEXT and socket in self._sockets:
                     with self._change:
                         self._heard.append(received.json())
                         self._change.notify_all()
         finally:
-            self._sockets.remove(socket)
+            if socket in self._sockets:
+                self._sockets.remove(socket)
         return socket
 
     async def _log(self, request: web.Request) -> web.Response:

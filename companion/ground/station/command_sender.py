@@ -165,7 +165,7 @@ class CommandSender:
         proven = None if known is None else known.proven
         if proven is None or proven.session != session:  # the vehicle was known when the command was given
             return f"a new flight of {vehicle} has started"
-        t_ms, ends = proven.now_ms(time.monotonic()), 0
+        t_ms, ends = proven.now_ms(time.monotonic(), known is not None and known.simulated), 0
         if command is CommandName.RESUME:
             ends = proven.hold if hold is None else hold
         try:

@@ -67,9 +67,9 @@ class ProvenState:
         """Whether proven messages are arriving."""
         return now_s - self.received_s < LIVE_S
 
-    def now_ms(self, now_s: float) -> int:
+    def now_ms(self, now_s: float, simulated: bool = False) -> int:
         """Return the current flight clock; never ahead of the vehicle's own."""
-        now_ms = self.clock.now_ms(now_s)
+        now_ms = self.clock.now_ms(now_s, simulated)
         assert now_ms is not None  # at least one message has arrived
         return now_ms
 
@@ -92,6 +92,11 @@ class Vehicle:
     """Estimate of the flight clock, used for the age of the displayed data."""
     proven: ProvenState | None = None
     """None if no stream message had a proof for this ground station's operator."""
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the vehicle has reported that its devices are simulated."""
+        return self.state is not None and self.state.simulated and self.state.session == self.session
 
     def stream_age_s(self, now_s: float) -> float | None:
         """Return the time since the newest stream message, or None if none has arrived in this session."""
@@ -234,6 +239,6 @@ class VehicleTracker:
                     return None  # the age of a retained stream message is unknown; it would look live
                 known.stream, known.stream_received_s = record, now_s
                 known.clock.add(record.t_s, now_s)
-                flight_ms = known.clock.now_ms(now_s)
+                flight_ms = known.clock.now_ms(now_s, known.simulated)
                 age_s = None if flight_ms is None else max(0.0, flight_ms / 1e3 - record.t_s)
         return ReceivedRecord(known.name, kind, record, age_s)

@@ -91,12 +91,14 @@ export class Vehicle {
 
   /**
    * Age of the displayed data, s: time since the newest stream message was sent, estimated without a common clock. A message that
-   * was delayed is old when it arrives. null if there was none.
+   * was delayed is old when it arrives; with simulated time, which has any pace, that is not known. null if there was none.
    */
   ageS(nowMs) {
     if (this.stream === null || this._offsetMs === null) return null;
+    const byReceiptS = this._lateS + (nowMs - this.receivedMs) / 1000;
+    if (this.state?.simulated) return byReceiptS;
     const byItsClockS = (nowMs - this._offsetMs) / 1000 - this.stream.t_s;
-    return Math.max(0, byItsClockS, this._lateS + (nowMs - this.receivedMs) / 1000);
+    return Math.max(0, byItsClockS, byReceiptS);
   }
 
   /** Seconds since the vehicle became known, if no stream message has arrived. */
