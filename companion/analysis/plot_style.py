@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import matplotlib
 import numpy as np
@@ -29,9 +29,9 @@ COLOURS = ("#0072b2", "#d55e00", "#000000", "#009e73", "#cc79a7", "#e69f00", "#5
 """Colours of flights and laws in comparisons; the first six by Okabe and Ito, "Color Universal Design", for any colour vision."""
 
 
-def new_figure(height_in: float) -> Figure:
-    """Return an empty figure of the common width."""
-    return Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained", facecolor="white")
+def new_figure(height_in: float, *, layout: Literal["constrained"] | None = "constrained") -> Figure:
+    """Return an empty figure of the common width; without a layout the caller sets the margins."""
+    return Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout=layout, facecolor="white")
 
 
 def write_png(figure: Figure, path: Path) -> None:

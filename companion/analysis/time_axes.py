@@ -27,7 +27,8 @@ def stack(
     """Return a figure, its axes stacked over a common time axis on which the phases and the catch are marked, and the mission
     time of each tick, s (NaN outside the marked phases).
     """
-    figure = new_figure(height_in)
+    figure = new_figure(height_in, layout=None)  # a layout by measuring takes half of the time of drawing
+    figure.subplots_adjust(left=0.09, right=0.985, top=1.0 - 0.62 / height_in, bottom=0.5 / height_in, hspace=0.13)
     grid = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)
     axes = [row[0] for row in grid]
     flying = np.array([o.phase_kind in _PHASES for o in log.outputs], dtype=np.bool_)
@@ -39,7 +40,7 @@ def stack(
         ax.margins(y=0.12)
     _mark_phases(log, axes)
     axes[-1].set_xlabel("mission time [s]")
-    figure.suptitle(title, fontsize=13, fontweight="bold", color=INK)
+    figure.suptitle(title, y=1.0 - 0.08 / height_in, fontsize=13, fontweight="bold", color=INK)
     return figure, axes, np.where(flying, t_s, np.nan) if flying.any() else t_s
 
 
