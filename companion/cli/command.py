@@ -11,24 +11,24 @@ from typing import Any
 from companion.cli.monitor import add_broker_options, vehicle_option
 from companion.config.document import ConfigError
 from companion.ground.protocol.access import broker_access
-from companion.ground.protocol.keys import SAFER_COMMANDS
-from companion.ground.protocol.messages import CommandName, Topic
+from companion.ground.protocol.messages import Topic
 from companion.ground.station.command_sender import FALLBACK_ADVICE, Failed, Sent, ack_text, signer_of
 from companion.ground.station.link import BrokerRefused
 from companion.ground.station.station import Station
 from companion.ground.station.vehicles import LIVE_S
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
+from companion.model.types import COMMANDS, SAFER_COMMANDS, OperatorCommand
 from companion.runtime.console import print_error
 from companion.runtime.tasks import until_first
 
 FOUND_S = 5.0
 """Timeout for connecting to the broker and for the vehicle's first message."""
 _HELP = {
-    CommandName.HOLD: "stop and hold position",
-    CommandName.LAND: "land",
-    CommandName.ABORT: "abort the mission and land immediately",
-    CommandName.RESUME: "continue after a hold, if the supervisor allows it",
-    CommandName.START: "take off; for flights that wait for START",
+    OperatorCommand.HOLD: "stop and hold position",
+    OperatorCommand.LAND: "land",
+    OperatorCommand.ABORT: "abort the mission and land immediately",
+    OperatorCommand.RESUME: "continue after a hold, if the supervisor allows it",
+    OperatorCommand.START: "take off; for flights that wait for START",
 }
 
 
@@ -41,7 +41,7 @@ def add_parser(commands: Any) -> None:
         + "; ".join(f"{name.value}: {text}" for name, text in _HELP.items())
         + ".",
     )
-    command.add_argument("name", choices=[name.value for name in CommandName], metavar="NAME", help="see above")
+    command.add_argument("name", choices=list(COMMANDS), metavar="NAME", help="see above")
     command.add_argument(
         "--hold",
         type=int,
@@ -59,8 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
     signer = signer_of(access, arguments.operators, arguments.operator)
     if isinstance(signer, str):
         raise ConfigError([f"companion command: {signer}"])
-    name = CommandName(arguments.name)
-    if arguments.hold is not None and (name is not CommandName.RESUME or arguments.hold < 1):
+    name = OperatorCommand(arguments.name)
+    if arguments.hold is not None and (name is not OperatorCommand.RESUME or arguments.hold < 1):
         raise ConfigError([f"--hold {arguments.hold}: expected the number of a hold, 1 or more, and only with resume"])
     commander = _Commander(name, only, arguments.hold)
     station = Station(
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _Commander:
-    def __init__(self, command: CommandName, only: str | None, hold: int | None) -> None:
+    def __init__(self, command: OperatorCommand, only: str | None, hold: int | None) -> None:
         self._command = command
         self._hold = hold
         self._only = only

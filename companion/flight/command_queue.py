@@ -9,24 +9,20 @@ import socket
 from collections.abc import Callable, Coroutine, Iterable, Iterator
 from typing import Any, NamedTuple, TypeVar
 
-from companion.model.types import GroundCommand, OperatorCommand, Outputs, PhaseKind, SafetyAction
+from companion.model.types import (
+    COMMANDS,
+    SAFER_COMMANDS,
+    GroundCommand,
+    OperatorCommand,
+    Outputs,
+    PhaseKind,
+    SafetyAction,
+)
 from companion.runtime import ipc
 
 WAITING_MAX = 32
 """Maximum number of queued commands. If there are more, the least severe are refused."""
-_GRAVEST_FIRST = {
-    command: rank
-    for rank, command in enumerate(
-        (
-            OperatorCommand.ABORT,
-            OperatorCommand.LAND,
-            OperatorCommand.HOLD,
-            OperatorCommand.RESUME,
-            OperatorCommand.START,
-        )
-    )
-}
-_STOPS = frozenset({OperatorCommand.ABORT, OperatorCommand.LAND, OperatorCommand.HOLD})
+_GRAVEST_FIRST = {command: rank for rank, command in enumerate(COMMANDS.values())}
 
 _T = TypeVar("_T")
 
@@ -79,10 +75,10 @@ class Operator:
         """
         dropped = []
         for asked in commands:
-            if asked.command in _STOPS:
+            if asked.command in SAFER_COMMANDS:
                 why = f"a {asked.command.value} was commanded later"
-                dropped += [Dropped(one, why) for one in self._waiting if one.command not in _STOPS]
-                self._waiting = [one for one in self._waiting if one.command in _STOPS]
+                dropped += [Dropped(one, why) for one in self._waiting if one.command not in SAFER_COMMANDS]
+                self._waiting = [one for one in self._waiting if one.command in SAFER_COMMANDS]
                 self._checking = None
             self._waiting.append(asked)
         self._waiting.sort(key=lambda asked: _GRAVEST_FIRST[asked.command])

@@ -13,6 +13,7 @@ Conventions:
 from __future__ import annotations
 
 from enum import Enum
+from typing import Final
 
 from companion.model.codec import Record
 from companion.model.estimator import EstimatorReport
@@ -128,6 +129,21 @@ class OperatorCommand(Enum):
     START = "start"  # take off; only for a flight that waits for its start
     LAND = "land"
     ABORT = "abort"  # fold the arm and land now; the outcome is ABORTED
+
+
+COMMANDS: Final = {
+    command.value: command
+    for command in (
+        OperatorCommand.ABORT,
+        OperatorCommand.LAND,
+        OperatorCommand.HOLD,
+        OperatorCommand.RESUME,
+        OperatorCommand.START,
+    )
+}
+"""Each command by its name, gravest first."""
+SAFER_COMMANDS: Final = frozenset({OperatorCommand.ABORT, OperatorCommand.LAND, OperatorCommand.HOLD})
+"""Commands that every operator may give, and that overtake all others."""
 
 
 class GroundCommand(Record, frozen=True, kw_only=True):

@@ -25,7 +25,16 @@ from typing import Any
 from companion.io.protocols import DeviceError
 from companion.model.codec import to_packet
 from companion.model.packets import Close, CommandAnswer, LogLine, Metadata, Packet, Tick
-from companion.model.types import GroundCommand, Inputs, OperatorCommand, Outputs, SafetyAction, Sent, Severity
+from companion.model.types import (
+    COMMANDS,
+    GroundCommand,
+    Inputs,
+    OperatorCommand,
+    Outputs,
+    SafetyAction,
+    Sent,
+    Severity,
+)
 from companion.runtime import simulated_time
 from companion.runtime.subprocesses import JsonLines
 
@@ -33,7 +42,6 @@ _BUFFER_BYTES = 8 * 2**20
 _MESSAGE_MAX_BYTES = 4096
 _MESSAGES_PER_TICK = 16
 """Maximum number of messages read in a tick; the rest are read in the next one."""
-_COMMANDS = {command.value: command for command in OperatorCommand if command is not OperatorCommand.NONE}
 _SO_SNDBUFFORCE = 32
 _ROOM_TIMEOUT_S = 2.0
 """Longest wait for a recorder whose channel is full, in simulated time only."""
@@ -181,9 +189,9 @@ class RecorderClient:
             case {"error": str(error)}:
                 self.error = error
             case {"command": str(name), "operator": str(operator), "nonce": str(nonce), "hold": int(hold)} if (
-                name in _COMMANDS
+                name in COMMANDS
             ):
-                self._commands.append(GroundCommand(command=_COMMANDS[name], operator=operator, nonce=nonce, hold=hold))
+                self._commands.append(GroundCommand(command=COMMANDS[name], operator=operator, nonce=nonce, hold=hold))
             case {"ground": str(text)}:
                 self.telemetry_status = text
 

@@ -13,16 +13,17 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from companion.ground.protocol.access import BrokerAccess, broker_access
-from companion.ground.protocol.messages import CommandName, EventLine, Events, Stream
+from companion.ground.protocol.messages import EventLine, Events, Stream
 from companion.ground.protocol.proof import Signer
 from companion.ground.station.command_sender import Failed, Sent, ack_text, signer_of
 from companion.ground.station.station import Station
 from companion.ground.station.vehicles import ReceivedRecord
 from companion.model.codec import to_json
+from companion.model.types import OperatorCommand
 
 Fields = dict[str, Any]
 """Fields of a ROS 2 message by name; those of a message in it are another dict. Fields that are not named keep their default."""
-COMMANDS = {command.value: command for command in (CommandName.HOLD, CommandName.LAND)}
+COMMANDS = {command.value: command for command in (OperatorCommand.HOLD, OperatorCommand.LAND)}
 """Commands that the bridge passes on. Whoever can publish in the ROS 2 network can give them; these two only make a flight safer."""
 
 

@@ -21,7 +21,6 @@ from msgspec.structs import replace
 from companion.ground.protocol.messages import (
     VERSION,
     Ack,
-    CommandName,
     EventLine,
     Events,
     Preflight,
@@ -36,7 +35,7 @@ from companion.ground.station.web_guard import HEADERS
 from companion.ground.telemetry.scene import scene_of
 from companion.ground.telemetry.stream import replay
 from companion.model.codec import to_jsonable
-from companion.model.types import Sent
+from companion.model.types import OperatorCommand, Sent
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from tests.ground.vehicle import ack_of, state_of
@@ -113,7 +112,7 @@ def event(number: int, text: str, *, id_: str = "hold", severity: str = "warning
 def ack(command: str, nonce: str, text: str, *, accepted: bool = True, operator: str = "anna") -> Ack:
     """Return the vehicle's answer to a command."""
     values = {"operator": operator, "accepted": accepted, "text": text, "t_s": 21.0}
-    return ack_of(SESSION, nonce, command=CommandName(command), **values)
+    return ack_of(SESSION, nonce, command=OperatorCommand(command), **values)
 
 
 def relayed(record: object, vehicle: str = NAME, **more: Any) -> Message:

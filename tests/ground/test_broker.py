@@ -26,7 +26,8 @@ from paho.mqtt.properties import Properties
 from companion.ground.broker import setup as broker_setup
 from companion.ground.protocol.commands import Accepted, Reason, Refused, Verifier, make_command
 from companion.ground.protocol.keys import load_login, load_operators, new_key
-from companion.ground.protocol.messages import COMMAND_MAX_BYTES, Command, CommandName, Topic, encode
+from companion.ground.protocol.messages import COMMAND_MAX_BYTES, Command, Topic, encode
+from companion.model.types import OperatorCommand
 from tests.broker import LOOPBACK, Broker, loopback_broker
 from tests.support import DEADLINE_S, ROOT, free_port
 from tools.docs.mosquitto import example_files
@@ -380,7 +381,7 @@ class Attack:
 def signed(
     key: bytes, vehicle: str = "tarot", operator: str = "anna", t_s: float = NOW_T_S, session: str = SESSION
 ) -> Command:
-    return make_command(CommandName.LAND, vehicle, session, operator, key, round(t_s * 1000))
+    return make_command(OperatorCommand.LAND, vehicle, session, operator, key, round(t_s * 1000))
 
 
 ATTACKS = {

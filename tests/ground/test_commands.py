@@ -27,13 +27,14 @@ from companion.ground.protocol.commands import (
 )
 from companion.ground.protocol.flight_clock import FlightClock
 from companion.ground.protocol.keys import Operator, Operators, Permission, new_key
-from companion.ground.protocol.messages import COMMAND_MAX_BYTES, Command, CommandName, encode
+from companion.ground.protocol.messages import COMMAND_MAX_BYTES, Command, encode
+from companion.model.types import COMMANDS, OperatorCommand
 
 VEHICLE, SESSION, NOW_T_S = "tarot", "f3a9", 100.0
 ANNA, BERT, VIEWER = new_key(), new_key(), new_key()
 OPERATORS = Operators([Operator("anna", ANNA), Operator("bert", BERT, Permission.SAFER_COMMANDS)], "operators.yaml")
-SAFE = [CommandName.HOLD, CommandName.LAND, CommandName.ABORT]
-OTHERS = [CommandName.RESUME, CommandName.START]
+SAFE = [OperatorCommand.HOLD, OperatorCommand.LAND, OperatorCommand.ABORT]
+OTHERS = [OperatorCommand.RESUME, OperatorCommand.START]
 
 
 def verifier() -> Verifier:
@@ -41,7 +42,7 @@ def verifier() -> Verifier:
 
 
 def made(
-    name: CommandName = CommandName.HOLD,
+    name: OperatorCommand = OperatorCommand.HOLD,
     t_s: float = NOW_T_S,
     operator: str = "anna",
     key: bytes = ANNA,
@@ -72,8 +73,8 @@ def changed(of: Command, /, **values: Any) -> bytes:
     return json.dumps(data).encode()
 
 
-@pytest.mark.parametrize("name", CommandName)
-def test_genuine_command_is_accepted_as_it_was_made(name: CommandName) -> None:
+@pytest.mark.parametrize("name", COMMANDS.values())
+def test_genuine_command_is_accepted_as_it_was_made(name: OperatorCommand) -> None:
     command = made(name)
     assert verifier().check(encode(command), False, NOW_T_S) == Accepted(command)
 
@@ -91,7 +92,7 @@ def test_signed_text_is_as_documented() -> None:
         vehicle="tarot",
         session="f3a9",
         operator="anna",
-        command=CommandName.LAND,
+        command=OperatorCommand.LAND,
         t_ms=12345,
         hold=0,
         nonce="0" * 32,
@@ -103,7 +104,7 @@ def test_signed_text_is_as_documented() -> None:
 
 
 @pytest.mark.parametrize(
-    "field", [name for name, hint in Command.__annotations__.items() if hint not in ("int", "CommandName")]
+    "field", [name for name, hint in Command.__annotations__.items() if hint not in ("int", "OperatorCommand")]
 )
 def test_signed_fields_cannot_be_shifted_into_each_other(field: str) -> None:
     command = replace(made(), **{field: "a\nb"})
@@ -130,6 +131,7 @@ UNSIGNED = {
     "made fresh again": (changed(made(t_s=10.0), t_ms=100_000), Reason.BAD_SIGNATURE),
     "another nonce": (changed(made(), nonce="1" * 32), Reason.BAD_SIGNATURE),
     "brought into this session": (changed(made(session="old"), session=SESSION), Reason.BAD_SIGNATURE),
+    "no command": (changed(made(), command="none"), Reason.MALFORMED),
     "no such command": (changed(made(), command="explode"), Reason.MALFORMED),
     "unknown field": (changed(made(), sudo=True), Reason.MALFORMED),
     "later version": (changed(made(), v=3), Reason.WRONG_VERSION),
@@ -180,19 +182,19 @@ def test_unsigned_floods_do_not_stop_a_genuine_command() -> None:
     """Whatever is sent without a key (garbage, copies, old or foreign commands), all commands of an operator pass."""
     judge = verifier()
     old = [encode(made(t_s=NOW_T_S - 60.0)) for _ in range(50)]
-    first = encode(made(CommandName.START))
+    first = encode(made(OperatorCommand.START))
     assert judged(first, judge) is None
     for number in range(2000):
         assert judged(first, judge) is Reason.REPLAYED
         assert judged(old[number % 50], judge) is Reason.STALE
         assert judged(first, judge, retained=True) is Reason.REPLAYED
         assert judged(UNSIGNED["viewer signs as anna"][0], judge) is Reason.BAD_SIGNATURE
-    for name in CommandName:
+    for name in COMMANDS.values():
         assert judged(encode(made(name, NOW_T_S + 1.0)), judge, now_t_s=NOW_T_S + 1.0) is None
 
 
-@pytest.mark.parametrize("name", CommandName)
-def test_freshness_at_its_edges(name: CommandName) -> None:
+@pytest.mark.parametrize("name", COMMANDS.values())
+def test_freshness_at_its_edges(name: OperatorCommand) -> None:
     age_max_s = LIMITS[name].age_max_s
     assert age_max_s == (5.0 if name in SAFE else 2.0)
     assert judged(encode(made(name, NOW_T_S - age_max_s + 0.001))) is None
@@ -208,13 +210,13 @@ def first_refusal_is_the_end(reasons: list[Reason | None]) -> bool:
 
 @given(
     st.lists(st.none() | st.floats(-200.0, 200.0), min_size=1, max_size=40),
-    st.sampled_from(list(CommandName)),
+    st.sampled_from(list(COMMANDS.values())),
     st.sampled_from([("anna", ANNA), ("bert", BERT)]),
     st.floats(-150.0, 150.0),
     st.data(),
 )
 def test_a_command_is_accepted_once_at_most_and_never_after_its_first_refusal(
-    times_t_s: list[float | None], name: CommandName, who: tuple[str, bytes], ahead_s: float, data: st.DataObject
+    times_t_s: list[float | None], name: OperatorCommand, who: tuple[str, bytes], ahead_s: float, data: st.DataObject
 ) -> None:
     """Copies may arrive at any time: before the flight starts, retained, with clock steps in any order."""
     judge, payload = verifier(), encode(made(name, NOW_T_S + ahead_s, *who))
@@ -227,10 +229,11 @@ def test_a_command_is_accepted_once_at_most_and_never_after_its_first_refusal(
 
 @settings(max_examples=30, deadline=None)
 @given(
-    st.lists(st.tuples(st.sampled_from(list(CommandName)), st.floats(-6.0, 90.0)), min_size=1, max_size=30), st.data()
+    st.lists(st.tuples(st.sampled_from(list(COMMANDS.values())), st.floats(-6.0, 90.0)), min_size=1, max_size=30),
+    st.data(),
 )
 def test_none_of_many_commands_is_accepted_after_its_first_refusal(
-    made_at: list[tuple[CommandName, float]], data: st.DataObject
+    made_at: list[tuple[OperatorCommand, float]], data: st.DataObject
 ) -> None:
     """Many commands are sent repeatedly in any order, next to floods that leave no room for their nonces."""
     judge, now_t_s = verifier(), NOW_T_S
@@ -240,7 +243,7 @@ def test_none_of_many_commands_is_accepted_after_its_first_refusal(
     reasons: dict[bytes, list[Reason | None]] = {payload: [] for payload in payloads}
     for _ in range(data.draw(st.integers(1, 60))):
         now_t_s += data.draw(st.sampled_from([0.0, 0.01, 1.0, 10.0]))
-        for payload in floods.pop(data.draw(st.sampled_from(list(CommandName))), ()):
+        for payload in floods.pop(data.draw(st.sampled_from(list(COMMANDS.values()))), ()):
             judged(payload, judge, now_t_s=now_t_s)
         payload = data.draw(st.sampled_from(payloads))
         reasons[payload].append(judged(payload, judge, now_t_s=now_t_s))
@@ -250,7 +253,7 @@ def test_none_of_many_commands_is_accepted_after_its_first_refusal(
 
 def test_a_start_that_was_from_the_future_is_not_accepted_when_its_time_has_come() -> None:
     """A forged clock made an operator sign it; a copy is sent again 60 s later."""
-    judge, payload = verifier(), encode(made(CommandName.START, NOW_T_S + 60.0))
+    judge, payload = verifier(), encode(made(OperatorCommand.START, NOW_T_S + 60.0))
     assert judged(payload, judge) is Reason.FROM_THE_FUTURE
     assert judged(payload, judge, now_t_s=NOW_T_S + 60.0) is Reason.REPLAYED
 
@@ -258,7 +261,7 @@ def test_a_start_that_was_from_the_future_is_not_accepted_when_its_time_has_come
 @pytest.mark.parametrize("stop", SAFE)
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_resume_or_start_that_was_given_before_a_stop_is_refused_after_it(
-    stop: CommandName, name: CommandName
+    stop: OperatorCommand, name: OperatorCommand
 ) -> None:
     """The network may reorder them, and two operators may use different paths."""
     judge = verifier()
@@ -279,40 +282,40 @@ def test_command_of_an_earlier_flight_is_refused() -> None:
 
 
 def test_operator_for_safety_only() -> None:
-    for name in CommandName:
+    for name in COMMANDS.values():
         expected = None if name in SAFE else Reason.NOT_ALLOWED
         assert judged(encode(made(name, operator="bert", key=BERT))) is expected
 
 
-@pytest.mark.parametrize("name", CommandName)
-def test_rate_is_limited_per_command_and_operator(name: CommandName) -> None:
+@pytest.mark.parametrize("name", COMMANDS.values())
+def test_rate_is_limited_per_command_and_operator(name: OperatorCommand) -> None:
     judge, per_s = verifier(), LIMITS[name].per_s
     assert per_s == (20 if name in SAFE else 1)
     for _ in range(per_s):
         assert judged(encode(made(name)), judge) is None
     assert judged(encode(made(name)), judge) is Reason.TOO_MANY
-    for other in CommandName:
+    for other in COMMANDS.values():
         if other is not name:
             assert judged(encode(made(other)), judge) is None
-    assert judged(encode(made(CommandName.HOLD, operator="bert", key=BERT)), judge) is None
+    assert judged(encode(made(OperatorCommand.HOLD, operator="bert", key=BERT)), judge) is None
     assert judged(encode(made(name, NOW_T_S + 1.0)), judge, now_t_s=NOW_T_S + 1.0) is None
 
 
 def test_what_was_one_too_many_cannot_be_sent_again_later() -> None:
-    judge, late = verifier(), encode(made(CommandName.START))
-    assert judged(encode(made(CommandName.START)), judge) is None
+    judge, late = verifier(), encode(made(OperatorCommand.START))
+    assert judged(encode(made(OperatorCommand.START)), judge) is None
     assert judged(late, judge) is Reason.TOO_MANY
     assert judged(late, judge, now_t_s=NOW_T_S + 1.5) is Reason.REPLAYED
 
 
-@pytest.mark.parametrize("flood", CommandName)
+@pytest.mark.parametrize("flood", COMMANDS.values())
 @pytest.mark.parametrize("ahead_s", [0.0, 60.0])
-def test_a_flood_of_one_command_leaves_room_for_every_other(flood: CommandName, ahead_s: float) -> None:
+def test_a_flood_of_one_command_leaves_room_for_every_other(flood: OperatorCommand, ahead_s: float) -> None:
     """A defective client sends well-signed commands of one operator as fast as it can."""
     judge = verifier()
     for _ in range(2 * REFUSED_MAX):
         judged(encode(made(flood, NOW_T_S + ahead_s)), judge)
-    for name in CommandName:
+    for name in COMMANDS.values():
         if name is not flood:
             assert judged(encode(made(name, NOW_T_S + 0.1)), judge, now_t_s=NOW_T_S + 0.1) is None
     if not ahead_s:
@@ -361,7 +364,7 @@ def test_well_signed_and_refused_is_answered_but_no_flood_of_it() -> None:
 
 @given(st.data())
 def test_any_changed_byte_is_refused(data: st.DataObject) -> None:
-    payload = bytearray(encode(made(data.draw(st.sampled_from(list(CommandName))))))
+    payload = bytearray(encode(made(data.draw(st.sampled_from(list(COMMANDS.values()))))))
     where = data.draw(st.integers(0, len(payload) - 1))
     payload[where] ^= data.draw(st.integers(1, 255))
     assert judged(bytes(payload)) is not None

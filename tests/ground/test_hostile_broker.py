@@ -21,7 +21,6 @@ from companion.ground.protocol.commands import Accepted, Verifier, make_command
 from companion.ground.protocol.connection import Connection
 from companion.ground.protocol.messages import (
     VERSION,
-    CommandName,
     Preflight,
     PreflightRow,
     Presence,
@@ -36,6 +35,7 @@ from companion.ground.station.text_view import StationStatus, render, status_lin
 from companion.ground.station.vehicles import LIVE_S, VEHICLES_MAX, VehicleTracker
 from companion.ground.telemetry.scene import scene_of
 from companion.model.codec import to_jsonable
+from companion.model.types import OperatorCommand
 from companion.runtime.tasks import until_first
 from tests.broker import Broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, played, until
@@ -85,7 +85,7 @@ def test_a_forged_stream_makes_nobody_sign_for_a_time_that_has_not_come(name: st
     known = watch.vehicles["rig"].proven
     assert known is not None
     assert (known.session, known.now_ms(50.1), known.hold) == ("s1", 100_100, 0)
-    command = make_command(CommandName.START, "rig", known.session, "anna", ANNA.key, known.now_ms(50.1))
+    command = make_command(OperatorCommand.START, "rig", known.session, "anna", ANNA.key, known.now_ms(50.1))
     assert isinstance(Verifier(OPERATORS, "rig", "s1").check(encode(command), False, 100.11), Accepted)
 
 
@@ -105,7 +105,7 @@ def test_a_copy_of_the_newest_message_keeps_no_dead_link_alive() -> None:
     known = watch.vehicles["rig"].proven
     assert known is not None and not known.live(70.0)
     assert known.now_ms(70.0) == 120_000
-    command = make_command(CommandName.HOLD, "rig", known.session, "anna", ANNA.key, known.now_ms(70.0))
+    command = make_command(OperatorCommand.HOLD, "rig", known.session, "anna", ANNA.key, known.now_ms(70.0))
     assert isinstance(Verifier(OPERATORS, "rig", "s1").check(encode(command), False, 120.01), Accepted)
 
 
@@ -140,7 +140,7 @@ def test_without_a_key_everything_is_shown() -> None:
 
 def test_an_answer_that_the_vehicle_did_not_prove_is_none() -> None:
     """Otherwise anyone who reads the nonce could answer "landing" and end the attempts."""
-    ack = ack_of("s1", command=CommandName.LAND, text="landing", action="land")
+    ack = ack_of("s1", command=OperatorCommand.LAND, text="landing", action="land")
     watch, topic = VehicleTracker(signer=SIGNER), "companion/rig/ack"
     assert watch.receive(topic, encode(ack), False, 50.0) is None
     assert watch.receive(topic, encode(replace(with_proof(ack, "rig", ANNA.key), accepted=False)), False, 50.0) is None
@@ -279,9 +279,9 @@ async def test_land_is_sent_and_answered_whatever_a_hostile_broker_sends(broker:
             ):
                 await hostile.publish(Topic.STATE.of("rig"), encode(lie), qos=1, retain=True)
                 await until(lambda lie=lie: watch.vehicles["rig"].state == lie)  # type: ignore[misc]
-                ack = await station.commands.send("rig", CommandName.LAND, lambda note: None)
+                ack = await station.commands.send("rig", OperatorCommand.LAND, lambda note: None)
                 assert ack is not None and ack.accepted
-            assert [command.command for command in vehicle.accepted] == [CommandName.LAND] * 3
+            assert [command.command for command in vehicle.accepted] == [OperatorCommand.LAND] * 3
             assert watch.rejected > 4000
         assert [text for text in changes if not text.startswith("connected")] == []
 
@@ -303,7 +303,7 @@ async def test_a_message_that_nobody_thought_of_ends_nothing(broker: Broker) -> 
     async def fight() -> None:
         async with played_vehicle(broker.port, OPERATORS):
             await until(lambda: station.tracker.rejected > 10)
-            ack = await station.commands.send("rig", CommandName.LAND, lambda note: None)
+            ack = await station.commands.send("rig", OperatorCommand.LAND, lambda note: None)
             assert ack is not None and ack.accepted
         assert "ZeroDivisionError: 'of our own'" in (station.tracker.rejected_text or "")
         assert len(changes) == 1

@@ -22,7 +22,7 @@ from companion.ground.protocol.keys import (
     operators_text,
     write_private,
 )
-from companion.ground.protocol.messages import CommandName
+from companion.model.types import OperatorCommand
 from tests.support import DEADLINE_S, ROOT
 
 KEY = base64.b64encode(bytes(range(32))).decode()
@@ -56,10 +56,10 @@ def test_written_file_reads_back(tmp_path: Path) -> None:
     operators = load_operators(tmp_path / "operators.yaml")
     assert operators.names == ("anna", "1e3", "null")
     assert [operators.key(one.name) for one in made] == [one.key for one in made]
-    assert operators.is_allowed("anna", CommandName.START)
-    assert operators.is_allowed("1e3", CommandName.ABORT)
-    assert not operators.is_allowed("1e3", CommandName.RESUME)
-    assert not operators.is_allowed("nobody", CommandName.HOLD)
+    assert operators.is_allowed("anna", OperatorCommand.START)
+    assert operators.is_allowed("1e3", OperatorCommand.ABORT)
+    assert not operators.is_allowed("1e3", OperatorCommand.RESUME)
+    assert not operators.is_allowed("nobody", OperatorCommand.HOLD)
     assert operators.find_key("nobody") is None
     with pytest.raises(ConfigError, match="no operator 'nobody'; expected one of anna, 1e3, null"):
         operators.key("nobody")

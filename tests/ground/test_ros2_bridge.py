@@ -14,8 +14,9 @@ from msgspec.structs import replace
 
 from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.keys import Operator
-from companion.ground.protocol.messages import VERSION, CommandName, EventLine, Events
+from companion.ground.protocol.messages import VERSION, EventLine, Events
 from companion.ground.protocol.proof import Signer
+from companion.model.types import OperatorCommand
 from tests.broker import loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, played
 from tests.ground.vehicle import flight, played_vehicle
@@ -131,7 +132,7 @@ async def test_hold_and_land_reach_the_vehicle_and_other_words_do_not(bridge: An
             running.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await running
-            assert [heard.command for heard in vehicle.accepted] == [CommandName.HOLD, CommandName.LAND]
+            assert [heard.command for heard in vehicle.accepted] == [OperatorCommand.HOLD, OperatorCommand.LAND]
     texts = [fields["data"] for topic, fields in published if topic == "events"]
     assert {"hold: hold: done", "land: land: done"} <= set(texts)
     assert [text for text in texts if "refused" in text] == [

@@ -25,12 +25,13 @@ from rich.console import Console
 
 from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.keys import operators_text, write_private
-from companion.ground.protocol.messages import CommandName, Presence, encode
+from companion.ground.protocol.messages import Presence, encode
 from companion.ground.protocol.proof import with_proofs
 from companion.ground.station.station import Station
 from companion.ground.station.text_monitor import _Screen
 from companion.ground.station.text_view import STALE_S, Notice, StationStatus, render, stale, status_line, status_word
 from companion.ground.station.vehicles import Vehicle, VehicleTracker
+from companion.model.types import OperatorCommand
 from tests.broker import Broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, played
 from tests.ground.vehicle import flight, played_vehicle, state_of
@@ -221,7 +222,7 @@ def test_a_confirmation_is_for_what_was_shown(after: dict[str, Any]) -> None:
     assert screen._command("r", station) is None
     shown(**after)
     assert screen._command("r", station) is None
-    assert screen._command("r", station) is CommandName.RESUME
+    assert screen._command("r", station) is OperatorCommand.RESUME
 
 
 @played
@@ -276,7 +277,7 @@ async def test_the_next_vehicle(broker: Broker, tmp_path: Path) -> None:
         await terminal.shows(f"{second.name}   FLYING")
         await terminal.shows(f"{second.name}: hold: hold: done (anna)", on="h")
         for vehicle in (first, second):  # a HOLD whose answer is late is sent again
-            assert {heard.command for heard in vehicle.accepted} == {CommandName.HOLD}
+            assert {heard.command for heard in vehicle.accepted} == {OperatorCommand.HOLD}
 
 
 @played

@@ -11,19 +11,20 @@ import pytest
 from companion.config.document import ConfigError
 from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.keys import Operator, operators_text, write_private
-from companion.ground.protocol.messages import CommandName, Presence
+from companion.ground.protocol.messages import Presence
 from companion.ground.protocol.proof import Signer
 from companion.ground.station.command_sender import ATTEMPTS, NO_ANSWER, signer_of
 from companion.ground.station.vehicles import LIVE_S
+from companion.model.types import COMMANDS, OperatorCommand
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, on_page, played, token_of, viewer_of
 from tests.ground.vehicle import PlayedVehicle, played_vehicle
 
 
-@pytest.mark.parametrize("command", list(CommandName))
+@pytest.mark.parametrize("command", list(COMMANDS.values()))
 @played
 async def test_a_command_is_signed_judged_by_the_vehicle_and_its_answer_shown(
-    broker: Broker, command: CommandName
+    broker: Broker, command: OperatorCommand
 ) -> None:
     async with (
         played_vehicle(broker.port, OPERATORS) as vehicle,
@@ -85,7 +86,7 @@ async def test_a_late_answer_ends_the_tries(broker: Broker) -> None:
         assert ack["data"]["nonce"] == vehicle.accepted[-1].nonce
         await viewer.order("hold")
         await viewer.until("ack", lambda message: message["data"]["command"] == "hold")
-        assert sum(heard.command is CommandName.LAND for heard in vehicle.accepted) <= 2
+        assert sum(heard.command is OperatorCommand.LAND for heard in vehicle.accepted) <= 2
 
 
 @played

@@ -19,7 +19,6 @@ from companion.ground.protocol.messages import (
     VERSION,
     Ack,
     Command,
-    CommandName,
     Events,
     Preflight,
     PreflightRow,
@@ -33,6 +32,7 @@ from companion.ground.protocol.messages import (
 from companion.ground.protocol.proof import with_proof, with_proofs
 from companion.ground.telemetry.scene import scene_of
 from companion.ground.telemetry.stream import STREAM_PERIOD_S, replay
+from companion.model.types import OperatorCommand
 from tests.analysis.synthetic_flight import synthetic_flight
 from tests.support import CATCH
 
@@ -68,7 +68,7 @@ def ack_of(session: str, nonce: str = "0" * 32, **values: Any) -> Ack:
         session=session,
         nonce=nonce,
         operator="anna",
-        command=CommandName.HOLD,
+        command=OperatorCommand.HOLD,
         accepted=True,
         text="holding",
         t_s=1.0,

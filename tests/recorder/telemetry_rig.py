@@ -21,8 +21,8 @@ from paho.mqtt.enums import CallbackAPIVersion
 from companion.config.loader import FlightConfig, load_flight
 from companion.ground.protocol.commands import make_command
 from companion.ground.protocol.keys import Operator, load_login, new_key, operators_text, write_private
-from companion.ground.protocol.messages import CommandName, Stream, Topic, decode, encode, vehicle_of
-from companion.model.types import Inputs, Outputs, Sent
+from companion.ground.protocol.messages import Stream, Topic, decode, encode, vehicle_of
+from companion.model.types import Inputs, OperatorCommand, Outputs, Sent
 from companion.recorder.client import RecorderProcess, RecorderReport
 from tests.analysis.synthetic_flight import synthetic_flight
 from tests.support import CATCH, DEADLINE_S, wait_until
@@ -177,6 +177,8 @@ def log_lines(path: Path) -> list[str]:
     return lines
 
 
-def command(listener: Listener, name: CommandName, session: str, key: bytes = ANNA, vehicle: str = VEHICLE) -> bytes:
+def command(
+    listener: Listener, name: OperatorCommand, session: str, key: bytes = ANNA, vehicle: str = VEHICLE
+) -> bytes:
     assert listener.t_s is not None
     return encode(make_command(name, vehicle, session, "anna", key, round(listener.t_s * 1e3)))

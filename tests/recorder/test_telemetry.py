@@ -15,7 +15,6 @@ from companion.analysis.log import FlightLog
 from companion.ground.protocol.messages import (
     RETAINED,
     Ack,
-    CommandName,
     Events,
     Preflight,
     Presence,
@@ -62,7 +61,12 @@ def test_every_topic_follows_its_schema_and_is_there_for_those_who_come_late(tmp
             for payload in heard:
                 jsonschema.Draft202012Validator(schema_of(topic)).validate(json.loads(payload))
         ack = listener.wait(Topic.ACK, Ack)
-        assert (ack.session, ack.command, ack.accepted, ack.text) == (state.session, CommandName.HOLD, True, "holding")
+        assert (ack.session, ack.command, ack.accepted, ack.text) == (
+            state.session,
+            OperatorCommand.HOLD,
+            True,
+            "holding",
+        )
         streams = [decode(Stream, payload) for payload in listener.of(Topic.STREAM)]
         assert [stream.seq for stream in streams] == sorted({stream.seq for stream in streams})
         assert {stream.session for stream in streams} == {state.session}

@@ -25,7 +25,7 @@ from companion.config.loader import load_flight
 from companion.ground.broker import setup as broker_setup
 from companion.ground.protocol.commands import make_command
 from companion.ground.protocol.keys import load_operators, new_key, write_private
-from companion.ground.protocol.messages import Ack, CommandName, Events, Presence, State, Topic, encode
+from companion.ground.protocol.messages import Ack, Events, Presence, State, Topic, encode
 from companion.model.types import GroundCommand, OperatorCommand, SafetyAction
 from tests.broker import Broker, loopback_broker
 from tests.ground.test_broker import WANTED, Site, running
@@ -45,9 +45,9 @@ def test_a_signed_command_reaches_the_flight_and_its_answer_comes_back(tmp_path:
         flight.begin(listener)
         state = listener.wait(Topic.STATE, State, lambda state: state.commands)
         client, heard = flight.recorder.client, []
-        listener.publish(topic, command(listener, CommandName.LAND, state.session, key=new_key()))
-        listener.publish(topic, command(listener, CommandName.LAND, "another"))
-        genuine = command(listener, CommandName.HOLD, state.session)
+        listener.publish(topic, command(listener, OperatorCommand.LAND, state.session, key=new_key()))
+        listener.publish(topic, command(listener, OperatorCommand.LAND, "another"))
+        genuine = command(listener, OperatorCommand.HOLD, state.session)
         listener.publish(topic, genuine)
         listener.publish(topic, genuine)
 
@@ -67,7 +67,7 @@ def test_a_signed_command_reaches_the_flight_and_its_answer_comes_back(tmp_path:
         answer = listener.wait(Topic.ACK, Ack, lambda ack: ack.accepted)
         assert (answer.nonce, answer.text, answer.session) == (asked.nonce, "holding", state.session)
         refused = listener.wait(Topic.ACK, Ack, lambda ack: not ack.accepted)
-        assert refused.command is CommandName.LAND and "another flight" in refused.text
+        assert refused.command is OperatorCommand.LAND and "another flight" in refused.text
         events = listener.wait(
             Topic.EVENTS, Events, lambda events: any(line.id == "command_refused_replayed" for line in events.lines)
         )
@@ -84,7 +84,7 @@ def test_a_signed_command_reaches_the_flight_and_its_answer_comes_back(tmp_path:
 
 def garbage(seed: int, count: int, session: str) -> Iterator[bytes]:
     chance = random.Random(seed)
-    like = json.loads(encode(make_command(CommandName.LAND, VEHICLE, session, "anna", new_key(), 5000)))
+    like = json.loads(encode(make_command(OperatorCommand.LAND, VEHICLE, session, "anna", new_key(), 5000)))
     for k in range(count):
         match k % 5:
             case 0:
@@ -126,7 +126,7 @@ def test_a_flood_of_rubbish_passes_nothing_costs_no_sample_and_does_not_drown_th
 
         def came() -> bool:
             # The broker drops what it cannot deliver in time, a genuine command too: people press again.
-            listener.publish(topic, command(listener, CommandName.HOLD, session))
+            listener.publish(topic, command(listener, OperatorCommand.HOLD, session))
             heard.extend(client.take_commands())
             return bool(heard)
 
@@ -154,7 +154,7 @@ def test_a_full_disk_costs_the_log_and_neither_a_command_nor_its_answer(tmp_path
         size = flight.path.stat().st_size
         resource.prlimit(flight.recorder.process.pid, resource.RLIMIT_FSIZE, (size, size))
         flight.wait(lambda: client.error is not None, "the flight is not told that the disk is full")
-        listener.publish(Topic.COMMAND.of(VEHICLE), command(listener, CommandName.LAND, session))
+        listener.publish(Topic.COMMAND.of(VEHICLE), command(listener, OperatorCommand.LAND, session))
 
         def came() -> bool:
             heard.extend(client.take_commands())
@@ -168,7 +168,7 @@ def test_a_full_disk_costs_the_log_and_neither_a_command_nor_its_answer(tmp_path
 
 def test_a_command_that_the_broker_kept_is_refused(tmp_path: Path, broker: Broker) -> None:
     with Listener(broker.port) as listener:
-        kept = make_command(CommandName.LAND, VEHICLE, "before", "anna", bytes(32), 0)
+        kept = make_command(OperatorCommand.LAND, VEHICLE, "before", "anna", bytes(32), 0)
         listener.publish(Topic.COMMAND.of(VEHICLE), encode(kept), retain=True)
         with flight_with(tmp_path, broker.url) as flight:
             flight.fly(100)
@@ -290,7 +290,7 @@ def test_over_tls_with_its_login_a_vehicle_is_seen_and_commanded(tmp_path: Path,
     ):
         flight.begin(listener)
         state = listener.wait(Topic.STATE, State, lambda state: state.commands)
-        payload = command(listener, CommandName.LAND, state.session, key, "tarot")
+        payload = command(listener, OperatorCommand.LAND, state.session, key, "tarot")
         listener.publish(Topic.COMMAND.of("tarot"), payload)
         client, heard = flight.recorder.client, []
 

@@ -25,10 +25,11 @@ from typing import NamedTuple, TypeAlias
 from msgspec.structs import replace
 
 from companion.config.ground import VEHICLE_NAME
-from companion.ground.protocol.keys import OPERATOR_NAME, SAFER_COMMANDS, Operators
-from companion.ground.protocol.messages import COMMAND_MAX_BYTES, VERSION, Command, CommandName
+from companion.ground.protocol.keys import OPERATOR_NAME, Operators
+from companion.ground.protocol.messages import COMMAND_MAX_BYTES, VERSION, Command
 from companion.ground.protocol.strict_json import StrictJsonError, parse
 from companion.model.codec import RecordError, from_jsonable
+from companion.model.types import SAFER_COMMANDS, OperatorCommand
 
 DOMAIN = "companion command 2"
 """First line of every signed text; it makes a signature for any other purpose invalid for commands."""
@@ -59,11 +60,11 @@ class Limits(NamedTuple):
 
 
 LIMITS = {
-    CommandName.HOLD: Limits(5.0, 20),
-    CommandName.LAND: Limits(5.0, 20),
-    CommandName.ABORT: Limits(5.0, 20),
-    CommandName.RESUME: Limits(2.0, 1),
-    CommandName.START: Limits(2.0, 1),
+    OperatorCommand.HOLD: Limits(5.0, 20),
+    OperatorCommand.LAND: Limits(5.0, 20),
+    OperatorCommand.ABORT: Limits(5.0, 20),
+    OperatorCommand.RESUME: Limits(2.0, 1),
+    OperatorCommand.START: Limits(2.0, 1),
 }
 """Limits of each command name, kept separately: a flood of HOLDs does not block LAND."""
 
@@ -136,7 +137,7 @@ def sign(command: Command, key: bytes) -> Command:
 
 
 def make_command(
-    name: CommandName, vehicle: str, session: str, operator: str, key: bytes, t_ms: int, hold: int = 0
+    name: OperatorCommand, vehicle: str, session: str, operator: str, key: bytes, t_ms: int, hold: int = 0
 ) -> Command:
     """Return a signed command with a new nonce; `companion.ground.protocol.messages.encode` makes the payload.
 
@@ -168,6 +169,8 @@ def _mac(command: Command, key: bytes) -> str:
 
 def _field_problem(command: Command) -> str | None:
     """Return the problem of a field of the signed text, or None."""
+    if command.command is OperatorCommand.NONE:
+        return "command: 'none', expected a command"
     if VEHICLE_NAME.fullmatch(command.vehicle) is None:
         return f"vehicle: {command.vehicle!r:.60} is not a vehicle name"
     if _SESSION.fullmatch(command.session) is None:

@@ -32,13 +32,12 @@ from companion.config.base import Model, refuse
 from companion.config.document import ConfigError, problem_lines
 from companion.config.explain import validate
 from companion.config.yaml_strict import read_document
-from companion.ground.protocol.messages import CommandName
+from companion.model.types import SAFER_COMMANDS, OperatorCommand
 from companion.runtime.files import write_whole
 
 OPERATOR_NAME = re.compile(r"[A-Za-z0-9_.-]{1,40}")
 KEY_BYTES = 32
 OPERATORS_MAX = 100
-SAFER_COMMANDS = frozenset({CommandName.HOLD, CommandName.LAND, CommandName.ABORT})
 
 M = TypeVar("M", bound=Model)
 
@@ -162,7 +161,7 @@ class Operators:
         operator = self._by_name.get(name)
         return None if operator is None else operator.key
 
-    def is_allowed(self, name: str, command: CommandName) -> bool:
+    def is_allowed(self, name: str, command: OperatorCommand) -> bool:
         """Whether an operator may give a command."""
         operator = self._by_name.get(name)
         return operator is not None and (operator.permission is Permission.ALL or command in SAFER_COMMANDS)

@@ -25,7 +25,7 @@ from typing import TypeVar
 
 from companion.ground.protocol.strict_json import StrictJsonError, parse
 from companion.model.codec import Record, RecordError, from_jsonable, to_json
-from companion.model.types import Joints, Quat, Vec3, Vec4
+from companion.model.types import Joints, OperatorCommand, Quat, Vec3, Vec4
 
 VERSION = 2
 ROOT = "companion"
@@ -294,16 +294,6 @@ class Stream(Record, frozen=True, kw_only=True):
     """One proof per operator whose key the vehicle holds (`companion.ground.protocol.proof`); empty if it accepts no commands."""
 
 
-class CommandName(Enum):
-    """Commands of an operator."""
-
-    HOLD = "hold"
-    LAND = "land"
-    ABORT = "abort"
-    RESUME = "resume"  # continue after a hold
-    START = "start"  # take off; for flights that wait for START
-
-
 class Command(Record, frozen=True, kw_only=True):
     """Message on topic ``command``, signed with the operator's key over every other field (`companion.ground.protocol.commands`)."""
 
@@ -311,7 +301,7 @@ class Command(Record, frozen=True, kw_only=True):
     vehicle: str
     session: str
     operator: str
-    command: CommandName
+    command: OperatorCommand
     t_ms: int
     """The vehicle's flight clock as estimated by the sender, ms: `Stream.t_s` of the last proven message plus the time since."""
     hold: int
@@ -329,7 +319,7 @@ class Ack(Record, frozen=True, kw_only=True):
     session: str
     nonce: str
     operator: str
-    command: CommandName
+    command: OperatorCommand
     accepted: bool
     """The command took effect, or the requested state had already been reached."""
     text: str

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 from companion.ground.protocol.access import BrokerAccess
 from companion.ground.protocol.commands import make_command
-from companion.ground.protocol.keys import SAFER_COMMANDS, default_operators_file, load_operators
-from companion.ground.protocol.messages import Ack, CommandName, Topic, encode
+from companion.ground.protocol.keys import default_operators_file, load_operators
+from companion.ground.protocol.messages import Ack, Topic, encode
 from companion.ground.protocol.proof import Signer
 from companion.ground.station.link import Link, LinkError
 from companion.ground.station.vehicles import Vehicle, VehicleTracker
+from companion.model.types import SAFER_COMMANDS, OperatorCommand
 
 ANSWER_S = 1.5
 """Timeout for the vehicle's `Ack`."""
@@ -58,7 +59,7 @@ class Sent:
     """A command was published."""
 
     vehicle: str
-    command: CommandName
+    command: OperatorCommand
     nonce: str
 
 
@@ -67,7 +68,7 @@ class Failed:
     """A command, or one attempt of it, has failed."""
 
     vehicle: str
-    command: CommandName
+    command: OperatorCommand
     text: str
 
 
@@ -112,7 +113,7 @@ class CommandSender:
         if answer is not None and not answer.done():
             answer.set_result(ack)
 
-    async def send(self, vehicle: str, command: CommandName, notify: Notify, hold: int | None = None) -> Ack | None:
+    async def send(self, vehicle: str, command: OperatorCommand, notify: Notify, hold: int | None = None) -> Ack | None:
         """Send a command; return when the vehicle has answered or all attempts have failed. A newer command for the same vehicle,
         or a new flight, ends the attempts.
 
@@ -153,7 +154,7 @@ class CommandSender:
         self,
         signer: Signer,
         vehicle: str,
-        command: CommandName,
+        command: OperatorCommand,
         hold: int | None,
         session: str | None,
         answer: asyncio.Future[Ack],
@@ -166,7 +167,7 @@ class CommandSender:
         if proven is None or proven.session != session:  # the vehicle was known when the command was given
             return f"a new flight of {vehicle} has started"
         t_ms, ends = proven.now_ms(time.monotonic(), known is not None and known.simulated), 0
-        if command is CommandName.RESUME:
+        if command is OperatorCommand.RESUME:
             ends = proven.hold if hold is None else hold
         try:
             signed = make_command(command, vehicle, session, signer.operator, signer.key, t_ms, ends)

@@ -16,12 +16,13 @@ from rich.console import Console
 from rich.live import Live
 
 from companion.ground.protocol.access import BrokerAccess
-from companion.ground.protocol.messages import Ack, CommandName, Topic
+from companion.ground.protocol.messages import Ack, Topic
 from companion.ground.protocol.proof import Signer
 from companion.ground.station.command_sender import Failed, Sent, ack_text
 from companion.ground.station.station import Station
 from companion.ground.station.text_view import Notice, StationStatus, render, status_line
 from companion.ground.station.vehicles import ReceivedRecord, Vehicle
+from companion.model.types import OperatorCommand
 from companion.runtime.console import terminal_console
 from companion.runtime.tasks import until_first
 
@@ -30,8 +31,8 @@ LINE_PERIOD_S = 1.0
 CONFIRM_S = 3.0
 """Time within which the key of a command that needs confirmation must be pressed again."""
 KEYS_MAX = 100
-IMMEDIATE_KEYS = {"h": CommandName.HOLD, "l": CommandName.LAND, "a": CommandName.ABORT}
-CONFIRMED_KEYS = {"r": CommandName.RESUME, "s": CommandName.START}
+IMMEDIATE_KEYS = {"h": OperatorCommand.HOLD, "l": OperatorCommand.LAND, "a": OperatorCommand.ABORT}
+CONFIRMED_KEYS = {"r": OperatorCommand.RESUME, "s": OperatorCommand.START}
 
 
 async def watch_in_terminal(access: BrokerAccess, signer: Signer | str, only: str | None) -> None:
@@ -73,7 +74,7 @@ class _Screen:
         self._console = console
         self._notices: deque[Notice] = deque(maxlen=10)
         self._chosen: str | None = None
-        self._unconfirmed: tuple[CommandName, float, tuple[object, ...]] | None = None
+        self._unconfirmed: tuple[OperatorCommand, float, tuple[object, ...]] | None = None
         """Command that awaits a second key press, when the wait began, and its target at that time (`_target`)."""
         self._keys: deque[str] = deque(maxlen=KEYS_MAX)
         self._pressed = asyncio.Event()
@@ -98,7 +99,7 @@ class _Screen:
                         command = self._command(key, station)
                         vehicle = self._vehicle(station)
                         if command is not None and vehicle is not None:
-                            hold = _hold(vehicle) if command is CommandName.RESUME else None
+                            hold = _hold(vehicle) if command is OperatorCommand.RESUME else None
                             errands.create_task(station.commands.send(vehicle.name, command, self._on_progress, hold))
                     live.update(
                         render(self._vehicle(station), time.monotonic(), self._station_status(station)), refresh=True
@@ -113,7 +114,7 @@ class _Screen:
             self._chosen = there[0] if there else None
         return known.get(self._chosen) if self._chosen is not None else None
 
-    def _command(self, key: str, station: Station) -> CommandName | None:
+    def _command(self, key: str, station: Station) -> OperatorCommand | None:
         """Return the command to send for this key press. None if the key has no command or the command still needs confirmation."""
         if key == "n":
             names = sorted(station.tracker.vehicles)

@@ -31,7 +31,6 @@ from aiohttp import WSMsgType, web
 
 from companion import __version__
 from companion.ground.protocol.access import BrokerAccess
-from companion.ground.protocol.messages import CommandName
 from companion.ground.protocol.proof import Signer
 from companion.ground.station.command_sender import CommandSender, Failed, Sent
 from companion.ground.station.hub import GOING_AWAY, TOO_SLOW, VIEWERS_MAX, CloseReason, Hub, Outbox
@@ -48,6 +47,7 @@ from companion.ground.station.web_guard import (
     origin_allowed,
     same_token,
 )
+from companion.model.types import COMMANDS, OperatorCommand
 from companion.runtime.tasks import until_first
 
 PAGE = Path(__file__).parent / "page"
@@ -234,7 +234,7 @@ class Monitor:
         if self._hub is not None:
             self._hub.remove(outbox)
 
-    def send_command(self, vehicle: str, command: CommandName, hold: int | None, outbox: Outbox) -> None:
+    def send_command(self, vehicle: str, command: OperatorCommand, hold: int | None, outbox: Outbox) -> None:
         """Send a command; it is completed even if the viewer disconnects."""
         assert self._commands is not None and self._tasks is not None
         self._tasks.create_task(self._commands.send(vehicle, command, lambda note: outbox.put(_note(note)), hold))
@@ -335,15 +335,12 @@ class _Session:
                     outbox.close(CloseReason(1008, "expected a token or a command"))
                     return
 
-    def _command(self, vehicle: str, command: CommandName, hold: int | None, outbox: Outbox) -> None:
+    def _command(self, vehicle: str, command: OperatorCommand, hold: int | None, outbox: Outbox) -> None:
         why_not = self._monitor.why_not(self._token)
         if why_not is None:
             self._monitor.send_command(vehicle, command, hold, outbox)
         else:
             outbox.put(_note(Failed(vehicle, command, why_not)))
-
-
-COMMANDS = {command.value: command for command in CommandName}
 
 
 def _parsed(text: str) -> dict[str, Any] | None:
