@@ -17,6 +17,17 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from companion.model.codec import to_jsonable
+from companion.model.launcher_messages import (
+    WorldAtRest,
+    WorldEnded,
+    WorldEvent,
+    WorldFailed,
+    WorldMessage,
+    WorldProgress,
+    WorldReady,
+    WorldSlipped,
+)
 from companion.runtime.event_loop import fine_loop
 from companion.runtime.realtime import WORLD_PRIORITY, claim_realtime, collect_no_garbage
 from companion.runtime.simulated_time import Page
@@ -36,9 +47,11 @@ after a flight with faults or several throws.
 """
 
 
-def _send(message: dict[str, Any]) -> None:
+def _send(message: WorldMessage) -> None:
     with contextlib.suppress(OSError):  # the launcher is gone; standard input ends too
-        os.write(1, json.dumps(message).encode() + b"\n")  # unbuffered, so that nothing is flushed into a closed pipe
+        os.write(
+            1, json.dumps(to_jsonable(message)).encode() + b"\n"
+        )  # unbuffered, so that nothing is flushed into a closed pipe
 
 
 async def _serve(
@@ -50,7 +63,7 @@ async def _serve(
     px4 = None
     if px4_folder is not None:
         airframe = config.vehicle.airframe
-        px4 = RealPx4(airframe, config.world, px4_folder, lambda text: on_message({"type": "progress", "text": text}))
+        px4 = RealPx4(airframe, config.world, px4_folder, lambda text: on_message(WorldProgress(text)))
     pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
     sitl = Sitl(config.vehicle, config.world, pose, ports, on_message, px4, keeper)
     loop = asyncio.get_running_loop()
@@ -60,7 +73,7 @@ async def _serve(
 
         def on_ready() -> None:
             if for_launcher:
-                _send({"type": "ready", "devices": devices, "flight_environment": sitl.flight_environment()})
+                _send(WorldReady(devices, sitl.flight_environment()))
             else:
                 _print_addresses(devices, px4)
 
@@ -79,7 +92,7 @@ def _send_final(sitl: Sitl, truth_file: Path | None) -> None:
     if truth_file is not None:
         with contextlib.suppress(OSError):  # the flight's folder may be missing or the disk full
             truth_file.write_text(json.dumps(sitl.ground_truth()), encoding="utf-8")
-    _send({"type": "final", "world": sitl.final()})
+    _send(WorldEnded(sitl.final()))
 
 
 def _end_with_launcher(sitl: Sitl) -> None:
@@ -99,19 +112,17 @@ def _end_with_launcher(sitl: Sitl) -> None:
     loop.add_reader(descriptor, on_input)
 
 
-def _print_message(message: dict[str, Any]) -> None:
-    if message["type"] == "event":
-        print(f"  t = {message['t_s']:7.2f} s  payload {message['kind']}", flush=True)
-    elif message["type"] == "progress":
-        print(f"  {message['text']}", file=sys.stderr, flush=True)
-    elif message["type"] == "slipped":
-        print(
-            f"  this computer is busy: the world has paused for {message['slipped_s']:.1f} s in all",
-            file=sys.stderr,
-            flush=True,
-        )
-    elif message["type"] == "at_rest":
-        print("  disarmed" if message["at_rest"] else "  armed", flush=True)
+def _print_message(message: WorldMessage) -> None:
+    match message:
+        case WorldEvent():
+            print(f"  t = {message.t_s:7.2f} s  payload {message.kind}", flush=True)
+        case WorldProgress():
+            print(f"  {message.text}", file=sys.stderr, flush=True)
+        case WorldSlipped():
+            text = f"this computer is busy: the world has paused for {message.slipped_s:.1f} s in all"
+            print(f"  {text}", file=sys.stderr, flush=True)
+        case WorldAtRest():
+            print("  disarmed" if message.at_rest else "  armed", flush=True)
 
 
 def _print_addresses(devices: dict[str, dict[str, Any]], px4: RealPx4 | None) -> None:
@@ -159,7 +170,7 @@ def main(argv: list[str] | None = None) -> int:
     except (OSError, LinkError, FaultError, Px4Error) as error:
         text = f"sitl: {error}"
         if arguments.for_launcher:
-            _send({"type": "error", "text": text})
+            _send(WorldFailed(text))
         else:
             print(text, file=sys.stderr)
         return 3

@@ -17,6 +17,7 @@ from typing import Any
 
 from companion.config.device_plugins import DYNAMIXEL, NATNET, RFT60
 from companion.config.vehicle import Vehicle
+from companion.model.launcher_messages import WorldAtRest, WorldEvent, WorldMessage, WorldProgress, WorldSlipped
 from companion.model.types import IDENTITY_QUAT, Joints, Vec2
 from companion.sitl_config.faults import FaultKind
 from companion.sitl_config.world import World as WorldConfig
@@ -48,7 +49,7 @@ _LEAVE_S = 30.0
 SLIP_REPORTED_S = 0.1
 """A world in real time reports its pauses each time that they have grown by this much."""
 
-OnMessage = Callable[[dict[str, Any]], None]
+OnMessage = Callable[[WorldMessage], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +213,7 @@ class Sitl:
                 if "type" in addresses.get(name, ()):
                     ours, theirs = addresses[name]["type"], getattr(device, name).type
                     text = f"devices.{name}.type: the simulated world has a {ours}, which is used in place of {theirs}"
-                    self._on_message({"type": "progress", "text": text})
+                    self._on_message(WorldProgress(text))
             yield addresses
 
     def _natnet_server(self) -> NatNetServer:
@@ -327,7 +328,7 @@ class Sitl:
                 self.slipped_s += behind_s - CATCH_UP_S
                 if self.slipped_s >= self._slip_reported_s + SLIP_REPORTED_S:
                     self._slip_reported_s = self.slipped_s
-                    self._on_message({"type": "slipped", "slipped_s": self.slipped_s})
+                    self._on_message(WorldSlipped(self.slipped_s))
                 self.autopilot.skip(behind_s - CATCH_UP_S)
                 behind_s = CATCH_UP_S
             for _ in range(int(behind_s / PHYSICS_DT_S)):
@@ -367,11 +368,11 @@ class Sitl:
         if self.flight.watch(plant.t_s, *observed, armed):
             self.flight.sample(plant.truth.position_world_m, plant.truth.attitude_wxyz)
         for event in plant.world.take_events():
-            self._on_message({"type": "event", "kind": event.kind, "t_s": event.t_s})
+            self._on_message(WorldEvent(event.kind, event.t_s))
         at_rest = not armed
         if at_rest != self._at_rest:
             self._at_rest = at_rest
-            self._on_message({"type": "at_rest", "at_rest": at_rest})
+            self._on_message(WorldAtRest(at_rest))
 
     def _hold_arm(self, hand: ArmHandling) -> None:
         servos, world = self.servos, self.plant.world

@@ -12,7 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from rich.console import Console
 from rich.markup import escape
@@ -33,6 +33,7 @@ from companion.launcher.sitl_process import SitlProcess
 from companion.mission.plan import Plan
 from companion.model.check_row import Level, Row, refusals
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.launcher_messages import WorldMessage, WorldProgress
 from companion.model.observations import Observations
 from companion.plugins import CONTROL_LAWS, find
 from companion.preflight import run as preflight
@@ -189,12 +190,12 @@ class _Line:
         if self._status is not None:
             self._status.update(f"companion check: {escape(text)}")
 
-    def world(self, message: dict[str, Any]) -> None:
+    def world(self, message: WorldMessage) -> None:
         """Show a message of the simulated world during its start."""
-        if message.get("type") == "progress":
+        if isinstance(message, WorldProgress):
             if self._status is None:
-                print_error(f"companion check: {message['text']}")
-            self(str(message["text"]))
+                print_error(f"companion check: {message.text}")
+            self(message.text)
 
     def stop(self) -> None:
         """Remove the line."""

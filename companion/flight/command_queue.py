@@ -9,6 +9,7 @@ import socket
 from collections.abc import Callable, Coroutine, Iterable, Iterator
 from typing import Any, NamedTuple, TypeVar
 
+from companion.model.launcher_messages import Land
 from companion.model.types import (
     COMMANDS,
     SAFER_COMMANDS,
@@ -174,5 +175,5 @@ class Operator:
                     asyncio.get_running_loop().remove_reader(self._channel)
                     self._land.set()
                     return
-                if message.get("type") == "land":
+                if isinstance(message, Land):
                     self._land.set()

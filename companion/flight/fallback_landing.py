@@ -9,6 +9,7 @@ from typing import Protocol
 from companion.config.loader import FlightConfig
 from companion.flight.heartbeat import FlightGuard
 from companion.model.flight_stage import flown_by_pilot
+from companion.model.launcher_messages import HandedOver
 from companion.model.types import AutopilotRequest, AutopilotStatus, Outcome
 from companion.runtime import ipc
 from companion.runtime.clock import Clock
@@ -55,7 +56,7 @@ async def land_without_core(
             start_s = clock()
         else:
             autopilot.request(AutopilotRequest.LAND)
-        ipc.send(channel, {"type": "handed over"})
+        ipc.send(channel, HandedOver())
         if guardian is not None:
             guardian.still_here()
         await asyncio.sleep(0.05)

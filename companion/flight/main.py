@@ -34,6 +34,17 @@ from companion.io.devices import Devices, open_devices
 from companion.io.protocols import DeviceError
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.exit_codes import EXIT_CODES, EXIT_INTERNAL, EXIT_REFUSED
+from companion.model.launcher_messages import (
+    CommandDone,
+    FlightEnded,
+    FlightEvent,
+    GroundText,
+    Px4Text,
+    Recorded,
+    RefusedFlight,
+    Started,
+    Status,
+)
 from companion.model.types import (
     AutopilotRequest,
     Event,
@@ -219,8 +230,10 @@ class Flight:
     def _tell_asker(self, asked: GroundCommand, accepted: bool, text: str, after: Outputs) -> None:
         about = (asked.nonce, asked.operator, asked.command)
         self._recorder.client.ack(*about, accepted, text, after.t_s, after.phase, after.action)
-        message = {"operator": asked.operator, "command": asked.command.value, "accepted": accepted, "text": text}
-        ipc.send(self._channel, {"type": "command", "t_s": after.mission_t_s, **message})
+        done = CommandDone(
+            mission_t_s=after.mission_t_s, operator=asked.operator, command=asked.command, accepted=accepted, text=text
+        )
+        ipc.send(self._channel, done)
 
     def _goes_on(self, outputs: Outputs) -> bool:
         """Report how a flight with a PX4 that was found armed goes on. Return False if PX4 has disarmed since, which ends the
@@ -249,16 +262,16 @@ class Flight:
         self._phase = outputs.phase
         for text in self._devices.autopilot.take_messages():
             self._recorder.client.text(outputs.t_s, Severity.WARNING, "px4", text)
-            ipc.send(self._channel, {"type": "px4", "text": text})
+            ipc.send(self._channel, Px4Text(text))
         if self._devices.ground is not None:
             for text in self._devices.ground.take_messages():
                 self._tell_forwarding(outputs.t_s, text)
         self._report_ground()
-        ipc.send(self._channel, self._status(tick, outputs, sent))
+        ipc.send(self._channel, status_of(outputs, sent))
 
     def _tell_forwarding(self, t_s: float, text: str) -> None:
         self._recorder.client.text(t_s, Severity.INFO, "ground", text)
-        ipc.send(self._channel, {"type": "ground", "text": text})
+        ipc.send(self._channel, GroundText(text))
 
     def _report_ground(self) -> None:
         """Report the state of the link to ground stations when it changes."""
@@ -271,42 +284,38 @@ class Flight:
         )
         if ground != self._ground:
             self._ground = ground
-            ipc.send(self._channel, {"type": "ground", "text": ground})
+            ipc.send(self._channel, GroundText(ground))
 
     def _tell(self, tick: int, outputs: Outputs, event: Event) -> None:
-        message = {
-            "type": "event",
-            "tick": tick,
-            "t_s": outputs.mission_t_s,
-            "flight_t_s": event.t_s,
-            "id": event.id,
-            "severity": event.severity.value,
-            "action": event.action.value,
-            "text": event.text,
-        }
+        message = FlightEvent(
+            tick=tick,
+            t_s=event.t_s,
+            mission_t_s=outputs.mission_t_s,
+            id=event.id,
+            severity=event.severity,
+            action=event.action,
+            text=event.text,
+        )
         ipc.send(self._channel, message)
 
-    def _status(self, tick: int, outputs: Outputs, sent: Sent) -> ipc.Message:
-        error = outputs.control.error if outputs.control else None
-        reference = outputs.reference
-        return {
-            "type": "status",
-            "tick": tick,
-            "t_s": outputs.t_s,
-            "mission_t_s": outputs.mission_t_s,
-            "phase": outputs.phase,
-            "kind": outputs.phase_kind.value,
-            "progress": outputs.progress,
-            "action": outputs.action.value,
-            "error_m": math.hypot(*error[0:3]) if error else None,
-            "position_m": [r + e for r, e in zip(reference.position_world_m, error[0:3], strict=True)]
-            if reference and error
-            else None,
-            "thrust": outputs.attitude.thrust if outputs.attitude else None,
-            "lateness_ms": sent.lateness_s * 1e3,
-            "missed": self._missed,
-            "dropped": self._recorder.client.dropped,
-        }
+
+def status_of(outputs: Outputs, sent: Sent) -> Status:
+    """Return what the launcher displays of one tick."""
+    position_error_m = outputs.control.error[0:3] if outputs.control else None
+    position_world_m = None
+    if outputs.reference and position_error_m:
+        (x, y, z), (e_x, e_y, e_z) = outputs.reference.position_world_m, position_error_m
+        position_world_m = (x + e_x, y + e_y, z + e_z)
+    return Status(
+        mission_t_s=outputs.mission_t_s,
+        phase=outputs.phase,
+        kind=outputs.phase_kind,
+        progress=outputs.progress,
+        action=outputs.action,
+        error_m=math.hypot(*position_error_m) if position_error_m else None,
+        position_world_m=position_world_m,
+        lateness_s=sent.lateness_s,
+    )
 
 
 def _claim_computer(config: FlightConfig) -> str:
@@ -391,7 +400,7 @@ async def fly(
                 raise
             print(error, file=sys.stderr)  # no log, but a landing
             outcome = await land_without_core(devices.autopilot, channel, clock, None)
-            ipc.send(channel, {"type": "result", "outcome": outcome.value, "recorder": None})
+            ipc.send(channel, FlightEnded(outcome))
             return outcome
         try:
             if not devices.found_armed:
@@ -405,9 +414,8 @@ async def fly(
             flight = Flight(config, devices, recorder, channel, operator, clock, guardian)
             got = _claim_computer(config)
             recorder.client.metadata("realtime", {"got": got})
-            kind = "real" if simulated_time.current() is None else "simulated"
-            started = {"type": "started", "recorder_pid": recorder.process.pid, "realtime": got, "clock": kind}
-            ipc.send(channel, started)
+            simulated = simulated_time.current() is not None
+            ipc.send(channel, Started(recorder_pid=recorder.process.pid, realtime=got, simulated=simulated))
             try:
                 outcome = await flight.run()
             except Exception:  # after any error the vehicle may be in the air
@@ -424,8 +432,7 @@ async def fly(
                 guardian.goodbye(devices.autopilot.status())
         finally:
             report = await asyncio.to_thread(recorder.finish)
-        recorded = {"samples": report.samples, "dropped": report.dropped, "error": report.error}
-        ipc.send(channel, {"type": "result", "outcome": outcome.value, "recorder": recorded})
+        ipc.send(channel, FlightEnded(outcome, Recorded(report.samples, report.dropped, report.error)))
     return outcome
 
 
@@ -449,14 +456,14 @@ def main(argv: list[str] | None = None) -> int:
         guardian = socket.socket(fileno=arguments.guardian)
         outcome = run(fly(config, arguments.out, channel, guardian, sitl=arguments.sitl))
     except DeviceError as error:
-        ipc.send(channel, {"type": "refused", "lines": str(error).splitlines(), "device_failed": True})
+        ipc.send(channel, RefusedFlight(tuple(str(error).splitlines()), device_failed=True))
         return EXIT_REFUSED
     except Refused as refused:
-        ipc.send(channel, {"type": "refused", "lines": refused.lines})
+        ipc.send(channel, RefusedFlight(tuple(refused.lines)))
         return EXIT_REFUSED
     except StartCancelled:
         outcome = Outcome.ABORTED
-        ipc.send(channel, {"type": "result", "outcome": outcome.value, "recorder": None})
+        ipc.send(channel, FlightEnded(outcome))
     return EXIT_CODES[outcome]
 
 

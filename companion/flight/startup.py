@@ -14,6 +14,7 @@ from companion.io.devices import Devices
 from companion.io.protocols import Autopilot, DeviceError
 from companion.mission.plan import Plan
 from companion.model.check_row import Row, refusals
+from companion.model.launcher_messages import PreflightDone, PreflightProgress
 from companion.model.observations import Observations
 from companion.model.types import Vec3
 from companion.preflight import run as preflight
@@ -69,13 +70,13 @@ async def check_before_flight(
     """
 
     def report(text: str, share: float) -> None:
-        ipc.send(channel, {"type": "preflight_progress", "text": text, "share": share})
+        ipc.send(channel, PreflightProgress(text, share))
 
     # A path takes seconds to plan, once in a process: here, while motion capture keeps flowing.
     plan = await asyncio.to_thread(Plan.build, config.mission, config.vehicle)
     known = Observations(start_s=0.0, duration_s=0.0, mission_s=plan.duration_s)
     rows, params = await preflight.preflight(devices, config, clock, out=out, progress=report, known=known, sitl=sitl)
-    ipc.send(channel, {"type": "preflight", "rows": [row.as_json() for row in rows]})
+    ipc.send(channel, PreflightDone(tuple(rows)))
     try:
         preflight.write(rows, out)
     except OSError as error:

@@ -17,8 +17,6 @@ from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 HEARTBEAT, RECORDER_CHANNEL, READY, PROBLEM = b"B", b"A", b"R", b"P"
 """Datagram types, given by the first byte."""
 READY_PERIOD_S = 0.1
-HANG_TEXT = "the flight process hangs"
-"""First words of the `guardian_took_over` text when the flight process hung; other texts mean that it died."""
 MAX_BYTES = 1024
 
 _Byte = Annotated[int, Meta(ge=0, le=255)]

@@ -33,7 +33,6 @@ class Link:
         self._autopilot_system = autopilot_system
         self._encoder = mavlink.MAVLink(None, srcSystem=own[0], srcComponent=own[1])
         self._decoder = self._new_decoder()
-        self.poses_sent = 0
 
     @staticmethod
     def _new_decoder() -> Any:
@@ -90,7 +89,6 @@ class Link:
                 usec, *position_ned_m, *euler_rad, _COVARIANCE_FROM_PARAMS, 0
             )
         )
-        self.poses_sent += 1
 
     def send_request(self, request: AutopilotRequest) -> None:
         """Send the MAVLink command of a request."""

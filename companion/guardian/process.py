@@ -28,6 +28,7 @@ from companion.guardian.takeover_landing import Notice, TakeoverLanding
 from companion.io.px4.wire import OpenWire, is_udp, open_wire
 from companion.io.reopening import Reopening
 from companion.model.codec import to_packet
+from companion.model.launcher_messages import FlightEvent, GuardianEnded, GuardianStatus, TookOver
 from companion.model.packets import LogLine
 from companion.model.types import SafetyAction, Severity
 from companion.runtime import ipc, simulated_time
@@ -135,6 +136,7 @@ class Guardian:
         self._reopening: Reopening[OpenWire] | None = None
         """Attempts to open a lost link again; None while it is open."""
         self._silent_s = 0.0
+        self._flight_hangs = False
         """Longest silence while the rotors might turn."""
 
     def run(self) -> int:
@@ -181,7 +183,8 @@ class Guardian:
             hangs = watch.update(now_s, heard or not lifting)
             self._silent_s = max(self._silent_s, watch.silent_s)
             if hangs:
-                return f"{heartbeat.HANG_TEXT} (silent for {watch.silent_s * 1e3:.0f} ms)"
+                self._flight_hangs = True
+                return f"the flight process hangs (silent for {watch.silent_s * 1e3:.0f} ms)"
             if now_s - status_s >= heartbeat.READY_PERIOD_S:
                 status_s = now_s
                 self._heartbeats.send_status(self._readiness_problem(now_s, last))
@@ -207,6 +210,7 @@ class Guardian:
     def _take_over(self, last: Heartbeat, reason: str) -> bool:
         """Kill the flight process, open its link and land; return whether the vehicle has landed."""
         self._flight.kill()
+        ipc.send(self._channel, TookOver(self._flight_hangs))
         gone = self._flight.wait(KILL_TIMEOUT_S)
         now_s = monotonic() - last.origin_s
         text = f"{reason}; the guardian has taken over" + (
@@ -215,7 +219,7 @@ class Guardian:
         self._publish(last, Notice(now_s, "guardian_took_over", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
         link = self._open_link(last)
         if link is None:
-            self._send_result(last, False, None)
+            self._send_result(False, None)
             return False
         try:
             return self._land(last, link)
@@ -235,7 +239,7 @@ class Guardian:
                 return Link(wire, (last.own_system, last.own_component), last.autopilot_system)
             if monotonic() > deadline_s:
                 return None
-            self._send_status(0)
+            self._send_status()
             simulated_time.wait(select.poll(), PERIOD_S, data=False)
 
     def _open_wire(self, last: Heartbeat) -> OpenWire:
@@ -307,8 +311,8 @@ class Guardian:
                 step_s = now_s
                 with self._contain_errors(last, landing, "the landing"):
                     landing.step(t_s)
-            self._send_status(link.poses_sent)
-        self._send_result(last, landing.landed, landing)
+            self._send_status()
+        self._send_result(landing.landed, landing)
         return landing.landed
 
     @contextlib.contextmanager
@@ -329,27 +333,25 @@ class Guardian:
             if what == "the landing":
                 landing.restart(t_s)
 
-    def _send_status(self, poses_sent: int) -> None:
+    def _send_status(self) -> None:
         """Send a status message to the launcher, twice a second."""
         now_s = monotonic()
         if now_s - self._status_s >= STATUS_PERIOD_S:
             self._status_s = now_s
-            ipc.send(self._channel, {"type": "guardian_status", "poses_sent": poses_sent})
+            ipc.send(self._channel, GuardianStatus())
 
     def _publish(self, last: Heartbeat, notice: Notice) -> None:
         """Send a notice to the launcher and to the log."""
         mission_t_s = last.mission_t_s + notice.t_s - last.t_s if last.mission_t_s else 0.0
-        message = {
-            "type": "event",
-            "source": "guardian",
-            "tick": last.tick,
-            "t_s": mission_t_s,
-            "flight_t_s": notice.t_s,
-            "id": notice.id,
-            "severity": notice.severity.value,
-            "action": notice.action.value,
-            "text": notice.text,
-        }
+        message = FlightEvent(
+            tick=last.tick,
+            t_s=notice.t_s,
+            mission_t_s=mission_t_s,
+            id=notice.id,
+            severity=notice.severity,
+            action=notice.action,
+            text=notice.text,
+        )
         ipc.send(self._channel, message)
         _log_line(f"{notice.t_s:.3f} {notice.id}: {notice.text}")
         if self._heartbeats.recorder is not None:
@@ -357,16 +359,8 @@ class Guardian:
             with contextlib.suppress(OSError):
                 self._heartbeats.recorder.send(packet, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
 
-    def _send_result(self, last: Heartbeat, landed: bool, landing: TakeoverLanding | None) -> None:
-        pose = landing.pose if landing is not None else None
-        message = {
-            "type": "guardian_result",
-            "landed": landed,
-            "overturned": landing is not None and landing.overturned,
-            "took_over_position_m": list(last.position_world_m),
-            "position_m": None if pose is None else list(pose.position_world_m),
-        }
-        ipc.send(self._channel, message)
+    def _send_result(self, landed: bool, landing: TakeoverLanding | None) -> None:
+        ipc.send(self._channel, GuardianEnded(landed, landing is not None and landing.overturned))
 
 
 def _log_line(text: str) -> None:

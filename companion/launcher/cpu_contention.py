@@ -11,10 +11,9 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from companion.model.check_row import Level
-from companion.model.types import SafetyAction, Severity
+from companion.model.check_row import refusals
+from companion.model.launcher_messages import FlightEvent, Message, PreflightDone, RefusedFlight, Status
 
 WAIT_MAX = 0.15
 """Fraction of the time that a process may wait for a core before it responds too late."""
@@ -98,11 +97,10 @@ class CpuContention:
         while now_s - self._samples[0][0] > WINDOW_S:
             self._samples.popleft()
 
-    def on_message(self, message: Mapping[str, Any], now_s: float) -> str | None:
+    def on_message(self, message: Message, now_s: float) -> str | None:
         """Process a message of the flight or the guardian; return the contention message when it is first known, else None."""
-        kind = message.get("type")
-        if kind == "status":
-            self._late_s.append((now_s, message["lateness_ms"] * 1e-3))
+        if isinstance(message, Status):
+            self._late_s.append((now_s, message.lateness_s))
             while now_s - self._late_s[0][0] > WINDOW_S:
                 self._late_s.popleft()
         elif self.message is None and _late(message):
@@ -127,11 +125,12 @@ class CpuContention:
         return late_s[int(0.99 * (len(late_s) - 1))] if late_s else 0.0
 
 
-def _late(message: Mapping[str, Any]) -> bool:
-    if message.get("type") == "event":
-        lands = SafetyAction(message["action"]).rank >= SafetyAction.LAND.rank
-        return message["id"] in CAUSED_BY_LATENESS and (lands or message["severity"] == Severity.CRITICAL.value)
-    if message.get("type") == "preflight":
-        refused = (row for row in message["rows"] if not row["ok"] and row["level"] == Level.REFUSE.value)
-        return any(row["id"] in CAUSED_BY_LATENESS for row in refused)
-    return message.get("type") == "refused" and bool(message.get("device_failed"))
+def _late(message: Message) -> bool:
+    match message:
+        case FlightEvent():
+            return message.id in CAUSED_BY_LATENESS and message.ends_flight
+        case PreflightDone():
+            return any(row.id in CAUSED_BY_LATENESS for row in refusals(message.rows))
+        case RefusedFlight():
+            return message.device_failed
+    return False

@@ -9,8 +9,8 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
+from companion.model.launcher_messages import FlightEvent, GuardianEnded, Message, TookOver
 from companion.model.types import Outcome
 from companion.runtime import ipc
 from companion.runtime.subprocesses import holds_traceback, how_it_ended, last_line, remove_file, terminate, write_text
@@ -70,8 +70,9 @@ class GuardianProcess:
             os.close(pidfd)
         self._pid_file = out / "guardian.pid"
         write_text(self._pid_file, str(self.process.pid))
-        self.events: list[ipc.Message] = []
-        self.result: ipc.Message | None = None
+        self.events: list[FlightEvent] = []
+        self.takeover: TookOver | None = None
+        self.result: GuardianEnded | None = None
         self.open = True
         """Whether the guardian's end of the channel is open."""
         self._heard_s = time.monotonic()
@@ -79,7 +80,7 @@ class GuardianProcess:
     @property
     def took_over(self) -> bool:
         """Whether the guardian has taken over the vehicle."""
-        return bool(self.events)
+        return self.takeover is not None
 
     @property
     def outcome(self) -> Outcome | None:
@@ -88,9 +89,9 @@ class GuardianProcess:
             return None
         return outcome_of(self.result)
 
-    def receive(self) -> list[ipc.Message]:
+    def receive(self) -> list[Message]:
         """Return the messages since the last call; never waits."""
-        heard: list[ipc.Message] = []
+        heard: list[Message] = []
         while self.open:
             try:
                 message = ipc.receive(self.channel)
@@ -101,10 +102,13 @@ class GuardianProcess:
                 break
             self._heard_s = time.monotonic()
             heard.append(message)
-            if message.get("type") == "event":
-                self.events.append(message)
-            elif message.get("type") == "guardian_result":
-                self.result = message
+            match message:
+                case TookOver():
+                    self.takeover = message
+                case FlightEvent():
+                    self.events.append(message)
+                case GuardianEnded():
+                    self.result = message
         return heard
 
     def hangs(self) -> bool:
@@ -131,24 +135,13 @@ class GuardianProcess:
             return f"guardian: an internal error was logged{last_line(self.log)}; see {self.log}"
         return None
 
-    def summary_events(self) -> list[dict[str, Any]]:
-        """Return the guardian's events in the format of summary.json."""
-        return [
-            {
-                "t_s": event["flight_t_s"],
-                "mission_t_s": event["t_s"],
-                **{key: event[key] for key in ("id", "severity", "action", "text")},
-            }
-            for event in self.events
-        ]
 
-
-def outcome_of(result: ipc.Message | None) -> Outcome:
+def outcome_of(result: GuardianEnded | None) -> Outcome:
     """Return the outcome of a flight that the guardian took over.
 
     Args:
-        result: the guardian's `guardian_result` message; None if it sent none.
+        result: the guardian's last message; None if it sent none.
     """
-    if result is None or not result["landed"]:
+    if result is None or not result.landed:
         return Outcome.LOST
-    return Outcome.CRASHED if result["overturned"] else Outcome.ABORTED
+    return Outcome.CRASHED if result.overturned else Outcome.ABORTED

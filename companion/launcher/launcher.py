@@ -15,18 +15,33 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
+
 from companion.config.loader import FlightConfig
-from companion.guardian.heartbeat import HANG_TEXT
 from companion.launcher.cpu_contention import CpuContention
 from companion.launcher.guardian_process import GuardianProcess
 from companion.launcher.shared_time import SharedTime
 from companion.launcher.sitl_process import SitlProcess
 from companion.model.exit_codes import EXIT_CODES
+from companion.model.launcher_messages import (
+    AnyMessage,
+    Busy,
+    FlightEnded,
+    FlightEvent,
+    Land,
+    Message,
+    Pace,
+    Px4Text,
+    RefusedFlight,
+    Started,
+    Status,
+    Unreadable,
+)
 from companion.model.types import Outcome, PhaseKind, SafetyAction, Severity
 from companion.runtime import ipc
 from companion.runtime.cores import keep_off
@@ -52,7 +67,7 @@ GUARDIAN_EXIT_TIMEOUT_S = 5.0
 """Time allowed for a guardian that has not taken over to exit after the flight process has ended."""
 RECORDER_CLOSE_TIMEOUT_S = 10.0
 
-OnMessage = Callable[[ipc.Message], None]
+OnMessage = Callable[[AnyMessage], None]
 Sitl = Literal["stub", "px4"]
 """Autopilot of the simulated world."""
 
@@ -102,7 +117,7 @@ class Launcher:
         out: existing folder for all files of the flight.
         sitl: autopilot of the simulated world; None for hardware.
         speed: simulated seconds in a second of real time at most, with SITL; None for a flight in real time.
-        on_message: called with every message of the flight process, for the display; messages of the world have "source": "sitl".
+        on_message: called with every message of the processes, for the display.
     """
 
     def __init__(
@@ -120,8 +135,8 @@ class Launcher:
         self._on_message = on_message
         self._stop_requested = False
         self._channel: socket.socket | None = None
-        self._result: dict[str, Any] | None = None
-        self._refused: list[str] | None = None
+        self._result: FlightEnded | None = None
+        self._refused: Sequence[str] | None = None
         self._critical_events: list[tuple[int, str]] = []
         """Tick and text of the events that end a flight; those of the first tick are the cause, later ones its consequences."""
         self._events: list[dict[str, Any]] = []
@@ -138,7 +153,7 @@ class Launcher:
         """Request a landing (Ctrl-C); repeated requests change nothing."""
         self._stop_requested = True
         if self._channel is not None:
-            ipc.send(self._channel, {"type": "land"})
+            ipc.send(self._channel, Land())
 
     def run(self) -> FlightResult:
         """Run the flight. Call it inside `landing_signals(launcher.request_landing)`.
@@ -156,9 +171,7 @@ class Launcher:
                 if self._speed is not None:
                     self._time = SharedTime(self._speed)
                 sitl = SitlProcess(self._config, self._out, self._time, px4=self._sitl == "px4")
-                config = replace_device_settings(
-                    config, sitl.devices(self._on_world_message, lambda: self._stop_requested)
-                )
+                config = replace_device_settings(config, sitl.devices(self._on_message, lambda: self._stop_requested))
             path = self._out / "config.json"
             write_text(path, config.model_dump_json(indent=1))
             # TMPDIR of the flight process: MAVSDK keeps folders there, and leaves them when it is killed.
@@ -180,20 +193,17 @@ class Launcher:
         world = sitl.final if sitl is not None else {}
         if world.get("crashed") and outcome is not Outcome.REFUSED:
             outcome = Outcome.CRASHED
-        recorder = self._result.get("recorder") if self._result else None
-        events = tuple(self._guardian.summary_events()) if self._guardian is not None else ()
+        recorded = self._result.recorded if self._result is not None else None
+        events = () if self._guardian is None else tuple(event.for_summary() for event in self._guardian.events)
         return FlightResult(
             outcome=outcome,
-            recorder=recorder,
+            recorder=None if recorded is None else msgspec.structs.asdict(recorded),
             world=world,
             events=tuple(self._events),
             guardian_events=events,
             pace=self._pace,
             lines=self._user_lines(outcome),
         )
-
-    def _on_world_message(self, message: dict[str, Any]) -> None:
-        self._on_message({**message, "source": "sitl"})
 
     def _fly(self, config_path: Path, sitl: SitlProcess | None, tmp: Path) -> Outcome:
         log_path = self._out / "flight.log"
@@ -261,7 +271,7 @@ class Launcher:
         elif guardian is not None and guardian.outcome is not None:
             outcome, expected = guardian.outcome, None
         elif self._result is not None and code >= 0:
-            outcome = Outcome(self._result["outcome"])
+            outcome = self._result.outcome
             expected = EXIT_CODES[outcome]
         elif self._recorder_pid is None and self._stop_requested and -code in _LAND_SIGNALS:
             outcome, expected = Outcome.ABORTED, code  # Ctrl-C reached it directly, as in `run`
@@ -294,7 +304,7 @@ class Launcher:
             Outcome.ABORTED: "the guardian landed the vehicle",
             Outcome.CRASHED: "the vehicle was flipped or tipped over, and the guardian stopped its rotors",
         }.get(guardian.outcome or Outcome.LOST, "the guardian could not confirm a landing")
-        hung = guardian.events[0]["text"].startswith(HANG_TEXT)
+        hung = guardian.takeover is not None and guardian.takeover.hangs
         what = "hung and was killed" if hung else f"{how_it_ended(code)}{last_line(log_path)}"
         return f"flight: the flight process {what}; {vehicle}; see {log_path}"
 
@@ -327,8 +337,8 @@ class Launcher:
             channels = [channel] * flight_open + [guardian.channel] * guardian.open
             readable, _, _ = select.select(channels, [], [], 0.5)
             if sitl is not None:
-                for message in sitl.messages(0.0):
-                    self._on_world_message(message)
+                for said in sitl.messages(0.0):
+                    self._on_message(said)
                 if sitl.ended:  # nothing is left to land
                     guardian.kill()
                     process.kill()
@@ -376,8 +386,8 @@ class Launcher:
 
     def _report_pace(self) -> None:
         pace = None if self._time is None or not self._flying else self._time.pace()
-        if pace is not None:
-            self._on_message({"type": "pace", "factor": pace, "speed": self._speed})
+        if pace is not None and self._speed is not None:
+            self._on_message(Pace(pace, self._speed))
 
     def _receive(self, channel: socket.socket) -> bool:
         """Handle the waiting messages of the flight process; return False if it has closed its channel."""
@@ -389,37 +399,45 @@ class Launcher:
                 self._handle(received)
         return True
 
-    def _handle(self, message: ipc.Message) -> None:
-        kind = message.get("type")
-        if kind == "result":
-            self._result = message
-        elif kind == "refused":
-            self._refused = message["lines"]
-        elif kind == "started":
-            self._recorder_pid = message["recorder_pid"]
-        elif kind == "status":
-            self._measure_pace()
-            self._flying = message["kind"] != PhaseKind.DONE.value
-        elif kind == "event":
-            fields = {key: message[key] for key in ("id", "severity", "action", "text")}
-            self._events.append({"t_s": message["flight_t_s"], "mission_t_s": message["t_s"], **fields})
-            ends = SafetyAction(message["action"]).rank >= SafetyAction.LAND.rank
-            if ends or message["severity"] == Severity.CRITICAL.value:
-                self._critical_events.append((message["tick"], message["text"]))
-        elif kind == "px4":
-            self._px4_texts.append(message["text"])
+    def _handle(self, message: Message) -> None:
+        match message:
+            case FlightEnded():
+                self._result = message
+            case RefusedFlight():
+                self._refused = message.lines
+            case Started():
+                self._recorder_pid = message.recorder_pid
+            case Status():
+                self._measure_pace()
+                self._flying = message.kind is not PhaseKind.DONE
+            case FlightEvent():
+                self._events.append(message.for_summary())
+                if message.ends_flight:
+                    self._critical_events.append((message.tick, message.text))
+            case Px4Text():
+                self._px4_texts.append(message.text)
+            case Unreadable():
+                self._failures.append(f"flight: an internal error: {message.text}")
         self._on_message(message)
         self._check_cpu_contention(message)
 
-    def _check_cpu_contention(self, message: ipc.Message) -> None:
+    def _check_cpu_contention(self, message: Message) -> None:
         """Report a busy computer together with an event that lateness may have caused."""
         text = self._cpu_contention.on_message(message, time.monotonic())
         if text is None:
             return
-        self._on_message({"type": "busy", "text": text})
-        stamps = {"t_s": message.get("flight_t_s", 0.0), "mission_t_s": message.get("t_s", 0.0)}
-        about = {"id": "computer_busy", "severity": Severity.WARNING.value, "action": SafetyAction.WARN.value}
-        self._events.append({**stamps, **about, "text": text})
+        self._on_message(Busy(text))
+        t_s, mission_t_s = (message.t_s, message.mission_t_s) if isinstance(message, FlightEvent) else (0.0, 0.0)
+        busy = FlightEvent(
+            tick=0,
+            t_s=t_s,
+            mission_t_s=mission_t_s,
+            id="computer_busy",
+            severity=Severity.WARNING,
+            action=SafetyAction.WARN,
+            text=text,
+        )
+        self._events.append(busy.for_summary())
 
     def _await_recorder(self) -> None:
         """Wait for the recorder to close the log if the flight process was killed. The recorder is not a child of this process,

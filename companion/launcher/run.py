@@ -15,7 +15,6 @@ from companion.analysis.summary import empty_summary, summarise, write_summary
 from companion.launcher.launcher import FlightResult, Launcher, Sitl, landing_signals
 from companion.model.types import Outcome
 from companion.runtime.console import FlightDisplay, print_error, print_result
-from companion.runtime.ipc import Message
 from companion.runtime.subprocesses import LaunchError
 from companion.sitl_config.loader import SitlConfig
 
@@ -48,13 +47,7 @@ def run_flight(
     title = f"{config.mission.name}: {config.controller.law} ({config.controller.preset}) on {where}"
     display = FlightDisplay(console, title)
 
-    def on_message(message: Message) -> None:
-        if message.get("type") == "progress" and message.get("source") == "sitl":
-            display.say(message["text"])
-        else:
-            display.on_message(message)
-
-    launcher = Launcher(config, out, sitl=sitl, on_message=on_message, speed=speed)
+    launcher = Launcher(config, out, sitl=sitl, on_message=display.on_message, speed=speed)
     # A second Ctrl-C after the end of a short flight must not lose the summary.
     with landing_signals(launcher.request_landing):
         with display:

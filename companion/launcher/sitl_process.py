@@ -10,9 +10,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from companion.launcher.shared_time import SharedTime
+from companion.model.codec import from_jsonable
+from companion.model.launcher_messages import WorldAtRest, WorldEnded, WorldFailed, WorldMessage, WorldReady
 from companion.runtime.subprocesses import JsonLines, LaunchError, how_it_ended, last_line, terminate, write_text
 from companion.sitl_config.loader import SitlConfig
 
@@ -70,13 +72,13 @@ class SitlProcess:
 
     def devices(
         self,
-        on_message: Callable[[dict[str, Any]], None] = lambda message: None,
+        on_message: Callable[[WorldMessage], None] = lambda message: None,
         given_up: Callable[[], bool] = lambda: False,
     ) -> dict[str, dict[str, Any]]:
         """Wait until the simulated devices are open and the autopilot can fly; return the addresses of the devices.
 
         Args:
-            on_message: called with the world's messages until then (type "progress": a line for the user).
+            on_message: called with the world's messages until then.
             given_up: polled several times per second; True cancels the wait.
 
         Raises:
@@ -94,17 +96,14 @@ class SitlProcess:
             raise LaunchError(self.exit_summary())
         raise LaunchError(f"sitl: the simulated world was not ready within {timeout_s:g} s; see {self.log}")
 
-    def _ready(
-        self, deadline_s: float, on_message: Callable[[dict[str, Any]], None]
-    ) -> dict[str, dict[str, Any]] | None:
+    def _ready(self, deadline_s: float, on_message: Callable[[WorldMessage], None]) -> dict[str, dict[str, Any]] | None:
         for message in self.messages(deadline_s):
             on_message(message)
-            if message.get("type") == "ready":
-                devices: dict[str, dict[str, Any]] = message["devices"]
-                self.flight_environment = message.get("flight_environment", {})
-                return devices
-            if message.get("type") == "error":
-                raise LaunchError(str(message["text"]))
+            if isinstance(message, WorldReady):
+                self.flight_environment = message.flight_environment
+                return message.devices
+            if isinstance(message, WorldFailed):
+                raise LaunchError(message.text)
         return None
 
     def exit_summary(self) -> str:
@@ -114,11 +113,12 @@ class SitlProcess:
             return self._error
         return f"sitl: the simulated world {how_it_ended(self.process.returncode)}{last_line(self.log)}; see {self.log}"
 
-    def messages(self, deadline_s: float) -> Iterator[dict[str, Any]]:
+    def messages(self, deadline_s: float) -> Iterator[WorldMessage]:
         """Yield the world's messages until the deadline (`time.monotonic`) or the end of the process. With deadline 0, yield only
         those that have already arrived.
         """
-        for message in self._lines.read(deadline_s):
+        for line in self._lines.read(deadline_s):
+            message: WorldMessage = from_jsonable(cast(Any, WorldMessage), line)
             self._update(message)
             yield message
 
@@ -127,13 +127,14 @@ class SitlProcess:
         """Whether the world has closed its end of the pipe, which means that it has exited or is about to."""
         return self._lines.ended
 
-    def _update(self, message: dict[str, Any]) -> None:
-        if message.get("type") == "final":
-            self.final = message["world"]
-        if message.get("type") == "error":
-            self._error = str(message["text"])
-        if message.get("type") == "at_rest":
-            self.at_rest = bool(message["at_rest"])
+    def _update(self, message: WorldMessage) -> None:
+        match message:
+            case WorldEnded():
+                self.final = message.world
+            case WorldFailed():
+                self._error = message.text
+            case WorldAtRest():
+                self.at_rest = message.at_rest
 
     def send_flight_pid(self, pid: int) -> None:
         """Send the id of the flight process to the world, which may have to kill or stop it."""

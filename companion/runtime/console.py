@@ -15,10 +15,25 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from companion.model.check_row import Level, Row
+from companion.model.check_row import Row, refusals
 from companion.model.flight_stage import Stage
+from companion.model.launcher_messages import (
+    AnyMessage,
+    Busy,
+    CommandDone,
+    FlightEvent,
+    GroundText,
+    Pace,
+    PreflightDone,
+    PreflightProgress,
+    Px4Text,
+    Started,
+    Status,
+    WorldEvent,
+    WorldProgress,
+)
 from companion.model.negative_zero import without_negative_zero
-from companion.runtime.ipc import Message
+from companion.model.types import SafetyAction, Severity
 
 
 class SteadyStream:
@@ -80,7 +95,7 @@ def print_error(text: object) -> None:
 
 SLOW_PACE = 0.8
 """Share of the wanted pace below which simulated time counts as slow."""
-_SEVERITY_STYLE = {"info": "cyan", "warning": "yellow", "critical": "bold red"}
+_SEVERITY_STYLE = {Severity.INFO: "cyan", Severity.WARNING: "yellow", Severity.CRITICAL: "bold red"}
 _OUTCOME_STYLE = {"completed": "bold green", "aborted": "bold yellow", "refused": "bold yellow"}
 
 
@@ -88,19 +103,17 @@ class _Numbers(ProgressColumn):
     """Progress column with the most important figures of the flight."""
 
     def render(self, task: Task) -> Text:
-        m: Message = task.fields.get("status") or {}
-        if not m:
+        status: Status | None = task.fields.get("status")
+        if status is None:
             return Text(task.fields.get("note") or "", no_wrap=True, overflow="ellipsis")
-        error = m.get("error_m")
-        parts = [f"t {m['mission_t_s']:5.1f} s"]
-        if error is not None:
-            parts.append(f"|e_p| {error * 100:4.1f} cm")
-        if m.get("position_m"):
-            x, y, z = m["position_m"]
+        parts = [f"t {status.mission_t_s:5.1f} s"]
+        if status.error_m is not None:
+            parts.append(f"|e_p| {status.error_m * 100:4.1f} cm")
+        if status.position_world_m is not None:
+            x, y, z = status.position_world_m
             parts.append(f"({x:+.2f} {y:+.2f} {z:.2f}) m")
-        parts.append(f"late {m['lateness_ms']:.1f} ms")
-        text = "  ".join(parts)
-        return Text(text, style="red" if m.get("action") not in ("nominal", "warn") else "")
+        parts.append(f"late {status.lateness_s * 1e3:.1f} ms")
+        return Text("  ".join(parts), style="red" if status.action.rank > SafetyAction.WARN.rank else "")
 
 
 class FlightDisplay:
@@ -132,52 +145,53 @@ class FlightDisplay:
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
-    def on_message(self, message: Message) -> None:
-        """Show one message of the flight process or of the simulated world."""
-        kind = message.get("type")
-        if kind == "status":
-            self._progress.update(
-                self._task, description=message["phase"], completed=message["progress"], status=message
-            )
-            if message["phase"] != self._phase:
-                self._phase = message["phase"]
-                if not self._console.is_terminal and self._phase != self._event:
-                    self._console.print(f"  t {message['mission_t_s']:6.2f} s  {escape(self._phase)}")
-                self._event = ""
-                if self._phase == Stage.READY.value:
-                    self.say("everything is ready; take off with: companion command start (Ctrl-C cancels the start)")
-        elif kind == "event" and message.get("source") == "sitl":
-            if message["kind"] == "rotor_touched":
+    def on_message(self, message: AnyMessage) -> None:
+        """Show one message of a process of the flight."""
+        match message:
+            case Status():
+                self._show_status(message)
+            case WorldEvent(kind="rotor_touched"):
                 self._line("", "a rotor touched a surface", "red")
-            elif message["kind"] in ("missed", "crashed"):
-                self._line(
-                    "", f"the payload was {message['kind']}" if message["kind"] == "missed" else "crashed", "red"
-                )
-        elif kind == "event":
-            self._event = message["text"]
-            self._line(f"t {message['t_s']:6.2f} s", message["text"], _SEVERITY_STYLE[message["severity"]])
-        elif kind == "preflight_progress":
-            if not self._console.is_terminal and self._phase != "preflight":
-                self._line("preflight", message["text"], "cyan")
-            self._phase = "preflight"
-            self._progress.update(self._task, description="preflight", completed=message["share"], note=message["text"])
-        elif kind == "preflight":
-            self._preflight(message["rows"])
-        elif kind == "started":
-            head = "clock" if message.get("clock") == "simulated" else "real time"
-            self._line(head, message["realtime"], "dim")
-        elif kind == "px4":
-            self._line("PX4", message["text"], "yellow")
-        elif kind == "command":
-            style = "cyan" if message["accepted"] else "yellow"
-            words = f"{message['operator']} commanded {message['command']}: {message['text']}"
-            self._line(f"t {message['t_s']:6.2f} s", words, style)
-        elif kind == "pace":
-            self._pace(message["factor"], message["speed"])
-        elif kind == "busy":
-            self._line("computer", message["text"], "yellow")
-        elif kind == "ground":
-            self._line("ground", message["text"], "cyan")
+            case WorldEvent(kind="missed"):
+                self._line("", "the payload was missed", "red")
+            case WorldEvent(kind="crashed"):
+                self._line("", "crashed", "red")
+            case WorldProgress():
+                self.say(message.text)
+            case FlightEvent():
+                self._event = message.text
+                self._line(f"t {message.mission_t_s:6.2f} s", message.text, _SEVERITY_STYLE[message.severity])
+            case PreflightProgress():
+                if not self._console.is_terminal and self._phase != "preflight":
+                    self._line("preflight", message.text, "cyan")
+                self._phase = "preflight"
+                self._progress.update(self._task, description="preflight", completed=message.share, note=message.text)
+            case PreflightDone():
+                self._preflight(message.rows)
+            case Started():
+                self._line("clock" if message.simulated else "real time", message.realtime, "dim")
+            case Px4Text():
+                self._line("PX4", message.text, "yellow")
+            case CommandDone():
+                words = f"{message.operator} commanded {message.command.value}: {message.text}"
+                self._line(f"t {message.mission_t_s:6.2f} s", words, "cyan" if message.accepted else "yellow")
+            case Pace():
+                self._pace(message.factor, message.speed)
+            case Busy():
+                self._line("computer", message.text, "yellow")
+            case GroundText(text=str(text)):
+                self._line("ground", text, "cyan")
+
+    def _show_status(self, status: Status) -> None:
+        self._progress.update(self._task, description=status.phase, completed=status.progress, status=status)
+        if status.phase == self._phase:
+            return
+        self._phase = status.phase
+        if not self._console.is_terminal and self._phase != self._event:
+            self._console.print(f"  t {status.mission_t_s:6.2f} s  {escape(self._phase)}")
+        self._event = ""
+        if self._phase == Stage.READY.value:
+            self.say("everything is ready; take off with: companion command start (Ctrl-C cancels the start)")
 
     def _pace(self, factor: float, speed: float) -> None:
         """Show how fast simulated time runs, once when it becomes slower than asked for."""
@@ -187,16 +201,15 @@ class FlightDisplay:
             self._line("computer", text, "yellow")
         self._slow = slow
 
-    def _preflight(self, rows: list[Message]) -> None:
+    def _preflight(self, rows: Sequence[Row]) -> None:
         """Show the preflight's result. The checks that refuse the flight are printed at the end, as the reason for the refusal."""
         self._progress.update(self._task, description="starting", completed=0.0, note="")
-        bad = [row for row in rows if not row["ok"]]
-        warned = [row for row in bad if row["level"] == Level.WARN.value]
-        refused = len(bad) - len(warned)
+        warned = [row for row in rows if not row.ok and not row.refuses]
+        refused = len(refusals(rows))
         told = f"{len(rows)} checks: " + (f"{refused} refused" if refused else "ok")
         self._line("preflight", told + (f", {len(warned)} warnings" if warned else ""), "red" if refused else "green")
         for row in warned:
-            self._line("", Row(**{**row, "level": Level.WARN}).line(), "yellow")
+            self._line("", row.line(), "yellow")
 
     def say(self, text: str) -> None:
         """Print one line from the launcher."""

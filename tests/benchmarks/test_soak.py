@@ -16,6 +16,7 @@ from benchmarks.soaking.processes import family, pss_mb, usage
 from benchmarks.soaking.verdict import ROLES, Sample, airborne, draw, lateness_problems, memory_growth, thirds
 from companion.analysis.log import FlightLog
 from tests.analysis.synthetic_flight import record_flight
+from tests.support import DEADLINE_S
 
 PERIOD_S = 0.005
 GOOD = {
@@ -158,6 +159,7 @@ def test_the_empty_loop_ends_when_asked_and_says_how_late_it_was(tmp_path: Path)
 import os, signal, threading
 from pathlib import Path
 from benchmarks.soaking import lateness
+from tests.support import DEADLINE_S
 ticks = []
 take = lateness.Minutes.take
 def counting(self, start_s, late_s):
@@ -168,7 +170,7 @@ def counting(self, start_s, late_s):
 lateness.Minutes.take = counting
 lateness.run_empty_loop(Path({str(out)!r}))
 """]  # fmt: skip
-    subprocess.run(command, check=True, timeout=60.0, cwd=Path(__file__).parents[2])
+    subprocess.run(command, check=True, timeout=DEADLINE_S, cwd=Path(__file__).parents[2])
     read = json.loads(out.read_text())
     assert set(read) == {"minutes", "missed", "skipped"}
     assert read["minutes"] == [], "a quarter of a second is no minute"

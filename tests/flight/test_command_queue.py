@@ -10,6 +10,7 @@ import msgspec
 import pytest
 
 from companion.flight.command_queue import WAITING_MAX, Operator, StartCancelled, Turn
+from companion.model.launcher_messages import Land
 from companion.model.types import AutopilotRequest, GroundCommand, OperatorCommand, Outputs, PhaseKind, SafetyAction
 from companion.runtime import ipc
 from tests.support import DEADLINE_S
@@ -198,7 +199,7 @@ def test_the_launchers_landing_stays_and_commands_are_still_answered(
             if gone:
                 launcher.close()
             else:
-                ipc.send(launcher, {"type": "land"})
+                ipc.send(launcher, Land())
             async with asyncio.timeout(DEADLINE_S):
                 with pytest.raises(StartCancelled):
                     await operator.unless_land(never())

@@ -16,6 +16,7 @@ from companion.flight.fallback_landing import unflown
 from companion.flight.main import Flight
 from companion.io.devices import Devices, VisionFilter
 from companion.model.estimator import EstimatorReport
+from companion.model.launcher_messages import Land
 from companion.model.observations import (
     ArmStatement,
     ForceCounts,
@@ -215,7 +216,7 @@ def test_a_flight_with_devices_of_another_make_arms_and_lands(tmp_path: Path) ->
     launcher, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     channel.setblocking(False)
     autopilot, arm = ObedientAutopilot(config, clock), OtherArm(config, clock)
-    autopilot.on_armed = lambda: ipc.send(launcher, {"type": "land"})
+    autopilot.on_armed = lambda: ipc.send(launcher, Land())
     devices = Devices(
         vision=VisionFilter(),
         autopilot=autopilot,

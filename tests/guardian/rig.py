@@ -22,10 +22,11 @@ from companion.config.loader import load_flight
 from companion.guardian import heartbeat
 from companion.guardian.heartbeat import Heartbeat
 from companion.launcher.launcher import replace_device_settings
+from companion.model.codec import from_packet
 from companion.model.frames import attitude_ned_frd_from_enu_flu, ned_from_enu
+from companion.model.launcher_messages import FlightEvent, GuardianEnded, Message
 from companion.model.packets import LogLine, Packet, read_packet
 from companion.model.types import Quat, Vec3
-from companion.runtime import ipc
 from sitl.natnet import BodyPose, NatNetServer
 from tests.io.px4_peer import Px4Peer
 from tests.support import DEADLINE_S, HOVER, free_udp_port, wait_until
@@ -108,7 +109,7 @@ class Rig:
         self.peer.attitude_ned_frd = attitude_ned_frd_from_enu_flu(ATTITUDE)
         self.origin_s = time.monotonic() - 10.0
         self.tick = 0
-        self.messages: list[ipc.Message] = []
+        self.messages: list[Message] = []
         self._disk_full = disk_full
         self.logged: list[Packet] = []
 
@@ -225,7 +226,7 @@ class Rig:
 
     def listen(self) -> None:
         """Read the messages to launcher and recorder."""
-        self.messages += map(json.loads, self._arrived(self.channel))
+        self.messages += [from_packet(Message, packet) for packet in self._arrived(self.channel)]
         self.logged += map(read_packet, self._arrived(self.recorder))
 
     def _arrived(self, opened: socket.socket) -> Iterator[bytes]:
@@ -237,7 +238,7 @@ class Rig:
     def events(self) -> list[str]:
         """Ids of the guardian's events that the launcher received."""
         self.listen()
-        return [message["id"] for message in self.messages if message["type"] == "event"]
+        return [message.id for message in self.messages if isinstance(message, FlightEvent)]
 
     @property
     def log_ids(self) -> list[str]:
@@ -246,10 +247,10 @@ class Rig:
         return [packet.source for packet in self.logged if isinstance(packet, LogLine)]
 
     @property
-    def result(self) -> ipc.Message | None:
+    def result(self) -> GuardianEnded | None:
         """The guardian's final message."""
         self.listen()
-        return next((message for message in self.messages if message["type"] == "guardian_result"), None)
+        return next((message for message in self.messages if isinstance(message, GuardianEnded)), None)
 
     def come_down(self) -> None:
         """Lower motion capture and PX4's position to standing height, slowly enough to be plausible."""

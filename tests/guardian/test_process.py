@@ -17,6 +17,7 @@ from companion.guardian.heartbeat import MAX_BYTES, PROBLEM, READY
 from companion.guardian.process import HeartbeatReceiver, main
 from companion.launcher.guardian_process import outcome_of
 from companion.model.frames import attitude_enu_flu_from_ned_frd, ned_from_enu, wrap_rad
+from companion.model.launcher_messages import FlightEvent, GuardianEnded
 from companion.model.types import Outcome
 from tests.guardian.rig import DISARMED, HOLD_MODE, LAND_MODE, OWN_IDS, POSITION_M, Rig
 from tests.support import DEADLINE_S, wait_until
@@ -89,7 +90,7 @@ def test_dead_or_hanging_in_the_air_it_takes_over_and_lands(tmp_path: Path, numb
         assert rig.events == ids
         assert outcome_of(rig.result) is Outcome.ABORTED
         assert rig.log_ids == ids, "the recorder got the same"
-        assert rig.result is not None and rig.result["landed"] is True
+        assert rig.result == GuardianEnded(landed=True, overturned=False)
         sources = {(m.get_srcSystem(), m.get_srcComponent()) for m in rig.peer.received}
         assert sources == {OWN_IDS}
         beat = rig.peer.of("HEARTBEAT")[0]
@@ -105,7 +106,7 @@ def test_a_full_disk_under_its_log_does_not_cost_the_landing(tmp_path: Path) -> 
         rig.land()
         assert rig.guardian.wait(DEADLINE_S) == 0
         assert rig.events == ["guardian_took_over", "guardian_land", "guardian_landed"]
-        assert rig.result is not None and rig.result["landed"] is True
+        assert rig.result == GuardianEnded(landed=True, overturned=False)
 
 
 def test_poses_go_on_as_the_flight_sent_them(tmp_path: Path) -> None:
@@ -333,8 +334,8 @@ def test_an_error_of_its_own_is_reported_and_the_landing_goes_on(
         rig.peer.custom_mode = LAND_MODE
         rig.peer.base_mode = DISARMED
         assert rig.guardian.wait(DEADLINE_S) == 0, rig.log.read_text()
-        assert rig.result is not None and rig.result["landed"] is True
-        errors = [message["text"] for message in rig.messages if message.get("id") == "guardian_error"]
+        assert rig.result == GuardianEnded(landed=True, overturned=False)
+        errors = [m.text for m in rig.messages if isinstance(m, FlightEvent) and m.id == "guardian_error"]
         assert len(errors) == 1, "told once"
         assert errors[0] == f"an error in {where} (ZeroDivisionError: a bug); the landing continues"
         assert "Traceback" in rig.log.read_text()

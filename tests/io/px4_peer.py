@@ -11,6 +11,8 @@ from typing import Any, Self
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from tests.support import DEADLINE_S
+
 _MARK = b"mark"
 GYRO_FRD_RAD_S = (0.11, 0.22, -0.33)
 ACCEL_FRD_M_S2 = (0.5, -0.25, -9.5)
@@ -96,7 +98,7 @@ class Px4Peer:
     def commands(self, command: int) -> list[Any]:
         return [message for message in self.of("COMMAND_LONG") if message.command == command]
 
-    def wait_for(self, name: str, count: int = 1, deadline_s: float = 20.0) -> Any:
+    def wait_for(self, name: str, count: int = 1, deadline_s: float = DEADLINE_S) -> Any:
         """Block until `count` messages of one type are there; the newest."""
         with self._changed:
             arrived = self._changed.wait_for(
@@ -111,7 +113,7 @@ class Px4Peer:
             target = self._marks + 1
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as marker:
                 marker.sendto(_MARK, self._socket.getsockname())
-            assert self._changed.wait_for(lambda: self._marks >= target, 20.0), "the peer is stuck"
+            assert self._changed.wait_for(lambda: self._marks >= target, DEADLINE_S), "the peer is stuck"
             return len(self.received)
 
     def say(self, message: Any) -> None:

@@ -10,6 +10,8 @@ from typing import Any, Self
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from tests.support import DEADLINE_S
+
 
 class GroundPeer:
     """Listens on a free port of loopback and records everything; answers whoever spoke last, as QGroundControl does."""
@@ -47,7 +49,9 @@ class GroundPeer:
         with self._changed:
             return {(system, component) for _, system, component in self._heard}
 
-    def wait_for(self, kind: str, /, component: int | None = None, deadline_s: float = 20.0, **fields: Any) -> Any:
+    def wait_for(
+        self, kind: str, /, component: int | None = None, deadline_s: float = DEADLINE_S, **fields: Any
+    ) -> Any:
         """Block until a message of the type, from the component, with these fields, is there."""
         with self._changed:
             found: list[Any] = []
@@ -70,7 +74,7 @@ class GroundPeer:
 
     def say_bytes(self, data: bytes) -> None:
         with self._changed:
-            assert self._changed.wait_for(lambda: self._partner is not None, 20.0), "nobody has spoken to us"
+            assert self._changed.wait_for(lambda: self._partner is not None, DEADLINE_S), "nobody has spoken to us"
         self._socket.sendto(data, self._partner)
 
     def settle(self) -> None:

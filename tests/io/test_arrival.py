@@ -12,7 +12,7 @@ from companion.config.loader import load_flight
 from companion.io import arrival
 from companion.io.arrival import STAMP_ROOM_BYTES, arrived_s, stamp_arrivals
 from companion.runtime.clock import flight_clock
-from tests.support import CATCH
+from tests.support import CATCH, DEADLINE_S
 
 _SO_TIMESTAMPNS = 35
 
@@ -31,7 +31,7 @@ def test_a_datagram_that_waited_is_as_old_as_it_is(monkeypatch: pytest.MonkeyPat
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
     ):
         receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(20.0)
+        receiver.settimeout(DEADLINE_S)
         stamp_arrivals(receiver)
         for _ in range(100):
             before_s = clock()

@@ -32,13 +32,13 @@ from companion.model.types import (
 )
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import ACCEL_FRD_M_S2, GYRO_FRD_RAD_S, PARAMS, POSITION_NED_M, VELOCITY_NED_M_S, Px4Peer
-from tests.support import eventually, free_udp_port, serial_line
+from tests.support import DEADLINE_S, eventually, free_udp_port, serial_line
 
 LEAN_RAD = 0.2
 DO_SET_MODE, NAV_LAND, ARM_DISARM = 176, 21, 400
 
 
-def edge(port: int, discovery_timeout_s: float = 20.0) -> MavsdkAutopilot:
+def edge(port: int, discovery_timeout_s: float = DEADLINE_S) -> MavsdkAutopilot:
     device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=discovery_timeout_s)
     return MavsdkAutopilot(device, flight_clock())
 
@@ -297,7 +297,7 @@ def test_heartbeat_loss_shows_as_an_old_stamp() -> None:
     async def fly() -> None:
         port = free_udp_port()
         clock = flight_clock()
-        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
         with Px4Peer(port) as peer:
             async with MavsdkAutopilot(device, clock) as autopilot:
                 await eventually(lambda: autopilot.status() is not None, "a heartbeat")
@@ -363,7 +363,7 @@ def test_a_repeated_request_is_one_command_and_its_refusals_are_reported_once_in
         with Px4Peer(port) as peer:
             peer.acks[ARM_DISARM] = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
             clock = flight_clock()
-            device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+            device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
             async with MavsdkAutopilot(device, clock) as autopilot:
                 start_s = clock()
 
@@ -587,7 +587,7 @@ def test_streams_without_a_reader_are_stopped(forwarding: bool, armed: bool, int
         port = free_udp_port()
         with Px4Peer(port) as peer:
             peer.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
-            device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+            device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
             async with MavsdkAutopilot(device, flight_clock(), forwarding=forwarding):
                 pass
             for unread in (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ODOMETRY):

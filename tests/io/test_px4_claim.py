@@ -126,7 +126,7 @@ class _Broadcasting(Px4Peer):
 def test_px4_that_broadcasts_until_it_has_a_partner_is_found() -> None:
     async def main() -> None:
         port = free_udp_port()
-        device = AutopilotDevice(address=f"udpin://0.0.0.0:{port}", discovery_timeout_s=20.0)
+        device = AutopilotDevice(address=f"udpin://0.0.0.0:{port}", discovery_timeout_s=DEADLINE_S)
         with _Broadcasting(port) as px4:
             async with MavsdkAutopilot(device, flight_clock()) as autopilot:
                 assert autopilot.identity().peer == px4.address

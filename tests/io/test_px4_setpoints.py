@@ -18,7 +18,7 @@ from companion.model.types import AttitudeSetpoint, FlightMode, Vec3
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import Px4Peer
 from tests.io.test_px4 import DO_SET_MODE, GOLDEN_ATTITUDES
-from tests.support import eventually, free_udp_port
+from tests.support import DEADLINE_S, eventually, free_udp_port
 
 Way = Literal["direct", "offboard"]
 WAYS: tuple[Way, ...] = get_args(Way)
@@ -27,7 +27,7 @@ LEVEL = AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.5)
 
 def edge(port: int, way: Way) -> MavsdkAutopilot:
     address = f"udpin://127.0.0.1:{port}"
-    device = AutopilotDevice(address=address, discovery_timeout_s=20.0, setpoint_path=way)
+    device = AutopilotDevice(address=address, discovery_timeout_s=DEADLINE_S, setpoint_path=way)
     return MavsdkAutopilot(device, flight_clock())
 
 

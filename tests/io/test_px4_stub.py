@@ -21,7 +21,7 @@ from companion.model.types import (
 )
 from companion.runtime.clock import Clock, flight_clock
 from tests.io.stub_rig import standing_stub
-from tests.support import eventually, free_udp_port
+from tests.support import DEADLINE_S, eventually, free_udp_port
 
 POSITION_WORLD_M = (-1.0, 0.5, 0.25)
 YAW_RAD = 0.4
@@ -68,7 +68,7 @@ class Companion:
 @asynccontextmanager
 async def companion(port: int) -> AsyncIterator[Companion]:
     clock = flight_clock()
-    device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+    device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
     async with MavsdkAutopilot(device, clock) as autopilot, asyncio.TaskGroup() as group:
         half = Companion(autopilot, clock)
         running = group.create_task(half.run())
@@ -116,10 +116,10 @@ def test_a_flight_on_the_floor_offboard_arm_land_disarm() -> None:
 def test_arming_without_a_setpoint_stream_is_refused_and_said_in_px4s_words() -> None:
     async def fly() -> None:
         port = free_udp_port()
-        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
         async with standing_stub(port) as stub, MavsdkAutopilot(device, flight_clock()) as autopilot:
             said: list[str] = []
-            async with asyncio.timeout(30.0):
+            async with asyncio.timeout(DEADLINE_S):
                 while len(set(said)) < 2:
                     autopilot.request(AutopilotRequest.ARM)
                     said += autopilot.take_messages()
@@ -136,7 +136,7 @@ def test_arming_without_a_setpoint_stream_is_refused_and_said_in_px4s_words() ->
 def test_parameters_and_firmware_of_the_stub() -> None:
     async def fly() -> None:
         port = free_udp_port()
-        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
         async with standing_stub(port) as stub, MavsdkAutopilot(device, flight_clock()) as autopilot:
             for name in ("COM_OF_LOSS_T", "EKF2_EV_CTRL"):
                 value = await autopilot.read_param(name)
@@ -150,7 +150,7 @@ def test_parameters_and_firmware_of_the_stub() -> None:
 def test_parameters_of_the_stub_at_once_and_one_written() -> None:
     async def fly() -> None:
         port = free_udp_port()
-        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
         async with standing_stub(port) as stub, MavsdkAutopilot(device, flight_clock()) as autopilot:
             stub.params.set("BAT1_CAPACITY", -1.0)
             read = await autopilot.read_params([*stub.params, "MAV_1_CONFIG"])
@@ -166,7 +166,7 @@ def test_parameters_of_the_stub_at_once_and_one_written() -> None:
 def test_the_estimator_shows_when_vision_is_fused_and_how_well() -> None:
     async def fly() -> None:
         port = free_udp_port()
-        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
         async with standing_stub(port) as stub:
             async with MavsdkAutopilot(device, flight_clock()) as autopilot:
                 assert stub.origin is not None
@@ -201,7 +201,7 @@ def test_the_streams_come_as_fast_as_they_were_asked() -> None:
             first = half.autopilot.vehicle()
             assert first is not None
             stamps = {first.imu_stamp_s}
-            async with asyncio.timeout(60.0):
+            async with asyncio.timeout(DEADLINE_S):
                 while len(stamps) < 200:
                     state = half.autopilot.vehicle()
                     assert state is not None
@@ -218,7 +218,7 @@ def test_a_flight_begins_with_no_change_of_velocity_from_before_it() -> None:
 
     async def fly() -> None:
         port = free_udp_port()
-        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
         async with standing_stub(port), MavsdkAutopilot(device, flight_clock()) as autopilot:
 
             def climbed_m_s() -> float:

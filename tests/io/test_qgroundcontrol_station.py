@@ -100,7 +100,7 @@ def outputs(tick: int = 0, phase: str = "approach", events: tuple[Event, ...] = 
 
 @asynccontextmanager
 async def link(port: int, address: str) -> AsyncIterator[tuple[MavsdkAutopilot, GroundStation]]:
-    device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
+    device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
     async with (
         MavsdkAutopilot(device, flight_clock(), forwarding=True) as autopilot,
         GroundStation(address, autopilot) as station,

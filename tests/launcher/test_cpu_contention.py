@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from companion.launcher.cpu_contention import (
     CAUSED_BY_LATENESS,
@@ -17,6 +17,9 @@ from companion.launcher.cpu_contention import (
     longest_wait,
     read_core_waits,
 )
+from companion.model.check_row import Level, Row
+from companion.model.launcher_messages import FlightEvent, Message, PreflightDone, RefusedFlight
+from companion.model.types import SafetyAction, Severity
 from companion.preflight.evaluation import CHECKS
 from companion.safety.rules import RULES
 from tests.support import wait_until
@@ -60,25 +63,29 @@ def test_every_id_that_lateness_may_cause_exists() -> None:
     assert known >= CAUSED_BY_LATENESS
 
 
-LOST = {"type": "event", "id": "arm_lost", "action": "land", "severity": "critical"}
-ROW: dict[str, Any] = {"id": "arm.reads", "ok": False, "level": "refuse"}
+LOST = FlightEvent(
+    tick=1, t_s=1.0, mission_t_s=0.0, id="arm_lost", severity=Severity.CRITICAL, action=SafetyAction.LAND, text=""
+)
+ROW = Row(id="arm.reads", title="", ok=False, read="")
+REFUSED = RefusedFlight(("arm: no joint state",), device_failed=True)
 
 
 @pytest.mark.parametrize(
     ("message", "judged"),
     [
         (LOST, True),
-        ({**LOST, "id": "guardian_took_over", "action": "autopilot_land"}, True),
-        ({**LOST, "action": "warn", "severity": "warning"}, False),
-        ({**LOST, "id": "operator_land"}, False),
-        ({"type": "preflight", "rows": [ROW]}, True),
-        ({"type": "preflight", "rows": [{**ROW, "level": "warn"}, {**ROW, "ok": True}]}, False),
-        ({"type": "preflight", "rows": [{**ROW, "id": "px4.battery"}]}, False),
-        ({"type": "refused", "lines": ["arm: no joint state"], "device_failed": True}, True),
-        ({"type": "refused", "lines": ["px4.battery: 3.2 V a cell"]}, False),
+        (replace(LOST, id="guardian_took_over", action=SafetyAction.AUTOPILOT_LAND), True),
+        (replace(LOST, action=SafetyAction.WARN, severity=Severity.WARNING), False),
+        (replace(LOST, id="operator_land"), False),
+        (PreflightDone((ROW,)), True),
+        (PreflightDone((replace(ROW, level=Level.WARN), replace(ROW, ok=True))), False),
+        (PreflightDone((replace(ROW, id="px4.battery"),)), False),
+        (REFUSED, True),
+        (RefusedFlight(("px4.battery: 3.2 V a cell",)), False),
     ],
+    ids=str,
 )
-def test_it_is_judged_when_something_happens_that_lateness_may_cause(message: dict[str, Any], judged: bool) -> None:
+def test_it_is_judged_when_something_happens_that_lateness_may_cause(message: Message, judged: bool) -> None:
     waited_s = iter([1.0, 2.2])
     monitor = CpuContention({"flight process": 7}, lambda pid: {pid: next(waited_s)})
     monitor.sample(10.0)
@@ -96,7 +103,7 @@ def test_a_process_that_has_ended_is_judged_by_its_last_sample() -> None:
     monitor = CpuContention({"flight process": 7}, lambda pid: next(reads))
     monitor.sample(10.0)
     monitor.sample(13.0)
-    line = monitor.on_message({"type": "refused", "lines": ["arm: no joint state"], "device_failed": True}, 13.0)
+    line = monitor.on_message(REFUSED, 13.0)
     assert line is not None
     assert "flight process waited 40 % of the time" in line
 

@@ -24,6 +24,7 @@ from companion.analysis.log import FlightLog
 from companion.launcher.launcher import Launcher
 from companion.launcher.sitl_process import SitlProcess
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_REFUSED
+from companion.model.launcher_messages import AnyMessage, RefusedFlight, WorldAtRest
 from companion.runtime import ipc
 from companion.sitl_config.loader import load_sitl
 from tests.runtime.test_cores import CORES, affinities
@@ -211,20 +212,20 @@ def test_process_that_cannot_start_is_named_in_one_line(tmp_path: Path, package:
 
 def test_a_flight_process_that_ends_while_the_launcher_is_busy_is_heard_to_its_last_word(tmp_path: Path) -> None:
     """Its refusal may come after `select` has returned without it, and before the launcher asks whether the process has ended."""
-    heard: list[dict[str, Any]] = []
+    heard: list[AnyMessage] = []
     launcher = Launcher(load_sitl(HOVER), tmp_path, sitl=None, on_message=heard.append)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setblocking(False)
 
     def ends() -> int:
-        ipc.send(theirs, {"type": "refused", "lines": ["because"]})
+        ipc.send(theirs, RefusedFlight(("because",)))
         return EXIT_REFUSED
 
     guardian: Any = SimpleNamespace(open=False, channel=None, receive=tuple, took_over=False, hangs=bool)
     process: Any = SimpleNamespace(poll=ends)
     with ours, theirs:
         launcher._watch(process, ours, guardian, None)
-    assert [message["lines"] for message in heard] == [["because"]]
+    assert heard == [RefusedFlight(("because",))]
 
 
 def test_a_world_that_does_not_leave_is_heard_to_its_last_word(tmp_path: Path) -> None:
@@ -242,7 +243,7 @@ def test_a_world_that_does_not_leave_is_heard_to_its_last_word(tmp_path: Path) -
                 ground.mav.command_long_send(1, 1, mavutil.mavlink.MAV_CMD_DO_SET_MODE, 0, 1, 6, 0, 0, 0, 0, 0)
                 ground.mav.command_long_send(1, 1, mavutil.mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, 0, 0, 0, 0, 0, 0)
                 said = world.messages(time.monotonic() + 0.05)
-                armed = any(message["type"] == "at_rest" and not message["at_rest"] for message in said)
+                armed = WorldAtRest(False) in list(said)
     finally:
         world.stop()
     assert world.ended

@@ -27,6 +27,7 @@ from companion.io.arm.plugin_driver import PluginArm
 from companion.io.devices import open_arm
 from companion.io.protocols import DeviceError
 from companion.model.exit_codes import EXIT_BAD_INPUT
+from companion.model.launcher_messages import WorldMessage, WorldProgress
 from companion.model.observations import ArmStatement, Observations
 from companion.model.types import ArmState
 from companion.plugins import ARMS
@@ -511,7 +512,7 @@ def test_a_log_is_read_without_the_arm(tmp_path: Path) -> None:
 
 def test_the_simulated_world_has_servos_with_the_torque_of_the_motors(tmp_path: Path) -> None:
     vehicle = load_flight("hover", vehicle_file(tmp_path, "type: moteus")).vehicle
-    messages: list[dict[str, Any]] = []
+    messages: list[WorldMessage] = []
     server = Sitl(vehicle, load_sitl("hover").world, start_of((0.0, 0.0), 0.0, (0.0, 0.0)), Ports(), messages.append)
 
     async def served() -> None:
@@ -519,8 +520,8 @@ def test_the_simulated_world_has_servos_with_the_torque_of_the_motors(tmp_path: 
             assert devices["arm"].items() >= {"type": "dynamixel", "options": {}}.items()
 
     asyncio.run(served())
-    assert [message["text"] for message in messages] == [
-        "devices.arm.type: the simulated world has a dynamixel, which is used in place of moteus"
+    assert messages == [
+        WorldProgress("devices.arm.type: the simulated world has a dynamixel, which is used in place of moteus"),
     ]
 
 

@@ -24,6 +24,7 @@ from companion.flight.main import _device_plugins
 from companion.io.force_torque.plugin_driver import PluginForceTorque, open_force
 from companion.io.protocols import DeviceError
 from companion.model.exit_codes import EXIT_BAD_INPUT
+from companion.model.launcher_messages import WorldMessage, WorldProgress
 from companion.plugins import FORCE_SENSORS
 from companion.runtime.clock import flight_clock
 from companion.sitl_config.world import World
@@ -384,7 +385,7 @@ def test_the_simulated_world_has_the_built_in_devices_and_says_so() -> None:
         "vehicle.devices.force.rate_hz=500",
     ]
     vehicle = load_flight("hover", overrides=settings).vehicle
-    messages: list[dict[str, Any]] = []
+    messages: list[WorldMessage] = []
     server = Sitl(vehicle, World(), start_of((0.0, 0.0), 0.0, (0.0, 0.0)), Ports(), messages.append)
 
     async def served() -> dict[str, dict[str, Any]]:
@@ -394,9 +395,9 @@ def test_the_simulated_world_has_the_built_in_devices_and_says_so() -> None:
     devices = asyncio.run(served())
     assert devices["force"].items() >= {"type": "rft60", "options": {}, "rate_hz": 200}.items()
     assert devices["mocap"]["type"] == "natnet"
-    assert [message["text"] for message in messages] == [
-        "devices.mocap.type: the simulated world has a natnet, which is used in place of vicon",
-        "devices.force.type: the simulated world has a rft60, which is used in place of ati",
+    assert messages == [
+        WorldProgress("devices.mocap.type: the simulated world has a natnet, which is used in place of vicon"),
+        WorldProgress("devices.force.type: the simulated world has a rft60, which is used in place of ati"),
     ]
 
 

@@ -7,13 +7,16 @@ from pathlib import Path
 
 from rich.console import Console
 
+from companion.flight.main import status_of
+from companion.model.launcher_messages import AnyMessage, FlightEvent, Started
 from companion.model.types import Outputs
 from companion.runtime.console import FlightDisplay, print_result
 from companion.runtime.realtime import Realtime
 from tests.flights.test_fast_flights import flown
+from tests.ground.monitor_stub import sent_at
 
 
-def shown(*messages: dict[str, object]) -> list[str]:
+def shown(*messages: AnyMessage) -> list[str]:
     """Lines below the title."""
     out = io.StringIO()
     with FlightDisplay(Console(file=out, width=60), "a flight") as display:
@@ -24,13 +27,13 @@ def shown(*messages: dict[str, object]) -> list[str]:
 
 def test_what_the_flight_got_of_the_system_is_one_line() -> None:
     got = str(Realtime(50, (2, 3), False, ("memory not locked (RLIMIT_MEMLOCK is 8192 kB, expected unlimited)",)))
-    [line] = shown({"type": "started", "recorder_pid": 1, "realtime": got})
+    [line] = shown(Started(recorder_pid=1, realtime=got, simulated=False))
     assert line.split(maxsplit=2) == ["real", "time", got]
 
 
 def test_what_the_system_refused_is_no_markup() -> None:
     got = "normal priority (PermissionError: [bold]no[/] permission)"
-    [line] = shown({"type": "started", "recorder_pid": 1, "realtime": got})
+    [line] = shown(Started(recorder_pid=1, realtime=got, simulated=False))
     assert line.endswith(got)
 
 
@@ -47,18 +50,22 @@ def test_a_flight_of_one_tick_has_neither_rate_nor_lateness() -> None:
     ]
 
 
-def messages_of(outputs: Outputs) -> list[dict[str, object]]:
+def messages_of(tick: int, outputs: Outputs) -> list[AnyMessage]:
     """As the flight process sends them in one tick."""
-    told: list[dict[str, object]] = [
-        {"type": "event", "t_s": outputs.mission_t_s, "severity": event.severity.value, "text": event.text}
-        for event in outputs.events
+    t_s, mission_t_s = outputs.t_s, outputs.mission_t_s
+    events = [
+        FlightEvent(
+            tick=tick, t_s=t_s, mission_t_s=mission_t_s, id=e.id, severity=e.severity, action=e.action, text=e.text
+        )
+        for e in outputs.events
     ]
-    return [*told, {"type": "status", "mission_t_s": outputs.mission_t_s, "phase": outputs.phase, "progress": 0.0}]
+    sent = sent_at(tick, t_s)
+    return [*events, status_of(outputs, sent)]
 
 
 def test_every_step_of_a_flight_is_printed_once() -> None:
     result = flown(0.2, "recommended")
-    lines = shown(*(message for outputs in result.outputs for message in messages_of(outputs)))
+    lines = shown(*(message for k, outputs in enumerate(result.outputs) for message in messages_of(k, outputs)))
     steps = [line[14:] for line in lines]
     assert len(set(steps)) == len(steps), steps
     assert [step for step in steps if "caught" not in step] == [
