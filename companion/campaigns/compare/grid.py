@@ -13,13 +13,15 @@ ADAPTATION = ("on", "off")
 ADAPTATION_OFF = f"{LESS}adaptation off"
 """Suffix of the name of a preset that is flown without its adaptation."""
 ABLATIONS: dict[str, tuple[str, ...]] = {
-    # rho = min(H . b + zeta, rho_max): the first override removes all that H and zeta learn, the others remove the adaptive loads.
+    # rho = min(H . b + zeta, rho_max): the first override removes all that H and zeta learn, which is the paper's adaptation; the others
+    # remove the adaptive loads.
     "adaptation off": (
         "controller.rho_max=1.0e-9",
         "controller.load_rate_xyz=[0, 0, 0]",
         "controller.moment_rate=0",
         "controller.friction_rate=0",
     ),
+    "H and zeta off": ("controller.rho_max=1.0e-9",),
     "H3 uncapped": ("controller.acceleration_cap=1.0e9",),
     "S = I": ("controller.row_weights_s=[1, 1, 1, 0, 0, 0, 1, 1]",),
     "base feed-forward off": ("controller.force_feedforward_xyz=[0, 0, 0]",),
@@ -29,7 +31,7 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "adaptive force off": ("controller.load_rate_xyz=[0, 0, 0]",),
     "adaptive moments and friction off": ("controller.moment_rate=0", "controller.friction_rate=0"),
     "lead off": ("controller.feedforward_lead_s=0",),
-    "arm inertia and friction off": ("controller.arm_inertia_nominal=false", "controller.arm_friction_share=0"),
+    "arm friction off": ("controller.arm_friction_share=0",),
 }
 """Overrides of each ablation of `ABLATED`. The attitude rows remain masked, because PX4 closes that loop."""
 
