@@ -3,7 +3,7 @@
     python -m benchmarks                      # everything: 14 minutes, 10 of them a hover
     python -m benchmarks --quick              # the hover lasts one minute
     python -m benchmarks --only core          # one part; the others are kept from an earlier run
-    python -m benchmarks --page               # docs/benchmarks.md from the last run; nothing is measured
+    python -m benchmarks --page               # docs/internals/benchmarks.md from the last run; nothing is measured
 
 Writes results.json and results.md into --out, and the files of each part into a folder of its own there. Every part runs in a separate
 process and is saved as soon as it is measured; a failed part is one line on the page and does not end the others. Ctrl-C lands the
@@ -38,7 +38,7 @@ from tools.compiled import BUILD
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "build" / "benchmarks"
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "internals" / "benchmarks.md"
 DEADLINE_S = {"core": 300.0, "compiled": 300.0, "pi": 300.0, "joints": 120.0, "setpoint": 900.0, "hover": 1500.0}
 """Deadline of each part, in the order in which they run."""
 LAND_S = 400.0
@@ -238,7 +238,9 @@ def main(argv: list[str] | None = None) -> int:
         "--out", type=Path, default=OUT, metavar="DIR", help="for results and logs (default: build/benchmarks)"
     )
     parser.add_argument(
-        "--page", action="store_true", help="write docs/benchmarks.md from the results in --out; measure nothing"
+        "--page",
+        action="store_true",
+        help="write docs/internals/benchmarks.md from the results in --out; measure nothing",
     )
     parser.add_argument("--part", choices=list(PARTS), help=argparse.SUPPRESS)
     options = parser.parse_args(argv)

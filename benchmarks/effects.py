@@ -1,6 +1,6 @@
 """Flies the catch in the ideal world with one effect of the laboratory at a time, and shows the position error that each causes.
 
-    python -m benchmarks.effects --table effects.md --picture docs/pictures/effects.png
+    python -m benchmarks.effects --table effects.md --picture docs/internals/pictures/effects.png
 
 An effect is drawn as in the laboratory of the same seed. Its cost is the median over laboratories of the difference in RMS ||e_p|| from
 the ideal flight with the same seed and payload. A flight that was not completed has no cost.

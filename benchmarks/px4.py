@@ -203,7 +203,7 @@ FAULT_COLUMNS: dict[str, Cell] = {
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """Return two tables for docs/px4.md, flights without and with a fault, with the spread over the runs."""
+    """Return two tables for docs/internals/px4.md, flights without and with a fault, with the spread over the runs."""
     versions = sorted({row.version or "?" for row in rows if row.autopilot == "px4"})
     lines = [f"PX4 {' and '.join(versions)}; each cell: smallest to largest of the runs."]
     for fault, columns in ((False, FLIGHT_COLUMNS), (True, FAULT_COLUMNS)):

@@ -27,8 +27,8 @@ LIMITS: dict[str, object] = {
     "vehicle.safety.vehicle_timeout_s": 0.6,
     "vehicle.devices.arm.watchdog_ms": 400,
 }
-"""Limits of docs/soak.md, wider than the vehicle file's, because a shared machine stalls now and then. The lateness is measured, not
-the reaction of the flight to it.
+"""Limits of docs/internals/soak.md, wider than the vehicle file's, because a shared machine stalls now and then. The lateness is
+measured, not the reaction of the flight to it.
 """
 
 

@@ -13,7 +13,7 @@ from benchmarks.measuring.figures import Row, Section, Target, figure, problems
 HEAD = """# Benchmarks
 
 `make bench` measures everything on this page, and `python -m benchmarks --page` writes the page from the results. A cell reads
-*figure / figure of the reference beside it = ratio*. All scripts: [benchmarks](../benchmarks/README.md).
+*figure / figure of the reference beside it = ratio*. All scripts: [benchmarks](../../benchmarks/README.md).
 """
 
 

@@ -47,7 +47,7 @@ class Joint(Model):
 
     servo: Annotated[ServoName | None, BeforeValidator(_with_current_control)] = "XM430-W210"
     """Model of the Dynamixel servo; the driver refuses a servo of another model. null for a motor that a plug-in drives
-    (docs/own-devices.md)."""
+    (docs/plug-ins.md)."""
     servo_id: Annotated[int, Field(ge=0, le=252)]
     """Id of the servo, or of the motor, on its bus."""
     sign: Literal[-1, 1]
@@ -144,7 +144,7 @@ class Arm(Model):
     tip_rpy_deg: Vector3 = (0.0, 0.0, 0.0)
     """Attitude of the tip's frame, whose x axis points outwards, in the frame of the last of `links`: roll, pitch, yaw (ZYX)."""
     urdf: str | None = None
-    """URDF file, relative to the vehicle file, from which `links`, `tip_m` and `tip_rpy_deg` are read (docs/arms.md)."""
+    """URDF file, relative to the vehicle file, from which `links`, `tip_m` and `tip_rpy_deg` are read (docs/arm.md)."""
     urdf_base: str | None = None
     """Name of the URDF's link that is the vehicle's body. If it is absent, the link that is no joint's child is used."""
     urdf_tip: str | None = None

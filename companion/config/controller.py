@@ -152,7 +152,7 @@ class LawConfig(ControllerConfig):
 
 
 class OnlineConfig(Model):
-    """Slow optimisation of the target impedance in flight: one scale of Phi and Lambda on x, y and z (docs/tune.md)."""
+    """Slow optimisation of the target impedance in flight: one scale of Phi and Lambda on x, y and z (docs/internals/tune.md)."""
 
     bound: Annotated[float, Field(gt=1, le=2)] = 2.0
     """The scale stays within 1 / bound and bound."""

@@ -34,7 +34,7 @@ class NatNetOptions(Model):
 
 
 class MocapDevice(Model):
-    """Motion capture: OptiTrack Motive over NatNet, or a system that a plug-in provides (docs/mocap-systems.md)."""
+    """Motion capture: OptiTrack Motive over NatNet, or a system that a plug-in provides (docs/mocap.md)."""
 
     type: str = NATNET
     """natnet, or the name of an installed motion-capture system (`companion plugins` lists them); `--sitl` uses natnet for them.
@@ -81,7 +81,7 @@ class DynamixelOptions(Model):
 
 
 class ArmDevice(Model):
-    """The arm's motors: Dynamixel servos on a U2D2 adapter, or motors that a plug-in drives (docs/own-devices.md)."""
+    """The arm's motors: Dynamixel servos on a U2D2 adapter, or motors that a plug-in drives (docs/plug-ins.md)."""
 
     type: str = DYNAMIXEL
     """dynamixel, or the name of an installed arm (`companion plugins` lists them). With `--sitl`, dynamixel is used."""
@@ -118,7 +118,7 @@ class Rft60Options(Model):
 
 
 class ForceDevice(Model):
-    """The force-torque sensor: the Robotous RFT60-HA01 on a serial port, or one that a plug-in provides (docs/own-devices.md)."""
+    """The force-torque sensor: the Robotous RFT60-HA01 on a serial port, or one that a plug-in provides (docs/plug-ins.md)."""
 
     type: str = RFT60
     """rft60, or the name of an installed force sensor (`companion plugins` lists them). With `--sitl`, rft60 is used."""
@@ -151,4 +151,4 @@ class Devices(Model):
     """Bus of the arm's servos; absent if and only if the vehicle has no arm."""
     force: ForceDevice | None
     """Force-torque sensor; null states that there is none: the control law then runs without a measured force, and no catch is detected
-    (docs/parts.md)."""
+    (docs/hardware.md)."""

@@ -10,7 +10,7 @@ from companion.config.base import Fraction, Model, NonNegative, PerJoint, Positi
 
 
 class Safety(Model):
-    """Thresholds of the safety rules, and limits of the reactions. docs/safety.md describes the rules."""
+    """Thresholds of the safety rules, and limits of the reactions. docs/internals/safety.md describes the rules."""
 
     preflight_s: Annotated[float, Field(ge=1, le=60)] = 5.0
     """Time for which the preflight check observes all devices before arming."""

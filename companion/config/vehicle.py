@@ -33,18 +33,18 @@ class Vehicle(Model):
     name: str
     airframe: Airframe
     arm: Annotated[Arm, OrElse({"type": "null"})]
-    """Arm; null states that there is none, and `arm.joints` is then empty (docs/parts.md)."""
+    """Arm; null states that there is none, and `arm.joints` is then empty (docs/hardware.md)."""
     tool: Tool | None
     """Net, rod or brush, with the force-torque sensor between the last link and it; null states that there is none. Only a net can
-    catch (docs/parts.md)."""
+    catch (docs/hardware.md)."""
     tether: Tether | None
     """Safety tether; null states that there is none: only the room then limits the flight, and no tether rule is evaluated
-    (docs/parts.md)."""
+    (docs/hardware.md)."""
     room: Room
     devices: Devices
     force_source: Literal["sensor", "observer"] = "sensor"
     """Source of the force that the control law uses and from which a catch is detected: `devices.force` (no force if that is null), or
-    a momentum observer, which estimates the force from thrust and motion (docs/parts.md). With the observer, a force sensor is only
+    a momentum observer, which estimates the force from thrust and motion (docs/hardware.md). With the observer, a force sensor is only
     logged, to show the observer's error."""
     computer: Computer = Computer()
     safety: Safety = Safety()

@@ -1,7 +1,7 @@
 """Adaptive impedance control without a model of the coupling (paper, eqs. control_law and adaptive_law_full; corrected, discrete).
 
 The rows are chi = [x y z | roll pitch yaw | joints]. PX4's attitude loop controls the attitude rows: they are masked out of every norm
-and get no torque. The numbered steps are those of docs/control-law.md.
+and get no torque. The numbered steps are those of docs/internals/control-law.md.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ p = m v + d(R h)/dt, where h is the first moment of arm and tool about the body 
 
 The second-order G follows Ruggiero et al. (ICRA 2014). One of first order that is as fast passes three times as much of the rotors'
 vibration. The accelerometer gives m v', as in Tomic, Ott and Haddadin (T-RO 2017). G s^2 is proper, so R h is not differentiated
-numerically. docs/control-law.md says why the rows of the joints are not used, and gives the measured error.
+numerically. docs/internals/control-law.md says why the rows of the joints are not used, and gives the measured error.
 
 F_ext is every force on the vehicle that does not come from rotors or gravity: payload, wind, tether, errors of the thrust model. What
 lasts is removed by `ForceObserver.step`; a gust is not.

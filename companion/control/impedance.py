@@ -2,7 +2,7 @@
 del_tau and adaptive_1).
 
 All matrices of the paper are diagonal, so each row of chi = [x y z | roll pitch yaw | joints] is a scalar impedance of its own. The
-letters are the paper's; what its printed equations need to hold is corrected as in docs/control-law.md.
+letters are the paper's; what its printed equations need to hold is corrected as in docs/internals/control-law.md.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Joint angles and rates at the time of the tick, from a joint state that is late. Pure.
 
 A servo measures when it is asked; adapters, a busy bus and a busy computer deliver the answer milliseconds later. A control law that
-took it for the present would lose the phase margin of its damping: from 8 ms on the arm swings at 16 Hz (docs/control-law.md, section
-Late joint states).
+took it for the present would lose the phase margin of its damping: from 8 ms on the arm swings at 16 Hz (docs/internals/control-law.md,
+section Late joint states).
 """
 
 from __future__ import annotations

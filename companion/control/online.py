@@ -1,4 +1,4 @@
-"""Slow optimisation of the target impedance in flight: one scale of Phi and Lambda on x, y and z (docs/tune.md, "In the air").
+"""Slow optimisation of the target impedance in flight: one scale of Phi and Lambda on x, y and z (docs/internals/tune.md, In the air).
 
 With the scale k, Phi = k Phi_0 and Lambda = k Lambda_0: the bandwidth of the position is k times that of the mission's gains, its
 stiffness Lambda Phi k^2 times. M_d and D stay, so that K_d = D + M_d Phi and K_p = D Phi follow, as in `AdaptiveConfig.with_gains`:

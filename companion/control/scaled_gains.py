@@ -110,4 +110,4 @@ def scale_text(config: ControllerConfig) -> str:
     if scale is None or set(scale) == {1.0}:
         return ""
     on_joints = ", ".join(f"{ratio:.2f}" for ratio in scale[6:])
-    return f"gains of {config.law}/{config.preset}: times {scale[0]:.2f} on x, y and z and {on_joints} on the joints (docs/arms.md)"
+    return f"gains of {config.law}/{config.preset}: times {scale[0]:.2f} on x, y and z and {on_joints} on the joints (docs/arm.md)"

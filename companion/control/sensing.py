@@ -233,7 +233,7 @@ class ObservedCatchDetector(CatchDetector):
     """Detector of a caught payload in the force of `ForceObserver`, which contains gusts and smooths the impact.
 
     In simulated laboratories, gusts and drag reached 1.5 N without a payload; the impact of 0.1 kg reached 2.2 N, and the weight after
-    it 0.7 N in the mean (docs/control-law.md).
+    it 0.7 N in the mean (docs/internals/control-law.md).
     """
 
     BLOW_N = 1.8

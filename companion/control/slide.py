@@ -2,8 +2,8 @@
 answers the force error, and an attitude setpoint that opposes the moment of the friction and steers the tip.
 
 The base moves by some millimetres in every gust. The joints answer the measured force error at once, while the base's push follows
-slowly. Nothing makes the arm stiffer: a stiff arm whose torques come 5 ms late swings (docs/contact.md). The friction of the gears
-would keep 1 to 2 N of each answer from the tip; the torques that overcome it follow the measured joint rates.
+slowly. Nothing makes the arm stiffer: a stiff arm whose torques come 5 ms late swings (docs/internals/contact.md). The friction of the
+gears would keep 1 to 2 N of each answer from the tip; the torques that overcome it follow the measured joint rates.
 
 Friction acts far ahead of the rotors and pitches the vehicle. PX4 holds the attitude against it only after its rate integrator has
 followed; until then the thrust presses with 0.5 N per degree too much or too little, which changes the friction again: the tip sticks

@@ -272,7 +272,7 @@ def usb_latency(check: Check, latency_ms: int | None) -> Row:
     wanted = f"{LATENCY_GOOD_MS} ms"
     if latency_ms is None:
         return check.good("not an FTDI adapter", wanted)
-    fix = "keep it at 1 ms with a udev rule (see docs/commissioning.md, step 2)"
+    fix = "keep it at 1 ms with a udev rule (see docs/first-flight.md, step 2)"
     return check.row(latency_ms <= LATENCY_GOOD_MS, f"{latency_ms} ms", wanted, fix)
 
 

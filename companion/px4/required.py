@@ -1,8 +1,8 @@
 """PX4 parameters on which a flight depends: the required value of each, and the consequence of any other value.
 
-The rows of the preflight checks, `companion px4 params`, configs/px4/indoor_mocap.params, the table of docs/px4.md and the stub's
-settings come from this one table. Names, types, limits and whether a change needs a reboot are taken from the parameter metadata of
-PX4 1.16.1 and 1.18; `companion.px4.versions` says which versions have a parameter.
+The rows of the preflight checks, `companion px4 params`, configs/px4/indoor_mocap.params, the table of docs/internals/px4.md and the
+stub's settings come from this one table. Names, types, limits and whether a change needs a reboot are taken from the parameter
+metadata of PX4 1.16.1 and 1.18; `companion.px4.versions` says which versions have a parameter.
 """
 
 from __future__ import annotations

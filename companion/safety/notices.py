@@ -1,6 +1,7 @@
 """Events that the state machine and the core report themselves, without a rule in `companion.safety.rules`.
 
-Each is one row; docs/safety.md is generated from them. Ids are stable because logs, summaries and users' scripts contain them.
+Each is one row; docs/internals/safety.md is generated from them. Ids are stable because logs, summaries and users' scripts contain
+them.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from typing import Final
 TURNS: Final = 4
 """Number of turning points within `WINDOW_S`: two whole periods."""
 WINDOW_S: Final = 6.0
-"""Three periods of the slowest limit cycle in docs/safety.md, 2 s."""
+"""Three periods of the slowest limit cycle in docs/internals/safety.md, 2 s."""
 RATE_RAD_S: Final = 0.3
 """Tilt rate (RMS) of an oscillation that the rotors drive. Vibration of a gyroscope alone reaches 0.2."""
 RATE_TIME_S: Final = 1.0

@@ -1,7 +1,7 @@
 """The event table: every rule of the monitors, one row each.
 
-`companion.safety.evaluation` evaluates the rows, `tools.docs.safety` prints them into docs/safety.md, and the tests go through them.
-Ids are stable because logs, summaries and users' scripts contain them. Simultaneous events are in the order of the rows.
+`companion.safety.evaluation` evaluates the rows, `tools.docs.safety` prints them into docs/internals/safety.md, and the tests go
+through them. Ids are stable because logs, summaries and users' scripts contain them. Simultaneous events are in the order of the rows.
 """
 
 from __future__ import annotations

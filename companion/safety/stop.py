@@ -15,7 +15,7 @@ from typing import Final
 from companion.config.safety import Safety
 
 LAND_AHEAD_S: Final = 0.6
-"""PX4 sets the stop point of LAND this far ahead, in addition to the braking distance. Confirmed by measurement: docs/px4.md."""
+"""PX4 sets the stop point of LAND this far ahead, in addition to the braking distance. Measured: docs/internals/px4.md."""
 LAND_DECELERATION_M_S2 = 8.0
 """MPC_ACC_HOR of configs/px4/indoor_mocap.params; enters only the distance of LAND's stop point."""
 

@@ -1,6 +1,6 @@
 """Faults of the simulated world: the kinds, the meaning of their sizes, and the settings of one injected fault.
 
-The world, `companion faults --list` and docs/faults.md use the same table. `sitl.faults` implements the effect of each kind;
+The world, `companion faults --list` and docs/internals/faults.md use the same table. `sitl.faults` implements the effect of each kind;
 `companion.campaigns.faults.variants` lists the faults that a campaign flies.
 """
 
@@ -342,7 +342,7 @@ def absent_part(kind: FaultKind, vehicle: Vehicle) -> str | None:
 
 
 class Fault(Model):
-    """An injected fault with its start, duration and size. docs/faults.md describes kinds and sizes."""
+    """An injected fault with its start, duration and size. docs/internals/faults.md describes kinds and sizes."""
 
     kind: FaultKind
     t_s: NonNegative | None = None

@@ -135,7 +135,7 @@ def test_the_page_says_what_kind_of_run_it_was() -> None:
 
 
 def test_the_committed_page_has_these_tables() -> None:
-    text = (ROOT / "docs/benchmarks.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/internals/benchmarks.md").read_text(encoding="utf-8")
     assert re.findall(r"^## (.+)$", text, flags=re.M) == [table.title for table in sections(GOOD)]
 
 

@@ -23,8 +23,8 @@ from tests.analysis.recorded import record
 from tests.support import CATCH, ROOT
 
 SEED = 9
-"""A laboratory whose intervals hold the truth. That of the thrust lag does not in 3 of the 8 tried (docs/identify.md: 41 of 50 hold).
-This flight shows nothing about coverage.
+"""A laboratory whose intervals hold the truth. That of the thrust lag does not in 3 of the 8 tried (docs/internals/identify.md: 41 of
+50 hold). This flight shows nothing about coverage.
 """
 LAG_S, DELAY_S = 0.060, 0.012
 PAYLOAD_KG = 0.25

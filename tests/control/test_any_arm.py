@@ -1,4 +1,4 @@
-"""The laws on arms of 0 to 7 joints with axes in all directions, against the formulas of docs/control-law.md in matrices."""
+"""The laws on arms of 0 to 7 joints with axes in all directions, against the formulas of docs/internals/control-law.md in matrices."""
 
 from __future__ import annotations
 

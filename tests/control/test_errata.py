@@ -1,4 +1,4 @@
-"""The paper's equations as printed against their corrected forms (docs/control-law.md, errata); tests carry the equations' labels.
+"""The paper's equations as printed against their corrected forms (docs/internals/control-law.md, errata); tests carry their labels.
 
 Two closed loops. `Machine` is a coupled machine flown by the whole controller: there the corrected identities must hold to 1e-6.
 `fly` is a decoupled machine, one mass per row, flown by the law's own adaptation and impedance with one equation at a time replaced:

@@ -1,6 +1,6 @@
 """Inputs that a test makes up tick by tick behind a recorded flight, and an account of what must hold for every stop of the rotors.
 
-The account knows nothing of `companion.safety.rotor_stop`: its numbers are those of docs/safety.md.
+The account knows nothing of `companion.safety.rotor_stop`: its numbers are those of docs/internals/safety.md.
 """
 
 from __future__ import annotations
@@ -217,7 +217,7 @@ class Account:
 
 
 def _lies_tilted(i: Inputs, low_m: float) -> bool:
-    """Rolled by more than 40 deg by both, and low: the numbers of `safety.tilt_abort_deg` and docs/safety.md."""
+    """Rolled by more than 40 deg by both, and low: the numbers of `safety.tilt_abort_deg` and docs/internals/safety.md."""
     assert i.vehicle is not None and i.status is not None
     ours = i.status.armed and i.status.mode in (FlightMode.OFFBOARD, FlightMode.LAND)
     pose = i.mocap if i.mocap is not None and i.t_s - i.mocap.stamp_s < 0.3 else None

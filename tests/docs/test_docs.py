@@ -30,9 +30,9 @@ from tools.docs.tables import written
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", ROOT / "benchmarks/README.md", *(ROOT / "docs").rglob("*.md")])
-COMMANDS, SAFETY, SITL = ROOT / "docs/commands.md", ROOT / "docs/safety.md", ROOT / "docs/sitl.md"
-FAULTS, LABORATORY = ROOT / "docs/faults.md", ROOT / "docs/world.md"
-LOG, LAW = ROOT / "docs/log.md", ROOT / "docs/control-law.md"
+COMMANDS, SAFETY, SITL = ROOT / "docs/commands.md", ROOT / "docs/internals/safety.md", ROOT / "docs/internals/sitl.md"
+FAULTS, LABORATORY = ROOT / "docs/internals/faults.md", ROOT / "docs/internals/world.md"
+LOG, LAW = ROOT / "docs/internals/log.md", ROOT / "docs/internals/control-law.md"
 # What a flight writes, or what a user is reported to make: no files of the repository.
 MADE_LATER = {
     "flight.mcap", "flight.log", "flight.pid", "guardian.log", "guardian.pid", "summary.json", "report.html", "config.json",
@@ -111,7 +111,7 @@ def test_links_and_file_names_exist(page: Path) -> None:
 
 
 def test_files_to_begin_in_exist_and_hold_the_names_in_brackets() -> None:
-    for cells in table(ROOT / "docs/architecture.md", "to change"):
+    for cells in table(ROOT / "docs/internals/architecture.md", "to change"):
         for path, name in re.findall(r"`(\w+/[^`]+)`(?: \(`(\w+)`\))?", " ".join(cells)):
             assert (ROOT / path).exists() and (not name or re.search(rf"\b{name}\b", text_of(ROOT / path))), (
                 path,
@@ -120,7 +120,7 @@ def test_files_to_begin_in_exist_and_hold_the_names_in_brackets() -> None:
 
 
 def test_pictures_are_small() -> None:
-    pictures = list((ROOT / "docs/pictures").glob("*"))
+    pictures = [path for path in (ROOT / "docs").rglob("pictures/*") if path.is_file()]
     assert pictures
     limits = {".png": 200_000, ".svg": 400_000, ".gif": 1_500_000}
     assert [picture.name for picture in pictures if picture.stat().st_size > limits[picture.suffix]] == []
@@ -177,7 +177,7 @@ def test_knobs_match() -> None:
 
 
 def test_faults_match() -> None:
-    """Made by `python -m tools.docs.faults docs/faults.md`."""
+    """Made by `python -m tools.docs.faults docs/internals/faults.md`."""
     assert written(text_of(FAULTS), {"kinds": kinds_markdown()}) == text_of(FAULTS)
     assert [codes(row[0])[0] for row in table(FAULTS, "kind", "what happens")] == list(KINDS)
     told = [name for row in table(FAULTS, "key", "meaning") for name in codes(row[0])]
@@ -190,7 +190,7 @@ def test_the_stubs_parameters_are_counted() -> None:
 
 
 def test_monitors_and_ladder_match() -> None:
-    """Made by `python -m tools.docs.safety docs/safety.md`."""
+    """Made by `python -m tools.docs.safety docs/internals/safety.md`."""
     assert written(text_of(SAFETY), safety_tables()) == text_of(SAFETY)
     named = {key for row in table(SAFETY, "id", "what is found") for cell in row[2:4] for key in codes(cell)}
     told = set(codes(text_of(SAFETY)))

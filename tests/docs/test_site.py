@@ -19,7 +19,7 @@ from tests.support import DEADLINE_S
 from tools.docs.reference import main, page, unit
 
 ROOT = Path(__file__).parents[2]
-CASE, TROUBLE = ROOT / "docs/safety-case.md", ROOT / "docs/troubleshooting.md"
+CASE, TROUBLE = ROOT / "docs/internals/safety-case.md", ROOT / "docs/troubleshooting.md"
 LANDS = {SafetyAction.LAND, SafetyAction.AUTOPILOT_LAND, SafetyAction.TERMINATE}
 
 
@@ -79,7 +79,7 @@ def test_it_loads_nothing_from_a_network(site: Path) -> None:
 
 
 def test_figures_say_how_far_they_are_behind_the_code(site: Path) -> None:
-    found = re.findall(r"at commit (\w+)(?: \((\d+) later commits)?", text_of(site / "robustness.html"))
+    found = re.findall(r"at commit (\w+)(?: \((\d+) later commits)?", text_of(site / "internals/robustness.html"))
     assert found
     for commit, later in found:
         command = ["git", "rev-list", "--count", f"{commit}..HEAD", "--", "companion/control", "sitl"]
@@ -106,8 +106,8 @@ def test_links_within_it_lead_somewhere(site: Path) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_reference_is_what_the_models_say(kind: str) -> None:
-    """Made by `python -m tools.docs.reference docs/reference`."""
-    assert text_of(ROOT / f"docs/reference/{kind}.md") == page(kind)
+    """Made by `python -m tools.docs.reference docs/internals/reference`."""
+    assert text_of(ROOT / f"docs/internals/reference/{kind}.md") == page(kind)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -175,13 +175,13 @@ def test_whatever_lands_is_among_the_symptoms() -> None:
 
 
 def test_every_event_of_the_sequence_that_ends_a_flight_is_among_the_symptoms() -> None:
-    safety = text_of(ROOT / "docs/safety.md")
+    safety = text_of(ROOT / "docs/internals/safety.md")
     table = safety.partition("| id | when |")[2].partition("\n## ")[0]
     ends = set(re.findall(r"^\| `(\w+)` \|.*(?:refused|lands)", table, flags=re.M))
     assert {"arming_refused", "no_touchdown"} <= ends <= set(re.findall(r"`(\w+)`", text_of(TROUBLE)))
 
 
 def test_every_row_of_the_preflight_is_among_the_symptoms() -> None:
-    listed = set(re.findall(r"^\| `(\w+\.\w+)` \|", text_of(ROOT / "docs/preflight.md"), flags=re.M))
+    listed = set(re.findall(r"^\| `(\w+\.\w+)` \|", text_of(ROOT / "docs/internals/preflight.md"), flags=re.M))
     assert len(listed) > 50
     assert listed <= set(re.findall(r"`(\w+\.\w+)`", text_of(TROUBLE)))

@@ -466,7 +466,7 @@ def test_profile_is_a_drop_in_of_the_system_service(site: Site, tmp_path: Path) 
 
 
 def test_table_of_attacks_names_tests_that_exist() -> None:
-    page = (ROOT / "docs/broker.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/internals/broker.md").read_text(encoding="utf-8")
     rows = [line for line in page.splitlines() if line.startswith("| ") and "`test_" in line]
     named = {name for row in rows for name in re.findall(r"`(test_\w+)`", row)}
     defined = {

@@ -279,5 +279,5 @@ def test_a_pause_in_the_middle_of_the_round_is_not_taken_for_the_floor() -> None
 
 
 def test_the_docs_list_every_row() -> None:
-    page = (ROOT / "docs/hand-test.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/internals/hand-test.md").read_text(encoding="utf-8")
     assert written(page, {"hand": checks_table(hand_test_evaluation.CHECKS)}) == page

@@ -389,8 +389,8 @@ def test_observations_of_nothing_refuse_and_do_not_fall_over() -> None:
 
 
 def test_the_docs_list_every_row() -> None:
-    """Made by `python -m tools.docs.preflight docs/preflight.md`."""
-    page = (ROOT / "docs/preflight.md").read_text(encoding="utf-8")
+    """Made by `python -m tools.docs.preflight docs/internals/preflight.md`."""
+    page = (ROOT / "docs/internals/preflight.md").read_text(encoding="utf-8")
     assert written(page, tables()) == page
     told = {check.id for checks in ROOMS.values() for check in checks}
     assert told == {check.id for check in evaluation.CHECKS}

@@ -177,5 +177,5 @@ def test_the_pilots_radio_is_switched_off_by_a_file_of_its_own() -> None:
 
 def test_the_table_of_the_docs_is_the_table() -> None:
     """Made by `python -m tools.docs.px4 .`."""
-    page = (ROOT / "docs/px4.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/internals/px4.md").read_text(encoding="utf-8")
     assert published.table_markdown() in page

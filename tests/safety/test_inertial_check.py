@@ -94,7 +94,7 @@ def test_true_motion_with_a_constant_bias_of_0_2_m_s2_raises_nothing(axis: int) 
 
 
 def test_a_drag_that_begins_slowly_is_not_found() -> None:
-    """The limit of the method, as docs/safety-case.md names it: the observer follows, whatever speed is reached."""
+    """The limit of the method, as docs/internals/safety-case.md names it: the observer follows, whatever speed is reached."""
     assert found_s(growing_m_s2=0.4) is None
     assert found_s(growing_m_s2=0.7) is not None
 

@@ -820,7 +820,7 @@ def test_at_every_wall_the_fence_is_where_the_rotors_leave_the_room(axis: int, s
         inputs = after_a_moment(at(*place, *velocity), ticks=60, sound=0)
         return [event.id for event in watched(VEHICLE, inputs, flying())]
 
-    stop_m = 0.5 * (0.21 + 0.6 + 0.5 / 16.0)  # docs/safety.md: 0.5 m/s; reaction, LAND's stop point, braking
+    stop_m = 0.5 * (0.21 + 0.6 + 0.5 / 16.0)  # docs/internals/safety.md: 0.5 m/s; reaction, LAND's stop point, braking
     assert found(-0.01, 0.0) == []
     assert found(0.01, 0.0) == ["geofence_left", "geofence_near"]
     assert found(-stop_m - 0.01, 0.5) == []

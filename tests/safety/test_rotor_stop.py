@@ -1,4 +1,4 @@
-"""When the rotors may be stopped: what each source must show, and for how long. The numbers are those of docs/safety.md."""
+"""When the rotors may be stopped: what each source must show, and for how long. The numbers are those of docs/internals/safety.md."""
 
 from __future__ import annotations
 

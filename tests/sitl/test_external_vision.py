@@ -99,8 +99,8 @@ def test_the_guardian_lands_on_the_other_programs_poses() -> None:
 
 @pytest.mark.parametrize(("kind", "height_m"), [("mocap_jump", 1.0), ("mocap_freeze", 1.0), ("mocap_occluded", 0.5)])
 def test_wrong_poses_of_the_other_program_end_in_no_crash_and_rotors_that_stop(kind: str, height_m: float) -> None:
-    """Without any pose PX4's estimate lasts for 6 s, enough to land from 0.5 m; from 1 m PX4 may float (docs/contact.md, Without the
-    link).
+    """Without any pose PX4's estimate lasts for 6 s, enough to land from 0.5 m; from 1 m PX4 may float (docs/internals/contact.md,
+    Without the link).
     """
     _, result = fly(HOVER, {"kind": kind, "t_s": 6.0}, sets=[f"mission.phases[0].height_m={height_m}"])
     assert not result.crashed and not result.armed

@@ -249,7 +249,7 @@ def test_mocap_lost_in_the_middle_of_the_line(duration_s: float | None) -> None:
 
 def test_a_vehicle_that_px4_lands_with_a_drifting_estimate_is_stopped_when_it_stands() -> None:
     """Poses freeze after the take-off. The estimate sinks 0.35 m/s too fast, and on the floor it continues at half of its speed; PX4
-    would raise the vehicle again (laboratory 9337 of docs/tune.md).
+    would raise the vehicle again (laboratory 9337 of docs/internals/tune.md).
     """
     faults = json.dumps([{"kind": "mocap_freeze", "t_s": 5.8}])
     overrides = [f"world.faults={faults}", "world.seed=9337", "world.payload_kg=0", "mission.repeat=1"]

@@ -1,4 +1,4 @@
-"""Writes the tables and plots of docs/compare.md: `python -m tools.docs.compare docs/compare.md compare.json [compare.json ...]`."""
+"""Writes the tables and plots of the comparison: `python -m tools.docs.compare docs/internals/compare.md compare.json [...]`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes the tables of docs/faults.md: `python -m tools.docs.faults docs/faults.md [faults.json]`.
+"""Writes the tables of docs/internals/faults.md: `python -m tools.docs.faults docs/internals/faults.md [faults.json]`.
 
 The kinds come from the code. The outcomes are written only if the results of a campaign are given.
 """

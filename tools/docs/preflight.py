@@ -1,4 +1,4 @@
-"""Writes the tables of docs/preflight.md from the checks: `python -m tools.docs.preflight docs/preflight.md`."""
+"""Writes the tables of docs/internals/preflight.md from the checks: `python -m tools.docs.preflight docs/internals/preflight.md`."""
 
 from __future__ import annotations
 

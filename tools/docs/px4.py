@@ -1,4 +1,4 @@
-"""Generates the files of configs/px4/ and the table of docs/px4.md from `companion.px4.required`.
+"""Generates the files of configs/px4/ and the table of docs/internals/px4.md from `companion.px4.required`.
 
 `python -m tools.docs.px4 .` writes them, given the repository's root.
 """
@@ -54,7 +54,7 @@ def no_radio_text() -> str:
 
 
 def table_markdown() -> str:
-    """Return the table of parameters for docs/px4.md."""
+    """Return the table of parameters for docs/internals/px4.md."""
     lines = []
     for title, group in GROUPS.items():
         lines += [
@@ -78,7 +78,7 @@ def main(root: Path) -> None:
     """Write all files below `root`."""
     (root / "configs/px4/indoor_mocap.params").write_text(indoor_mocap_text(), encoding="utf-8")
     (root / "configs/px4" / NO_RADIO_FILE).write_text(no_radio_text(), encoding="utf-8")
-    page = root / "docs/px4.md"
+    page = root / "docs/internals/px4.md"
     page.write_text(written(page.read_text(encoding="utf-8"), {DOCS_MARK: table_markdown()}), encoding="utf-8")
 
 

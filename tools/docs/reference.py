@@ -1,6 +1,6 @@
-"""Generates the pages of docs/reference/ from the JSON Schemas of the configuration models.
+"""Generates the pages of docs/internals/reference/ from the JSON Schemas of the configuration models.
 
-`python -m tools.docs.reference docs/reference` writes them.
+`python -m tools.docs.reference docs/internals/reference` writes them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from companion.cli.schema import KINDS, Described
 
 Schema = dict[str, Any]
 _INTRO = {
-    "mission": "One flight: start pose of the vehicle, motion limits, and phases in order. [Mission files](../missions.md) explains "
+    "mission": "One flight: start pose of the vehicle, motion limits, and phases in order. [Mission files](../../missions.md) explains "
     "the phases.",
     "vehicle": "One vehicle: masses and dimensions, devices, tether, room and limits. [Safety](../safety.md) explains the limits of "
     "`safety`.",
@@ -74,9 +74,7 @@ def page(kind: str) -> str:
         ]
         lines += ["", *_section(path, model, definitions)]
         queue[:0] = inner
-    made = (
-        "Made by `python -m tools.docs.reference docs/reference`; a test checks that this page agrees with the models."
-    )
+    made = "Made by `python -m tools.docs.reference docs/internals/reference`; a test checks that this page agrees with the models."
     return "\n".join([*lines, "", made, ""])
 
 
@@ -211,7 +209,7 @@ def write(folder: Path) -> None:
 def main(arguments: list[str]) -> int:
     """Write the pages and return the exit code; print the reason for a failure on standard error."""
     if len(arguments) != 1:
-        print("expected one folder: python -m tools.docs.reference docs/reference", file=sys.stderr)
+        print("expected one folder: python -m tools.docs.reference docs/internals/reference", file=sys.stderr)
         return 2
     try:
         write(Path(arguments[0]))

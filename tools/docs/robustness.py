@@ -1,4 +1,4 @@
-"""Writes the results of a campaign into docs/robustness.md: `python -m tools.docs.robustness docs/robustness.md robustness.json`."""
+"""Writes the results of a campaign into its page: `python -m tools.docs.robustness docs/internals/robustness.md robustness.json`."""
 
 from __future__ import annotations
 

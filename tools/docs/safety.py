@@ -1,4 +1,4 @@
-"""Writes the tables of docs/safety.md from the code: `python -m tools.docs.safety docs/safety.md`."""
+"""Writes the tables of docs/internals/safety.md from the code: `python -m tools.docs.safety docs/internals/safety.md`."""
 
 from __future__ import annotations
 

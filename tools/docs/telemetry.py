@@ -1,4 +1,4 @@
-"""Writes the JSON Schemas of the telemetry messages, one file per topic in docs/telemetry: `python -m tools.docs.telemetry`."""
+"""Writes the JSON Schemas of the telemetry messages, one per topic, to docs/internals/telemetry: `python -m tools.docs.telemetry`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from companion.ground.protocol.messages import RECORDS, Topic
 from companion.model.codec import json_schema
 
-FOLDER = Path(__file__).parents[2] / "docs/telemetry"
+FOLDER = Path(__file__).parents[2] / "docs/internals/telemetry"
 
 
 def schema_of(topic: Topic) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Evaluates a flight with a fault: its outcome, the time to detection, and violations of safety requirements.
 
-A row holds the results of one flight, as `companion faults --json` prints it; docs/faults.md describes its keys.
+A row holds the results of one flight, as `companion faults --json` prints it; docs/internals/faults.md describes its keys.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Flights in worlds drawn at random: drawn values, distribution of the position error and its correlations.
 
-A row holds the results of one flight, as `companion robustness --json` prints it; docs/robustness.md describes its keys.
+A row holds the results of one flight, as `companion robustness --json` prints it; docs/internals/robustness.md describes its keys.
 """
 
 from __future__ import annotations

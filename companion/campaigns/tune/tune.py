@@ -66,7 +66,7 @@ class Tune:
         if len(self.space.axes) < 2:
             law = find(CONTROL_LAWS, self.config.controller.law)
             text = f"companion tune: {law}: expected a law that declares two or more gains to tune, found "
-            raise ConfigError([f"{text}{len(self.space.axes)} (tuned_gains of its settings; docs/tune.md)"])
+            raise ConfigError([f"{text}{len(self.space.axes)} (tuned_gains of its settings; docs/internals/tune.md)"])
 
     @property
     def space(self) -> Space:

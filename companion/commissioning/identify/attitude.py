@@ -32,7 +32,7 @@ _SLOW_HZ = 1.0
 _LAG_SHARE = 0.05
 _BANDWIDTH_SHARE = 0.09
 """Standard errors, relative, that no fit of one flight shows. The bandwidth follows the arm: folded and unfolded, it differs by 20 %
-about roll and 10 % about pitch (docs/identify.md), and a flight shows one mean of it.
+about roll and 10 % about pitch (docs/internals/identify.md), and a flight shows one mean of it.
 """
 _MOVED_MIN_RAD = math.radians(0.3)
 """Smallest standard deviation of the setpoint that excites the loop."""

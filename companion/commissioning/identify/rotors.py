@@ -17,7 +17,7 @@ from companion.model.frames import quat_conjugate, quat_rotate
 
 HOVER_SHARE = 0.012
 """Standard error of the hover thrust, relative, that no flight shows: bias of the vertical accelerometer, the tether's weight, ground
-effect, downwash on the arm. Measured in drawn laboratories (docs/identify.md).
+effect, downwash on the arm. Measured in drawn laboratories (docs/internals/identify.md).
 """
 _DELAY = Prior(0.018, 0.008)
 """Delay before the rotors react, s: link, PX4's cycle, motor controllers."""

@@ -21,7 +21,7 @@ def profile_text(folder: Path) -> str:
     """Return mosquitto.conf(5) of a broker for several computers; its other files are in `folder`."""
     return f"""\
 # For several computers: TLS and a login from everywhere, a login without TLS from this computer. Written by
-# companion broker init; docs/broker.md explains each line.
+# companion broker init; docs/internals/broker.md explains each line.
 listener {TLS_PORT}
 certfile {folder}/server.pem
 keyfile {folder}/server.key

@@ -3,7 +3,7 @@
 MAVSDK makes JSON of every message and calls Python from its own threads, which costs more than all else that a tick does with PX4. So
 the link is the driver's (`companion.io.px4.wire`): once per tick it reads what has arrived, decodes what the flight uses, and passes
 everything but the streams of the vehicle's state to MAVSDK, whose `raw://` connection returns what is to be sent. Setpoints, poses and
-commands are written straight onto the link. Decision 14 (docs/decisions) gives the figures.
+commands are written straight onto the link. Decision 14 (docs/internals/decisions) gives the figures.
 """
 
 from __future__ import annotations

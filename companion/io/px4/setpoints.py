@@ -1,6 +1,6 @@
 """The two paths of attitude setpoints: through MAVSDK's Offboard plugin (the default) and straight onto the link.
 
-Both send SET_ATTITUDE_TARGET once per call, and nothing when the caller is silent; decision 1 (docs/decisions) compares them.
+Both send SET_ATTITUDE_TARGET once per call, and nothing when the caller is silent; decision 1 (docs/internals/decisions) compares them.
 """
 
 from __future__ import annotations

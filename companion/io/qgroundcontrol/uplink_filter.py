@@ -1,7 +1,7 @@
 """Filter of messages from a ground station to the vehicle. Pure: time is an argument.
 
 A message passes only as a whole frame with a valid checksum, of a kind that ground stations need, and never with the vehicle's own
-ids (`docs/qgroundcontrol.md`).
+ids (`docs/internals/qgroundcontrol.md`).
 
 While PX4 is armed only listed messages pass: those that read, and those that end or pause the flight (LAND, HOLD, a pilot's mode, a
 disarm that PX4 itself may refuse). Everything else is refused until PX4 is disarmed, including a forced disarm, a restart, flight
