@@ -151,7 +151,7 @@ def _rates(o: Observations) -> Row:
     if rates_hz[0] == 0.0:
         fix = "PX4 sends no position until it fuses motion capture: see the row 'EKF2 fuses motion capture'"
     else:
-        fix = "make the link faster: 921600 baud, MAV_x_RATE 80000 or more, MAV_x_MODE onboard (docs/internals/px4.md)"
+        fix = "make the link faster: 921600 baud, MAV_x_RATE 80000 or more, MAV_x_MODE onboard (docs/px4.md)"
     return RATES.graded(min(rates_hz) >= RATE_GOOD_HZ, min(rates_hz) >= RATE_MIN_HZ, read, wanted, fix)
 
 

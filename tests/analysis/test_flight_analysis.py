@@ -90,9 +90,7 @@ def test_a_log_as_data_frames_holds_every_field_of_every_tick(flight: FlightLog)
 
 def test_the_example_of_the_page_on_logs_runs(flight: FlightLog, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("pandas")
-    (example,) = re.findall(
-        r"^```python\n(.*?)^```", (ROOT / "docs/internals/log.md").read_text(encoding="utf-8"), re.M | re.S
-    )
+    (example,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs/logs.md").read_text(encoding="utf-8"), re.M | re.S)
     exec(example.replace("flights/A/flight.mcap", str(flight.path)), {})
     assert re.match(r"largest height error \d\.\d{4} m\n", capsys.readouterr().out)
 

@@ -110,6 +110,25 @@ def test_links_and_file_names_exist(page: Path) -> None:
     assert wrong == []
 
 
+def test_pages_that_the_program_and_its_files_name_exist() -> None:
+    texts = [
+        text_of(path)
+        for folder in ("companion", "sitl", "tools", "benchmarks", "configs")
+        for suffix in ("py", "yaml", "conf", "json")
+        for path in (ROOT / folder).rglob(f"*.{suffix}")
+    ]
+    named = {name for text in texts for name in re.findall(r"(?<![\w./])docs/[\w/-]+\.md", text)}
+    assert len(named) > 10
+    assert sorted(name for name in named if not (ROOT / name).is_file()) == []
+
+
+def test_pages_for_users_name_no_commit() -> None:
+    """Figures and their commits are in docs/internals."""
+    pages = list((ROOT / "docs").glob("*.md"))
+    assert len(pages) > 10
+    assert [page.name for page in pages if re.search(r"\bcommit [0-9a-f]{7}", text_of(page))] == []
+
+
 def test_files_to_begin_in_exist_and_hold_the_names_in_brackets() -> None:
     for cells in table(ROOT / "docs/internals/architecture.md", "to change"):
         for path, name in re.findall(r"`(\w+/[^`]+)`(?: \(`(\w+)`\))?", " ".join(cells)):
