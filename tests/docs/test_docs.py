@@ -270,5 +270,5 @@ def preset_text(law: AdaptiveConfig, key: str) -> str:
         return str(value).lower()
     if not isinstance(value, tuple):
         return f"{value:g}"
-    rows = value[6:8] if key.endswith("arm") else value[0:3]
+    rows = value[6:8] if key.endswith("arm") else value if key == "`nu`" else value[0:3]
     return ", ".join(f"{number:g}" for number in rows)
