@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import gc
+import itertools
 import os
 import signal
 from collections.abc import Iterator
@@ -83,9 +84,22 @@ def _nothing_is_hoarded(request: pytest.FixtureRequest) -> Iterator[None]:
             shared.cache_clear()
 
 
+_WHOLE_FLIGHTS = {"commissioning", "core", "flights", "launcher", "recorder", "sitl"}
+"""Folders of tests that fly: their files take longest."""
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let one worker run the tests that share a fixture of their module, so that it is made once."""
+    """Let one worker run the tests that share a fixture of their module, so that it is made once. Begin long files early, each beside a
+    quick one: at the end no worker waits for another.
+    """
+    files: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    long = [of for path, of in files.items() if _WHOLE_FLIGHTS & set(path.parts)]
+    quick = [of for path, of in files.items() if not _WHOLE_FLIGHTS & set(path.parts)]
+    nothing: list[pytest.Item] = []
+    items[:] = [item for both in itertools.zip_longest(long, quick, fillvalue=nothing) for of in both for item in of]
     for item in items:
         fixtures = item._fixtureinfo.name2fixturedefs.values() if isinstance(item, pytest.Function) else ()
         if any(fixture.scope == "module" for (*_, fixture) in fixtures) and not item.get_closest_marker("xdist_group"):
