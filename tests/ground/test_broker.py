@@ -11,7 +11,7 @@ import shutil
 import socket
 import ssl
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,8 +25,8 @@ from paho.mqtt.properties import Properties
 
 from companion.ground.broker import setup as broker_setup
 from companion.ground.protocol.commands import Accepted, Reason, Refused, Verifier, make_command
-from companion.ground.protocol.keys import load_login, load_operators, new_key
-from companion.ground.protocol.messages import COMMAND_MAX_BYTES, Command, Topic, encode
+from companion.ground.protocol.keys import load_login, load_operators
+from companion.ground.protocol.messages import Command, Topic, encode
 from companion.model.types import OperatorCommand
 from tests.broker import LOOPBACK, Broker, loopback_broker
 from tests.support import DEADLINE_S, ROOT, free_port
@@ -178,18 +178,15 @@ def trusting(ca: Path) -> ssl.SSLContext:
 # --- who gets in --------------------------------------------------------------------------------------------------------------------
 
 
-def test_anonymous_is_refused_and_logged(site: Site) -> None:
-    assert Peer(site.plain_port).connect() == NOT_AUTHORISED
-    logged(site.broker, "Client <unknown> disconnected, not authorised")
-
-
-def test_anonymous_over_tls_is_refused(site: Site) -> None:
-    assert Peer(site.tls_port, tls=trusting(site.folder / "ca.pem")).connect() == NOT_AUTHORISED
-
-
-def test_wrong_password_is_refused_and_logged(site: Site) -> None:
+@pytest.mark.parametrize("how", ["anonymous", "anonymous over TLS", "wrong password"])
+def test_a_missing_or_wrong_login_is_refused_and_logged(site: Site, how: str) -> None:
     before = len(site.broker.log)
-    assert peer(site, "operators/anna", password="guess").connect() == NOT_AUTHORISED
+    client = {
+        "anonymous": lambda: Peer(site.plain_port),
+        "anonymous over TLS": lambda: Peer(site.tls_port, tls=trusting(site.folder / "ca.pem")),
+        "wrong password": lambda: peer(site, "operators/anna", password="guess"),
+    }[how]()
+    assert client.connect() == NOT_AUTHORISED
     logged(site.broker, "Client <unknown> disconnected, not authorised", before)
 
 
@@ -246,7 +243,7 @@ def reached(host: str, port: int) -> bool:
     return True
 
 
-def test_plain_listener_takes_nobody_from_elsewhere(site: Site) -> None:
+def test_plain_listener_accepts_this_computer_only(site: Site) -> None:
     """127.0.0.2 is another address of this computer, as its network address is."""
     with closing(socket.create_server(("0.0.0.0", 0))) as open_to_all:
         assert reached("127.0.0.2", open_to_all.getsockname()[1]), "the test itself: such a connection can be made"
@@ -254,7 +251,7 @@ def test_plain_listener_takes_nobody_from_elsewhere(site: Site) -> None:
     assert not reached("127.0.0.2", site.plain_port)
 
 
-def test_loopback_profile_takes_nobody_from_elsewhere(tmp_path: Path) -> None:
+def test_loopback_profile_accepts_this_computer_only(tmp_path: Path) -> None:
     with loopback_broker(tmp_path) as broker:
         assert reached("127.0.0.1", broker.port)
         assert not reached("127.0.0.2", broker.port)
@@ -285,7 +282,7 @@ def test_viewer_commanding_is_refused_and_logged(site: Site, qos: int) -> None:
         assert vehicle.hear() == (COMMAND, b"after it", False)
 
 
-def test_viewers_will_commands_nothing(site: Site) -> None:
+def test_a_viewers_last_will_is_not_delivered_as_a_command(site: Site) -> None:
     """The broker publishes a will in the client's name; an operator's will shows that it does."""
     with peer(site, "vehicles/tarot") as vehicle, peer(site, "operators/anna") as anna:
         assert vehicle.subscribe(COMMAND) == 1
@@ -305,7 +302,7 @@ def test_viewers_will_commands_nothing(site: Site) -> None:
 
 @pytest.mark.parametrize("room", ["viewers/wall", "operators/anna", "vehicles/second"])
 @pytest.mark.parametrize("topic", [topic for topic in Topic if topic is not Topic.COMMAND])
-def test_nobody_else_speaks_for_a_vehicle(site: Site, room: str, topic: Topic) -> None:
+def test_only_a_vehicle_may_publish_on_its_topics(site: Site, room: str, topic: Topic) -> None:
     with peer(site, room) as other:
         assert other.publish(topic.of("tarot"), b"forged", retain=True) == NOT_AUTHORISED
         logged(site.broker, denied(other, topic.of("tarot")))
@@ -315,7 +312,7 @@ def test_nobody_else_speaks_for_a_vehicle(site: Site, room: str, topic: Topic) -
         assert bert.hear() == (topic.of("tarot"), b"true", False), "nothing forged was kept"
 
 
-def test_vehicle_commands_nobody(site: Site) -> None:
+def test_a_vehicle_may_not_publish_commands(site: Site) -> None:
     with peer(site, "vehicles/tarot") as vehicle:
         assert vehicle.publish(Topic.COMMAND.of("second"), b"land") == NOT_AUTHORISED
         assert vehicle.publish(COMMAND, b"land") == NOT_AUTHORISED
@@ -323,7 +320,7 @@ def test_vehicle_commands_nobody(site: Site) -> None:
 
 @pytest.mark.parametrize("room", ["viewers/wall", "operators/bert", "vehicles/second"])
 @pytest.mark.parametrize("topic", ["companion/tarot/command", "companion/+/command", "companion/#", "#"])
-def test_commands_are_heard_by_their_vehicle_alone(site: Site, room: str, topic: str) -> None:
+def test_commands_are_delivered_to_their_vehicle_only(site: Site, room: str, topic: str) -> None:
     """The broker grants the subscription, and sends nothing."""
     with peer(site, room) as other, peer(site, "operators/anna") as anna, peer(site, "vehicles/second") as second:
         other.subscribe(topic)
@@ -339,7 +336,7 @@ def test_commands_are_heard_by_their_vehicle_alone(site: Site, room: str, topic:
         assert other.hear()[1] == b"after it"
 
 
-def test_broker_says_nothing_of_itself(site: Site) -> None:
+def test_the_brokers_own_topics_are_not_delivered(site: Site) -> None:
     """$SYS would show a viewer who else is connected."""
     with peer(site, "viewers/wall") as wall, peer(site, "vehicles/tarot") as vehicle:
         wall.subscribe("$SYS/#")
@@ -368,60 +365,31 @@ def test_oversized_message_ends_the_connection(site: Site) -> None:
 SESSION, NOW_T_S = "f3a9", 60.0
 
 
-@dataclass
-class Attack:
-    """A message on the command topic of a broker that lets anyone publish."""
-
-    reason: Reason
-    payload: Callable[[bytes, bytes], bytes]
-    """Built from the operator's key and a genuine command."""
-    retain: bool = False
+def signed(key: bytes) -> Command:
+    return make_command(OperatorCommand.LAND, "tarot", SESSION, "anna", key, round(NOW_T_S * 1000))
 
 
-def signed(
-    key: bytes, vehicle: str = "tarot", operator: str = "anna", t_s: float = NOW_T_S, session: str = SESSION
-) -> Command:
-    return make_command(OperatorCommand.LAND, vehicle, session, operator, key, round(t_s * 1000))
-
-
-ATTACKS = {
-    "replayed": Attack(Reason.REPLAYED, lambda key, genuine: genuine),
-    "stale": Attack(Reason.STALE, lambda key, genuine: encode(signed(key, t_s=NOW_T_S - 5.1))),
-    "of another flight": Attack(Reason.WRONG_SESSION, lambda key, genuine: encode(signed(key, session="f3a8"))),
-    "from the future": Attack(Reason.FROM_THE_FUTURE, lambda key, genuine: encode(signed(key, t_s=NOW_T_S + 0.6))),
-    "malformed": Attack(Reason.MALFORMED, lambda key, genuine: b'{"v":2,"command":"land"}'),
-    "oversized": Attack(Reason.OVERSIZED, lambda key, genuine: genuine + b" " * COMMAND_MAX_BYTES),
-    "wrong vehicle": Attack(Reason.WRONG_VEHICLE, lambda key, genuine: encode(signed(key, vehicle="second"))),
-    "unsigned": Attack(Reason.MALFORMED, lambda key, genuine: re.sub(rb'"mac":"\w+"', b'"mac":""', genuine)),
-    "changed": Attack(
-        Reason.BAD_SIGNATURE,
-        lambda key, genuine: genuine.replace(b':"hold"', b':"abort"').replace(b'"land"', b'"abort"'),
-    ),
-    "a viewer's key": Attack(Reason.BAD_SIGNATURE, lambda key, genuine: encode(signed(new_key()))),
-    "a viewer's name": Attack(Reason.UNKNOWN_OPERATOR, lambda key, genuine: encode(signed(new_key(), operator="wall"))),
-    "retained": Attack(Reason.RETAINED, lambda key, genuine: encode(signed(key)), retain=True),
-}
-
-
-@pytest.mark.parametrize("attack", ATTACKS.values(), ids=ATTACKS)
-def test_open_broker_lets_it_pass_and_the_vehicle_refuses(site: Site, tmp_path: Path, attack: Attack) -> None:
+@pytest.mark.parametrize("reason", [Reason.REPLAYED, Reason.BAD_SIGNATURE, Reason.RETAINED])
+def test_open_broker_lets_it_pass_and_the_vehicle_refuses(site: Site, tmp_path: Path, reason: Reason) -> None:
+    """On a broker that lets anyone publish. test_commands.py has every other reason."""
     operators = load_operators(site.folder / "vehicles/tarot/operators.yaml")
     key = load_operators(site.folder / "operators/anna/operators.yaml").key("anna")
     judge = Verifier(operators, "tarot", SESSION)
     with loopback_broker(tmp_path) as broker, Peer(broker.port) as vehicle, Peer(broker.port) as stranger:
         genuine = encode(signed(key))
-        if attack.retain:
-            stranger.publish(COMMAND, attack.payload(key, genuine), retain=True)
+        if reason is Reason.RETAINED:
+            stranger.publish(COMMAND, genuine, retain=True)
         vehicle.subscribe(COMMAND)
-        if not attack.retain:
+        if reason is not Reason.RETAINED:
             stranger.publish(COMMAND, genuine)
             _, payload, retained = vehicle.hear()
             assert isinstance(judge.check(payload, retained, NOW_T_S), Accepted)
-            stranger.publish(COMMAND, attack.payload(key, genuine))
+            changed = genuine if reason is Reason.REPLAYED else genuine.replace(b'"land"', b'"abort"')
+            stranger.publish(COMMAND, changed)
         _, payload, retained = vehicle.hear()
         verdict = judge.check(payload, retained, NOW_T_S)
         assert isinstance(verdict, Refused)
-        assert verdict.reason is attack.reason
+        assert verdict.reason is reason
         stranger.publish(COMMAND, encode(signed(key)))
         _, payload, retained = vehicle.hear()
         assert isinstance(judge.check(payload, retained, NOW_T_S), Accepted), "a genuine one passes as before"

@@ -37,7 +37,9 @@ async def command(capsys: pytest.CaptureFixture[str], name: str, broker: Broker 
 
 
 @played
-async def test_what_was_done_is_printed(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_the_answer_of_the_vehicle_is_printed(
+    broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     async with played_vehicle(broker.port, OPERATORS) as vehicle:
         for name in ("hold", "resume", "land", "abort", "start"):
             ended = await command(capsys, name, broker, keys)
@@ -82,7 +84,9 @@ async def test_an_unknown_operator_is_informed_that_the_vehicle_does_not_have_th
 
 
 @played
-async def test_no_answer(broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_a_missing_answer_is_reported_after_each_attempt(
+    broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     async with played_vehicle(broker.port, OPERATORS) as vehicle:
         vehicle.answers = False
         ended = await command(capsys, "land", broker, keys)
@@ -92,7 +96,7 @@ async def test_no_answer(broker: Broker, keys: str, capsys: pytest.CaptureFixtur
 
 
 @played
-async def test_nobody_there(
+async def test_no_broker_and_no_vehicle_are_reported_in_one_line(
     broker: Broker, keys: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(command_command, "FOUND_S", 1.0)
@@ -144,7 +148,7 @@ async def test_a_vehicle_is_not_taken_for_the_only_one_because_another_one_is_qu
 
 @pytest.mark.parametrize("name", ["hold", "land", "abort"])
 @played
-async def test_a_state_that_was_left_behind_keeps_nobody_from_making_it_safer(
+async def test_a_retained_state_does_not_prevent_hold_land_and_abort(
     name: str, broker: Broker, keys: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A retained state may be forged: the command goes to the one vehicle with a proven stream, and the other is named."""

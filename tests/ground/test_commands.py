@@ -79,7 +79,7 @@ def test_genuine_command_is_accepted_as_it_was_made(name: OperatorCommand) -> No
     assert verifier().check(encode(command), False, NOW_T_S) == Accepted(command)
 
 
-def test_json_of_another_hand_is_accepted() -> None:
+def test_white_space_and_field_order_of_the_json_do_not_matter() -> None:
     """White space and field order are the sender's choice: the content is signed."""
     data = json.loads(encode(made()))
     payload = json.dumps(dict(reversed(data.items())), indent=1).encode()
@@ -166,9 +166,8 @@ UNSIGNED = {
 def test_refused_and_never_answered(payload: bytes, reason: Reason) -> None:
     verdict = verifier().check(payload, False, NOW_T_S)
     assert isinstance(verdict, Refused)
-    assert verdict.reason is reason
-    assert verdict.command is None
-    assert judged(payload) is reason
+    assert (verdict.reason, verdict.command) == (reason, None)
+    assert verdict.text.isprintable() and 0 < len(verdict.text) <= 200
 
 
 def test_retained_is_refused_though_genuine() -> None:
@@ -301,13 +300,6 @@ def test_rate_is_limited_per_command_and_operator(name: OperatorCommand) -> None
     assert judged(encode(made(name, NOW_T_S + 1.0)), judge, now_t_s=NOW_T_S + 1.0) is None
 
 
-def test_what_was_one_too_many_cannot_be_sent_again_later() -> None:
-    judge, late = verifier(), encode(made(OperatorCommand.START))
-    assert judged(encode(made(OperatorCommand.START)), judge) is None
-    assert judged(late, judge) is Reason.TOO_MANY
-    assert judged(late, judge, now_t_s=NOW_T_S + 1.5) is Reason.REPLAYED
-
-
 @pytest.mark.parametrize("flood", COMMANDS.values())
 @pytest.mark.parametrize("ahead_s", [0.0, 60.0])
 def test_a_flood_of_one_command_leaves_room_for_every_other(flood: OperatorCommand, ahead_s: float) -> None:
@@ -377,10 +369,8 @@ def test_any_changed_byte_of_the_key_is_refused(data: st.DataObject) -> None:
     assert judged(encode(made(key=bytes(key)))) is Reason.BAD_SIGNATURE
 
 
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
-    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=10), inner, max_size=5),
-)
+SCALAR = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20)
+JSON = SCALAR | st.lists(SCALAR, max_size=3) | st.dictionaries(st.text(max_size=10), SCALAR, max_size=3)
 
 
 @given(st.binary(max_size=2000))
@@ -426,7 +416,7 @@ def test_flight_clock_follows_the_fastest_message() -> None:
 
 
 @pytest.mark.parametrize("paces", [[0.1], [0.4], [1.0], [3.0], [1.0, 0.0, 0.1], [0.01, 5.0]], ids=str)
-def test_all_who_listen_agree_on_simulated_time_at_any_pace_however_long_they_listened(paces: list[float]) -> None:
+def test_all_listeners_agree_on_simulated_time_at_any_pace(paces: list[float]) -> None:
     """A command of a flight slower than real time was called stale, or older than one that another program had given before."""
     vehicle, ground, fresh = FlightClock(), FlightClock(), FlightClock()
     now_s = t_s = 0.0

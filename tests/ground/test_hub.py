@@ -12,9 +12,11 @@ from msgspec.structs import replace
 from companion.config.document import ConfigError
 from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.messages import VERSION, Events, Presence, Topic, encode
+from companion.ground.protocol.proof import Signer, with_proofs
 from companion.ground.station.hub import FRESH_S, OUTBOX_MAX, TOO_SLOW, Hub, Outbox
 from companion.ground.station.vehicles import LIVE_S, VEHICLES_MAX, ReceivedRecord, VehicleTracker
 from companion.ground.station.web_guard import MESSAGES_BURST, RateLimiter, host_allowed, origin_allowed, same_token
+from tests.ground.monitor_rig import ANNA, SIGNER
 from tests.ground.vehicle import ack_of, flight, state_of
 from tests.support import DEADLINE_S
 
@@ -52,7 +54,7 @@ RUBBISH: dict[str, tuple[str, bytes]] = {
 
 
 @pytest.mark.parametrize(("topic", "payload"), RUBBISH.values(), ids=RUBBISH.keys())
-def test_rubbish_is_counted_and_remembered_by_nobody(topic: str, payload: bytes) -> None:
+def test_an_invalid_message_is_counted_and_not_stored(topic: str, payload: bytes) -> None:
     watch = VehicleTracker()
     assert watch.receive(topic, payload, False, 0.0) is None
     assert watch.rejected == 1
@@ -60,7 +62,7 @@ def test_rubbish_is_counted_and_remembered_by_nobody(topic: str, payload: bytes)
     assert not watch.vehicles
 
 
-def test_a_retained_record_that_is_deleted_is_no_rubbish() -> None:
+def test_a_retained_record_that_is_deleted_is_not_counted_as_invalid() -> None:
     watch = VehicleTracker()
     assert watch.receive("companion/rig/state", b"", True, 0.0) is None
     assert watch.rejected == 0
@@ -72,7 +74,7 @@ def test_a_retained_stream_does_not_look_alive() -> None:
     assert not watch.vehicles["rig"].live(0.0)
 
 
-def test_a_late_message_says_how_late_it_is() -> None:
+def test_a_late_message_has_its_delay() -> None:
     watch = VehicleTracker()
     first = watch.receive("companion/rig/stream", stream_of(t_s=1.0), False, 100.0)
     late = watch.receive("companion/rig/stream", stream_of(t_s=1.05), False, 103.0)
@@ -91,16 +93,19 @@ def test_a_new_flight_has_a_clock_of_its_own_and_an_old_retained_state_does_not_
     assert not known.ended
 
 
-def test_a_flood_of_vehicles_does_not_push_out_the_one_that_flies() -> None:
-    watch = VehicleTracker()
+@pytest.mark.parametrize("signer", [None, SIGNER])
+def test_a_flood_of_vehicles_does_not_push_out_the_one_that_flies_or_is_proven(signer: Signer | None) -> None:
+    """A vehicle with a proven message is kept even if it is silent."""
+    watch, proven = VehicleTracker(signer=signer), with_proofs(flight()[1][30], "rig", [ANNA.key])
     for number in range(3 * VEHICLES_MAX):
-        watch.receive("companion/rig/stream", stream_of(), False, number + 0.5)
-        watch.receive(f"companion/fake-{number}/state", encode(state_of(f"fake-{number}", "s")), True, float(number))
+        if signer is None or number == 0:
+            watch.receive("companion/rig/stream", encode(proven), False, number + 0.5)
+        watch.receive(f"companion/fake-{number}/state", encode(state_of(f"fake-{number}", "s")), True, number + 0.6)
     assert len(watch.vehicles) == VEHICLES_MAX
     assert watch.vehicles["rig"].stream is not None
 
 
-def test_who_is_there() -> None:
+def test_vehicles_that_ended_or_were_lost_are_not_present() -> None:
     watch = VehicleTracker()
     for name, presence in (("flies", Presence.FLYING), ("over", Presence.ENDED), ("gone", Presence.LOST)):
         watch.receive(f"companion/{name}/state", encode(state_of(name, SESSION, presence=presence)), True, 0.0)
@@ -125,7 +130,7 @@ def test_the_newest_stream_wins_and_nothing_else_is_lost() -> None:
     assert took(outbox) == [f"event {number}" for number in range(5)] + ["rig 4", "other 4"]
 
 
-def test_a_viewer_that_would_lose_an_event_is_sent_away_and_streams_never_do_that() -> None:
+def test_a_viewer_that_would_lose_an_event_is_disconnected_and_one_that_misses_streams_is_not() -> None:
     outbox = Outbox()
     for _ in range(10 * OUTBOX_MAX):
         outbox.put_stream("rig", "{}")
@@ -143,7 +148,7 @@ def test_an_idle_viewer_costs_bounded_memory_however_many_vehicles_are_made_up()
     assert took(outbox) == list(range(9 * VEHICLES_MAX, 10 * VEHICLES_MAX))
 
 
-def test_a_few_huge_messages_are_too_many_too() -> None:
+def test_a_few_huge_messages_fill_an_outbox() -> None:
     outbox = Outbox()
     for _ in range(30):
         outbox.put("x" * 200_000)
@@ -163,7 +168,7 @@ def test_a_late_viewer_gets_the_known_state_but_no_old_stream() -> None:
     assert [message["kind"] for message in took(late)] == ["broker", "state", "events"]
 
 
-def test_everybody_gets_the_same_text_and_who_left_gets_nothing() -> None:
+def test_all_viewers_get_the_same_text_and_a_removed_one_gets_nothing() -> None:
     hub = Hub(VehicleTracker(), "no broker yet")
     outboxes = [Outbox() for _ in range(3)]
     for outbox in outboxes:

@@ -8,6 +8,7 @@ import itertools
 import json
 import re
 import signal
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from tests.analysis.synthetic_flight import record_flight
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, played, self_signed
 from tests.ground.vehicle import played_vehicle
-from tests.support import CATCH, Sandbox, free_port, sandbox_in
+from tests.support import CATCH, Sandbox, sandbox_in
 
 
 @pytest.fixture
@@ -78,9 +79,7 @@ async def test_it_prints_an_address_to_open_and_ends_in_order(broker: Broker, sa
     sandbox.assert_nobody_left()
 
 
-def test_a_broker_that_does_not_want_us_is_reported_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_refusal_by_the_broker_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with loopback_broker(tmp_path) as broker:
         broker.stop()
         config = tmp_path / "loopback.conf"
@@ -94,20 +93,18 @@ def test_a_broker_that_does_not_want_us_is_reported_in_one_line(
             )
 
 
-def test_a_port_that_is_taken(sandbox: Sandbox) -> None:
-    with sandbox.start("monitor", "--port", 0, "--broker", f"mqtt://127.0.0.1:{free_port()}", "--view-only") as running:
-        running.wait_for("(Ctrl-C ends)\n")
-        port = re.findall(r":(\d+)/", running._text("out"))[0]
-        ended = sandbox.run("monitor", "--port", port, "--view-only")
-        running.signal(signal.SIGTERM)
-        assert running.end().code == EXIT_OK
-    assert ended.code == EXIT_REFUSED
-    assert ended.err_lines == [
-        f"companion monitor: port {port} of 127.0.0.1 is in use, perhaps by another monitor; choose another: --port N"
-    ]
+def test_an_address_that_cannot_be_listened_on_is_reported_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert failed(["--port", str(port), "--view-only"], capsys) == (
+            EXIT_REFUSED,
+            f"companion monitor: port {port} of 127.0.0.1 is in use, perhaps by another monitor; choose another: --port N",
+        )
+    code, line = failed(["--host", "192.0.2.7", "--port", "0", "--view-only"], capsys)
+    assert code == EXIT_REFUSED and "--host 192.0.2.7: cannot listen there" in line
 
 
-def test_mistakes(tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line(tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     damaged, foreign, empty = tmp_path / "damaged.mcap", tmp_path / "foreign.mcap", tmp_path / "empty.mcap"
     data = bytearray(log.read_bytes())
     data[len(data) // 2] ^= 0xFF

@@ -146,7 +146,7 @@ def test_without_motion_capture_the_pose_is_that_of_px4_and_says_so(loss: dict[s
     assert stream.e_p_m == pytest.approx(math.dist((0.5, 0.5, 0.5), reference.position_world_m), abs=6e-6)
 
 
-def test_with_nothing_known_everything_is_none_and_all_lights_of_devices_are_off() -> None:
+def test_without_device_data_every_value_is_none_and_the_lights_are_off() -> None:
     row = changed(
         ROWS[0], vehicle=None, status=None, mocap=None, arm=None, force=None, outputs__reference=None, outputs__attitude=None
     )  # fmt: skip
@@ -163,7 +163,7 @@ BAD_NUMBERS = [math.nan, math.inf, -math.inf, 1e308]
 
 
 @pytest.mark.parametrize("bad", BAD_NUMBERS)
-def test_numbers_that_are_none_make_a_message_that_every_parser_reads(bad: float) -> None:
+def test_values_that_are_not_finite_make_a_message_that_every_parser_reads(bad: float) -> None:
     def corrupted(value: Any) -> Any:
         if isinstance(value, float):
             return bad
@@ -270,33 +270,21 @@ def old(device: str, limit_s: float) -> Callable[[float], dict[str, Any]]:
     return lambda share: {f"{device}__{stamp}": IN_FLIGHT[0].t_s - share * limit_s for stamp in stamps}
 
 
-def test_an_absent_force_sensor_is_shown_as_absent_and_no_force_is_shown() -> None:
-    config = load_flight(CATCH, overrides=["vehicle.devices.force=null"])
-    maker = StreamBuilder(config, "s")
-    maker.add_tick(*changed(IN_FLIGHT, force=None))
+@pytest.mark.parametrize(
+    ("absent", "name", "text"),
+    [
+        (["devices.force=null"], "force sensor", "none on this vehicle"),
+        (["devices.force=null", "force_source=observer"], "force sensor", "momentum observer"),
+        (["tether=null"], "tether", "none on this vehicle"),
+    ],
+)
+def test_an_absent_device_is_shown_as_absent(absent: list[str], name: str, text: str) -> None:
+    maker = StreamBuilder(load_flight(CATCH, overrides=[f"vehicle.{key}" for key in absent]), "s")
+    maker.add_tick(*changed(IN_FLIGHT, force=None, outputs__tether=None))
     stream = maker.build(1.7e9)
-    assert light_of(stream, "force sensor") == (HealthLevel.OFF, "none on this vehicle")
-    assert stream.control is not None
-    assert stream.control.force_ext_world_n is None
-    assert stream_of(IN_FLIGHT).control.force_ext_world_n is not None  # type: ignore[union-attr]
-
-
-def test_the_force_of_the_momentum_observer_is_shown() -> None:
-    config = load_flight(CATCH, overrides=["vehicle.devices.force=null", "vehicle.force_source=observer"])
-    maker = StreamBuilder(config, "s")
-    maker.add_tick(*changed(IN_FLIGHT, force=None))
-    stream = maker.build(1.7e9)
-    assert light_of(stream, "force sensor") == (HealthLevel.OFF, "momentum observer")
-    assert stream.control is not None
-    assert stream.control.force_ext_world_n is not None
-
-
-def test_an_absent_tether_is_shown_as_absent() -> None:
-    maker = StreamBuilder(load_flight(CATCH, overrides=["vehicle.tether=null"]), "s")
-    maker.add_tick(*changed(IN_FLIGHT, outputs__tether=None))
-    stream = maker.build(1.7e9)
-    assert stream.tether is None
-    assert light_of(stream, "tether") == (HealthLevel.OFF, "none on this vehicle")
+    assert light_of(stream, name) == (HealthLevel.OFF, text)
+    assert stream.tether is None and stream.control is not None
+    assert (stream.control.force_ext_world_n is None) == (absent == ["devices.force=null"])
 
 
 AGES = [
@@ -308,15 +296,11 @@ AGES = [
 
 
 @pytest.mark.parametrize(("name", "aged"), AGES)
-def test_a_light_turns_with_the_age_of_its_device(name: str, aged: Callable[[float], dict[str, Any]]) -> None:
-    assert light_of(stream_of(changed(IN_FLIGHT, **aged(0.1))), name)[0] is HealthLevel.OK
-    assert light_of(stream_of(changed(IN_FLIGHT, **aged(1.1))), name)[0] is HealthLevel.BAD
-
-
-@pytest.mark.parametrize("name_aged", AGES)
-def test_a_light_warns_from_half_its_limit_on(name_aged: tuple[str, Callable[[float], dict[str, Any]]]) -> None:
-    name, aged = name_aged
-    assert light_of(stream_of(changed(IN_FLIGHT, **aged(0.7))), name)[0] is HealthLevel.WARN
+def test_a_light_warns_from_half_the_age_limit_of_its_device(
+    name: str, aged: Callable[[float], dict[str, Any]]
+) -> None:
+    for share, light in ((0.1, HealthLevel.OK), (0.7, HealthLevel.WARN), (1.1, HealthLevel.BAD)):
+        assert light_of(stream_of(changed(IN_FLIGHT, **aged(share))), name)[0] is light
 
 
 @pytest.mark.parametrize(
@@ -377,7 +361,7 @@ def test_each_active_rule_turns_its_light_and_no_other(rule: Rule) -> None:
     assert [a.name for a, b in zip(after.lights, before.lights, strict=True) if a != b] == [rule.lamp]
 
 
-def test_of_two_active_rules_a_light_shows_the_graver() -> None:
+def test_of_two_active_rules_a_light_shows_the_more_severe() -> None:
     mild = ActiveRule(id="battery_warn", action=SafetyAction.WARN, text="mild")
     grave = ActiveRule(id="battery_low", action=SafetyAction.LAND, text="grave")
     for active in ((mild, grave), (grave, mild)):
@@ -409,7 +393,7 @@ def test_a_log_is_replayed_at_the_rate_of_the_stream_from_its_first_tick_to_its_
     assert {record.session for record in records} == {events.session} == {"log"}
 
 
-@pytest.mark.parametrize("max_records", [2, 3, 50, 199, 200, 201, 202])
+@pytest.mark.parametrize("max_records", [2, 50, 200, 201])
 def test_a_long_log_is_replayed_at_a_lower_rate_and_keeps_its_worst_moment(max_records: int) -> None:
     late = [changed(row, sent__lateness_s=0.123) if row[0].tick == 777 else row for row in ROWS]
     records, events = replay(iter(late), CONFIG, "log", 0.0, max_records=max_records)

@@ -25,7 +25,7 @@ from rich.console import Console
 
 from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.keys import operators_text, write_private
-from companion.ground.protocol.messages import Presence, encode
+from companion.ground.protocol.messages import Presence, TetherView, encode
 from companion.ground.protocol.proof import with_proofs
 from companion.ground.station.station import Station
 from companion.ground.station.text_monitor import _Screen
@@ -83,7 +83,7 @@ def plain(text: str) -> str:
         (known(Presence.ENDED), 100.0, "ENDED: completed", False),
     ],
 )
-def test_the_word(vehicle: Vehicle, now_s: float, expected: str, alarm: bool) -> None:
+def test_the_status_word(vehicle: Vehicle, now_s: float, expected: str, alarm: bool) -> None:
     text, style = status_word(vehicle, now_s)
     assert text == expected
     assert ("on red" in style) is alarm
@@ -96,7 +96,7 @@ def test_what_is_shown_of_a_flight() -> None:
         assert expected in text, (expected, text)
 
 
-def test_old_figures_do_not_look_alive() -> None:
+def test_stale_figures_are_not_green() -> None:
     vehicle = known()
     assert not stale(vehicle, STALE_S - 0.01) and stale(vehicle, STALE_S + 0.01)
     fresh, old = drawn(vehicle, 0.0), drawn(vehicle, 5.0)
@@ -104,11 +104,9 @@ def test_old_figures_do_not_look_alive() -> None:
     assert "\x1b[32m" not in old.split("caught")[0], "something is still green"
 
 
-def test_a_taut_tether_is_loud() -> None:
-    tether = {"slack_m": 0.0, "stop_slack_m": 0.0, "pull_n": 3.0, "turns": 0.0, "taut": True, "snagged": False}
-    from companion.ground.protocol.messages import TetherView
-
-    assert "TETHER TAUT" in drawn(known(tether=TetherView(**tether)))  # type: ignore[arg-type]
+def test_a_taut_tether_is_shown() -> None:
+    tether = TetherView(slack_m=0.0, stop_slack_m=0.0, pull_n=3.0, turns=0.0, taut=True, snagged=False)
+    assert "TETHER TAUT" in drawn(known(tether=tether))
 
 
 def test_a_viewer_without_permission_gets_the_reason_and_no_keys() -> None:
@@ -133,7 +131,7 @@ def test_text_from_the_network_does_not_steer_the_terminal() -> None:
 class Terminal:
     """`companion monitor --text` in a pty, as SSH gives one."""
 
-    def __init__(self, broker: Broker, keys: Path, *more: str) -> None:
+    def __init__(self, broker: Broker, keys: Path) -> None:
         self.ours, theirs = pty.openpty()
         self._screen = ""
         termios.tcsetwinsize(theirs, (24, 80))  # as low as terminals are
@@ -141,7 +139,7 @@ class Terminal:
         self._theirs = theirs
         command = [sys.executable, "-m", "companion", "monitor", "--text", "--broker", broker.url]
         self.process = subprocess.Popen(
-            [*command, "--operators", str(keys), *more],
+            [*command, "--operators", str(keys)],
             cwd=ROOT,
             env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "", "LINES": ""},
             stdin=theirs,
@@ -193,10 +191,10 @@ class Terminal:
 
 
 @contextlib.asynccontextmanager
-async def terminal_at(broker: Broker, folder: Path, *more: str) -> AsyncIterator[Terminal]:
+async def terminal_at(broker: Broker, folder: Path) -> AsyncIterator[Terminal]:
     keys = folder / "operators.yaml"
     write_private(keys, operators_text([ANNA]).encode())
-    terminal = Terminal(broker, keys, *more)
+    terminal = Terminal(broker, keys)
     try:
         yield terminal
     finally:
@@ -254,16 +252,7 @@ async def test_it_shows_commands_and_leaves_the_terminal_as_it_was(broker: Broke
 
 
 @played
-async def test_ctrl_c_ends_it(broker: Broker, tmp_path: Path) -> None:
-    async with terminal_at(broker, tmp_path, "--view-only") as terminal:
-        await terminal.shows("view only: this monitor was started with --view-only")
-        terminal.process.send_signal(signal.SIGINT)
-        assert await terminal.ended() == 0
-        assert terminal.settings == terminal.before
-
-
-@played
-async def test_the_next_vehicle(broker: Broker, tmp_path: Path) -> None:
+async def test_n_shows_the_next_vehicle_and_ctrl_c_ends_the_display(broker: Broker, tmp_path: Path) -> None:
     async with (
         played_vehicle(broker.port, OPERATORS, "one") as one,
         played_vehicle(broker.port, OPERATORS, "two") as two,
@@ -278,6 +267,9 @@ async def test_the_next_vehicle(broker: Broker, tmp_path: Path) -> None:
         await terminal.shows(f"{second.name}: hold: hold: done (anna)", on="h")
         for vehicle in (first, second):  # a HOLD whose answer is late is sent again
             assert {heard.command for heard in vehicle.accepted} == {OperatorCommand.HOLD}
+        terminal.process.send_signal(signal.SIGINT)
+        assert await terminal.ended() == 0
+        assert terminal.settings == terminal.before
 
 
 @played
@@ -289,7 +281,7 @@ async def test_a_pipe_gets_a_line_a_second(broker: Broker) -> None:
             stdout=asyncio.subprocess.PIPE,
         )
         assert process.stdout is not None
-        lines = [(await process.stdout.readline()).decode() for _ in range(4)]
+        lines = [(await process.stdout.readline()).decode() for _ in range(3)]
         process.send_signal(signal.SIGINT)
         await process.communicate()
         assert process.returncode == 0

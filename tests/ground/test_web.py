@@ -17,7 +17,7 @@ from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.messages import Topic
 from companion.ground.station.hub import Hub
 from companion.ground.station.station import Station
-from companion.ground.station.web import Monitor, ServerSettings, WebError
+from companion.ground.station.web import Monitor, ServerSettings
 from companion.ground.station.web_guard import HEADERS, MESSAGE_MAX_BYTES
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import (
@@ -61,7 +61,7 @@ async def test_a_silent_viewer_is_greeted_without_a_token(broker: Broker) -> Non
 
 
 @played
-async def test_strange_hosts_and_origins_are_turned_away(broker: Broker) -> None:
+async def test_requests_of_other_hosts_and_origins_are_refused(broker: Broker) -> None:
     async with monitor_at(broker.url) as monitor, aiohttp.ClientSession() as session:
         base = base_of(monitor)
         own = base.rstrip("/")
@@ -91,7 +91,7 @@ async def test_strange_hosts_and_origins_are_turned_away(broker: Broker) -> None
     ],
 )
 @played
-async def test_a_viewer_that_talks_rubbish_is_sent_away(broker: Broker, text: str, code: int) -> None:
+async def test_a_viewer_that_sends_an_invalid_message_is_disconnected(broker: Broker, text: str, code: int) -> None:
     async with monitor_at(broker.url) as monitor, viewer_of(monitor) as viewer, viewer_of(monitor) as other:
         await viewer.until("broker")
         await viewer.ws.send_str(text)
@@ -100,7 +100,7 @@ async def test_a_viewer_that_talks_rubbish_is_sent_away(broker: Broker, text: st
 
 
 @played
-async def test_a_viewer_that_floods_is_sent_away(broker: Broker) -> None:
+async def test_a_viewer_that_floods_is_disconnected(broker: Broker) -> None:
     async with on_page(broker) as (vehicle, _monitor, viewer):
         await viewer.until("stream")
         with contextlib.suppress(ConnectionError):
@@ -112,7 +112,7 @@ async def test_a_viewer_that_floods_is_sent_away(broker: Broker) -> None:
 
 
 @played
-async def test_a_viewer_that_does_not_keep_up_is_sent_away_and_nobody_else_misses_an_event(broker: Broker) -> None:
+async def test_a_slow_viewer_is_disconnected_and_no_other_misses_an_event(broker: Broker) -> None:
     async with on_page(broker, quiet=True) as (vehicle, monitor, viewer):
         await viewer.until("events")
         with idle_viewer(monitor):
@@ -127,25 +127,7 @@ async def test_a_viewer_that_does_not_keep_up_is_sent_away_and_nobody_else_misse
 
 
 @played
-async def test_twenty_viewers_see_the_same_last_stream(broker: Broker) -> None:
-    async with contextlib.AsyncExitStack() as stack:
-        vehicle = await stack.enter_async_context(played_vehicle(broker.port, OPERATORS))
-        monitor = await stack.enter_async_context(monitor_at(broker.url))
-        viewers = [await stack.enter_async_context(viewer_of(monitor)) for _ in range(20)]
-        for viewer in viewers:
-            await viewer.until("stream")
-        vehicle.streams = False
-        last = await vehicle.say_stream(phase="the last one")
-        texts = [
-            await viewer.until("stream", lambda message: message["data"]["phase"] == "the last one")
-            for viewer in viewers
-        ]
-        assert all(text == texts[0] for text in texts)
-        assert texts[0]["data"]["seq"] == last.seq
-
-
-@played
-async def test_rubbish_at_the_broker_is_counted_and_not_passed_on(broker: Broker) -> None:
+async def test_an_invalid_message_is_counted_and_not_passed_on(broker: Broker) -> None:
     async with (
         played_vehicle(broker.port, OPERATORS, quiet=True) as vehicle,
         aiomqtt.Client("127.0.0.1", broker.port) as stranger,
@@ -230,14 +212,3 @@ async def test_the_page_over_tls(broker: Broker, tmp_path: Path) -> None:
         await viewer.until("stream")
         await viewer.order("land")
         await viewer.until("ack")
-
-
-@played
-async def test_a_port_that_is_taken_is_said(broker: Broker) -> None:
-    async with monitor_at(broker.url) as monitor:
-        with pytest.raises(WebError, match=f"port {monitor.port} of 127.0.0.1 is in use"):
-            async with monitor_at(broker.url, serving=ServerSettings("127.0.0.1", monitor.port)):
-                pass
-    with pytest.raises(WebError, match=r"--host 192\.0\.2\.7: cannot listen there"):
-        async with monitor_at(broker.url, serving=ServerSettings("192.0.2.7", 0)):
-            pass

@@ -58,7 +58,7 @@ def in_flight(**changes: Any) -> Stream:
     return replace(flown().at(8.5), **changes)
 
 
-def test_the_page_says_its_token_first_and_hides_it(stub: MonitorStub, page: Page) -> None:
+def test_the_page_sends_its_token_first_and_hides_it(stub: MonitorStub, page: Page) -> None:
     wait_until(lambda: bool(stub.received("token")), lambda: "the page sends no token")
     assert stub.received("token") == [{"kind": "token", "token": "secret"}]
     assert page.tab.evaluate("location.hash") == ""
@@ -124,7 +124,7 @@ def test_stale_shows_within_half_a_second_of_the_last_message(page: Page) -> Non
 
 
 @pytest.mark.parametrize("how", ["stale", "ended"])
-def test_figures_look_dead_when_they_are_old(page: Page, how: str) -> None:
+def test_stale_figures_are_greyed_out(page: Page, how: str) -> None:
     def look() -> list[str]:
         found: list[str] = page.tab.evaluate(
             "['.tile .value', '#light-list .text', '.lamp', '#scene', '.plot canvas'].map((s) => document.querySelector(s))"
@@ -218,9 +218,15 @@ def test_the_word_says_what_it_does_and_how_grave_that_is(
 
 
 @pytest.mark.parametrize(
-    ("tile", "lamp"), [("tether", "tether"), ("error", "flight"), ("battery", "battery"), ("latency", "loop")]
+    ("tile", "lamp", "level"),
+    [
+        ("tether", "tether", HealthLevel.OK),
+        ("tether", "tether", HealthLevel.BAD),
+        ("error", "flight", HealthLevel.WARN),
+        ("battery", "battery", HealthLevel.BAD),
+        ("latency", "loop", HealthLevel.WARN),
+    ],
 )
-@pytest.mark.parametrize("level", [HealthLevel.OK, HealthLevel.WARN, HealthLevel.BAD])
 def test_a_figure_has_the_colour_of_its_lamp(
     watched: Page, newest: Callable[[Stream], Message], tile: str, lamp: str, level: HealthLevel
 ) -> None:
@@ -252,6 +258,10 @@ def test_the_catch_appears_among_the_events_and_is_read_out(page: Page) -> None:
 
 
 def test_events_can_be_filtered(page: Page) -> None:
+    page.tab.click("[data-filter='critical']")
+    assert page.text("#event-none") == "No events yet."
+    page.show(events_of(event(1, "a", severity="info"), event(2, "b")))
+    assert page.text("#event-none") == "No events of this severity."
     page.show(events_of(event(1, "a", severity="info"), event(2, "b"), event(3, "c", severity="critical")))
     visible = page.tab.locator("#event-list li:visible")
     for filtered, expected in (("warning", ["critical", "warning"]), ("critical", ["critical"])):
@@ -259,14 +269,6 @@ def test_events_can_be_filtered(page: Page) -> None:
         assert [visible.nth(k).get_attribute("data-severity") for k in range(visible.count())] == expected
     page.tab.click("[data-filter='info']")
     assert visible.count() == 3
-
-
-def test_a_filter_that_leaves_nothing_says_so(page: Page) -> None:
-    page.tab.click("[data-filter='critical']")
-    assert page.text("#event-none") == "No events yet."
-    page.show(relayed(flown().events))
-    assert page.tab.locator("#event-list li:visible").count() == 0
-    assert page.text("#event-none") == "No events of this severity."
 
 
 def test_a_new_session_begins_with_nothing_of_the_old_one(page: Page) -> None:
@@ -312,26 +314,21 @@ def test_several_vehicles(stub: MonitorStub, page: Page) -> None:
     assert stub.wait_received("command", 1) == [{"kind": "command", "vehicle": "second", "command": "hold"}]
 
 
-def test_a_restarted_monitor_is_found_again(browser: Any, own_stub: MonitorStub) -> None:
+def test_without_a_connection_nothing_is_sent_and_a_restarted_monitor_is_found_again(
+    browser: Any, own_stub: MonitorStub
+) -> None:
     with watching(browser, own_stub, may="WebSocket connection to") as page:
         page.show(relayed(in_flight()))
         own_stub.stop()
         page.until_text("#stale", "NO CONNECTION")
         assert page.body("frame") == "bad" and page.enabled() <= SAFE
+        page.press("hold")
+        assert "NOT SENT" in page.text("#answers [data-for='hold']")
         own_stub.start()
         page.tab.clock.resume()
         own_stub.wait_received("token", 2)
         page.show(relayed(in_flight(t_s=5000.0, position_world_m=(0.0, 0.0, 1.55))))
         page.until_text("[data-figure='height']", "1.55")
-
-
-def test_without_a_connection_a_press_says_that_nothing_was_sent(browser: Any, own_stub: MonitorStub) -> None:
-    with watching(browser, own_stub, may="WebSocket connection to") as page:
-        page.show(relayed(in_flight()))
-        own_stub.stop()
-        page.until_text("#stale", "NO CONNECTION")
-        page.press("hold")
-        assert "NOT SENT" in page.text("#answers [data-for='hold']")
 
 
 def test_a_page_that_may_only_watch_says_why(stub: MonitorStub, shared: Page) -> None:

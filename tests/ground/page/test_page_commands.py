@@ -82,7 +82,7 @@ def test_no_answer_is_red_until_a_late_one_comes(page: Page) -> None:
     assert answer(page, "land") == ("done", "✓ landing")
 
 
-def test_a_monitor_that_says_nothing_is_no_answer_either(page: Page) -> None:
+def test_a_silent_monitor_is_shown_as_no_answer(page: Page) -> None:
     page.press("hold")
     page.run(2.4)
     assert answer(page, "hold")[0] == "wait"
@@ -110,9 +110,7 @@ def test_a_double_click_sends_one_command(stub: MonitorStub, page: Page) -> None
     [state(Presence.ENDED, outcome="completed"), state(Presence.FLYING, commands=False, text="hears nothing")],
     ids=["ended", "hears no commands"],
 )
-def test_a_state_that_the_stream_contradicts_keeps_nobody_from_landing_it(
-    stub: MonitorStub, page: Page, lie: Any
-) -> None:
+def test_a_state_that_the_stream_contradicts_does_not_prevent_landing(stub: MonitorStub, page: Page, lie: Any) -> None:
     """The stream is proven, the state is not."""
     page.show(relayed(replace(flown().at(8.55), proofs=("0" * 32,))), relayed(lie))
     assert page.enabled() == {"hold", "land", "abort"}

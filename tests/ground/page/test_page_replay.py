@@ -135,12 +135,11 @@ def test_keys_step_and_play(page: Page) -> None:
     assert shown_s(page) == after_s
 
 
-@pytest.mark.parametrize("speed", ["0.25", "8"])
-def test_speeds(page: Page, speed: str) -> None:
-    page.tab.select_option("#replay-speed", speed)
+def test_a_log_is_played_at_the_chosen_speed(page: Page) -> None:
+    page.tab.select_option("#replay-speed", "8")
     page.tab.click("#replay-play")
     page.run(2.0)
-    assert shown_s(page) == pytest.approx(2.0 * float(speed), abs=0.4)
+    assert shown_s(page) == pytest.approx(16.0, abs=0.4)
 
 
 def test_playing_ends_with_the_log(page: Page) -> None:
