@@ -171,3 +171,11 @@ def test_overheating_comes_back_after_reboot_while_it_is_hot() -> None:
     servo.set_temperature_c(60)
     servo.reboot()
     assert get(servo, 70, 1) == 0
+
+
+def test_watchdog_sleeps_while_torque_is_off() -> None:
+    servo = ServoModel(1)
+    servo.write(98, b"\x01")
+    servo.update(0.0, 0.0, 0.0)
+    servo.update(5.0, 0.0, 0.0)
+    assert get(servo, 98, 1) == 1

@@ -134,3 +134,13 @@ def test_it_changes_a_flight_in_the_fast_loop(pair: Pair) -> None:
 def test_the_list_of_exceptions_names_settings_that_there_are() -> None:
     assert set(ON_WIRES_ONLY) <= {field(pair) for pair in PAIRS}
     assert len({field(pair) for pair in PAIRS} - set(ON_WIRES_ONLY)) > 40
+
+
+def test_parts_that_are_off_change_nothing_whatever_their_other_settings_are() -> None:
+    off: dict[str, Settings] = {}
+    for pair in PAIRS:
+        for part, settings in pair.changed.items():
+            if isinstance(settings, dict) and "on" in settings:
+                off.setdefault(part, {}).update({**settings, "on": False})
+    assert {"air", "battery", "downwash", "force_sensor", "imu", "machine", "mocap", "net", "rotors"} <= off.keys()
+    assert not flights_differ(Pair("off", {}, off), UNTIL_S[-1])
