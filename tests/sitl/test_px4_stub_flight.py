@@ -87,7 +87,7 @@ def test_take_off_hold_land_and_automatic_disarm() -> None:
 
 def test_nothing_turns_while_disarmed_and_nothing_lifts_during_spool_up() -> None:
     rig = ready()
-    rig.stub.on_attitude_target(rig.t_s, AttitudeTarget(LEVEL, 0.9))
+    rig.stub.on_setpoint(rig.t_s, AttitudeTarget(LEVEL, 0.9))
     rig.run(0.2)
     assert rig.stub.rotors == (0.0, 0.0, 0.0, 0.0)
     rig.command(Command.NAV_TAKEOFF)
@@ -139,7 +139,7 @@ def test_setpoints_act_after_the_configured_delay() -> None:
     rig.arm()
     stream(rig, 0.1, AttitudeTarget(LEVEL, 0.05))
     rig.run(0.04)
-    rig.stub.on_attitude_target(rig.t_s, AttitudeTarget(LEVEL, 0.3))
+    rig.stub.on_setpoint(rig.t_s, AttitudeTarget(LEVEL, 0.3))
     took_s = run_until(rig, lambda: rig.stub.target.thrust == 0.3, 1.0)
     assert took_s == pytest.approx(0.02, abs=PERIOD_S)
 
