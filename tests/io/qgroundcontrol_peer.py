@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 
 class GroundPeer:
-    """Listens on a free port of loopback and records everything; answers whoever spoke last, as QGroundControl does."""
+    """Listens on a free port of loopback and records everything; answers the last sender, as QGroundControl does."""
 
     def __init__(self, beating: bool = True) -> None:
         self.beating = beating
@@ -70,7 +70,7 @@ class GroundPeer:
 
     def say_bytes(self, data: bytes) -> None:
         with self._changed:
-            assert self._changed.wait_for(lambda: self._partner is not None, 20.0), "nobody has spoken to us"
+            assert self._changed.wait_for(lambda: self._partner is not None, 20.0), "no message has arrived"
         self._socket.sendto(data, self._partner)
 
     def settle(self) -> None:

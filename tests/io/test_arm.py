@@ -202,7 +202,7 @@ async def test_torque_that_is_not_renewed_goes_to_zero_while_reads_go_on() -> No
         assert [register(s, 64) for s in setup.servos] == [1, 1]
 
 
-async def test_servos_hear_from_the_bus_though_nobody_reads() -> None:
+async def test_servos_receive_packets_although_no_state_is_read() -> None:
     async with flying_arm() as setup:
         first = setup.arm.latest()
         assert first is not None
@@ -437,7 +437,7 @@ def test_absent_servo_is_named_with_the_ids_that_answer() -> None:
     assert "servo 12 (joint 2): does not answer at 3000000 baud; ids that answer: 11;" in text
 
 
-def test_wrong_baud_rate_says_that_nobody_answers() -> None:
+def test_wrong_baud_rate_is_reported_as_no_answer() -> None:
     text = refused(new_servos(57600))
     assert "servo 11 (joint 1): does not answer at 3000000 baud; no servo answers at all;" in text
 

@@ -450,7 +450,7 @@ async def test_frames_follow_the_world_clock() -> None:
             assert (await line.receive(1))[0][0] == Command.START
 
 
-async def test_nobody_reads() -> None:
+async def test_bytes_that_are_not_read_are_dropped_and_block_nothing() -> None:
     async with ForceTorqueServer() as server:
         with Line(server) as line:
             await line.send(Command.START)

@@ -344,13 +344,13 @@ async def test_a_repeated_request_is_one_command_and_its_refusals_are_reported_o
 
             await eventually(refused_three_times, "three refused ARM commands")
             assert clock() - start_s >= 1.0  # a lower bound: at most one command each 0.5 s
-            said: list[str] = []
+            reports: list[str] = []
             await eventually(
-                lambda: said.extend(autopilot.take_messages()) or autopilot._requests.pending() == 0,  # type: ignore[func-returns-value]
+                lambda: reports.extend(autopilot.take_messages()) or autopilot._requests.pending() == 0,  # type: ignore[func-returns-value]
                 "the answers",
             )
-            said += autopilot.take_messages()
-        assert said == ["ARM refused: temporarily rejected (MAV_RESULT 1)"]
+            reports += autopilot.take_messages()
+        assert reports == ["ARM refused: temporarily rejected (MAV_RESULT 1)"]
 
 
 async def test_land_goes_out_while_arm_and_offboard_hang() -> None:
@@ -365,35 +365,35 @@ async def test_land_goes_out_while_arm_and_offboard_hang() -> None:
             autopilot.request(AutopilotRequest.LAND)
             await eventually(lambda: bool(peer.commands(NAV_LAND)), "LAND")
             peer.finish(mavlink.MAV_RESULT_FAILED)
-            said: list[str] = []
+            reports: list[str] = []
             await eventually(
-                lambda: said.extend(autopilot.take_messages()) or len(said) == 2,  # type: ignore[func-returns-value]
+                lambda: reports.extend(autopilot.take_messages()) or len(reports) == 2,  # type: ignore[func-returns-value]
                 "two refusals",
             )
-        assert sorted(said) == ["ARM refused: failed (MAV_RESULT 4)", "OFFBOARD refused: failed (MAV_RESULT 4)"]
+        assert sorted(reports) == ["ARM refused: failed (MAV_RESULT 4)", "OFFBOARD refused: failed (MAV_RESULT 4)"]
 
 
-async def test_a_command_that_nobody_answers_is_reported() -> None:
+async def test_a_command_without_an_answer_is_reported() -> None:
     port = free_udp_port()
     with Px4Peer(port) as peer:
         peer.acks[ARM_DISARM] = None
         async with edge(port) as autopilot:
-            said: list[str] = []
+            reports: list[str] = []
 
             def reported() -> bool:
                 autopilot.request(AutopilotRequest.ARM)  # as the core does, in every tick
-                said.extend(autopilot.take_messages())
-                return bool(said)
+                reports.extend(autopilot.take_messages())
+                return bool(reports)
 
             await eventually(reported, "the command without an answer")
-        assert said == ["ARM: no answer within 3 s; requesting it again"]
+        assert reports == ["ARM: no answer within 3 s; requesting it again"]
 
 
 async def test_statustexts_become_lines_each_reported_once() -> None:
     port = free_udp_port()
     with Px4Peer(port) as peer:
         async with edge(port) as autopilot:
-            said: list[str] = []
+            reports: list[str] = []
 
             def text(severity: int, data: bytes, identity: int, chunk: int = 0) -> None:
                 peer.say(mavlink.MAVLink_statustext_message(severity, data, identity, chunk))
@@ -407,10 +407,10 @@ async def test_statustexts_become_lines_each_reported_once() -> None:
                 text(critical, b"Preflight Fail: heading estimate not stable", identity)
             text(critical, b"exactly fifty characters, which may be a beginning", 5)
             await eventually(
-                lambda: said.extend(autopilot.take_messages()) or len(said) >= 3,  # type: ignore[func-returns-value]
+                lambda: reports.extend(autopilot.take_messages()) or len(reports) >= 3,  # type: ignore[func-returns-value]
                 "three texts",
             )
-        assert said == [
+        assert reports == [
             "critical: Arming denied: Resolve system health failures first",
             "critical: Preflight Fail: heading estimate not stable (PX4 does not arm while this holds)",
             "critical: exactly fifty characters, which may be a beginning",

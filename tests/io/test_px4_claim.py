@@ -232,8 +232,8 @@ async def test_px4_that_a_router_moved_to_another_port_is_heard_there() -> None:
 
                 await eventually(armed, "PX4 is heard at its new port")
                 assert autopilot.identity().peer == moved.address
-                said = [text for text in texts if "the link uses that port" in text]
-                assert len(said) == 1 and f"now sends from port {moved.address[1]}" in said[0]
+                reports = [text for text in texts if "the link uses that port" in text]
+                assert len(reports) == 1 and f"now sends from port {moved.address[1]}" in reports[0]
 
 
 async def test_what_is_not_mavlink_from_a_stranger_is_not_reported() -> None:

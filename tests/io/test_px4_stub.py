@@ -33,7 +33,7 @@ class Companion:
     def __init__(self, autopilot: MavsdkAutopilot, clock: Clock) -> None:
         self.autopilot = autopilot
         self.request = AutopilotRequest.NONE
-        self.said: list[str] = []
+        self.reports: list[str] = []
         self._clock = clock
 
     async def run(self) -> None:
@@ -52,7 +52,7 @@ class Companion:
             assert self.autopilot.send_vision(pose)
             assert self.autopilot.send_attitude(AttitudeSetpoint(attitude, 0.1))
             self.autopilot.request(self.request)
-            self.said += self.autopilot.take_messages()
+            self.reports += self.autopilot.take_messages()
             number += 1
             await asyncio.sleep(0.01)
 
@@ -62,7 +62,9 @@ class Companion:
                 while (status := self.autopilot.status()) is None or not done(status):  # noqa: ASYNC110 - MAVSDK's threads
                     await asyncio.sleep(0.01)
         except TimeoutError:
-            pytest.fail(f"not within {deadline_s} s: {what}; said: {self.said}; status: {self.autopilot.status()}")
+            pytest.fail(
+                f"not within {deadline_s} s: {what}; reports: {self.reports}; status: {self.autopilot.status()}"
+            )
 
 
 @asynccontextmanager
@@ -104,23 +106,23 @@ async def test_a_flight_on_the_floor_offboard_arm_land_disarm() -> None:
         half.request = AutopilotRequest.NONE
         await half.until(lambda status: status.landed is LandedState.ON_GROUND, "on the ground")
         # The stub disarms only once its land detector is sure; until then it says so, and is asked again.
-        assert set(half.said) <= {
+        assert set(half.reports) <= {
             "DISARM refused: temporarily rejected (MAV_RESULT 1)",
             "critical: Disarming denied: not landed",
         }
 
 
-async def test_arming_without_a_setpoint_stream_is_refused_and_said_in_px4s_words() -> None:
+async def test_arming_without_a_setpoint_stream_is_refused_and_reported_in_px4s_words() -> None:
     port = free_udp_port()
     device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
     async with standing_stub(port) as stub, MavsdkAutopilot(device, flight_clock()) as autopilot:
-        said: list[str] = []
+        reports: list[str] = []
         async with asyncio.timeout(30.0):
-            while len(set(said)) < 2:
+            while len(set(reports)) < 2:
                 autopilot.request(AutopilotRequest.ARM)
-                said += autopilot.take_messages()
+                reports += autopilot.take_messages()
                 await asyncio.sleep(0.01)
-        assert set(said) == {
+        assert set(reports) == {
             "ARM refused: temporarily rejected (MAV_RESULT 1)",
             "critical: Arming denied: Resolve system health failures first",
         }

@@ -137,17 +137,17 @@ async def test_qgroundcontrol_sees_the_stub_reads_a_parameter_and_hears_our_word
                 text="slack 0.1 m: going back",
             )
             station.report_tick(inputs(), outputs(events=(event,)))
-            said = await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text="phase approach")
-            assert said.severity == mavlink.MAV_SEVERITY_INFO
+            notice = await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text="phase approach")
+            assert notice.severity == mavlink.MAV_SEVERITY_INFO
             text = "RETRACT: slack 0.1 m: going back"
-            said = await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text=text)
-            assert said.severity == mavlink.MAV_SEVERITY_CRITICAL
+            notice = await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text=text)
+            assert notice.severity == mavlink.MAV_SEVERITY_CRITICAL
             slack = await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191, name="slack_m")
             assert slack.value == pytest.approx(0.75)
             stop = await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191, name="stop_slk_m")
             assert stop.value == pytest.approx(0.5)
             await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191, name="progress", value=0.25)
-            # The companion's own part of the talk with PX4 (component 195) is nobody else's business.
+            # The companion's own part of the talk with PX4 (component 195) concerns no other program.
             assert ground.senders() == {(1, 1), (1, 191)}
             assert station.take_messages() == [f"ground station 127.0.0.1:{ground.port} is connected"]
 
@@ -242,8 +242,8 @@ async def test_nothing_that_the_ground_forges_enters_the_companions_state() -> N
             forged = [m for m in px4.of("HEARTBEAT") if m.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED]
             assert {m.get_srcSystem() for m in forged} <= {255}  # PX4 takes a ground station's for what it is
             assert not px4.of("ATTITUDE_QUATERNION") and not px4.of("COMMAND_ACK") and not px4.of("STATUSTEXT")
-            said = station.take_messages()
-            assert any("sent with the vehicle's system id 1" in line for line in said), said
+            reports = station.take_messages()
+            assert any("sent with the vehicle's system id 1" in line for line in reports), reports
             # The same from PX4's side is believed: this test can tell.
             for message in _forgeries():
                 px4.say(message)
@@ -313,9 +313,9 @@ async def test_a_ground_station_that_connects_late_receives_the_phase() -> None:
 
 
 async def test_without_any_ground_station_the_link_to_px4_is_as_ever() -> None:
-    port, nobody = free_udp_port(), free_udp_port()
+    port, unheard = free_udp_port(), free_udp_port()
     with Px4Peer(port) as px4:
-        async with link(port, f"udpout://localhost:{nobody}") as (autopilot, station):
+        async with link(port, f"udpout://localhost:{unheard}") as (autopilot, station):
             await send_setpoints(autopilot, px4, 200, lambda tick: station.report_tick(inputs(tick), outputs(tick)))
             assert await autopilot.read_param("COM_RC_IN_MODE") == 4
             assert station.take_messages() == []
@@ -328,27 +328,27 @@ async def test_a_relay_that_was_killed_costs_the_ground_station_and_nothing_else
             await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1)
             assert station.relay_pid is not None
             os.kill(station.relay_pid, signal.SIGKILL)
-            said: list[str] = []
+            reports: list[str] = []
 
             def each(tick: int) -> None:
                 station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}"))
-                said.extend(station.take_messages())
+                reports.extend(station.take_messages())
 
             await send_setpoints(autopilot, px4, 400, each)
             assert await autopilot.read_param("COM_RC_IN_MODE") == 4
 
             def reported() -> bool:
-                said.extend(station.take_messages())
-                return any("relay has ended" in line for line in said)
+                reports.extend(station.take_messages())
+                return any("relay has ended" in line for line in reports)
 
             # A killed process ends when the kernel comes to it.
             await eventually(reported, "the relay's end")
-            assert [line for line in said if "relay has ended" in line] == [
+            assert [line for line in reports if "relay has ended" in line] == [
                 f"ground station {ground.address}: the relay has ended; nothing is forwarded"
             ]
 
 
-async def test_a_stopped_relay_holds_nobody_up() -> None:
+async def test_a_stopped_relay_blocks_no_other_program() -> None:
     port = free_udp_port()
     with GroundPeer() as ground, Px4Peer(port) as px4:
         async with link(port, ground.address) as (autopilot, station):

@@ -69,8 +69,8 @@ def test_two_worlds_never_share_an_instance() -> None:
 def test_an_instance_whose_mavlink_ports_are_in_use_is_passed_over() -> None:
     with Instance.claim() as free:
         number = free.number
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
-        somebody.bind(("127.0.0.1", 14580 + number))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 14580 + number))
         with Instance.claim() as claimed:
             assert claimed.number > number
 

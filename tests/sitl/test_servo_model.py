@@ -135,7 +135,7 @@ def test_watchdog_trips_and_stays_until_cleared() -> None:
     servo.write(98, b"\x05")
     servo.write(102, word(200))
     servo.update(1.0, 0.0, 0.0)
-    line.feed(packet(7, b"\x01"))  # a packet for somebody else counts
+    line.feed(packet(7, b"\x01"))  # a packet for another servo counts
     assert servo.update(1.099, 0.0, 0.0) != 0.0
     assert servo.update(1.101, 0.0, 0.0) == 0.0
     assert get(servo, 98, 1) == 0xFF
