@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import gc
+import inspect
 import itertools
 import os
 import signal
@@ -18,7 +20,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
 from hypothesis.internal.constants_ast import Constants
 
-from tests.support import Sandbox, sandbox_in
+from tests.support import DEADLINE_S, Sandbox, sandbox_in
 
 _LOADED_COMPUTER = [HealthCheck.too_slow]
 """Neither this check nor a deadline may fail a test: both measure the computer."""
@@ -86,6 +88,21 @@ def _nothing_is_hoarded(request: pytest.FixtureRequest) -> Iterator[None]:
 
 _WHOLE_FLIGHTS = {"commissioning", "core", "flights", "launcher", "recorder", "sitl"}
 """Folders of tests that fly: their files take longest."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a test that is a coroutine in an event loop of its own, for at most `DEADLINE_S`."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    arguments = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
+
+    async def test() -> None:
+        async with asyncio.timeout(DEADLINE_S):
+            await pyfuncitem.obj(**arguments)
+
+    asyncio.run(test())
+    return True
 
 
 @pytest.hookimpl(tryfirst=True)

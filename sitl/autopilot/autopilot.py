@@ -239,10 +239,6 @@ class Px4Stub:
         self._setpoint_kind = target.kind if isinstance(target, PositionTarget) else OffboardKind.ATTITUDE
         self._queue.append((t_s + self._setpoint_delay_s, target))
 
-    def on_attitude_target(self, t_s: float, target: AttitudeTarget) -> None:
-        """Process a SET_ATTITUDE_TARGET that arrived at world time `t_s`."""
-        self.on_setpoint(t_s, target)
-
     def on_vision(self, t_s: float, position_ned_m: Vec3, attitude_ned_frd: Quat) -> bool:
         """Process a vision pose that arrived at world time `t_s`; return whether EKF2_EV_CTRL enables its fusion."""
         self.vision_received += 1

@@ -14,7 +14,7 @@ from tests.support import DEADLINE_S
 
 
 class GroundPeer:
-    """Listens on a free port of loopback and records everything; answers whoever spoke last, as QGroundControl does."""
+    """Listens on a free port of loopback and records everything; answers the last sender, as QGroundControl does."""
 
     def __init__(self, beating: bool = True) -> None:
         self.beating = beating
@@ -74,7 +74,7 @@ class GroundPeer:
 
     def say_bytes(self, data: bytes) -> None:
         with self._changed:
-            assert self._changed.wait_for(lambda: self._partner is not None, DEADLINE_S), "nobody has spoken to us"
+            assert self._changed.wait_for(lambda: self._partner is not None, DEADLINE_S), "no message has arrived"
         self._socket.sendto(data, self._partner)
 
     def settle(self) -> None:

@@ -8,7 +8,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,12 +90,9 @@ async def flying_arm(**device: Any) -> AsyncIterator[Setup]:
         yield Setup(servos, bus, arm, clock)
 
 
-def fly(scenario: Callable[[Setup], Awaitable[None]], **device: Any) -> None:
-    async def main() -> None:
-        async with flying_arm(**device) as setup:
-            await asyncio.wait_for(scenario(setup), DEADLINE_S)
-
-    asyncio.run(main())
+@pytest.fixture(autouse=True)
+def _nothing_left() -> Iterator[None]:
+    yield
     assert_nothing_left()
 
 
@@ -112,7 +109,7 @@ async def state_when(arm: ArmEdge, condition: Callable[[ArmState], bool]) -> Arm
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    while not condition():  # noqa: ASYNC110 - registers have no event to wait for; `asyncio.wait_for` around ends it
+    while not condition():  # noqa: ASYNC110 - registers have no event to wait for
         await asyncio.sleep(0.001)
 
 
@@ -131,7 +128,6 @@ def refused(servos: list[ServoModel], config: ArmConfig | None = None, **device:
             return str(caught.value)
 
     text = asyncio.run(main())
-    assert_nothing_left()
     assert [register(servo, 64) for servo in servos] == [0] * len(servos)
     return text
 
@@ -139,21 +135,17 @@ def refused(servos: list[ServoModel], config: ArmConfig | None = None, **device:
 # --- flight ---------------------------------------------------------------------------------------------------------------
 
 
-def test_an_arm_opens_although_every_second_packet_is_damaged() -> None:
-    async def main() -> None:
-        servos, number = new_servos(), itertools.count()
-        async with ServoBus(servos) as bus:
-            bus.damaged = lambda: next(number) % 2 == 0
-            async with DynamixelArm(device_on(bus.path), arm_config(), flight_clock()) as arm:
-                assert arm.latest() is not None
-                assert [register(servo, 64) for servo in servos] == [1, 1]
-
-    asyncio.run(main())
-    assert_nothing_left()
+async def test_an_arm_opens_although_every_second_packet_is_damaged() -> None:
+    servos, number = new_servos(), itertools.count()
+    async with ServoBus(servos) as bus:
+        bus.damaged = lambda: next(number) % 2 == 0
+        async with DynamixelArm(device_on(bus.path), arm_config(), flight_clock()) as arm:
+            assert arm.latest() is not None
+            assert [register(servo, 64) for servo in servos] == [1, 1]
 
 
-def test_joint_state_arrives_in_the_papers_angles() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_joint_state_arrives_in_the_papers_angles() -> None:
+    async with flying_arm() as setup:
         edge: ArmEdge = setup.arm
         state = edge.latest()
         assert state is not None
@@ -169,20 +161,16 @@ def test_joint_state_arrives_in_the_papers_angles() -> None:
         assert (state.hardware_error, state.read_failures) == ((0, 0), 0)
         assert state.stamp_s <= setup.clock()
 
-    fly(scenario)
 
-
-def test_servos_are_set_up_for_current_control() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_servos_are_set_up_for_current_control() -> None:
+    async with flying_arm(watchdog_ms=120) as setup:
         for servo in setup.servos:
             assert [register(servo, a) for a in (9, 11, 64, 98)] == [0, 0, 1, 6]
             assert register(servo, 102, 2) == 0
 
-    fly(scenario, watchdog_ms=120)
 
-
-def test_torque_returned_is_the_torque_that_flows() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_torque_returned_is_the_torque_that_flows() -> None:
+    async with flying_arm(watchdog_ms=2540) as setup:
         sent = setup.arm.write_torque((0.5, -99.0))
         assert sent == pytest.approx((0.5, -1.5), abs=NM_PER_COUNT)
         await until(lambda: register(setup.servos[1], 102, 2) != 0)
@@ -194,22 +182,18 @@ def test_torque_returned_is_the_torque_that_flows() -> None:
         state = await state_when(setup.arm, lambda s: s.torque_nm[1] != 0.0)
         assert state.torque_nm == pytest.approx(sent, abs=1e-9)
 
-    fly(scenario, watchdog_ms=2540)
 
-
-def test_newest_torque_wins() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_newest_torque_wins() -> None:
+    async with flying_arm(watchdog_ms=2540) as setup:
         for step in range(200):
             setup.arm.write_torque((step * 0.01, 0.0))
         last = setup.arm.write_torque((0.7, 0.3))
         counts = [round(JOINTS[i].sign * last[i] / NM_PER_COUNT) for i in (0, 1)]
         await until(lambda: [register(s, 102, 2) for s in setup.servos] == counts)
 
-    fly(scenario, watchdog_ms=2540)
 
-
-def test_torque_that_is_not_renewed_goes_to_zero_while_reads_go_on() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_torque_that_is_not_renewed_goes_to_zero_while_reads_go_on() -> None:
+    async with flying_arm() as setup:
         setup.arm.write_torque((0.5, 0.5))
         await until(lambda: register(setup.servos[0], 102, 2) != 0)
         for _ in range(10):
@@ -217,20 +201,16 @@ def test_torque_that_is_not_renewed_goes_to_zero_while_reads_go_on() -> None:
         await until(lambda: [register(s, 102, 2) for s in setup.servos] == [0, 0])
         assert [register(s, 64) for s in setup.servos] == [1, 1]
 
-    fly(scenario)
 
-
-def test_servos_hear_from_the_bus_though_nobody_reads() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_servos_receive_packets_although_no_state_is_read() -> None:
+    async with flying_arm() as setup:
         first = setup.arm.latest()
         assert first is not None
         await until(lambda: setup.arm.latest() is not first)
 
-    fly(scenario)
 
-
-def test_servo_falling_silent_counts_and_comes_back() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_servo_falling_silent_counts_and_comes_back() -> None:
+    async with flying_arm(watchdog_ms=2540) as setup:
         before = setup.arm.latest()
         assert before is not None
         setup.servos[1].fail_silent(True)
@@ -246,11 +226,9 @@ def test_servo_falling_silent_counts_and_comes_back() -> None:
         back = await state_when(setup.arm, lambda s: s.read_failures == 0)
         assert back.stamp_s > lost.stamp_s
 
-    fly(scenario, watchdog_ms=2540)
 
-
-def test_hardware_error_is_reported_and_never_rebooted() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_hardware_error_is_reported_and_never_rebooted() -> None:
+    async with flying_arm() as setup:
         setup.servos[0].trip_overload()
         state = await state_when(setup.arm, lambda s: s.hardware_error != (0, 0))
         assert state.hardware_error == (0x20, 0)
@@ -260,31 +238,25 @@ def test_hardware_error_is_reported_and_never_rebooted() -> None:
             assert state.hardware_error == (0x20, 0)
         assert [register(s, 64) for s in setup.servos] == [0, 1]
 
-    fly(scenario)
 
-
-def test_servo_that_restarts_by_itself_is_a_lost_servo_not_an_angle_of_zero() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_servo_that_restarts_by_itself_is_a_lost_servo_not_an_angle_of_zero() -> None:
+    async with flying_arm() as setup:
         before = setup.arm.latest()
         assert before is not None
         setup.servos[1].reboot()
         state = await state_when(setup.arm, lambda s: s.read_failures >= 5)
         assert state.angle_rad == pytest.approx(before.angle_rad)
 
-    fly(scenario)
 
-
-def test_overheating_is_reported_with_its_temperature() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_overheating_is_reported_with_its_temperature() -> None:
+    async with flying_arm() as setup:
         setup.servos[1].set_temperature_c(85.0)
         state = await state_when(setup.arm, lambda s: s.temperature_c[1] > 80.0)
         assert state.hardware_error == (0, 0x04)
 
-    fly(scenario)
 
-
-def test_tripped_watchdog_is_shown_and_started_again() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_tripped_watchdog_is_shown_and_started_again() -> None:
+    async with flying_arm() as setup:
         servo, joint = setup.servos[0], JOINTS[0]
         servo.update(1.0, shaft_rad(joint, 1.0), 0.0)
         servo.update(9.0, shaft_rad(joint, 1.0), 0.0)  # no packet came in between, by the servo's time
@@ -295,8 +267,6 @@ def test_tripped_watchdog_is_shown_and_started_again() -> None:
         assert [register(s, 98) for s in setup.servos] == [5, 5]
         setup.arm.write_torque((0.3, 0.0))
         await until(lambda: register(servo, 102, 2) != 0)
-
-    fly(scenario)
 
 
 def test_leaving_lets_go_of_the_arm() -> None:
@@ -312,22 +282,18 @@ def test_leaving_lets_go_of_the_arm() -> None:
     servos = asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
     for servo in servos:
         assert (register(servo, 102, 2), register(servo, 64), register(servo, 98)) == (0, 0, 0)
-    assert_nothing_left()
 
 
-def test_leaving_a_dead_bus_is_quiet_and_ends() -> None:
-    async def main() -> None:
-        servos = new_servos()
-        async with ServoBus(servos) as bus:
-            arm = DynamixelArm(device_on(bus.path), arm_config(), flight_clock())
-            await arm.__aenter__()
-            for servo in servos:
-                servo.fail_silent(True)
-            await state_when(arm, lambda s: s.read_failures >= 3)
-            await arm.__aexit__(None, None, None)
-            assert_nothing_left()
-
-    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
+async def test_leaving_a_dead_bus_is_quiet_and_ends() -> None:
+    servos = new_servos()
+    async with ServoBus(servos) as bus:
+        arm = DynamixelArm(device_on(bus.path), arm_config(), flight_clock())
+        await arm.__aenter__()
+        for servo in servos:
+            servo.fail_silent(True)
+        await state_when(arm, lambda s: s.read_failures >= 3)
+        await arm.__aexit__(None, None, None)
+        assert_nothing_left()
 
 
 def test_unplugged_port_counts_as_failures_and_leaving_ends() -> None:
@@ -346,56 +312,46 @@ def test_unplugged_port_counts_as_failures_and_leaving_ends() -> None:
     assert set(os.listdir("/proc/self/fd")) == before
 
 
-def test_a_port_that_comes_back_under_its_name_is_read_again_and_moves_nothing_by_itself(tmp_path: Path) -> None:
-    async def main() -> None:
-        servos = new_servos()
-        async with AsyncExitStack() as stack:
-            async with ServoBus(servos) as bus:
-                with plugged(tmp_path / "arm", bus.path) as port:
-                    arm = await stack.enter_async_context(DynamixelArm(device_on(port), arm_config(), flight_clock()))
-                    await until(lambda: rewritten(arm, servos))
-            lost = await state_when(arm, lambda s: bool(arm.problem))
-            for servo, joint in zip(
-                servos, JOINTS, strict=True
-            ):  # no packet comes, by the servos' time: watchdogs trip
-                servo.update(1.0, shaft_rad(joint, 1.0), 0.0)
-                servo.update(9.0, shaft_rad(joint, 1.0), 0.0)
-            arm.write_torque((0.4, 0.4))
-            async with ServoBus(servos) as bus:
-                with plugged(tmp_path / "arm", bus.path):
-                    back = await state_when(arm, lambda s: s.read_failures == 0)
-                    assert back.hardware_error == (WATCHDOG_ERROR, WATCHDOG_ERROR)
-                    assert back.stamp_s > lost.stamp_s
-                    await state_when(arm, lambda s: s.hardware_error == (0, 0))
-                    assert [register(servo, 102, 2) for servo in servos] == [0, 0], "no torque of before the loss"
-                    await until(lambda: rewritten(arm, servos))
-                    await arm.__aexit__(None, None, None)
-                    await until(lambda: [register(servo, 64) for servo in servos] == [0, 0])
-
-    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
-    assert_nothing_left()
+async def test_a_port_that_comes_back_under_its_name_is_read_again_and_moves_nothing_by_itself(tmp_path: Path) -> None:
+    servos = new_servos()
+    async with AsyncExitStack() as stack:
+        async with ServoBus(servos) as bus:
+            with plugged(tmp_path / "arm", bus.path) as port:
+                arm = await stack.enter_async_context(DynamixelArm(device_on(port), arm_config(), flight_clock()))
+                await until(lambda: rewritten(arm, servos))
+        lost = await state_when(arm, lambda s: bool(arm.problem))
+        for servo, joint in zip(servos, JOINTS, strict=True):  # no packet comes, by the servos' time: watchdogs trip
+            servo.update(1.0, shaft_rad(joint, 1.0), 0.0)
+            servo.update(9.0, shaft_rad(joint, 1.0), 0.0)
+        arm.write_torque((0.4, 0.4))
+        async with ServoBus(servos) as bus:
+            with plugged(tmp_path / "arm", bus.path):
+                back = await state_when(arm, lambda s: s.read_failures == 0)
+                assert back.hardware_error == (WATCHDOG_ERROR, WATCHDOG_ERROR)
+                assert back.stamp_s > lost.stamp_s
+                await state_when(arm, lambda s: s.hardware_error == (0, 0))
+                assert [register(servo, 102, 2) for servo in servos] == [0, 0], "no torque of before the loss"
+                await until(lambda: rewritten(arm, servos))
+                await arm.__aexit__(None, None, None)
+                await until(lambda: [register(servo, 64) for servo in servos] == [0, 0])
 
 
-def test_servos_that_lost_their_power_with_the_port_keep_their_torque_off(tmp_path: Path) -> None:
-    async def main() -> None:
-        servos = new_servos()
-        async with AsyncExitStack() as stack:
-            async with ServoBus(servos) as bus:
-                with plugged(tmp_path / "arm", bus.path) as port:
-                    arm = await stack.enter_async_context(DynamixelArm(device_on(port), arm_config(), flight_clock()))
-            lost = await state_when(arm, lambda s: bool(arm.problem))
-            for servo in servos:
-                servo.reboot()
-            async with ServoBus(servos) as bus:
-                with plugged(tmp_path / "arm", bus.path):
-                    arm.write_torque((0.4, 0.4))
-                    await until(lambda: rewritten(arm, servos))
-                    state = await state_when(arm, lambda s: s.read_failures > lost.read_failures + 5)
-                    assert state.stamp_s == lost.stamp_s
-                    assert [register(servo, 64) for servo in servos] == [0, 0]
-
-    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
-    assert_nothing_left()
+async def test_servos_that_lost_their_power_with_the_port_keep_their_torque_off(tmp_path: Path) -> None:
+    servos = new_servos()
+    async with AsyncExitStack() as stack:
+        async with ServoBus(servos) as bus:
+            with plugged(tmp_path / "arm", bus.path) as port:
+                arm = await stack.enter_async_context(DynamixelArm(device_on(port), arm_config(), flight_clock()))
+        lost = await state_when(arm, lambda s: bool(arm.problem))
+        for servo in servos:
+            servo.reboot()
+        async with ServoBus(servos) as bus:
+            with plugged(tmp_path / "arm", bus.path):
+                arm.write_torque((0.4, 0.4))
+                await until(lambda: rewritten(arm, servos))
+                state = await state_when(arm, lambda s: s.read_failures > lost.read_failures + 5)
+                assert state.stamp_s == lost.stamp_s
+                assert [register(servo, 64) for servo in servos] == [0, 0]
 
 
 def rewritten(arm: DynamixelArm, servos: list[ServoModel]) -> bool:
@@ -423,16 +379,13 @@ def test_cancelled_opening_leaves_nothing_behind() -> None:
 
 
 @pytest.mark.parametrize("baud", [57600, 1_000_000, 4_000_000])
-def test_other_baud_rates_work(baud: int) -> None:
-    async def main() -> None:
-        servos = new_servos(baud)
-        async with (
-            ServoBus(servos) as bus,
-            DynamixelArm(device_on(bus.path, baud=baud), arm_config(), flight_clock()) as arm,
-        ):
-            await state_when(arm, lambda s: s.read_failures == 0)
-
-    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
+async def test_other_baud_rates_work(baud: int) -> None:
+    servos = new_servos(baud)
+    async with (
+        ServoBus(servos) as bus,
+        DynamixelArm(device_on(bus.path, baud=baud), arm_config(), flight_clock()) as arm,
+    ):
+        await state_when(arm, lambda s: s.read_failures == 0)
 
 
 # --- refusals -------------------------------------------------------------------------------------------------------------
@@ -446,7 +399,6 @@ def enter(device: ArmDevice) -> str:
 
     text = asyncio.run(main())
     assert "\n" not in text
-    assert_nothing_left()
     return text
 
 
@@ -471,16 +423,13 @@ def test_busy_port_is_refused() -> None:
             return str(caught.value)
 
     assert "port is busy; another program" in asyncio.run(main())
-    assert_nothing_left()
 
 
-def test_second_companion_is_refused_and_the_first_flies_on() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_second_companion_is_refused_and_the_first_flies_on() -> None:
+    async with flying_arm() as setup:
         with pytest.raises(DeviceError, match="port is busy"):
             await DynamixelArm(device_on(setup.bus.path), arm_config(), flight_clock()).__aenter__()
         await state_when(setup.arm, lambda s: s.read_failures == 0)
-
-    fly(scenario)
 
 
 def test_absent_servo_is_named_with_the_ids_that_answer() -> None:
@@ -488,7 +437,7 @@ def test_absent_servo_is_named_with_the_ids_that_answer() -> None:
     assert "servo 12 (joint 2): does not answer at 3000000 baud; ids that answer: 11;" in text
 
 
-def test_wrong_baud_rate_says_that_nobody_answers() -> None:
+def test_wrong_baud_rate_is_reported_as_no_answer() -> None:
     text = refused(new_servos(57600))
     assert "servo 11 (joint 1): does not answer at 3000000 baud; no servo answers at all;" in text
 
@@ -506,7 +455,7 @@ def test_old_firmware_of_a_330_is_refused_because_its_addresses_differ() -> None
     assert "servo 1 (joint 1): has firmware 52; the XL330-M288 needs 53 or newer" in text
 
 
-def test_three_models_on_one_bus_are_each_driven_in_their_own_units() -> None:
+async def test_three_models_on_one_bus_are_each_driven_in_their_own_units() -> None:
     limits_nm: dict[ServoName, float] = {"XM540-W270": 6.0, "XL330-M288": 0.3, "XM430-W210": 1.2}
     torques_nm = (6.0, -0.3, 1.2)
     common: dict[str, Any] = {"sign": 1, "zero_count": 2048, "angle_deg": (-90, 90), "velocity_max_deg_s": 150.0}
@@ -516,27 +465,23 @@ def test_three_models_on_one_bus_are_each_driven_in_their_own_units() -> None:
     ]
     config = arm_config(*joints, torque_per_amp_nm_a=None)
 
-    async def main() -> None:
-        servos = [
-            ServoModel(joint.servo_id, kind=joint.kind.name, shaft_angle_rad=shaft_rad(joint, 0.5)) for joint in joints
-        ]
-        async with (
-            ServoBus(servos) as bus,
-            DynamixelArm(device_on(bus.path, watchdog_ms=2000), config, flight_clock()) as arm,
-        ):
-            assert [report.model for report in arm.servos] == [1120, 1200, 1030]
-            sent_nm = arm.write_torque(torques_nm)
-            assert sent_nm == pytest.approx(torques_nm, rel=0.005)
-            await until(lambda: all(register(servo, 102, 2) for servo in servos))
-            for joint, servo, torque_nm in zip(joints, servos, torques_nm, strict=True):
-                current_a = servo.update(0.1, shaft_rad(joint, 0.5), 0.0)
-                assert current_a * KINDS[joint.kind.name].nm_per_amp == pytest.approx(torque_nm, rel=0.01)
-            state = await state_when(arm, lambda s: all(s.torque_nm))
-            assert state.torque_nm == pytest.approx(sent_nm, rel=1e-9)
-            assert state.angle_rad == pytest.approx((0.5, 0.5, 0.5), abs=0.002)
-
-    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
-    assert_nothing_left()
+    servos = [
+        ServoModel(joint.servo_id, kind=joint.kind.name, shaft_angle_rad=shaft_rad(joint, 0.5)) for joint in joints
+    ]
+    async with (
+        ServoBus(servos) as bus,
+        DynamixelArm(device_on(bus.path, watchdog_ms=2000), config, flight_clock()) as arm,
+    ):
+        assert [report.model for report in arm.servos] == [1120, 1200, 1030]
+        sent_nm = arm.write_torque(torques_nm)
+        assert sent_nm == pytest.approx(torques_nm, rel=0.005)
+        await until(lambda: all(register(servo, 102, 2) for servo in servos))
+        for joint, servo, torque_nm in zip(joints, servos, torques_nm, strict=True):
+            current_a = servo.update(0.1, shaft_rad(joint, 0.5), 0.0)
+            assert current_a * KINDS[joint.kind.name].nm_per_amp == pytest.approx(torque_nm, rel=0.01)
+        state = await state_when(arm, lambda s: all(s.torque_nm))
+        assert state.torque_nm == pytest.approx(sent_nm, rel=1e-9)
+        assert state.angle_rad == pytest.approx((0.5, 0.5, 0.5), abs=0.002)
 
 
 def test_hardware_error_at_start_is_named_and_not_rebooted() -> None:
@@ -584,29 +529,26 @@ def test_current_limit_below_the_joints_torque_is_refused() -> None:
     assert "current limit (register 38) is 400, which is 1.40 N m; torque_max_nm 2.5 needs 714" in text
 
 
-def test_servos_left_in_odd_states_are_taken_over() -> None:
-    async def main() -> None:
-        servos = new_servos()
+async def test_servos_left_in_odd_states_are_taken_over() -> None:
+    servos = new_servos()
+    for servo in servos:
+        servo.write(11, b"\x00")
+        servo.write(64, b"\x01")
+        servo.write(98, b"\x01")
+        servo.write(102, (300).to_bytes(2, "little"))
+        servo.write(68, b"\x00")
+    first = servos[0]
+    for t_s in (0.0, 1.0):
+        first.update(t_s, shaft_rad(JOINTS[0], 1.0), 0.0)
+    assert register(first, 98) == 0xFF
+    async with ServoBus(servos) as bus, DynamixelArm(device_on(bus.path), arm_config(), flight_clock()):
         for servo in servos:
-            servo.write(11, b"\x00")
-            servo.write(64, b"\x01")
-            servo.write(98, b"\x01")
-            servo.write(102, (300).to_bytes(2, "little"))
-            servo.write(68, b"\x00")
-        first = servos[0]
-        for t_s in (0.0, 1.0):
-            first.update(t_s, shaft_rad(JOINTS[0], 1.0), 0.0)
-        assert register(first, 98) == 0xFF
-        async with ServoBus(servos) as bus, DynamixelArm(device_on(bus.path), arm_config(), flight_clock()):
-            for servo in servos:
-                assert [register(servo, a) for a in (9, 11, 64, 68, 98)] == [0, 0, 1, 2, 5]
-                assert register(servo, 102, 2) == 0
-
-    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
+            assert [register(servo, a) for a in (9, 11, 64, 68, 98)] == [0, 0, 1, 2, 5]
+            assert register(servo, 102, 2) == 0
 
 
-def test_noise_on_the_line_costs_reads_not_the_thread() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_noise_on_the_line_costs_reads_not_the_thread() -> None:
+    async with flying_arm() as setup:
         noise = bytes(range(256)) + b"\xff\xff\xfd\x00\x0b\x0d\x00\x55\x00" * 5
         for _ in range(30):
             setup.bus.inject(noise)
@@ -614,11 +556,9 @@ def test_noise_on_the_line_costs_reads_not_the_thread() -> None:
         assert (await state_when(setup.arm, lambda s: s.read_failures == 0)).hardware_error == (0, 0)
         assert not setup.arm.problem
 
-    fly(scenario)
 
-
-def test_reads_end_though_the_caller_waits_for_less() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_reads_end_though_the_caller_waits_for_less() -> None:
+    async with flying_arm() as setup:
         for servo in setup.servos:
             servo.fail_silent(True)
         state = await setup.arm.read(0.0)
@@ -626,11 +566,9 @@ def test_reads_end_though_the_caller_waits_for_less() -> None:
         failed = await state_when(setup.arm, lambda s: s.read_failures > state.read_failures)
         assert failed.stamp_s <= time.monotonic()
 
-    fly(scenario)
 
-
-def test_a_read_begun_early_is_there_when_it_is_asked_for() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_a_read_begun_early_is_there_when_it_is_asked_for() -> None:
+    async with flying_arm(watchdog_ms=2000) as setup:
         before = setup.arm.latest()
         assert before is not None
         setup.arm.begin_read()
@@ -646,12 +584,9 @@ def test_a_read_begun_early_is_there_when_it_is_asked_for() -> None:
         assert later is not None
         assert later.stamp_s > state.stamp_s
 
-    # The thread must not read by itself meanwhile.
-    fly(scenario, watchdog_ms=2000)
 
-
-def test_a_read_begins_at_its_time_or_when_it_is_wanted() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_a_read_begins_at_its_time_or_when_it_is_wanted() -> None:
+    async with flying_arm(watchdog_ms=2000) as setup:
         at_s = setup.clock() + 0.05
         setup.arm.begin_read(at_s)
         setup.arm.write_torque((0.0, 0.0))  # is not held up by it
@@ -668,23 +603,18 @@ def test_a_read_begins_at_its_time_or_when_it_is_wanted() -> None:
         assert wanted is not None
         assert wanted.stamp_s > state.stamp_s
 
-    # The thread must not read by itself meanwhile.
-    fly(scenario, watchdog_ms=2000)
 
-
-def test_a_read_that_is_far_off_keeps_no_torque_alive() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_a_read_that_is_far_off_keeps_no_torque_alive() -> None:
+    async with flying_arm() as setup:
         setup.arm.write_torque((0.5, 0.5))
         await until(lambda: register(setup.servos[0], 102, 2) != 0)
         setup.arm.begin_read(setup.clock() + 3600.0)
         await until(lambda: [register(servo, 102, 2) for servo in setup.servos] == [0, 0])
         assert [register(servo, 98) for servo in setup.servos] == [5, 5]  # by us: no watchdog had to trip
 
-    fly(scenario)
 
-
-def test_the_time_of_a_read_is_learnt() -> None:
-    async def scenario(setup: Setup) -> None:
+async def test_the_time_of_a_read_is_learnt() -> None:
+    async with flying_arm() as setup:
         taken_s = []
         for _ in range(100):
             state = await setup.arm.read(1.0)
@@ -693,27 +623,21 @@ def test_the_time_of_a_read_is_learnt() -> None:
             taken_s.append(state.stamp_s - state.asked_s)
         assert min(taken_s) < setup.arm.read_takes_s < max(taken_s) + 3 * (max(taken_s) - min(taken_s))
 
-    fly(scenario)
 
-
-def test_the_edge_shows_both_servos_as_it_left_them() -> None:
-    async def main() -> None:
-        servos = new_servos()
-        servos[0].set_voltage_v(11.8)
-        servos[1].write(38, (900).to_bytes(2, "little"))
-        async with ServoBus(servos) as bus, DynamixelArm(device_on(bus.path), arm_config(), flight_clock()) as arm:
-            first, second = arm.servos
-            assert first == ServoReport(
-                servo_id=11,
-                model=1030,
-                firmware=48,
-                operating_mode=0,
-                return_delay_us=0,
-                current_limit_counts=1193,
-                watchdog_ms=100,
-                voltage_v=11.8,
-            )
-            assert (second.servo_id, second.current_limit_counts, second.voltage_v) == (12, 900, 12.0)
-
-    asyncio.run(asyncio.wait_for(main(), DEADLINE_S))
-    assert_nothing_left()
+async def test_the_edge_shows_both_servos_as_it_left_them() -> None:
+    servos = new_servos()
+    servos[0].set_voltage_v(11.8)
+    servos[1].write(38, (900).to_bytes(2, "little"))
+    async with ServoBus(servos) as bus, DynamixelArm(device_on(bus.path), arm_config(), flight_clock()) as arm:
+        first, second = arm.servos
+        assert first == ServoReport(
+            servo_id=11,
+            model=1030,
+            firmware=48,
+            operating_mode=0,
+            return_delay_us=0,
+            current_limit_counts=1193,
+            watchdog_ms=100,
+            voltage_v=11.8,
+        )
+        assert (second.servo_id, second.current_limit_counts, second.voltage_v) == (12, 900, 12.0)

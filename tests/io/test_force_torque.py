@@ -143,185 +143,152 @@ async def sample_with(edge: RobotousForceTorque, force_x_n: float) -> ForceSampl
                     return sample
 
 
-def test_samples_arrive_quantised() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer() as server, world(server):
-            server.set_wrench((1.013, -2.0, 30.0), (0.12345, -0.0002, 1.0))
-            async with driver(server.port) as edge:
-                source: ForceTorque = edge
-                sample = source.latest()
-                assert sample is not None
-                assert sample.force_sensor_n == (1.02, -2.0, 30.0)
-                assert sample.torque_sensor_nm == (0.1235, 0.0, 1.0)
-                assert not sample.overload
-                assert edge.product_name == "RFT60-HA01"
-                assert edge.firmware == "V1.2.0"
-                assert server.streaming
-                assert server.rate_hz == 200
-                server.set_wrench((5.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-                later = await sample_with(edge, 5.0)
-                assert later.stamp_s >= sample.stamp_s
-            async with asyncio.timeout(DEADLINE_S):
-                while server.streaming:  # noqa: ASYNC110 - the STOP is read by another task, no event to wait for
-                    await asyncio.sleep(0.001)
-
-    asyncio.run(run())
-
-
-def test_reopening_a_sensor_that_still_streams() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer() as server, world(server):
-            crashed = driver(server.port)
-            await crashed.__aenter__()
-            crashed._send = lambda *_: None  # type: ignore[method-assign]  # killed before it could say STOP
-            await crashed.__aexit__(None, None, None)
+async def test_samples_arrive_quantised() -> None:
+    async with ForceTorqueServer() as server, world(server):
+        server.set_wrench((1.013, -2.0, 30.0), (0.12345, -0.0002, 1.0))
+        async with driver(server.port) as edge:
+            source: ForceTorque = edge
+            sample = source.latest()
+            assert sample is not None
+            assert sample.force_sensor_n == (1.02, -2.0, 30.0)
+            assert sample.torque_sensor_nm == (0.1235, 0.0, 1.0)
+            assert not sample.overload
+            assert edge.product_name == "RFT60-HA01"
+            assert edge.firmware == "V1.2.0"
             assert server.streaming
-            async with driver(server.port) as edge:
-                assert edge.latest() is not None
-
-    asyncio.run(run())
-
-
-def test_rate_is_set_and_read_back() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer() as server, world(server):
-            async with driver(server.port, rate_hz=333):
-                assert server.rate_hz == 333
-            async with driver(server.port, rate_hz=200):
-                assert server.rate_hz == 200
-
-    asyncio.run(run())
+            assert server.rate_hz == 200
+            server.set_wrench((5.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            later = await sample_with(edge, 5.0)
+            assert later.stamp_s >= sample.stamp_s
+        async with asyncio.timeout(DEADLINE_S):
+            while server.streaming:  # noqa: ASYNC110 - the STOP is read by another task, no event to wait for
+                await asyncio.sleep(0.001)
 
 
-def test_start_and_stop_bytes_in_the_payload_and_noise_between_packets() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer() as server, world(server):
-            server.set_wrench(AWKWARD.force_n, AWKWARD.torque_nm)
-            async with driver(server.port) as edge:
-                for noise in (
-                    b"\x55\xaa\x55",
-                    b"\x00" * 7,
-                    rft.encode_wrench(Command.START, AWKWARD)[:9],
-                    b"\x55" * 30,
-                ):
-                    server.inject(noise)
-                    for sample in await edge.tare_samples(0.05):
-                        assert sample.force_sensor_n == AWKWARD.force_n
-                        assert sample.torque_sensor_nm == AWKWARD.torque_nm
-                        assert sample.overload
-                assert edge.counts().skipped_bytes >= 49
-
-    asyncio.run(run())
-
-
-def test_overload_by_the_sensor_and_by_the_device_file() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer() as server, world(server), driver(server.port, force_max_n=50.0) as edge:
-            server.set_wrench((60.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-            assert (await sample_with(edge, 60.0)).overload
-            server.set_wrench((40.0, 0.0, 0.0), (0.0, 0.0, 4.1))
-            assert (await sample_with(edge, 40.0)).overload
-            server.set_wrench((30.0, 0.0, 0.0), (0.0, 0.0, 3.9))
-            assert not (await sample_with(edge, 30.0)).overload
-
-    asyncio.run(run())
-
-
-def test_tare_takes_the_samples_that_it_was_asked_for() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer() as server, world(server):
-            server.set_wrench((1.2, -0.8, 2.5), (0.0, 0.0, 0.0))
-            async with driver(server.port) as edge:
-                samples = await edge.tare_samples(0.25)
-                assert len(samples) == 50
-                assert {sample.force_sensor_n for sample in samples} == {(1.2, -0.8, 2.5)}
-
-    asyncio.run(run())
-
-
-def test_sensor_falls_silent_in_flight() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer() as server, world(server), driver(server.port) as edge:
-            server.silent = True
-            with pytest.raises(
-                DeviceError, match="of 100 samples received, none in the last 1 s, while taring; the sensor fell silent"
-            ):
-                await edge.tare_samples(0.5)
+async def test_reopening_a_sensor_that_still_streams() -> None:
+    async with ForceTorqueServer() as server, world(server):
+        crashed = driver(server.port)
+        await crashed.__aenter__()
+        crashed._send = lambda *_: None  # type: ignore[method-assign]  # killed before it could say STOP
+        await crashed.__aexit__(None, None, None)
+        assert server.streaming
+        async with driver(server.port) as edge:
             assert edge.latest() is not None
 
-    asyncio.run(run())
+
+async def test_rate_is_set_and_read_back() -> None:
+    async with ForceTorqueServer() as server, world(server):
+        async with driver(server.port, rate_hz=333):
+            assert server.rate_hz == 333
+        async with driver(server.port, rate_hz=200):
+            assert server.rate_hz == 200
 
 
-def test_in_flight_the_ticks_read_the_port() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer() as server:
-            async with world(server):
-                edge = await driver(server.port).__aenter__()
-                edge.read_in_ticks()
-                server.set_wrench((5.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-                before = edge.counts().samples
-                async with asyncio.timeout(DEADLINE_S):
-                    while (sample := edge.latest()) is None or sample.force_sensor_n[0] != 5.0:  # noqa: ASYNC110 - as the ticks do
-                        await asyncio.sleep(0.005)
-                assert edge.counts().samples > before
-            edge.latest()
-            assert edge.latest() is edge.latest()  # no new bytes: not lost
-            assert edge.counts().lost is None
-        edge.latest()
-        assert edge.counts().lost is not None
-        await edge.__aexit__(None, None, None)
-
-    asyncio.run(run())
+async def test_start_and_stop_bytes_in_the_payload_and_noise_between_packets() -> None:
+    async with ForceTorqueServer() as server, world(server):
+        server.set_wrench(AWKWARD.force_n, AWKWARD.torque_nm)
+        async with driver(server.port) as edge:
+            for noise in (
+                b"\x55\xaa\x55",
+                b"\x00" * 7,
+                rft.encode_wrench(Command.START, AWKWARD)[:9],
+                b"\x55" * 30,
+            ):
+                server.inject(noise)
+                for sample in await edge.tare_samples(0.05):
+                    assert sample.force_sensor_n == AWKWARD.force_n
+                    assert sample.torque_sensor_nm == AWKWARD.torque_nm
+                    assert sample.overload
+            assert edge.counts().skipped_bytes >= 49
 
 
-def test_port_vanishes_in_flight() -> None:
-    async def run() -> None:
-        server = ForceTorqueServer()
-        async with server, world(server):
+async def test_overload_by_the_sensor_and_by_the_device_file() -> None:
+    async with ForceTorqueServer() as server, world(server), driver(server.port, force_max_n=50.0) as edge:
+        server.set_wrench((60.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        assert (await sample_with(edge, 60.0)).overload
+        server.set_wrench((40.0, 0.0, 0.0), (0.0, 0.0, 4.1))
+        assert (await sample_with(edge, 40.0)).overload
+        server.set_wrench((30.0, 0.0, 0.0), (0.0, 0.0, 3.9))
+        assert not (await sample_with(edge, 30.0)).overload
+
+
+async def test_tare_takes_the_samples_that_it_was_asked_for() -> None:
+    async with ForceTorqueServer() as server, world(server):
+        server.set_wrench((1.2, -0.8, 2.5), (0.0, 0.0, 0.0))
+        async with driver(server.port) as edge:
+            samples = await edge.tare_samples(0.25)
+            assert len(samples) == 50
+            assert {sample.force_sensor_n for sample in samples} == {(1.2, -0.8, 2.5)}
+
+
+async def test_sensor_falls_silent_in_flight() -> None:
+    async with ForceTorqueServer() as server, world(server), driver(server.port) as edge:
+        server.silent = True
+        with pytest.raises(
+            DeviceError, match="of 100 samples received, none in the last 1 s, while taring; the sensor fell silent"
+        ):
+            await edge.tare_samples(0.5)
+        assert edge.latest() is not None
+
+
+async def test_in_flight_the_ticks_read_the_port() -> None:
+    async with ForceTorqueServer() as server:
+        async with world(server):
             edge = await driver(server.port).__aenter__()
-        last = edge.latest()
-        with pytest.raises(DeviceError, match="the port was lost"):
-            await edge.tare_samples(10.0)
-        assert edge.latest() == last
-        assert edge.counts().lost is not None
-        await edge.__aexit__(None, None, None)
+            edge.read_in_ticks()
+            server.set_wrench((5.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            before = edge.counts().samples
+            async with asyncio.timeout(DEADLINE_S):
+                while (sample := edge.latest()) is None or sample.force_sensor_n[0] != 5.0:  # noqa: ASYNC110 - as the ticks do
+                    await asyncio.sleep(0.005)
+            assert edge.counts().samples > before
+        edge.latest()
+        assert edge.latest() is edge.latest()  # no new bytes: not lost
+        assert edge.counts().lost is None
+    edge.latest()
+    assert edge.counts().lost is not None
+    await edge.__aexit__(None, None, None)
 
-    asyncio.run(run())
+
+async def test_port_vanishes_in_flight() -> None:
+    server = ForceTorqueServer()
+    async with server, world(server):
+        edge = await driver(server.port).__aenter__()
+    last = edge.latest()
+    with pytest.raises(DeviceError, match="the port was lost"):
+        await edge.tare_samples(10.0)
+    assert edge.latest() == last
+    assert edge.counts().lost is not None
+    await edge.__aexit__(None, None, None)
 
 
 @pytest.mark.parametrize("in_ticks", [False, True])
-def test_a_port_that_comes_back_under_its_name_is_read_again(tmp_path: Path, in_ticks: bool) -> None:
+async def test_a_port_that_comes_back_under_its_name_is_read_again(tmp_path: Path, in_ticks: bool) -> None:
     """The second sensor has just got its power: it streams nothing until it is started."""
 
-    async def run() -> None:
-        async with AsyncExitStack() as stack:
-            async with ForceTorqueServer() as server, world(server):
-                with plugged(tmp_path / "force", server.port) as port:
-                    edge = await stack.enter_async_context(driver(port))
-                    if in_ticks:
-                        edge.read_in_ticks()
-            await looked_at(edge, lambda sample: edge.counts().lost is not None)
-            async with ForceTorqueServer() as server, world(server):
-                server.set_wrench((7.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-                with plugged(tmp_path / "force", server.port):
-                    await looked_at(edge, lambda sample: sample.force_sensor_n[0] == 7.0)
-                    assert edge.counts().lost is None
-
-    asyncio.run(run())
+    async with AsyncExitStack() as stack:
+        async with ForceTorqueServer() as server, world(server):
+            with plugged(tmp_path / "force", server.port) as port:
+                edge = await stack.enter_async_context(driver(port))
+                if in_ticks:
+                    edge.read_in_ticks()
+        await looked_at(edge, lambda sample: edge.counts().lost is not None)
+        async with ForceTorqueServer() as server, world(server):
+            server.set_wrench((7.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            with plugged(tmp_path / "force", server.port):
+                await looked_at(edge, lambda sample: sample.force_sensor_n[0] == 7.0)
+                assert edge.counts().lost is None
 
 
-def test_another_device_under_its_name_is_not_read_as_the_sensor(tmp_path: Path) -> None:
-    async def run() -> None:
-        async with AsyncExitStack() as stack:
-            async with ForceTorqueServer() as server, world(server):
-                with plugged(tmp_path / "force", server.port) as port:
-                    edge = await stack.enter_async_context(driver(port))
-            async with ForceTorqueServer("RFT40-SA01") as server, world(server):
-                with plugged(tmp_path / "force", server.port):
-                    await looked_at(edge, lambda sample: "expected a RFT60-HA01" in (edge.counts().lost or ""))
-                    assert not server.streaming
-
-    asyncio.run(run())
+async def test_another_device_under_its_name_is_not_read_as_the_sensor(tmp_path: Path) -> None:
+    async with AsyncExitStack() as stack:
+        async with ForceTorqueServer() as server, world(server):
+            with plugged(tmp_path / "force", server.port) as port:
+                edge = await stack.enter_async_context(driver(port))
+        async with ForceTorqueServer("RFT40-SA01") as server, world(server):
+            with plugged(tmp_path / "force", server.port):
+                await looked_at(edge, lambda sample: "expected a RFT60-HA01" in (edge.counts().lost or ""))
+                assert not server.streaming
 
 
 async def looked_at(edge: RobotousForceTorque, condition: Callable[[ForceSample], bool]) -> None:
@@ -348,12 +315,9 @@ def test_no_such_port() -> None:
     assert text.startswith("force sensor /dev/no-such-port: no such port; serial ports of this computer: ")
 
 
-def test_port_in_use() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer() as server, world(server), driver(server.port):
-            assert "in use by another program" in await refusal(driver(server.port))
-
-    asyncio.run(run())
+async def test_port_in_use() -> None:
+    async with ForceTorqueServer() as server, world(server), driver(server.port):
+        assert "in use by another program" in await refusal(driver(server.port))
 
 
 def test_port_that_is_a_file(tmp_path: Path) -> None:
@@ -363,31 +327,22 @@ def test_port_that_is_a_file(tmp_path: Path) -> None:
     assert path.read_text() == "not a port"
 
 
-def test_silent_sensor() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer() as server:
-            server.silent = True
-            text = await refusal(driver(server.port, answer_timeout_s=0.2))
-            assert "no answer to command 1 (PRODUCT_NAME) within 0.2 s, nothing was received" in text
-
-    asyncio.run(run())
+async def test_silent_sensor() -> None:
+    async with ForceTorqueServer() as server:
+        server.silent = True
+        text = await refusal(driver(server.port, answer_timeout_s=0.2))
+        assert "no answer to command 1 (PRODUCT_NAME) within 0.2 s, nothing was received" in text
 
 
-def test_sensor_that_answers_but_never_streams() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer() as server:  # no world, so it never ticks
-            text = await refusal(driver(server.port, answer_timeout_s=1.0))
-            assert "0 of 5 samples after START within 1 s" in text
-
-    asyncio.run(run())
+async def test_sensor_that_answers_but_never_streams() -> None:
+    async with ForceTorqueServer() as server:  # no world, so it never ticks
+        text = await refusal(driver(server.port, answer_timeout_s=1.0))
+        assert "0 of 5 samples after START within 1 s" in text
 
 
-def test_other_model() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer(product_name="RFT40-SA01") as server:
-            assert 'a "RFT40-SA01" answers, expected a RFT60-HA01' in await refusal(driver(server.port))
-
-    asyncio.run(run())
+async def test_other_model() -> None:
+    async with ForceTorqueServer(product_name="RFT40-SA01") as server:
+        assert 'a "RFT40-SA01" answers, expected a RFT60-HA01' in await refusal(driver(server.port))
 
 
 @contextmanager
@@ -402,17 +357,14 @@ def babbler(garbage: bytes) -> Iterator[str]:
             loop.remove_reader(far)
 
 
-def test_wrong_checksums() -> None:
-    async def run() -> None:
-        packet = bytearray(rft.pack(b"\x01RFT60-HA01", rft.RESPONSE_BYTES))
-        packet[-2] ^= 0xFF
-        with babbler(bytes(packet)) as port:
-            text = await refusal(driver(port, answer_timeout_s=1.0))
-            assert "bytes received but no valid packet" in text
-            assert "(0 wrong checksums)" not in text
-            assert "baud rate (115200)" in text
-
-    asyncio.run(run())
+async def test_wrong_checksums() -> None:
+    packet = bytearray(rft.pack(b"\x01RFT60-HA01", rft.RESPONSE_BYTES))
+    packet[-2] ^= 0xFF
+    with babbler(bytes(packet)) as port:
+        text = await refusal(driver(port, answer_timeout_s=1.0))
+        assert "bytes received but no valid packet" in text
+        assert "(0 wrong checksums)" not in text
+        assert "baud rate (115200)" in text
 
 
 # -- the emulated sensor alone -------------------------------------------------------------------------------------------------
@@ -450,74 +402,65 @@ class Line:
             return []
 
 
-def test_sensor_once_bias_and_refused_rate() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer() as server:
-            with Line(server) as line:
-                server.set_wrench((2.0, 0.0, 0.0), (0.0, 0.5, 0.0))
-                await line.send(Command.SERIAL_NUMBER)
-                assert rft.decode_text((await line.receive(1))[0]) == "RFT60HA-0001"
-                await line.send(Command.SET_BIAS, 1)
-                await line.send(Command.READ_ONCE)
-                assert rft.decode_wrench((await line.receive(1))[0]) == Wrench(
-                    force_n=(0.0,) * 3, torque_nm=(0.0,) * 3, overload_bits=0
-                )
-                await line.send(Command.SET_BIAS, 0)
-                await line.send(Command.READ_ONCE)
-                assert rft.decode_wrench((await line.receive(1))[0]).force_n == (2.0, 0.0, 0.0)
-                await line.send(Command.SET_RATE, 99)
-                assert (await line.receive(1))[0][:3] == bytes((15, 0, 2))
-                await line.send(Command.SET_RATE, 4)
-                assert (await line.receive(1))[0][:3] == bytes((15, 1, 0))
-                await line.send(Command.GET_RATE)
-                assert (await line.receive(1))[0][:2] == bytes((16, 4))
-
-    asyncio.run(run())
+async def test_sensor_once_bias_and_refused_rate() -> None:
+    async with ForceTorqueServer() as server:
+        with Line(server) as line:
+            server.set_wrench((2.0, 0.0, 0.0), (0.0, 0.5, 0.0))
+            await line.send(Command.SERIAL_NUMBER)
+            assert rft.decode_text((await line.receive(1))[0]) == "RFT60HA-0001"
+            await line.send(Command.SET_BIAS, 1)
+            await line.send(Command.READ_ONCE)
+            assert rft.decode_wrench((await line.receive(1))[0]) == Wrench(
+                force_n=(0.0,) * 3, torque_nm=(0.0,) * 3, overload_bits=0
+            )
+            await line.send(Command.SET_BIAS, 0)
+            await line.send(Command.READ_ONCE)
+            assert rft.decode_wrench((await line.receive(1))[0]).force_n == (2.0, 0.0, 0.0)
+            await line.send(Command.SET_RATE, 99)
+            assert (await line.receive(1))[0][:3] == bytes((15, 0, 2))
+            await line.send(Command.SET_RATE, 4)
+            assert (await line.receive(1))[0][:3] == bytes((15, 1, 0))
+            await line.send(Command.GET_RATE)
+            assert (await line.receive(1))[0][:2] == bytes((16, 4))
 
 
-def test_frames_follow_the_world_clock() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer() as server:
-            with Line(server) as line:
-                server.tick(0.0)
-                await line.send(Command.START)
-                async with asyncio.timeout(DEADLINE_S):
-                    while not server.streaming:  # noqa: ASYNC110 - the server reads in a callback
-                        await asyncio.sleep(0.001)
-                for k in range(201):  # 0.2 s of world time, however long it takes
-                    server.tick(1.0 + k * 0.001)
-                assert len(await line.receive(41)) == 41
-                server.tick(100.0)  # a jump is not paid back in a burst
-                assert len(await line.receive(1)) == 1
-                server.stuck = True
-                server.set_wrench((9.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-                server.tick(100.005)
-                assert rft.decode_wrench((await line.receive(1))[0]).force_n == (0.0, 0.0, 0.0)
-                server.silent = True
-                server.tick(100.010)
-                assert line.read() == []
-                await line.send(Command.PRODUCT_NAME)  # not executed while streaming
-                server.silent = False
-                server.tick(100.015)
-                assert (await line.receive(1))[0][0] == Command.START
-
-    asyncio.run(run())
+async def test_frames_follow_the_world_clock() -> None:
+    async with ForceTorqueServer() as server:
+        with Line(server) as line:
+            server.tick(0.0)
+            await line.send(Command.START)
+            async with asyncio.timeout(DEADLINE_S):
+                while not server.streaming:  # noqa: ASYNC110 - the server reads in a callback
+                    await asyncio.sleep(0.001)
+            for k in range(201):  # 0.2 s of world time, however long it takes
+                server.tick(1.0 + k * 0.001)
+            assert len(await line.receive(41)) == 41
+            server.tick(100.0)  # a jump is not paid back in a burst
+            assert len(await line.receive(1)) == 1
+            server.stuck = True
+            server.set_wrench((9.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            server.tick(100.005)
+            assert rft.decode_wrench((await line.receive(1))[0]).force_n == (0.0, 0.0, 0.0)
+            server.silent = True
+            server.tick(100.010)
+            assert line.read() == []
+            await line.send(Command.PRODUCT_NAME)  # not executed while streaming
+            server.silent = False
+            server.tick(100.015)
+            assert (await line.receive(1))[0][0] == Command.START
 
 
-def test_nobody_reads() -> None:
-    async def run() -> None:
-        async with ForceTorqueServer() as server:
-            with Line(server) as line:
-                await line.send(Command.START)
-                async with asyncio.timeout(DEADLINE_S):
-                    while not server.streaming:  # noqa: ASYNC110 - the server reads in a callback
-                        await asyncio.sleep(0.001)
-                for k in range(20_000):
-                    server.tick(k * 0.005)
-                    if server.dropped:
-                        break
-                assert server.dropped > 0
-            async with world(server), driver(server.port) as edge:
-                assert edge.latest() is not None
-
-    asyncio.run(run())
+async def test_bytes_that_are_not_read_are_dropped_and_block_nothing() -> None:
+    async with ForceTorqueServer() as server:
+        with Line(server) as line:
+            await line.send(Command.START)
+            async with asyncio.timeout(DEADLINE_S):
+                while not server.streaming:  # noqa: ASYNC110 - the server reads in a callback
+                    await asyncio.sleep(0.001)
+            for k in range(20_000):
+                server.tick(k * 0.005)
+                if server.dropped:
+                    break
+            assert server.dropped > 0
+        async with world(server), driver(server.port) as edge:
+            assert edge.latest() is not None

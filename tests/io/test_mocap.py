@@ -92,95 +92,77 @@ def mocap(
 
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("transport", ["unicast", "multicast"])
-def test_pose_arrives(version: str, transport: Transport) -> None:
-    async def run() -> None:
-        group = GROUP if transport == "multicast" else None
-        inbox = Inbox()
-        async with NatNetServer(version, multicast_group=group) as server, streaming(server, STRANGER, POSE):
-            edge = mocap(device_for(server, transport, natnet_version=None if version == LATER else version), inbox)
-            assert edge.latest() is None
-            async with edge:
-                latest: Mocap = edge
-                pose = latest.latest()
-                assert pose is not None
-                assert pose.position_world_m == (-1.25, 0.5, 1.0)
-                assert pose.attitude_wxyz == (0.5, -0.5, 0.5, 0.5)
-                assert pose.tracking_valid
-                assert pose.marker_error_m == pytest.approx(0.00025)
-                assert pose.latency_s is not None and pose.latency_s > 0.004 - 1e-6
-                first, second = await inbox.next(), await inbox.next()
-                assert second.frame_number > first.frame_number
-                assert second.stamp_s >= first.stamp_s
-                assert edge.server_info is not None
-                assert edge.server_info.version == version
-                assert set(edge.bodies) == {STRANGER.id, POSE.id}
-
-    asyncio.run(run())
+async def test_pose_arrives(version: str, transport: Transport) -> None:
+    group = GROUP if transport == "multicast" else None
+    inbox = Inbox()
+    async with NatNetServer(version, multicast_group=group) as server, streaming(server, STRANGER, POSE):
+        edge = mocap(device_for(server, transport, natnet_version=None if version == LATER else version), inbox)
+        assert edge.latest() is None
+        async with edge:
+            latest: Mocap = edge
+            pose = latest.latest()
+            assert pose is not None
+            assert pose.position_world_m == (-1.25, 0.5, 1.0)
+            assert pose.attitude_wxyz == (0.5, -0.5, 0.5, 0.5)
+            assert pose.tracking_valid
+            assert pose.marker_error_m == pytest.approx(0.00025)
+            assert pose.latency_s is not None and pose.latency_s > 0.004 - 1e-6
+            first, second = await inbox.next(), await inbox.next()
+            assert second.frame_number > first.frame_number
+            assert second.stamp_s >= first.stamp_s
+            assert edge.server_info is not None
+            assert edge.server_info.version == version
+            assert set(edge.bodies) == {STRANGER.id, POSE.id}
 
 
-def test_the_latency_contains_the_delay_on_the_network() -> None:
+async def test_the_latency_contains_the_delay_on_the_network() -> None:
     """The server has stamped each frame 0.15 s before it arrives; the server's answers to echo requests show it."""
 
-    async def run() -> None:
-        inbox = Inbox()
-        async with NatNetServer() as server, streaming(server, POSE, held_s=0.15), mocap(device_for(server), inbox):
-            latencies_s = [(await inbox.next()).latency_s or 0.0 for _ in range(300)]
-            assert max(latencies_s) >= 0.15
-
-    asyncio.run(run())
+    inbox = Inbox()
+    async with NatNetServer() as server, streaming(server, POSE, held_s=0.15), mocap(device_for(server), inbox):
+        latencies_s = [(await inbox.next()).latency_s or 0.0 for _ in range(300)]
+        assert max(latencies_s) >= 0.15
 
 
-def test_unicast_client_of_a_multicast_server() -> None:
-    async def run() -> None:
-        async with (
-            NatNetServer(multicast_group=GROUP) as server,
-            streaming(server, POSE),
-            mocap(device_for(server)) as edge,
-        ):
-            assert edge.latest() is not None
-
-    asyncio.run(run())
+async def test_unicast_client_of_a_multicast_server() -> None:
+    async with (
+        NatNetServer(multicast_group=GROUP) as server,
+        streaming(server, POSE),
+        mocap(device_for(server)) as edge,
+    ):
+        assert edge.latest() is not None
 
 
-def test_multicast_of_another_sender_is_dropped_by_the_kernel() -> None:
-    async def run() -> None:
-        inbox = Inbox()
-        async with (
-            NatNetServer(multicast_group=GROUP) as server,
-            streaming(server, POSE),
-            mocap(device_for(server, "multicast"), inbox) as edge,
-        ):
-            with closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger:
-                stranger.bind(("127.0.0.9", 0))
-                stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
-                for _ in range(20):
-                    stranger.sendto(b"anything", (GROUP, server.data_port))
-                    await inbox.next()
-            assert edge.counts().foreign == 0
-
-    asyncio.run(run())
+async def test_multicast_of_another_sender_is_dropped_by_the_kernel() -> None:
+    inbox = Inbox()
+    async with (
+        NatNetServer(multicast_group=GROUP) as server,
+        streaming(server, POSE),
+        mocap(device_for(server, "multicast"), inbox) as edge,
+    ):
+        with closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger:
+            stranger.bind(("127.0.0.9", 0))
+            stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
+            for _ in range(20):
+                stranger.sendto(b"anything", (GROUP, server.data_port))
+                await inbox.next()
+        assert edge.counts().foreign == 0
 
 
-def test_two_listeners_share_the_multicast_port() -> None:
-    async def run() -> None:
-        async with NatNetServer(multicast_group=GROUP) as server, streaming(server, POSE):
-            device = device_for(server, "multicast")
-            async with mocap(device) as flight, mocap(device) as guardian:
-                assert flight.latest() is not None
-                assert guardian.latest() is not None
-
-    asyncio.run(run())
+async def test_two_listeners_share_the_multicast_port() -> None:
+    async with NatNetServer(multicast_group=GROUP) as server, streaming(server, POSE):
+        device = device_for(server, "multicast")
+        async with mocap(device) as flight, mocap(device) as guardian:
+            assert flight.latest() is not None
+            assert guardian.latest() is not None
 
 
-def test_leaving_unsubscribes_and_frees_the_sockets() -> None:
-    async def run() -> None:
-        async with NatNetServer() as server, streaming(server, POSE):
-            for _ in range(3):
-                async with mocap(device_for(server)):
-                    assert len(server.unicast_clients) == 1
-                await until(lambda: not server.unicast_clients)
-
-    asyncio.run(run())
+async def test_leaving_unsubscribes_and_frees_the_sockets() -> None:
+    async with NatNetServer() as server, streaming(server, POSE):
+        for _ in range(3):
+            async with mocap(device_for(server)):
+                assert len(server.unicast_clients) == 1
+            await until(lambda: not server.unicast_clients)
 
 
 @asynccontextmanager
@@ -206,44 +188,38 @@ async def until(condition: Callable[[], bool]) -> None:
             await asyncio.sleep(0.001)
 
 
-def test_newest_of_the_waiting_frames_wins() -> None:
-    async def run() -> None:
-        inbox = Inbox()
-        async with quiet_after_opening(inbox) as (server, edge):
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as witness:
-                witness.bind(("127.0.0.1", 0))
-                witness.settimeout(DEADLINE_S)
-                witness.sendto(natnet.encode_connect(), ("127.0.0.1", server.command_port))
-                await until(lambda: len(server.unicast_clients) == 2)
-                inbox.clear()
-                before = edge.counts()
-                for k in range(5):
-                    server.publish(10.0 + k, [BodyPose(1, (float(k), 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))], None)
-                # The loop stands still here. Frames go to the edge first: when the witness has five, so has the edge's socket.
-                while natnet.message_id(witness.recv(65535)) != Message.FRAME:
-                    pass
-                for _ in range(4):
-                    witness.recv(65535)
-            assert (await inbox.next()).position_world_m == (4.0, 0.0, 0.0)
-            assert inbox.queue.empty()
-            assert edge.counts().superseded - before.superseded == 4
-            assert edge.counts().frames - before.frames == 1
-
-    asyncio.run(run())
-
-
-def test_unicast_server_that_was_restarted_is_connected_again() -> None:
-    async def run() -> None:
-        inbox = Inbox()
-        async with quiet_after_opening(inbox) as (server, _):
-            port = server.command_port
-            await server.__aexit__(None, None, None)
+async def test_newest_of_the_waiting_frames_wins() -> None:
+    inbox = Inbox()
+    async with quiet_after_opening(inbox) as (server, edge):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as witness:
+            witness.bind(("127.0.0.1", 0))
+            witness.settimeout(DEADLINE_S)
+            witness.sendto(natnet.encode_connect(), ("127.0.0.1", server.command_port))
+            await until(lambda: len(server.unicast_clients) == 2)
             inbox.clear()
-            moved = BodyPose(1, (9.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
-            async with NatNetServer(command_port=port) as successor, streaming(successor, moved):
-                assert (await inbox.next()).position_world_m == (9.0, 0.0, 1.0)
+            before = edge.counts()
+            for k in range(5):
+                server.publish(10.0 + k, [BodyPose(1, (float(k), 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))], None)
+            # The loop stands still here. Frames go to the edge first: when the witness has five, so has the edge's socket.
+            while natnet.message_id(witness.recv(65535)) != Message.FRAME:
+                pass
+            for _ in range(4):
+                witness.recv(65535)
+        assert (await inbox.next()).position_world_m == (4.0, 0.0, 0.0)
+        assert inbox.queue.empty()
+        assert edge.counts().superseded - before.superseded == 4
+        assert edge.counts().frames - before.frames == 1
 
-    asyncio.run(run())
+
+async def test_unicast_server_that_was_restarted_is_connected_again() -> None:
+    inbox = Inbox()
+    async with quiet_after_opening(inbox) as (server, _):
+        port = server.command_port
+        await server.__aexit__(None, None, None)
+        inbox.clear()
+        moved = BodyPose(1, (9.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
+        async with NatNetServer(command_port=port) as successor, streaming(successor, moved):
+            assert (await inbox.next()).position_world_m == (9.0, 0.0, 1.0)
 
 
 def test_callback_that_fails_does_not_stop_reception(caplog: pytest.LogCaptureFixture) -> None:
@@ -281,152 +257,114 @@ async def refusal(edge: NatNetMocap) -> str:
     return text
 
 
-def test_no_answer() -> None:
-    async def run() -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
-            deaf.bind(("127.0.0.1", 0))
-            port = deaf.getsockname()[1]
-            device = MocapDevice(
-                server="127.0.0.1", interface="127.0.0.1", transport="unicast", command_port=port, rigid_body_id=1
-            )
-            text = await refusal(NatNetMocap(device, flight_clock(), Inbox(), connect_timeout_s=0.3))
-            assert f"127.0.0.1:{port}: no answer to the NatNet connect request within 0.3 s" in text
-
-    asyncio.run(run())
+async def test_no_answer() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
+        deaf.bind(("127.0.0.1", 0))
+        port = deaf.getsockname()[1]
+        device = MocapDevice(
+            server="127.0.0.1", interface="127.0.0.1", transport="unicast", command_port=port, rigid_body_id=1
+        )
+        text = await refusal(NatNetMocap(device, flight_clock(), Inbox(), connect_timeout_s=0.3))
+        assert f"127.0.0.1:{port}: no answer to the NatNet connect request within 0.3 s" in text
 
 
-def test_other_version_than_wanted() -> None:
-    async def run() -> None:
-        async with NatNetServer("4.1") as server:
-            text = await refusal(mocap(device_for(server, natnet_version="3.0")))
-            assert "Motive speaks NatNet 4.1, expected 3.0" in text
-            await until(lambda: server.requests > 1 and server.unicast_clients == ())
-
-    asyncio.run(run())
+async def test_other_version_than_wanted() -> None:
+    async with NatNetServer("4.1") as server:
+        text = await refusal(mocap(device_for(server, natnet_version="3.0")))
+        assert "Motive speaks NatNet 4.1, expected 3.0" in text
+        await until(lambda: server.requests > 1 and server.unicast_clients == ())
 
 
-def test_version_that_is_not_supported() -> None:
-    async def run() -> None:
-        loop = asyncio.get_running_loop()
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ancient:
-            ancient.bind(("127.0.0.1", 0))
-            ancient.setblocking(False)
+async def test_version_that_is_not_supported() -> None:
+    loop = asyncio.get_running_loop()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ancient:
+        ancient.bind(("127.0.0.1", 0))
+        ancient.setblocking(False)
 
-            async def answer() -> None:
-                _, client = await loop.sock_recvfrom(ancient, 2000)
-                sender = struct.pack("<256s4s4s", b"Arena", bytes((1, 0, 0, 0)), bytes((2, 9, 0, 0)))
-                await loop.sock_sendto(ancient, natnet.encode_message(Message.SERVER_INFO, sender), client)
+        async def answer() -> None:
+            _, client = await loop.sock_recvfrom(ancient, 2000)
+            sender = struct.pack("<256s4s4s", b"Arena", bytes((1, 0, 0, 0)), bytes((2, 9, 0, 0)))
+            await loop.sock_sendto(ancient, natnet.encode_message(Message.SERVER_INFO, sender), client)
 
-            answering = asyncio.create_task(answer())
-            device = MocapDevice(
-                server="127.0.0.1",
-                interface="127.0.0.1",
-                transport="unicast",
-                command_port=ancient.getsockname()[1],
-                rigid_body_id=1,
-            )
-            text = await refusal(mocap(device))
-            await answering
-            assert "Arena speaks NatNet 2.9, expected 3.0 or later" in text
-
-    asyncio.run(run())
+        answering = asyncio.create_task(answer())
+        device = MocapDevice(
+            server="127.0.0.1",
+            interface="127.0.0.1",
+            transport="unicast",
+            command_port=ancient.getsockname()[1],
+            rigid_body_id=1,
+        )
+        text = await refusal(mocap(device))
+        await answering
+        assert "Arena speaks NatNet 2.9, expected 3.0 or later" in text
 
 
-def test_body_never_seen_lists_the_others() -> None:
-    async def run() -> None:
-        async with NatNetServer(bodies=[(1, "quad"), (4, "wand")]) as server, streaming(server, POSE, STRANGER):
-            text = await refusal(mocap(device_for(server, rigid_body_id=7), body_timeout_s=2.0))
-            assert "rigid body id 7 was never seen within 2 s" in text
-            assert '1 "quad", 4 "wand"' in text
-
-    asyncio.run(run())
+async def test_body_never_seen_lists_the_others() -> None:
+    async with NatNetServer(bodies=[(1, "quad"), (4, "wand")]) as server, streaming(server, POSE, STRANGER):
+        text = await refusal(mocap(device_for(server, rigid_body_id=7), body_timeout_s=2.0))
+        assert "rigid body id 7 was never seen within 2 s" in text
+        assert '1 "quad", 4 "wand"' in text
 
 
-def test_two_bodies_with_one_streaming_id() -> None:
-    async def run() -> None:
-        twin = dataclasses.replace(STRANGER, id=1)
-        async with NatNetServer(bodies=[(1, "quad")]) as server, streaming(server, POSE, twin):
-            text = await refusal(mocap(device_for(server)))
-            assert 'two rigid bodies have the streaming id 1 "quad"; give each its own id in Motive' in text
-
-    asyncio.run(run())
+async def test_two_bodies_with_one_streaming_id() -> None:
+    twin = dataclasses.replace(STRANGER, id=1)
+    async with NatNetServer(bodies=[(1, "quad")]) as server, streaming(server, POSE, twin):
+        text = await refusal(mocap(device_for(server)))
+        assert 'two rigid bodies have the streaming id 1 "quad"; give each its own id in Motive' in text
 
 
-def test_body_never_tracked() -> None:
-    async def run() -> None:
-        lost = BodyPose(1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), valid=False)
-        async with NatNetServer(bodies=[(1, "quad")]) as server, streaming(server, lost):
-            text = await refusal(mocap(device_for(server), body_timeout_s=2.0))
-            assert 'rigid body 1 "quad" is streamed but was not tracked' in text
-
-    asyncio.run(run())
+async def test_body_never_tracked() -> None:
+    lost = BodyPose(1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), valid=False)
+    async with NatNetServer(bodies=[(1, "quad")]) as server, streaming(server, lost):
+        text = await refusal(mocap(device_for(server), body_timeout_s=2.0))
+        assert 'rigid body 1 "quad" is streamed but was not tracked' in text
 
 
 @pytest.mark.parametrize("transport", ["unicast", "multicast"])
-def test_server_that_does_not_stream(transport: Transport) -> None:
-    async def run() -> None:
-        group = GROUP if transport == "multicast" else None
-        async with NatNetServer(multicast_group=group) as server:
-            text = await refusal(mocap(device_for(server, transport), body_timeout_s=0.2))
-            assert "no frame of data arrived within 0.2 s" in text
-            assert transport in text
-
-    asyncio.run(run())
+async def test_server_that_does_not_stream(transport: Transport) -> None:
+    group = GROUP if transport == "multicast" else None
+    async with NatNetServer(multicast_group=group) as server:
+        text = await refusal(mocap(device_for(server, transport), body_timeout_s=0.2))
+        assert "no frame of data arrived within 0.2 s" in text
+        assert transport in text
 
 
-def test_transport_or_group_that_the_server_does_not_use() -> None:
-    async def run() -> None:
-        async with NatNetServer() as server:
-            assert "the server streams unicast, expected multicast" in await refusal(
-                mocap(device_for(server, "multicast"))
-            )
-        async with NatNetServer(multicast_group=GROUP) as server:
-            device = device_for(server, "multicast", multicast_group="239.255.42.98")
-            text = await refusal(mocap(device))
-            assert f"streams to {GROUP}:{server.data_port}, expected 239.255.42.98:{server.data_port}" in text
-
-    asyncio.run(run())
+async def test_transport_or_group_that_the_server_does_not_use() -> None:
+    async with NatNetServer() as server:
+        assert "the server streams unicast, expected multicast" in await refusal(mocap(device_for(server, "multicast")))
+    async with NatNetServer(multicast_group=GROUP) as server:
+        device = device_for(server, "multicast", multicast_group="239.255.42.98")
+        text = await refusal(mocap(device))
+        assert f"streams to {GROUP}:{server.data_port}, expected 239.255.42.98:{server.data_port}" in text
 
 
-def test_port_in_use() -> None:
-    async def run() -> None:
-        async with NatNetServer(multicast_group=GROUP) as server:
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as selfish:
-                selfish.bind((GROUP, server.data_port))
-                text = await refusal(mocap(device_for(server, "multicast")))
-                assert f"cannot open UDP {GROUP}:{server.data_port}: another program holds the port" in text
-
-    asyncio.run(run())
+async def test_port_in_use() -> None:
+    async with NatNetServer(multicast_group=GROUP) as server:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as selfish:
+            selfish.bind((GROUP, server.data_port))
+            text = await refusal(mocap(device_for(server, "multicast")))
+            assert f"cannot open UDP {GROUP}:{server.data_port}: another program holds the port" in text
 
 
-def test_given_up_in_the_moment_in_which_the_name_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def run() -> None:
-        loop = asyncio.get_running_loop()
-        found: asyncio.Future[Any] = loop.create_future()
-        monkeypatch.setattr(loop, "getaddrinfo", lambda *_, **__: found)
-        device = MocapDevice(server="motive.invalid", interface="127.0.0.1", transport="unicast", rigid_body_id=1)
-        opening = asyncio.ensure_future(mocap(device).__aenter__())
-        await asyncio.sleep(0.0)
-        found.set_result([(socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("127.0.0.1", 0))])
-        opening.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await opening
-
-    asyncio.run(run())
+async def test_given_up_in_the_moment_in_which_the_name_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = asyncio.get_running_loop()
+    found: asyncio.Future[Any] = loop.create_future()
+    monkeypatch.setattr(loop, "getaddrinfo", lambda *_, **__: found)
+    device = MocapDevice(server="motive.invalid", interface="127.0.0.1", transport="unicast", rigid_body_id=1)
+    opening = asyncio.ensure_future(mocap(device).__aenter__())
+    await asyncio.sleep(0.0)
+    found.set_result([(socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("127.0.0.1", 0))])
+    opening.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await opening
 
 
-def test_interface_of_another_machine() -> None:
-    async def run() -> None:
-        async with NatNetServer() as server:
-            text = await refusal(mocap(device_for(server, interface="192.0.2.1")))
-            assert "set devices.mocap.interface to an address of this computer" in text
-
-    asyncio.run(run())
+async def test_interface_of_another_machine() -> None:
+    async with NatNetServer() as server:
+        text = await refusal(mocap(device_for(server, interface="192.0.2.1")))
+        assert "set devices.mocap.interface to an address of this computer" in text
 
 
-def test_server_name_that_is_no_address() -> None:
-    async def run() -> None:
-        device = MocapDevice(server="256.256.256.256", interface="127.0.0.1", rigid_body_id=1)
-        assert "the name cannot be resolved" in await refusal(mocap(device))
-
-    asyncio.run(run())
+async def test_server_name_that_is_no_address() -> None:
+    device = MocapDevice(server="256.256.256.256", interface="127.0.0.1", rigid_body_id=1)
+    assert "the name cannot be resolved" in await refusal(mocap(device))

@@ -86,26 +86,23 @@ def test_two_senders_that_claim_to_be_px4_are_refused_by_address() -> None:
         assert all(f"{host}:{at}" in text for host, at in (one.address, other.address))
 
 
-def test_beside_an_armed_px4_the_other_sender_is_reported_and_the_flight_goes_on() -> None:
-    async def main() -> None:
-        port = free_udp_port()
-        one, other = Px4Peer(port), Px4Peer(port)
-        one.base_mode = other.base_mode = ARMED
-        with one, other:
-            async with edge(port) as autopilot:
-                peer = autopilot.identity().peer
-                rival = next(each.address for each in (one, other) if each.address != peer)
-                texts: list[str] = []
+async def test_beside_an_armed_px4_the_other_sender_is_reported_and_the_flight_goes_on() -> None:
+    port = free_udp_port()
+    one, other = Px4Peer(port), Px4Peer(port)
+    one.base_mode = other.base_mode = ARMED
+    with one, other:
+        async with edge(port) as autopilot:
+            peer = autopilot.identity().peer
+            rival = next(each.address for each in (one, other) if each.address != peer)
+            texts: list[str] = []
 
-                def reported() -> bool:
-                    texts.extend(autopilot.take_messages())
-                    return any(f"{rival[0]}:{rival[1]} claims to be PX4 (system 1)" in text for text in texts)
+            def reported() -> bool:
+                texts.extend(autopilot.take_messages())
+                return any(f"{rival[0]}:{rival[1]} claims to be PX4 (system 1)" in text for text in texts)
 
-                await eventually(reported, "the rival is reported")
-                texts.extend(text for _ in range(10) for text in autopilot.take_messages())
-                assert sum("claims to be PX4" in text for text in texts) == 1
-
-    asyncio.run(main())
+            await eventually(reported, "the rival is reported")
+            texts.extend(text for _ in range(10) for text in autopilot.take_messages())
+            assert sum("claims to be PX4" in text for text in texts) == 1
 
 
 class _Broadcasting(Px4Peer):
@@ -123,30 +120,24 @@ class _Broadcasting(Px4Peer):
             self.remote = self._partner
 
 
-def test_px4_that_broadcasts_until_it_has_a_partner_is_found() -> None:
-    async def main() -> None:
-        port = free_udp_port()
-        device = AutopilotDevice(address=f"udpin://0.0.0.0:{port}", discovery_timeout_s=DEADLINE_S)
-        with _Broadcasting(port) as px4:
-            async with MavsdkAutopilot(device, flight_clock()) as autopilot:
-                assert autopilot.identity().peer == px4.address
-                await eventually(lambda: autopilot.status() is not None, "a heartbeat")
-
-    asyncio.run(main())
+async def test_px4_that_broadcasts_until_it_has_a_partner_is_found() -> None:
+    port = free_udp_port()
+    device = AutopilotDevice(address=f"udpin://0.0.0.0:{port}", discovery_timeout_s=DEADLINE_S)
+    with _Broadcasting(port) as px4:
+        async with MavsdkAutopilot(device, flight_clock()) as autopilot:
+            assert autopilot.identity().peer == px4.address
+            await eventually(lambda: autopilot.status() is not None, "a heartbeat")
 
 
-def test_calling_px4_leaves_no_task_behind() -> None:
+async def test_calling_px4_leaves_no_task_behind() -> None:
     """It was cancelled and not waited for: it still ran when its port was closed."""
 
-    async def main() -> None:
-        port = free_udp_port()
-        with Px4Peer(port) as px4, closing(LinkClaim(f"udpin://127.0.0.1:{port}")) as claim:
-            await claim.find_px4(DEADLINE_S)
-            async with claim.calling((1, 191)):
-                await eventually(lambda: bool(px4.of("HEARTBEAT")), "a call")
-            assert asyncio.all_tasks() == {asyncio.current_task()}
-
-    asyncio.run(main())
+    port = free_udp_port()
+    with Px4Peer(port) as px4, closing(LinkClaim(f"udpin://127.0.0.1:{port}")) as claim:
+        await claim.find_px4(DEADLINE_S)
+        async with claim.calling((1, 191)):
+            await eventually(lambda: bool(px4.of("HEARTBEAT")), "a call")
+        assert asyncio.all_tasks() == {asyncio.current_task()}
 
 
 @pytest.mark.parametrize(
@@ -196,99 +187,87 @@ async def _enter(port: int) -> None:
         pass
 
 
-def test_a_stranger_in_px4s_name_changes_nothing_and_is_reported_once() -> None:
-    async def main() -> None:
-        port = free_udp_port()
-        with Px4Peer(port) as px4, closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger:
-            async with edge(port) as autopilot:
-                assert autopilot.identity().peer == px4.address
-                await eventually(lambda: autopilot.status() is not None, "a heartbeat")
-                texts: list[str] = []
-                armed: list[bool] = []
+async def test_a_stranger_in_px4s_name_changes_nothing_and_is_reported_once() -> None:
+    port = free_udp_port()
+    with Px4Peer(port) as px4, closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger:
+        async with edge(port) as autopilot:
+            assert autopilot.identity().peer == px4.address
+            await eventually(lambda: autopilot.status() is not None, "a heartbeat")
+            texts: list[str] = []
+            armed: list[bool] = []
 
-                def forged() -> bool:
-                    stranger.sendto(forged_heartbeat(), ("127.0.0.1", port))
-                    texts.extend(autopilot.take_messages())
-                    status = autopilot.status()
-                    armed.append(status is not None and status.armed)
-                    return len(armed) > 100
+            def forged() -> bool:
+                stranger.sendto(forged_heartbeat(), ("127.0.0.1", port))
+                texts.extend(autopilot.take_messages())
+                status = autopilot.status()
+                armed.append(status is not None and status.armed)
+                return len(armed) > 100
 
-                await eventually(forged, "a hundred forged heartbeats")
-                _, at = stranger.getsockname()
-                assert [text for text in texts if f":{at} claims to be PX4 (system 1)" in text] == texts
-                assert (len(texts), any(armed)) == (1, False)
-
-    asyncio.run(main())
+            await eventually(forged, "a hundred forged heartbeats")
+            _, at = stranger.getsockname()
+            assert [text for text in texts if f":{at} claims to be PX4 (system 1)" in text] == texts
+            assert (len(texts), any(armed)) == (1, False)
 
 
-def test_px4_that_a_router_moved_to_another_port_is_heard_there() -> None:
+async def test_px4_that_a_router_moved_to_another_port_is_heard_there() -> None:
     """Only after it was silent at its own port, and only at its own IP address: rivals elsewhere send all the time."""
 
-    async def main() -> None:
-        port = free_udp_port()
-        with closing(socket.socket(type=socket.SOCK_DGRAM)) as elsewhere, Px4Peer(port) as px4:
-            elsewhere.bind(("127.0.0.9", 0))
-            async with edge(port) as autopilot:
-                where = px4.address
-                await eventually(lambda: autopilot.status() is not None, "a heartbeat")
-                px4.__exit__(None, None, None)
-                with Px4Peer(port) as moved:
-                    assert moved.address[1] != where[1]
-                    moved.base_mode = ARMED
-                    texts: list[str] = []
-
-                    def armed() -> bool:
-                        elsewhere.sendto(forged_heartbeat(), ("127.0.0.1", port))
-                        texts.extend(autopilot.take_messages())
-                        status = autopilot.status()
-                        return status is not None and status.armed
-
-                    await eventually(armed, "PX4 is heard at its new port")
-                    assert autopilot.identity().peer == moved.address
-                    said = [text for text in texts if "the link uses that port" in text]
-                    assert len(said) == 1 and f"now sends from port {moved.address[1]}" in said[0]
-
-    asyncio.run(main())
-
-
-def test_what_is_not_mavlink_from_a_stranger_is_not_reported() -> None:
-    async def main() -> None:
-        port = free_udp_port()
-        with Px4Peer(port), closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger:
-            async with edge(port) as autopilot:
-                for data in (b"\xfd", forged_heartbeat()[:-1], b"", os.urandom(100)):
-                    stranger.sendto(data, ("127.0.0.1", port))
-                assert [autopilot.take_messages() for _ in range(10)] == [[]] * 10
-
-    asyncio.run(main())
-
-
-def test_px4_that_restarts_at_the_same_address_is_heard_again() -> None:
-    async def main() -> None:
-        port = free_udp_port()
-        with Px4Peer(port) as px4:
+    port = free_udp_port()
+    with closing(socket.socket(type=socket.SOCK_DGRAM)) as elsewhere, Px4Peer(port) as px4:
+        elsewhere.bind(("127.0.0.9", 0))
+        async with edge(port) as autopilot:
             where = px4.address
-            async with edge(port) as autopilot:
-                px4.__exit__(None, None, None)
-                for tick in range(20):  # what is sent now comes back as ICMP errors
-                    autopilot.send_vision(
-                        MocapPose(
-                            stamp_s=1.0 + tick,
-                            frame_number=tick,
-                            position_world_m=(0.0, 0.0, 0.0),
-                            attitude_wxyz=LEVEL,
-                            tracking_valid=True,
-                            marker_error_m=0.0,
-                        )
+            await eventually(lambda: autopilot.status() is not None, "a heartbeat")
+            px4.__exit__(None, None, None)
+            with Px4Peer(port) as moved:
+                assert moved.address[1] != where[1]
+                moved.base_mode = ARMED
+                texts: list[str] = []
+
+                def armed() -> bool:
+                    elsewhere.sendto(forged_heartbeat(), ("127.0.0.1", port))
+                    texts.extend(autopilot.take_messages())
+                    status = autopilot.status()
+                    return status is not None and status.armed
+
+                await eventually(armed, "PX4 is heard at its new port")
+                assert autopilot.identity().peer == moved.address
+                reports = [text for text in texts if "the link uses that port" in text]
+                assert len(reports) == 1 and f"now sends from port {moved.address[1]}" in reports[0]
+
+
+async def test_what_is_not_mavlink_from_a_stranger_is_not_reported() -> None:
+    port = free_udp_port()
+    with Px4Peer(port), closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger:
+        async with edge(port) as autopilot:
+            for data in (b"\xfd", forged_heartbeat()[:-1], b"", os.urandom(100)):
+                stranger.sendto(data, ("127.0.0.1", port))
+            assert [autopilot.take_messages() for _ in range(10)] == [[]] * 10
+
+
+async def test_px4_that_restarts_at_the_same_address_is_heard_again() -> None:
+    port = free_udp_port()
+    with Px4Peer(port) as px4:
+        where = px4.address
+        async with edge(port) as autopilot:
+            px4.__exit__(None, None, None)
+            for tick in range(20):  # what is sent now comes back as ICMP errors
+                autopilot.send_vision(
+                    MocapPose(
+                        stamp_s=1.0 + tick,
+                        frame_number=tick,
+                        position_world_m=(0.0, 0.0, 0.0),
+                        attitude_wxyz=LEVEL,
+                        tracking_valid=True,
+                        marker_error_m=0.0,
                     )
-                    await asyncio.sleep(0.005)
-                with Px4Peer(port, at=where) as again:
-                    again.base_mode = ARMED
+                )
+                await asyncio.sleep(0.005)
+            with Px4Peer(port, at=where) as again:
+                again.base_mode = ARMED
 
-                    def armed() -> bool:
-                        status = autopilot.status()
-                        return status is not None and status.armed
+                def armed() -> bool:
+                    status = autopilot.status()
+                    return status is not None and status.armed
 
-                    await eventually(armed, "PX4 is heard after its restart")
-
-    asyncio.run(main())
+                await eventually(armed, "PX4 is heard after its restart")

@@ -183,7 +183,7 @@ def test_a_lost_answer_is_reported_after_its_deadline() -> None:
     assert requests.take_messages(times_s[-1]) == ["LAND: no answer within 3 s; requesting it again"]
 
 
-def test_the_newest_messages_are_kept_when_nobody_takes_them() -> None:
+def test_the_newest_messages_are_kept_when_none_are_taken() -> None:
     requests = RequestQueue()
     for number in range(500):
         requests.hear({"severity": 2, "text": str(number), "id": number, "chunk_seq": 0}, 0.0)

@@ -17,33 +17,27 @@ from tests.support import eventually, free_udp_port
 ASK_ORIGIN = mavlink.MAV_CMD_REQUEST_MESSAGE
 
 
-def test_a_question_is_repeated_until_it_is_answered() -> None:
-    async def fly() -> None:
-        port = free_udp_port()
-        with Px4Peer(port) as peer:
-            async with edge(port) as autopilot:
-                peer.acks[ASK_ORIGIN] = None
-                before = len(peer.commands(ASK_ORIGIN))
-                asking = asyncio.create_task(autopilot.ensure_origin())
-                await eventually(lambda: len(peer.commands(ASK_ORIGIN)) >= before + 2, "the question, twice")
-                peer.acks[ASK_ORIGIN] = mavlink.MAV_RESULT_ACCEPTED
-                assert await asking
-
-    asyncio.run(fly())
+async def test_a_question_is_repeated_until_it_is_answered() -> None:
+    port = free_udp_port()
+    with Px4Peer(port) as peer:
+        async with edge(port) as autopilot:
+            peer.acks[ASK_ORIGIN] = None
+            before = len(peer.commands(ASK_ORIGIN))
+            asking = asyncio.create_task(autopilot.ensure_origin())
+            await eventually(lambda: len(peer.commands(ASK_ORIGIN)) >= before + 2, "the question, twice")
+            peer.acks[ASK_ORIGIN] = mavlink.MAV_RESULT_ACCEPTED
+            assert await asking
 
 
-def test_a_question_that_px4_never_answers_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_question_that_px4_never_answers_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(questions, "ASKS", 2)
 
-    async def fly() -> None:
-        port = free_udp_port()
-        with Px4Peer(port) as peer:
-            async with edge(port) as autopilot:
-                peer.acks[ASK_ORIGIN] = None
-                with pytest.raises(DeviceError, match=r"global origin, found no answer within 1 s; check the link$"):
-                    await autopilot.ensure_origin()
-
-    asyncio.run(fly())
+    port = free_udp_port()
+    with Px4Peer(port) as peer:
+        async with edge(port) as autopilot:
+            peer.acks[ASK_ORIGIN] = None
+            with pytest.raises(DeviceError, match=r"global origin, found no answer within 1 s; check the link$"):
+                await autopilot.ensure_origin()
 
 
 class _SlowLoop(asyncio.SelectorEventLoop):

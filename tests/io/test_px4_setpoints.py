@@ -32,21 +32,18 @@ def edge(port: int, way: Way) -> MavsdkAutopilot:
 
 
 @pytest.mark.parametrize(("euler_world_rad", "euler_ned_rad"), GOLDEN_ATTITUDES)
-def test_the_plugin_sends_the_same_attitude_and_thrust(euler_world_rad: Vec3, euler_ned_rad: Vec3) -> None:
-    async def fly() -> None:
-        port = free_udp_port()
-        with Px4Peer(port) as peer:
-            async with edge(port, "offboard") as autopilot:
-                assert autopilot.send_attitude(AttitudeSetpoint(quat_from_euler_zyx(*euler_world_rad), 0.625))
-                target = await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET")
-        expected = quat_from_euler_zyx(*euler_ned_rad)
-        dot = sum(a * b for a, b in zip(target.q, expected, strict=True))
-        assert abs(dot) == pytest.approx(1.0, abs=1e-6)
-        assert target.thrust == 0.625
-        assert target.type_mask == 7  # attitude and thrust count, body rates are ignored
-        assert (target.target_system, target.target_component) == (1, 1)
-
-    asyncio.run(fly())
+async def test_the_plugin_sends_the_same_attitude_and_thrust(euler_world_rad: Vec3, euler_ned_rad: Vec3) -> None:
+    port = free_udp_port()
+    with Px4Peer(port) as peer:
+        async with edge(port, "offboard") as autopilot:
+            assert autopilot.send_attitude(AttitudeSetpoint(quat_from_euler_zyx(*euler_world_rad), 0.625))
+            target = await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET")
+    expected = quat_from_euler_zyx(*euler_ned_rad)
+    dot = sum(a * b for a, b in zip(target.q, expected, strict=True))
+    assert abs(dot) == pytest.approx(1.0, abs=1e-6)
+    assert target.thrust == 0.625
+    assert target.type_mask == 7  # attitude and thrust count, body rates are ignored
+    assert (target.target_system, target.target_component) == (1, 1)
 
 
 @pytest.mark.parametrize(
@@ -59,20 +56,17 @@ def test_the_plugin_sends_the_same_attitude_and_thrust(euler_world_rad: Vec3, eu
     ],
     ids=["nan", "no-direction", "thrust-nan", "thrust-above-one"],
 )
-def test_a_setpoint_that_must_not_leave_does_not_reach_the_plugin(setpoint: AttitudeSetpoint) -> None:
+async def test_a_setpoint_that_must_not_leave_does_not_reach_the_plugin(setpoint: AttitudeSetpoint) -> None:
     """MAVSDK itself would send it."""
 
-    async def fly() -> None:
-        port = free_udp_port()
-        with Px4Peer(port) as peer:
-            async with edge(port, "offboard") as autopilot:
-                with pytest.raises(ValueError, match="setpoint"):
-                    autopilot.send_attitude(setpoint)
-                assert autopilot.send_attitude(LEVEL)
-                await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET")
-            assert {target.thrust for target in peer.of("SET_ATTITUDE_TARGET")} == {LEVEL.thrust}
-
-    asyncio.run(fly())
+    port = free_udp_port()
+    with Px4Peer(port) as peer:
+        async with edge(port, "offboard") as autopilot:
+            with pytest.raises(ValueError, match="setpoint"):
+                autopilot.send_attitude(setpoint)
+            assert autopilot.send_attitude(LEVEL)
+            await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET")
+        assert {target.thrust for target in peer.of("SET_ATTITUDE_TARGET")} == {LEVEL.thrust}
 
 
 async def fly_in_offboard(peer: Px4Peer, autopilot: MavsdkAutopilot) -> None:
@@ -93,42 +87,36 @@ async def counted(peer: Px4Peer, for_s: float) -> int:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_each_setpoint_leaves_once_and_a_caller_who_falls_silent_leaves_nothing_behind(way: Way) -> None:
+async def test_each_setpoint_leaves_once_and_a_caller_who_falls_silent_leaves_nothing_behind(way: Way) -> None:
     """A thread of the plugin repeats the last one at 20 Hz: PX4's failsafe would not see that the flight loop hangs."""
 
-    async def fly() -> None:
-        port = free_udp_port()
-        with Px4Peer(port) as peer:
-            async with edge(port, way) as autopilot:
-                await fly_in_offboard(peer, autopilot)
-                assert await counted(peer, 1.0) == 0
-                for k in range(10):
-                    assert autopilot.send_attitude(AttitudeSetpoint(LEVEL.attitude_wxyz, 0.1 + 0.05 * k))
-                await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET", 11)
-                assert autopilot.send_attitude(None) is False
-                assert await counted(peer, 0.5) == 0
-                sent = [target.thrust for target in peer.of("SET_ATTITUDE_TARGET")]
-                assert sent == pytest.approx([LEVEL.thrust] + [0.1 + 0.05 * k for k in range(10)])
-            assert await counted(peer, 0.5) == 0, "the edge is left"
-
-    asyncio.run(fly())
+    port = free_udp_port()
+    with Px4Peer(port) as peer:
+        async with edge(port, way) as autopilot:
+            await fly_in_offboard(peer, autopilot)
+            assert await counted(peer, 1.0) == 0
+            for k in range(10):
+                assert autopilot.send_attitude(AttitudeSetpoint(LEVEL.attitude_wxyz, 0.1 + 0.05 * k))
+            await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET", 11)
+            assert autopilot.send_attitude(None) is False
+            assert await counted(peer, 0.5) == 0
+            sent = [target.thrust for target in peer.of("SET_ATTITUDE_TARGET")]
+            assert sent == pytest.approx([LEVEL.thrust] + [0.1 + 0.05 * k for k in range(10)])
+        assert await counted(peer, 0.5) == 0, "the edge is left"
 
 
-def test_what_the_plugin_does_not_send_in_time_leaves_straight_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_what_the_plugin_does_not_send_in_time_leaves_straight_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.io.px4.setpoints.PLUGIN_MAX_S", 0.0)
 
-    async def fly() -> None:
-        port = free_udp_port()
-        with Px4Peer(port) as peer:
-            async with edge(port, "offboard") as autopilot:
-                await fly_in_offboard(peer, autopilot)
-                for _ in range(20):
-                    assert autopilot.send_attitude(LEVEL)
-                    await asyncio.sleep(0.02)
-                await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET", 21)
-            assert peer.packets_so_far() and len(peer.of("SET_ATTITUDE_TARGET")) == 21
-
-    asyncio.run(fly())
+    port = free_udp_port()
+    with Px4Peer(port) as peer:
+        async with edge(port, "offboard") as autopilot:
+            await fly_in_offboard(peer, autopilot)
+            for _ in range(20):
+                assert autopilot.send_attitude(LEVEL)
+                await asyncio.sleep(0.02)
+            await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET", 21)
+        assert peer.packets_so_far() and len(peer.of("SET_ATTITUDE_TARGET")) == 21
 
 
 def test_a_setpoint_that_the_link_does_not_take_counts_as_not_sent() -> None:
@@ -153,16 +141,13 @@ def test_a_setpoint_that_the_link_does_not_take_counts_as_not_sent() -> None:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_neither_way_asks_for_a_mode_of_its_own(way: Way) -> None:
+async def test_neither_way_asks_for_a_mode_of_its_own(way: Way) -> None:
     """MAVSDK's offboard.stop() would command HOLD; an edge that closes commands nothing."""
 
-    async def fly() -> None:
-        port = free_udp_port()
-        with Px4Peer(port) as peer:
-            async with edge(port, way) as autopilot:
-                await fly_in_offboard(peer, autopilot)
-                autopilot.send_attitude(None)
-            assert peer.packets_so_far()
-            assert peer.commands(DO_SET_MODE) == []
-
-    asyncio.run(fly())
+    port = free_udp_port()
+    with Px4Peer(port) as peer:
+        async with edge(port, way) as autopilot:
+            await fly_in_offboard(peer, autopilot)
+            autopilot.send_attitude(None)
+        assert peer.packets_so_far()
+        assert peer.commands(DO_SET_MODE) == []

@@ -62,26 +62,23 @@ def test_px4_behind_a_stream_of_bytes(link: Callable[[], AbstractContextManager[
         asyncio.run(fly(address))
 
 
-def test_a_serial_port_that_comes_back_under_its_name_is_used_again_and_the_streams_are_requested_again(
+async def test_a_serial_port_that_comes_back_under_its_name_is_used_again_and_the_streams_are_requested_again(
     tmp_path: Path,
 ) -> None:
-    async def fly() -> None:
-        device = AutopilotDevice(address=f"serial://{tmp_path / 'px4'}:921600", discovery_timeout_s=DEADLINE_S)
-        async with contextlib.AsyncExitStack() as stack:
-            with px4_cable(tmp_path / "px4"):
-                autopilot = await stack.enter_async_context(MavsdkAutopilot(device, flight_clock()))
-                await eventually(lambda: autopilot.vehicle() is not None, "the vehicle's state")
-            await eventually(lambda: has_hung_up(autopilot), "the loss")
-            before = autopilot.counts()
-            assert not autopilot.send_attitude(LEVEL)
-            with px4_cable(tmp_path / "px4") as px4:  # a restarted end of the link: PX4 has forgotten the rates
-                await eventually(lambda: _read(autopilot) > before.attitude + 50, "50 more attitudes")
-                assert autopilot.send_attitude(LEVEL)
-                await eventually(lambda: bool(px4.of("SET_ATTITUDE_TARGET")), "a setpoint")
-                autopilot.request(AutopilotRequest.LAND)
-                await eventually(lambda: bool(px4.commands(mavlink.MAV_CMD_NAV_LAND)), "LAND")
-
-    asyncio.run(fly())
+    device = AutopilotDevice(address=f"serial://{tmp_path / 'px4'}:921600", discovery_timeout_s=DEADLINE_S)
+    async with contextlib.AsyncExitStack() as stack:
+        with px4_cable(tmp_path / "px4"):
+            autopilot = await stack.enter_async_context(MavsdkAutopilot(device, flight_clock()))
+            await eventually(lambda: autopilot.vehicle() is not None, "the vehicle's state")
+        await eventually(lambda: has_hung_up(autopilot), "the loss")
+        before = autopilot.counts()
+        assert not autopilot.send_attitude(LEVEL)
+        with px4_cable(tmp_path / "px4") as px4:  # a restarted end of the link: PX4 has forgotten the rates
+            await eventually(lambda: _read(autopilot) > before.attitude + 50, "50 more attitudes")
+            assert autopilot.send_attitude(LEVEL)
+            await eventually(lambda: bool(px4.of("SET_ATTITUDE_TARGET")), "a setpoint")
+            autopilot.request(AutopilotRequest.LAND)
+            await eventually(lambda: bool(px4.commands(mavlink.MAV_CMD_NAV_LAND)), "LAND")
 
 
 @contextmanager

@@ -46,7 +46,7 @@ def opened(address: str, local_port: int = 0, peer: tuple[str, int] | None = Non
     [b"\xfd", b"no MAVLink", heartbeat()[:-1], heartbeat()[:-1] + b"\x00", heartbeat(255, 190), heartbeat(1, 154)],
     ids=["one byte", "text", "cut", "checksum", "ground station", "gimbal"],
 )
-def test_udpin_takes_nobody_for_px4_but_the_sender_of_a_valid_heartbeat(data: bytes) -> None:
+def test_udpin_takes_only_the_sender_of_a_valid_heartbeat_for_px4(data: bytes) -> None:
     port = free_udp_port()
     with (
         opened(f"udpin://127.0.0.1:{port}") as wire,

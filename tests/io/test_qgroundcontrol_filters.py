@@ -389,7 +389,7 @@ def test_values_have_names_that_fit_and_what_is_not_finite_is_left_out() -> None
 
 
 def test_no_value_of_a_sick_tick_breaks_the_tick_that_shows_it() -> None:
-    """NaN and infinity from a sensor, an estimator or the law: told to nobody, and nothing is raised in the flight process."""
+    """NaN and infinity from a sensor, an estimator or the law: not sent, and nothing is raised in the flight process."""
     inputs, outputs, _ = next(
         row for row in synthetic_flight() if row[1].control and row[1].attitude and row[0].vehicle
     )

@@ -118,87 +118,78 @@ async def send_setpoints(autopilot: MavsdkAutopilot, px4: Px4Peer, count: int, e
     await asyncio.to_thread(px4.wait_for, "SET_ATTITUDE_TARGET", count)
 
 
-def test_qgroundcontrol_sees_the_stub_reads_a_parameter_and_hears_our_words() -> None:
-    async def fly() -> None:
-        port = free_udp_port()
-        with GroundPeer() as ground:
-            async with standing_stub(port) as stub, link(port, ground.address) as (_, station):
-                await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1, autopilot=mavlink.MAV_AUTOPILOT_PX4)
-                await asyncio.to_thread(ground.wait_for, "ATTITUDE_QUATERNION", 1)
-                value = await asyncio.to_thread(ground.read_param, "COM_OF_LOSS_T")
-                assert value.param_value == pytest.approx(stub.params.real("COM_OF_LOSS_T"))
-                ours = await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 191)
-                assert (ours.type, ours.autopilot) == (18, 8)  # MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID
+async def test_qgroundcontrol_sees_the_stub_reads_a_parameter_and_hears_our_words() -> None:
+    port = free_udp_port()
+    with GroundPeer() as ground:
+        async with standing_stub(port) as stub, link(port, ground.address) as (_, station):
+            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1, autopilot=mavlink.MAV_AUTOPILOT_PX4)
+            await asyncio.to_thread(ground.wait_for, "ATTITUDE_QUATERNION", 1)
+            value = await asyncio.to_thread(ground.read_param, "COM_OF_LOSS_T")
+            assert value.param_value == pytest.approx(stub.params.real("COM_OF_LOSS_T"))
+            ours = await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 191)
+            assert (ours.type, ours.autopilot) == (18, 8)  # MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID
 
-                event = Event(
-                    t_s=1.0,
-                    id="tether_short",
-                    severity=Severity.CRITICAL,
-                    action=SafetyAction.RETRACT,
-                    text="slack 0.1 m: going back",
-                )
-                station.report_tick(inputs(), outputs(events=(event,)))
-                said = await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text="phase approach")
-                assert said.severity == mavlink.MAV_SEVERITY_INFO
-                text = "RETRACT: slack 0.1 m: going back"
-                said = await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text=text)
-                assert said.severity == mavlink.MAV_SEVERITY_CRITICAL
-                slack = await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191, name="slack_m")
-                assert slack.value == pytest.approx(0.75)
-                stop = await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191, name="stop_slk_m")
-                assert stop.value == pytest.approx(0.5)
-                await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191, name="progress", value=0.25)
-                # The companion's own part of the talk with PX4 (component 195) is nobody else's business.
-                assert ground.senders() == {(1, 1), (1, 191)}
-                assert station.take_messages() == [f"ground station 127.0.0.1:{ground.port} is connected"]
-
-    asyncio.run(fly())
+            event = Event(
+                t_s=1.0,
+                id="tether_short",
+                severity=Severity.CRITICAL,
+                action=SafetyAction.RETRACT,
+                text="slack 0.1 m: going back",
+            )
+            station.report_tick(inputs(), outputs(events=(event,)))
+            notice = await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text="phase approach")
+            assert notice.severity == mavlink.MAV_SEVERITY_INFO
+            text = "RETRACT: slack 0.1 m: going back"
+            notice = await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text=text)
+            assert notice.severity == mavlink.MAV_SEVERITY_CRITICAL
+            slack = await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191, name="slack_m")
+            assert slack.value == pytest.approx(0.75)
+            stop = await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191, name="stop_slk_m")
+            assert stop.value == pytest.approx(0.5)
+            await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191, name="progress", value=0.25)
+            # The companion's own part of the talk with PX4 (component 195) concerns no other program.
+            assert ground.senders() == {(1, 1), (1, 191)}
+            assert station.take_messages() == [f"ground station 127.0.0.1:{ground.port} is connected"]
 
 
 @pytest.mark.parametrize("kind", ["COMMAND_LONG", "COMMAND_INT"])
-def test_a_forced_disarm_from_the_ground_does_not_reach_an_armed_px4(kind: str) -> None:
-    async def fly() -> None:
-        port = free_udp_port()
-        with GroundPeer() as ground, Px4Peer(port) as px4:
-            px4.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-            async with link(port, ground.address) as (_, station):
-                await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1, autopilot=mavlink.MAV_AUTOPILOT_PX4)
-                if kind == "COMMAND_LONG":
-                    ground.say(mavlink.MAVLink_command_long_message(1, 1, 400, 0, 0.0, 21196.0, *[0.0] * 5))
-                else:
-                    forced = (0.0, 21196.0, 0.0, 0.0)
-                    ground.say(mavlink.MAVLink_command_int_message(1, 1, 0, 400, 0, 0, *forced, 0, 0, 0.0))
-                ground.say(mavlink.MAVLink_command_long_message(1, 1, 21, 0, *[0.0] * 7))
-                await eventually(lambda: bool(px4.commands(21)), "LAND, which was sent after it")
-                assert px4.commands(400) == []
-                assert [message for message in px4.of("COMMAND_INT") if message.command == 400] == []
-                texts: list[str] = []
+async def test_a_forced_disarm_from_the_ground_does_not_reach_an_armed_px4(kind: str) -> None:
+    port = free_udp_port()
+    with GroundPeer() as ground, Px4Peer(port) as px4:
+        px4.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+        async with link(port, ground.address) as (_, station):
+            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1, autopilot=mavlink.MAV_AUTOPILOT_PX4)
+            if kind == "COMMAND_LONG":
+                ground.say(mavlink.MAVLink_command_long_message(1, 1, 400, 0, 0.0, 21196.0, *[0.0] * 5))
+            else:
+                forced = (0.0, 21196.0, 0.0, 0.0)
+                ground.say(mavlink.MAVLink_command_int_message(1, 1, 0, 400, 0, 0, *forced, 0, 0, 0.0))
+            ground.say(mavlink.MAVLink_command_long_message(1, 1, 21, 0, *[0.0] * 7))
+            await eventually(lambda: bool(px4.commands(21)), "LAND, which was sent after it")
+            assert px4.commands(400) == []
+            assert [message for message in px4.of("COMMAND_INT") if message.command == 400] == []
+            texts: list[str] = []
 
-                def refused() -> bool:
-                    texts.extend(station.take_messages())
-                    return len(texts) > 1
+            def refused() -> bool:
+                texts.extend(station.take_messages())
+                return len(texts) > 1
 
-                await eventually(refused, "what was refused")
-                assert any("1 command 400 while PX4 is armed" in text for text in texts), texts
-
-    asyncio.run(fly())
+            await eventually(refused, "what was refused")
+            assert any("1 command 400 while PX4 is armed" in text for text in texts), texts
 
 
-def test_a_mode_that_the_ground_chose_reaches_px4_and_the_companion_sees_it() -> None:
-    async def fly() -> None:
-        port = free_udp_port()
-        with GroundPeer() as ground:
-            async with standing_stub(port), link(port, ground.address) as (autopilot, _):
-                await eventually(lambda: autopilot.status() is not None, "a heartbeat")
-                await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1, autopilot=mavlink.MAV_AUTOPILOT_PX4)
-                custom = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
-                for main, sub, mode in ((1.0, 0.0, FlightMode.MANUAL), (4.0, 3.0, FlightMode.HOLD)):
-                    fields = (custom, main, sub, 0.0, 0.0, 0.0, 0.0)
-                    ground.say(mavlink.MAVLink_command_long_message(1, 1, 176, 0, *fields))
-                    await eventually(partial(is_in_mode, autopilot, mode), mode.name)
-                await asyncio.to_thread(ground.wait_for, "COMMAND_ACK", 1, command=176)
-
-    asyncio.run(fly())
+async def test_a_mode_that_the_ground_chose_reaches_px4_and_the_companion_sees_it() -> None:
+    port = free_udp_port()
+    with GroundPeer() as ground:
+        async with standing_stub(port), link(port, ground.address) as (autopilot, _):
+            await eventually(lambda: autopilot.status() is not None, "a heartbeat")
+            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1, autopilot=mavlink.MAV_AUTOPILOT_PX4)
+            custom = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
+            for main, sub, mode in ((1.0, 0.0, FlightMode.MANUAL), (4.0, 3.0, FlightMode.HOLD)):
+                fields = (custom, main, sub, 0.0, 0.0, 0.0, 0.0)
+                ground.say(mavlink.MAVLink_command_long_message(1, 1, 176, 0, *fields))
+                await eventually(partial(is_in_mode, autopilot, mode), mode.name)
+            await asyncio.to_thread(ground.wait_for, "COMMAND_ACK", 1, command=176)
 
 
 def _forgeries() -> list[Any]:
@@ -228,173 +219,152 @@ def _believed(autopilot: MavsdkAutopilot) -> list[str]:
     return found
 
 
-def test_nothing_that_the_ground_forges_enters_the_companions_state() -> None:
-    async def fly() -> None:
-        port = free_udp_port()
-        with GroundPeer() as ground, Px4Peer(port) as px4, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            async with link(port, ground.address) as (autopilot, station):
-                await eventually(lambda: autopilot.vehicle() is not None and autopilot.status() is not None, "a state")
-                # PX4 falls silent: nothing overwrites what comes in.
-                px4.beating = False
-                await asyncio.to_thread(px4.packets_so_far)
-                before = autopilot.vehicle()
-                encoder = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-                own_port = station.vehicle_port
-                assert own_port
-                for message in _forgeries():
-                    for system, component in ((1, 1), (1, 195), (255, 1), (255, 190)):
-                        ground.say(message, system, component)
-                    stranger.sendto(message.pack(encoder), ("127.0.0.1", own_port))
-                # What was sent later through the same sockets has been through.
-                await asyncio.to_thread(ground.read_param, "MPC_THR_HOVER")
-                assert _believed(autopilot) == []
-                assert autopilot.vehicle() == before
-                forged = [m for m in px4.of("HEARTBEAT") if m.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED]
-                assert {m.get_srcSystem() for m in forged} <= {255}  # PX4 takes a ground station's for what it is
-                assert not px4.of("ATTITUDE_QUATERNION") and not px4.of("COMMAND_ACK") and not px4.of("STATUSTEXT")
-                said = station.take_messages()
-                assert any("sent with the vehicle's system id 1" in line for line in said), said
-                # The same from PX4's side is believed: this test can tell.
-                for message in _forgeries():
-                    px4.say(message)
-                await eventually(lambda: autopilot.vehicle() != before, "PX4's own")
-                await eventually(lambda: (s := autopilot.status()) is not None and s.armed, "PX4's own heartbeat")
-                assert "attitude" in _believed(autopilot)
-
-    asyncio.run(fly())
+async def test_nothing_that_the_ground_forges_enters_the_companions_state() -> None:
+    port = free_udp_port()
+    with GroundPeer() as ground, Px4Peer(port) as px4, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        async with link(port, ground.address) as (autopilot, station):
+            await eventually(lambda: autopilot.vehicle() is not None and autopilot.status() is not None, "a state")
+            # PX4 falls silent: nothing overwrites what comes in.
+            px4.beating = False
+            await asyncio.to_thread(px4.packets_so_far)
+            before = autopilot.vehicle()
+            encoder = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+            own_port = station.vehicle_port
+            assert own_port
+            for message in _forgeries():
+                for system, component in ((1, 1), (1, 195), (255, 1), (255, 190)):
+                    ground.say(message, system, component)
+                stranger.sendto(message.pack(encoder), ("127.0.0.1", own_port))
+            # What was sent later through the same sockets has been through.
+            await asyncio.to_thread(ground.read_param, "MPC_THR_HOVER")
+            assert _believed(autopilot) == []
+            assert autopilot.vehicle() == before
+            forged = [m for m in px4.of("HEARTBEAT") if m.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED]
+            assert {m.get_srcSystem() for m in forged} <= {255}  # PX4 takes a ground station's for what it is
+            assert not px4.of("ATTITUDE_QUATERNION") and not px4.of("COMMAND_ACK") and not px4.of("STATUSTEXT")
+            reports = station.take_messages()
+            assert any("sent with the vehicle's system id 1" in line for line in reports), reports
+            # The same from PX4's side is believed: this test can tell.
+            for message in _forgeries():
+                px4.say(message)
+            await eventually(lambda: autopilot.vehicle() != before, "PX4's own")
+            await eventually(lambda: (s := autopilot.status()) is not None and s.armed, "PX4's own heartbeat")
+            assert "attitude" in _believed(autopilot)
 
 
-def test_px4_never_hears_the_companions_words_and_no_station_in_its_name() -> None:
-    async def fly() -> None:
-        port = free_udp_port()
-        with GroundPeer(beating=False) as ground, Px4Peer(port) as px4:
-            px4.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED  # in the air
-            async with link(port, ground.address) as (autopilot, station):
-                for tick in range(200):
-                    station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}"))
-                await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191)
-                await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 191)
+async def test_px4_never_hears_the_companions_words_and_no_station_in_its_name() -> None:
+    port = free_udp_port()
+    with GroundPeer(beating=False) as ground, Px4Peer(port) as px4:
+        px4.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED  # in the air
+        async with link(port, ground.address) as (autopilot, station):
+            for tick in range(200):
+                station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}"))
+            await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191)
+            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 191)
+            assert autopilot.send_attitude(LEVEL)
+            await asyncio.to_thread(px4.wait_for, "SET_ATTITUDE_TARGET")
+            heard = {(m.get_srcSystem(), m.get_srcComponent()) for m in px4.received}
+            assert heard == {(1, 195)}
+            assert mavlink.MAV_TYPE_GCS not in {m.type for m in px4.of("HEARTBEAT")}
+
+
+async def test_a_flood_is_cut_down_and_setpoints_pass() -> None:
+    port = free_udp_port()
+    with GroundPeer() as ground, Px4Peer(port) as px4:
+        async with link(port, ground.address) as (autopilot, station):
+            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1)
+            start_s = time.monotonic()
+
+            def flood() -> None:
+                for i in range(6000):
+                    ground.say(mavlink.MAVLink_param_request_read_message(1, 1, b"NO_SUCH_NAME", -1))
+                    ground.say_bytes(bytes(range(i % 256)))
+
+            flooding = asyncio.create_task(asyncio.to_thread(flood))
+            sent = 0
+            while not flooding.done():
                 assert autopilot.send_attitude(LEVEL)
-                await asyncio.to_thread(px4.wait_for, "SET_ATTITUDE_TARGET")
-                heard = {(m.get_srcSystem(), m.get_srcComponent()) for m in px4.received}
-                assert heard == {(1, 195)}
-                assert mavlink.MAV_TYPE_GCS not in {m.type for m in px4.of("HEARTBEAT")}
-
-    asyncio.run(fly())
-
-
-def test_a_flood_is_cut_down_and_setpoints_pass() -> None:
-    async def fly() -> None:
-        port = free_udp_port()
-        with GroundPeer() as ground, Px4Peer(port) as px4:
-            async with link(port, ground.address) as (autopilot, station):
-                await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1)
-                start_s = time.monotonic()
-
-                def flood() -> None:
-                    for i in range(6000):
-                        ground.say(mavlink.MAVLink_param_request_read_message(1, 1, b"NO_SUCH_NAME", -1))
-                        ground.say_bytes(bytes(range(i % 256)))
-
-                flooding = asyncio.create_task(asyncio.to_thread(flood))
-                sent = 0
-                while not flooding.done():
-                    assert autopilot.send_attitude(LEVEL)
-                    sent += 1
-                    await asyncio.sleep(0.005)
-                await flooding
-                await asyncio.to_thread(px4.wait_for, "SET_ATTITUDE_TARGET", sent)
-                # A parameter is read as soon as the flood is over.
-                value = None
-                async with asyncio.timeout(DEADLINE_S):
-                    while value is None:
-                        ground.say(mavlink.MAVLink_param_request_read_message(1, 1, b"MPC_THR_HOVER", -1))
-                        await asyncio.sleep(0.05)
-                        value = next(iter(ground.of("PARAM_VALUE")), None)
-                passed = sum(m.param_id == "NO_SUCH_NAME" for m in px4.of("PARAM_REQUEST_READ"))
-                assert 0 < passed <= UP_BURST + UP_RATE_HZ * (time.monotonic() - start_s)
-                assert len(px4.of("SET_ATTITUDE_TARGET")) == sent
-                assert any("refused" in line for line in station.take_messages())
-
-    asyncio.run(fly())
+                sent += 1
+                await asyncio.sleep(0.005)
+            await flooding
+            await asyncio.to_thread(px4.wait_for, "SET_ATTITUDE_TARGET", sent)
+            # A parameter is read as soon as the flood is over.
+            value = None
+            async with asyncio.timeout(DEADLINE_S):
+                while value is None:
+                    ground.say(mavlink.MAVLink_param_request_read_message(1, 1, b"MPC_THR_HOVER", -1))
+                    await asyncio.sleep(0.05)
+                    value = next(iter(ground.of("PARAM_VALUE")), None)
+            passed = sum(m.param_id == "NO_SUCH_NAME" for m in px4.of("PARAM_REQUEST_READ"))
+            assert 0 < passed <= UP_BURST + UP_RATE_HZ * (time.monotonic() - start_s)
+            assert len(px4.of("SET_ATTITUDE_TARGET")) == sent
+            assert any("refused" in line for line in station.take_messages())
 
 
-def test_a_ground_station_that_connects_late_receives_the_phase() -> None:
-    async def fly() -> None:
-        port, ground = free_udp_port(), GroundPeer(beating=False)
-        with ground, Px4Peer(port):
-            async with link(port, ground.address) as (_, station):
-                station.report_tick(inputs(), outputs(phase="catch"))
-                await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text="phase catch")
-                assert len(ground.of("STATUSTEXT", 191)) == 1
-                ground.beating = True
-                await eventually(lambda: len(ground.of("STATUSTEXT", 191)) == 2, "the phase again")
-
-    asyncio.run(fly())
+async def test_a_ground_station_that_connects_late_receives_the_phase() -> None:
+    port, ground = free_udp_port(), GroundPeer(beating=False)
+    with ground, Px4Peer(port):
+        async with link(port, ground.address) as (_, station):
+            station.report_tick(inputs(), outputs(phase="catch"))
+            await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text="phase catch")
+            assert len(ground.of("STATUSTEXT", 191)) == 1
+            ground.beating = True
+            await eventually(lambda: len(ground.of("STATUSTEXT", 191)) == 2, "the phase again")
 
 
-def test_without_any_ground_station_the_link_to_px4_is_as_ever() -> None:
-    async def fly() -> None:
-        port, nobody = free_udp_port(), free_udp_port()
-        with Px4Peer(port) as px4:
-            async with link(port, f"udpout://localhost:{nobody}") as (autopilot, station):
-                await send_setpoints(autopilot, px4, 200, lambda tick: station.report_tick(inputs(tick), outputs(tick)))
-                assert await autopilot.read_param("COM_RC_IN_MODE") == 4
-                assert station.take_messages() == []
-
-    asyncio.run(fly())
+async def test_without_any_ground_station_the_link_to_px4_is_as_ever() -> None:
+    port, unheard = free_udp_port(), free_udp_port()
+    with Px4Peer(port) as px4:
+        async with link(port, f"udpout://localhost:{unheard}") as (autopilot, station):
+            await send_setpoints(autopilot, px4, 200, lambda tick: station.report_tick(inputs(tick), outputs(tick)))
+            assert await autopilot.read_param("COM_RC_IN_MODE") == 4
+            assert station.take_messages() == []
 
 
-def test_a_relay_that_was_killed_costs_the_ground_station_and_nothing_else() -> None:
-    async def fly() -> None:
-        port = free_udp_port()
-        with GroundPeer() as ground, Px4Peer(port) as px4:
-            async with link(port, ground.address) as (autopilot, station):
-                await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1)
-                assert station.relay_pid is not None
-                os.kill(station.relay_pid, signal.SIGKILL)
-                said: list[str] = []
+async def test_a_relay_that_was_killed_costs_the_ground_station_and_nothing_else() -> None:
+    port = free_udp_port()
+    with GroundPeer() as ground, Px4Peer(port) as px4:
+        async with link(port, ground.address) as (autopilot, station):
+            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1)
+            assert station.relay_pid is not None
+            os.kill(station.relay_pid, signal.SIGKILL)
+            reports: list[str] = []
 
-                def each(tick: int) -> None:
-                    station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}"))
-                    said.extend(station.take_messages())
+            def each(tick: int) -> None:
+                station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}"))
+                reports.extend(station.take_messages())
 
-                await send_setpoints(autopilot, px4, 400, each)
-                assert await autopilot.read_param("COM_RC_IN_MODE") == 4
+            await send_setpoints(autopilot, px4, 400, each)
+            assert await autopilot.read_param("COM_RC_IN_MODE") == 4
 
-                def told() -> bool:
-                    said.extend(station.take_messages())
-                    return any("relay has ended" in line for line in said)
+            def reported() -> bool:
+                reports.extend(station.take_messages())
+                return any("relay has ended" in line for line in reports)
 
-                # A killed process ends when the kernel comes to it.
-                await eventually(told, "the relay's end")
-                assert [line for line in said if "relay has ended" in line] == [
-                    f"ground station {ground.address}: the relay has ended; nothing is forwarded"
-                ]
-
-    asyncio.run(fly())
+            # A killed process ends when the kernel comes to it.
+            await eventually(reported, "the relay's end")
+            assert [line for line in reports if "relay has ended" in line] == [
+                f"ground station {ground.address}: the relay has ended; nothing is forwarded"
+            ]
 
 
-def test_a_stopped_relay_holds_nobody_up() -> None:
-    async def fly() -> None:
-        port = free_udp_port()
-        with GroundPeer() as ground, Px4Peer(port) as px4:
-            async with link(port, ground.address) as (autopilot, station):
-                await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1)
-                assert station.relay_pid is not None
-                os.kill(station.relay_pid, signal.SIGSTOP)
-                try:
-                    # More than its sockets hold.
-                    await send_setpoints(
-                        *(autopilot, px4, 2000),
-                        lambda tick: station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}")),
-                    )
-                finally:
-                    os.kill(station.relay_pid, signal.SIGCONT)
-                station.report_tick(inputs(2000), outputs(2000, phase="landing"))
-                await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 191)
-
-    asyncio.run(fly())
+async def test_a_stopped_relay_blocks_no_other_program() -> None:
+    port = free_udp_port()
+    with GroundPeer() as ground, Px4Peer(port) as px4:
+        async with link(port, ground.address) as (autopilot, station):
+            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1)
+            assert station.relay_pid is not None
+            os.kill(station.relay_pid, signal.SIGSTOP)
+            try:
+                # More than its sockets hold.
+                await send_setpoints(
+                    *(autopilot, px4, 2000),
+                    lambda tick: station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}")),
+                )
+            finally:
+                os.kill(station.relay_pid, signal.SIGCONT)
+            station.report_tick(inputs(2000), outputs(2000, phase="landing"))
+            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 191)
 
 
 class NoForwarder:
@@ -490,17 +460,14 @@ def test_an_address_that_is_none_is_one_line(address: str) -> None:
         ("udpout://255.255.255.255:14550", "found the group 255.255.255.255"),
     ],
 )
-def test_a_host_that_cannot_be_spoken_to_is_one_line_and_leaves_nothing_open(address: str, found: str) -> None:
-    async def fly() -> None:
-        port = free_udp_port()
-        with Px4Peer(port):
-            with pytest.raises(DeviceError) as caught:
-                async with link(port, address):
-                    pytest.fail("it opened")
-            line = str(caught.value)
-            assert found in line and "\n" not in line
-
-    asyncio.run(fly())
+async def test_a_host_that_cannot_be_spoken_to_is_one_line_and_leaves_nothing_open(address: str, found: str) -> None:
+    port = free_udp_port()
+    with Px4Peer(port):
+        with pytest.raises(DeviceError) as caught:
+            async with link(port, address):
+                pytest.fail("it opened")
+        line = str(caught.value)
+        assert found in line and "\n" not in line
 
 
 @pytest.mark.parametrize("address", ["udp://127.0.0.1:14550", "udpout://127.0.0.1", "udpout://127.0.0.1:0"])

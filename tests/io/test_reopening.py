@@ -1,4 +1,4 @@
-"""A lost device is opened again in a thread, whose waits hold up nobody."""
+"""A lost device is opened again in a thread, whose waits block nothing else."""
 
 from __future__ import annotations
 

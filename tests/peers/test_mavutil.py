@@ -34,29 +34,26 @@ def ground_script(connection: Any) -> dict[str, Any]:
     return seen
 
 
-def test_mavutil_sees_the_heartbeat_and_reads_every_parameter() -> None:
-    async def scenario() -> None:
-        rig = Rig()
-        stop = asyncio.Event()
-        async with MavlinkServer(rig.stub, Ports(0, 0)) as server:
-            connection = mavutil.mavlink_connection(f"udpout:127.0.0.1:{server.onboard_port}", source_system=255)
-            try:
-                connection.mav.heartbeat_send(6, 8, 0, 0, 4)
-                async with asyncio.TaskGroup() as group:
-                    group.create_task(rig.fly(server, stop))
-                    try:
-                        seen = await asyncio.wait_for(asyncio.to_thread(ground_script, connection), DEADLINE_S)
-                    finally:
-                        stop.set()
-            finally:
-                connection.close()
-        assert seen["autopilot"] == mavutil.mavlink.MAV_AUTOPILOT_PX4
-        assert seen["type"] == mavutil.mavlink.MAV_TYPE_QUADROTOR
-        assert seen["mode"] == "LOITER"
-        assert seen["params"] == set(rig.params)
-        assert seen["count"] == len(rig.params)
-        assert math.isclose(seen["hover"], 0.5)
-        assert seen["ack"].command == mavutil.mavlink.MAV_CMD_COMPONENT_ARM_DISARM
-        assert seen["ack"].result == mavutil.mavlink.MAV_RESULT_TEMPORARILY_REJECTED, "no origin: Hold cannot arm"
-
-    asyncio.run(scenario())
+async def test_mavutil_sees_the_heartbeat_and_reads_every_parameter() -> None:
+    rig = Rig()
+    stop = asyncio.Event()
+    async with MavlinkServer(rig.stub, Ports(0, 0)) as server:
+        connection = mavutil.mavlink_connection(f"udpout:127.0.0.1:{server.onboard_port}", source_system=255)
+        try:
+            connection.mav.heartbeat_send(6, 8, 0, 0, 4)
+            async with asyncio.TaskGroup() as group:
+                group.create_task(rig.fly(server, stop))
+                try:
+                    seen = await asyncio.wait_for(asyncio.to_thread(ground_script, connection), DEADLINE_S)
+                finally:
+                    stop.set()
+        finally:
+            connection.close()
+    assert seen["autopilot"] == mavutil.mavlink.MAV_AUTOPILOT_PX4
+    assert seen["type"] == mavutil.mavlink.MAV_TYPE_QUADROTOR
+    assert seen["mode"] == "LOITER"
+    assert seen["params"] == set(rig.params)
+    assert seen["count"] == len(rig.params)
+    assert math.isclose(seen["hover"], 0.5)
+    assert seen["ack"].command == mavutil.mavlink.MAV_CMD_COMPONENT_ARM_DISARM
+    assert seen["ack"].result == mavutil.mavlink.MAV_RESULT_TEMPORARILY_REJECTED, "no origin: Hold cannot arm"

@@ -48,7 +48,7 @@ def read_one(server: NatNetServer, multicast: bool, deadline_s: float = 20.0) ->
     ("version", "multicast"),
     [("3.0", False), ("3.1", True), ("4.0", False), ("4.1", True), ("4.2", False), ("4.4", True)],
 )
-def test_peer_reads_the_right_poses(version: str, multicast: bool) -> None:
+async def test_peer_reads_the_right_poses(version: str, multicast: bool) -> None:
     async def publish(server: NatNetServer) -> None:
         t_s = 0.0
         while True:
@@ -56,28 +56,25 @@ def test_peer_reads_the_right_poses(version: str, multicast: bool) -> None:
             server.publish(t_s, POSES, t_s - 0.004)
             await asyncio.sleep(0.005)
 
-    async def run() -> None:
-        group = GROUP if multicast else None
-        async with NatNetServer(version, multicast_group=group, bodies=[(1, "quad"), (2, "ball")]) as server:
-            publisher = asyncio.create_task(publish(server))
-            try:
-                info, frame, models = await asyncio.to_thread(read_one, server, multicast)
-            finally:
-                publisher.cancel()
-                await asyncio.gather(publisher, return_exceptions=True)
-        assert info.application_name == "Motive"
-        assert str(info.nat_net_protocol_version.truncate(2)) == version
-        assert [(body.id_num, body.tracking_valid) for body in frame.rigid_bodies] == [(1, True), (2, False)]
-        for body, pose in zip(frame.rigid_bodies, POSES, strict=True):
-            w, x, y, z = pose.quat_wxyz
-            assert body.pos == pytest.approx(pose.position_m)
-            assert body.rot == pytest.approx((x, y, z, w))
-            assert body.marker_error == pytest.approx(pose.error_m)
-        assert [marker_set.model_name for marker_set in frame.marker_sets] == ["quad", "ball", "all"]
-        assert len(frame.unlabeled_marker_pos) == 1
-        assert [marker.model_id for marker in frame.labeled_markers[:8]] == [1] * 4 + [2] * 4
-        suffix = frame.suffix
-        assert suffix.stamp_transmit - suffix.stamp_camera_mid_exposure == 40_000
-        assert [(body.id_num, body.name) for body in models.rigid_bodies] == [(1, "quad"), (2, "ball")]
-
-    asyncio.run(run())
+    group = GROUP if multicast else None
+    async with NatNetServer(version, multicast_group=group, bodies=[(1, "quad"), (2, "ball")]) as server:
+        publisher = asyncio.create_task(publish(server))
+        try:
+            info, frame, models = await asyncio.to_thread(read_one, server, multicast)
+        finally:
+            publisher.cancel()
+            await asyncio.gather(publisher, return_exceptions=True)
+    assert info.application_name == "Motive"
+    assert str(info.nat_net_protocol_version.truncate(2)) == version
+    assert [(body.id_num, body.tracking_valid) for body in frame.rigid_bodies] == [(1, True), (2, False)]
+    for body, pose in zip(frame.rigid_bodies, POSES, strict=True):
+        w, x, y, z = pose.quat_wxyz
+        assert body.pos == pytest.approx(pose.position_m)
+        assert body.rot == pytest.approx((x, y, z, w))
+        assert body.marker_error == pytest.approx(pose.error_m)
+    assert [marker_set.model_name for marker_set in frame.marker_sets] == ["quad", "ball", "all"]
+    assert len(frame.unlabeled_marker_pos) == 1
+    assert [marker.model_id for marker in frame.labeled_markers[:8]] == [1] * 4 + [2] * 4
+    suffix = frame.suffix
+    assert suffix.stamp_transmit - suffix.stamp_camera_mid_exposure == 40_000
+    assert [(body.id_num, body.name) for body in models.rigid_bodies] == [(1, "quad"), (2, "ball")]

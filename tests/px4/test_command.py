@@ -32,45 +32,42 @@ def told(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     return loaded
 
 
-def test_diff_write_diff_on_the_stub(
+async def test_diff_write_diff_on_the_stub(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("companion.io.px4.params.ASKS", 2)  # every read asks for the ports that the stub does not have
     backup = tmp_path / "old.params"
 
-    async def session() -> None:
-        async def run(*words: str) -> int:
-            return await asyncio.to_thread(params, port, *words)
+    async def run(*words: str) -> int:
+        return await asyncio.to_thread(params, port, *words)
 
-        port = free_udp_port()
-        async with standing_stub(port, SPOILED) as stub:
-            assert await run("--diff", "--json") == EXIT_REFUSED
-            found = told(capsys)
-            assert found["ok"] is False
-            assert {row["name"]: (row["px4"], row["reboot"]) for row in found["differs"]} == {
-                "EKF2_EV_CTRL": (3, False),
-                "COM_OF_LOSS_T": (5.0, False),
-                "EKF2_HGT_REF": (0, True),
-            }
-            assert set(found["absent_port"]) == {"MAV_1_CONFIG", "MAV_1_MODE", "MAV_1_RATE", "SER_TEL2_BAUD"}
-            assert "written" not in found
+    port = free_udp_port()
+    async with standing_stub(port, SPOILED) as stub:
+        assert await run("--diff", "--json") == EXIT_REFUSED
+        found = told(capsys)
+        assert found["ok"] is False
+        assert {row["name"]: (row["px4"], row["reboot"]) for row in found["differs"]} == {
+            "EKF2_EV_CTRL": (3, False),
+            "COM_OF_LOSS_T": (5.0, False),
+            "EKF2_HGT_REF": (0, True),
+        }
+        assert set(found["absent_port"]) == {"MAV_1_CONFIG", "MAV_1_MODE", "MAV_1_RATE", "SER_TEL2_BAUD"}
+        assert "written" not in found
 
-            revision = stub.params.revision
-            assert await run("--write", "--json", "--backup", str(backup)) == EXIT_OK
-            found = told(capsys)
-            assert set(found["written"]) == set(SPOILED)
-            assert found["reboot"] == ["EKF2_HGT_REF"]
-            assert stub.params.revision == revision + len(SPOILED), "only what differed was written"
-            assert all(stub.params[name] == single(file_values()[name]) for name in SPOILED)
-            assert params_file.read(backup).values == {1: SPOILED}
+        revision = stub.params.revision
+        assert await run("--write", "--json", "--backup", str(backup)) == EXIT_OK
+        found = told(capsys)
+        assert set(found["written"]) == set(SPOILED)
+        assert found["reboot"] == ["EKF2_HGT_REF"]
+        assert stub.params.revision == revision + len(SPOILED), "only what differed was written"
+        assert all(stub.params[name] == single(file_values()[name]) for name in SPOILED)
+        assert params_file.read(backup).values == {1: SPOILED}
 
-            assert await run("--diff") == EXIT_OK
-            assert "nothing differs" in capsys.readouterr().out
-            assert await run("--write", str(backup), "--backup", str(tmp_path / "older.params")) == EXIT_OK
-            assert "reboot PX4: EKF2_HGT_REF" in capsys.readouterr().out
-            assert all(stub.params[name] == value for name, value in SPOILED.items())
-
-    asyncio.run(session())
+        assert await run("--diff") == EXIT_OK
+        assert "nothing differs" in capsys.readouterr().out
+        assert await run("--write", str(backup), "--backup", str(tmp_path / "older.params")) == EXIT_OK
+        assert "reboot PX4: EKF2_HGT_REF" in capsys.readouterr().out
+        assert all(stub.params[name] == value for name, value in SPOILED.items())
 
 
 @pytest.fixture

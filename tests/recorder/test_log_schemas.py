@@ -52,8 +52,8 @@ def check(viewed: Viewed, *, every: int = 1) -> None:
 
 
 def test_every_channel_says_what_it_holds_in_the_terms_of_the_viewers(synthetic: Viewed) -> None:
-    said = {topic: (message, name, schema) for topic, (message, name, schema, _) in synthetic.schemas.items()}
-    assert said == {
+    found = {topic: (message, name, schema) for topic, (message, name, schema, _) in synthetic.schemas.items()}
+    assert found == {
         **{topic: ("json", name, "jsonschema") for topic, name in JSON.items()},
         **{topic: ("protobuf", name, "protobuf") for topic, name in PROTOBUF.items()},
     }

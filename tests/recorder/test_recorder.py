@@ -169,7 +169,7 @@ def test_a_full_channel_drops_and_counts_without_waiting() -> None:
     with theirs:
         client = RecorderClient(ours)
         offered = 0
-        while client.dropped < 100:  # nobody reads: every call must return
+        while client.dropped < 100:  # there is no reader: every call must return
             client.record(*tick(offered))
             offered += 1
         assert client.samples + client.dropped == offered
@@ -260,10 +260,10 @@ def test_a_full_disk_is_said_once_and_the_log_so_far_is_kept(tmp_path: Path, cap
     offered = 0
     deadline_s = time.monotonic() + DEADLINE_S
     while recorder.client.error is None:
-        assert time.monotonic() < deadline_s, "the flight is not told"
+        assert time.monotonic() < deadline_s, "the flight reports nothing"
         offer(recorder, range(offered, offered + 100))
         offered += 100
-    told = recorder.client.error
+    reported = recorder.client.error
     offer(recorder, range(offered, offered + 100))
     offered += 100
     report = recorder.finish(DEADLINE_S)
@@ -274,7 +274,7 @@ def test_a_full_disk_is_said_once_and_the_log_so_far_is_kept(tmp_path: Path, cap
     assert readable == list(range(report.samples))
     assert 0 < report.samples < offered
     assert report.samples + report.dropped == offered
-    assert told == report.error
+    assert reported == report.error
     assert capfd.readouterr().err.count("File too large") == 1
 
 

@@ -82,9 +82,9 @@ def test_every_topic_follows_its_schema_and_is_there_for_those_who_come_late(tmp
         assert [(row.id, row.level, row.text) for row in preflight.rows] == [("px4", "ok", "well")]
         events = late.wait(Topic.EVENTS, Events)
         assert set(late.retained()) == RETAINED
-    told = [event.id for row in ROWS for event in row[1].events]
-    assert sorted(line.id for line in events.lines) == sorted([*told, "px4"])
-    assert events.count == len(told) + 1
+    reported = [event.id for row in ROWS for event in row[1].events]
+    assert sorted(line.id for line in events.lines) == sorted([*reported, "px4"])
+    assert events.count == len(reported) + 1
     log = FlightLog.read(flight.path)
     assert len(log.inputs) == len(ROWS)
     assert log.metadata["recorder"]["session"] == state.session
@@ -139,7 +139,8 @@ def test_a_broker_that_dies_and_comes_back_costs_no_sample_and_is_reported_every
             listener.wait(Topic.EVENTS, Events, lambda events: events.count == 1)
             broker.kill()
         flight.wait(
-            lambda: "no broker" in (flight.recorder.client.telemetry_status or ""), "the flight is not told of the loss"
+            lambda: "no broker" in (flight.recorder.client.telemetry_status or ""),
+            "the flight does not report the loss",
         )
         flight.fly(2500)
         broker.start()
@@ -154,7 +155,7 @@ def test_a_broker_that_dies_and_comes_back_costs_no_sample_and_is_reported_every
             listener.wait(Topic.STREAM, Stream, lambda stream: stream.t_s > 17.0)
             flight.wait(
                 lambda: (flight.recorder.client.telemetry_status or "").startswith("connected"),
-                "the flight is not told of the return",
+                "the flight does not report the return",
             )
             flight.fly(len(ROWS))
             report = flight.finish()
@@ -163,8 +164,8 @@ def test_a_broker_that_dies_and_comes_back_costs_no_sample_and_is_reported_every
     log = FlightLog.read(flight.path)
     assert len(log.inputs) == len(ROWS)
     assert int(log.metadata["recorder"]["broker_connections"]) == 2
-    told = [line for line in log_lines(flight.path) if "broker at" in line or "connected to" in line]
-    assert len(told) == 3, told
+    reported = [line for line in log_lines(flight.path) if "broker at" in line or "connected to" in line]
+    assert len(reported) == 3, reported
 
 
 def test_a_broker_that_takes_nothing_costs_no_sample_and_holds_nobody(tmp_path: Path, broker: Broker) -> None:
@@ -175,7 +176,7 @@ def test_a_broker_that_takes_nothing_costs_no_sample_and_holds_nobody(tmp_path: 
         report = flight.finish()
         broker.signal(signal.SIGCONT)
         assert (report.samples, report.dropped, report.error) == (len(ROWS), 0, None)
-        # It could not be told of the end in time: then the last word is the will's, or the end if it took that after all.
+        # It could not receive the end in time: then the last word is the will's, or the end if it took that after all.
         listener.wait(Topic.STATE, State, lambda state: state.presence in (Presence.LOST, Presence.ENDED))
     assert len(FlightLog.read(flight.path).inputs) == len(ROWS)
 
@@ -183,7 +184,7 @@ def test_a_broker_that_takes_nothing_costs_no_sample_and_holds_nobody(tmp_path: 
 def test_no_broker_at_all_is_reported_once_and_costs_no_sample(tmp_path: Path) -> None:
     url = f"mqtt://127.0.0.1:{free_port()}"
     with flight_with(tmp_path, url) as flight:
-        flight.wait(lambda: flight.recorder.client.telemetry_status is not None, "the flight is not told")
+        flight.wait(lambda: flight.recorder.client.telemetry_status is not None, "the flight reports nothing")
         assert flight.recorder.client.telemetry_status == f"no broker at {url}, trying: Connection refused"
         # Its thread yields to everything; 21 s of ticks in a moment could be over before it has written its line.
         flight.wait(lambda: any("no broker" in line for line in log_lines(flight.path)), "not in the log")

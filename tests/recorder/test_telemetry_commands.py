@@ -71,9 +71,9 @@ def test_a_signed_command_reaches_the_flight_and_its_answer_comes_back(tmp_path:
         events = listener.wait(
             Topic.EVENTS, Events, lambda events: any(line.id == "command_refused_replayed" for line in events.lines)
         )
-        told = {line.id: line.text for line in events.lines}
-        assert "not signed with the key of anna" in told["command_refused_bad_signature"]
-        assert "another flight" in told["command_refused_wrong_session"]
+        reported = {line.id: line.text for line in events.lines}
+        assert "not signed with the key of anna" in reported["command_refused_bad_signature"]
+        assert "another flight" in reported["command_refused_wrong_session"]
         flight.fly(len(ROWS))
         assert client.take_commands() == []
         assert len(listener.of(Topic.ACK)) == 2
@@ -130,7 +130,7 @@ def test_a_flood_of_rubbish_passes_nothing_costs_no_sample_and_does_not_drown_th
             heard.extend(client.take_commands())
             return bool(heard)
 
-        flight.wait(came, "nobody commands any more")
+        flight.wait(came, "no ground station commands any more")
         took_s = time.monotonic() - began_s
         flight.fly(len(ROWS))
         report = flight.finish()
@@ -153,7 +153,7 @@ def test_a_full_disk_costs_the_log_and_neither_a_command_nor_its_answer(tmp_path
         client, heard = flight.recorder.client, list[GroundCommand]()
         size = flight.path.stat().st_size
         resource.prlimit(flight.recorder.process.pid, resource.RLIMIT_FSIZE, (size, size))
-        flight.wait(lambda: client.error is not None, "the flight is not told that the disk is full")
+        flight.wait(lambda: client.error is not None, "the flight does not report that the disk is full")
         listener.publish(Topic.COMMAND.of(VEHICLE), command(listener, OperatorCommand.LAND, session))
 
         def came() -> bool:
@@ -212,9 +212,9 @@ def own_address() -> str:
 
 def test_no_command_is_heard_over_a_plain_way_to_another_computer(tmp_path: Path) -> None:
     address = own_address()
-    url = f"mqtt://{address}:{free_port()}"  # nobody listens there: what is refused is refused before any connection
+    url = f"mqtt://{address}:{free_port()}"  # there is no listener: what is refused is refused before any connection
     with flight_with(tmp_path, url) as flight:
-        flight.wait(lambda: flight.recorder.client.telemetry_status is not None, "the flight is not told")
+        flight.wait(lambda: flight.recorder.client.telemetry_status is not None, "the flight reports nothing")
         flight.finish()
     assert any("commands are not accepted over an unencrypted connection" in line for line in log_lines(flight.path))
 
@@ -228,10 +228,10 @@ def test_a_login_that_cannot_be_used_is_reported_in_one_line_and_the_log_is_writ
         login.write_text("username: x\npassword: y\n" if fault == "open to others" else "{[", encoding="utf-8")
         login.chmod(0o644 if fault == "open to others" else 0o600)
     with flight_with(tmp_path, broker.url, login_file=str(login)) as flight:
-        flight.wait(lambda: flight.recorder.client.telemetry_status is not None, "the flight is not told")
-        told = flight.recorder.client.telemetry_status or ""
-        assert told.startswith("no telemetry: ") and str(login) in told and "\n" not in told
-        assert ("chmod 600" in told) == (fault == "open to others")
+        flight.wait(lambda: flight.recorder.client.telemetry_status is not None, "the flight reports nothing")
+        reported = flight.recorder.client.telemetry_status or ""
+        assert reported.startswith("no telemetry: ") and str(login) in reported and "\n" not in reported
+        assert ("chmod 600" in reported) == (fault == "open to others")
         flight.fly(600)
         assert flight.finish().samples == 600
     assert any("no telemetry" in line for line in log_lines(flight.path))
@@ -255,7 +255,7 @@ def test_a_broker_that_does_not_let_the_vehicle_speak_is_reported(tmp_path: Path
     try:
         with flight_with(tmp_path, broker.url) as flight:
             text = "does not let this vehicle publish its state: Not authorized"
-            flight.wait(lambda: any(text in line for line in log_lines(flight.path)), "the log is not told")
+            flight.wait(lambda: any(text in line for line in log_lines(flight.path)), "the log has no line of it")
             assert "does not let this vehicle publish its" in (flight.recorder.client.telemetry_status or "")
     finally:
         broker.stop()
@@ -306,7 +306,7 @@ def test_over_tls_with_its_login_a_vehicle_is_seen_and_commanded(tmp_path: Path,
 
 
 @pytest.mark.parametrize(
-    ("fault", "told"),
+    ("fault", "reported"),
     [
         ("wrong password", "Not authorized"),
         ("no login", "Not authorized"),
@@ -317,7 +317,7 @@ def test_over_tls_with_its_login_a_vehicle_is_seen_and_commanded(tmp_path: Path,
     ],
 )
 def test_what_is_wrong_with_login_or_certificate_is_reported_and_the_log_is_written(
-    tmp_path: Path, site: Site, fault: str, told: str
+    tmp_path: Path, site: Site, fault: str, reported: str
 ) -> None:
     settings: dict[str, Any] = secure(site)
     url = f"mqtts://localhost:{site.tls_port}"
@@ -336,7 +336,7 @@ def test_what_is_wrong_with_login_or_certificate_is_reported_and_the_log_is_writ
         case _:
             url = f"mqtt://localhost:{site.tls_port}"
     with flight_with(tmp_path, url, **settings) as flight:
-        flight.wait(lambda: told in (flight.recorder.client.telemetry_status or ""), "the flight is not told")
+        flight.wait(lambda: reported in (flight.recorder.client.telemetry_status or ""), "the flight reports nothing")
         assert "\n" not in (flight.recorder.client.telemetry_status or "")
         flight.fly(1500)
         assert flight.finish().samples == 1500

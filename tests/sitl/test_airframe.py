@@ -8,23 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-import numpy as np
 import pytest
 
 from companion.config.airframe import Rotor
 from companion.config.vehicle import Vehicle
-from companion.model.rotors import LAYOUTS, LayoutName
+from companion.model.rotors import LAYOUTS
 from companion.model.types import Outcome, Vec3
-from companion.sitl_config.loader import SitlConfig, load_sitl
+from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.mixer import Mixer
 from sitl.fast.loop import FastFlight
 from sitl.world.world import World
-from tests.support import HOVER, SHORT_CATCH
+from tests.support import HOVER, LOW_HOVER, SHORT_CATCH
 
 VEHICLE = load_sitl(HOVER).vehicle
-SMALL = {"rotor_arm_m": 0.22, "inertia_kg_m2": (0.022, 0.022, 0.04), "yaw_torque_per_thrust_m": 0.016}
-FULL_N = VEHICLE.airframe.thrust_max_n / 4.0
 
 
 def with_airframe(**changes: Any) -> Vehicle:
@@ -107,56 +104,23 @@ def test_errors_of_rotors_are_used_again_from_the_first_if_there_are_more_rotors
         assert abs(yaw_nm) == pytest.approx(0.025 * (1.0 + error))
 
 
-WEAK = "world.faults=[{kind: motor_weak, t_s: 1.0, size: 0.2}]"
+WEAK = [
+    "world.faults=[{kind: motor_weak, t_s: 1.0, size: 0.2}]",
+    *(f"{key}={value}" for key, value in LOW_HOVER.items()),
+]
 
 
-@pytest.mark.parametrize("layout", ["quad_plus", "hexa_x", "octa_plus"])
-@pytest.mark.parametrize("mission", [HOVER, SHORT_CATCH])
-def test_other_layouts_hover_with_a_weak_rotor_and_catch(layout: LayoutName, mission: Path) -> None:
-    overrides = [f"vehicle.airframe.layout={layout}", *([WEAK] if mission == HOVER else [])]
-    flight = FastFlight(load_sitl(mission, overrides=overrides))
+@pytest.mark.parametrize(
+    ("layout", "mission", "extra"),
+    [("quad_plus", SHORT_CATCH, []), ("hexa_x", HOVER, WEAK), ("octa_plus", SHORT_CATCH, [])],
+)
+def test_other_layouts_hover_with_a_weak_rotor_and_catch(layout: str, mission: Path, extra: list[str]) -> None:
+    flight = FastFlight(load_sitl(mission, overrides=[f"vehicle.airframe.layout={layout}", *extra]))
     result, world = flight.run(), flight.plant.world
     assert world.rotor_count == {"quad_plus": 4, "hexa_x": 6, "octa_plus": 8}[layout]
-    if mission == HOVER:
-        assert world.rotor_share == (0.8, *[1.0] * (world.rotor_count - 1))
+    assert world.rotor_share == ((0.8, *[1.0] * 5) if extra else None)
     assert result.caught is (mission == SHORT_CATCH)
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     for truth, output in zip(result.truth, result.outputs, strict=True):
-        if output.reference is not None and truth.position_world_m[2] > 0.6:
+        if output.reference is not None and truth.position_world_m[2] > 0.4:
             assert math.dist(truth.position_world_m, output.reference.position_world_m) < 0.12
-
-
-def test_the_base_has_the_inertia_of_the_vehicle_file() -> None:
-    for inertia in ((0.045, 0.045, 0.075), (0.02, 0.025, 0.03)):
-        world = World(with_airframe(inertia_kg_m2=inertia), WorldConfig(), (0.0, 0.0), 0.0, (1.5, 1.5))
-        assert world.model.body("base").inertia.tolist() == list(inertia)
-
-
-def test_the_joints_have_the_armature_of_the_vehicle_file() -> None:
-    arm = VEHICLE.arm.model_copy(update={"joint_armature_kg_m2": 0.003})
-    world = World(VEHICLE.model_copy(update={"arm": arm}), WorldConfig(), (0.0, 0.0), 0.0, (1.5, 1.5))
-    assert world.model.dof_armature[list(world.layout.joint_v)].tolist() == [0.003, 0.003]
-
-
-def hovering(vehicle: Vehicle) -> SitlConfig:
-    config = load_sitl(HOVER)
-    return config.model_copy(update={"vehicle": vehicle})
-
-
-def test_another_quadrotor_hovers_and_moves_otherwise_than_a_tarot() -> None:
-    tarot, small = (
-        FastFlight(hovering(vehicle)).run(until_mission_s=7.5) for vehicle in (VEHICLE, with_airframe(**SMALL))
-    )
-    for flight in (tarot, small):
-        errors_m = [
-            math.dist(truth.position_world_m, output.reference.position_world_m)
-            for truth, output in zip(flight.truth, flight.outputs, strict=True)
-            if output.reference is not None and truth.position_world_m[2] > 0.95
-        ]
-        assert len(errors_m) > 800
-        assert max(errors_m) < 0.03
-    rates = [np.array([truth.angular_rate_body_rad_s for truth in flight.truth]) for flight in (tarot, small)]
-    shared = min(map(len, rates))
-    difference = np.abs(rates[0][:shared] - rates[1][:shared]).max(axis=0)
-    assert difference[0] > 0.01
-    assert difference[2] > 0.01

@@ -24,36 +24,34 @@ from sitl.external_vision import ExternalVision
 from sitl.fast.loop import FastFlight, FastResult
 from sitl.world.plant import MocapFrame
 from tests.sitl.px4_rig import Rig
-from tests.support import DEADLINE_S, HOVER, SHORT_CATCH
+from tests.support import DEADLINE_S, HOVER, HOVERS_S, LOW_HOVER, SHORT_CATCH
 
 EXTERNAL = "vehicle.devices.mocap.type=external"
 
 
-def test_poses_reach_px4_on_a_link_of_their_own() -> None:
-    async def run() -> None:
-        rig = Rig()
-        frame = MocapFrame(7, 0.0, (1.0, 2.0, 3.0), quat_from_euler_zyx(0.1, -0.2, 0.5), True, 0.0)
-        async with (
-            MavlinkServer(rig.stub, Ports(0, 0), None, Ports(0, 0)) as server,
-            ExternalVision(("127.0.0.1", server.vision_port)) as vision,
-        ):
-            assert server.vision_port != server.onboard_port
-            server.link_down = True  # the companion's link, not this one
-            before = rig.stub.vision_received
-            vision.publish(frame._replace(valid=False), 1.0)
-            vision.publish(frame, 1.005)
-            async with asyncio.timeout(DEADLINE_S):
-                while rig.stub.vision_received == before:  # noqa: ASYNC110 - the stub signals nothing
-                    await asyncio.sleep(0.001)
-            await asyncio.sleep(0)
-            assert rig.stub.vision_received == before + 1, "an untracked body is no pose"
-            assert server.messages_in == 0
-
-    asyncio.run(run())
+async def test_poses_reach_px4_on_a_link_of_their_own() -> None:
+    rig = Rig()
+    frame = MocapFrame(7, 0.0, (1.0, 2.0, 3.0), quat_from_euler_zyx(0.1, -0.2, 0.5), True, 0.0)
+    async with (
+        MavlinkServer(rig.stub, Ports(0, 0), None, Ports(0, 0)) as server,
+        ExternalVision(("127.0.0.1", server.vision_port)) as vision,
+    ):
+        assert server.vision_port != server.onboard_port
+        server.link_down = True  # the companion's link, not this one
+        before = rig.stub.vision_received
+        vision.publish(frame._replace(valid=False), 1.0)
+        vision.publish(frame, 1.005)
+        async with asyncio.timeout(DEADLINE_S):
+            while rig.stub.vision_received == before:  # noqa: ASYNC110 - the stub signals nothing
+                await asyncio.sleep(0.001)
+        await asyncio.sleep(0)
+        assert rig.stub.vision_received == before + 1, "an untracked body is no pose"
+        assert server.messages_in == 0
 
 
 def fly(mission: Any, *faults: dict[str, Any], sets: Sequence[str] = ()) -> tuple[FastFlight, FastResult]:
-    overrides = [EXTERNAL, "world.seed=1", f"world.faults={json.dumps(list(faults))}", *sets]
+    low = [f"{key}={value}" for key, value in LOW_HOVER.items()] if mission == HOVER else []
+    overrides = [EXTERNAL, *low, "world.seed=1", f"world.faults={json.dumps(list(faults))}", *sets]
     flight = FastFlight(load_sitl(mission, preset="recommended", overrides=overrides))
     return flight, flight.run()
 
@@ -74,7 +72,7 @@ def test_the_other_programs_end_is_found_px4_lands_and_the_flight_has_its_report
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plots, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
-    flight, result = fly(HOVER, {"kind": "mocap_loss", "t_s": 6.0})
+    flight, result = fly(HOVER, {"kind": "mocap_loss", "t_s": HOVERS_S})
     begun_s = flight.faults.begun_s
     assert begun_s is not None
     first = next(event for event in events_of(result) if event.t_s >= begun_s)
@@ -91,16 +89,16 @@ def test_the_other_programs_end_is_found_px4_lands_and_the_flight_has_its_report
 
 
 def test_the_guardian_lands_on_the_other_programs_poses() -> None:
-    _, result = fly(HOVER, {"kind": "kill_flight", "t_s": 6.0})
+    _, result = fly(HOVER, {"kind": "kill_flight", "t_s": HOVERS_S})
     assert result.guardian_landed
     assert "guardian_touchdown" in {event.id for event in result.guardian_events}
     assert not result.crashed and not result.armed
 
 
-@pytest.mark.parametrize(("kind", "height_m"), [("mocap_jump", 1.0), ("mocap_freeze", 1.0), ("mocap_occluded", 0.5)])
-def test_wrong_poses_of_the_other_program_end_in_no_crash_and_rotors_that_stop(kind: str, height_m: float) -> None:
-    """Without any pose PX4's estimate lasts for 6 s, enough to land from 0.5 m; from 1 m PX4 may float (docs/internals/contact.md,
-    Without the link).
+@pytest.mark.parametrize("kind", ["mocap_jump", "mocap_freeze", "mocap_occluded"])
+def test_wrong_poses_of_the_other_program_end_in_no_crash_and_rotors_that_stop(kind: str) -> None:
+    """Without any pose PX4's estimate lasts for 6 s, enough to land from 0.5 m; from 1 m PX4 may float (docs/internals/contact.md, Without the
+    link).
     """
-    _, result = fly(HOVER, {"kind": kind, "t_s": 6.0}, sets=[f"mission.phases[0].height_m={height_m}"])
+    _, result = fly(HOVER, {"kind": kind, "t_s": HOVERS_S})
     assert not result.crashed and not result.armed

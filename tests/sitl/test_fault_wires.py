@@ -1,98 +1,71 @@
-"""Faults where they meet a wire or another process: noise on the bus, a slow link, a recorder that cannot write."""
+"""Faults where they meet a wire: the server's devices, and the link of the fast loop."""
 
 from __future__ import annotations
 
 import asyncio
-import os
+import json
 import subprocess
-import sys
-import termios
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-from msgspec.structs import replace
 
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.types import AutopilotStatus, FlightMode, LandedState, VehicleState
-from companion.sitl_config.faults import Fault
+from companion.sitl_config.faults import Fault, FaultKind
 from companion.sitl_config.loader import load_sitl
+from sitl.autopilot.backend import StubBackend
+from sitl.autopilot.mavlink import Ports as LinkPorts
 from sitl.fast.link import FastLink
 from sitl.fast.loop import FastFlight
-from sitl.faults.processes import inject_process_fault
-from sitl.servo.bus import ServoBus
-from sitl.servo.model import ServoModel
-from sitl.servo.protocol import packet, status
-from tests.sitl.simulated_devices import turns_until
-from tests.support import CATCH, DEADLINE_S
+from sitl.server import OTHER_PROCESS_FAULTS, Ports, Sitl, start_of
+from tests.support import CATCH
 
-# -- the servo bus -----------------------------------------------------------------------------------------------------
-
-_LED = 65
+# -- the server --------------------------------------------------------------------------------------------------------
 
 
-def test_a_damaged_instruction_is_heard_by_nobody() -> None:
-    async def scenario() -> tuple[int, bytes]:
-        servo = ServoModel(1)
-        async with ServoBus([servo], wire_time=False) as bus:
-            asked: list[bool] = []
+def test_the_server_begins_and_ends_each_fault_of_a_wire_or_a_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    struck: list[FaultKind] = []
 
-            def first_only() -> bool:
-                asked.append(not asked)
-                return asked[-1]
+    def strike(kind: FaultKind, pid: int) -> bool:
+        struck.append(kind)
+        return True
 
-            bus.damaged = first_only
-            fd = os.open(bus.path, os.O_RDWR | os.O_NOCTTY)
-            try:
-                speed = termios.tcgetattr(fd)
-                speed[4] = speed[5] = termios.B3000000
-                termios.tcsetattr(fd, termios.TCSANOW, speed)
-                os.write(fd, packet(1, bytes((3, _LED, 0, 1))))
-                await turns_until(lambda: len(asked) == 1)
-                os.write(fd, packet(1, bytes((2, 0, 0, 6, 0))))
-                expected = status(1, 0, servo.read(0, 6))
-                return servo.read(_LED, 1)[0], await _read(fd, len(expected))
-            finally:
-                os.close(fd)
+    monkeypatch.setattr("sitl.server.inject_process_fault", strike)
+    kinds = ("link_loss", "link_delay", "bus_noise", "bus_delay", "force_loss", "servo_loss", "clock_step")
+    sizes = {"link_delay": 0.05, "bus_noise": 1.0, "bus_delay": 0.02, "clock_step": 5.0}
+    common = {"after": "start", "t_s": 0.01, "duration_s": 0.02}
+    faults = [{**common, "kind": kind, "size": sizes.get(kind)} for kind in (*kinds, *OTHER_PROCESS_FAULTS)]
+    config = load_sitl(CATCH, overrides=[f"world.faults={json.dumps([*faults, {**common, 'kind': 'stop_flight'}])}"])
+    px4 = StubBackend(config.vehicle.airframe, config.world, LinkPorts(0, 0))
+    server = Sitl(config.vehicle, config.world, start_of((0.0, 0.0), 0.0, (20.0, 20.0)), Ports(), lambda _: None, px4)
 
-    led, answer = asyncio.run(scenario())
-    assert led == 0, "the damaged write was carried out"
-    assert answer == status(1, 0, ServoModel(1).read(0, 6)), "and the answer to it came first"
+    def seen() -> tuple[object, ...]:
+        link, bus, sensor = px4._mavlink, server.bus, server.force
+        assert bus is not None and sensor is not None
+        silent = server.servos[0].silent
+        return (
+            *(link.link_down, link.delay_s, bus.damaged(), bus.answers_late_s, sensor.silent, silent),
+            server.faults.server_clock_s(server.plant.t_s),
+        )
 
+    async def run() -> None:
+        async with server.wires():
+            for until_s, found in (
+                (0.009, (False, 0.0, False, 0.0, False, False, 0.008)),
+                (0.02, (True, 0.05, True, 0.02, True, True, 5.02)),
+                (0.04, (False, 0.0, False, 0.0, False, False, 0.04)),
+            ):
+                while server.plant.t_s < until_s - 0.0015:
+                    server._step()
+                assert seen() == pytest.approx(found), until_s
 
-def test_a_delayed_answer_comes_that_much_later() -> None:
-    delay_s = 0.03
-
-    async def scenario() -> float:
-        async with ServoBus([ServoModel(1)]) as bus:
-            bus.answers_late_s = delay_s
-            fd = os.open(bus.path, os.O_RDWR | os.O_NOCTTY)
-            try:
-                speed = termios.tcgetattr(fd)
-                speed[4] = speed[5] = termios.B3000000
-                termios.tcsetattr(fd, termios.TCSANOW, speed)
-                asked_s = asyncio.get_running_loop().time()
-                os.write(fd, packet(1, bytes((2, 0, 0, 6, 0))))
-                await _read(fd, len(status(1, 0, bytes(6))))
-                return asyncio.get_running_loop().time() - asked_s
-            finally:
-                os.close(fd)
-
-    assert asyncio.run(scenario()) >= delay_s
-
-
-async def _read(fd: int, size: int) -> bytes:
-    loop = asyncio.get_running_loop()
-    data = b""
-    while len(data) < size:
-        ready: asyncio.Future[None] = loop.create_future()
-        loop.add_reader(fd, ready.set_result, None)
+    with subprocess.Popen(["sleep", "600"]) as process:
         try:
-            await asyncio.wait_for(ready, DEADLINE_S)
+            server.flight.pid = process.pid
+            asyncio.run(run())
         finally:
-            loop.remove_reader(fd)
-        data += os.read(fd, size - len(data))
-    return data
+            process.kill()
+    assert struck == list(OTHER_PROCESS_FAULTS)
+    assert server.flight.kind == "stop_flight"
 
 
 # -- the link of the fast loop -----------------------------------------------------------------------------------------
@@ -103,8 +76,12 @@ def flight() -> FastFlight:
     return FastFlight(load_sitl(CATCH))
 
 
+@pytest.fixture
+def link(flight: FastFlight) -> FastLink:
+    return FastLink(flight.faults, flight.plant.world, flight.px4, TICK_PERIOD_S)
+
+
 def at_rest(t_s: float) -> tuple[VehicleState, AutopilotStatus]:
-    level = (1.0, 0.0, 0.0, 0.0)
     nothing = (0.0, 0.0, 0.0)
     state = VehicleState(
         position_stamp_s=t_s,
@@ -112,7 +89,7 @@ def at_rest(t_s: float) -> tuple[VehicleState, AutopilotStatus]:
         imu_stamp_s=t_s,
         position_world_m=(t_s, 0.0, 0.0),
         velocity_world_m_s=nothing,
-        attitude_wxyz=level,
+        attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
         angular_rate_body_rad_s=nothing,
         specific_force_body_m_s2=(0.0, 0.0, 9.81),
         boot_s=t_s,
@@ -127,8 +104,8 @@ def at_rest(t_s: float) -> tuple[VehicleState, AutopilotStatus]:
     )
 
 
-def test_over_a_slow_link_everything_comes_in_order_and_that_much_later(flight: FastFlight) -> None:
-    world, link = flight.plant.world, FastLink(flight.faults, flight.plant.world, flight.px4, TICK_PERIOD_S)
+def test_over_a_slow_link_everything_comes_in_order_and_that_much_later(flight: FastFlight, link: FastLink) -> None:
+    world = flight.plant.world
     arrived: list[tuple[float, float]] = []
     flight.faults.active["link_delay"] = Fault(kind="link_delay", t_s=0.0, size=0.05)
     for tick in range(40):
@@ -138,20 +115,17 @@ def test_over_a_slow_link_everything_comes_in_order_and_that_much_later(flight: 
         state, heard = link.receive(*at_rest(t_s))
         assert state is not None and heard is not None
         if tick >= 10:
-            assert state.position_world_m[0] == pytest.approx(t_s - 0.05), "what was said then"
+            assert state.position_world_m[0] == state.boot_s == pytest.approx(t_s - 0.05), "what was sent then"
             assert state.attitude_stamp_s == heard.heartbeat_stamp_s == pytest.approx(t_s), "but it arrives now"
-            assert state.boot_s == pytest.approx(t_s - 0.05)
-    assert [sent_s for sent_s, _ in arrived] == sorted(sent_s for sent_s, _ in arrived)
-    assert len(arrived) == 30
+    assert [sent_s for sent_s, _ in arrived] == pytest.approx([tick * TICK_PERIOD_S for tick in range(30)])
     assert all(at_s - sent_s == pytest.approx(0.05) for sent_s, at_s in arrived)
 
 
-def test_a_link_that_slows_down_in_flight_brings_nothing_twice(flight: FastFlight) -> None:
-    """Its messages keep their order: for as long as the delay grows, the last word stays."""
-    world, link = flight.plant.world, FastLink(flight.faults, flight.plant.world, flight.px4, TICK_PERIOD_S)
+def test_a_link_that_slows_down_in_flight_delivers_nothing_twice(flight: FastFlight, link: FastLink) -> None:
+    """Its messages keep their order: while the delay grows, the last state stays."""
     heard: list[float | None] = []
     for tick in range(60):
-        world.t_s = t_s = round(tick * TICK_PERIOD_S, 4)
+        flight.plant.world.t_s = t_s = round(tick * TICK_PERIOD_S, 4)
         if tick == 20:
             flight.faults.active["link_delay"] = Fault(kind="link_delay", t_s=0.0, size=0.05)
         if tick == 40:
@@ -163,61 +137,12 @@ def test_a_link_that_slows_down_in_flight_brings_nothing_twice(flight: FastFligh
     assert ticks == [*range(20), *[19] * 10, *range(20, 30), *range(40, 60)]
 
 
-def test_over_a_dead_link_nothing_comes_and_the_last_word_stays(flight: FastFlight) -> None:
-    world, link = flight.plant.world, FastLink(flight.faults, flight.plant.world, flight.px4, TICK_PERIOD_S)
+def test_over_a_dead_link_nothing_arrives_and_the_last_state_stays(flight: FastFlight, link: FastLink) -> None:
     last = link.receive(*at_rest(0.0))
     flight.faults.active["link_loss"] = Fault(kind="link_loss", t_s=0.0)
-    world.t_s = 1.0
+    flight.plant.world.t_s = 1.0
     link.send(lambda: pytest.fail("it arrived"))
     link.deliver_due()
-    assert link.receive(*at_rest(1.0)) == last
+    assert link.receive(*at_rest(1.0)) == last == at_rest(0.0)
     flight.faults.active.clear()
     assert link.receive(*at_rest(1.0)) == at_rest(1.0)
-    assert last[1] is not None
-    assert replace(last[1], heartbeat_stamp_s=1.0) == at_rest(1.0)[1]
-
-
-# -- processes ---------------------------------------------------------------------------------------------------------
-
-_WRITER = """
-import sys
-with open(sys.argv[2], "wb", buffering=0) as file:
-    file.write(b"before")
-    print("ready", flush=True)
-    sys.stdin.readline()
-    try:
-        file.write(b"after")
-    except OSError as error:
-        print(error.errno, flush=True)
-"""
-
-
-@pytest.fixture
-def recorder(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    """A child process with the recorder's command line that writes on request."""
-    command = [sys.executable, "-c", _WRITER, "companion.recorder.main", str(tmp_path / "log")]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-        yield process
-    finally:
-        process.kill()
-        process.communicate(timeout=DEADLINE_S)
-
-
-def test_on_a_full_disk_the_recorder_alone_cannot_write(recorder: subprocess.Popen[str], tmp_path: Path) -> None:
-    assert inject_process_fault("disk_full", os.getpid())
-    out, _ = recorder.communicate("\n", timeout=DEADLINE_S)
-    assert out.strip().isdigit(), "its write went through"
-    assert (tmp_path / "log").read_bytes() == b"before"
-    (tmp_path / "other").write_bytes(b"x" * 10_000)
-
-
-def test_the_recorder_is_found_among_the_children_and_killed(recorder: subprocess.Popen[str]) -> None:
-    assert inject_process_fault("kill_recorder", os.getpid())
-    assert recorder.wait(DEADLINE_S) == -9
-
-
-def test_a_process_that_is_not_there_is_not_struck() -> None:
-    assert not inject_process_fault("kill_recorder", os.getpid())

@@ -11,19 +11,19 @@ import pytest
 from companion.campaigns.faults.judge import good
 from companion.campaigns.process import CampaignError
 from companion.campaigns.runner import Row
+from companion.cli.main import main
 from companion.config.document import ConfigError
 from companion.mission.plan import Plan
 from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.model.flight_stage import SPOOL_S
 from companion.model.frames import attitude_ned_frd_from_enu_flu
-from companion.model.types import Outcome, Quat, SafetyAction, Vec3
+from companion.model.types import Event, Outcome, Quat, SafetyAction, Vec3
 from companion.safety.stop import StopModel
 from companion.sitl_config.faults import KINDS, FaultKind, FlightPhase
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.faults import fly, prepare
 from sitl.campaigns.robustness import draw, throws
 from sitl.fast.loop import FastFlight, FastResult
-from sitl.faults.processes import environment
 from sitl.faults.timing import FaultError, with_fault_times
 from tests.support import CATCH, HOVER, ROOT, SHORT_CATCH
 
@@ -38,18 +38,27 @@ def with_faults(*faults: dict[str, Any], mission: Any = CATCH, world: str = "wor
 
 
 def flown(
-    kind: FaultKind,
-    phase: FlightPhase,
-    size: float | None = None,
-    duration_s: float | None = None,
-    *,
-    config: SitlConfig = SHORT,
+    kind: FaultKind, phase: FlightPhase, size: float | None = None, config: SitlConfig = SHORT, duration_s: Any = None
 ) -> Row:
     row: Row = fly(config, {"kind": kind, "size": size, "duration_s": duration_s, "phase": phase})["row"]
     return row
 
 
-# -- when --------------------------------------------------------------------------------------------------------------
+def fault_and_events(config: SitlConfig) -> tuple[float, FastFlight, FastResult, dict[str, Event]]:
+    """Fly; return when the fault began, and the first event of each kind since then."""
+    flight = FastFlight(config)
+    result = flight.run()
+    begun_s = flight.faults.begun_s
+    assert begun_s is not None
+    events = [event for outputs in result.outputs for event in outputs.events if event.t_s >= begun_s]
+    return begun_s, flight, result, {event.id: event for event in reversed(events)}
+
+
+def assert_lands_near(result: FastResult, begun_s: float) -> None:
+    """It lands, within 0.6 m of where it was when the fault began."""
+    assert not result.crashed and not result.armed
+    at_fault = next(truth for truth in result.truth if truth.t_s >= begun_s)
+    assert math.dist(at_fault.position_world_m[:2], result.truth[-1].position_world_m[:2]) < 0.6
 
 
 def test_a_phase_is_a_time_of_the_plan() -> None:
@@ -62,22 +71,6 @@ def test_a_phase_is_a_time_of_the_plan() -> None:
         assert plan.segment(fault.t_s - SPOOL_S).name == name, phase
 
 
-def test_the_world_reports_the_catch_unless_nothing_is_thrown() -> None:
-    (fault,) = with_fault_times(with_faults({"kind": "mocap_loss", "phase": "catch"})).world.faults
-    assert fault.after == "catch"
-    (fault,) = with_fault_times(
-        with_faults({"kind": "mocap_loss", "phase": "catch"}, world="world.payload_kg=0")
-    ).world.faults
-    assert fault.after == "arming"
-
-
-def test_a_heavy_payload_is_the_one_that_is_thrown() -> None:
-    assert (
-        with_fault_times(with_faults({"kind": "payload_heavy", "phase": "catch"})).world.payload_kg
-        == KINDS["payload_heavy"].default
-    )
-
-
 def test_a_mission_without_a_way_back_has_no_such_phase() -> None:
     with pytest.raises(FaultError, match="mission 'hover' has no phase 'return'; give t_s instead"):
         with_fault_times(with_faults({"kind": "mocap_loss", "phase": "return"}, mission=HOVER))
@@ -87,7 +80,7 @@ def test_a_mission_without_a_way_back_has_no_such_phase() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "told"),
+    ("fault", "problem"),
     [
         ({"kind": "mocap_loss"}, "give either t_s or phase"),
         ({"kind": "mocap_loss", "t_s": 1.0, "phase": "line"}, "give either t_s or phase"),
@@ -98,12 +91,10 @@ def test_a_mission_without_a_way_back_has_no_such_phase() -> None:
     ],
 )
 def test_a_fault_that_means_nothing_is_refused(
-    fault: dict[str, Any], told: str, capsys: pytest.CaptureFixture[str]
+    fault: dict[str, Any], problem: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from companion.cli.main import main
-
     assert main(["check", str(CATCH), "--set", f"world.faults={json.dumps([fault])}"]) == EXIT_BAD_INPUT
-    assert told in capsys.readouterr().err
+    assert problem in capsys.readouterr().err
 
 
 def test_a_fault_of_a_part_that_vehicle_or_world_do_not_have_is_refused() -> None:
@@ -185,50 +176,36 @@ def test_a_clock_that_steps_makes_the_frames_late_that_were_on_their_way() -> No
 
 
 def test_without_faults_the_flight_is_the_same_to_the_last_bit() -> None:
-    """A fault that never comes changes nothing but that the guardian is reported of."""
     late = FastFlight(with_faults({"kind": "mocap_loss", "t_s": 1000.0})).run(3.0)
     never = FastFlight(CONFIG).run(3.0)
     assert [o.attitude for o in late.outputs] == [o.attitude for o in never.outputs]
     assert [s.q for s in late.snapshots] == [s.q for s in never.snapshots]
 
 
-# -- what comes of it --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
-    ("kind", "phase", "size", "duration_s", "outcome", "event", "action"),
+    ("kind", "phase", "size", "duration_s", "end"),
     [
-        ("mocap_swap", "catch", 1.0, None, "landed", "mocap_jump", "autopilot_land"),
-        ("mocap_latency", "line", 0.2, None, "landed", "mocap_lost", "autopilot_land"),
-        ("link_delay", "line", 0.08, None, "landed", "link_late", "autopilot_land"),
-        ("offboard_refused", "landing", None, None, "landed", "offboard_left", "autopilot_land"),
-        ("arming_refused", "ground", None, None, "refused", "arming_refused", "nominal"),
-        ("servo_overload", "line", None, None, "landed", "servo_error", "land"),
-        ("servo_angle", "line", 40.0, None, "landed", "joint_jump", "land"),
-        ("bus_noise", "takeoff", 0.6, None, "completed", "arm_read_failures", "warn"),
-        ("bus_delay", "takeoff", 0.01, None, "completed", "joint_states_late", "warn"),
-        ("force_stuck", "line", None, None, "completed", "force_stuck", "warn"),
-        ("battery_sag", "line", 4.0, None, "landed", "battery_voltage", "land"),
-        ("kill_recorder", "landing", None, None, "completed", "recorder_drops", "warn"),
-        ("kill_guardian", "takeoff", None, None, "completed", "guardian_lost", "warn"),
-        ("stop_flight", "catch", None, None, "landed", "guardian_took_over", "autopilot_land"),
-        ("kill_flight", "takeoff", None, None, "landed", "guardian_took_over", "autopilot_land"),
-        ("stall_loop", "line", None, 0.06, "completed", "loop_late", "warn"),
-        ("pilot_takeover", "landing", 1.0, None, "landed", "pilot_took_over", "autopilot_land"),
+        ("mocap_swap", "catch", 1.0, None, ("landed", "mocap_jump", "autopilot_land")),
+        ("mocap_latency", "line", 0.2, None, ("landed", "mocap_lost", "autopilot_land")),
+        ("link_delay", "line", 0.08, None, ("landed", "link_late", "autopilot_land")),
+        ("offboard_refused", "landing", None, None, ("landed", "offboard_left", "autopilot_land")),
+        ("arming_refused", "ground", None, None, ("refused", "arming_refused", "nominal")),
+        ("servo_overload", "line", None, None, ("landed", "servo_error", "land")),
+        ("servo_angle", "line", 40.0, None, ("landed", "joint_jump", "land")),
+        ("bus_noise", "takeoff", 0.6, None, ("completed", "arm_read_failures", "warn")),
+        ("bus_delay", "takeoff", 0.01, None, ("completed", "joint_states_late", "warn")),
+        ("force_stuck", "line", None, None, ("completed", "force_stuck", "warn")),
+        ("battery_sag", "line", 4.0, None, ("landed", "battery_voltage", "land")),
+        ("kill_recorder", "landing", None, None, ("completed", "recorder_drops", "warn")),
+        ("stall_loop", "line", None, 0.06, ("completed", "loop_late", "warn")),
     ],
 )  # fmt: skip
 def test_it_ends_well_and_is_reported(
-    kind: FaultKind,
-    phase: FlightPhase,
-    size: float | None,
-    duration_s: float | None,
-    outcome: str,
-    event: str | None,
-    action: str,
+    kind: FaultKind, phase: FlightPhase, size: float | None, duration_s: float | None, end: tuple[str, ...]
 ) -> None:
-    row = flown(kind, phase, size, duration_s)
+    row = flown(kind, phase, size, duration_s=duration_s)
     assert good(row), row["problems"]
-    assert (row["outcome"], row["event"], row["action"]) == (outcome, event, action), row["events"]
+    assert (row["outcome"], row["event"], row["action"]) == end, row["events"]
 
 
 @pytest.mark.parametrize("kind", ["tether_taut", "tether_snag"])
@@ -239,9 +216,8 @@ def test_a_tether_that_holds_it_brings_it_down(kind: FaultKind) -> None:
     assert {"tether_taut", "tether_snagged"} & set(row["events"])
 
 
-@pytest.mark.parametrize("duration_s", [0.3, None])
-def test_mocap_lost_in_the_middle_of_the_line(duration_s: float | None) -> None:
-    row = flown("mocap_loss", "line", None, duration_s, config=CONFIG)
+def test_mocap_lost_in_the_middle_of_the_line() -> None:
+    row = flown("mocap_loss", "line", config=CONFIG)
     assert row["outcome"] == "landed"
     assert row["reacted_s"] <= CONFIG.vehicle.safety.mocap_timeout_s + 0.03
     assert row["drift_m"] <= StopModel(CONFIG.vehicle.safety).distance_m(LINE_M_S)
@@ -286,11 +262,12 @@ class Received:
         return self._on_vision(t_s, position_ned_m, attitude_ned_frd)
 
 
-@pytest.mark.parametrize("kind", ["mocap_flip", "mocap_flicker"])
 @pytest.mark.parametrize(
-    "frames",
-    [{"rate_hz": 100.0}, {"rate_hz": 120.0}, {"rate_hz": 240.0}, {"rate_hz": 200.0, "jitter_s": 0.004}],
-    ids=["100 Hz", "120 Hz", "240 Hz", "4 ms of jitter"],
+    ("kind", "frames"),
+    [
+        ("mocap_flip", {"rate_hz": 200.0, "jitter_s": 0.004}),
+        ("mocap_flicker", {"rate_hz": 240.0}),
+    ],
 )
 def test_of_a_body_that_flickers_px4_gets_the_good_poses_and_no_bad_one(
     kind: FaultKind, frames: dict[str, float]
@@ -299,14 +276,8 @@ def test_of_a_body_that_flickers_px4_gets_the_good_poses_and_no_bad_one(
     mocap = f"world.mocap={{on: {'true' if 'jitter_s' in frames else 'false'}, "
     mocap += f"delivery_jitter_s: {frames.get('jitter_s', 0.0)}, pivot_offset_m: [0, 0, 0], body_yaw_deg: 0, "
     mocap += "body_tilt_deg: [0, 0], lost_share: 0, wobble_m: 0, wobble_deg: 0}"
-    config = load_sitl(
-        SHORT_CATCH,
-        overrides=[
-            f"world.faults=[{{kind: {kind}, phase: takeoff}}]",
-            f"world.mocap_rate_hz={frames['rate_hz']}",
-            mocap,
-        ],
-    )
+    fault, rate = f"world.faults=[{{kind: {kind}, phase: takeoff}}]", f"world.mocap_rate_hz={frames['rate_hz']}"
+    config = load_sitl(SHORT_CATCH, overrides=[fault, rate, mocap])
     flight = FastFlight(config)
     received = Received(flight)
     result = flight.run()
@@ -329,7 +300,7 @@ def test_the_guardian_passes_on_none_of_the_bad_poses_either() -> None:
 
 @pytest.mark.parametrize(
     ("delay_s", "id_", "most_m"),
-    [(0.06, "mocap_late", 1.0), (0.1, "mocap_late", 1.0), (0.15, "mocap_too_late", 0.6), (0.18, "mocap_too_late", 0.6)],
+    [(0.1, "mocap_late", 1.0), (0.15, "mocap_too_late", 0.6), (0.18, "mocap_too_late", 0.6)],
 )
 def test_a_delay_behind_the_servers_stamp_is_reported_and_ends_well(delay_s: float, id_: str, most_m: float) -> None:
     """At 0.15 s the vehicle swung by 0.5 m and crashed, at 0.18 s it was lost, and no event named the cause."""
@@ -343,29 +314,19 @@ def test_poses_dragged_at_0_3_m_s_are_found_and_px4_lands_before_they_moved_it_0
     sharp = CONFIG.vehicle.safety.model_copy(update={"mocap_inertial_m": 0.015})
     config = with_faults({"kind": "mocap_drag", "phase": "line", "size": 0.3})
     vehicle = config.vehicle.model_copy(update={"safety": sharp})
-    flight = FastFlight(config.model_copy(update={"vehicle": vehicle}))
-    result = flight.run()
-    begun_s = flight.faults.begun_s
-    assert begun_s is not None
-    events = [event for outputs in result.outputs for event in outputs.events if event.t_s >= begun_s]
-    assert (events[0].id, events[0].action) == ("mocap_dragged", SafetyAction.AUTOPILOT_LAND)
-    assert events[0].t_s - begun_s < 0.2
-    assert not any(outputs.mocap_trusted for outputs in result.outputs if outputs.t_s >= events[0].t_s)
-    assert not result.crashed and not result.armed
-    x, y, _ = next(truth for truth in result.truth if truth.t_s >= begun_s).position_world_m
-    landed_x, landed_y, _ = result.truth[-1].position_world_m
-    assert math.dist((x, y), (landed_x, landed_y)) < 0.6
+    begun_s, _, result, events = fault_and_events(config.model_copy(update={"vehicle": vehicle}))
+    first = min(events.values(), key=lambda event: event.t_s)
+    assert (first.id, first.action) == ("mocap_dragged", SafetyAction.AUTOPILOT_LAND)
+    assert first.t_s - begun_s < 0.2
+    assert not any(outputs.mocap_trusted for outputs in result.outputs if outputs.t_s >= first.t_s)
+    assert_lands_near(result, begun_s)
 
 
 def test_a_catch_in_a_drawn_world_is_no_drag() -> None:
     """Wind, delays, mass errors and the impact of the payload: one of the flights from which the threshold was chosen."""
     knobs = draw(11, 7, throws(CONFIG.mission, CONFIG.vehicle))
-    flight = FastFlight(
-        load_sitl(
-            CATCH, overrides=[f"world.{key}={json.dumps(value)}" for key, value in knobs.items()], world="robustness"
-        )
-    )
-    result = flight.run(until_mission_s=11.0)
+    drawn = [f"world.{key}={json.dumps(value)}" for key, value in knobs.items()]
+    result = FastFlight(load_sitl(CATCH, overrides=drawn, world="robustness")).run(until_mission_s=11.0)
     assert result.caught
     assert "mocap_dragged" not in {event.id for outputs in result.outputs for event in outputs.events}
 
@@ -373,55 +334,40 @@ def test_a_catch_in_a_drawn_world_is_no_drag() -> None:
 def test_after_a_gap_another_bodys_pose_does_not_reach_px4_which_lands_without_it() -> None:
     """PX4 would reset its position to the first pose: this flight ended 4 m away, on its tether (laboratory 1)."""
     faults = ({"kind": "mocap_loss", "duration_s": 1.5}, {"kind": "mocap_swap", "size": 0.8})
-    config = load_sitl(
-        CATCH, overrides=[f"world.faults={json.dumps([{**fault, 'phase': 'line'} for fault in faults])}"], world="lab"
+    on_the_line = json.dumps([{**fault, "phase": "line"} for fault in faults])
+    config = load_sitl(CATCH, overrides=[f"world.faults={on_the_line}"], world="lab")
+    begun_s, _, result, events = fault_and_events(config)
+    assert "mocap_swapped" in events
+    assert_lands_near(result, begun_s)
+
+
+def test_after_a_gap_the_vehicles_own_poses_are_used_again() -> None:
+    gap_s = 2.0
+    begun_s, _, result, _ = fault_and_events(
+        with_faults({"kind": "mocap_loss", "phase": "line", "duration_s": gap_s}, mission=SHORT_CATCH)
     )
-    flight = FastFlight(config)
-    result = flight.run()
-    begun_s = flight.faults.begun_s
-    assert begun_s is not None
-    assert "mocap_swapped" in {event.id for outputs in result.outputs for event in outputs.events}
-    assert not result.crashed and not result.armed
-    x, y, _ = next(truth for truth in result.truth if truth.t_s >= begun_s).position_world_m
-    landed_x, landed_y, _ = result.truth[-1].position_world_m
-    assert math.dist((x, y), (landed_x, landed_y)) < 0.6
-
-
-@pytest.mark.parametrize("gap_s", [1.2, 2.0])
-def test_after_a_gap_the_vehicles_own_poses_are_used_again(gap_s: float) -> None:
-    config = with_faults({"kind": "mocap_loss", "phase": "line", "duration_s": gap_s})
-    flight = FastFlight(config)
-    result = flight.run()
-    begun_s = flight.faults.begun_s
-    assert begun_s is not None
     back = [o.mocap_trusted for o in result.outputs if o.t_s > begun_s + gap_s + 0.1]
     assert back and all(back)
     assert not result.crashed and not result.armed
 
 
 def test_a_gap_shorter_than_the_timeout_is_flown_through() -> None:
-    row = flown("mocap_loss", "line", None, 0.1)
+    row = flown("mocap_loss", "line", duration_s=0.1)
     assert (row["outcome"], row["action"]) == ("completed", "nominal")
     assert row["drift_m"] < 0.05
 
 
 def test_a_second_payload_is_carried_too() -> None:
-    flight = FastFlight(
-        with_faults({"kind": "payload_double", "after": "catch", "t_s": 0.2, "size": 0.2}, mission=SHORT_CATCH)
-    )
-    result = flight.run(limit_s=9.9)
-    begun_s = flight.faults.begun_s
-    assert begun_s is not None
+    fault = {"kind": "payload_double", "after": "catch", "t_s": 0.2, "size": 0.2}
+    begun_s, _, result, _ = fault_and_events(with_faults(fault, mission=SHORT_CATCH))
     assert _load_n(result, begun_s + 1.5) == pytest.approx(0.4 * 9.81, abs=0.6)
 
 
 def test_a_payload_that_is_dropped_is_felt_no_more() -> None:
-    flight = FastFlight(with_faults({"kind": "payload_dropped", "after": "catch", "t_s": 1.0}, mission=SHORT_CATCH))
-    result = flight.run()
+    fault = {"kind": "payload_dropped", "after": "catch", "t_s": 1.0}
+    begun_s, _, result, _ = fault_and_events(with_faults(fault, mission=SHORT_CATCH))
     assert result.outputs[-1].outcome is Outcome.COMPLETED and not result.crashed
     assert {o.action for o in result.outputs} == {SafetyAction.NOMINAL}
-    begun_s = flight.faults.begun_s
-    assert begun_s is not None
     assert _load_n(result, begun_s - 0.3) == pytest.approx(0.2 * 9.81, abs=0.5)
     assert _load_n(result, begun_s + 1.0) == pytest.approx(0.0, abs=0.4)
 
@@ -435,16 +381,7 @@ def _load_n(result: FastResult, t_s: float) -> float:
 
 
 def test_a_restart_of_px4_in_the_air_is_a_fall_and_is_called_so() -> None:
-    row = flown("autopilot_reboot", "line", 2.0, config=CONFIG)
+    row = flown("autopilot_reboot", "line", 2.0)
     assert row["outcome"] == "crashed"
     assert row["problems"] == ["crashed"]
     assert row["event"] == "vehicle_state_lost"
-
-
-# -- processes ---------------------------------------------------------------------------------------------------------
-
-
-def test_the_flight_process_receives_the_duration_of_its_stall() -> None:
-    assert environment({"mocap_loss"}, 0.2) == {}
-    assert environment({"stall_loop"}, 0.2)["COMPANION_SITL_STALL_S"] == "0.2"
-    assert "COMPANION_SITL_STALL_S" not in environment({"stall_loop"})

@@ -5,29 +5,18 @@ from __future__ import annotations
 import pytest
 
 from companion.model.frames import quat_conjugate, quat_multiply
-from companion.model.types import Quat, Vec3, Vec4
-from sitl.autopilot.types import ImuSample
-from sitl.server import start_of
-from sitl.servo.drive import ServoDrive
-from sitl.world.plant import MocapFrame, Plant
+from companion.model.types import Quat, Vec3
+from sitl.world.plant import MocapFrame
 from tests.preflight.hand_rig import world
+from tests.sitl.plants import plant_of
 
-
-class FullAndUneven:
-    """An autopilot that climbs and tumbles."""
-
-    def step(self, imu: ImuSample) -> Vec4:
-        return (1.0, 0.9, 1.0, 0.95)
+CLIMBS_AND_TUMBLES = (1.0, 0.9, 1.0, 0.95)
 
 
 def flight(between_steps: bool, rate_hz: float = 200.0) -> tuple[list[MocapFrame], dict[float, tuple[Vec3, Quat]]]:
     """Frames of the first 0.4 s of a flight without noise, and the truth after every step."""
     config = world("mocap_noise_m=0", "mocap_noise_deg=0", "hand=false", f"mocap_rate_hz={rate_hz:g}")
-    start = config.mission.start
-    pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
-    drives = [ServoDrive() for _ in config.vehicle.arm.joints]
-    where = (pose.position_m, pose.yaw_rad, pose.arm_rad)
-    plant = Plant(config.vehicle, config.world, FullAndUneven(), drives, where, between_steps=between_steps)
+    plant = plant_of(config, CLIMBS_AND_TUMBLES, between_steps=between_steps)
     frames, truth = [], {}
     while plant.t_s < 0.4:
         plant.step(True)
@@ -51,10 +40,7 @@ def test_a_frame_between_two_steps_shows_what_is_between_them() -> None:
     frames, truth = flight(True)
     moved = 0
     for frame in frames:
-        before, after = (
-            truth.get(round(frame.exposure_t_s - 0.001, 6)),
-            truth.get(round(frame.exposure_t_s + 0.001, 6)),
-        )
+        before, after = (truth.get(round(frame.exposure_t_s + side_s, 6)) for side_s in (-0.001, 0.001))
         if before is None or after is None:
             continue
         middle = [(a + b) / 2.0 for a, b in zip(before[0], after[0], strict=True)]
@@ -70,11 +56,7 @@ def test_a_frame_between_two_steps_shows_what_is_between_them() -> None:
 
 def test_frames_are_handed_out_with_the_time_at_which_they_leave() -> None:
     config = world("mocap_latency_s=0.005", "hand=false")
-    start = config.mission.start
-    pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
-    drives = [ServoDrive() for _ in config.vehicle.arm.joints]
-    where = (pose.position_m, pose.yaw_rad, pose.arm_rad)
-    plant = Plant(config.vehicle, config.world, FullAndUneven(), drives, where, between_steps=True)
+    plant = plant_of(config, between_steps=True)
     leave_s = []
     while plant.t_s < 0.1:
         plant.step(False)

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from sitl.autopilot.modes import NavState
-from sitl.faults.processes import SIGNALS, FlightFaultKind, ProcessFaults, environment
+from sitl.faults.processes import FlightFaultKind, ProcessFaults, environment, inject_process_fault
 from tests.support import DEADLINE_S, wait_until
 
 START = (1.0, 2.0, 1.5)
@@ -59,7 +59,7 @@ def letters(process: subprocess.Popen[bytes]) -> set[str]:
 @pytest.mark.parametrize(
     ("kind", "left"), [("kill_flight", ""), ("stop_flight", ""), ("hold_gil", ""), ("stall_loop", "t")]
 )
-def test_who_still_runs(kind: FlightFaultKind, left: str) -> None:
+def test_which_threads_still_run(kind: FlightFaultKind, left: str) -> None:
     with flight_process(kind) as process:
         seen: set[str] = set()
 
@@ -94,6 +94,7 @@ def test_who_still_runs(kind: FlightFaultKind, left: str) -> None:
 def test_hooks_only_where_they_are_needed() -> None:
     assert environment({"kill_flight", "stop_flight", "mocap_loss"}) == {}
     assert "faults/hang" in environment({"hold_gil"})["PYTHONPATH"]
+    assert environment({"stall_loop"}, 0.2)["COMPANION_SITL_STALL_S"] == "0.2"
     done = subprocess.run(
         [sys.executable, "-c", "import signal; print(signal.getsignal(signal.SIGUSR1) is signal.SIG_DFL)"],
         env={**os.environ, **environment({"hold_gil"})},
@@ -102,13 +103,6 @@ def test_hooks_only_where_they_are_needed() -> None:
         check=True,
     )
     assert done.stdout == "True\n", "another process is left alone"
-
-
-def test_nothing_happens_without_a_flight_process() -> None:
-    faults = ProcessFaults()
-    assert not faults.inject("kill_flight", 1.0, START, 0)
-    assert faults.report() is None
-    assert set(SIGNALS) == {"kill_flight", "stop_flight", "hold_gil", "stall_loop"}
 
 
 @pytest.fixture
@@ -141,14 +135,51 @@ def test_the_report_shows_late_setpoints_a_gap_in_vision_and_drift(injected: Pro
     assert report["drift_m"] == pytest.approx(0.5)
 
 
-def test_the_report_does_not_make_up_what_never_happened(injected: ProcessFaults) -> None:
+def test_the_report_has_nothing_that_never_happened(injected: ProcessFaults) -> None:
     for k in range(1, 2000):
         injected.watch(5.0 + 0.002 * k, 4.999, 100, NavState.OFFBOARD, armed=True)
     report = injected.report()
     assert report is not None
-    assert (report["last_setpoint_s"], report["vision_back_s"], report["land_s"], report["disarmed_s"]) == (
-        0.0,
-        None,
-        None,
-        None,
-    )
+    never = ("vision_back_s", "land_s", "disarmed_s")
+    assert [report[key] for key in ("last_setpoint_s", *never)] == [0.0, None, None, None]
+
+
+_WRITER = """
+import sys
+with open(sys.argv[2], "wb", buffering=0) as file:
+    file.write(b"before")
+    print("ready", flush=True)
+    sys.stdin.readline()
+    try:
+        file.write(b"after")
+    except OSError as error:
+        print(error.errno, flush=True)
+"""
+
+
+@pytest.fixture
+def recorder(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A child process with the recorder's command line that writes on request."""
+    command = [sys.executable, "-c", _WRITER, "companion.recorder.main", str(tmp_path / "log")]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate(timeout=DEADLINE_S)
+
+
+def test_on_a_full_disk_the_recorder_alone_cannot_write(recorder: subprocess.Popen[str], tmp_path: Path) -> None:
+    assert inject_process_fault("disk_full", os.getpid())
+    out, _ = recorder.communicate("\n", timeout=DEADLINE_S)
+    assert out.strip().isdigit(), "its write went through"
+    assert (tmp_path / "log").read_bytes() == b"before"
+    (tmp_path / "other").write_bytes(b"x" * 10_000)
+
+
+def test_the_recorder_is_found_among_the_children_and_killed(recorder: subprocess.Popen[str]) -> None:
+    assert inject_process_fault("kill_recorder", os.getpid())
+    assert recorder.wait(DEADLINE_S) == -9
+    assert not inject_process_fault("kill_recorder", os.getpid()), "there is none any more"

@@ -48,72 +48,53 @@ async def connected() -> AsyncIterator[tuple[ControlLink, Rig]]:
                 stop.set()
 
 
-def test_parameters_are_written_by_type_and_read_back() -> None:
-    async def scenario() -> None:
-        async with connected() as (control, rig):
-            await control.await_heartbeat()
-            await control.write({"EKF2_EV_CTRL": 15, "MPC_THR_HOVER": 0.43, "COM_OF_LOSS_T": 0.3})
-            assert rig.params["EKF2_EV_CTRL"] == 15
-            assert rig.params["MPC_THR_HOVER"] == pytest.approx(0.43)
-            found = await control.read(["EKF2_EV_CTRL", "MPC_THR_HOVER", "NO_SUCH_NAME"])
-            assert set(found) == {"EKF2_EV_CTRL", "MPC_THR_HOVER"}
-            assert same(found["MPC_THR_HOVER"], 0.43)
-            assert found["EKF2_EV_CTRL"] == 15 and isinstance(found["EKF2_EV_CTRL"], int)
-
-    asyncio.run(scenario())
+async def test_parameters_are_written_by_type_and_read_back() -> None:
+    async with connected() as (control, rig):
+        await control.await_heartbeat()
+        await control.write({"EKF2_EV_CTRL": 15, "MPC_THR_HOVER": 0.43, "COM_OF_LOSS_T": 0.3})
+        assert rig.params["EKF2_EV_CTRL"] == 15
+        assert rig.params["MPC_THR_HOVER"] == pytest.approx(0.43)
+        found = await control.read(["EKF2_EV_CTRL", "MPC_THR_HOVER", "NO_SUCH_NAME"])
+        assert set(found) == {"EKF2_EV_CTRL", "MPC_THR_HOVER"}
+        assert same(found["MPC_THR_HOVER"], 0.43)
+        assert found["EKF2_EV_CTRL"] == 15 and isinstance(found["EKF2_EV_CTRL"], int)
 
 
-def test_a_parameter_that_is_not_taken_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_parameter_that_is_not_taken_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sitl.px4.control_link.PARAMS_DEADLINE_S", 0.5)
-
-    async def scenario() -> None:
-        async with connected() as (control, _):
-            await control.await_heartbeat()
-            with pytest.raises(Px4Error, match="expected EKF2_EV_CTRL to become 15, found 11"):
-                await control.write({"EKF2_EV_CTRL": 15.0})  # of the wrong type: PX4 ignores it
-
-    asyncio.run(scenario())
+    async with connected() as (control, _):
+        await control.await_heartbeat()
+        with pytest.raises(Px4Error, match="expected EKF2_EV_CTRL to become 15, found 11"):
+            await control.write({"EKF2_EV_CTRL": 15.0})  # of the wrong type: PX4 ignores it
 
 
-def test_a_px4_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_px4_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sitl.px4.control_link.HEARTBEAT_DEADLINE_S", 0.3)
-
-    async def scenario() -> None:
-        with Instance.claim() as instance:
-            async with ControlLink(instance, 4) as control:
-                with pytest.raises(Px4Error, match="expected a heartbeat on UDP"):
-                    await control.await_heartbeat()
-
-    asyncio.run(scenario())
+    with Instance.claim() as instance:
+        async with ControlLink(instance, 4) as control:
+            with pytest.raises(Px4Error, match="expected a heartbeat on UDP"):
+                await control.await_heartbeat()
 
 
-def test_a_mode_is_chosen_and_seen() -> None:
-    async def scenario() -> None:
-        async with connected() as (control, rig):
-            await control.await_heartbeat()
-            control.request_mode(NavState.LAND)
-            async with asyncio.timeout(DEADLINE_S):
-                while control.nav_state is not NavState.LAND:
-                    await control.await_heartbeat()
-            assert rig.stub.nav_state is NavState.LAND
-
-    asyncio.run(scenario())
+async def test_a_mode_is_chosen_and_seen() -> None:
+    async with connected() as (control, rig):
+        await control.await_heartbeat()
+        control.request_mode(NavState.LAND)
+        async with asyncio.timeout(DEADLINE_S):
+            while control.nav_state is not NavState.LAND:
+                await control.await_heartbeat()
+        assert rig.stub.nav_state is NavState.LAND
 
 
-def test_the_geometry_is_that_of_the_world() -> None:
+def test_the_geometry_is_that_of_the_world_and_that_of_a_hexacopter_that_of_px4s_airframe() -> None:
     """Front right first, turning counter-clockwise; FRD, so right is positive."""
-    airframe = VEHICLE.airframe.model_copy(update={"rotor_arm_m": 0.2, "yaw_torque_per_thrust_m": 0.03})
-    geometry = rotor_geometry(airframe)
+    geometry = rotor_geometry(VEHICLE.airframe.model_copy(update={"rotor_arm_m": 0.2, "yaw_torque_per_thrust_m": 0.03}))
     offset = 0.2 / math.sqrt(2.0)
     places = [(geometry[f"CA_ROTOR{i}_PX"], geometry[f"CA_ROTOR{i}_PY"]) for i in range(4)]
     assert places == [(offset, offset), (-offset, -offset), (offset, -offset), (-offset, offset)]
     assert [geometry[f"CA_ROTOR{i}_KM"] for i in range(4)] == [0.03, 0.03, -0.03, -0.03]
     assert (geometry["CA_ROTOR_COUNT"], geometry["MAV_TYPE"], geometry["CA_ROTOR0_PZ"]) == (4, 2, -0.03)
-
-
-def test_the_geometry_of_a_hexacopter_is_that_of_px4s_airframe() -> None:
-    airframe = VEHICLE.airframe.model_copy(update={"layout": "hexa_x", "rotor_arm_m": 0.5})
-    geometry = rotor_geometry(airframe)
+    geometry = rotor_geometry(VEHICLE.airframe.model_copy(update={"layout": "hexa_x", "rotor_arm_m": 0.5}))
     assert (geometry["CA_ROTOR_COUNT"], geometry["MAV_TYPE"]) == (6, 13)
     assert (geometry["CA_ROTOR0_PX"], geometry["CA_ROTOR0_PY"]) == (0.0, 0.5)
     assert (geometry["CA_ROTOR5_PX"], geometry["CA_ROTOR5_PY"]) == pytest.approx((-0.433, -0.25), abs=1e-3)
@@ -157,52 +138,46 @@ def test_a_px4_started_by_hand_that_still_runs_after_its_flight_is_found() -> No
     assert "make" in how_to_start_it(0) and "px4 -i 3`" in how_to_start_it(3) and "make" not in how_to_start_it(3)
 
 
-def test_the_battery_is_sent_as_one_of_px4s_own_system() -> None:
-    async def scenario() -> None:
-        loop = asyncio.get_running_loop()
-        with Instance.claim() as instance, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as px4:
-            px4.bind(instance.control_address)
-            px4.setblocking(False)
-            async with ControlLink(instance, 4) as control, asyncio.timeout(DEADLINE_S):
-                control.send_battery(Battery(15.2, 21.5, 0.8, 640.0))
-                (message,) = mavlink.MAVLink(None).parse_buffer(await loop.sock_recv(px4, 512))
-            assert message.get_type() == "BATTERY_STATUS"
-            assert message.get_srcSystem() == instance.number + 1
-            assert message.get_srcComponent() != mavlink.MAV_COMP_ID_AUTOPILOT1, "PX4 ignores its own"
-        assert message.voltages == [3800] * 4 + [0xFFFF] * 6
-        assert (message.current_battery, message.current_consumed, message.battery_remaining) == (2150, 640, 80)
-
-    asyncio.run(scenario())
+async def test_the_battery_is_sent_as_one_of_px4s_own_system() -> None:
+    loop = asyncio.get_running_loop()
+    with Instance.claim() as instance, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as px4:
+        px4.bind(instance.control_address)
+        px4.setblocking(False)
+        async with ControlLink(instance, 4) as control, asyncio.timeout(DEADLINE_S):
+            control.send_battery(Battery(15.2, 21.5, 0.8, 640.0))
+            (message,) = mavlink.MAVLink(None).parse_buffer(await loop.sock_recv(px4, 512))
+        assert message.get_type() == "BATTERY_STATUS"
+        assert message.get_srcSystem() == instance.number + 1
+        assert message.get_srcComponent() != mavlink.MAV_COMP_ID_AUTOPILOT1, "PX4 ignores its own"
+    assert message.voltages == [3800] * 4 + [0xFFFF] * 6
+    assert (message.current_battery, message.current_consumed, message.battery_remaining) == (2150, 640, 80)
 
 
-def test_the_relay_passes_on_both_ways_until_it_is_down() -> None:
-    async def scenario() -> None:
-        loop = asyncio.get_running_loop()
-        with Instance.claim() as instance, contextlib.ExitStack() as stack:
-            px4, companion = (stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
-            px4.bind(instance.onboard_address)
-            for end in (px4, companion):
-                end.setblocking(False)
-            relay = Relay(instance)
-            async with relay.opened() as address, asyncio.timeout(DEADLINE_S):
-                host, port = address.removeprefix("udpout://").split(":")
-                companion.connect((host, int(port)))
-                companion.send(b"up")
-                data, source = await loop.sock_recvfrom(px4, 100)
-                assert (data, source[1]) == (b"up", instance.onboard_port)
-                px4.sendto(b"down", source)
-                assert await loop.sock_recv(companion, 100) == b"down"
-                relay.down = True
-                companion.send(b"lost")
-                px4.sendto(b"lost", source)
-                await asyncio.sleep(0)
-                relay.delay_s = 0.01
-                while relay.datagrams < 4:  # noqa: ASYNC110 - a datagram that is dropped sets no event
-                    await asyncio.sleep(0.001)
-                relay.down = False
-                companion.send(b"late")
-                assert await loop.sock_recv(px4, 100) == b"late", "what came while it was down is lost"
-                px4.sendto(b"late", source)
-                assert await loop.sock_recv(companion, 100) == b"late"
-
-    asyncio.run(scenario())
+async def test_the_relay_passes_on_both_ways_until_it_is_down() -> None:
+    loop = asyncio.get_running_loop()
+    with Instance.claim() as instance, contextlib.ExitStack() as stack:
+        px4, companion = (stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
+        px4.bind(instance.onboard_address)
+        for end in (px4, companion):
+            end.setblocking(False)
+        relay = Relay(instance)
+        async with relay.opened() as address, asyncio.timeout(DEADLINE_S):
+            host, port = address.removeprefix("udpout://").split(":")
+            companion.connect((host, int(port)))
+            companion.send(b"up")
+            data, source = await loop.sock_recvfrom(px4, 100)
+            assert (data, source[1]) == (b"up", instance.onboard_port)
+            px4.sendto(b"down", source)
+            assert await loop.sock_recv(companion, 100) == b"down"
+            relay.down = True
+            companion.send(b"lost")
+            px4.sendto(b"lost", source)
+            await asyncio.sleep(0)
+            relay.delay_s = 0.01
+            while relay.datagrams < 4:  # noqa: ASYNC110 - a datagram that is dropped sets no event
+                await asyncio.sleep(0.001)
+            relay.down = False
+            companion.send(b"late")
+            assert await loop.sock_recv(px4, 100) == b"late", "what came while it was down is lost"
+            px4.sendto(b"late", source)
+            assert await loop.sock_recv(companion, 100) == b"late"

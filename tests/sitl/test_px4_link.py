@@ -6,6 +6,8 @@ import asyncio
 import contextlib
 import itertools
 import socket
+from collections.abc import AsyncIterator, Iterable
+from typing import Any
 
 import pytest
 
@@ -13,7 +15,7 @@ from companion.model.frames import quat_from_euler_zyx
 from sitl.autopilot.types import ImuSample
 from sitl.px4 import hil_link as px4_link
 from sitl.px4.hil_link import HilSensors, Px4Error, SimulatorLink, field_frd_gauss, pressure_hpa
-from tests.sitl.px4_peer import Answer, LockstepPeer
+from tests.sitl.px4_peer import ARMED, Answer, LockstepPeer
 from tests.support import DEADLINE_S
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -24,12 +26,14 @@ def sample(i: int) -> ImuSample:
     return ImuSample(i * PERIOD_S, (0.1, 0.2, 0.3), (0.0, 0.0, -9.81))
 
 
-def link(rotors: int = 4) -> SimulatorLink:
-    return SimulatorLink(socket.create_server(("127.0.0.1", 0)), HilSensors(1), rotors)
+@contextlib.asynccontextmanager
+async def opened(rotors: int = 4) -> AsyncIterator[SimulatorLink]:
+    async with SimulatorLink(socket.create_server(("127.0.0.1", 0)), HilSensors(1), rotors) as link:
+        yield link
 
 
-async def connected(link: SimulatorLink, answer: Answer) -> LockstepPeer:
-    return await asyncio.to_thread(LockstepPeer, link.port, answer)
+async def peer_of(link: SimulatorLink, answer: Answer = lambda message: [0.5] * 4, mode: int = ARMED) -> LockstepPeer:
+    return await asyncio.to_thread(LockstepPeer, link.port, answer, mode)
 
 
 async def boot(link: SimulatorLink, i: int = 0) -> int:
@@ -42,180 +46,132 @@ async def boot(link: SimulatorLink, i: int = 0) -> int:
     return i
 
 
-async def until_answered(link: SimulatorLink, i: int) -> None:
-    """Check that lockstep works again: a sample is awaited and answered."""
+async def step(link: SimulatorLink, numbers: Iterable[int]) -> None:
     async with asyncio.timeout(DEADLINE_S):
-        while True:
-            i += 1
-            link.send(sample(i), 0.3, LEVEL)
-            waited = link.pending
-            await link.answered()
-            if waited:
-                return
-            await asyncio.sleep(PERIOD_S)
-
-
-async def until_it_fails(link: SimulatorLink, i: int) -> None:
-    async with asyncio.timeout(DEADLINE_S):
-        while True:
-            i += 1
+        for i in numbers:
             link.send(sample(i), 0.3, LEVEL)
             await link.answered()
 
 
-def test_each_sample_is_answered_before_the_next_one_and_the_answer_is_its_own() -> None:
-    def answer(message: object) -> list[float]:
-        return [(message.time_usec // 4000) % 100 / 100.0] * 4  # type: ignore[attr-defined]
-
-    async def scenario() -> None:
-        async with link() as under_test:
-            with await connected(under_test, answer) as peer:
-                first = await boot(under_test)
-                for i in range(first, first + 200):
-                    under_test.send(sample(i), 0.3, LEVEL)
-                    await under_test.answered()
-                    assert under_test.clock_begun_s is not None
-                    clock_us = px4_link.clock_us(i * PERIOD_S - under_test.clock_begun_s)
-                    assert under_test.rotors[0] == pytest.approx((clock_us // 4000) % 100 / 100)
-                assert under_test.armed
-                stamps = [message.time_usec for message in peer.sensors]
-                assert {later - earlier for earlier, later in itertools.pairwise(stamps)} == {4000}
-                assert under_test.unanswered == 0
-
-    asyncio.run(scenario())
+def stamp_steps_us(peer: LockstepPeer) -> set[int]:
+    return {later.time_usec - earlier.time_usec for earlier, later in itertools.pairwise(peer.sensors)}
 
 
-def test_a_px4_that_rests_on_the_ground_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_each_sample_is_answered_before_the_next_one_and_the_answer_is_its_own() -> None:
+    def answer(message: Any) -> list[float]:
+        return [(message.time_usec // 4000) % 100 / 100.0] * 4
+
+    async with opened() as link:
+        with await peer_of(link, answer) as peer:
+            first = await boot(link)
+            for i in range(first, first + 200):
+                await step(link, (i,))
+                assert link.clock_begun_s is not None
+                clock_us = px4_link.clock_us(i * PERIOD_S - link.clock_begun_s)
+                assert link.rotors[0] == pytest.approx((clock_us // 4000) % 100 / 100)
+            assert link.armed
+            assert stamp_steps_us(peer) == {4000}
+            assert link.unanswered == 0
+
+
+async def test_a_px4_that_rests_on_the_ground_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Disarmed in OFFBOARD without setpoints PX4 sends no controls at all."""
     monkeypatch.setattr(px4_link, "ANSWER_PATIENCE_S", 0.5)
     monkeypatch.setattr(px4_link, "ANSWER_DEADLINE_S", 1.0)
-    rests = range(100, 200)
 
-    def answer(message: object) -> list[float] | None:
-        number = round((message.time_usec - px4_link.clock_us(0.0)) / 4000)  # type: ignore[attr-defined]
-        return None if number in rests else [0.5] * 4
+    def answer(message: Any) -> list[float] | None:
+        number = round((message.time_usec - px4_link.clock_us(0.0)) / 4000)
+        return None if number in range(100, 200) else [0.5] * 4
 
-    async def scenario() -> None:
-        async with link() as under_test:
-            with await asyncio.to_thread(LockstepPeer, under_test.port, answer, 0):
-                for i in range(await boot(under_test), 300):
-                    under_test.send(sample(i), 0.3, LEVEL)
-                    await under_test.answered()
-                assert under_test.unanswered == 1, "one sample's patience, then none until it answers again"
-                await until_answered(under_test, 300)
+    async with opened() as link:
+        with await peer_of(link, answer, mode=0):
+            await step(link, range(await boot(link), 300))
+            assert link.unanswered == 1, "one sample's patience, then none until it answers again"
+            async with asyncio.timeout(DEADLINE_S):
+                i, waited = 300, False
+                while not waited:
+                    i += 1
+                    link.send(sample(i), 0.3, LEVEL)
+                    waited = link.pending
+                    await link.answered()
+                    await asyncio.sleep(PERIOD_S)
 
-    asyncio.run(scenario())
 
-
-def test_a_px4_that_boots_is_not_waited_for_and_one_that_stops_answering_is_one_line(
+async def test_a_px4_that_boots_is_not_waited_for_and_one_that_stops_answering_is_one_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(px4_link, "ANSWER_PATIENCE_S", 0.5)
     monkeypatch.setattr(px4_link, "ANSWER_DEADLINE_S", 1.5)
-    answers = 3
-
-    def answer(message: object) -> list[float] | None:
-        nonlocal answers
-        answers -= 1
-        return [0.5] * 4 if answers >= 0 else None
-
-    async def scenario() -> None:
-        async with link() as under_test:
-            under_test.send(sample(0), 0.3, LEVEL)
-            await under_test.answered()  # nobody there: nothing to wait for
-            with await connected(under_test, answer):
-                i = await boot(under_test, 1)
-                with pytest.raises(Px4Error, match=r"lockstep.*none for") as raised:
-                    await until_it_fails(under_test, i)
-                assert "\n" not in str(raised.value)
-                assert under_test.unanswered == 3, "patience, three times, is the deadline"
-
-    asyncio.run(scenario())
+    answers = iter([[0.5] * 4] * 3)
+    async with opened() as link:
+        await step(link, (0,))  # there is no PX4: nothing to wait for
+        with await peer_of(link, lambda _: next(answers, None)):
+            i = await boot(link, 1)
+            with pytest.raises(Px4Error, match=r"^.*lockstep.*none for.*$"):
+                await step(link, itertools.count(i))
+            assert link.unanswered == 3, "patience, three times, is the deadline"
 
 
-def test_one_sample_without_an_answer_does_not_end_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_one_sample_without_an_answer_does_not_end_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(px4_link, "ANSWER_PATIENCE_S", 0.5)
-
-    async def scenario() -> None:
-        async with link() as under_test:
-            with await connected(under_test, lambda m: None if m.time_usec == px4_link.clock_us(1.0) else [0.5] * 4):
-                for i in range(await boot(under_test), 500):
-                    under_test.send(sample(i), 0.3, LEVEL)
-                    await under_test.answered()
-                assert under_test.unanswered == 1
-
-    asyncio.run(scenario())
+    async with opened() as link:
+        with await peer_of(link, lambda m: None if m.time_usec == px4_link.clock_us(1.0) else [0.5] * 4):
+            await step(link, range(await boot(link), 500))
+            assert link.unanswered == 1
 
 
-def test_as_many_controls_are_read_as_there_are_rotors() -> None:
+async def test_as_many_controls_are_read_as_there_are_rotors() -> None:
     controls = [0.1 * number for number in range(1, 9)]
-
-    async def scenario() -> None:
-        async with link(rotors=8) as under_test:
-            assert under_test.rotors == (0.0,) * 8
-            with await connected(under_test, lambda _: [*controls, 0.9, 1.0]):
-                await boot(under_test)
-                assert under_test.rotors == pytest.approx(controls)
-
-    asyncio.run(scenario())
+    async with opened(rotors=8) as link:
+        assert link.rotors == (0.0,) * 8
+        with await peer_of(link, lambda _: [*controls, 0.9, 1.0]):
+            await boot(link)
+            assert link.rotors == pytest.approx(controls)
 
 
-def test_a_px4_that_leaves_stops_the_rotors_and_may_come_back() -> None:
-    async def scenario() -> None:
-        async with link() as under_test:
-            with await connected(under_test, lambda message: [0.5] * 4):
-                i = await boot(under_test)
-                assert under_test.rotors == (0.5, 0.5, 0.5, 0.5)
-                under_test.send(sample(i), 0.3, LEVEL)
-            assert await under_test.await_disconnect(DEADLINE_S)
-            await under_test.answered()  # what was pending will never come
-            assert under_test.rotors == (0.0, 0.0, 0.0, 0.0)
-            assert not under_test.armed
-            with await connected(under_test, lambda message: [0.25] * 4):
-                await boot(under_test, i + 1)
-                assert under_test.rotors[0] == 0.25
-                assert under_test.connections == 2
-
-    asyncio.run(scenario())
+async def test_a_px4_that_leaves_stops_the_rotors_and_may_come_back() -> None:
+    async with opened() as link:
+        with await peer_of(link):
+            i = await boot(link)
+            assert link.rotors == (0.5, 0.5, 0.5, 0.5)
+            link.send(sample(i), 0.3, LEVEL)
+        assert await link.await_disconnect(DEADLINE_S)
+        await link.answered()  # what was pending will never come
+        assert link.rotors == (0.0, 0.0, 0.0, 0.0)
+        assert not link.armed
+        with await peer_of(link, lambda message: [0.25] * 4):
+            await boot(link, i + 1)
+            assert link.rotors[0] == 0.25
+            assert link.connections == 2
 
 
-def test_the_clock_of_a_px4_begins_anew_however_late_it_connects() -> None:
+async def test_the_clock_of_a_px4_begins_anew_however_late_it_connects() -> None:
     """A real one whose clock begins at some minutes has no estimate for a long time."""
     late = 75_000  # 300 s
-
-    async def scenario() -> None:
-        async with link() as under_test:
-            for begun in (late, 3 * late):
-                with await connected(under_test, lambda message: [0.5] * 4) as peer:
-                    i = await boot(under_test, begun)
-                    under_test.send(sample(i), 0.3, LEVEL)
-                    await under_test.answered()
-                    stamps = [message.time_usec for message in peer.sensors]
-                    assert stamps[0] == px4_link.clock_us(0.0)
-                    assert {later - earlier for earlier, later in itertools.pairwise(stamps)} == {4000}
-                    assert under_test.clock_begun_s is not None
-                    assert begun * PERIOD_S <= under_test.clock_begun_s <= i * PERIOD_S
-                assert await under_test.await_disconnect(DEADLINE_S)
-            assert under_test.unanswered == 0
-
-    asyncio.run(scenario())
+    async with opened() as link:
+        for begun in (late, 3 * late):
+            with await peer_of(link) as peer:
+                i = await boot(link, begun)
+                await step(link, (i,))
+                assert peer.sensors[0].time_usec == px4_link.clock_us(0.0)
+                assert stamp_steps_us(peer) == {4000}
+                assert link.clock_begun_s is not None
+                assert begun * PERIOD_S <= link.clock_begun_s <= i * PERIOD_S
+            assert await link.await_disconnect(DEADLINE_S)
+        assert link.unanswered == 0
 
 
-def test_a_second_px4_is_turned_away() -> None:
-    async def scenario() -> None:
-        async with link() as under_test:
-            with await connected(under_test, lambda message: [0.5] * 4):
-                i = await boot(under_test)
-                reader, writer = await asyncio.open_connection("127.0.0.1", under_test.port)
-                async with asyncio.timeout(DEADLINE_S):
-                    with contextlib.suppress(ConnectionError):
-                        assert await reader.read(1) == b"", "closed"
-                writer.close()
-                under_test.send(sample(i), 0.3, LEVEL)
-                await under_test.answered()
-                assert (under_test.connections, under_test.unanswered) == (1, 0)
-
-    asyncio.run(scenario())
+async def test_a_second_px4_is_rejected() -> None:
+    async with opened() as link:
+        with await peer_of(link):
+            i = await boot(link)
+            reader, writer = await asyncio.open_connection("127.0.0.1", link.port)
+            async with asyncio.timeout(DEADLINE_S):
+                with contextlib.suppress(ConnectionError):
+                    assert await reader.read(1) == b"", "closed"
+            writer.close()
+            await step(link, (i,))
+            assert (link.connections, link.unanswered) == (1, 0)
 
 
 def test_what_px4_senses() -> None:

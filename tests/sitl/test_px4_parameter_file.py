@@ -46,19 +46,16 @@ def test_whatever_is_in_it_does_no_harm(junk: bytes) -> None:
     decode(struct.pack("<i", len(junk) + 4) + junk)
 
 
-def test_it_waits_for_the_values_and_not_for_their_names(tmp_path: Path) -> None:
-    async def scenario() -> None:
-        file = tmp_path / NAME
-        waiting = asyncio.create_task(stored(tmp_path, {"EKF2_EV_CTRL": 11, "MPC_THR_HOVER": 0.43}))
-        for data in (b"", document({"EKF2_EV_CTRL": 0, "MPC_THR_HOVER": 0.43}), document({"EKF2_EV_CTRL": 11})):
-            file.write_bytes(data)
-            done, _ = await asyncio.wait((waiting,), timeout=0.15)
-            assert not done
-        whole = document({"MPC_THR_HOVER": struct.unpack("<f", struct.pack("<f", 0.43))[0], "EKF2_EV_CTRL": 11})
-        file.write_bytes(whole)
-        assert await asyncio.wait_for(waiting, DEADLINE_S) == whole
-
-    asyncio.run(scenario())
+async def test_it_waits_for_the_values_and_not_for_their_names(tmp_path: Path) -> None:
+    file = tmp_path / NAME
+    waiting = asyncio.create_task(stored(tmp_path, {"EKF2_EV_CTRL": 11, "MPC_THR_HOVER": 0.43}))
+    for data in (b"", document({"EKF2_EV_CTRL": 0, "MPC_THR_HOVER": 0.43}), document({"EKF2_EV_CTRL": 11})):
+        file.write_bytes(data)
+        done, _ = await asyncio.wait((waiting,), timeout=0.15)
+        assert not done
+    whole = document({"MPC_THR_HOVER": struct.unpack("<f", struct.pack("<f", 0.43))[0], "EKF2_EV_CTRL": 11})
+    file.write_bytes(whole)
+    assert await asyncio.wait_for(waiting, DEADLINE_S) == whole
 
 
 def test_values_that_never_come_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

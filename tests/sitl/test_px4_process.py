@@ -69,39 +69,36 @@ def test_two_worlds_never_share_an_instance() -> None:
 def test_an_instance_whose_mavlink_ports_are_in_use_is_passed_over() -> None:
     with Instance.claim() as free:
         number = free.number
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
-        somebody.bind(("127.0.0.1", 14580 + number))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 14580 + number))
         with Instance.claim() as claimed:
             assert claimed.number > number
 
 
-def test_it_runs_in_its_folder_and_ends_when_asked(tmp_path: Path) -> None:
-    async def scenario() -> None:
-        installation = find({"PX4_SITL": str(installed(tmp_path / "build"))})
-        assert installation is not None
-        with Instance.claim() as instance:
-            async with SimulatorLink(instance.simulator, HilSensors(1), 4) as link:
-                process = Px4Process(installation, instance, tmp_path / "scratch", {"SDLOG_MODE": 1})
-                try:
-                    async with asyncio.timeout(DEADLINE_S):
-                        t_s = 0.0
-                        while not link.in_step:
-                            t_s += 0.004
-                            link.send(ImuSample(t_s, (0.0, 0.0, 0.0), (0.0, 0.0, -9.81)), 0.3, (1.0, 0.0, 0.0, 0.0))
-                            await link.await_lockstep(0.004)
-                    left = f"/tmp/px4-sock-{instance.number}"  # PX4 leaves it there also at an orderly end
-                    with contextlib.suppress(FileExistsError):
-                        os.symlink("nowhere", left)
-                    process.terminate()
-                    assert await process.await_end(DEADLINE_S)
-                finally:
-                    process.kill()
-        with pytest.raises(FileNotFoundError):
-            os.lstat(left)
-        log = (tmp_path / "scratch" / "px4.log").read_text()
-        assert f"instance {instance.number}, start scripts {tmp_path / 'build' / 'etc'}" in log
-
-    asyncio.run(scenario())
+async def test_it_runs_in_its_folder_and_ends_when_asked(tmp_path: Path) -> None:
+    installation = find({"PX4_SITL": str(installed(tmp_path / "build"))})
+    assert installation is not None
+    with Instance.claim() as instance:
+        async with SimulatorLink(instance.simulator, HilSensors(1), 4) as link:
+            process = Px4Process(installation, instance, tmp_path / "scratch", {"SDLOG_MODE": 1})
+            try:
+                async with asyncio.timeout(DEADLINE_S):
+                    t_s = 0.0
+                    while not link.in_step:
+                        t_s += 0.004
+                        link.send(ImuSample(t_s, (0.0, 0.0, 0.0), (0.0, 0.0, -9.81)), 0.3, (1.0, 0.0, 0.0, 0.0))
+                        await link.await_lockstep(0.004)
+                left = f"/tmp/px4-sock-{instance.number}"  # PX4 leaves it there also at an orderly end
+                with contextlib.suppress(FileExistsError):
+                    os.symlink("nowhere", left)
+                process.terminate()
+                assert await process.await_end(DEADLINE_S)
+            finally:
+                process.kill()
+    with pytest.raises(FileNotFoundError):
+        os.lstat(left)
+    log = (tmp_path / "scratch" / "px4.log").read_text()
+    assert f"instance {instance.number}, start scripts {tmp_path / 'build' / 'etc'}" in log
 
 
 def test_one_that_dies_is_reported_with_its_last_complaint(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from sitl.autopilot.commander import FORCE_MAGIC, OFFBOARD_LOSS_EXTRA_S, Command, Commander, Result
-from sitl.autopilot.modes import Health, NavState, OffboardKind, nav_state_from_custom
+from sitl.autopilot.modes import Health, NavState, OffboardKind
 from sitl.autopilot.params import Params
 
 GOOD = Health(
@@ -108,11 +108,21 @@ def test_disarming_in_the_air_needs_force(health: Health, magic: float, result: 
     assert it.armed is armed
 
 
-@pytest.mark.parametrize("action", [2.0, -1.0, math.nan])
-def test_arm_commands_that_mean_nothing_are_unsupported(action: float) -> None:
+@pytest.mark.parametrize(
+    ("command", "params", "result"),
+    [
+        (Command.COMPONENT_ARM_DISARM, (2.0,), Result.UNSUPPORTED),
+        (Command.COMPONENT_ARM_DISARM, (math.nan,), Result.UNSUPPORTED),
+        (Command.DO_SET_MODE, (1.0, math.nan, math.nan), Result.DENIED),
+        (Command.DO_SET_MODE, (1.0, 4.0, 7.0), Result.TEMPORARILY_REJECTED),
+        (Command.DO_SET_MODE, (1.0, 9.0, 0.0), Result.TEMPORARILY_REJECTED),
+        (31000, (), Result.UNSUPPORTED),
+    ],
+)
+def test_a_command_without_a_meaning_changes_nothing(command: int, params: tuple[float, ...], result: Result) -> None:
     it = commander()
-    assert ask(it, Command.COMPONENT_ARM_DISARM, action) is Result.UNSUPPORTED
-    assert not it.armed
+    assert ask(it, command, *params) is result
+    assert not it.armed and it.user_intention is NavState.LOITER
 
 
 @pytest.mark.parametrize(
@@ -189,39 +199,12 @@ def test_offboard_loss_leads_to_com_obl_rc_act(action: int, health: Health, stat
     assert it.notices[-1].text.startswith("Failsafe activated")
 
 
-def test_offboard_loss_may_disarm_at_once() -> None:
-    it = flying(NavState.OFFBOARD, COM_OBL_RC_ACT=7)
-    it.update(1.0, replace(FLYING, setpoint_age_s=1.0))
-    assert not it.armed
-
-
 def test_offboard_returns_with_its_setpoints() -> None:
     it = flying(NavState.OFFBOARD, COM_OBL_RC_ACT=4)
     it.update(1.0, replace(FLYING, setpoint_age_s=1.0))
     it.update(1.1, FLYING)
     assert it.nav_state is NavState.OFFBOARD
     assert it.failsafe is False
-
-
-def test_attitude_offboard_has_no_failsafe_when_position_is_lost() -> None:
-    it = flying(NavState.OFFBOARD)
-    it.update(10.0, replace(FLYING, position_valid=False))
-    assert it.nav_state is NavState.OFFBOARD
-    assert it.failsafe is False
-
-
-def test_position_offboard_lands_blind_when_position_is_lost() -> None:
-    it = flying(NavState.OFFBOARD)
-    it.update(10.0, replace(FLYING, position_valid=False, setpoint_kind=OffboardKind.POSITION))
-    assert it.nav_state is NavState.DESCEND
-
-
-def test_land_without_position_becomes_a_blind_descent() -> None:
-    it = flying(NavState.OFFBOARD)
-    set_mode(it, NavState.LAND, FLYING)
-    it.update(1.0, FLYING)
-    it.update(1.1, replace(FLYING, position_valid=False))
-    assert it.nav_state is NavState.DESCEND
 
 
 def test_after_landing_px4_disarms_and_is_back_in_offboard() -> None:
@@ -247,26 +230,6 @@ def test_without_a_take_off_it_disarms_after_com_disarm_prflt() -> None:
     assert not it.armed
 
 
-@pytest.mark.parametrize("state", [s for s in NavState if s not in (NavState.DESCEND, NavState.TERMINATION)])
-def test_custom_modes_go_there_and_back(state: NavState) -> None:
-    assert nav_state_from_custom(state.custom_mode >> 16 & 0xFF, state.custom_mode >> 24) is state
-
-
-@pytest.mark.parametrize(("main", "sub"), [(4, 7), (9, 0), (0, 0)])
-def test_unknown_custom_modes_are_rejected(main: int, sub: int) -> None:
-    it = commander()
-    assert ask(it, Command.DO_SET_MODE, 1.0, float(main), float(sub)) is Result.TEMPORARILY_REJECTED
-    assert it.user_intention is NavState.LOITER
-
-
-def test_a_mode_command_made_of_nan_is_denied() -> None:
-    assert ask(commander(), Command.DO_SET_MODE, 1.0, math.nan, math.nan) is Result.DENIED
-
-
-def test_unknown_commands_are_unsupported() -> None:
-    assert ask(commander(), 31000) is Result.UNSUPPORTED
-
-
 def test_a_kill_disarms_after_com_kill_disarm_and_forbids_arming() -> None:
     it = flying(NavState.OFFBOARD, COM_KILL_DISARM=5)
     killed = replace(FLYING, killed=True)
@@ -280,3 +243,19 @@ def test_a_kill_disarms_after_com_kill_disarm_and_forbids_arming() -> None:
     it.update(11.2, killed)
     assert not it.armed
     assert it.arming_problem(replace(GOOD, killed=True)) == "Kill switch engaged"
+
+
+@pytest.mark.parametrize(
+    ("kind", "state"), [(OffboardKind.ATTITUDE, NavState.OFFBOARD), (OffboardKind.POSITION, NavState.DESCEND)]
+)
+def test_when_position_is_lost_offboard_with_attitudes_has_no_failsafe(kind: OffboardKind, state: NavState) -> None:
+    it = flying(NavState.OFFBOARD)
+    it.update(10.0, replace(FLYING, position_valid=False, setpoint_kind=kind))
+    assert it.nav_state is state
+    assert it.failsafe is (kind is not OffboardKind.ATTITUDE)
+
+
+def test_offboard_loss_may_disarm_at_once() -> None:
+    it = flying(NavState.OFFBOARD, COM_OBL_RC_ACT=7)
+    it.update(1.0, replace(FLYING, setpoint_age_s=1.0))
+    assert not it.armed

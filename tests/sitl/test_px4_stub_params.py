@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from sitl.autopilot.autopilot import gains_from_params
 from sitl.autopilot.params import (
     MAV_PARAM_TYPE_INT32,
-    MAV_PARAM_TYPE_REAL32,
     Params,
     decode_bytewise,
     encode_bytewise,
@@ -39,24 +38,6 @@ def test_every_parameter_reads_back_from_its_own_wire_value() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("EKF2_EV_CTRL", 11), ("EKF2_HGT_REF", 3), ("EKF2_GPS_CTRL", 0), ("SYS_HAS_GPS", 0), ("EKF2_EV_DELAY", 5.0),
-        ("EKF2_EV_NOISE_MD", 0), ("EKF2_MAG_TYPE", 5), ("SYS_HAS_MAG", 0), ("EKF2_BARO_CTRL", 0), ("COM_RC_IN_MODE", 4),
-        ("COM_OBL_RC_ACT", 4), ("COM_OF_LOSS_T", 0.5), ("MAV_SYS_ID", 1), ("MPC_THR_HOVER", 0.5), ("COM_DISARM_LAND", 2.0),
-    ],
-)  # fmt: skip
-def test_defaults_fit_a_vehicle_on_mocap(name: str, value: float) -> None:
-    assert Params()[name] == value
-
-
-def test_reals_are_single_precision_as_in_px4() -> None:
-    params = Params({"EKF2_EVP_NOISE": 0.01})
-    assert params["EKF2_EVP_NOISE"] == struct.unpack("<f", struct.pack("<f", 0.01))[0]
-    assert params.mav_type("EKF2_EVP_NOISE") == MAV_PARAM_TYPE_REAL32
-
-
-@pytest.mark.parametrize(
     ("name", "value", "error"),
     [
         ("NO_SUCH_PARAM", 1, KeyError),
@@ -69,13 +50,6 @@ def test_reals_are_single_precision_as_in_px4() -> None:
 def test_bad_values_are_refused(name: str, value: float, error: type[Exception]) -> None:
     with pytest.raises(error):
         Params({name: value})
-
-
-def test_a_type_that_disagrees_changes_nothing() -> None:
-    params = Params()
-    with pytest.raises(ValueError, match="MAV_PARAM_TYPE"):
-        params.set_from_wire("EKF2_EV_CTRL", 0.0, MAV_PARAM_TYPE_REAL32)
-    assert params["EKF2_EV_CTRL"] == 11
 
 
 def test_the_hash_and_the_revision_show_of_every_change() -> None:

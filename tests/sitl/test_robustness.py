@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import json
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -13,14 +11,10 @@ import pytest
 from companion.campaigns.process import CampaignError
 from companion.control.arm_model import manipulator_of
 from companion.mission.plan import Plan
-from companion.model.types import PhaseKind
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from companion.sitl_config.world import World
 from sitl.campaigns import flights, robustness
 from sitl.campaigns.flights import Flown
-from sitl.world.model import link_masses_kg
-from sitl.world.world import World as SimulatedWorld
-from tests.support import CATCH, HOVER, SHORT_CATCH, position_error_m
+from tests.support import CATCH, HOVER, SHORT_CATCH
 
 CONFIG = load_sitl(CATCH, preset="recommended")
 PLACES = robustness.throws(CONFIG.mission, CONFIG.vehicle)
@@ -34,18 +28,9 @@ def worlds(config: SitlConfig, numbers: Iterable[int], fixed: Sequence[str] = ()
     return [flight["world"] for flight in robustness.prepare(job, [config])]
 
 
-# -- what is drawn -----------------------------------------------------------------------------------------------------
-
-
 def test_a_draw_depends_on_its_number_and_seed_alone() -> None:
     assert worlds(CONFIG, (5, 6)) == DRAWS[5:7]
     assert robustness.draw(8, 5, PLACES) != DRAWS[5]
-
-
-def test_every_draw_is_a_world_that_a_command_line_can_repeat() -> None:
-    for knobs in DRAWS:
-        world = World.model_validate(knobs)
-        assert json.loads(world.model_dump_json(exclude_unset=True)) == json.loads(json.dumps(knobs))
 
 
 def spread(values: list[float], low: float, high: float) -> None:
@@ -88,13 +73,6 @@ def test_every_throw_starts_above_the_floor_and_misses_the_rotors() -> None:
         assert apex_m < at.position_world_m[2] + 0.08
 
 
-def test_catch_points_are_on_the_first_pass() -> None:
-    assert PLACES[0].at_m[0] == pytest.approx(-0.92, abs=0.01)
-    assert PLACES[-1].at_m[0] == pytest.approx(0.92, abs=0.01)
-    steps = [after.at_m[0] - before.at_m[0] for before, after in itertools.pairwise(PLACES)]
-    assert min(steps) > 0.0 and max(steps) < 0.02, "the whole line, forwards"
-
-
 def test_a_mission_that_stands_still_is_refused() -> None:
     hover = load_sitl(HOVER)
     with pytest.raises(CampaignError, match=r"mission 'hover' never flies in the \+x direction") as refused:
@@ -108,9 +86,6 @@ def test_what_is_fixed_is_not_drawn() -> None:
         flown = flights.with_world(config, world).world
         assert (flown.payload_kg, flown.rotor_lag_s) == (0.3, 0.05)
         assert flown.seed in {knobs["seed"] for knobs in DRAWS[:3]}
-
-
-# -- what comes of it --------------------------------------------------------------------------------------------------
 
 
 SHORT = load_sitl(SHORT_CATCH, preset="recommended")
@@ -127,8 +102,8 @@ def test_a_row_is_what_the_flight_was(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = {"name": "draw 0", "number": 0, "world": {"payload_kg": 0.25, "setpoint_delay_s": 0.03, "seed": 6}}
     row = robustness.fly(SHORT, flight)["row"]
     (whole,) = seen
-    flown, world = whole.result, whole.fast.plant.world if whole.fast is not None else None
-    assert world is not None
+    assert whole.fast is not None
+    flown, world = whole.result, whole.fast.plant.world
     assert (row["name"], row["number"]) == ("draw 0", 0)
     unchanged = {"throw_velocity_m_s": [-2.0, 0.15, -1.5], "catch_at_m": [0.0, 0.0]}
     assert row["world"] == {"payload_kg": 0.25, "setpoint_delay_s": 0.03, "seed": 6, **unchanged}
@@ -140,22 +115,16 @@ def test_a_row_is_what_the_flight_was(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (row["thrown"], row["caught"]) == (True, True) == (world.payload.thrown_t_s is not None, flown.caught)
     begun_s = next(o.t_s - o.mission_t_s for o in flown.outputs if o.mission_t_s > 0)
     assert row["caught_s"] + begun_s == pytest.approx(world.payload.caught_t_s)
-    errors = [
-        position_error_m(i, o)
-        for i, o in zip(flown.inputs, flown.outputs, strict=True)
-        if i.mocap and o.reference and o.phase_kind is PhaseKind.FLIGHT
-    ]
-    assert row["peak_e_p_m"] == pytest.approx(max(errors), rel=1e-9)
+    assert row["felt"] and row["catch_t_s"] is not None
+    assert 0.0 < row["peak_e_p_m"] < 0.1
     assert row["home_m"] == pytest.approx(0.6, abs=0.2)
     assert 0.0 < row["tilt_max_deg"] < 40.0
 
 
-@pytest.mark.parametrize(("lost_s", "felt"), [(2.0, False), (5.0, True)])
-def test_a_catch_is_felt_if_the_force_sensor_still_works(lost_s: float, felt: bool) -> None:
-    world = {"payload_kg": 0.2, "faults": [{"kind": "force_loss", "t_s": lost_s}]}
+def test_without_the_force_sensor_a_catch_is_not_felt() -> None:
+    world = {"payload_kg": 0.2, "faults": [{"kind": "force_loss", "t_s": 2.0}]}
     found = robustness.fly(SHORT, {"name": "a", "number": None, "world": world})["row"]
-    assert found["caught"] and found["felt"] is felt
-    assert (found["catch_t_s"] is not None) is felt
+    assert found["caught"] and not found["felt"] and found["catch_t_s"] is None
 
 
 def test_what_ended_a_mission_early_is_reported() -> None:
@@ -165,13 +134,3 @@ def test_what_ended_a_mission_early_is_reported() -> None:
     assert found["why"].startswith("battery_voltage: ")
     assert "touchdown" in found["events"]
     assert found["pre_e_p_m"] is None and found["peak_e_p_m"] is None, "what was not flown to its end is not graded"
-
-
-def test_links_weigh_what_the_world_says() -> None:
-    world = World(link_mass_error=(0.2, -0.1))
-    first, second = CONFIG.vehicle.arm.link_masses_kg
-    assert link_masses_kg(CONFIG.vehicle, world) == pytest.approx((1.2 * first, 0.9 * second))
-    start = ((0.0, 0.0), 0.0, (2.8, 2.4))
-    true, believed = SimulatedWorld(CONFIG.vehicle, world, *start), SimulatedWorld(CONFIG.vehicle, World(), *start)
-    heavier_kg = (true.hover_command - believed.hover_command) * CONFIG.vehicle.airframe.thrust_max_n / 9.81
-    assert heavier_kg == pytest.approx(0.2 * first - 0.1 * second)

@@ -56,15 +56,6 @@ def test_a_goal_takes_effect_after_its_delay(delay_s: float, steps: int) -> None
     assert currents == [0.0] * steps + [100 * AMP_PER_COUNT] * (8 - steps)
 
 
-def test_goals_on_their_way_keep_their_order_and_their_distance() -> None:
-    drive = in_current_mode(0.010)
-    seen = []
-    for k in range(40):
-        seen.append(round(drive.update(k * STEP_S, 0.0, 0.0) / AMP_PER_COUNT))
-        drive.set_goal_current(k)
-    assert seen[6:] == list(range(34))
-
-
 def test_torque_off_and_a_changed_mode_do_not_wait_for_the_delay() -> None:
     servo = ServoModel(1)
     servo.goal_delay_s = 0.01

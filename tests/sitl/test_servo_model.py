@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 
+from companion.config.loader import load_vehicle
+from companion.sitl_config.world import World
 from sitl.servo.bus import ServoLine
+from sitl.servo.from_config import servos_of
 from sitl.servo.model import AMP_PER_COUNT as AMP
 from sitl.servo.model import RAD_PER_COUNT, RAD_S_PER_COUNT, ServoModel, ServoRefusal
 from sitl.servo.protocol import ALERT, StatusError, packet, status
 
-_PING = packet(1, b"\x01")
+VEHICLE = load_vehicle("tarot650_2r")
 
 
 def word(value: int, size: int = 2) -> bytes:
@@ -47,10 +51,6 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
     assert get(servo, 11, 1) == 5
 
 
-def test_only_the_modes_that_are_modelled_can_be_set() -> None:
-    assert refusal(ServoModel(1), 11, b"\x04") is StatusError.DATA_RANGE
-
-
 def test_goal_current_beyond_the_current_limit_is_refused() -> None:
     servo = ServoModel(1)
     servo.write(11, b"\x00")
@@ -65,14 +65,6 @@ def test_a_write_of_several_registers_is_all_or_nothing() -> None:
     servo = ServoModel(1)
     assert refusal(servo, 64, b"\x01\x07") is StatusError.DATA_RANGE
     assert get(servo, 64, 1) == 0
-
-
-def test_present_values_are_in_register_units() -> None:
-    servo = in_current_mode()
-    servo.write(102, word(-300))
-    assert servo.update(0.001, -2.0, -1.0) == pytest.approx(-300 * AMP)
-    assert get(servo, 126, 2, signed=True) == -300
-    assert get(servo, 128, 4, signed=True) == round(-1.0 / RAD_S_PER_COUNT)
 
 
 def test_position_starts_within_one_turn_and_then_counts_turns() -> None:
@@ -98,41 +90,28 @@ def test_reverse_mode_turns_every_sign() -> None:
     assert get(servo, 128, 4, signed=True) == round(1.0 / RAD_S_PER_COUNT)
 
 
-def test_indirect_data_is_a_window_on_other_registers() -> None:
-    servo = in_current_mode()
-    addresses = [132, 133, 134, 135, 70, 102, 103]
-    servo.write(168, b"".join(word(a) for a in addresses))
-    servo.update(0.0, 1.0, 0.0)
-    assert servo.read(224, 4) == servo.read(132, 4)
-    servo.write(229, word(77))
-    assert get(servo, 102, 2) == 77
-    assert refusal(servo, 224, word(0, 4)) is StatusError.ACCESS
-    assert refusal(servo, 229, b"\x01") is StatusError.DATA_LENGTH
-    servo.write(231, b"\xaa\xbb")
-    assert servo.read(231, 2) == b"\xaa\xbb"
-    assert refusal(servo, 168, word(63)) is StatusError.DATA_RANGE
-
-
-def test_second_indirect_block_works_too() -> None:
-    servo = ServoModel(1)
-    servo.write(578, word(65))
-    servo.write(634, b"\x01")
-    assert get(servo, 65, 1) == 1
+@pytest.mark.parametrize(
+    ("setting", "address", "size", "value"),
+    [
+        ({"firmware": 40}, 6, 1, 40),
+        ({"id": 9}, 7, 1, 9),
+        ({"return_delay_us": 100}, 9, 1, 50),
+        ({"drive_mode": 1}, 10, 1, 1),
+        ({"operating_mode": 5}, 11, 1, 5),
+        ({"shadow_id": 7}, 12, 1, 7),
+        ({"current_limit_counts": 600}, 38, 2, 600),
+        ({"position_limit_counts": (10, 4000)}, 48, 4, 4000),
+        ({"position_limit_counts": (10, 4000)}, 52, 4, 10),
+    ],
+)
+def test_a_setting_of_the_world_is_in_its_register(
+    setting: dict[str, Any], address: int, size: int, value: int
+) -> None:
+    world = World.model_validate({"servos": [{}, setting]})
+    assert get(servos_of(VEHICLE, world)[1], address, size) == value
 
 
 # --- motor ----------------------------------------------------------------------------------------------------------------
-
-
-def test_motor_gives_current_only_with_torque_on() -> None:
-    servo = in_current_mode()
-    servo.write(102, word(200))
-    assert servo.update(0.001, 0.0, 0.0) == pytest.approx(200 * AMP)
-    servo.write(64, b"\x00")
-    assert servo.update(0.002, 0.0, 0.0) == 0.0
-
-
-def test_goal_current_starts_at_zero_in_current_mode() -> None:
-    assert in_current_mode().update(0.001, 0.0, 0.0) == 0.0
 
 
 @pytest.mark.parametrize("mode", [3, 5])
@@ -156,7 +135,7 @@ def test_watchdog_trips_and_stays_until_cleared() -> None:
     servo.write(98, b"\x05")
     servo.write(102, word(200))
     servo.update(1.0, 0.0, 0.0)
-    line.feed(packet(7, b"\x01"))  # a packet for somebody else counts
+    line.feed(packet(7, b"\x01"))  # a packet for another servo counts
     assert servo.update(1.099, 0.0, 0.0) != 0.0
     assert servo.update(1.101, 0.0, 0.0) == 0.0
     assert get(servo, 98, 1) == 0xFF
@@ -166,26 +145,6 @@ def test_watchdog_trips_and_stays_until_cleared() -> None:
     servo.write(98, b"\x00")
     servo.write(102, word(10))
     assert servo.update(1.2, 0.0, 0.0) == pytest.approx(10 * AMP)
-
-
-def test_watchdog_sleeps_while_torque_is_off() -> None:
-    servo = ServoModel(1)
-    servo.write(98, b"\x01")
-    servo.update(0.0, 0.0, 0.0)
-    servo.update(5.0, 0.0, 0.0)
-    assert get(servo, 98, 1) == 1
-
-
-def test_silent_servo_is_let_go_by_its_watchdog() -> None:
-    servo = in_current_mode()
-    servo.write(98, b"\x05")
-    servo.write(102, word(200))
-    line = ServoLine([servo])
-    servo.update(0.0, 0.0, 0.0)
-    servo.fail_silent(True)
-    assert line.feed(_PING) == b""
-    assert servo.update(0.09, 0.0, 0.0) != 0.0
-    assert servo.update(0.11, 0.0, 0.0) == 0.0
 
 
 def test_overload_lets_go_until_reboot() -> None:
@@ -214,7 +173,9 @@ def test_overheating_comes_back_after_reboot_while_it_is_hot() -> None:
     assert get(servo, 70, 1) == 0
 
 
-def test_voltage_error_is_reported_but_does_not_shut_down_by_default() -> None:
-    servo = in_current_mode()
-    servo.set_voltage_v(9.0)
-    assert (get(servo, 70, 1), get(servo, 64, 1), get(servo, 144, 2)) == (1, 1, 90)
+def test_watchdog_sleeps_while_torque_is_off() -> None:
+    servo = ServoModel(1)
+    servo.write(98, b"\x01")
+    servo.update(0.0, 0.0, 0.0)
+    servo.update(5.0, 0.0, 0.0)
+    assert get(servo, 98, 1) == 1

@@ -1,4 +1,8 @@
-"""Every setting of `world.*` has an effect: it changes a flight in the fast closed loop, and what the devices send over the wires."""
+"""Every setting of `world.*` has an effect: it changes a flight in the fast closed loop.
+
+`tests/flights/test_lockstep.py` shows that a flight over the wires is that of the fast loop; what acts on wires alone is tested in
+`test_fault_wires.py` and `test_servo_model.py`.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,6 @@ import pytest
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from companion.sitl_config.world import World
 from sitl.fast.loop import FastFlight, FastResult
-from tests.sitl.simulated_devices import END_STEPS, Emitted, emitted
 from tests.sitl.world_settings import Pair, Settings, fault_pairs, pairs
 from tests.support import HOVER, SHORT_CATCH
 
@@ -46,8 +49,6 @@ A pair flies until its first difference. Shorter flights are tried first, unless
 SHARED = {world for world, pairs_of_it in Counter(json.dumps(pair.usual) for pair in PAIRS).items() if pairs_of_it > 3}
 EARLY = {"air", "battery", "compliance", "imu", "machine", "mocap", "push", "rotors"}
 """Parts of shared worlds that act before the catch."""
-UNTIL_STEPS = (130, 400, END_STEPS)
-"""The same on the wires, in steps of the physics."""
 
 
 class Unlike(Exception):
@@ -93,11 +94,6 @@ def usual_flight(world_json: str, limit_s: float) -> FastResult:
     return FastFlight(in_world(World.model_validate_json(world_json))).run(limit_s)
 
 
-@cache
-def usual_emitted(world_json: str, end: int) -> Emitted:
-    return emitted(in_world(World.model_validate_json(world_json)), end)
-
-
 def flights_differ(pair: Pair, limit_s: float) -> bool:
     """Return whether core, world or guardian differ in the fast loop up to this time."""
     usual = usual_flight(world(pair.usual).world.model_dump_json(), limit_s)
@@ -114,17 +110,11 @@ def flights_differ(pair: Pair, limit_s: float) -> bool:
     return len(result.inputs) < len(usual.inputs)
 
 
-def devices_differ(pair: Pair, end: int) -> bool:
-    """Return whether the devices' output differs up to this physics step."""
-    usual = usual_emitted(world(pair.usual).world.model_dump_json(), end)
-    return emitted(world(pair.changed), end, usual) != usual
-
-
-def tried(pair: Pair, limits: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return the limits to try in turn until the pair differs."""
+def tried(pair: Pair) -> tuple[float, ...]:
+    """Return the flight times to try in turn until the pair differs."""
     if json.dumps(pair.usual) not in SHARED:
-        return limits[pair.acts :]
-    return limits[1:] if pair.usual.keys() & EARLY else limits[-1:]
+        return UNTIL_S[pair.acts :]
+    return UNTIL_S[1:] if pair.usual.keys() & EARLY else UNTIL_S[-1:]
 
 
 def field(pair: Pair) -> str:
@@ -137,53 +127,8 @@ def test_it_changes_a_flight_in_the_fast_loop(pair: Pair) -> None:
     if field(pair) in ON_WIRES_ONLY:
         assert not flights_differ(pair, EARLY_S), "it does act in the fast loop: take it off the list"
     else:
-        differ = any(flights_differ(pair, limit_s) for limit_s in tried(pair, UNTIL_S))
+        differ = any(flights_differ(pair, limit_s) for limit_s in tried(pair))
         assert differ, f"world.{pair.setting} does nothing in the fast loop"
-
-
-OF_DEVICES = (
-    *(
-        "payload_kg",
-        "seed",
-        "hover_thrust_error",
-        "rotor_lag_s",
-        "setpoint_delay_s",
-        "arm_delay_s",
-        "arm_hand",
-        "hand_t_s",
-    ),
-    *(
-        "push.t_s",
-        "mocap_",
-        "natnet_version",
-        "gyro_noise",
-        "force_noise",
-        "servos.",
-        "battery_",
-        "px4_params",
-        "faults.t_s",
-    ),
-    *("imu.on", "rotors.on", "battery.on", "servo_mechanics.on", "faults.kind", "faults.size link_delay"),
-    *("faults.size bus_noise", "faults.size clock_step", "faults.size autopilot_reboot"),
-)
-"""How settings begin that are tried on the wires: those of the devices, and some that show that `Plant` and `Faults` get theirs."""
-SENT = [
-    pair
-    for pair in PAIRS
-    if pair.setting.startswith(OF_DEVICES)
-    and pair.setting != "faults.kind bus_delay"  # it delays answers, which are not timed here: test_fault_wires.py
-    and pair.acts < 2
-    and "surfaces" not in pair.usual
-]
-"""Both loops give the world's settings as a whole to one `Plant` and one `Faults`: what these do is seen in the fast loop."""
-
-
-@pytest.mark.parametrize("pair", SENT, ids=lambda pair: pair.setting)
-def test_it_changes_what_the_devices_send(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    # The server notes what it struck; no process of ours is struck.
-    monkeypatch.setattr("sitl.server.inject_process_fault", lambda kind, pid: True)
-    differ = any(devices_differ(pair, end) for end in tried(pair, UNTIL_STEPS))
-    assert differ, f"world.{pair.setting} does nothing on the wires"
 
 
 def test_the_list_of_exceptions_names_settings_that_there_are() -> None:
@@ -191,9 +136,11 @@ def test_the_list_of_exceptions_names_settings_that_there_are() -> None:
     assert len({field(pair) for pair in PAIRS} - set(ON_WIRES_ONLY)) > 40
 
 
-def test_the_devices_send_the_same_when_nothing_is_changed() -> None:
-    usual = usual_emitted(world({}).world.model_dump_json(), END_STEPS)
-    assert emitted(world({}), END_STEPS, usual) == usual
-    caught = usual.steps[-1][-1][-1]
-    assert "thrown" in caught[-2]
-    assert "caught" in caught[-1]
+def test_parts_that_are_off_change_nothing_whatever_their_other_settings_are() -> None:
+    off: dict[str, Settings] = {}
+    for pair in PAIRS:
+        for part, settings in pair.changed.items():
+            if isinstance(settings, dict) and "on" in settings:
+                off.setdefault(part, {}).update({**settings, "on": False})
+    assert {"air", "battery", "downwash", "force_sensor", "imu", "machine", "mocap", "net", "rotors"} <= off.keys()
+    assert not flights_differ(Pair("off", {}, off), UNTIL_S[-1])

@@ -121,19 +121,20 @@ def pairs() -> Iterator[Pair]:
 
 
 def fault_pairs() -> Iterator[Pair]:
-    """Return a pair for each kind of fault that may begin, and one for each kind that has a size."""
+    """Return two sizes for each kind of fault that has a size, and the other kinds with and without the fault."""
     for kind, about in KINDS.items():
         after = "catch" if kind.startswith("payload_") else "arming" if kind in IN_THE_AIR else "start"
         acts = ("start", "arming", "catch").index(after)
         fault = {"kind": kind, "t_s": 0.1, "after": after}
         world = {"surfaces": [EXAMPLES[Surface]]} if about.phases == CONTACT_PHASES else {}
-        if kind not in ("payload_missed", "payload_heavy"):  # those act from the start, whatever t_s says
-            with_it = BESIDE.get(kind, _NEVER)
-            usual, changed = {**world, "faults": [with_it]}, {**world, "faults": [with_it, fault]}
-            yield Pair(f"faults.kind {kind}", usual, changed, acts)
         if about.default is not None and kind != "pilot_takeover":
             other = {**fault, "size": SIZES.get(kind, 0.5 * about.default)}
             yield Pair(f"faults.size {kind}", {**world, "faults": [fault]}, {**world, "faults": [other]}, acts)
+        else:
+            with_it = BESIDE.get(kind, _NEVER)
+            yield Pair(
+                f"faults.kind {kind}", {**world, "faults": [with_it]}, {**world, "faults": [with_it, fault]}, acts
+            )
 
 
 def _acts(setting: str) -> int:

@@ -27,10 +27,6 @@ def pack(start: float = 1.0, life_s: float = 900.0, **changes: Any) -> BatteryPa
     return made
 
 
-def test_battery_that_is_off_is_none() -> None:
-    assert BatteryPack.of(BatteryConfig(), 1.0, 900.0, WEIGHT_N, VEHICLE.airframe) is None
-
-
 def test_open_circuit_voltage_falls_from_full_to_empty() -> None:
     volts = [open_circuit_v(0.01 * percent, 4) for percent in range(101)]
     assert volts == sorted(volts)

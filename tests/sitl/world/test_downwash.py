@@ -14,7 +14,7 @@ from companion.model.rotors import standard_layout
 from companion.sitl_config.effects.downwash import Downwash as DownwashConfig
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
-from sitl.world.effects.downwash import Downwash, Wakes
+from sitl.world.effects.downwash import Wakes
 from sitl.world.world import World
 from tests.support import CATCH
 
@@ -48,7 +48,7 @@ def test_the_velocity_is_the_induced_one_in_the_disk_and_twice_as_much_far_below
     assert wakes.pressure_pa(FOUR_N, below_rotor(-0.01)) == 0.0
 
 
-@pytest.mark.parametrize("spread", [0.1, 0.2, 0.4])
+@pytest.mark.parametrize("spread", [0.1, 0.4])
 @pytest.mark.parametrize("depth_m", [0.3, 1.5])
 def test_smearing_keeps_the_momentum(spread: float, depth_m: float) -> None:
     """The flow of momentum through a plane, the integral of twice the dynamic pressure, is the thrust times the development."""
@@ -74,14 +74,6 @@ def test_the_four_wakes_are_one_jet_where_the_spread_is_the_rotors_distance_from
     wakes = Wakes(LAYOUT, RADIUS_M, spread)
     assert wakes.pressure_pa(FOUR_N, (0.0, 0.0, -depth_m)) > wakes.pressure_pa(FOUR_N, below_rotor(depth_m))
     assert wakes.pressure_pa(FOUR_N, (0.0, 0.0, -0.4 * depth_m)) < wakes.pressure_pa(FOUR_N, below_rotor(0.4 * depth_m))
-
-
-def test_each_thrust_drives_the_wake_below_its_own_rotor() -> None:
-    wakes = Wakes(LAYOUT, RADIUS_M, SHARP)
-    for number, (x, y, _) in enumerate(LAYOUT.positions_body_m):
-        thrust_n = (float(number == 0), float(number == 1), float(number == 2), float(number == 3))
-        for other, (x2, y2, _) in enumerate(LAYOUT.positions_body_m):
-            assert bool(wakes.pressure_pa(thrust_n, (x2, y2, -0.1))) == (number == other), (x, y)
 
 
 def under_rotor(arm_rad: tuple[float, float], **settings: Any) -> World:
@@ -179,9 +171,8 @@ def test_turbulence_pushes_sideways_with_its_intensity() -> None:
     np.testing.assert_allclose(sigma / abs(mean[2]), [intensity, intensity, 2.0 * intensity], rtol=0.1)
 
 
-def test_nothing_blows_while_no_rotor_turns_and_off_there_is_no_effect() -> None:
+def test_there_is_no_wake_while_no_rotor_turns() -> None:
     world = hovering(VEHICLE, (math.radians(90.0), 0.0), turbulence_intensity=0.25)
     world.data.ctrl[0:4] = 0.0
     act(world)
     assert not world.data.xfrc_applied.any()
-    assert Downwash.of(DownwashConfig(), RADIUS_M, VEHICLE, world, 1) is None

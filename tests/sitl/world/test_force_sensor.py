@@ -12,12 +12,11 @@ from companion.io.force_torque import rft
 from companion.model.types import Vec3
 from companion.sitl_config.effects.force_sensor import ForceSensor as Config
 from companion.sitl_config.loader import load_sitl
-from sitl.autopilot.backend import stub_of
 from sitl.fast.loop import FastFlight
 from sitl.force_torque import ForceTorqueServer, overloaded, quantised
-from sitl.servo.drive import ServoDrive
 from sitl.world.effects.force_sensor import ForceSensor
 from sitl.world.plant import Plant
+from tests.sitl.plants import plant_of
 from tests.support import SHORT_CATCH
 
 FORCE_N, TORQUE_NM = (8.0, -3.0, 5.0), (0.3, 0.2, -0.4)
@@ -42,9 +41,8 @@ def first_reading(seed: int = 1, **changes: Any) -> list[float]:
     return [*force_n, *torque_nm]
 
 
-def test_a_perfect_sensor_reads_the_truth_and_the_effect_is_off_by_default() -> None:
+def test_a_perfect_sensor_reads_the_truth() -> None:
     assert first_reading() == pytest.approx([*FORCE_N, *TORQUE_NM], abs=1e-12)
-    assert ForceSensor.of(Config(), 1) is None
 
 
 def test_a_turned_sensor_reads_the_wrench_in_its_own_axes() -> None:
@@ -111,26 +109,9 @@ def test_the_fast_loop_reads_the_counts_of_the_wire(wrench: tuple[Vec3, Vec3]) -
     assert overloaded(*wrench) is bool(arrived.overload_bits)
 
 
-def test_every_reading_in_the_fast_loop_is_a_whole_number_of_counts() -> None:
-    result = FastFlight(load_sitl(SHORT_CATCH)).run(limit_s=0.7)
-    forces = [i.force for i in result.inputs if i.force is not None]
-    assert len(forces) > 30
-    for force in forces:
-        for values, per_unit in ((force.force_sensor_n, 50.0), (force.torque_sensor_nm, 2000.0)):
-            counts = [value * per_unit for value in values]
-            assert counts == pytest.approx([round(count) for count in counts], abs=1e-9)
-
-
 def quiet(*overrides: str) -> Plant:
     config = load_sitl(SHORT_CATCH, overrides=("world.force_noise_n=0", "world.force_bias_n=[0,0,0]", *overrides))
-    drives = (ServoDrive(), ServoDrive())
-    return Plant(
-        config.vehicle,
-        config.world,
-        stub_of(config.world, config.vehicle.airframe),
-        drives,
-        ((0.0, 0.0), 0.0, (1.5, 1.5)),
-    )
+    return plant_of(config)
 
 
 def test_the_scale_multiplies_what_both_loops_read() -> None:
@@ -144,11 +125,3 @@ def test_the_scale_multiplies_what_both_loops_read() -> None:
     sample = FastFlight(config).run(limit_s=0.55).inputs[-1].force
     assert sample is not None
     assert sample.force_sensor_n[2] == pytest.approx(42.0, abs=1.0)
-
-
-def test_the_plant_rounds_to_the_resolution_after_everything_else() -> None:
-    coarse = quiet(
-        "world.force_sensor.on=true", "world.force_sensor.resolution_n=0.5", "world.force_sensor.cross_talk=0"
-    )
-    coarse_n = coarse.force_torque()[0]
-    assert [value / 0.5 for value in coarse_n] == [round(value / 0.5) for value in coarse_n]

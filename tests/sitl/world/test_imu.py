@@ -12,12 +12,9 @@ from companion.model.rotors import standard_layout
 from companion.model.types import Vec3, Vec4
 from companion.sitl_config.effects.imu import Imu
 from companion.sitl_config.loader import load_sitl
-from sitl.autopilot.types import ImuSample
-from sitl.server import start_of
-from sitl.servo.drive import ServoDrive
 from sitl.world.effects.imu import ImuErrors
 from sitl.world.noise import noise
-from sitl.world.plant import Plant
+from tests.sitl.plants import plant_of
 from tests.support import CATCH
 
 G = 9.81
@@ -44,24 +41,13 @@ def errors(interval_s: float = 0.004, **settings: Any) -> ImuErrors:
     return found
 
 
-def test_off_is_nothing() -> None:
-    assert ImuErrors.of(Imu(), 0.004, 1.0, LAYOUT) is None
-
-
 def test_biases_appear_in_px4s_axes() -> None:
-    class Idle:
-        def step(self, imu: ImuSample) -> Vec4:
-            return STOPPED
-
     config = load_sitl(CATCH, overrides=["world.gyro_noise_rad_s=0", "world.accel_noise_m_s2=0"])
     settings = {**NOTHING, "accel_bias_m_s2": (0.1, 0.2, 0.3), "gyro_bias_deg_s": (1.0, 2.0, 3.0)}
     world = config.world.model_copy(update={"imu": Imu(on=True, **settings)})
-    start = config.mission.start
-    pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
-    where = (pose.position_m, pose.yaw_rad, pose.arm_rad)
     samples = []
     for this in (config.world, world):
-        plant = Plant(config.vehicle, this, Idle(), [ServoDrive() for _ in config.vehicle.arm.joints], where)
+        plant = plant_of(config.model_copy(update={"world": this}))
         for _ in range(200):
             plant.step(False)
         samples.append(plant.sample_imu())
@@ -112,11 +98,6 @@ def test_four_rotors_have_the_rms_of_one_sine_behind_the_filter_of_the_mean() ->
         passed = math.sin(math.pi * of * interval_s) / (math.pi * of * interval_s)
         rms = statistics.pstdev(sample[axis] for sample in samples)
         assert rms == pytest.approx(amplitude / math.sqrt(2.0) * passed, rel=0.05)
-
-
-def test_standing_rotors_neither_shake_nor_shift() -> None:
-    imu = errors(vibration_m_s2=6.0, gyro_vibration_deg_s=5.0, rectification_m_s2=(0.1, 0.1, 0.1))
-    assert imu.measure(STOPPED, *STILL) == STILL
 
 
 def test_vibration_shifts_the_mean_with_its_square() -> None:

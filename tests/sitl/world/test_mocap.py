@@ -10,14 +10,11 @@ from typing import Any
 import pytest
 
 from companion.model.frames import euler_zyx_from_quat, quat_from_euler_zyx
-from companion.model.types import IDENTITY_QUAT, Vec4
+from companion.model.types import IDENTITY_QUAT
 from companion.sitl_config.effects.mocap import Mocap
 from companion.sitl_config.loader import load_sitl
-from sitl.autopilot.types import ImuSample
-from sitl.server import start_of
-from sitl.servo.drive import ServoDrive
 from sitl.world.effects.mocap import MocapErrors
-from sitl.world.plant import Plant
+from tests.sitl.plants import plant_of
 from tests.support import CATCH
 
 NOTHING: dict[str, Any] = {
@@ -38,10 +35,6 @@ def errors(**settings: Any) -> MocapErrors:
     return found
 
 
-def test_off_is_nothing() -> None:
-    assert MocapErrors.of(Mocap(), 1) is None
-
-
 def test_the_pivot_turns_with_the_body() -> None:
     cameras = errors(pivot_offset_m=(0.01, 0.02, 0.03))
     left = quat_from_euler_zyx(0.0, 0.0, math.pi / 2.0)
@@ -52,17 +45,10 @@ def test_the_pivot_turns_with_the_body() -> None:
 
 
 def test_the_plant_streams_pivot_yaw_and_tilt() -> None:
-    class Idle:
-        def step(self, imu: ImuSample) -> Vec4:
-            return (0.0, 0.0, 0.0, 0.0)
-
     config = load_sitl(CATCH, overrides=["world.mocap_noise_m=0", "world.mocap_noise_deg=0"])
     settings = {**NOTHING, "pivot_offset_m": (0.01, 0.0, 0.0), "body_yaw_deg": 2.0, "body_tilt_deg": (0.5, -0.5)}
     world = config.world.model_copy(update={"mocap": Mocap(on=True, **settings)})
-    start = config.mission.start
-    pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
-    where = (pose.position_m, pose.yaw_rad, pose.arm_rad)
-    plant = Plant(config.vehicle, world, Idle(), [ServoDrive() for _ in config.vehicle.arm.joints], where)
+    plant = plant_of(config.model_copy(update={"world": world}))
     frames = []
     for _ in range(20):
         plant.step(False)
@@ -83,11 +69,6 @@ def test_bursts_have_their_share_and_their_length() -> None:
     assert lost / len(tracked) == pytest.approx(0.1, rel=0.1)
     # A burst shorter than a period may fall between two frames: those seen have exp(-period/mean) of a frame more at the end.
     assert lost * period_s / bursts == pytest.approx(period_s / -math.expm1(-period_s / 0.02), rel=0.1)
-
-
-def test_without_losses_every_frame_is_tracked() -> None:
-    cameras = errors()
-    assert all(cameras.pose(float(k), ORIGIN, IDENTITY_QUAT)[2] for k in range(1000))
 
 
 def test_hidden_markers_move_the_pose_for_a_while() -> None:

@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.config.loader import load_vehicle
-from companion.config.vehicle import Vehicle
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Outcome, Vec2, Vec3
 from companion.sitl_config.effects.net import Net
@@ -23,6 +22,7 @@ from sitl.world.effects.net import SETTLED_S, Bag
 from sitl.world.model import PAYLOAD_RADIUS_M, SECOND, SECOND_CATCH
 from sitl.world.payload import Ball
 from sitl.world.world import PHYSICS_DT_S, World
+from tests.sitl.plants import run
 from tests.sitl.test_throws import FIRST_MISSED, TO_AND_FRO
 from tests.support import SHORT_CATCH, tool_of
 
@@ -31,9 +31,12 @@ HOOP_M = 0.09
 CATCH_POSE = (math.radians(100), math.radians(60))
 
 
-@pytest.fixture(scope="module")
-def vehicle() -> Vehicle:
-    return load_vehicle("configs/vehicles/tarot650_2r.yaml")
+VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
+LEVEL = (0.0, 0.0)
+
+
+def world_with(config: WorldConfig, arm_rad: Vec2 = LEVEL) -> World:
+    return World(VEHICLE, config, (0.0, 0.0), 0.0, arm_rad)
 
 
 def ball_of(world: World) -> Ball:
@@ -118,26 +121,11 @@ def test_a_settled_payload_swings_with_the_period_of_the_pendulum() -> None:
     assert period_s == pytest.approx(math.tau * math.sqrt(length_m / GRAVITY_M_S2), rel=0.01)
 
 
-def test_the_swing_decays_with_its_damping_ratio() -> None:
-    payload = falling(0.0, swing_damping_ratio=0.1)
-    payload.bag.side, payload.bag._above = 1, False
-    payload.position = (0.01, 0.0, -payload.bag._depth_m - 0.006)
-    peaks: list[float] = []
-    while payload.t_s < 2.0:
-        before = payload.velocity[0]
-        payload.step()
-        if before > 0.0 >= payload.velocity[0]:
-            peaks.append(payload.position[0])
-    decrement = math.log(peaks[0] / peaks[1])
-    assert decrement == pytest.approx(math.tau * 0.1 / math.sqrt(1 - 0.1**2), rel=0.1)
-
-
-@pytest.mark.parametrize("mass_kg", [0.02, 0.1, 0.3, 1.0])
-@pytest.mark.parametrize("at", [(0.0, 0.0), (0.05, 0.03), (0.0, 0.085)])
-def test_ten_seconds_of_settling_add_no_energy(mass_kg: float, at: Vec2) -> None:
+@pytest.mark.parametrize(("mass_kg", "at"), [(0.02, (0.05, 0.03)), (0.1, (0.0, 0.085)), (1.0, (0.0, 0.0))])
+def test_settling_adds_no_energy(mass_kg: float, at: Vec2) -> None:
     payload = falling(2.0, mass_kg, at)
     before = energy = mass_kg * (0.5 * 2.0**2 + GRAVITY_M_S2 * payload.position[2])
-    while payload.t_s < 10.0:
+    while payload.t_s < 6.0:
         payload.step()
         if payload.force is None:
             now = mass_kg * (0.5 * math.hypot(*payload.velocity) ** 2 + GRAVITY_M_S2 * payload.position[2])
@@ -225,10 +213,10 @@ def thrown_at(world: World, ball: Ball, ball_from_net_m: Vec3, velocity_m_s: Vec
 
 
 @pytest.mark.parametrize("payload_kg", [0.1, 0.3])
-def test_an_off_centre_catch_conserves_both_momenta(vehicle: Vehicle, payload_kg: float) -> None:
+def test_an_off_centre_catch_conserves_both_momenta(payload_kg: float) -> None:
     """In weightlessness, without air: the vehicle takes up the payload's change of momentum."""
     config = WorldConfig(payload_kg=payload_kg, joint_friction_nm=0.0, joint_damping_nms=0.0, net=Net(on=True))
-    world = World(vehicle, config, (0.0, 0.0), 0.0, CATCH_POSE)
+    world = world_with(config, CATCH_POSE)
     world.release_arm()
     m, d = world.model, world.data
     m.opt.gravity[:] = 0
@@ -242,8 +230,7 @@ def test_an_off_centre_catch_conserves_both_momenta(vehicle: Vehicle, payload_kg
 
     linear, angular = momenta()
     payload_before = payload_kg * d.qvel[ball_of(world).v : ball_of(world).v + 3]
-    for _ in range(round(0.2 / PHYSICS_DT_S)):
-        world.step((0, 0, 0, 0), (0, 0), False, drag=False)
+    run(world, 0.2, drag=False)
     linear_after, angular_after = momenta()
     payload_after = payload_kg * d.qvel[ball_of(world).v : ball_of(world).v + 3]
     assert np.linalg.norm(payload_after - payload_before) > 0.5 * np.linalg.norm(payload_before), "an impact"
@@ -251,16 +238,15 @@ def test_an_off_centre_catch_conserves_both_momenta(vehicle: Vehicle, payload_kg
     assert np.linalg.norm(angular_after - angular) <= 0.01 * np.linalg.norm(angular)
 
 
-def test_a_payload_that_settles_off_centre_turns_the_force_sensor(vehicle: Vehicle) -> None:
+def test_a_payload_that_settles_off_centre_turns_the_force_sensor() -> None:
     """On the floor, the arm held out level: the sensor reads the weight, and the weight times its lever."""
     config = WorldConfig(payload_kg=0.2, net=Net(on=True, pocket=1.0))
-    world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0, 0.0))
+    world = world_with(config)
     thrown_at(world, ball_of(world), (-0.02, 0.06, 0.05), (0.0, 0.0, -1.0))
-    for _ in range(round(4.0 / PHYSICS_DT_S)):
-        world.step((0, 0, 0, 0), (0, 0), False)
+    run(world, 4.0)
     assert [event.kind for event in world.take_events()] == ["caught"]
     truth = world.truth()
-    net_weight_n = tool_of(vehicle).beyond_sensor_kg * GRAVITY_M_S2
+    net_weight_n = tool_of(VEHICLE).beyond_sensor_kg * GRAVITY_M_S2
     weight_n = 0.2 * GRAVITY_M_S2
     assert truth.force_sensor_n[2] == pytest.approx(-weight_n - net_weight_n, rel=0.01)
     lever_x_m, lever_y_m = world.data.xpos[ball_of(world).body][0:2] - world.data.xpos[world._tip][0:2]
@@ -269,67 +255,65 @@ def test_a_payload_that_settles_off_centre_turns_the_force_sensor(vehicle: Vehic
     assert truth.torque_sensor_nm[1] == pytest.approx(weight_n * lever_x_m, rel=0.05)
 
 
-def test_what_bounces_out_is_an_event_and_no_catch(vehicle: Vehicle) -> None:
+def test_what_bounces_out_is_an_event_and_no_catch() -> None:
     config = WorldConfig(payload_kg=0.1, net=Net(on=True))
-    world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0, 0.0))
+    world = world_with(config)
     thrown_at(world, ball_of(world), (0.0, 0.0, 0.1), (0.0, 0.0, -9.0))
-    for _ in range(round(0.6 / PHYSICS_DT_S)):
-        world.step((0, 0, 0, 0), (0, 0), False)
+    run(world, 0.6)
     assert [event.kind for event in world.take_events()] == ["bounced_out"]
     assert world.payload.caught_t_s is None
 
 
-def test_a_payload_falls_out_of_the_bag_when_it_is_dropped_and_can_be_thrown_again(vehicle: Vehicle) -> None:
+def test_a_payload_falls_out_of_the_bag_when_it_is_dropped_and_can_be_thrown_again() -> None:
     config = WorldConfig(throws=2, keep_s=1.0, net=Net(on=True))
-    world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0, 0.0))
+    world = world_with(config)
     lay = world.data.xpos[ball_of(world).body].copy()
     thrown_at(world, ball_of(world), (0.0, 0.0, 0.02), (0.0, 0.0, -1.0))
-    seen = []
-    for step in range(round(1.3 / PHYSICS_DT_S)):
-        world.step((0, 0, 0, 0), (0, 0), False)
-        seen += [event.kind for event in world.take_events()]
-        if step == round(0.7 / PHYSICS_DT_S):
-            assert seen == ["caught"]
-            world.payload.drop()
-        if step == round(0.95 / PHYSICS_DT_S):
-            assert world.data.xpos[ball_of(world).body][2] < 0.06, "on the floor"
-    assert seen == ["caught", "taken"]
+    run(world, 0.7)
+    assert [event.kind for event in world.take_events()] == ["caught"]
+    world.payload.drop()
+    run(world, 0.25)
+    assert world.data.xpos[ball_of(world).body][2] < 0.06, "on the floor"
+    run(world, 0.35)
+    assert [event.kind for event in world.take_events()] == ["taken"]
     assert world.data.xpos[ball_of(world).body] == pytest.approx(lay, abs=0.01)
 
 
-def test_two_payloads_lie_in_the_bag(vehicle: Vehicle) -> None:
+def test_a_flight_whose_payload_missed_flies_on_and_catches_the_next_one() -> None:
+    overrides = ("world.catch_at_m=[0.2, 0]", "mission.repeat=2", "world.throws=2", "world.net.on=true", FIRST_MISSED)
+    flight = FastFlight(load_sitl(SHORT_CATCH, overrides=(*TO_AND_FRO, *overrides)))
+    result, world = flight.run(), flight.plant.world
+    assert result.outputs[-1].outcome is Outcome.COMPLETED
+    payload = world.payload
+    assert (payload.throws, payload.catches, payload.missed, payload.caught_t_s) == (2, 1, True, None)
+    # The impact, 4 N m give or take 1, overloads the sensor (4 N m) or does not; before and after it nothing may.
+    ids = [event.id for output in result.outputs for event in output.events]
+    assert ids in (["takeoff", *overload, "catch", "touchdown"] for overload in ([], ["force_overload"]))
+
+
+def test_the_swing_decays_with_its_damping_ratio() -> None:
+    payload = falling(0.0, swing_damping_ratio=0.1)
+    payload.bag.side, payload.bag._above = 1, False
+    payload.position = (0.01, 0.0, -payload.bag._depth_m - 0.006)
+    peaks: list[float] = []
+    while payload.t_s < 2.0:
+        before = payload.velocity[0]
+        payload.step()
+        if before > 0.0 >= payload.velocity[0]:
+            peaks.append(payload.position[0])
+    decrement = math.log(peaks[0] / peaks[1])
+    assert decrement == pytest.approx(math.tau * 0.1 / math.sqrt(1 - 0.1**2), rel=0.1)
+
+
+def test_two_payloads_lie_in_the_bag() -> None:
     config = WorldConfig(faults=(Fault(kind="payload_double", t_s=0.0),), net=Net(on=True))
-    world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0, 0.0))
+    world = world_with(config)
     second = Ball.of(world.model, SECOND, SECOND_CATCH)
     thrown_at(world, second, (0.02, 0.0, 0.04), (0.0, 0.0, -1.0))
     thrown_at(world, ball_of(world), (0.0, 0.0, 0.02), (0.0, 0.0, -1.0))
     assert not world.payload.catch(second)
-    for _ in range(round(3.0 / PHYSICS_DT_S)):
-        world.step((0, 0, 0, 0), (0, 0), False)
+    run(world, 3.0)
     assert world.payload.catch(second)
     assert world.payload.catches == 1
-    both_n = GRAVITY_M_S2 * (config.payload_kg + config.faults[0].magnitude + tool_of(vehicle).beyond_sensor_kg)
+    both_n = GRAVITY_M_S2 * (config.payload_kg + config.faults[0].magnitude + tool_of(VEHICLE).beyond_sensor_kg)
     assert world.truth().force_sensor_n[2] == pytest.approx(-both_n, rel=0.01)
-
-
-def test_a_flight_whose_payload_missed_flies_on_and_catches_the_next_one() -> None:
-    overrides = (
-        *TO_AND_FRO,
-        "world.catch_at_m=[0.2, 0]",
-        "mission.repeat=2",
-        "world.throws=2",
-        "world.net.on=true",
-        FIRST_MISSED,
-    )
-    flight = FastFlight(load_sitl(SHORT_CATCH, overrides=overrides))
-    result, world = flight.run(), flight.plant.world
-    assert result.outputs[-1].outcome is Outcome.COMPLETED
-    assert (world.payload.throws, world.payload.catches, world.payload.missed, world.payload.caught_t_s) == (
-        2,
-        1,
-        True,
-        None,
-    )
-    # The impact, 4 N m give or take 1, overloads the sensor (4 N m) or does not; before and after it nothing may.
-    ids = [event.id for output in result.outputs for event in output.events]
-    assert ids in (["takeoff", *overload, "catch", "touchdown"] for overload in ([], ["force_overload"]))

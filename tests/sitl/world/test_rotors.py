@@ -45,10 +45,6 @@ def standing(**sections: Any) -> World:
     return World(VEHICLE, WorldConfig(payload_kg=0.0, **sections), (0.0, 0.0), 0.0, (1.0, 1.0))
 
 
-def test_rotors_that_are_off_are_none() -> None:
-    assert Rotors.of(RotorsConfig(), LAYOUT, PHYSICS_DT_S) is None
-
-
 def test_settled_thrust_is_the_curve_times_each_rotors_own_gain() -> None:
     signals, errors = (0.2, 0.5, 0.8, 1.0), (0.03, -0.03, 0.01, 0.0)
     found = run(rotors(thrust_curve=0.6, thrust_error=errors), signals, 2.0)
@@ -132,23 +128,6 @@ def test_hover_command_is_the_setpoint_that_carries_the_weight() -> None:
         near = rotors().ground_effect(world.q[2] + LAYOUT.height_m)
         world.step((signal,) * 4, (0.0, 0.0))
     assert sum(world.data.ctrl[0:4]) == pytest.approx(world.weight_n * near, rel=2e-3)
-
-
-def test_weak_rotor_of_a_fault_stays_weak() -> None:
-    world = standing(rotors={"on": True, **ALIKE})
-    world.rotor_share = (0.5, 1.0, 1.0, 1.0)
-    for _ in range(50):
-        world.step(HALF, (0.0, 0.0))
-    weak, *others = world.data.ctrl[0:4].tolist()
-    assert [weak] * 3 == pytest.approx([0.5 * force for force in others])
-
-
-def test_yaw_torque_of_each_rotor_has_its_error() -> None:
-    errors = (0.1, -0.1, 0.05, 0.0)
-    world = standing(rotors={"on": True, "yaw_torque_error": errors})
-    ratio = VEHICLE.airframe.yaw_torque_per_thrust_m
-    found = [abs(world.model.actuator(f"rotor{i}").gear[5]) for i in range(4)]
-    assert found == pytest.approx([ratio * (1.0 + error) for error in errors])
 
 
 def test_vehicle_hovers_at_the_true_hover_thrust() -> None:

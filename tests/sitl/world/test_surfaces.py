@@ -19,6 +19,7 @@ from companion.sitl_config.world import World as WorldConfig
 from sitl.world.handling import Wrench
 from sitl.world.surfaces import Placed, Surfaces
 from sitl.world.world import PHYSICS_DT_S, World
+from tests.sitl.plants import run
 
 SHIPPED = load_vehicle("configs/vehicles/tarot650_2r_rod.yaml")
 assert SHIPPED.tool is not None
@@ -58,7 +59,7 @@ def pushed(world: World, force_n: Vec3, time_s: float) -> list[Vec3]:
     return forces
 
 
-@pytest.mark.parametrize("stiffness_n_m", [1e3, 1e4, 1e5, 1e6])
+@pytest.mark.parametrize("stiffness_n_m", [1e3, 1e6])
 def test_the_tip_sinks_in_by_force_over_stiffness_and_rests(stiffness_n_m: float) -> None:
     world = in_front(stiffness_n_m=stiffness_n_m, damping_ratio=1.0)
     forces = [-x for x, _, _ in pushed(world, (5.0, 0.0, 0.0), 4.0)]
@@ -79,14 +80,13 @@ def test_a_tip_yields_in_addition_to_the_surface(kind: str, stiffness_n_m: float
     assert depth_m == pytest.approx(5.0 / 1000.0 + 5.0 / stiffness_n_m, rel=0.05)
 
 
-@pytest.mark.parametrize("damping_ratio", [0.0, 0.3])
-@pytest.mark.parametrize("stiffness_n_m", [1e3, 1e4, 1e5, 1e6])
+@pytest.mark.parametrize(("stiffness_n_m", "damping_ratio"), [(1e3, 0.0), (1e6, 0.0), (1e4, 0.3)])
 def test_an_impact_adds_no_energy(stiffness_n_m: float, damping_ratio: float) -> None:
     world = in_front(0.01, stiffness_n_m=stiffness_n_m, damping_ratio=damping_ratio)
     energy_j = []
     world.data.qvel[0] = 0.2
     for _ in range(1000):
-        world.step((0.0,) * 4, (0.0, 0.0), False, drag=False)
+        run(world, PHYSICS_DT_S, drag=False)
         mass = np.zeros((world.model.nv, world.model.nv))
         mujoco.mj_fullM(world.model, world.data, mass)
         energy_j.append(0.5 * float(world.data.qvel @ mass @ world.data.qvel))
@@ -100,8 +100,7 @@ def test_the_soft_ball_of_the_rod_makes_the_touch_of_a_hard_wall_a_third_as_hard
     for vehicle in (ROD, SHIPPED):
         world = in_front(0.002, vehicle, stiffness_n_m=1e5)
         world.data.qvel[0] = 0.05
-        for _ in range(300):
-            world.step((0.0,) * 4, (0.0, 0.0), False, drag=False)
+        run(world, 0.6, drag=False)
         hardest_n.append(surfaces(world).force_max_n)
     assert 3.0 < hardest_n[1] < hardest_n[0] / 3.0
 
@@ -127,8 +126,7 @@ def test_the_force_sensor_feels_the_contact_and_the_lever_of_the_rod() -> None:
     world = in_front(stiffness_n_m=1e4, damping_ratio=1.0)
     pushed(world, (0.0, 0.0, 0.0), 0.5)
     world.hold(Wrench((6.0, 0.0, 2.0), (0.0, 0.0, 0.0)))
-    for _ in range(100):
-        world.step((0.0,) * 4, (0.0, 0.0), False, drag=False)
+    run(world, 0.2, drag=False)
     truth, (_, force_n) = world.truth(), contact(world)
     assert math.hypot(*force_n) > 1.0
     assert ROD.tool is not None
@@ -177,8 +175,7 @@ def test_a_rotor_that_touches_a_wall_is_a_crash() -> None:
     world.data.qvel[0] = 0.5
     world.step((0.0,) * 4, (0.0, 0.0), False, drag=False)
     assert surfaces(world).rotor_distance_m == pytest.approx(0.1, abs=0.003)
-    for _ in range(130):
-        world.step((0.0,) * 4, (0.0, 0.0), False, drag=False)
+    run(world, 0.26, drag=False)
     assert world.crashed
     assert surfaces(world).report()["rotor_distance_min_m"] <= 0.0
     assert [event.kind for event in world.take_events()] == ["rotor_touched", "crashed"]

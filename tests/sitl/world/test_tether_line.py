@@ -11,7 +11,7 @@ import pytest
 from companion.sitl_config.effects.tether_line import TetherLine as TetherLineConfig
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
-from sitl.world.effects.tether_line import Hanging, TetherLine, hanging
+from sitl.world.effects.tether_line import Hanging, hanging
 from sitl.world.world import World
 from tests.support import CATCH, tether_of
 
@@ -119,7 +119,3 @@ def test_a_pull_beside_the_centre_of_mass_turns_the_vehicle() -> None:
     world = World(VEHICLE.model_copy(update={"tether": tether}), config, (0.4, 0.0), 0.0, (1.7, 1.0))
     act(world)
     assert load(world)[3:] == pytest.approx([0.0, -0.1 * load(world)[2], 0.0])
-
-
-def test_off_there_is_no_effect() -> None:
-    assert TetherLine.of(TetherLineConfig(), VEHICLE.tether, 1) is None

@@ -7,12 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from companion.config.loader import load_vehicle
 from companion.model.types import Vec3
 from companion.sitl_config.effects.thrower import Thrower as ThrowerConfig
-from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.thrower import Thrower
-from sitl.world.world import World
 
 POINT: Vec3 = (0.9, -0.07, 0.7)
 VELOCITY: Vec3 = (-2.0, 0.15, 2.9)
@@ -48,19 +45,3 @@ def test_the_arrival_scatters_as_speed_and_direction_do() -> None:
     assert np.std(error @ np.cross(along, aside)) == pytest.approx(math.radians(1.3) * path_m, rel=0.1)
     assert np.linalg.norm(error.mean(axis=0)) < 0.005
     assert np.std(points, axis=0) == pytest.approx([0.05] * 3, rel=0.1)
-
-
-def test_the_world_throws_with_the_errors_of_the_person() -> None:
-    vehicle = load_vehicle("configs/vehicles/tarot650_2r.yaml")
-
-    def thrown(thrower: ThrowerConfig) -> list[float]:
-        world = World(vehicle, WorldConfig(thrower=thrower), (0.0, 0.0), 0.0, (2.0, 1.5))
-        ball = world.payload.ball
-        assert ball is not None
-        world.payload.throw(ball)
-        state = [*world.data.qpos[ball.q : ball.q + 3], *world.data.qvel[ball.v : ball.v + 3]]
-        return [float(value) for value in state]
-
-    exact = thrown(ThrowerConfig())
-    assert thrown(EXACT) == pytest.approx(exact, abs=1e-12)
-    assert math.dist(thrown(ThrowerConfig(on=True))[0:3], exact[0:3]) > 0.01

@@ -7,17 +7,13 @@ from typing import Any
 
 import pytest
 
-from companion.model.types import Vec4
 from companion.sitl_config.effects.compliance import Compliance
 from companion.sitl_config.effects.servo_mechanics import GEAR_MIN_DEG_PER_NM, ServoMechanics
 from companion.sitl_config.world import World as WorldConfig
-from sitl.autopilot.types import ImuSample
-from sitl.server import start_of
-from sitl.servo.drive import AMP_PER_COUNT, MODE_CURRENT, ServoDrive
+from sitl.servo.drive import AMP_PER_COUNT, MODE_CURRENT
 from sitl.servo.from_config import servos_of
 from sitl.world.effects.transmission import ARMATURE_MIN_KG_M2, Transmission, transmissions_of
 from sitl.world.model import mjcf
-from sitl.world.plant import Plant
 from sitl.world.world import PHYSICS_DT_S
 from tests.preflight.hand_rig import world
 from tests.sitl.test_airframe import VEHICLE
@@ -30,13 +26,6 @@ COLD = {"warm_up_k": 0.0}
 def joint(outer: float = 0.0, armature_kg_m2: float = 0.008, **changes: Any) -> Transmission:
     servo = ServoMechanics(on=True, **{**COLD, **changes})
     return Transmission(servo, armature_kg_m2, GEAR, outer, Compliance().relaxation_s, 0.0, DT_S)
-
-
-class Off:
-    """An autopilot that leaves the rotors off."""
-
-    def step(self, imu: ImuSample) -> Vec4:
-        return (0.0, 0.0, 0.0, 0.0)
 
 
 class Link:
@@ -182,28 +171,6 @@ def test_the_present_current_follows_the_goal_with_the_time_constant_of_the_loop
         expected = 500 * (1.0 - math.exp(-n * DT_S / 0.003))
         assert current_a == pytest.approx(expected * AMP_PER_COUNT)
         assert drive.present()[0] == round(expected)
-
-
-def test_in_the_world_the_encoders_stand_beside_the_links_by_what_the_springs_yield() -> None:
-    config = world("compliance.on=true", "hand=false")
-    start = config.mission.start
-    pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
-    drives = [ServoDrive() for _ in config.vehicle.arm.joints]
-    plant = Plant(config.vehicle, config.world, Off(), drives, (pose.position_m, pose.yaw_rad, pose.arm_rad))
-    plant.step(False)
-    for drive in drives:
-        drive.torque_on, (_, _, drive.goal_position_counts) = True, drive.present()
-    plant.world.release_arm()
-    for _ in range(1500):
-        plant.step(False)
-    world_ = plant.world
-    for drive, own, q, v, deg_per_nm in zip(
-        drives, config.vehicle.arm.joints, world_.layout.joint_q, world_.layout.joint_v, (1.0, 1.0), strict=True
-    ):
-        shaft_rad = own.sign * (drive.angle_rad - own.zero_count / 4096.0 * math.tau)
-        held_nm = float(world_.data.qfrc_bias[v])
-        assert abs(held_nm) > 0.1
-        assert shaft_rad - world_.q[q] == pytest.approx(math.radians(deg_per_nm) * held_nm, abs=2e-5)
 
 
 def test_without_both_effects_the_joints_are_mujoco_s() -> None:
