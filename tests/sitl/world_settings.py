@@ -124,7 +124,7 @@ def fault_pairs() -> Iterator[Pair]:
     """Return two sizes for each kind of fault that has a size, and the other kinds with and without the fault."""
     for kind, about in KINDS.items():
         after = "catch" if kind.startswith("payload_") else "arming" if kind in IN_THE_AIR else "start"
-        acts = ("start", "arming", "catch").index(after)
+        acts = 2 if kind.startswith("tether_") else ("start", "arming", "catch").index(after)
         fault = {"kind": kind, "t_s": 0.1, "after": after}
         world = {"surfaces": [EXAMPLES[Surface]]} if about.phases == CONTACT_PHASES else {}
         if about.default is not None and kind != "pilot_takeover":
@@ -145,8 +145,8 @@ def _of_part(name: str, field: FieldInfo, part: type[Model]) -> Iterator[Pair]:
     wide = 2 if part is Servo else 1
     beside = BESIDE_PART.get(name, {})
     for key, inner in part.model_fields.items():
-        if (name, key) == ("faults", "kind"):
-            continue  # `fault_pairs`
+        if (name, key) == ("faults", "kind") or key == "on":
+            continue  # `fault_pairs`; a part whose other settings act when it is on, and do not when it is off, is switched
         path = f"{name}.{key}"
         usual = {**_example(part), **TOGETHER_IN_PART.get(path, {})}
         for number, changed in _changes(path, inner, usual, part):
