@@ -1,7 +1,7 @@
 """Contact with a surface: the offset of the reference along the direction of an approach, and the force with which to press. Pure.
 
 The plan is the motion in front of the surface and a function of time alone. What depends on the measured force is one record,
-`ContactState`, which `companion.core.contact` advances in every tick. It adds two quantities to the plan's reference: an offset along
+`ContactState`, which `machine` advances in every tick. It adds two quantities to the plan's reference: an offset along
 the direction, until the surface is touched, and from then on the push, a force on the base (`Reference.push_world_n`, the desired force
 F_d of the paper on the rows of the base). The push is the wanted force plus the integral of the force error; the position reference
 rests at the place of the touch, so that the stiffness of the control law limits how far the vehicle moves if the surface gives way.
@@ -10,13 +10,14 @@ rests at the place of the touch, so that the stiffness of the control law limits
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 from msgspec.structs import replace
 
-from companion.config.mission import Approach, Probe
-from companion.mission.surface import farthest_step_m, points_of
 from companion.model.frames import wrap_rad
-from companion.model.types import ContactMode, ContactShift, ContactState, Joints, Reference, Vec3
+from companion.model.types import ContactMode, ContactShift, ContactState, Joints, Reference, Vec2, Vec3
 
 WEIGH_S = 1.0
 """Time at rest before the approach, in which the force without contact is averaged."""
@@ -82,29 +83,47 @@ tilted by 15 deg about both axes.
 """
 
 
+@dataclass(frozen=True, slots=True)
+class Way:
+    """The way to a surface, from the keys of the phase that begins a contact."""
+
+    direction_world: Vec3
+    """Unit vector."""
+    distance_max_m: float
+    speed_m_s: float
+    touch_n: float
+    points: tuple[Vec2, ...]
+    """Points that are touched to find the surface, right and up of the way straight ahead, m."""
+    presses: bool
+    """Whether the vehicle then turns to the surface and presses; if not, the contact is over."""
+
+
 def travel_s(distance_m: float, speed_m_s: float) -> float:
     """Return the time in which the offset travels a distance from rest to rest, s."""
     return distance_m / speed_m_s + speed_m_s / ACCELERATION_M_S2
 
 
-def approach_s(approach: Approach | Probe) -> float:
+def approach_s(way: Way) -> float:
     """Return the duration of an approach or a probe, s: the largest of an approach, about that of what touches points."""
-    duration_s = WEIGH_S + travel_s(approach.distance_max_m, approach.speed_m_s)
-    points = points_of(approach)
-    if not points:
+    duration_s = WEIGH_S + travel_s(way.distance_max_m, way.speed_m_s)
+    if not way.points:
         return duration_s
-    step_m = farthest_step_m(points)
-    back_m = back_from_point_m(approach)
+    back_m = back_from_point_m(way)
     each_s = (
-        travel_s(back_m, SHIFT_M_S) + travel_s(back_m, approach.speed_m_s) + travel_s(step_m, SHIFT_M_S)
+        travel_s(back_m, SHIFT_M_S) + travel_s(back_m, way.speed_m_s) + travel_s(_farthest_step_m(way.points), SHIFT_M_S)
         + TOUCH_SETTLE_S + TOUCH_MEAN_S
     )  # fmt: skip
-    return len(points) * each_s + (2.0 if isinstance(approach, Approach) else 1.0) * duration_s
+    return len(way.points) * each_s + (2.0 if way.presses else 1.0) * duration_s
 
 
-def back_from_point_m(approach: Approach | Probe) -> float:
+def back_from_point_m(way: Way) -> float:
     """Return how far the tip moves back from a point before it moves in front of the next one, m."""
-    return FROM_POINT_M + FROM_POINT_SHARE * farthest_step_m(points_of(approach))
+    return FROM_POINT_M + FROM_POINT_SHARE * _farthest_step_m(way.points)
+
+
+def _farthest_step_m(points: Sequence[Vec2]) -> float:
+    """Return the largest distance between consecutive points."""
+    return max((math.dist(a, b) for a, b in pairwise(points)), default=0.0)
 
 
 def begun(t_s: float, direction_world: Vec3, tip_per_n_m: Vec3) -> ContactState:
@@ -200,12 +219,6 @@ def tip_per_n_m(direction_world: Vec3, tip_world_m: Vec3, weight_n: float) -> Ve
     (nx, ny, _), (x, y, z) = direction_world, tip_world_m
     level = nx * x + ny * y
     return (-z * nx / weight_n, -z * ny / weight_n, level / weight_n)
-
-
-def before_approach_m(reference: Reference, contact: ContactState) -> Vec3:
-    """Return the position of the reference without the contact's offset, world frame, m: in front of the surface."""
-    (x, y, z), (nx, ny, nz), d = reference.position_world_m, contact.direction_world, contact.offset_m
-    return (x - d * nx, y - d * ny, z - d * nz)
 
 
 def way_back_m(contact: ContactState) -> Vec3:
