@@ -45,6 +45,7 @@ COMPILED = (
     "companion/phases/contact/points.py",
     "companion/phases/contact/sliding.py",
     "companion/phases/contact/surface.py",
+    "companion/phases/contact/way.py",
     "companion/model/*.py",
     "companion/io/dynamixel/scale.py",
     "companion/io/px4/delta_velocity.py",

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
 from companion.config.phase import PhaseSettings
-from companion.mission.phase import Checking
 from companion.model.types import Vec2
-from companion.phases.contact import checks
 from companion.phases.contact.base import Opening
 
 
@@ -37,7 +34,3 @@ class Approach(Opening):
     def unfinished(self, after: PhaseSettings) -> str:
         """Return that a press or a slide must follow."""
         return f"a press or a slide must follow the approach, not a {after.type}"
-
-    def problems(self, c: Checking) -> Iterator[str]:
-        """Check the tool and the room for its way."""
-        yield from checks.way_problems(c.vehicle, c.begin, self.way)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
@@ -12,9 +12,10 @@ from pydantic import Field, model_validator
 from companion.config.base import Vector3, refuse
 from companion.config.phase import PhaseSettings
 from companion.mission.air import Air, Expectation
-from companion.mission.phase import Phase, Planning
+from companion.mission.phase import Checking, Phase, Planning
 from companion.model.types import ContactState, Reference, Vec2
-from companion.phases.contact import force, machine, points
+from companion.phases.contact import checks, force, machine, points
+from companion.phases.contact.way import Way, approach_s
 
 ContactForce = Annotated[float, Field(gt=0, le=50)]
 ContactSpeed = Annotated[float, Field(ge=0.02, le=0.2)]
@@ -27,19 +28,11 @@ class ContactPhase(Phase):
     slides: ClassVar[bool] = False
     """Whether the tip moves along the surface."""
 
-    def plan(self, p: Planning) -> None:
-        """Append the time: the plan stays in front of the surface."""
-        p.builder.t_s += self.duration_planned_s(p.earlier)
-
-    def duration_planned_s(self, earlier: Sequence[Phase]) -> float:
-        """Return how long the phase takes if all goes well, s."""
-        raise NotImplementedError
-
-    def touching(self, air: Air, contact: ContactState, way: force.Way) -> ContactState:
+    def touching(self, air: Air, contact: ContactState, way: Way) -> ContactState:
         """Return the state after one tick in which the tool touches the surface."""
         return contact
 
-    def leave_m_s(self, way: force.Way) -> float:
+    def leave_m_s(self, way: Way) -> float:
         """Return the speed of the way back from the surface."""
         return way.speed_m_s
 
@@ -93,7 +86,7 @@ class Opening(ContactPhase):
         return self
 
     @property
-    def way(self) -> force.Way:
+    def way(self) -> Way:
         """The way to the surface."""
         return _way_of(self)
 
@@ -102,9 +95,13 @@ class Opening(ContactPhase):
         """Points that are touched to find the surface, right and up of the way straight ahead, m."""
         return ()
 
-    def duration_planned_s(self, earlier: Sequence[Phase]) -> float:
-        """Return the largest duration of an approach, about that of what touches points, s."""
-        return force.approach_s(self.way)
+    def plan(self, p: Planning) -> None:
+        """Append the largest duration of an approach, or about that of what touches points."""
+        p.builder.t_s += approach_s(self.way)
+
+    def problems(self, c: Checking) -> Iterator[str]:
+        """Check the tool and the room for its way."""
+        yield from checks.way_problems(c.vehicle, c.begin, self.way)
 
     def begin(self, air: Air) -> ContactState:
         """Return the state at the beginning of the contact."""
@@ -130,10 +127,10 @@ class Pressing(ContactPhase):
 
 
 @functools.lru_cache(maxsize=16)  # read in every tick
-def _way_of(phase: Opening) -> force.Way:
+def _way_of(phase: Opening) -> Way:
     x, y, z = phase.direction
     length = math.hypot(x, y, z)
-    return force.Way(
+    return Way(
         direction_world=(x / length, y / length, z / length),
         distance_max_m=phase.distance_max_m,
         speed_m_s=phase.speed_m_s,

@@ -13,9 +13,9 @@ from companion.control.thrust import attitude_from_roll_pitch_yaw, roll_pitch_fr
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_conjugate, quat_rotate
 from companion.model.types import Reference, Vec2, Vec3
-from companion.phases.contact.force import Way
 from companion.phases.contact.sliding import Stroke
 from companion.phases.contact.surface import axes, tool_turn_rad
+from companion.phases.contact.way import Way
 from companion.safety.governor import SafeSet
 
 TURN_RAD = math.radians(15.0)

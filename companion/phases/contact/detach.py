@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal
 
 from companion.config.phase import PhaseSettings
 from companion.mission.air import Air
-from companion.mission.phase import Phase
+from companion.mission.phase import Planning
 from companion.model.types import ContactState
 from companion.phases.contact import machine
 from companion.phases.contact.base import ContactPhase, ContactSpeed, Pressing, opening_of
-from companion.phases.contact.force import RELEASE_S, Way, travel_s
+from companion.phases.contact.force import RELEASE_S
+from companion.phases.contact.way import Way, travel_s
 
 
 class Detach(ContactPhase):
@@ -24,9 +24,9 @@ class Detach(ContactPhase):
         """Return that there must be something to detach from."""
         return None if isinstance(before, Pressing) else "a detach must follow a press or a slide"
 
-    def duration_planned_s(self, earlier: Sequence[Phase]) -> float:
-        """Return the largest duration of the way back, s."""
-        return RELEASE_S + travel_s(opening_of(earlier).distance_max_m, self.speed_m_s)
+    def plan(self, p: Planning) -> None:
+        """Append the largest duration of the way back."""
+        p.builder.t_s += RELEASE_S + travel_s(opening_of(p.earlier).distance_max_m, self.speed_m_s)
 
     def leave_m_s(self, way: Way) -> float:
         """Return the speed of the way back from the surface."""

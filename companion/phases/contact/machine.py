@@ -18,8 +18,8 @@ from companion.mission.air import Air
 from companion.model.types import ContactMode, ContactState
 from companion.phases.contact import force as c
 from companion.phases.contact import points, sliding
-from companion.phases.contact.force import Way
 from companion.phases.contact.sliding import Stroke
+from companion.phases.contact.way import Way
 from companion.safety import notices
 from companion.safety.notices import Notice
 

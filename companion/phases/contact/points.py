@@ -17,8 +17,8 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_rotate
 from companion.model.types import ContactMode, ContactState, FoundSurface, TouchedPoint, Vec3
 from companion.phases.contact import force as c
-from companion.phases.contact.force import Way
 from companion.phases.contact.surface import TILT_MAX_RAD, axes, plane, tool_turn_rad, turn_to
+from companion.phases.contact.way import Way, back_from_point_m
 
 
 def seeks_points(contact: ContactState, way: Way) -> bool:
@@ -70,7 +70,7 @@ def moving_back(air: Air, contact: ContactState, way: Way) -> ContactState | Non
         return None
     if not more and not way.presses:
         return c.entered(contact, t_s, ContactMode.LEAVE)
-    least_m = max(0.0, contact.touched_offset_m - c.back_from_point_m(way)) if more else 0.0
+    least_m = max(0.0, contact.touched_offset_m - back_from_point_m(way)) if more else 0.0
     if contact.push_n > 0.0:
         return c.released(contact, dt_s)
     contact = c.moved(contact, dt_s, -c.SHIFT_M_S, least_m)

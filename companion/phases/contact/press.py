@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Literal
 
 from companion.config.phase import Duration
 from companion.mission.air import Air
-from companion.mission.phase import Checking, Phase
+from companion.mission.phase import Checking, Planning
 from companion.model.types import ContactState
 from companion.phases.contact import checks, machine
 from companion.phases.contact.base import Pressing, opening_of
-from companion.phases.contact.force import PRESS_RAMP_S, Way
+from companion.phases.contact.force import PRESS_RAMP_S
+from companion.phases.contact.way import Way
 
 
 class Press(Pressing):
@@ -25,9 +26,9 @@ class Press(Pressing):
         """What the phase does, for a phase without a name."""
         return f"press with {self.force_n:g} N"
 
-    def duration_planned_s(self, earlier: Sequence[Phase]) -> float:
-        """Return the time of the ramp and of the press, s."""
-        return PRESS_RAMP_S + self.duration_s
+    def plan(self, p: Planning) -> None:
+        """Append the time of the ramp and of the press."""
+        p.builder.t_s += PRESS_RAMP_S + self.duration_s
 
     def problems(self, c: Checking) -> Iterator[str]:
         """Check the reserves for the force."""

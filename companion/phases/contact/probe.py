@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from companion.mission.phase import Checking
 from companion.model.types import Vec2
-from companion.phases.contact import checks
 from companion.phases.contact.base import Opening
 
 
@@ -31,7 +28,3 @@ class Probe(Opening):
         rows = [self.spacing_m * (k - 0.5 * (self.rows - 1)) for k in range(self.rows)]
         # Row by row upwards, every other row from right to left.
         return tuple((x, y) for k, y in enumerate(rows) for x in (across if k % 2 == 0 else reversed(across)))
-
-    def problems(self, c: Checking) -> Iterator[str]:
-        """Check the tool and the room for its way."""
-        yield from checks.way_problems(c.vehicle, c.begin, self.way)

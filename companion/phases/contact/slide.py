@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import takewhile
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -12,12 +12,13 @@ from pydantic import Field, model_validator
 
 from companion.config.base import Vector2, refuse
 from companion.mission.air import Air, Expectation
-from companion.mission.phase import Checking, Phase
+from companion.mission.phase import Checking, Planning
 from companion.model.types import ContactMode, ContactState
 from companion.phases.contact import checks, machine
 from companion.phases.contact.base import ContactSpeed, Pressing, opening_of
-from companion.phases.contact.force import PRESS_RAMP_S, Way, travel_s
+from companion.phases.contact.force import PRESS_RAMP_S
 from companion.phases.contact.sliding import Stroke
+from companion.phases.contact.way import Way, travel_s
 
 SLIDE_MIN_M = 0.01
 
@@ -52,9 +53,9 @@ class Slide(Pressing):
         """The keys as the record of `sliding`."""
         return Stroke(self.force_n, self.by_m, self.speed_m_s, self.friction_max)
 
-    def duration_planned_s(self, earlier: Sequence[Phase]) -> float:
-        """Return the time of the ramp and of the way, s."""
-        return PRESS_RAMP_S + travel_s(math.hypot(*self.by_m), self.speed_m_s)
+    def plan(self, p: Planning) -> None:
+        """Append the time of the ramp and of the way."""
+        p.builder.t_s += PRESS_RAMP_S + travel_s(math.hypot(*self.by_m), self.speed_m_s)
 
     def problems(self, c: Checking) -> Iterator[str]:
         """Check the reserves for force and friction, and the room for the way since the touch."""
