@@ -1,4 +1,4 @@
-"""The flight that a control law must complete, as a check for the tests of the law's author."""
+"""Flights in the fast loop as checks, for the tests of the author of a control law or of a phase."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from pathlib import Path
 
 from companion.config.shipped import DEFAULT_MISSION
 from companion.mission.check import check_mission
-from companion.model.types import Outcome
-from companion.sitl_config.loader import load_sitl
+from companion.model.types import Event, Outcome
+from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.flights import fly_to_end
 
 
@@ -24,14 +24,35 @@ def check_catch(law: str, preset: str | None = None, mission: str | Path = DEFAU
         ConfigError: a configuration file is invalid.
         PluginError: the law cannot be used.
     """
-    config = load_sitl(mission, controller_law=law, preset=preset)
+    events = _complete(load_sitl(mission, controller_law=law, preset=preset), law)
+    assert any(event.id == "catch" for event in events), f"{law}: no catch was detected: {_shown(events)}"
+
+
+def check_flight(mission: str | Path, *overrides: str) -> list[Event]:
+    """Fly a mission in the fast loop, in the ideal world, and return its events.
+
+    Args:
+        mission: mission file, or the name of a shipped one.
+        overrides: `--set` options.
+
+    Raises:
+        AssertionError: the mission cannot be flown, or was not completed.
+        ConfigError: a configuration file is invalid.
+    """
+    return _complete(load_sitl(mission, overrides=overrides), str(mission))
+
+
+def _complete(config: SitlConfig, label: str) -> list[Event]:
     problems = check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases)
     assert not problems, f"companion fly refuses this mission: {'; '.join(problems)}"
     flown = fly_to_end(config)
-    assert flown.error is None, f"{law}: the law raises in flight: {flown.error}"
+    assert flown.error is None, f"{label}: raises in flight: {flown.error}"
     outputs = flown.result.outputs
     events = [event for output in outputs for event in output.events]
-    text = "; ".join(f"t = {event.t_s:.1f} s: {event.text}" for event in events)
-    assert any(event.id == "catch" for event in events), f"{law}: no catch was detected: {text}"
-    assert not flown.result.crashed, f"{law}: the vehicle crashed: {text}"
-    assert outputs[-1].outcome is Outcome.COMPLETED, f"{law}: the mission was not completed: {text}"
+    assert not flown.result.crashed, f"{label}: the vehicle crashed: {_shown(events)}"
+    assert outputs[-1].outcome is Outcome.COMPLETED, f"{label}: the mission was not completed: {_shown(events)}"
+    return events
+
+
+def _shown(events: list[Event]) -> str:
+    return "; ".join(f"t = {event.t_s:.1f} s: {event.text}" for event in events)

@@ -40,6 +40,12 @@ COMPILED = (
     "companion/control/**/*.py",
     "companion/safety/*.py",
     "companion/mission/*.py",
+    "companion/phases/contact/force.py",
+    "companion/phases/contact/machine.py",
+    "companion/phases/contact/points.py",
+    "companion/phases/contact/sliding.py",
+    "companion/phases/contact/surface.py",
+    "companion/phases/contact/way.py",
     "companion/model/*.py",
     "companion/io/dynamixel/scale.py",
     "companion/io/px4/delta_velocity.py",
@@ -59,6 +65,8 @@ INTERPRETED = frozenset(
         "companion/model/observations.py",
         "companion/model/packets.py",
         "companion/model/types.py",
+        # A Pydantic model.
+        "companion/mission/phase.py",
         # I/O, which the fast loop does not have; mypyc does not support asynchronous generators.
         "sitl/autopilot/backend.py",
         "sitl/autopilot/mavlink.py",

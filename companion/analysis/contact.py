@@ -10,11 +10,11 @@ import numpy as np
 
 from companion.analysis.arm_skeleton import pose
 from companion.analysis.log import Array, FlightLog
-from companion.mission.surface import axes
 from companion.model.arm_skeleton import ArmSkeleton, logged_skeleton
 from companion.model.best_pose import best_pose
 from companion.model.frames import quat_rotate
 from companion.model.types import ContactMode, ContactState, Vec3
+from companion.phases.contact.surface import axes
 from companion.safety import notices
 
 SETTLED_S = 1.5

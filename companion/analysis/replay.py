@@ -69,7 +69,7 @@ def replay(log: FlightLog, make_core: Callable[[str], Core]) -> ReplayResult:
     try:
         core = make_core(config_json)
     except ValueError as error:
-        reason = str(error).splitlines()[0]
+        reason = ": ".join([line.strip() for line in str(error).splitlines()[:3]])  # of Pydantic: count, key, problem
         raise LogError(
             f"{log.path}: the recorded configuration is not compatible with this version: {reason}"
         ) from None

@@ -8,15 +8,16 @@ from typing import Any
 from companion.config.base import Model
 from companion.config.controller import LAWS
 from companion.config.device_plugins import device_class
+from companion.config.phase import phase_class
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
-from companion.plugins import CONTROL_LAWS, KINDS, PluginError, installed
+from companion.plugins import CONTROL_LAWS, KINDS, PHASES, PluginError, installed
 
 
 def add_parser(commands: Any) -> None:
     """Add `plugins` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "plugins",
-        help="list the installed control laws, motion-capture systems, force sensors and arms, and the packages that provide them",
+        help="list the installed control laws, devices and phases of missions, and the packages that provide them",
         description="List the installed plug-ins: name, kind, distribution, version, description. Exit code 2: one cannot be used.",
     )
     parser.set_defaults(run=run)
@@ -45,5 +46,9 @@ def _settings(group: str, name: str) -> type[Model]:
     Raises:
         PluginError: the plug-in cannot be used.
     """
-    settings: type[Model] = LAWS[name] if group == CONTROL_LAWS else device_class(group, name).options
+    settings: type[Model]
+    if group == CONTROL_LAWS:
+        settings = LAWS[name]
+    else:
+        settings = phase_class(name) if group == PHASES else device_class(group, name).options
     return settings

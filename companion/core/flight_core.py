@@ -11,25 +11,22 @@ from typing import Final
 import msgspec
 
 from companion.config.loader import FlightConfig
-from companion.config.mission import Slide
 from companion.config.vehicle import OBSERVER
 from companion.control.types import Tuning
 from companion.control.vehicle_control import Command, VehicleControl
-from companion.core.contact import force_on_tool_n
-from companion.core.flight_state import Observation, Request, Tare
+from companion.core.flight_state import Request, Tare
 from companion.core.sequence import missing_inputs
-from companion.core.sliding import within_friction
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters, event_of
 from companion.core.verdict import verdict_of
-from companion.mission.contact import along, sensed_n
+from companion.mission.air import Observation
 from companion.mission.plan import Plan
 from companion.model import flight_stage as seq
+from companion.model.algebra import across
 from companion.model.best_pose import pose_used_s
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.flight_stage import Stage
 from companion.model.types import (
-    ContactMode,
     ControlLog,
     Event,
     Inputs,
@@ -60,7 +57,6 @@ _POSE_AGE_MAX_S: Final = 0.1
 _PLAN: Final = Stage.PLAN
 _SPOOL: Final = Stage.SPOOL
 _TOUCHDOWN: Final = Stage.TOUCHDOWN
-_SLIDE: Final = ContactMode.SLIDE
 _NO_COMMAND: Final = OperatorCommand.NONE
 _NO_ERROR: Vec3 = (0.0, 0.0, 0.0)
 
@@ -113,7 +109,7 @@ class FlightCore:
         self._log = command.log
         phase, kind, progress = state.phase(t_s)
         events = list(request.events)
-        if command.log is not None and kind is PhaseKind.FLIGHT and state.contact is None:
+        if command.log is not None and kind is PhaseKind.FLIGHT and state.expected.into_world is None:
             self._watch_for_catch(t_s, command.log, events)
         online = self._control.online
         if online is not None and (report := online.take_report()):
@@ -152,7 +148,7 @@ class FlightCore:
             tether=self._situation.tether,
             limited_by=self._limited_by,
             mocap_innovation_m=self._monitors.mocap_innovation_m,
-            contact=state.contact,
+            contact=state.expected.contact,
         )
 
     def forwards(self, pose: MocapPose, vehicle: VehicleState | None) -> bool:
@@ -185,10 +181,7 @@ class FlightCore:
             situation.found_armed = None
         situation.tracking_error_m = self._control.tracking_error_m if stage is _PLAN else None
         situation.control, situation.disturbance_world_n = self._log, self._control.disturbance_world_n
-        contact = self._state.contact
-        situation.contact_n = (
-            max(contact.force_n, sensed_n(contact)) if contact is not None and contact.touches else None
-        )
+        situation.contact_n = self._state.expected.contact_n
         situation.waiting = stage is Stage.WAIT and bool(missing_inputs(inputs, self._vehicle))
         armed_by_others = stage in seq.BEFORE_ARMING and seq.is_armed(inputs.status)
         if armed_by_others:
@@ -224,22 +217,17 @@ class FlightCore:
             return
         log, flying = self._log, self._state.stage is _PLAN
         # The observer's force contains the tether's pull: subtracted, it would hide the pull.
-        contact = self._state.contact
-        touching = contact is not None and contact.touches > 0
+        expected = self._state.expected
+        into = expected.into_world
         if log is None or not flying:
             tool_n = None
-        elif touching and self._observes:
-            assert contact is not None
-            nx, ny, nz = contact.direction_world
-            tool_n = (-contact.force_n * nx, -contact.force_n * ny, -contact.force_n * nz)
+        elif into is not None and expected.touches and self._observes:
+            nx, ny, nz = into
+            tool_n = (-expected.force_n * nx, -expected.force_n * ny, -expected.force_n * nz)
         else:
-            tool_n = log.force_measured_world_n if touching or self._observes else log.force_ext_world_n
-        if tool_n is not None and contact is not None and contact.mode is _SLIDE:
-            segment = self._state.contact_segment
-            assert segment is not None
-            phase = self._parameters.config.mission.phases[segment.index]
-            assert isinstance(phase, Slide)
-            tool_n = within_friction(contact, phase, tool_n)
+            tool_n = log.force_measured_world_n if expected.touches or self._observes else log.force_ext_world_n
+        if tool_n is not None and into is not None and expected.friction_max_n is not None:
+            tool_n = within_friction(into, expected.friction_max_n, tool_n)
         self._situation.tether = state = watch.update(
             i.t_s,
             v.position_world_m,
@@ -281,11 +269,11 @@ class FlightCore:
         if course is None or not (stage is _PLAN or stage is _SPOOL or stage is _TOUCHDOWN):
             return None, self._without_reference(stage, dt_s, i)
         reference = course.plan.reference(0.0) if stage is _SPOOL else course.reference(i.t_s)
-        contact = state.contact
-        self._control.near_surface = contact is not None
-        self._control.press_direction = contact.direction_world if contact is not None and contact.touches else None
-        if contact is not None:
-            reference = along(reference, contact)
+        expected, engaged = state.expected, state.engaged
+        self._control.near_surface = expected.into_world is not None
+        self._control.press_direction = expected.into_world if expected.touches else None
+        if state.own is not None and engaged is not None:
+            reference = self._parameters.phases[engaged.index].reference(reference, state.own)
         if stage is _PLAN:
             governed = self._governor.constrain(dt_s, reference, self._situation.tether)
             reference, self._limited_by = governed.reference, governed.limited_by
@@ -303,7 +291,7 @@ class FlightCore:
             return Tuning.FREEZE
         if kind is PhaseKind.LANDING:
             return Tuning.UNDO
-        disturbed = state.contact is not None or self._limited_by or not self._monitors.mocap_trusted
+        disturbed = state.expected.into_world is not None or self._limited_by or not self._monitors.mocap_trusted
         stale = t_s - self._pose_s > _POSE_AGE_MAX_S
         return Tuning.FREEZE if disturbed or stale else Tuning.RUN
 
@@ -324,7 +312,7 @@ class FlightCore:
 
     def _is_tool_a_bumper(self, i: Inputs) -> bool:
         """Return whether the tool may touch a surface and does not touch the floor before the landing gear."""
-        if self._state.contact is None or i.arm is None:
+        if self._state.expected.into_world is None or i.arm is None:
             return False
         z_m = self._parameters.manipulator.net_body_m(i.arm.angle_rad)[2]
         return z_m - self._vehicle.tip_radius_m > -self._vehicle.airframe.ground_clearance_m
@@ -339,3 +327,18 @@ class FlightCore:
         elif self._control.payload_left(t_s):
             self._situation.caught = False
             events.append(event_of(notices.PAYLOAD_LEFT, t_s, "the payload has left the net"))
+
+
+def force_on_tool_n(log: ControlLog) -> Vec3:
+    """Return the force on the tool that a tick of the control law measured or, without a force sensor, observed."""
+    return log.force_ext_world_n if log.force_observed_world_n is None else log.force_observed_world_n
+
+
+def within_friction(into_world: Vec3, most_n: float, force_world_n: Vec3) -> Vec3:
+    """Return a measured force whose part along the surface is limited to the largest friction: what exceeds it is cross-talk."""
+    x, y, z = across(force_world_n, into_world)
+    size_n = math.hypot(x, y, z)
+    if size_n <= most_n:
+        return force_world_n
+    k, (fx, fy, fz) = 1.0 - most_n / size_n, force_world_n
+    return (fx - k * x, fy - k * y, fz - k * z)

@@ -6,6 +6,7 @@ import math
 from enum import Enum
 
 from companion.mission.active_plan import Course
+from companion.mission.air import NOTHING, Expectation
 from companion.mission.plan import Plan
 from companion.mission.segments import Segment
 from companion.mission.settled import SettledEstimate
@@ -14,14 +15,9 @@ from companion.model.codec import Record
 from companion.model.flight_stage import Stage
 from companion.model.types import (
     AutopilotRequest,
-    ContactState,
     Event,
-    Inputs,
     Outcome,
     PhaseKind,
-    Reference,
-    TetherState,
-    Vec3,
 )
 from companion.safety.autopilot_landing import AutopilotLanding
 from companion.safety.rotor_stop import RotorStop
@@ -78,11 +74,14 @@ class FlightState(Record, frozen=True):
     """The landing by PX4 needs level setpoints with zero thrust."""
     waiting: Waiting = Waiting()
     landing: AutopilotLanding | None = None
-    contact: ContactState | None = None
-    contact_segment: Segment | None = None
-    """Segment of the plan that the contact belongs to."""
-    contact_over: bool = False
-    """Whether the contact of these phases has ended: what is left of them is skipped."""
+    own: Record | None = None
+    """State of the phase that is flown, if it acts and has begun."""
+    engaged: Segment | None = None
+    """Segment of the plan that this state belongs to."""
+    skips: bool = False
+    """Whether that state has ended early: phases that go on with it are skipped."""
+    expected: Expectation = NOTHING
+    """What that state expects of the flight."""
 
     @property
     def pilot_flies(self) -> bool:
@@ -120,35 +119,6 @@ class FlightState(Record, frozen=True):
         if not self.aborting and elapsed_s < seq.SPOOL_TO_FULL_S:
             return seq.SPOOL_SHARE + (1.0 - seq.SPOOL_SHARE) * elapsed_s / seq.SPOOL_TO_FULL_S
         return self.touchdown.relief
-
-
-class Observation(Record, frozen=True):
-    """Inputs to a transition other than the state and the events."""
-
-    inputs: Inputs
-    airborne: bool
-    """The rotors may be lifting the vehicle, or PX4 was found armed and flying."""
-    armed_by_others: bool
-    """PX4 is armed although the companion has not requested it."""
-    standing: str | None
-    """Message of the active rule that still requires a hold and therefore forbids resuming; None if there is none."""
-    reference: Reference | None
-    """Reference that the controller followed in the last tick; None before its first tick."""
-    tether: TetherState | None
-    thrust_share: float
-    """Thrust of the last command divided by hover thrust."""
-    pose_s: float
-    """Stamp of the newest trusted pose before this tick; -inf before the first."""
-    dt_s: float
-    """Time since the previous tick."""
-    force_world_n: Vec3 | None
-    """Force on the tool in the last tick, world frame; None if the law did not run."""
-    disturbance_world_n: Vec3 | None
-    """Force on the vehicle that its motion shows, world frame; None on the ground, and if it is the force on the tool as well."""
-    position_error_m: Vec3
-    """Position minus reference in the last tick, world frame; 0 if the law did not run."""
-    yaw_error_rad: float
-    """Yaw minus reference in the last tick; 0 if the law did not run."""
 
 
 class Request(Record, frozen=True):

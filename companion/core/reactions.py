@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from companion.core.contact import leave
+from companion.core.phase_tick import leave
 from companion.core.transition import Transition
-from companion.mission.contact import before_approach_m
 from companion.mission.plan import landing_from
 from companion.mission.retract import inward_only, retract_from
 from companion.model import flight_stage as seq
@@ -140,17 +139,20 @@ def _retract(t: Transition) -> None:
 
 def _faces_the_anchor(t: Transition) -> bool:
     """Return whether the way to the anchor leads towards the surface that the tool may touch."""
-    now, contact, tether = t.o.reference, t.state.contact, t.parameters.vehicle.tether
-    if now is None or contact is None or tether is None:
+    now, into, tether = t.o.reference, t.state.expected.into_world, t.parameters.vehicle.tether
+    if now is None or into is None or tether is None:
         return False
-    (nx, ny, _), (x, y, _), (ax, ay, _) = contact.direction_world, now.position_world_m, tether.anchor_world_m
+    (nx, ny, _), (x, y, _), (ax, ay, _) = into, now.position_world_m, tether.anchor_world_m
     return nx * (ax - x) + ny * (ay - y) > 0.0
 
 
 def _before_surface_m(t: Transition, now: Reference) -> Vec3 | None:
     """Return the position in front of the surface that the tool may touch; None if it touches none."""
-    contact = t.state.contact
-    return None if contact is None else before_approach_m(now, contact)
+    back_m = t.state.expected.back_m
+    if back_m is None:
+        return None
+    (x, y, z), (bx, by, bz) = now.position_world_m, back_m
+    return (x + bx, y + by, z + bz)
 
 
 def _land_instead(t: Transition, text: str) -> None:

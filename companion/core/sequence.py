@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from companion.config.vehicle import Vehicle
-from companion.core.contact import advance_contact
 from companion.core.flight_state import Tare
+from companion.core.phase_tick import advance_phase
 from companion.core.transition import Transition
 from companion.mission.active_plan import Course
 from companion.mission.check import check_start
@@ -226,8 +226,8 @@ def _spool(t: Transition, elapsed_s: float) -> AutopilotRequest:
 
 
 def _fly(t: Transition, _: float) -> AutopilotRequest:
-    if t.parameters.touches and not t.state.aborting:
-        advance_contact(t)
+    if t.parameters.acts and not t.state.aborting:
+        advance_phase(t)
     i, course, vehicle = t.i, t.state.course, t.i.vehicle
     assert course is not None
     plan_s = course.pace(i.t_s)[0]

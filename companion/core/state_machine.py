@@ -6,10 +6,11 @@ sequence of stages (`companion.core.sequence`, `companion.model.flight_stage`).
 
 from __future__ import annotations
 
-from companion.core.flight_state import FlightState, Observation, Request
+from companion.core.flight_state import FlightState, Request
 from companion.core.reactions import supervise
 from companion.core.sequence import advance
 from companion.core.transition import Parameters, Transition
+from companion.mission.air import Observation
 from companion.model.types import Event
 from companion.safety.rules import OPERATOR_START
 

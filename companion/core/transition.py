@@ -9,12 +9,13 @@ from typing import Any
 from msgspec.structs import replace
 
 from companion.config.loader import FlightConfig
-from companion.config.mission import Approach, Probe
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.control.manipulator import Manipulator
-from companion.core.flight_state import FlightState, Observation, Tare
+from companion.core.flight_state import FlightState, Tare
 from companion.mission.active_plan import Course
+from companion.mission.air import NOTHING, Observation
+from companion.mission.phase import Phase, phases_of
 from companion.mission.plan import Plan
 from companion.model import flight_stage as seq
 from companion.model.flight_stage import Stage
@@ -42,13 +43,14 @@ class Parameters:
     waits_for_start: bool
     """Whether the take-off waits for the operator's start command."""
     manipulator: Manipulator
-    touches: bool
-    """Whether the mission has contact phases."""
+    phases: tuple[Phase, ...]
+    acts: bool
+    """Whether one of the phases has a state of its own in the air."""
 
     @classmethod
     def of(cls, config: FlightConfig) -> Parameters:
         """Return the constants of an effective configuration."""
-        vehicle, safety = config.vehicle, config.vehicle.safety
+        vehicle, safety, phases = config.vehicle, config.vehicle.safety, phases_of(config.mission)
         return cls(
             config=config,
             vehicle=vehicle,
@@ -58,7 +60,8 @@ class Parameters:
             times=LadderTimes.of(safety),
             waits_for_start=config.mission.start.takeoff == "by_operator",
             manipulator=manipulator_of(vehicle),
-            touches=any(isinstance(phase, Approach | Probe) for phase in config.mission.phases),
+            phases=phases,
+            acts=any(phase.acts for phase in phases),
         )
 
     def initial_state(self) -> FlightState:
@@ -157,4 +160,4 @@ class Transition:
     def leave_mission(self, plan: Plan) -> None:
         """Replace the mission with this plan."""
         self.finish(Outcome.ABORTED)
-        self.change(course=Course(plan, self.i.t_s), aborting=True, contact=None)
+        self.change(course=Course(plan, self.i.t_s), aborting=True, own=None, expected=NOTHING)

@@ -6,7 +6,6 @@ import msgspec
 
 from companion.guardian.client import GuardianClient
 from companion.guardian.heartbeat import Heartbeat
-from companion.mission.contact import way_back_m
 from companion.model.best_pose import best_pose, pose_used_s
 from companion.model.flight_stage import PILOT_FLIES
 from companion.model.types import (
@@ -21,6 +20,7 @@ from companion.model.types import (
     PhaseKind,
     Vec3,
 )
+from companion.phases.contact.force import way_back_m
 from companion.safety.rules import MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS, PILOT_TOOK_OVER
 
 _IN_THE_AIR = frozenset({PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING})

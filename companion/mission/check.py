@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from companion.config.mission import ArmMove, Mission
+from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
-from companion.mission.contact_check import contact_problems
 from companion.mission.minsnap import Progress
+from companion.mission.phase import Checking, phases_of
 from companion.mission.plan import Plan
 from companion.mission.sample_check import CATCH_NEAR_M, STOP, SampleCheck
 from companion.mission.segments import Segment
@@ -24,7 +24,6 @@ from companion.safety.governor import SafeSet
 
 SAMPLE_S = 0.02
 SAMPLES_PER_SEGMENT_MAX = 3000
-TAKEOFF_RISE_MIN_M = 0.2
 SPEED_SHARE_MAX = 0.8
 """Largest planned speed as a fraction of the speed at which the flight is stopped. The rest is a margin for a caught payload, gusts
 and tracking errors.
@@ -65,9 +64,11 @@ def check_mission(
         return problems
     plan = Plan.build(mission, vehicle, position, yaw_rad, start_arm_rad, progress)
     problems = check_start(mission, vehicle, position, yaw_rad, start_arm_rad)
-    problems += [*_speed(mission, vehicle), *_whole(mission, vehicle, plan, phase_origins)]
-    for segment, text in contact_problems(mission, vehicle, plan):
-        problems.append(f"{_place(mission, segment, phase_origins)} {text}")
+    problems += [
+        *_speed(mission, vehicle),
+        *_of_phases(mission, vehicle, plan, phase_origins),
+        *_catch(mission, vehicle, plan, phase_origins),
+    ]
     samples = SampleCheck(mission, vehicle)
     told: dict[str, str] = {}
     where: dict[str, set[int]] = {}
@@ -192,25 +193,20 @@ def _speed(mission: Mission, vehicle: Vehicle) -> Iterator[str]:
         )
 
 
-def _whole(mission: Mission, vehicle: Vehicle, plan: Plan, phase_origins: Sequence[str]) -> list[str]:
-    """Check properties of the whole plan that no single sample shows."""
+def _of_phases(mission: Mission, vehicle: Vehicle, plan: Plan, phase_origins: Sequence[str]) -> Iterator[str]:
+    """Check what each type of phase needs."""
+    phases = phases_of(mission)
+    for segment in plan.segments:
+        if segment.repetition < 2:
+            begin, end = plan.reference(segment.start_s), plan.reference(segment.end_s)
+            c = Checking(mission, vehicle, begin, end, phases[: segment.index])
+            for text in phases[segment.index].problems(c):
+                yield f"{_place(mission, segment, phase_origins)} {text}"
+
+
+def _catch(mission: Mission, vehicle: Vehicle, plan: Plan, phase_origins: Sequence[str]) -> list[str]:
+    """Check that the plan passes where the payload is expected, with a net."""
     problems: list[str] = []
-    takeoff = plan.segments[0]
-    top_m = plan.reference(takeoff.end_s).position_world_m[2]
-    clearance_m = vehicle.airframe.ground_clearance_m
-    if top_m < clearance_m + TAKEOFF_RISE_MIN_M:
-        problems.append(
-            f"{_place(mission, takeoff, phase_origins)} ends at {top_m:g} m, but the body's origin is "
-            f"{clearance_m:g} m above the floor when the vehicle is on the ground; "
-            f"set height_m to {clearance_m + TAKEOFF_RISE_MIN_M:g} or more"
-        )
-    if not vehicle.arm.joints:
-        for segment in plan.segments:
-            if segment.repetition < 2 and isinstance(mission.phases[segment.index], ArmMove):
-                problems.append(
-                    f"{_place(mission, segment, phase_origins)} moves the arm, but vehicle '{vehicle.name}' has no arm; "
-                    "add arm to the vehicle file, or remove the phase from the mission"
-                )
     if mission.catch is not None:
         flown = [segment for segment in plan.segments if segment.kind is PhaseKind.FLIGHT]
         near_m, catching = min(
@@ -220,7 +216,7 @@ def _whole(mission: Mission, vehicle: Vehicle, plan: Plan, phase_origins: Sequen
                 for t_s in _samples(segment)
             ),
             key=lambda found: found[0],
-            default=(math.inf, takeoff),
+            default=(math.inf, plan.segments[0]),
         )
         if not vehicle.has_net:
             instead = f", but a {vehicle.tool.kind}" if vehicle.tool is not None else ""

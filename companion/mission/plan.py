@@ -9,14 +9,14 @@ import math
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 
-from companion.config.mission import Approach, ArmMove, Detach, Land, Line, Mission, Path, Press, Probe, Slide, Takeoff
+from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
 from companion.mission.arm_motion import ArmLimits
-from companion.mission.contact import PRESS_RAMP_S, RELEASE_S, approach_s, travel_s
-from companion.mission.minsnap import Progress, VehicleLimits, least_line_s
+from companion.mission.minsnap import Progress, VehicleLimits
+from companion.mission.phase import Planning, phases_of
 from companion.mission.plan_builder import PlanBuilder
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED, Track, reference_at
-from companion.mission.segments import Repeats, Segment, counted, flown_phases, phase_name, repeats_of
+from companion.mission.segments import Repeats, Segment, counted, flown_phases, repeats_of
 from companion.model.types import Joints, PhaseKind, Reference, Vec3
 
 BELOW_GROUND_M = 0.4
@@ -73,60 +73,26 @@ class Plan:
             progress: called with the completed fraction of the planning, 0 to 1, while paths are solved.
         """
         start = mission.start
-        arm_start = _radians(start.arm_deg)
-        yaw_start = math.radians(start.yaw_deg)
         builder = PlanBuilder(
             start_position_world_m or (*start.position_m, vehicle.airframe.ground_clearance_m),
-            yaw_start if start_yaw_rad is None else start_yaw_rad,
-            start_arm_rad or arm_start,
+            math.radians(start.yaw_deg) if start_yaw_rad is None else start_yaw_rad,
+            start_arm_rad or tuple(map(math.radians, start.arm_deg)),
         )
         limits, arm_limits = _vehicle_limits(mission), _arm_limits(mission, vehicle)
-        flown = flown_phases(mission)
-        approach: Approach | None = None
-        paths, solved = sum(isinstance(mission.phases[index], Path) for index, _ in flown), 0
+        phases, flown = phases_of(mission), flown_phases(mission)
+        slow, solved = sum(phases[index].slow_to_plan for index, _ in flown), 0
         for index, repetition in flown:
-            phase = mission.phases[index]
-            start_s = builder.t_s
-            kind = PhaseKind.FLIGHT
-            if isinstance(phase, Takeoff):
-                kind = PhaseKind.TAKEOFF
-                x_m, y_m = start.position_m
-                builder.move_vehicle((x_m, y_m, phase.height_m), phase.duration_s)
-                builder.turn(yaw_start, phase.duration_s)
-                builder.move_arm(arm_start, 0.0, phase.duration_s, arm_limits)
-                builder.t_s += phase.duration_s
-            elif isinstance(phase, Line):
-                builder.t_s += _line(builder, phase, limits, arm_limits)
-            elif isinstance(phase, Path):
-                builder.t_s += builder.follow(phase.through_m, phase.duration_s, limits, _part(progress, solved, paths))
-                solved += 1
-            elif isinstance(phase, ArmMove):
-                to_rad = _radians(phase.arm_deg)
-                duration_s = phase.duration_s or builder.least_arm_s(to_rad, arm_limits)
-                builder.move_arm(to_rad, 0.0, duration_s, arm_limits)
-                builder.t_s += duration_s
-            elif isinstance(phase, Approach):
-                approach = phase
-                builder.t_s += approach_s(approach)
-            elif isinstance(phase, Probe):
-                builder.t_s += approach_s(phase)
-            elif isinstance(phase, Press):
-                builder.t_s += PRESS_RAMP_S + phase.duration_s
-            elif isinstance(phase, Slide):
-                builder.t_s += PRESS_RAMP_S + travel_s(math.hypot(*phase.by_m), phase.speed_m_s)
-            elif isinstance(phase, Detach):
-                assert approach is not None, "the mission file is checked: an approach comes first"
-                builder.t_s += RELEASE_S + travel_s(approach.distance_max_m, phase.speed_m_s)
-            elif isinstance(phase, Land):
-                kind = PhaseKind.LANDING
-                builder.t_s = builder.descend(phase.speed_m_s, vehicle.airframe.ground_clearance_m - BELOW_GROUND_M)
-            else:
-                builder.t_s += phase.duration_s
-            name = counted(phase_name(phase), repetition, mission.repeat)
+            phase, start_s = phases[index], builder.t_s
+            part = _part(progress, solved, slow) if phase.slow_to_plan else None
+            phase.plan(Planning(builder, mission, vehicle, limits, arm_limits, phases[:index], part))
+            solved += phase.slow_to_plan
+            name = counted(phase.title, repetition, mission.repeat)
             builder.segments.append(
-                Segment(name=name, kind=kind, start_s=start_s, end_s=builder.t_s, index=index, repetition=repetition)
+                Segment(
+                    name=name, kind=phase.kind, start_s=start_s, end_s=builder.t_s, index=index, repetition=repetition
+                )
             )
-        repeats = repeats_of(mission, builder.segments, tuple(map(phase_name, mission.phases[1:-1])))
+        repeats = repeats_of(mission, builder.segments, tuple([phase.title for phase in phases[1:-1]]))
         return cls.of(mission.name, builder, repeats)
 
     @classmethod
@@ -258,22 +224,6 @@ def fold_time_s(arm_rad: Joints, arm_fold_rad: Joints) -> float:
     return max(FOLD_MIN_S, REST_TO_REST_PEAK_SPEED * farthest_rad / FOLD_SPEED_RAD_S)
 
 
-def _line(builder: PlanBuilder, phase: Line, limits: VehicleLimits, arm_limits: ArmLimits) -> float:
-    """Append a line and the arm's simultaneous move; return the duration, s."""
-    arm_rad = None if phase.arm_deg is None else _radians(phase.arm_deg)
-    delay_s = phase.arm_delay_s or 0.0
-    duration_s = phase.duration_s
-    if duration_s is None:
-        duration_s = least_line_s(builder.line_m(phase.to_m), limits)
-        if arm_rad is not None:
-            arm_s = phase.arm_duration_s or builder.least_arm_s(arm_rad, arm_limits)
-            duration_s = max(duration_s, delay_s + arm_s)
-    builder.move_vehicle(phase.to_m, duration_s)
-    if arm_rad is not None:
-        builder.move_arm(arm_rad, delay_s, phase.arm_duration_s or duration_s - delay_s, arm_limits)
-    return duration_s
-
-
 def _vehicle_limits(mission: Mission) -> VehicleLimits:
     limits = mission.limits
     return VehicleLimits(limits.speed_max_m_s, limits.acceleration_max_m_s2, limits.jerk_max_m_s3)
@@ -291,9 +241,5 @@ def _arm_limits(mission: Mission, vehicle: Vehicle) -> ArmLimits:
 
 
 def _part(progress: Progress | None, done: int, count: int) -> Progress | None:
-    """Return a progress callback that converts the progress of one path into the progress of all paths."""
+    """Return a progress callback that converts the progress of one slow phase into the progress of all of them."""
     return None if progress is None else lambda share: progress((done + share) / count)
-
-
-def _radians(angle_deg: Joints) -> Joints:
-    return tuple(map(math.radians, angle_deg))

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from companion.config.mission import ArmMove, Line, Mission, Path, Phase, Press, Slide
+from companion.config.mission import Mission
 from companion.model.types import PhaseKind
 
 
@@ -90,23 +90,3 @@ def repeats_of(mission: Mission, segments: Sequence[Segment], names: tuple[str, 
 def counted(name: str, repetition: int, count: int) -> str:
     """Return the name of a phase for display."""
     return f"{name} ({repetition} of {count})" if repetition else name
-
-
-_PLAIN_NAMES = {"takeoff": "take-off"}
-
-
-def phase_name(phase: Phase) -> str:
-    """Return the name of a phase: the configured one, or a description."""
-    if phase.name:
-        return phase.name
-    if isinstance(phase, Line):
-        return f"line to ({', '.join(f'{value:g}' for value in phase.to_m)}) m"
-    if isinstance(phase, Path):
-        return f"path to ({', '.join(f'{value:g}' for value in phase.through_m[-1])}) m"
-    if isinstance(phase, ArmMove):
-        return f"arm to ({', '.join(f'{value:g}' for value in phase.arm_deg)}) deg"
-    if isinstance(phase, Press):
-        return f"press with {phase.force_n:g} N"
-    if isinstance(phase, Slide):
-        return f"slide by ({', '.join(f'{value:g}' for value in phase.by_m)}) m with {phase.force_n:g} N"
-    return _PLAIN_NAMES.get(phase.type, phase.type)

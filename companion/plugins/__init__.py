@@ -20,11 +20,13 @@ CONTROL_LAWS = "companion.control_laws"
 MOCAP_SYSTEMS = "companion.mocap_systems"
 FORCE_SENSORS = "companion.force_sensors"
 ARMS = "companion.arms"
+PHASES = "companion.phases"
 KINDS = {
     CONTROL_LAWS: "control law",
     MOCAP_SYSTEMS: "motion-capture system",
     FORCE_SENSORS: "force sensor",
     ARMS: "arm",
+    PHASES: "phase",
 }
 """Kind of part, in words, that each group of entry points announces."""
 _SOURCE_TREE = Path(__file__).parents[2]

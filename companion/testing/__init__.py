@@ -25,6 +25,7 @@ from companion.model.types import Joints, Reference, Vec3
 from companion.testing.devices import check_arm as check_arm
 from companion.testing.devices import check_force_sensor as check_force_sensor
 from companion.testing.mocap import check_mocap as check_mocap
+from companion.testing.phases import check_phases as check_phases
 
 RANDOM_TICKS = 300
 THRUST_TOLERANCE = 0.03

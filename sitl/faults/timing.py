@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from companion.config.mission import Press, Slide
+from companion.mission.phase import phases_of
 from companion.mission.plan import Plan
 from companion.mission.segments import Segment
 from companion.model.flight_stage import SPOOL_S
@@ -64,17 +64,16 @@ def _timed(fault: Fault, config: SitlConfig) -> Fault:
 
 def _into_press_s(phase: FlightPhase, config: SitlConfig) -> float:
     """Return the time since press or slide began: in its middle, or just after it; 0 for the first touch, which may come earlier."""
-    phases, kinds = config.mission.phases, {"press": (Press,), "slide": (Slide,)}.get(phase, (Press, Slide))
+    phases, before_or_after = phases_of(config.mission), {"touch", "detach"}
     pressing_s = [
         segment.end_s - segment.start_s
         for segment in Plan.build(config.mission, config.vehicle).segments
-        if segment.index >= 0 and isinstance(phases[segment.index], kinds)
+        if phases[segment.index].presses and phase in before_or_after | {phases[segment.index].type}
     ]
     if not pressing_s:
         text = f"world.faults: mission '{config.mission.name}' has no phase '{phase}'; give t_s instead of the phase"
         raise FaultError(text)
-    middle_s = _MIDDLE * pressing_s[0]
-    return {"touch": 0.0, "press": middle_s, "slide": middle_s}.get(phase, pressing_s[0] + INTO_DETACH_S)
+    return {"touch": 0.0, "detach": pressing_s[0] + INTO_DETACH_S}.get(phase, _MIDDLE * pressing_s[0])
 
 
 def _plan_time_s(phase: FlightPhase, config: SitlConfig) -> float:

@@ -11,11 +11,12 @@ from msgspec.structs import replace
 from companion.config.loader import load_flight
 from companion.core.flight_state import FlightState, Request
 from companion.core.transition import Parameters
-from companion.mission import contact as c
 from companion.mission.active_plan import Course
 from companion.mission.plan import Plan
 from companion.model.flight_stage import Stage
 from companion.model.types import ContactMode, ContactState, Inputs, Outcome, TouchedPoint, Vec3
+from companion.phases.contact import force as c
+from companion.phases.contact.base import opening_of
 from tests.core.test_reactions import ids, tick
 from tests.safety.healthy import healthy, put
 
@@ -28,7 +29,7 @@ APPROACH, PRESS, DETACH, AFTER = (
 NOW_S, DT_S, TOUCH_N = healthy().t_s, 0.005, 1.0
 INTO: Vec3 = (1.0, 0.0, 0.0)
 """Phases of the mission: an approach along +x of at most 0.35 m, touch at 1 N, a press with 5 N, a detach with 0.1 m/s."""
-assert CONFIG.mission.phases[3].touch_n == TOUCH_N  # type: ignore[union-attr]
+assert opening_of(P.phases[:4]).touch_n == TOUCH_N
 
 
 def contact(mode: ContactMode, since_s: float = 0.0, **fields: Any) -> ContactState:
@@ -44,8 +45,8 @@ def at_plan(plan_s: float, now: ContactState | None, segment: Any = APPROACH, **
         plan=PLAN,
         course=Course(PLAN, NOW_S - plan_s),
         mission_start_s=NOW_S - plan_s,
-        contact=now,
-        contact_segment=None if now is None else segment,
+        own=now,
+        engaged=None if now is None else segment,
     )
     return replace(state, **fields)
 
@@ -65,7 +66,7 @@ def pressing(**fields: Any) -> FlightState:
 
 
 def mode_of(state: FlightState) -> ContactMode | None:
-    return None if state.contact is None else state.contact.mode
+    return None if state.expected.contact is None else state.expected.contact.mode
 
 
 def plan_s(state: FlightState) -> float:
@@ -75,13 +76,13 @@ def plan_s(state: FlightState) -> float:
 
 def test_a_contact_begins_with_its_approach_and_the_rest_of_a_failed_one_is_skipped() -> None:
     state, _ = step(at_plan(IN_APPROACH, None))
-    assert mode_of(state) is ContactMode.WEIGH and state.contact is not None
-    assert state.contact.direction_world == INTO
+    assert mode_of(state) is ContactMode.WEIGH and state.expected.contact is not None
+    assert state.expected.contact.direction_world == INTO
     for inside, segment in ((IN_APPROACH, APPROACH), (IN_PRESS, PRESS), (DETACH.start_s + 0.01, DETACH)):
-        state, _ = step(at_plan(inside, None, contact_over=True))
-        assert state.contact is None and plan_s(state) == pytest.approx(segment.end_s)
-        assert state.contact_over
-    assert not step(at_plan(AFTER.start_s + 0.1, None, contact_over=True))[0].contact_over
+        state, _ = step(at_plan(inside, None, skips=True))
+        assert state.expected.contact is None and plan_s(state) == pytest.approx(segment.end_s)
+        assert state.skips
+    assert not step(at_plan(AFTER.start_s + 0.1, None, skips=True))[0].skips
 
 
 @pytest.mark.parametrize(
@@ -101,13 +102,13 @@ def test_the_plan_waits_before_the_end_of_the_approach() -> None:
 def test_a_force_that_lasts_for_15_ms_is_a_touch_and_the_press_begins() -> None:
     state = at_plan(IN_APPROACH, contact(ContactMode.APPROACH, 5.0, offset_m=0.11, rate_m_s=0.03))
     for expected in (ContactMode.APPROACH, ContactMode.APPROACH, ContactMode.PRESS):
-        before = state.contact
+        before = state.expected.contact
         state, request = step(state, 1.1)
         assert mode_of(state) is expected
     assert ids(request) == ["touched"]
-    assert state.contact is not None and before is not None
-    assert (state.contact.touches, state.contact.wanted_n) == (1, TOUCH_N)
-    assert state.contact.touched_offset_m == state.contact.offset_m > before.offset_m
+    assert state.expected.contact is not None and before is not None
+    assert (state.expected.contact.touches, state.expected.contact.wanted_n) == (1, TOUCH_N)
+    assert state.expected.contact.touched_offset_m == state.expected.contact.offset_m > before.offset_m
     assert plan_s(state) == pytest.approx(APPROACH.end_s)
     short = at_plan(IN_APPROACH, contact(ContactMode.APPROACH, 5.0, beyond_s=0.011))
     assert mode_of(step(short, 0.9)[0]) is ContactMode.APPROACH, "below the threshold"
@@ -166,7 +167,9 @@ def test_what_contradicts_the_contact_leads_away_from_the_surface(
     if event is None:
         assert mode_of(state) is mode and state.outcome is None
     else:
-        assert mode_of(state) is ContactMode.LEAVE and state.contact is not None and state.contact.failed
+        assert (
+            mode_of(state) is ContactMode.LEAVE and state.expected.contact is not None and state.expected.contact.failed
+        )
         assert state.outcome is Outcome.ABORTED
         assert state.course is not None and state.course.held
 
@@ -198,25 +201,25 @@ def test_a_press_without_contact_for_a_second_waits_half_a_second_and_approaches
         slid = replace(PRESSING.shift, to_m=(0.0, 0.0, -0.5), length_m=0.5, way_m=0.1)
         lost = at_plan(IN_PRESS, contact(ContactMode.LOST, since_s, touches=1, push_n=3.0, shift=slid), PRESS)
         state, _ = step(lost)
-        assert mode_of(state) is mode and state.contact is not None
-        assert state.contact.push_n == pytest.approx(3.0 - 15.0 * DT_S)
-        assert state.contact.touches == 1
-        assert state.contact.shift.rate_m_s == 0.0
+        assert mode_of(state) is mode and state.expected.contact is not None
+        assert state.expected.contact.push_n == pytest.approx(3.0 - 15.0 * DT_S)
+        assert state.expected.contact.touches == 1
+        assert state.expected.contact.shift.rate_m_s == 0.0
 
 
 def test_a_detach_releases_the_force_first_then_moves_back_and_ends_with_its_phase() -> None:
     state, _ = step(at_plan(DETACH.start_s + 0.1, replace(PRESSING, push_n=4.0), PRESS), 5.0)
-    assert mode_of(state) is ContactMode.LEAVE and state.contact_segment == DETACH
+    assert mode_of(state) is ContactMode.LEAVE and state.engaged == DETACH
     state, _ = step(state, 5.0)
-    assert state.contact is not None
-    assert state.contact.push_n == pytest.approx(4.0 - 15.0 * DT_S)
-    assert state.contact.offset_m == pytest.approx(0.2)
+    assert state.expected.contact is not None
+    assert state.expected.contact.push_n == pytest.approx(4.0 - 15.0 * DT_S)
+    assert state.expected.contact.offset_m == pytest.approx(0.2)
     back = at_plan(DETACH.start_s + 0.1, contact(ContactMode.LEAVE, 1.0, offset_m=0.1), DETACH)
     state, _ = step(back)
-    assert state.contact is not None and 0.0 < state.contact.offset_m < 0.1
+    assert state.expected.contact is not None and 0.0 < state.expected.contact.offset_m < 0.1
     home = at_plan(DETACH.start_s + 0.1, contact(ContactMode.LEAVE, 1.0, touches=2), DETACH)
     state, _ = step(home)  # nothing was shifted: RETURN ends at once
-    assert state.contact is None and not state.contact_over
+    assert state.expected.contact is None and not state.skips
     assert plan_s(state) == pytest.approx(DETACH.end_s)
 
 
@@ -225,7 +228,7 @@ def test_after_a_failed_contact_the_rest_is_skipped_and_the_plan_goes_on_where_i
     assert failed.course is not None
     held = replace(failed, course=failed.course.hold(NOW_S - 5.0))
     state, _ = step(held)
-    assert state.contact is None and state.contact_over
+    assert state.expected.contact is None and state.skips
     assert state.course is not None and not state.course.held
     assert plan_s(state) < PRESS.end_s - 1.0
 
@@ -253,10 +256,10 @@ FACING = Parameters.of(load_flight("configs/missions/press.yaml"))
 def test_the_points_to_touch_lie_right_and_up_of_the_direction() -> None:
     begun = c.begun(NOW_S - 1.1, (0.48, 0.36, -0.8), (0.0, 0.0, 0.0))
     state, _ = tick(at_plan(IN_APPROACH, begun), parameters=FACING, force_world_n=(0.0, 0.0, 0.0), dt_s=DT_S)
-    assert state.contact is not None and state.contact.mode is ContactMode.SHIFT
+    assert state.expected.contact is not None and state.expected.contact.mode is ContactMode.SHIFT
     right, up, low_m = (0.6, -0.8, 0.0), (0.64, 0.48, 0.6), 0.2 / math.sqrt(12.0)
     first = tuple(-0.1 * r - low_m * u for r, u in zip(right, up, strict=True))
-    assert state.contact.shift.to_m == pytest.approx(first)
+    assert state.expected.contact.shift.to_m == pytest.approx(first)
 
 
 @pytest.mark.parametrize(
@@ -268,9 +271,9 @@ def test_a_point_is_averaged_for_half_a_second_after_it_has_settled_for_0_4_s(
 ) -> None:
     held = contact(ContactMode.PRESS, since_s, touches=1, wanted_n=1.0, force_n=force_n, samples=7)
     state, _ = tick(at_plan(IN_APPROACH, held), parameters=FACING, force_world_n=(-force_n, 0.0, 0.0), dt_s=DT_S)
-    assert state.contact is not None
-    assert (state.contact.samples, len(state.contact.points)) == (samples, points)
-    assert state.contact.mode is (ContactMode.BACK if points else ContactMode.PRESS)
+    assert state.expected.contact is not None
+    assert (state.expected.contact.samples, len(state.expected.contact.points)) == (samples, points)
+    assert state.expected.contact.mode is (ContactMode.BACK if points else ContactMode.PRESS)
 
 
 @pytest.mark.parametrize(
@@ -284,10 +287,10 @@ def test_from_a_point_it_moves_back_and_gives_up_if_the_points_lie_on_no_plane(
     points = (TouchedPoint(NOW_S - 1.0, (1.0, 0.0, 1.0), 1.0),) * touched
     back = contact(ContactMode.BACK, 0.5, points=points, offset_m=0.3, touched_offset_m=0.3, push_n=push_n)
     state, request = tick(at_plan(IN_APPROACH, back), parameters=FACING, force_world_n=(0.0, 0.0, 0.0), dt_s=DT_S)
-    assert state.contact is not None and state.contact.mode is mode
+    assert state.expected.contact is not None and state.expected.contact.mode is mode
     assert ids(request) == (["surface_missing"] if touched == 3 else [])
-    assert (state.contact.push_n < push_n) is (push_n > 0.0)
-    assert (state.contact.offset_m < 0.3) is (push_n == 0.0 and touched == 1)
+    assert (state.expected.contact.push_n < push_n) is (push_n > 0.0)
+    assert (state.expected.contact.offset_m < 0.3) is (push_n == 0.0 and touched == 1)
 
 
 def test_the_last_point_completes_the_surface() -> None:
@@ -299,4 +302,4 @@ def test_the_last_point_completes_the_surface() -> None:
             at_plan(IN_APPROACH, replace(held, points=before)), parameters=FACING, force_world_n=(-1.0, 0.0, 0.0),
             dt_s=DT_S,
         )  # fmt: skip
-        assert state.contact is not None and (state.contact.surface is not None) is complete
+        assert state.expected.contact is not None and (state.expected.contact.surface is not None) is complete

@@ -10,11 +10,12 @@ import pytest
 from msgspec.structs import replace
 
 from companion.config.loader import load_flight
-from companion.core.flight_state import FlightState, Observation, Request
+from companion.core.flight_state import FlightState, Request
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters
-from companion.mission import contact
 from companion.mission.active_plan import Course
+from companion.mission.air import Observation
+from companion.mission.phase import phases_of
 from companion.mission.plan import Plan
 from companion.mission.reference import at_rest
 from companion.model.flight_stage import Stage
@@ -30,6 +31,7 @@ from companion.model.types import (
     TetherState,
     Vec3,
 )
+from companion.phases.contact import force
 from companion.safety.autopilot_landing import AutopilotLanding
 from companion.safety.supervisor import SupervisorState
 from tests.safety.healthy import SLOW, healthy, put
@@ -112,8 +114,12 @@ def test_a_landing_with_a_slack_tether_brakes_from_the_present_velocity() -> Non
     assert state.outcome is Outcome.ABORTED
 
 
+CONTACT = phases_of(load_flight("press").mission)[3]
+
+
 def touching(towards: Vec3) -> FlightState:
-    return replace(in_plan(), contact=contact.begun(healthy().t_s, towards, (0.0, 0.0, 0.0)))
+    own = force.begun(healthy().t_s, towards, (0.0, 0.0, 0.0))
+    return replace(in_plan(), own=own, expected=CONTACT.expects(own))
 
 
 @pytest.mark.parametrize(
@@ -131,7 +137,7 @@ def test_no_retract_leads_through_the_surface_between_vehicle_and_anchor(towards
     state, request = after(state, "tether_taut", SafetyAction.RETRACT, tether=PULLS[0])
     assert ("no_room_to_stay" in ids(request)) is not retracts
     assert state.supervisor.action is (SafetyAction.RETRACT if retracts else SafetyAction.LAND)
-    assert state.course is not None and state.aborting and state.contact is None
+    assert state.course is not None and state.aborting and state.expected.contact is None
     last = state.course.plan.reference(state.course.plan.duration_s).position_world_m
     nearer_m = math.dist(HERE[:2], ANCHOR[:2]) - math.dist(last[:2], ANCHOR[:2])
     assert nearer_m > 0.3 if retracts else nearer_m < 0.05

@@ -9,16 +9,17 @@ import pytest
 from msgspec.structs import replace
 
 from companion.config.loader import load_flight
-from companion.config.mission import Slide
-from companion.core import sliding
+from companion.core.flight_core import within_friction
 from companion.core.flight_state import FlightState, Request
 from companion.core.transition import Parameters
-from companion.mission import contact as c
 from companion.mission.active_plan import Course
 from companion.mission.plan import Plan
 from companion.model.flight_stage import Stage
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import ContactMode, ContactState, Inputs, Vec3
+from companion.phases.contact import force as c
+from companion.phases.contact import sliding
+from companion.phases.contact.slide import Slide
 from tests.core.test_reactions import ids, tick
 from tests.safety.healthy import healthy, put
 
@@ -35,7 +36,7 @@ MOST_N = 0.8 * 3.0 + 0.5
 def pressing(**fields: Any) -> ContactState:
     begun = replace(c.begun(NOW_S - 5.0, INTO, (0.0, 0.0, 0.0)), mode=ContactMode.PRESS, touches=1, wanted_n=3.0)
     begun = replace(begun, force_n=3.0)
-    return replace(sliding.begun(begun, PHASE), **fields)
+    return replace(sliding.begun(begun, PHASE.stroke), **fields)
 
 
 SLIDING = pressing(mode=ContactMode.SLIDE)
@@ -60,13 +61,13 @@ def step(
         plan=PLAN,
         course=Course(PLAN, NOW_S - plan_s),
         mission_start_s=NOW_S - plan_s,
-        contact=contact,
-        contact_segment=SLIDE,
+        own=contact,
+        engaged=SLIDE,
     )
     given = {"inputs": seen(off_m, plan_s), "dt_s": DT_S, "force_world_n": (-force_n, 0.0, 0.0), **observed}
     after, request = tick(state, parameters=P, **given)
-    assert after.contact is not None
-    return after.contact, after, request
+    assert after.expected.contact is not None
+    return after.expected.contact, after, request
 
 
 def test_the_way_leads_from_where_the_tip_is_by_that_of_the_mission() -> None:
@@ -79,7 +80,7 @@ def test_a_slanted_way_from_where_the_last_one_ended_is_followed_without_lag_or_
     """On a wall right and up are -y and z: by 0.3 m to the right and 0.4 m down, from (0.01, 0.1, 0.2); half of it is done."""
     from_m = (0.01, 0.1, 0.2)
     moved = replace(SLIDING, shift=replace(SLIDING.shift, from_m=from_m, to_m=from_m, way_m=0.0, length_m=0.0))
-    slanted = sliding.begun(moved, PHASE.model_copy(update={"by_m": (0.3, -0.4)}))
+    slanted = sliding.begun(moved, PHASE.model_copy(update={"by_m": (0.3, -0.4)}).stroke)
     assert sliding.way(slanted) == pytest.approx((0.0, -0.6, -0.8))
     half = replace(slanted, mode=ContactMode.SLIDE, shift=replace(slanted.shift, way_m=0.25, rate_m_s=0.05))
     step_m = 0.05 * DT_S
@@ -162,7 +163,10 @@ def test_after_a_slide_force_and_turn_end_gradually() -> None:
 
 
 def test_a_reading_across_the_tool_counts_up_to_the_largest_friction() -> None:
-    assert sliding.within_friction(SLIDING, PHASE, (-3.0, 2.0, -2.0)) == (-3.0, 2.0, -2.0)
+    assert PHASE.expects(pressing()).friction_max_n is None
+    most_n = PHASE.expects(SLIDING).friction_max_n
+    assert most_n is not None and most_n == pytest.approx(MOST_N)
+    assert within_friction(INTO, most_n, (-3.0, 2.0, -2.0)) == (-3.0, 2.0, -2.0)
     size_n = math.hypot(6.0, 8.0)
-    limited = sliding.within_friction(SLIDING, PHASE, (-3.0, 6.0, -8.0))
+    limited = within_friction(INTO, most_n, (-3.0, 6.0, -8.0))
     assert limited == pytest.approx((-3.0, 6.0 * MOST_N / size_n, -8.0 * MOST_N / size_n))

@@ -15,12 +15,12 @@ from companion.analysis.contact_plots import contact_force
 from companion.control import slide as control
 from companion.control.arm_model import manipulator_of
 from companion.core.flight_core import FlightCore
-from companion.core.sliding import STEER_MAX_RAD, UNSEEN_MAX_N
 from companion.mission.check import check_mission
-from companion.mission.contact import touches
 from companion.mission.reference import at_rest
 from companion.model.frames import euler_zyx_from_quat
 from companion.model.types import ContactMode, Joints, Outcome, Vec3
+from companion.phases.contact.force import touches
+from companion.phases.contact.sliding import STEER_MAX_RAD, UNSEEN_MAX_N
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight, FastResult

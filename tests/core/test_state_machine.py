@@ -9,11 +9,12 @@ import msgspec
 import pytest
 
 from companion.core import flight_core
-from companion.core.contact import force_on_tool_n
-from companion.core.flight_state import FlightState, Observation, Request
+from companion.core.flight_core import force_on_tool_n
+from companion.core.flight_state import FlightState, Request
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters
 from companion.mission.active_plan import Course
+from companion.mission.air import Observation
 from companion.mission.plan import Plan
 from companion.model.flight_stage import Stage
 from companion.model.types import Event, Outcome, Outputs

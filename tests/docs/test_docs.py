@@ -39,8 +39,8 @@ MADE_LATER = {
     "sitl_config.json", "sitl.log", "world.json", "preflight.json", "mine.yaml", "my_vehicle.yaml", "flights/",
     "compare.json", "compare.html", "LAW_PRESET.yaml", "identified_world.yaml", "identified.json",
 }  # fmt: skip
-EXAMPLE = ROOT / "examples/law"
-"""The folder that the reader of docs/own-law.md makes."""
+EXAMPLES = (ROOT / "examples/law", ROOT / "examples/phase")
+"""The folders that the readers of docs/own-law.md and docs/own-phase.md make."""
 FOLDERS = ("companion", "sitl", "configs", "tests", "docs", "benchmarks")
 KNOWN_NAMES = {path.name for folder in FOLDERS for path in (ROOT / folder).rglob("*.*")}
 _FILE = re.compile(r"(?!/)[\w./-]*(?:\.(?:py|yaml|md|json|toml|txt|html|png|log|pid|mcap)|/)")
@@ -104,7 +104,11 @@ def test_links_and_file_names_exist(page: Path) -> None:
     for name in codes(prose(page)):
         if not _FILE.fullmatch(name) or name in MADE_LATER or name.startswith("DIR/"):
             continue
-        exists = (ROOT / name).exists() or (EXAMPLE / name).exists() or ("/" not in name and name in KNOWN_NAMES)
+        exists = (
+            (ROOT / name).exists()
+            or any((example / name).exists() for example in EXAMPLES)
+            or ("/" not in name and name in KNOWN_NAMES)
+        )
         if not exists:
             wrong.append(name)
     assert wrong == []
@@ -216,8 +220,9 @@ def test_monitors_and_ladder_match() -> None:
     assert {key for key in Safety.model_fields if key not in named} <= told
 
 
-def test_every_notice_is_reported_by_the_core() -> None:
-    core = "".join(text_of(path) for path in sorted((ROOT / "companion/core").glob("*.py")))
+def test_every_notice_is_reported_by_the_core_or_a_phase() -> None:
+    paths = [path for part in ("core", "phases") for path in sorted((ROOT / "companion" / part).rglob("*.py"))]
+    core = "".join(map(text_of, paths))
     names = {name for name, value in vars(notices).items() if isinstance(value, notices.Notice)}
     assert len(names) == len({notice.id for notice in notices.NOTICES}) == len(notices.NOTICES)
     assert names == set(re.findall(r"\bnotices\.([A-Z_]+)\b", core))

@@ -15,7 +15,6 @@ from companion.flight.heartbeat import FlightGuard, Heartbeats
 from companion.guardian import heartbeat
 from companion.guardian.client import SILENT_S, GuardianClient
 from companion.io.protocols import DeviceError
-from companion.mission import contact
 from companion.model.types import (
     AutopilotRequest,
     AutopilotStatus,
@@ -33,6 +32,7 @@ from companion.model.types import (
     SafetyAction,
     Severity,
 )
+from companion.phases.contact import force as contact
 from tests.support import HOVER
 
 Pair = tuple[GuardianClient, socket.socket]

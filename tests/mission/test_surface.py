@@ -7,8 +7,8 @@ from random import Random
 
 import pytest
 
-from companion.mission.surface import plane
 from companion.model.types import Vec3
+from companion.phases.contact.surface import plane
 
 AHEAD: Vec3 = (1.0, 0.0, 0.0)
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from companion.mission.contact import begun
 from companion.model import packets, types
 from companion.model.codec import (
     Record,
@@ -27,6 +26,7 @@ from companion.model.codec import (
     to_jsonable,
     to_packet,
 )
+from companion.phases.contact.force import begun
 
 RECORDS = [types.Inputs, types.Outputs, types.Sent, types.GroundCommand]
 """With the records in them."""

@@ -11,6 +11,7 @@ from companion import plugins
 from companion.config.controller import law_class
 from companion.config.device_plugins import device_class
 from companion.config.explain import schema_of
+from companion.config.phase import forget_phases
 from companion.config.shipped import FILES
 
 
@@ -46,6 +47,7 @@ def _forget() -> None:
     device_class.cache_clear()
     law_class.cache_clear()
     schema_of.cache_clear()
+    forget_phases()
 
 
 LAW = """

@@ -15,10 +15,12 @@ import numpy.typing as npt
 import pytest
 
 from companion.config.controller import AdaptiveConfig
-from companion.config.mission import ArmMove, Hold, Takeoff
 from companion.control.arm_model import manipulator_of
 from companion.model.flight_stage import SPOOL_S
 from companion.model.types import Vec3
+from companion.phases.arm import ArmMove
+from companion.phases.hold import Hold
+from companion.phases.takeoff import Takeoff
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from companion.sitl_config.world import Push
 from sitl.fast.loop import FastFlight

@@ -19,8 +19,8 @@ import numpy as np
 from companion.commissioning.tool import Report, Session
 from companion.config.document import ConfigError
 from companion.config.loader import logged_flight
-from companion.config.mission import Probe
 from companion.config.vehicle import Vehicle
+from companion.mission.phase import phases_of
 from companion.mission.plan import Plan
 from companion.model.types import Vec3
 from companion.preflight.checks import Check
@@ -103,8 +103,8 @@ def _probed(folder: Path, point_m: Vec3, normal: Vec3) -> Probed:
         surface = (summary.get("contact") or {}).get("surface")
     except (OSError, ValueError, AttributeError):
         raise _wrong(f"{folder}: expected the folder of a flight, with its summary.json and config.json") from None
-    plan = Plan.build(config.mission, config.vehicle)
-    probe = next((one for one in plan.segments if isinstance(config.mission.phases[one.index], Probe)), None)
+    plan, phases = Plan.build(config.mission, config.vehicle), phases_of(config.mission)
+    probe = next((one for one in plan.segments if phases[one.index].surveys), None)
     if probe is None or surface is None:
         raise _wrong(f"{folder}: expected a flight with a phase `probe` that found a surface")
     away = [found - known for found, known in zip(surface["point_m"], point_m, strict=True)]

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 
 from companion.config.arm_chain import chain_of
 from companion.config.loader import FlightConfig
-from companion.config.mission import Approach, Probe
 from companion.ground.protocol.messages import VERSION, Scene
-from companion.mission.segments import phase_name
+from companion.mission.phase import phases_of
 from companion.model.arm_skeleton import skeleton_of
 from companion.model.types import Vec3
 
@@ -23,7 +22,7 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
         path_world_m: planned path at equal time steps; thinned to `PATH_POINTS_MAX` evenly spaced points if it has more.
         mission_s: planned duration; 0 before it is planned.
     """
-    vehicle = config.vehicle
+    vehicle, phases = config.vehicle, phases_of(config.mission)
     room, tether, safety, airframe, arm = vehicle.room, vehicle.tether, vehicle.safety, vehicle.airframe, vehicle.arm
     skeleton = skeleton_of(chain_of(vehicle))
     return Scene(
@@ -50,8 +49,8 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
         tracking_abort_m=safety.tracking_error_abort_m,
         mission_s=mission_s,
         path_world_m=thinned(path_world_m),
-        phases=tuple(map(phase_name, config.mission.phases)),
-        has_contact=any(isinstance(phase, Approach | Probe) for phase in config.mission.phases) or None,
+        phases=tuple(phase.title for phase in phases),
+        has_contact=any(phase.touches for phase in phases) or None,
     )
 
 

@@ -12,16 +12,15 @@ vehicle's motion shows the true force, with gusts. What it shows in excess of th
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from msgspec.structs import replace
 
-from companion.config.mission import Approach, Probe, Slide
-from companion.core.probing import ahead_m, tip_world_m
-from companion.core.transition import Transition
-from companion.mission import contact as c
-from companion.mission.surface import axes
-from companion.model.algebra import across
-from companion.model.types import ContactMode, ContactState, Vec3
+from companion.mission.air import Air
+from companion.model.types import ContactMode, ContactState, Vec2, Vec3
+from companion.phases.contact import force as c
+from companion.phases.contact.points import ahead_m, tip_world_m
+from companion.phases.contact.surface import axes
 
 LAG_N_M, LAG_N_MS = 30.0, 40.0
 """Force along the way per lag of the tip, and its rate. With twice as much, the tip sticks and slips."""
@@ -40,33 +39,48 @@ RELEASE_N_S = 3.0
 _ENDED: Vec3 = (0.0, 0.0, 0.0)
 
 
-def begun(contact: ContactState, phase: Slide) -> ContactState:
+@dataclass(frozen=True, slots=True)
+class Stroke:
+    """The keys of a slide."""
+
+    force_n: float
+    by_m: Vec2
+    speed_m_s: float
+    friction_max: float
+
+    @property
+    def most_n(self) -> float:
+        """Return the largest force along the surface: the largest friction, and a little more."""
+        return self.friction_max * self.force_n + BEYOND_FRICTION_N
+
+
+def begun(contact: ContactState, stroke: Stroke) -> ContactState:
     """Return the state with the way of a slide planned; the tip stays until the force is reached."""
-    (r, u), (right, up) = phase.by_m, axes(contact.direction_world)
+    (r, u), (right, up) = stroke.by_m, axes(contact.direction_world)
     rest = c.shift_to(contact, contact.shift.to_m, contact.shift.to_yaw_rad, contact.shift.to_tool_rad).from_m
     x, y, z = (p + r * a + u * b for p, a, b in zip(rest, right, up, strict=True))
     shift = c.shift_to(contact, (x, y, z), contact.shift.to_yaw_rad, contact.shift.to_tool_rad)
     return replace(contact, shift=shift, mode=ContactMode.PRESS, lag_m=0.0, lag_integral_n=0.0, stuck_s=0.0)
 
 
-def slid(t: Transition, contact: ContactState, phase: Slide, approach: Approach | Probe) -> ContactState:
+def slid(air: Air, contact: ContactState, stroke: Stroke, touch_n: float) -> ContactState:
     """Return the state after one tick of a slide."""
-    dt_s = t.o.dt_s
-    contact = c.pressed(contact, t.i.t_s, dt_s, approach.touch_n, phase.force_n)
+    dt_s = air.dt_s
+    contact = c.pressed(contact, air.t_s, dt_s, touch_n, stroke.force_n)
     slides = contact.mode is ContactMode.SLIDE
-    if not slides and contact.wanted_n != phase.force_n:
+    if not slides and contact.wanted_n != stroke.force_n:
         return contact
-    felt = c.touches(contact, approach.touch_n)
+    felt = c.touches(contact, touch_n)
     if slides:
-        contact = c.shifted(contact, dt_s, phase.speed_m_s if felt else 0.0)
-    beside_m = _beside_m(t, contact)
+        contact = c.shifted(contact, dt_s, stroke.speed_m_s if felt else 0.0)
+    beside_m = _beside_m(air, contact)
     if beside_m is None:
         return contact
     if not felt:  # nothing rubs: the force would move the tip away
         return replace(contact, lag_integral_n=0.0, slide_world_n=_ENDED)
-    most_n = _most_n(phase)
+    most_n = stroke.most_n
     if not slides:
-        contact = replace(contact, mode=ContactMode.SLIDE, since_s=t.i.t_s, beside_m=beside_m)
+        contact = replace(contact, mode=ContactMode.SLIDE, since_s=air.t_s, beside_m=beside_m)
     lag_m = _along(contact, contact.beside_m) - _along(contact, beside_m)
     integral_n = min(most_n, max(-most_n, contact.lag_integral_n + LAG_N_MS * dt_s * lag_m))
     unseen_n = contact.unseen_n + dt_s / UNSEEN_S * (UNSEEN_SHARE * contact.disagreement_n - contact.unseen_n)
@@ -81,21 +95,6 @@ def slid(t: Transition, contact: ContactState, phase: Slide, approach: Approach 
         stuck_s=contact.stuck_s + dt_s if abs(lag_m) > STUCK_M else 0.0,
     )
     return _driven(contact, min(most_n, max(-most_n, integral_n + LAG_N_M * lag_m)))
-
-
-def within_friction(contact: ContactState, phase: Slide, force_world_n: Vec3) -> Vec3:
-    """Return a measured force whose part along the surface is limited to the largest friction: what exceeds it is cross-talk."""
-    x, y, z = across(force_world_n, contact.direction_world)
-    size_n, most_n = math.hypot(x, y, z), _most_n(phase)
-    if size_n <= most_n:
-        return force_world_n
-    k, (fx, fy, fz) = 1.0 - most_n / size_n, force_world_n
-    return (fx - k * x, fy - k * y, fz - k * z)
-
-
-def _most_n(phase: Slide) -> float:
-    """Return the largest force along the surface: the largest friction, and a little more."""
-    return phase.friction_max * phase.force_n + BEYOND_FRICTION_N
 
 
 def _driven(contact: ContactState, force_n: float) -> ContactState:
@@ -128,14 +127,14 @@ def way(contact: ContactState) -> Vec3:
     return ((tx - fx) / length_m, (ty - fy) / length_m, (tz - fz) / length_m)
 
 
-def _beside_m(t: Transition, contact: ContactState) -> Vec3 | None:
+def _beside_m(air: Air, contact: ContactState) -> Vec3 | None:
     """Return the place of the tip minus that of its reference; None if it is unknown."""
-    tip, course, shift = tip_world_m(t), t.state.course, contact.shift
-    if tip is None or course is None:
+    tip, shift = tip_world_m(air), contact.shift
+    if tip is None:
         return None
     (px, py, pz), (ax, ay, az) = (
-        course.reference(t.i.t_s).position_world_m,
-        ahead_m(t, shift.to_yaw_rad, shift.to_tool_rad),
+        air.plan_reference().position_world_m,
+        ahead_m(air, shift.to_yaw_rad, shift.to_tool_rad),
     )
     (fx, fy, fz), (tx, ty, tz), share = shift.from_m, shift.to_m, shift.way_m / shift.length_m
     x, y, z = tip

@@ -1,17 +1,15 @@
-"""The plane through touched points: where to touch a surface, and its place and normal from the touches. Pure."""
+"""The plane through touched points: the place and the normal of a surface. Pure."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Final
 
-from companion.config.mission import Approach, Phase, Probe
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
 from companion.model.algebra import dot
-from companion.model.types import FoundSurface, Joints, Vec2, Vec3
+from companion.model.types import FoundSurface, Joints, Vec3
 
 TILT_MAX_RAD = math.radians(30.0)
 """Largest angle between a surface's normal and the direction of the approach. Beyond it a touch is taken for a false one."""
@@ -36,24 +34,6 @@ def axes(direction_world: Vec3) -> tuple[Vec3, Vec3]:
     right = (ny / level, -nx / level, 0.0) if level > 1e-6 else (0.0, -1.0, 0.0)
     rx, ry, rz = right
     return right, (ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx)
-
-
-def points_of(phase: Phase | None) -> tuple[Vec2, ...]:
-    """Return the points that a phase touches to find the surface, right and up of the way straight ahead, m."""
-    if isinstance(phase, Probe):
-        across = [phase.spacing_m * (k - 0.5 * (phase.columns - 1)) for k in range(phase.columns)]
-        rows = [phase.spacing_m * (k - 0.5 * (phase.rows - 1)) for k in range(phase.rows)]
-        # Row by row upwards, every other row from right to left.
-        return tuple((x, y) for k, y in enumerate(rows) for x in (across if k % 2 == 0 else reversed(across)))
-    if isinstance(phase, Approach) and phase.face_m is not None:
-        half, low = 0.5 * phase.face_m, phase.face_m / math.sqrt(12.0)
-        return ((-half, -low), (half, -low), (0.0, 2.0 * low))
-    return ()
-
-
-def farthest_step_m(points: Sequence[Vec2]) -> float:
-    """Return the largest distance between consecutive points."""
-    return max((math.dist(a, b) for a, b in pairwise(points)), default=0.0)
 
 
 def plane(tips_m: Sequence[Vec3], direction_world: Vec3, radius_m: float) -> FoundSurface | None:

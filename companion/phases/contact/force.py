@@ -1,7 +1,7 @@
 """Contact with a surface: the offset of the reference along the direction of an approach, and the force with which to press. Pure.
 
 The plan is the motion in front of the surface and a function of time alone. What depends on the measured force is one record,
-`ContactState`, which `companion.core.contact` advances in every tick. It adds two quantities to the plan's reference: an offset along
+`ContactState`, which `machine` advances in every tick. It adds two quantities to the plan's reference: an offset along
 the direction, until the surface is touched, and from then on the push, a force on the base (`Reference.push_world_n`, the desired force
 F_d of the paper on the rows of the base). The push is the wanted force plus the integral of the force error; the position reference
 rests at the place of the touch, so that the stiffness of the control law limits how far the vehicle moves if the surface gives way.
@@ -13,8 +13,6 @@ import math
 
 from msgspec.structs import replace
 
-from companion.config.mission import Approach, Probe
-from companion.mission.surface import farthest_step_m, points_of
 from companion.model.frames import wrap_rad
 from companion.model.types import ContactMode, ContactShift, ContactState, Joints, Reference, Vec3
 
@@ -76,35 +74,6 @@ SHIFT_M_S = 0.1
 """Speed of moves that are not towards an unknown surface."""
 FREE_M = 0.08
 """Distance from a known surface up to which an approach is as fast."""
-FROM_POINT_M, FROM_POINT_SHARE = 0.03, 0.4
-"""Distance to which the tip moves back from a point, and additionally as a fraction of the way to the next point: a surface may be
-tilted by 15 deg about both axes.
-"""
-
-
-def travel_s(distance_m: float, speed_m_s: float) -> float:
-    """Return the time in which the offset travels a distance from rest to rest, s."""
-    return distance_m / speed_m_s + speed_m_s / ACCELERATION_M_S2
-
-
-def approach_s(approach: Approach | Probe) -> float:
-    """Return the duration of an approach or a probe, s: the largest of an approach, about that of what touches points."""
-    duration_s = WEIGH_S + travel_s(approach.distance_max_m, approach.speed_m_s)
-    points = points_of(approach)
-    if not points:
-        return duration_s
-    step_m = farthest_step_m(points)
-    back_m = back_from_point_m(approach)
-    each_s = (
-        travel_s(back_m, SHIFT_M_S) + travel_s(back_m, approach.speed_m_s) + travel_s(step_m, SHIFT_M_S)
-        + TOUCH_SETTLE_S + TOUCH_MEAN_S
-    )  # fmt: skip
-    return len(points) * each_s + (2.0 if isinstance(approach, Approach) else 1.0) * duration_s
-
-
-def back_from_point_m(approach: Approach | Probe) -> float:
-    """Return how far the tip moves back from a point before it moves in front of the next one, m."""
-    return FROM_POINT_M + FROM_POINT_SHARE * farthest_step_m(points_of(approach))
 
 
 def begun(t_s: float, direction_world: Vec3, tip_per_n_m: Vec3) -> ContactState:
@@ -200,12 +169,6 @@ def tip_per_n_m(direction_world: Vec3, tip_world_m: Vec3, weight_n: float) -> Ve
     (nx, ny, _), (x, y, z) = direction_world, tip_world_m
     level = nx * x + ny * y
     return (-z * nx / weight_n, -z * ny / weight_n, level / weight_n)
-
-
-def before_approach_m(reference: Reference, contact: ContactState) -> Vec3:
-    """Return the position of the reference without the contact's offset, world frame, m: in front of the surface."""
-    (x, y, z), (nx, ny, nz), d = reference.position_world_m, contact.direction_world, contact.offset_m
-    return (x - d * nx, y - d * ny, z - d * nz)
 
 
 def way_back_m(contact: ContactState) -> Vec3:

@@ -6,16 +6,16 @@ import math
 from collections.abc import Iterator
 from itertools import product
 
-from companion.config.mission import Approach, Limits, Mission, Press, Probe, Slide
+from companion.config.mission import Limits
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.control.thrust import attitude_from_roll_pitch_yaw, roll_pitch_from_force
-from companion.mission.plan import Plan
-from companion.mission.segments import Segment
-from companion.mission.surface import axes, points_of, tool_turn_rad
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_conjugate, quat_rotate
 from companion.model.types import Reference, Vec2, Vec3
+from companion.phases.contact.sliding import Stroke
+from companion.phases.contact.surface import axes, tool_turn_rad
+from companion.phases.contact.way import Way
 from companion.safety.governor import SafeSet
 
 TURN_RAD = math.radians(15.0)
@@ -35,53 +35,8 @@ FORCE_SHARE_MAX = 0.6
 """Largest wanted force as a fraction of `safety.contact_force_max_n`: an overshoot of 50 % passes."""
 
 
-def contact_problems(mission: Mission, vehicle: Vehicle, plan: Plan) -> Iterator[tuple[Segment, str]]:
-    """Return each segment that cannot be flown, with the reason and the advice."""
-    direction: Vec3 = (0.0, 0.0, 0.0)
-    faces = False
-    approach: Approach | Probe | None = None
-    slid_m: Vec2 = (0.0, 0.0)
-    for segment in plan.segments:
-        if segment.repetition > 1:
-            continue
-        phase = mission.phases[segment.index]
-        if isinstance(phase, Approach | Probe):
-            length = math.hypot(*phase.direction)
-            x, y, z = phase.direction
-            direction = (x / length, y / length, z / length)
-            faces = isinstance(phase, Approach) and phase.face_m is not None
-            approach, slid_m = phase, (0.0, 0.0)
-            yield from (
-                (segment, text) for text in _approach(vehicle, plan.reference(segment.start_s), direction, phase)
-            )
-        elif isinstance(phase, Press):
-            reference = plan.reference(segment.start_s)
-            yield from ((segment, text) for text in _force(vehicle, reference, direction, phase.force_n))
-            yield from ((segment, text) for text in _torque(vehicle, reference, direction, phase.force_n, faces))
-        elif isinstance(phase, Slide):
-            assert approach is not None, "the mission file is checked: an approach comes first"
-            reference = plan.reference(segment.start_s)
-            slid_m = (slid_m[0] + phase.by_m[0], slid_m[1] + phase.by_m[1])
-            yield from ((segment, text) for text in _force(vehicle, reference, direction, phase.force_n))
-            yield from ((segment, text) for text in _slide(vehicle, mission.limits, reference, direction, phase, faces))
-            low_m = (
-                reference.position_world_m[2] + slid_m[1] * axes(direction)[1][2] - vehicle.airframe.ground_clearance_m
-            )
-            if low_m < FLOOR_M:
-                yield (
-                    segment,
-                    f"ends {low_m:.2f} m above standing height (minimum {FLOOR_M:g} m); shorten by_m or begin higher",
-                )
-            far, beyond_m = _farthest(vehicle, reference, direction, approach, slid_m)
-            if beyond_m > 0.0:
-                yield (
-                    segment,
-                    f"may move to ({far[0]:.2f}, {far[1]:.2f}, {far[2]:.2f}) m, {beyond_m:.2f} m beyond what room and tether allow "
-                    f"with a margin of {TRACKING_M:g} m; shorten by_m or begin elsewhere",
-                )
-
-
-def _approach(vehicle: Vehicle, reference: Reference, direction: Vec3, phase: Approach | Probe) -> Iterator[str]:
+def way_problems(vehicle: Vehicle, reference: Reference, way: Way) -> Iterator[str]:
+    """Check the tool and the room for its way to a surface."""
     if vehicle.tool is None or vehicle.has_net:
         yield f"touches a surface, but vehicle '{vehicle.name}' has no rod or brush (tool.kind); add one to the vehicle file"
         return
@@ -89,7 +44,7 @@ def _approach(vehicle: Vehicle, reference: Reference, direction: Vec3, phase: Ap
         (math.cos(0.5 * reference.yaw_rad), 0.0, 0.0, math.sin(0.5 * reference.yaw_rad)),
         manipulator_of(vehicle).net_body_m(reference.arm_rad),
     )
-    nx, ny, nz = direction
+    nx, ny, nz = way.direction_world
     body_m = math.hypot(nx, ny) * vehicle.airframe.radius_m
     ahead_m = nx * x + ny * y + nz * z - body_m
     if ahead_m < AHEAD_M:
@@ -97,7 +52,7 @@ def _approach(vehicle: Vehicle, reference: Reference, direction: Vec3, phase: Ap
             f"approaches with the tip {ahead_m:.2f} m beyond the rotors (minimum {AHEAD_M:g} m); stretch the arm in the direction of "
             "the approach, or turn the vehicle"
         )
-    far, beyond_m = _farthest(vehicle, reference, direction, phase)
+    far, beyond_m = _farthest(vehicle, reference, way)
     if beyond_m > 0.0:
         yield (
             f"may move to ({far[0]:.2f}, {far[1]:.2f}, {far[2]:.2f}) m if it touches nothing, {beyond_m:.2f} m beyond what room and "
@@ -105,31 +60,31 @@ def _approach(vehicle: Vehicle, reference: Reference, direction: Vec3, phase: Ap
         )
 
 
-def _farthest(
-    vehicle: Vehicle, reference: Reference, direction: Vec3, phase: Approach | Probe, slid_m: Vec2 = (0.0, 0.0)
-) -> tuple[Vec3, float]:
+def _farthest(vehicle: Vehicle, reference: Reference, way: Way, slid_m: Vec2 = (0.0, 0.0)) -> tuple[Vec3, float]:
     """Return the place that is farthest beyond room and tether, and by how much with the margin, m; `slid_m` is the way of the slides
     since the touch, right and up.
     """
-    safe, (right, up) = SafeSet(vehicle), axes(direction)
+    safe, (right, up) = SafeSet(vehicle), axes(way.direction_world)
     x, y, _ = manipulator_of(vehicle).net_body_m(reference.arm_rad)
     shift = [slid_m[0] * a + slid_m[1] * b for a, b in zip(right, up, strict=True)]
     found = []
-    for px, py, pz in _corners(reference, direction, phase, math.hypot(x, y)):
+    for px, py, pz in _corners(reference, way, math.hypot(x, y)):
         at = (px + shift[0], py + shift[1], pz + shift[2])
         found.append((at, max(safe.breach_walls_m(at), safe.breach_tether_m(at)) + TRACKING_M))
     return max(found, key=lambda place: place[1])
 
 
-def _slide(
-    vehicle: Vehicle, limits: Limits, reference: Reference, direction: Vec3, phase: Slide, faces: bool
+def slide_problems(
+    vehicle: Vehicle, limits: Limits, reference: Reference, way: Way, stroke: Stroke, slid_m: Vec2
 ) -> Iterator[str]:
-    """Check what the largest friction needs: joints, thrust, and the rotors' yaw torque."""
-    (right, up), length_m, airframe = axes(direction), math.hypot(*phase.by_m), vehicle.airframe
-    way = [(phase.by_m[0] * a + phase.by_m[1] * b) / length_m for a, b in zip(right, up, strict=True)]
-    most_n, weight_n = phase.friction_max * phase.force_n, airframe.mass_kg * GRAVITY_M_S2
-    friction = (-most_n * way[0], -most_n * way[1], -most_n * way[2])
-    yield from _torque(vehicle, reference, direction, phase.force_n, faces, friction)
+    """Check what the largest friction needs, joints, thrust and the rotors' yaw torque, and the room; `slid_m` is the way of the slides
+    since the touch, right and up.
+    """
+    (right, up), length_m, airframe = axes(way.direction_world), math.hypot(*stroke.by_m), vehicle.airframe
+    along = [(stroke.by_m[0] * a + stroke.by_m[1] * b) / length_m for a, b in zip(right, up, strict=True)]
+    most_n, weight_n = stroke.friction_max * stroke.force_n, airframe.mass_kg * GRAVITY_M_S2
+    friction = (-most_n * along[0], -most_n * along[1], -most_n * along[2])
+    yield from torque_problems(vehicle, reference, way, stroke.force_n, friction)
     most_share = limits.thrust_share_max * airframe.thrust_max_n
     if weight_n - friction[2] > most_share:
         yield (
@@ -140,34 +95,44 @@ def _slide(
     needed_nm = math.hypot(x, y) * math.hypot(friction[0], friction[1])
     yaw_nm = YAW_SHARE * airframe.yaw_torque_per_thrust_m * weight_n
     if needed_nm > yaw_nm:
-        least = phase.friction_max * yaw_nm / needed_nm
+        least = stroke.friction_max * yaw_nm / needed_nm
         yield (
-            f"needs {needed_nm:.2f} N m of yaw torque to slide sideways with friction up to {phase.friction_max:g} (limit {yaw_nm:.2f} "
-            f"N m: {YAW_SHARE:g} of what the rotors have at hover); slide up or down, or if the surface is slippery, set friction_max "
-            f"to at most {least:.2f}"
+            f"needs {needed_nm:.2f} N m of yaw torque to slide sideways with friction up to {stroke.friction_max:g} (limit "
+            f"{yaw_nm:.2f} N m: {YAW_SHARE:g} of what the rotors have at hover); slide up or down, or if the surface is slippery, set "
+            f"friction_max to at most {least:.2f}"
+        )
+    low_m = reference.position_world_m[2] + slid_m[1] * up[2] - airframe.ground_clearance_m
+    if low_m < FLOOR_M:
+        yield f"ends {low_m:.2f} m above standing height (minimum {FLOOR_M:g} m); shorten by_m or begin higher"
+    far, beyond_m = _farthest(vehicle, reference, way, slid_m)
+    if beyond_m > 0.0:
+        yield (
+            f"may move to ({far[0]:.2f}, {far[1]:.2f}, {far[2]:.2f}) m, {beyond_m:.2f} m beyond what room and tether allow with a "
+            f"margin of {TRACKING_M:g} m; shorten by_m or begin elsewhere"
         )
 
 
-def _corners(reference: Reference, direction: Vec3, phase: Approach | Probe, ahead_m: float) -> Iterator[Vec3]:
+def _corners(reference: Reference, way: Way, ahead_m: float) -> Iterator[Vec3]:
     """Return the corners of the space in which the reference may move during an approach or a probe; `ahead_m` is the distance of the
     tip from the centre.
     """
-    points = points_of(phase)
+    points = way.points
     across_m = max((abs(right) for right, _ in points), default=0.0)
     upwards_m = max((abs(up) for _, up in points), default=0.0)
-    if points and isinstance(phase, Approach):
+    if points and way.presses:
         across_m = max(across_m, ahead_m * math.sin(TURN_RAD))
-    right, up = axes(direction)
-    sides_m = (phase.distance_max_m,) if not points else (0.0, phase.distance_max_m)
+    right, up = axes(way.direction_world)
+    sides_m = (way.distance_max_m,) if not points else (0.0, way.distance_max_m)
     for d, r, u in product(sides_m, (-across_m, across_m), (-upwards_m, upwards_m)):
         x, y, z = (
             p + d * n + r * a + u * b
-            for p, n, a, b in zip(reference.position_world_m, direction, right, up, strict=True)
+            for p, n, a, b in zip(reference.position_world_m, way.direction_world, right, up, strict=True)
         )
         yield (x, y, z)
 
 
-def _force(vehicle: Vehicle, reference: Reference, direction: Vec3, force_n: float) -> Iterator[str]:
+def force_problems(vehicle: Vehicle, reference: Reference, direction: Vec3, force_n: float) -> Iterator[str]:
+    """Check the limit of the force, and the tilt with which the vehicle presses."""
     airframe, most_n = vehicle.airframe, FORCE_SHARE_MAX * vehicle.safety.contact_force_max_n
     if force_n > most_n:
         yield (
@@ -184,20 +149,19 @@ def _force(vehicle: Vehicle, reference: Reference, direction: Vec3, force_n: flo
         )
 
 
-def _torque(
+def torque_problems(
     vehicle: Vehicle,
     reference: Reference,
-    direction: Vec3,
+    way: Way,
     force_n: float,
-    faces: bool,
     friction: Vec3 = (0.0, 0.0, 0.0),
 ) -> Iterator[str]:
     """Check the torques that hold the arm against weight, force and friction; if the vehicle turns to the surface, also on tilted
     surfaces.
     """
-    manipulator = manipulator_of(vehicle)
+    manipulator, direction = manipulator_of(vehicle), way.direction_world
     worst: dict[int, float] = {}
-    for tilt_rad in (-TURN_RAD, 0.0, TURN_RAD) if faces else (0.0,):
+    for tilt_rad in (-TURN_RAD, 0.0, TURN_RAD) if way.points else (0.0,):
         into = _raised(direction, tilt_rad)
         nx, ny, nz = into
         *inner, last = reference.arm_rad

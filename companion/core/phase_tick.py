@@ -1,0 +1,114 @@
+"""Flies the phases that have a state of their own in the air (`companion.mission.phase`): one tick. Pure."""
+
+from __future__ import annotations
+
+from companion.core.transition import Transition
+from companion.mission.active_plan import Course
+from companion.mission.air import NOTHING, Air
+from companion.mission.phase import Phase
+from companion.mission.segments import Segment
+from companion.model.codec import Record
+from companion.model.types import Outcome, Reference, SafetyAction
+from companion.safety.notices import Notice
+
+_BEFORE_END_S = 1e-6
+
+
+def advance_phase(t: Transition) -> None:
+    """Advance the phase at the plan's time by one tick; called in every tick of a mission with a phase that acts."""
+    state, t_s = t.state, t.i.t_s
+    course = state.course
+    assert course is not None
+    segment = course.segment(t_s)
+    phase: Phase = t.parameters.phases[segment.index]
+    if state.own is None:
+        if not phase.acts:
+            if state.skips:
+                t.change(skips=False)
+            return
+        begun = None if state.skips else phase.begin(_PhaseTick(t, segment, segment))
+        if begun is None:
+            t.change(course=course.moved_to(segment.end_s, t_s))
+        else:
+            _fly(t, phase, begun, segment)
+        return
+    engaged = state.engaged
+    assert engaged is not None
+    tick = _PhaseTick(t, segment, engaged)
+    own = _phase_of(t, engaged).step(tick, state.own)
+    if own is None:
+        _end(t, engaged, tick.skips_rest)
+    else:
+        _fly(t, _phase_of(t, tick.engaged), own, tick.engaged)
+
+
+def leave(t: Transition) -> None:
+    """Leave what the phase does, because the flight is to hold."""
+    own, engaged = t.state.own, t.state.engaged
+    if own is None or engaged is None:
+        return
+    phase = _phase_of(t, engaged)
+    left = phase.leave(own, t.i.t_s)
+    if left is None:
+        t.change(own=None, skips=True, expected=NOTHING)
+    else:
+        _fly(t, phase, left, engaged)
+
+
+def _phase_of(t: Transition, segment: Segment) -> Phase:
+    phase: Phase = t.parameters.phases[segment.index]
+    return phase
+
+
+def _fly(t: Transition, phase: Phase, own: Record, engaged: Segment) -> None:
+    t.change(own=own, engaged=engaged, expected=phase.expects(own))
+
+
+def _end(t: Transition, engaged: Segment, skips: bool) -> None:
+    """End the phase. If it ended early, those that go on with its state are skipped."""
+    course, t_s = t.state.course, t.i.t_s
+    assert course is not None
+    if course.held and t.state.supervisor.action is not SafetyAction.HOLD:
+        course = course.resume(t_s)
+    if not skips:
+        course = course.moved_to(engaged.end_s, t_s)
+    t.change(own=None, skips=skips, expected=NOTHING, course=course)
+
+
+class _PhaseTick(Air):
+    """One tick of a phase, as part of a transition."""
+
+    def __init__(self, t: Transition, segment: Segment, engaged: Segment) -> None:
+        p = t.parameters
+        super().__init__(t.o, p.vehicle, p.manipulator, p.phases, segment, engaged)
+        self._t = t
+
+    @property
+    def _course(self) -> Course:
+        course = self._t.state.course
+        assert course is not None
+        return course
+
+    def plan_reference(self) -> Reference:
+        """Return the plan's reference, without what the phase adds."""
+        return self._course.reference(self.t_s)
+
+    def report(self, notice: Notice, text: str) -> None:
+        """Add an event."""
+        self._t.report(notice, text)
+
+    def fail(self, notice: Notice, text: str) -> None:
+        """Report a failure: the flight counts as aborted, and the plan's time stops until the state ends."""
+        self._t.report(notice, text)
+        self._t.finish(Outcome.ABORTED)
+        self._t.change(course=self._course.hold(self.t_s))
+
+    def stay(self, segment: Segment) -> None:
+        """Keep the plan's time before the end of a segment."""
+        course, last_s = self._course, segment.end_s - _BEFORE_END_S
+        if not course.held and course.pace(self.t_s)[0] >= last_s:
+            self.move_to(last_s)
+
+    def move_to(self, plan_s: float) -> None:
+        """Move the plan's time to a start or an end of a segment, where the plan is at rest."""
+        self._t.change(course=self._course.moved_to(plan_s, self.t_s))

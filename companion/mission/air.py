@@ -1,0 +1,118 @@
+"""What a phase with a state of its own sees in a tick, and what it may ask for in the air. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from companion.config.vehicle import Vehicle
+from companion.control.manipulator import Manipulator
+from companion.mission.segments import Segment
+from companion.model.codec import Record
+from companion.model.types import ContactState, Inputs, Reference, TetherState, Vec3
+from companion.safety.notices import Notice
+
+
+class Expectation(Record, frozen=True):
+    """What a phase expects of the flight as long as its present state lasts; rules, control and tether read it."""
+
+    into_world: Vec3 | None = None
+    """Unit vector into the surface that the tool may touch; None if there is none."""
+    touches: bool = False
+    """Whether the tool touches the surface."""
+    force_n: float = 0.0
+    """Force of the surface against `into_world`."""
+    contact_n: float | None = None
+    """Force that the rule `contact_force_high` limits; None without contact."""
+    friction_max_n: float | None = None
+    """Largest force along the surface, if the tool slides; None if it does not."""
+    back_m: Vec3 | None = None
+    """Way from the reference to a place in front of the surface, world frame; None if there is no surface."""
+    contact: ContactState | None = None
+    """State of the contact for the log and for the displays."""
+
+
+NOTHING = Expectation()
+
+
+class Observation(Record, frozen=True):
+    """Inputs to a transition other than the state and the events."""
+
+    inputs: Inputs
+    airborne: bool
+    """The rotors may be lifting the vehicle, or PX4 was found armed and flying."""
+    armed_by_others: bool
+    """PX4 is armed although the companion has not requested it."""
+    standing: str | None
+    """Message of the active rule that still requires a hold and therefore forbids resuming; None if there is none."""
+    reference: Reference | None
+    """Reference that the controller followed in the last tick; None before its first tick."""
+    tether: TetherState | None
+    thrust_share: float
+    """Thrust of the last command divided by hover thrust."""
+    pose_s: float
+    """Stamp of the newest trusted pose before this tick; -inf before the first."""
+    dt_s: float
+    """Time since the previous tick."""
+    force_world_n: Vec3 | None
+    """Force on the tool in the last tick, world frame; None if the law did not run."""
+    disturbance_world_n: Vec3 | None
+    """Force on the vehicle that its motion shows, world frame; None on the ground, and if it is the force on the tool as well."""
+    position_error_m: Vec3
+    """Position minus reference in the last tick, world frame; 0 if the law did not run."""
+    yaw_error_rad: float
+    """Yaw minus reference in the last tick; 0 if the law did not run."""
+
+
+class Air:
+    """One tick of a phase with a state of its own; `companion.core.phase_tick` implements it.
+
+    Args:
+        o: inputs of the tick.
+        vehicle: the vehicle file.
+        manipulator: kinematics of the arm.
+        phases: phases of the mission (`companion.mission.phase.Phase`).
+        segment: segment at the plan's time.
+        engaged: segment of the phase whose state it is; after a hold, the plan's time may have passed its end.
+    """
+
+    def __init__(
+        self,
+        o: Observation,
+        vehicle: Vehicle,
+        manipulator: Manipulator,
+        phases: Sequence[Any],
+        segment: Segment,
+        engaged: Segment,
+    ) -> None:
+        self.o = o
+        self.i = o.inputs
+        self.t_s = o.inputs.t_s
+        self.dt_s = o.dt_s
+        self.vehicle = vehicle
+        self.manipulator = manipulator
+        self.phases = phases
+        self.segment = segment
+        self.engaged = engaged
+        self.skips_rest = False
+        """Whether the phases that follow and need the state of this one are skipped when it ends."""
+
+    def plan_reference(self) -> Reference:
+        """Return the plan's reference, without what the phase adds."""
+        raise NotImplementedError
+
+    def report(self, notice: Notice, text: str) -> None:
+        """Add an event."""
+        raise NotImplementedError
+
+    def fail(self, notice: Notice, text: str) -> None:
+        """Report a failure: the flight counts as aborted, and the plan's time stops until the state ends."""
+        raise NotImplementedError
+
+    def stay(self, segment: Segment) -> None:
+        """Keep the plan's time before the end of a segment."""
+        raise NotImplementedError
+
+    def move_to(self, plan_s: float) -> None:
+        """Move the plan's time to a start or an end of a segment, where the plan is at rest."""
+        raise NotImplementedError

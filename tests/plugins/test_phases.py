@@ -1,0 +1,123 @@
+"""Types of mission phases: those of the companion keep the contract, and one of another package flies without a change of ours."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from companion.cli.main import main
+from companion.config.document import ConfigError
+from companion.config.loader import load_flight
+from companion.config.phase import PhaseSettings, phase_classes
+from companion.mission.check import check_mission
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
+from companion.plugins import PHASES
+from companion.testing import check_phases
+from sitl.testing import check_flight
+from tests.plugins.installed import on_path, write_distribution
+from tests.support import ROOT
+
+EXAMPLE = ROOT / "examples/phase"
+MISSION = EXAMPLE / "weigh.yaml"
+FILES = ("pyproject.toml", "lab_weigh.py", "weigh.yaml", "test_lab_weigh.py")
+FLOWN = ("catch", "circuit", "press", "slide", "probe")
+CODE = (EXAMPLE / "lab_weigh.py").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Path]:
+    """A folder with the example's package, installed."""
+    shutil.copy(EXAMPLE / "lab_weigh.py", tmp_path)
+    write_distribution(tmp_path, "lab-weigh", "0.1.0", {"weigh": "lab_weigh:Weigh"}, PHASES)
+    with on_path(tmp_path):
+        yield tmp_path
+
+
+@pytest.mark.parametrize("mission", FLOWN)
+def test_the_companions_own_phases_keep_the_contract(mission: str) -> None:
+    check_phases(mission)
+
+
+def test_the_checked_missions_have_every_type_but_one() -> None:
+    flown = {phase.type for mission in FLOWN for phase in load_flight(mission).mission.phases}
+    assert set(phase_classes()) - flown == {"arm"}
+
+
+def test_the_page_shows_the_files_as_they_are() -> None:
+    page = (ROOT / "docs" / "own-phase.md").read_text(encoding="utf-8")
+    for name in FILES:
+        kind = {".toml": "toml", ".py": "python", ".yaml": "yaml"}[Path(name).suffix]
+        assert f"`{name}`:\n\n```{kind}\n{(EXAMPLE / name).read_text(encoding='utf-8')}```\n" in page, name
+
+
+@pytest.mark.parametrize("payload_kg", [0.1, 0.25])
+def test_a_phase_of_another_package_keeps_the_contract_and_weighs_the_payload(site: Path, payload_kg: float) -> None:
+    check_phases(MISSION)
+    events = check_flight(MISSION, f"world.payload_kg={payload_kg}")
+    (text,) = [event.text for event in events if event.id == "weighed"]
+    assert float(text.split()[-2]) == pytest.approx(payload_kg, abs=0.015)
+
+
+def test_its_checks_are_part_of_those_before_take_off(site: Path) -> None:
+    config = load_flight(MISSION)
+    devices = config.vehicle.devices.model_copy(update={"force": None})
+    found = check_mission(config.mission, config.vehicle.model_copy(update={"devices": devices}))
+    assert any("phase 'weigh' weighs, but vehicle" in problem for problem in found)
+
+
+def test_it_is_listed(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plugins"]) == EXIT_OK
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("weigh ")]
+    assert row.split()[:4] == ["weigh", "phase", "lab-weigh", "0.1.0"]
+    assert row.endswith("Hover, and report the mass of what is in the net.")
+
+
+def test_a_type_that_is_not_installed_is_named_with_its_place_and_the_nearest_one(tmp_path: Path) -> None:
+    written = tmp_path / "mission.yaml"
+    written.write_text(MISSION.read_text(encoding="utf-8").replace("weigh\n    duration", "presss\n    duration"))
+    with pytest.raises(ConfigError) as caught:
+        load_flight(written, "tarot650_2r")
+    (line,) = caught.value.lines
+    assert line.startswith(f"{written}:35:11: phases[4].type: expected one of approach, arm, detach, hold, ")
+    assert line.endswith('got "presss" (did you mean press?)')
+
+
+BROKEN = [
+    ("raise OSError('no licence')\n" + CODE, "lab_weigh:Weigh cannot be imported: OSError: no licence"),
+    (CODE.replace('Literal["weigh"]', 'Literal["scale"]'), "the field 'type' of Weigh is not Literal[\"weigh\"]"),
+    (CODE.replace("(Phase):", "(Record):"), "it is not a subclass of companion.mission.phase.Phase"),
+]
+
+
+@pytest.mark.parametrize(("code", "reason"), BROKEN, ids=["import", "type", "class"])
+def test_a_type_that_cannot_be_used_spoils_only_the_missions_that_name_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], code: str, reason: str
+) -> None:
+    (tmp_path / "lab_weigh.py").write_text(code)
+    write_distribution(tmp_path, "lab-weigh", "0.1.0", {"weigh": "lab_weigh:Weigh"}, PHASES)
+    with on_path(tmp_path):
+        assert all(isinstance(phase, PhaseSettings) for phase in load_flight("catch").mission.phases)
+        with pytest.raises(ConfigError) as caught:
+            load_flight(MISSION)
+        assert caught.value.lines == (f"{MISSION}:35:5: phases[4]: phase 'weigh' (lab-weigh 0.1.0): {reason}",)
+        assert main(["plugins"]) == EXIT_BAD_INPUT
+    assert f"cannot be used: {reason}" in capsys.readouterr().out
+
+
+BREACHES = [
+    ("p.builder.t_s += self.duration_s", "p.builder.stop((0.5, 0.0, 0.0)); p.builder.t_s += 2.0", "m/s at t = "),
+    ("return Weighing(air.t_s, 0, 0.0)", "return air.t_s", "its state is float, expected a Record"),
+    ("air.stay(air.engaged)", "Weigh.n = getattr(Weigh, 'n', 0.0) + 1.0; own = replace(own, mean_n=Weigh.n)", "the same inputs twice"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("right", "wrong", "found"), BREACHES, ids=["plan", "state", "replay"])
+def test_a_phase_that_breaks_the_contract_is_told_how(site: Path, right: str, wrong: str, found: str) -> None:
+    assert right in CODE
+    (site / "lab_weigh.py").write_text(CODE.replace(right, wrong))
+    with pytest.raises(AssertionError) as caught:
+        check_phases(MISSION)
+    assert "phases[4], weigh" in str(caught.value) and found in str(caught.value)
