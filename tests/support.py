@@ -310,7 +310,7 @@ class World:
 
     def __enter__(self) -> Self:
         try:
-            self.devices = self.wait_for(lambda message: message["type"] == "ready")["devices"]
+            self.devices = self.wait_for(lambda message: message["type"] == "WorldReady")["devices"]
         except BaseException:
             self.__exit__(None, None, None)
             raise
@@ -339,16 +339,16 @@ class World:
     @property
     def armings(self) -> int:
         """How often the rotors were armed."""
-        return sum(message["type"] == "at_rest" and not message["at_rest"] for message in self.messages)
+        return sum(message["type"] == "WorldAtRest" and not message["at_rest"] for message in self.messages)
 
     @property
     def pauses(self) -> int:
         """How often the world in real time has paused for a tenth of a second, because the computer was busy."""
-        return sum(message["type"] == "slipped" for message in self.messages)
+        return sum(message["type"] == "WorldSlipped" for message in self.messages)
 
     @property
     def crashes(self) -> int:
-        return sum(message["type"] == "event" and message["kind"] == "crashed" for message in self.messages)
+        return sum(message["type"] == "WorldEvent" and message["kind"] == "crashed" for message in self.messages)
 
     def wait_for(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """The first message, past or to come, that is wanted."""

@@ -12,7 +12,7 @@ import pytest
 from companion.campaigns.faults.judge import FaultFlight, Point, Tick, good, row_of
 from companion.campaigns.faults.sitl_flights import _offset_s
 from companion.campaigns.faults.sitl_flights import flown as flown_over_wires
-from companion.campaigns.faults.variants import CONTACT, VARIANTS, WIRES, Variant, planned
+from companion.campaigns.faults.variants import CONTACT, VARIANTS, Variant, planned
 from companion.cli.main import main
 from companion.launcher.launcher import FlightResult
 from companion.launcher.run import _summary
@@ -30,7 +30,7 @@ from companion.model.types import (
 )
 from companion.safety.notices import NOTICES
 from companion.safety.rules import RULES
-from companion.sitl_config.faults import CONTACT_PHASES, IN_FLIGHT, KINDS, PHASES, FaultKind
+from companion.sitl_config.faults import CONTACT_PHASES, KINDS, PHASES, FaultKind
 from companion.sitl_config.loader import load_sitl
 from tests.campaigns.made_up import fault_row
 from tests.support import CATCH
@@ -119,7 +119,7 @@ def test_a_flight_that_was_given_up_and_stands_has_landed() -> None:
         (flight(outcome="lost", error="ZeroDivisionError: x"), "internal error"),
     ],
 )
-def test_what_must_not_be_is_a_problem(made: FaultFlight, problem: str) -> None:
+def test_a_violated_safety_requirement_is_a_problem(made: FaultFlight, problem: str) -> None:
     row = row_of(LOST, "line", made, VEHICLE)
     assert problem in row["problems"]
     assert not good(row)
@@ -135,50 +135,15 @@ def test_a_tether_that_was_made_taut_may_be_so_but_not_be_followed_outward() -> 
     taut = event(10.5, "tether_taut", SafetyAction.RETRACT)
     assert good(row_of(Variant("tether_taut", 0.1), "line", flight(tension_n=20.0, events=(taut,)), VEHICLE))
     made = flight(tension_n=20.0, events=(taut,))
-    outward = [
-        Point(
-            t_s=p.t_s,
-            position_world_m=p.position_world_m,
-            tilt_rad=p.tilt_rad,
-            slack_m=(p.slack_m or 0.0) - (0.3 if p.t_s > 12.5 else 0.0),
-            tension_n=p.tension_n,
-        )
-        for p in made.course
-    ]
-    row = row_of(
-        Variant("tether_taut", 0.1),
-        "line",
-        FaultFlight(
-            outcome="aborted",
-            begun_s=10.0,
-            course=outward,
-            ticks=made.ticks,
-            events=made.events,
-            landed=True,
-            caught=False,
-        ),
-        VEHICLE,
-    )
+    outward = [dataclasses.replace(p, slack_m=(p.slack_m or 0.0) - (0.3 if p.t_s > 12.5 else 0.0)) for p in made.course]
+    row = row_of(Variant("tether_taut", 0.1), "line", dataclasses.replace(made, course=outward), VEHICLE)
     assert row["problems"] == ["moved outward on a taut tether"]
 
 
 def test_what_is_reported_after_the_landing_is_no_answer() -> None:
     made = flight(outcome="completed", events=(event(16.5, "force_lost", SafetyAction.LAND),))
     ticks = [Tick(t.t_s, t.kind if t.t_s < 16.0 else PhaseKind.DONE, SafetyAction.NOMINAL, None) for t in made.ticks]
-    row = row_of(
-        Variant("force_loss"),
-        "line",
-        FaultFlight(
-            outcome="completed",
-            begun_s=10.0,
-            course=made.course,
-            ticks=ticks,
-            events=made.events,
-            landed=True,
-            caught=True,
-        ),
-        VEHICLE,
-    )
+    row = row_of(Variant("force_loss"), "line", dataclasses.replace(made, ticks=ticks, caught=True), VEHICLE)
     assert (row["action"], row["event"], row["reacted_s"]) == ("nominal", None, None)
 
 
@@ -189,17 +154,14 @@ def test_the_table_of_kinds_is_the_literal_and_names_events_that_exist() -> None
     assert {name for kind in KINDS.values() for name in kind.named_by} - known == set()
 
 
-def test_the_campaign_is_as_large_as_it_should_be() -> None:
-    everywhere = [variant for variant in VARIANTS if set(IN_FLIGHT) <= set(variant.phases)]
-    assert len(everywhere) >= 45
+def test_the_campaign_flies_every_kind_of_fault_with_a_size_where_it_has_one() -> None:
     assert len(set(VARIANTS)) == len(VARIANTS)
     assert {variant.kind for variant in (*VARIANTS, *CONTACT)} == set(KINDS)
-    assert len(WIRES) >= 15
     for variant in (*VARIANTS, *CONTACT):
         assert (variant.size is not None) == (KINDS[variant.kind].size is not None), variant
 
 
-def test_what_is_named_is_flown() -> None:
+def test_the_chosen_kinds_and_phases_are_flown() -> None:
     assert {variant.kind for variant, _ in planned(["gust"], [])} == {"gust"}
     assert {phase for _, phase in planned([], ["line"])} == {"line"}
     assert planned(["autopilot_reboot"], []) == [(Variant("autopilot_reboot", 2.0), "ground")]
@@ -234,7 +196,7 @@ def test_the_page_of_the_docs_shows_the_outcome_of_each_phase() -> None:
 # -- over wires --------------------------------------------------------------------------------------------------------
 
 
-def test_a_flight_that_left_nothing_behind_is_lost_and_says_why(tmp_path: Path) -> None:
+def test_a_flight_without_files_is_lost_with_the_reason(tmp_path: Path) -> None:
     found = flown_over_wires(tmp_path, load_sitl(CATCH))
     assert found.outcome == "lost"
     assert "summary.json" in str(found.error)

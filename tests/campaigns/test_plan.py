@@ -79,7 +79,7 @@ def test_a_flight_reports_its_processor_time_and_how_many_fly_at_once() -> None:
     assert 0.0 <= result["cpu_s"] <= result["wall_s"] - 0.04, "sleeping takes no processor time"
 
 
-def test_a_plan_without_a_scheduler_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plan_without_its_scheduler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     fly_made_up(monkeypatch, lambda flight: None, CampaignError("--scheduler tcp://x: no answer", bad_input=True))
     ended = run_here(*PLAN, "--scheduler", "tcp://x")
     assert (ended.code, ended.out) == (EXIT_BAD_INPUT, "")

@@ -28,7 +28,7 @@ from tests.campaigns.made_up import draw_row as row
 from tests.support import CATCH
 
 
-def test_a_name_says_what_is_hard() -> None:
+def test_the_name_of_a_draw_lists_what_is_hard() -> None:
     assert name_of(WORLD) == "heavy_fast_from_behind_force_lost_slow_setpoints"
     gentle = {**WORLD, "payload_kg": 0.06, "throw_velocity_m_s": [0.1, -0.6, -1.0], "wind_m_s": [2.9, 0.0, 0.0]}
     gentle = {**gentle, "faults": [{"kind": "force_loss", "t_s": 0.0}], "setpoint_delay_s": 0.01}

@@ -157,7 +157,7 @@ def test_a_bad_flight_with_a_fault_is_shown_and_is_exit_code_5(monkeypatch: pyte
     assert "script" not in page.tags
 
 
-def test_a_flight_over_wires_that_is_refused_is_lost_and_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flight_over_wires_that_is_refused_is_lost_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     program = Path("python")
     program.write_text('#!/bin/sh\necho refused: "$@" >&2\nexit 2\n', encoding="utf-8")
     program.chmod(0o755)

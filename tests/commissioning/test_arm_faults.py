@@ -57,7 +57,7 @@ def test_servos_out_of_their_boxes_are_set_up_and_nothing_else_is_wrong(tmp_path
         one.assert_check_passes_the_arm()
 
 
-def test_a_wrong_id_is_found_and_the_file_gives_way(tmp_path: Path) -> None:
+def test_a_wrong_id_is_found_and_the_file_is_changed(tmp_path: Path) -> None:
     with bench(tmp_path, "[{}, {id: 7}]") as one:
         assert not one.check_rows()["arm.device"].ok
         before = one.vehicle.read_text(encoding="utf-8")
@@ -70,7 +70,7 @@ def test_a_wrong_id_is_found_and_the_file_gives_way(tmp_path: Path) -> None:
         one.assert_check_passes_the_arm()
 
 
-def test_a_wrong_id_is_found_and_the_servo_gives_way(tmp_path: Path) -> None:
+def test_a_wrong_id_is_found_and_the_servo_is_changed(tmp_path: Path) -> None:
     with bench(tmp_path, "[{}, {id: 7}]") as one:
         code, done = one.json("setup", "--yes")
         assert code == EXIT_OK
@@ -166,7 +166,7 @@ def test_doubled_friction_and_a_weaker_motor_are_measured(tmp_path: Path) -> Non
         one.assert_check_passes_the_arm()
 
 
-def test_an_overload_is_cleared_by_a_reboot_that_somebody_agreed_to(tmp_path: Path) -> None:
+def test_an_overload_is_cleared_by_a_reboot_that_was_confirmed(tmp_path: Path) -> None:
     servos = [ServoModel(joint.servo_id) for joint in load_vehicle(SHIPPED).arm.joints]
     servos[1].trip_overload()
     with sandbox_in(tmp_path) as sandbox, served(ServoBus(servos)) as port:

@@ -81,17 +81,12 @@ def test_zeros_signs_and_plugs_of_any_number_of_joints_are_found(count: int) -> 
         assert abs((found.zero_count - zeros[joint] + 2048) % COUNTS_PER_TURN - 2048) <= 1
 
 
-@pytest.mark.parametrize("count", [1, 3, 4])
-def test_an_arm_hangs_where_gravity_turns_no_joint(count: int) -> None:
-    vehicle = vehicle_with_joints(count)
+@pytest.mark.parametrize("count", [1, 3, 4, "of a URDF"])
+def test_in_the_hanging_pose_gravity_turns_no_joint(count: int | str) -> None:
+    vehicle = vehicle_with_joints(count) if isinstance(count, int) else load_vehicle("tarot650_4r")
     pose_rad = tuple(map(math.radians, hanging_deg(vehicle)))
-    assert manipulator_of(vehicle).gravity_torque_nm(pose_rad, IDENTITY_QUAT) == pytest.approx((0.0,) * count, abs=1e-6)
-
-
-def test_an_arm_from_a_urdf_hangs_where_gravity_turns_no_joint() -> None:
-    vehicle = load_vehicle("tarot650_4r")
-    pose_rad = tuple(map(math.radians, hanging_deg(vehicle)))
-    assert manipulator_of(vehicle).gravity_torque_nm(pose_rad, IDENTITY_QUAT) == pytest.approx((0.0,) * 4, abs=1e-5)
+    torque_nm = manipulator_of(vehicle).gravity_torque_nm(pose_rad, IDENTITY_QUAT)
+    assert torque_nm == pytest.approx((0.0,) * len(pose_rad), abs=1e-5)
 
 
 @pytest.mark.parametrize("count", [1, 3, 4])

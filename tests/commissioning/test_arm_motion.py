@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from companion.commissioning.arm.jog import KEY_TIMEOUT_S, STEP_DEG, ByKeys, keys_in
 from companion.commissioning.arm.motion import SPEED_MAX_DEG_S, TORQUE_SHARE, Motion, Moved, limits_deg
-from companion.commissioning.arm.sweep import Leg, Sweeper, legs_of
+from companion.commissioning.arm.sweep import Sweeper, legs_of
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
@@ -123,23 +123,17 @@ def test_no_goal_lies_beyond_a_joint_limit(vehicle: Vehicle) -> None:
         assert bench.degrees[joint] == pytest.approx(high if goal_deg > 0 else low, abs=1.0)
 
 
-def test_something_in_the_way_stops_it_gently(vehicle: Vehicle) -> None:
-    bench = Bench(vehicle)
+@pytest.mark.parametrize("torque_max_nm", [None, 0.75])
+def test_an_obstacle_stops_it_gently(torque_max_nm: float | None) -> None:
+    """A small servo that cannot press as hard stops at its torque limit."""
+    small = [] if torque_max_nm is None else [f"vehicle.arm.joints[1].torque_max_nm={torque_max_nm}"]
+    bench = Bench(load_vehicle(SHIPPED, small))
     obstacle_rad = math.radians(40.0)
     bench.disturbance = lambda angle: (0.0, -200.0 * max(0.0, angle[1] - obstacle_rad))
     bench.motion.go(1, math.radians(80.0), math.radians(20.0))
     moved = bench.until(lambda m: m.reached)
     assert moved.stop.startswith("joint 2: +0.") and "obstacle" in moved.stop and moved.torque_nm == (0.0, 0.0)
-    assert bench.degrees[1] < 41.0
-
-
-def test_a_small_servo_that_cannot_press_as_hard_stops_at_its_torque_limit() -> None:
-    bench = Bench(load_vehicle(SHIPPED, ["vehicle.arm.joints[1].torque_max_nm=0.75"]))
-    obstacle_rad = math.radians(40.0)
-    bench.disturbance = lambda angle: (0.0, -200.0 * max(0.0, angle[1] - obstacle_rad))
-    bench.motion.go(1, math.radians(80.0), math.radians(20.0))
-    moved = bench.until(lambda m: m.reached)
-    assert moved.stop.startswith("joint 2: +0.") and "obstacle" in moved.stop and moved.torque_nm == (0.0, 0.0)
+    assert torque_max_nm is not None or bench.degrees[1] < 41.0
 
 
 @pytest.mark.parametrize("joint", [0, 1])
@@ -203,7 +197,7 @@ def test_a_held_key_moves_a_released_one_stops(vehicle: Vehicle) -> None:
     assert leader.update(bench.motion, moved, bench.state())
 
 
-def test_a_key_that_a_jam_makes_last_times_out(vehicle: Vehicle) -> None:
+def test_a_key_times_out_and_without_keys_it_ends(vehicle: Vehicle) -> None:
     bench, keys = Bench(vehicle), Keys()
     leader = ByKeys(keys.take)
     leader.begin(bench.state())
@@ -214,26 +208,12 @@ def test_a_key_that_a_jam_makes_last_times_out(vehicle: Vehicle) -> None:
     before = bench.motion.reference_rad
     bench.step()
     assert bench.motion.reference_rad == before
-
-
-def test_nobody_at_the_keys_ends_it(vehicle: Vehicle) -> None:
-    bench, keys = Bench(vehicle), Keys()
-    leader = ByKeys(keys.take)
-    leader.begin(bench.state())
-    assert not leader.update(bench.motion, None, bench.state())
-    assert leader.update(bench.motion, None, replace(bench.state(), stamp_s=1000.0))
+    assert leader.update(bench.motion, None, replace(bench.state(), stamp_s=1000.0)), "without any key it ends"
 
 
 def test_what_a_terminal_sends_is_taken_apart() -> None:
     assert keys_in("\x1b[C\x1b[Dq1") == ["\x1b[C", "\x1b[D", "q", "1"]
     assert keys_in("\x1b") == ["\x1b"]
-
-
-def test_to_an_angle_and_no_further(vehicle: Vehicle) -> None:
-    bench, leader = Bench(vehicle), Sweeper([Leg(1, 50.0, SPEED_MAX_DEG_S)], (1.0, 1.0))
-    leader.begin(bench.state())
-    bench.until(lambda m: leader.update(bench.motion, m, bench.state()))
-    assert bench.degrees == pytest.approx((90.0, 50.0), abs=1.0)
 
 
 def test_the_sweeps_keep_samples_of_both_ways_at_both_speeds_and_end_hanging(vehicle: Vehicle) -> None:

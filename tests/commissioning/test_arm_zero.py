@@ -94,20 +94,14 @@ def test_every_sign_zero_and_plug_is_reported(
         assert 0 <= found.zero_count < COUNTS_PER_TURN
 
 
-def test_an_arm_as_the_file_says_needs_no_change() -> None:
-    arm = arm_with()
-    result = Bench(arm, (1, -1), (1024, 3072)).through().result
-    assert result is not None and result.changes(arm) == {}
-
-
 def test_a_hand_s_two_degrees_are_left_alone_and_ten_are_not() -> None:
     arm = arm_with()
-    for off_counts, expected in ((15, set()), (-15, set()), (120, {("arm", "joints", 0, "zero_count")})):
+    for off_counts, expected in ((0, set()), (15, set()), (-15, set()), (120, {("arm", "joints", 0, "zero_count")})):
         result = Bench(arm, (1, -1), (1024 + off_counts, 3072)).through().result
         assert result is not None and set(result.changes(arm)) == expected
 
 
-def test_nothing_counts_before_the_arm_was_moved_unless_somebody_says_so() -> None:
+def test_a_pose_counts_only_after_the_arm_was_moved_or_with_a_confirmation() -> None:
     bench = Bench(arm_with(), (1, -1), (1024, 3072))
     bench.at = list(bench.guide.steps[0].pose_deg)
     assert bench.hold().number == 1

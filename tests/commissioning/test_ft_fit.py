@@ -144,14 +144,14 @@ def test_a_sensor_that_repeats_itself_is_stuck() -> None:
     assert "0.39 s" in row.read or "0.40 s" in row.read
 
 
-def test_the_worlds_weight_hangs_while_somebody_reads_the_sensor() -> None:
+def test_the_simulated_weight_is_on_the_net_while_the_sensor_is_read() -> None:
     hung = HungWeight(World(net_weight_kg=0.5, net_weight_t_s=2.0))
     reads = ((0.0, False), (1.0, True), (2.9, True), (3.0, True), (9.0, True), (9.1, False), (9.2, True))
     pulls_n = [hung.pull_n(t_s, read) for t_s, read in reads]
     assert pulls_n == pytest.approx([0.0, 0.0, 0.0, 4.905, 4.905, 0.0, 0.0])
 
 
-def test_drift_is_told_from_samples_that_came_in_one_burst() -> None:
+def test_drift_is_computed_from_samples_that_arrive_in_one_burst() -> None:
     """A computer that was held up delivers most samples of a second at once; the line is defined all the same."""
     t = np.arange(0.0, 1.21, 0.01)
     samples = stream(np.column_stack((30.0 + t, 0.0 * t, 0.0 * t)), rate_hz=100.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -32,6 +33,7 @@ def vector(values: np.ndarray) -> Vec3:
     return (float(values[0]), float(values[1]), float(values[2]))
 
 
+@cache
 def tapped(
     delay_s: float,
     *,
@@ -86,14 +88,14 @@ def test_taps_are_found_and_sway_is_not() -> None:
     assert find_taps(tapped(0.005, strength_m_s2=0.0)[0]) == []
 
 
-def test_noise_of_motion_capture_is_reported() -> None:
+def test_the_noise_of_motion_capture_is_measured() -> None:
     _, poses = tapped(0.005)
     position_m, rotation_rad = mocap_noise(poses)
     assert position_m == pytest.approx(0.0002, rel=0.15)
     assert rotation_rad == pytest.approx(math.radians(0.05), rel=0.15)
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.0053, 0.0207, 0.09])
+@pytest.mark.parametrize("delay_s", [0.0, 0.0207, 0.09])
 def test_a_delay_is_found_finer_than_the_samples(delay_s: float) -> None:
     taps = measured(*tapped(delay_s, seed=1))
     assert [tap.problem for tap in taps] == [""] * len(TAPS_AT_S)
@@ -103,15 +105,9 @@ def test_a_delay_is_found_finer_than_the_samples(delay_s: float) -> None:
     assert result.error_s < 0.001
 
 
-def test_a_quiet_imu_and_sharp_cameras_show_it_to_a_fraction_of_a_millisecond() -> None:
-    result = combine(measured(*tapped(0.0123, accel_noise=0.03, mocap_noise_m=0.00005)))
-    assert not isinstance(result, str), result
-    assert result.delay_s == pytest.approx(0.0123, abs=0.0003)
-
-
 def test_each_taps_error_is_what_it_scatters_by() -> None:
     off, told = [], []
-    for seed in range(10, 16):
+    for seed in range(10, 14):
         for tap in measured(*tapped(0.010, seed=seed)):
             off.append(tap.delay_s - 0.010)
             told.append(tap.error_s)
@@ -171,7 +167,7 @@ def test_lost_frames_around_a_tap_make_it_not_count() -> None:
     assert latency_fit.TAPS_MIN == 5
 
 
-def test_people_get_a_table_and_its_sum() -> None:
+def test_the_table_of_taps_and_its_sum_are_printed() -> None:
     taps = made_up(35.9, 36.4, 35.7, 36.2, 36.0)
     m = Measured(
         taps=(*taps, *made_up(80.0, problem="too weak: x")),

@@ -65,7 +65,7 @@ VERTICAL = "--plane=1.5,0,1,-1,0,0"
 PLANES = [VERTICAL, VERTICAL, f"--plane=1.5,0,1,{LEANED[0]},0,{LEANED[2]}"]
 
 
-def test_the_command_says_how_to_move_the_pivot(flights: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_how_to_move_the_pivot(flights: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["mocap", "pivot", *flights, *PLANES]) == EXIT_REFUSED
     out = capsys.readouterr().out
     assert "24.4 mm off" in out

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_OK
 from tests.support import CATCH, ROOT, Ended, Sandbox, World, run_here, set_options
 
 VEHICLE = ROOT / "configs/vehicles/tarot650_2r.yaml"
@@ -113,24 +113,6 @@ def test_a_server_at_another_address_is_found_by_broadcast(sandbox: Sandbox, veh
     assert bad(first) == {"mocap.server": "set devices.mocap.server: 127.0.0.1"}
     assert changes(first) == {"devices.mocap.server": "127.0.0.1"}
     assert "mocap.server" not in bad(again)
-
-
-def test_nobody_there_is_one_line_with_what_to_look_at() -> None:
-    port = {"vehicle.devices.mocap.server": "127.0.0.1", "vehicle.devices.mocap.interface": "127.0.0.1"}
-    ended = run_here(
-        "mocap", "check", "--vehicle", VEHICLE, *set_options(**port, **{"vehicle.devices.mocap.command_port": 9})
-    )
-    assert ended.code == EXIT_REFUSED
-    assert "Motive running" in ended.out
-    assert "no server answers on this segment" in ended.out
-    assert "Traceback" not in ended.err
-
-
-@pytest.mark.parametrize("options", [("--seconds", "0"), ("--seconds", "nan"), ("--vehicle", "none.yaml")])
-def test_bad_input_opens_nothing(options: tuple[str, ...]) -> None:
-    ended = run_here("mocap", "check", *(() if "--vehicle" in options else ("--vehicle", VEHICLE)), *options)
-    assert ended.code == EXIT_BAD_INPUT
-    assert len(ended.err_lines) == 1
 
 
 def test_a_y_up_stream_is_found_and_written(sandbox: Sandbox, vehicle: Path) -> None:

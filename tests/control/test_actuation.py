@@ -116,10 +116,6 @@ def test_each_saturation_is_known_to_the_law(
     assert found.any_clipped is any(clipped)
 
 
-def test_a_torque_that_is_no_number_stays_none_for_the_gate_to_refuse() -> None:
-    assert all(map(math.isnan, sent((0.0, 0.0, WEIGHT_N), (math.nan, math.nan)).arm_torque_nm))
-
-
 def test_on_the_ground_only_a_share_of_the_vertical_force_is_commanded() -> None:
     found = sent((5.0, 5.0, WEIGHT_N), scale=0.4)
     assert found.force_world_n == pytest.approx((0.0, 0.0, 0.4 * WEIGHT_N))

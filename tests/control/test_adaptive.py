@@ -61,13 +61,6 @@ def test_it_pushes_against_the_position_error(config: FlightConfig, axis: int) -
     assert tau[axis] - rest[axis] <= -0.1 * stiffness * 0.999
 
 
-def test_leaning_follows_the_lateral_force(config: FlightConfig) -> None:
-    """Too far forward and left: it leans back (pitch < 0) and right (roll > 0)."""
-    roll, pitch, _ = settled(config, state(position=(0.2, 0.2, 1.0)), 100).log.attitude_desired_rad
-    assert pitch < -0.01
-    assert roll > 0.01
-
-
 @pytest.mark.parametrize("joint", [0, 1])
 def test_it_pushes_joints_back_and_respects_their_limit(config: FlightConfig, joint: int) -> None:
     rest = settled(config, state(), 1).arm_torque_nm
@@ -95,14 +88,6 @@ def test_without_force_sensor_it_flies_on() -> None:
     config = load_flight("configs/missions/catch.yaml", preset="recommended")
     wrench = settled(config, state(force=None))
     assert wrench.log.force_ext_world_n == (0.0, 0.0, 0.0)
-
-
-def test_lateral_force_is_limited_by_tilt(config: FlightConfig) -> None:
-    wrench = settled(config, state(position=(3.0, -3.0, 1.0)), 400)
-    roll, pitch, _ = wrench.log.attitude_desired_rad
-    tilt = math.acos(math.cos(roll) * math.cos(pitch))
-    assert tilt <= math.radians(config.vehicle.airframe.tilt_max_deg) + 1e-6
-    assert wrench.log.saturated[1]
 
 
 norms = st.floats(0, 1e4)

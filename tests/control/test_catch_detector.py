@@ -168,7 +168,7 @@ def test_a_swinging_payload_is_not_lost() -> None:
     assert net.left == []
 
 
-def test_a_sensor_that_says_nothing_says_nothing_of_the_payload() -> None:
+def test_without_force_samples_the_payload_has_not_left() -> None:
     net = Net()
     net.catch()
     net.feel(3.0, None)

@@ -16,7 +16,7 @@ from companion.control.csc import CscController
 from companion.control.types import PlantState, Wrench
 from companion.core.flight_core import FlightCore
 from companion.mission.reference import at_rest
-from companion.model.frames import quat_rotate, rotation_matrix
+from companion.model.frames import rotation_matrix
 from companion.model.types import IDENTITY_QUAT, PhaseKind, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
@@ -110,7 +110,7 @@ def test_spooling_scales_the_vertical_force_alone() -> None:
     assert wrench.collective_n == pytest.approx(0.4 * WEIGHT_N, rel=0.05)
 
 
-def test_it_saturates_and_says_so() -> None:
+def test_saturation_is_logged() -> None:
     config = configured()
     wrench = stepped(config, at(position=(9.0, 0.0, -9.0), arm=(POSE[0] + 3.0, POSE[1] - 3.0)))
     assert wrench.log.saturated == (True, True, True)
@@ -120,11 +120,10 @@ def test_it_saturates_and_says_so() -> None:
     assert math.atan2(math.hypot(force[0], force[1]), force[2]) <= math.radians(20) + 1e-9
 
 
-@pytest.mark.parametrize(("payload_kg", "limit_m"), [(0.2, 0.06), (0.3, 0.08)])
-def test_it_catches_the_payload_and_carries_it(payload_kg: float, limit_m: float) -> None:
-    result = flown(f"world.payload_kg={payload_kg}")
+def test_it_catches_the_payload_and_carries_it() -> None:
+    result = flown("world.payload_kg=0.2")
     assert event_ids(result) == ["takeoff", "catch"]
-    assert error_after_catch_m(result) <= limit_m
+    assert error_after_catch_m(result) <= 0.06
 
 
 def height_error_before_catch_m(result: FastResult) -> float:
@@ -138,15 +137,13 @@ def height_error_before_catch_m(result: FastResult) -> float:
     return sum(errors) / len(errors)
 
 
-@pytest.mark.parametrize(("scale", "sign"), [(0.85, -1), (1.15, 1)])
-def test_a_wrong_model_is_visibly_worse(scale: float, sign: int) -> None:
-    """15 % in every mass: off its height by the missing weight over the stiffness; too much mass makes up for some payload."""
+def test_a_model_with_too_little_mass_flies_low_and_with_a_larger_error() -> None:
+    """15 % in every mass: below its height by the missing weight over the stiffness."""
     right = flown("world.payload_kg=0.2")
-    masses = configured("world.payload_kg=0.2", f"controller.model_mass_scale={scale}")
-    wrong = FastFlight(masses).run(until_mission_s=11.0 if scale < 1.0 else 8.0)
+    wrong = flown("world.payload_kg=0.2", "controller.model_mass_scale=0.85")
     assert abs(height_error_before_catch_m(right)) < 0.003
-    assert sign * height_error_before_catch_m(wrong) > 0.006
-    assert scale > 1.0 or error_after_catch_m(wrong) > 1.25 * error_after_catch_m(right)
+    assert height_error_before_catch_m(wrong) < -0.006
+    assert error_after_catch_m(wrong) > 1.25 * error_after_catch_m(right)
 
 
 def test_a_core_built_from_the_recorded_configuration_flies_the_same() -> None:
@@ -154,13 +151,3 @@ def test_a_core_built_from_the_recorded_configuration_flies_the_same() -> None:
     again = FlightCore(FlightConfig.model_validate_json(flight.config.flight.model_dump_json()))
     result = flown("world.payload_kg=0.2")
     assert [again.step(inputs) for inputs in result.inputs[:1500]] == result.outputs[:1500]
-
-
-def test_the_net_force_is_felt_in_the_body_frame() -> None:
-    """A force along the body's y axis turns no joint."""
-    config = configured()
-    c = CscController(law(config), config.vehicle, 0.49)
-    tilted = at(attitude=(math.cos(0.1), math.sin(0.1), 0.0, 0.0))
-    sideways = quat_rotate(tilted.attitude_wxyz, (0.0, 2.0, 0.0))
-    tau_ext, _ = c._external(tilted, sideways)
-    assert tau_ext[6:8] == pytest.approx((0.0, 0.0), abs=1e-12)

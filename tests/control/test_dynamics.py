@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
-from companion.control.arm_model import dynamics_of, manipulator_of
+from companion.control.arm_model import dynamics_of
 from companion.control.dynamics import Dynamics, DynamicsTerms, chi_rate_from_body_rate
 from companion.model.frames import quat_from_euler_zyx, rotation_matrix
 from companion.model.types import Chi, Joints, Vec3
@@ -114,19 +114,6 @@ def test_mass_is_symmetric_and_positive_and_changes_as_twice_coriolis_power(vehi
         mass_power = (power(h) - power(-h)) / (2 * h)
         coriolis_power = float(np.array(rate) @ np.array(terms(dynamics, rpy, arm, rate).coriolis))
         assert mass_power == pytest.approx(2.0 * coriolis_power, abs=1e-5)
-
-
-def test_arm_alone_is_the_arm_block_at_rest(vehicle: Vehicle) -> None:
-    dynamics, manipulator = dynamics_of(vehicle), manipulator_of(vehicle)
-    rng = np.random.default_rng(6)
-    for _ in range(20):
-        rpy, arm, rate = random_state(rng)
-        still: Chi = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, rate[6], rate[7])
-        whole, alone = terms(dynamics, rpy, arm, still), dynamics.arm_terms(arm, (rate[6], rate[7]))
-        np.testing.assert_allclose(np.array(whole.mass)[6:, 6:], np.array(alone.mass), atol=1e-14)
-        np.testing.assert_allclose(whole.coriolis[6:], alone.coriolis, atol=1e-12)
-        gravity = manipulator.gravity_torque_nm(arm, quat_from_euler_zyx(*rpy))
-        np.testing.assert_allclose(whole.gravity[6:], gravity, atol=1e-12)
 
 
 def test_a_scaled_model_is_scaled_throughout(vehicle: Vehicle) -> None:

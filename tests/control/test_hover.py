@@ -58,7 +58,7 @@ def test_steady_climb_and_acceleration_are_no_change() -> None:
     assert learnt(TRUE * (1.0 + 1.0 / GRAVITY_M_S2), state((0.0, 0.0, 1.0))) == pytest.approx(TRUE, rel=1e-3)
 
 
-def test_leaning_into_a_turn_is_no_change() -> None:
+def test_tilting_into_a_turn_is_no_change() -> None:
     pitch = math.radians(10.0)
     plant = state((GRAVITY_M_S2 * math.tan(pitch), 0.0, 0.0), quat_from_euler_zyx(0.0, pitch, 0.0))
     assert learnt(TRUE / math.cos(pitch), plant) == pytest.approx(TRUE, rel=1e-3)

@@ -19,9 +19,8 @@ from companion.control.arm_model import manipulator_of
 from companion.control.load_adaptation import LoadAdaptation
 from companion.mission.reference import at_rest
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import IDENTITY_QUAT, ControlLog, Joints, Matrix
+from companion.model.types import ControlLog, Joints, Matrix
 from tests.control.states import POSE, at
-from tests.support import tool_of
 
 CONFIG = load_flight("configs/missions/catch.yaml", preset="recommended")
 MANIPULATOR = manipulator_of(CONFIG.vehicle)
@@ -64,7 +63,7 @@ def test_a_constant_force_is_cancelled_and_s_returns_to_zero() -> None:
     np.testing.assert_allclose(s, 0.0, atol=1e-3)
 
 
-def test_leakage_leaves_the_error_that_its_balance_says() -> None:
+def test_leakage_leaves_the_error_of_its_balance() -> None:
     """At rest theta = -(Gamma / nu) s and Lambda s = load + theta, so s = load / (Lambda + Gamma / nu)."""
     load = LoadAdaptation(law(load_rate_xyz=(0.0, 0.0, 20.0), load_leakage=0.5), MANIPULATOR)
     s = 0.0
@@ -93,19 +92,6 @@ def test_moments_and_friction_are_found_while_the_arm_moves() -> None:
     np.testing.assert_allclose(load.moments_kg_m, moments, rtol=0.05)
     np.testing.assert_allclose(load.friction_nm, friction, rtol=0.1)
     np.testing.assert_allclose(s, 0.0, atol=5e-3)
-
-
-def test_the_levers_of_gravity_times_the_moments_are_the_gravity_torque() -> None:
-    arm, tool = CONFIG.vehicle.arm, tool_of(CONFIG.vehicle)
-    carried_kg = tool.sensor_mass_kg + tool.beyond_sensor_kg
-    first = arm.link_masses_kg[0] * arm.link_com_m[0] + (arm.link_masses_kg[1] + carried_kg) * arm.link_lengths_m[0]
-    second = arm.link_masses_kg[1] * arm.link_com_m[1] + carried_kg * arm.link_lengths_m[1]
-    levers = MANIPULATOR.gravity_levers_m_s2((1.7, 1.0), (0.0, 0.0, GRAVITY_M_S2))
-    expected = MANIPULATOR.gravity_torque_nm((1.7, 1.0), IDENTITY_QUAT)
-    np.testing.assert_allclose(np.array(levers) @ (first, second), expected, rtol=1e-12)
-    np.testing.assert_allclose(MANIPULATOR.moment_torque_nm(levers, (first, second)), expected, rtol=1e-12)
-    transposed = np.array(levers).T @ (0.3, -0.8)
-    np.testing.assert_allclose(MANIPULATOR.projected_on_moments(levers, (0.3, -0.8)), transposed, rtol=1e-12)
 
 
 @pytest.mark.parametrize("held_nm", [0.15, -0.15])

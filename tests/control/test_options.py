@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 from typing import Any
 
 import pytest
@@ -72,20 +71,6 @@ def test_the_arms_inertia_takes_the_place_of_m_d(config: FlightConfig) -> None:
     assert isinstance(config.controller, AdaptiveConfig)
     first, second = config.controller.inertia_md[6:8]
     assert added[6:] == pytest.approx([(m11 - first) * 2.0 + m12, m21 * 2.0 + m22 - second])
-
-
-def test_the_closed_form_of_the_arm_is_the_dynamics(config: FlightConfig) -> None:
-    draw = random.Random(1)
-    dynamics = dynamics_of(config.vehicle)
-    for _ in range(200):
-        angle, rate, acceleration = ((draw.gauss(0, 3), draw.gauss(0, 3)) for _ in range(3))
-        terms = dynamics.arm_terms(angle, rate)
-        (m11, m12), (m21, m22) = terms.mass
-        wanted = (
-            m11 * acceleration[0] + m12 * acceleration[1] + terms.coriolis[0],
-            m21 * acceleration[0] + m22 * acceleration[1] + terms.coriolis[1],
-        )
-        assert dynamics.arm_torque_nm(angle, rate, acceleration) == pytest.approx(wanted, abs=1e-12)
 
 
 def test_the_observer_finds_a_steady_force_whatever_is_asked_for() -> None:

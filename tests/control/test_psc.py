@@ -12,12 +12,11 @@ from msgspec.structs import replace
 from companion.analysis.log import FlightLog
 from companion.analysis.replay import flight_core, replay
 from companion.config.controller import PscConfig
-from companion.control.arm_model import dynamics_of, manipulator_of
 from companion.control.payload_mass import PayloadEstimator
 from companion.control.psc import PscController
 from companion.control.types import PlantState, Wrench
 from companion.mission.reference import at_rest
-from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind
+from companion.model.types import Outcome, PhaseKind
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight, FastResult
@@ -73,24 +72,6 @@ def test_the_vehicle_follows_its_own_law_and_ignores_the_arm() -> None:
     ):
         force = stepped(config, state).log.tau[0:3]
         assert force == pytest.approx((wanted[0], wanted[1], wanted[2] + MASS_KG * G), abs=1e-9)
-
-
-def test_the_arm_on_a_still_base_moves_as_its_target_impedance() -> None:
-    config = configured()
-    c = law(config)
-    state = at(arm=(POSE[0] + 0.05, POSE[1] - 0.04), arm_rate=(0.2, -0.1), force=(0.3, 0.0, -0.5))
-    wrench = stepped(config, state)
-    manipulator = manipulator_of(config.vehicle)
-    terms = dynamics_of(config.vehicle).arm_terms(state.arm_rad, state.arm_rate_rad_s)
-    external = np.array(manipulator.joint_torque_from_force(state.arm_rad, (0.3, 0.0, -0.5)))
-    gravity = np.array(manipulator.gravity_torque_nm(state.arm_rad, IDENTITY_QUAT))
-    applied = np.array(wrench.arm_torque_nm)
-    found = np.linalg.solve(np.array(terms.mass), applied + external - gravity - np.array(terms.coriolis))
-    e, e_rate = np.array(wrench.log.error[6:8]), np.array(wrench.log.error_rate[6:8])
-    wanted = np.array([0.3, -0.2]) - (
-        np.array(c.arm_damping_kd) * e_rate + np.array(c.arm_stiffness_kp) * e - external
-    ) / np.array(c.arm_inertia_md)
-    np.testing.assert_allclose(found, wanted, atol=1e-9)
 
 
 def test_the_integral_part_ends_a_lasting_error_and_is_bounded() -> None:

@@ -57,7 +57,7 @@ def test_an_internal_error_in_the_air_lands_by_px4(tmp_path: Path) -> None:
             check=False,
         )
         assert flown.stdout.strip() == Outcome.ABORTED.value
-        rest = [message["at_rest"] for message in world.messages if message["type"] == "at_rest"]
+        rest = [message["at_rest"] for message in world.messages if message["type"] == "WorldAtRest"]
         assert rest[-2:] == [False, True], "it armed, and stands disarmed"
         assert not world.crashes
 

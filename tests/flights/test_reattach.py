@@ -109,7 +109,7 @@ def test_hung_beside_a_hung_guardian_px4_lands_it(sandbox: Sandbox) -> None:
 
 
 def at_rest(world: World) -> bool:
-    rests = [message["at_rest"] for message in world.messages if message["type"] == "at_rest"]
+    rests = [message["at_rest"] for message in world.messages if message["type"] == "WorldAtRest"]
     return bool(rests) and rests[-1]
 
 

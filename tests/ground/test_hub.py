@@ -9,8 +9,6 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from companion.config.document import ConfigError
-from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.messages import VERSION, Events, Presence, Topic, encode
 from companion.ground.protocol.proof import Signer, with_proofs
 from companion.ground.station.hub import FRESH_S, OUTBOX_MAX, TOO_SLOW, Hub, Outbox
@@ -242,19 +240,3 @@ def test_a_burst_is_allowed_a_flood_is_not_and_it_is_forgotten() -> None:
     assert allowed == MESSAGES_BURST
     assert not bucket.take(0.05)
     assert all(bucket.take(100.0) for _ in range(int(MESSAGES_BURST)))
-
-
-@pytest.mark.parametrize(
-    ("url", "ca", "why"),
-    [
-        ("http://127.0.0.1", None, "--broker: expected mqtt://HOST:PORT"),
-        ("mqtt://127.0.0.1:99999", None, "--broker: expected a port"),
-        ("mqtts://127.0.0.1", "nofile.pem", "--ca nofile.pem: no such file"),
-        ("mqtts://127.0.0.1", "README.md", "--ca README.md: not a certificate"),
-        ("mqtt://127.0.0.1", "README.md", "--ca README.md: has no effect without TLS"),
-    ],
-)
-def test_unusable_brokers(url: str, ca: str | None, why: str) -> None:
-    with pytest.raises(ConfigError, match=why) as caught:
-        broker_access(url, None, ca)
-    assert len(caught.value.lines) == 1

@@ -169,19 +169,8 @@ class PlayedVehicle:
                     continue
                 command, accepted, text = verdict.command, False, verdict.text
             if self.answers:
-                ack = Ack(
-                    v=VERSION,
-                    session=self.session,
-                    nonce=command.nonce,
-                    operator=command.operator,
-                    command=command.command,
-                    accepted=accepted,
-                    text=text,
-                    t_s=self.t_s,
-                    phase="catch",
-                    action="nominal",
-                    proof="",
-                )
+                values = {"operator": command.operator, "command": command.command, "accepted": accepted, "text": text}
+                ack = ack_of(self.session, command.nonce, **values, t_s=self.t_s, action="nominal")
                 await self.say(Topic.ACK, with_proof(ack, self.name, self._operators.key(command.operator)))
 
 

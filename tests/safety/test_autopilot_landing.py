@@ -130,7 +130,7 @@ def test_px4s_word_that_it_stands_is_believed_after_the_first_second() -> None:
     assert 0.01 * first == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_height_that_nobody_can_vouch_for_is_no_touchdown() -> None:
+def test_a_height_without_a_trusted_pose_is_no_touchdown() -> None:
     """Without vision for longer than PX4's height holds, thrust is not cut on its word."""
     landing = Landing(pilot=False)
     for k in range(400):

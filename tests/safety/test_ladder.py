@@ -65,7 +65,7 @@ def test_the_same_event_again_does_not_prolong_a_hold() -> None:
     assert update(state, [], 21.1, TIMES).cause == HOLD_EXPIRED.id
 
 
-def test_going_on_in_the_tick_of_something_graver_changes_nothing() -> None:
+def test_resume_in_the_tick_of_a_more_severe_action_changes_nothing() -> None:
     state = SupervisorState(SafetyAction.HOLD, "before", 1.0)
     for events in itertools.permutations([event(RESUME, SafetyAction.NOMINAL), event("arm_lost", SafetyAction.LAND)]):
         assert update(state, events, 2.0, TIMES).action is SafetyAction.LAND
@@ -77,7 +77,7 @@ def test_a_resume_does_not_end_a_hold_that_begins_in_the_same_tick() -> None:
 
 
 @pytest.mark.parametrize("now", SafetyAction)
-def test_nobody_lets_it_go_on_while_something_stands(now: SafetyAction) -> None:
+def test_resume_is_refused_while_a_finding_is_active(now: SafetyAction) -> None:
     state = SupervisorState(now, "before", 1.0)
     assert update(state, [event(RESUME, SafetyAction.NOMINAL)], 2.0, TIMES, "too little tether left") is state
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -464,7 +464,7 @@ def test_on_the_ground_only_what_matters_there_is_reported(rule: Rule) -> None:
 
 
 @pytest.mark.parametrize("situation", [flying, standing])
-def test_a_machine_in_good_health_is_left_alone(situation: Callable[[], Situation]) -> None:
+def test_a_healthy_machine_raises_no_event(situation: Callable[[], Situation]) -> None:
     assert watched(VEHICLE, [healthy(k) for k in range(4000)], situation()) == []
 
 
@@ -509,22 +509,22 @@ def broken_fields() -> list[tuple[str, str, int | None]]:
     return found
 
 
-@pytest.mark.parametrize("bad", [NAN, math.inf, -math.inf, 1e300])
 @pytest.mark.parametrize(("part", "name", "index"), broken_fields())
-def test_a_value_that_is_no_number_is_reported_and_its_record_counts_as_missing(
-    part: str, name: str, index: int | None, bad: float
+def test_a_value_that_is_not_finite_is_reported_and_its_record_counts_as_missing(
+    part: str, name: str, index: int | None
 ) -> None:
-    monitors = Monitors(VEHICLE)
-    assert watched(VEHICLE, [healthy(0), healthy(1)], flying(), monitors) == []
-    value = getattr(getattr(healthy(2), part), name)
-    value = bad if index is None else (*value[:index], bad, *value[index + 1 :])
-    events = monitors.check(put(part, **{name: value})(healthy(2)), flying())
-    assert [(event.id, event.action) for event in events] == [(f"{part}_not_finite", SafetyAction.WARN)]
-    assert f"ignored: {name} = " in events[0].text and f"{bad:g}" in events[0].text and len(events[0].text) < 120
-    assert monitors.trusted is not None and getattr(monitors.trusted, part) is None
-    good = healthy(3)
-    assert monitors.check(good, flying()) == ()
-    assert monitors.trusted is good
+    for bad in (NAN, math.inf, -math.inf, 1e300):
+        monitors = Monitors(VEHICLE)
+        assert watched(VEHICLE, [healthy(0), healthy(1)], flying(), monitors) == []
+        value = getattr(getattr(healthy(2), part), name)
+        value = bad if index is None else (*value[:index], bad, *value[index + 1 :])
+        events = monitors.check(put(part, **{name: value})(healthy(2)), flying())
+        assert [(event.id, event.action) for event in events] == [(f"{part}_not_finite", SafetyAction.WARN)]
+        assert f"ignored: {name} = " in events[0].text and f"{bad:g}" in events[0].text and len(events[0].text) < 120
+        assert monitors.trusted is not None and getattr(monitors.trusted, part) is None
+        good = healthy(3)
+        assert monitors.check(good, flying()) == ()
+        assert monitors.trusted is good
 
 
 # -- motion capture --------------------------------------------------------------------------------------------------
@@ -650,7 +650,7 @@ def test_bad_poses_of_every_kind_in_turn_are_no_motion_capture() -> None:
     assert first.t_s - START_S <= VEHICLE.safety.mocap_timeout_s + 5 * TICK_S
 
 
-@pytest.mark.parametrize("gone_s", [0.3, 0.8, 2.5])
+@pytest.mark.parametrize("gone_s", [0.3, 2.5])
 def test_motion_capture_that_comes_back_at_its_full_rate_is_not_reported_as_slow(gone_s: float) -> None:
     def lost_for_a_while(i: Inputs) -> Inputs:
         return stopped("mocap")(i) if 1.0 <= i.t_s - START_S < 1.0 + gone_s else i
@@ -813,7 +813,7 @@ WALLS = [(0, 1, 1.81), (0, -1, 1.81), (1, 1, 1.41), (1, -1, 1.41), (2, 1, 2.15)]
 
 
 @pytest.mark.parametrize(("axis", "side", "most_m"), WALLS)
-def test_at_every_wall_the_fence_is_where_the_rotors_leave_the_room(axis: int, side: int, most_m: float) -> None:
+def test_at_every_side_the_fence_is_where_the_rotors_leave_the_room(axis: int, side: int, most_m: float) -> None:
     def found(off_m: float, speed_m_s: float) -> list[str]:
         place, velocity = [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]
         place[axis], velocity[axis] = side * (most_m + off_m), side * speed_m_s
@@ -835,7 +835,9 @@ def test_at_every_wall_the_fence_is_where_the_rotors_leave_the_room(axis: int, s
     ("gap_s", "spoken"),
     [(0.04, []), (0.2, [("loop_late", SafetyAction.WARN)]), (1.0, [("loop_stalled", SafetyAction.LAND)])],
 )
-def test_a_held_up_process_blames_itself_and_no_device(gap_s: float, spoken: list[tuple[str, SafetyAction]]) -> None:
+def test_after_a_late_tick_the_loop_is_reported_and_no_device(
+    gap_s: float, spoken: list[tuple[str, SafetyAction]]
+) -> None:
     """The first tick after a hold-up sees old stamps of everything; a moment later all is fresh."""
     late_s = START_S + gap_s
     inputs = [healthy(), replace(healthy(), t_s=late_s), *[healthy(k, late_s + k * TICK_S) for k in range(1, 60)]]
@@ -851,28 +853,24 @@ def test_a_mocap_that_stays_away_after_a_hold_up_is_lost() -> None:
 # -- what comes and goes ---------------------------------------------------------------------------------------------
 
 
-def test_what_flickers_is_not_reported_in_every_tick() -> None:
-    def now_and_then(i: Inputs) -> Inputs:
-        return put("arm", read_failures=6)(i) if i.tick % 20 == 5 else i
+@pytest.mark.parametrize(("ticks", "reports"), [(range(5, 700, 20), 1), ((100, 500), 2)])
+def test_a_finding_that_flickers_is_reported_once_and_one_that_returns_later_again(
+    ticks: Sequence[int], reports: int
+) -> None:
+    def failing(i: Inputs) -> Inputs:
+        return put("arm", read_failures=6)(i) if i.tick in ticks else i
 
-    assert len(watched(VEHICLE, after_a_moment(now_and_then), flying())) == 1
+    assert len(watched(VEHICLE, after_a_moment(failing), flying())) == reports
 
 
-def test_what_ends_before_its_hold_time_begins_it_anew() -> None:
+def test_a_finding_that_ends_before_its_hold_time_begins_it_anew() -> None:
     def low_twice(i: Inputs) -> Inputs:
         return put("status", battery_remaining=0.25)(i) if 100 <= i.tick < 280 or 300 <= i.tick < 480 else i
 
     assert watched(VEHICLE, after_a_moment(low_twice), flying()) == []
 
 
-def test_what_comes_back_after_a_while_is_reported_again() -> None:
-    def twice(i: Inputs) -> Inputs:
-        return put("arm", read_failures=6)(i) if i.tick in (100, 500) else i
-
-    assert len(watched(VEHICLE, after_a_moment(twice), flying())) == 2
-
-
-def test_what_is_still_there_after_a_hold_was_taken_back_is_reported_again() -> None:
+def test_a_finding_that_is_active_after_a_resume_is_reported_again() -> None:
     monitors = Monitors(VEHICLE)
     inputs = after_a_moment(at(1.6, 0.0, 1.0, vx=0.8), sound=0)
     before = watched(VEHICLE, inputs[:100], flying(), monitors)
@@ -881,7 +879,7 @@ def test_what_is_still_there_after_a_hold_was_taken_back_is_reported_again() -> 
     assert [[event.id for event in events] for events in (before, after)] == [["geofence_near"], ["geofence_near"]]
 
 
-def test_what_stands_is_known_until_it_was_gone_for_a_second() -> None:
+def test_a_finding_is_active_until_it_was_gone_for_a_second() -> None:
     monitors = Monitors(VEHICLE)
     near = after_a_moment(at(1.6, 0.0, 1.0, vx=0.8), sound=0)[:100]
     watched(VEHICLE, near, flying(), monitors)
@@ -893,7 +891,7 @@ def test_what_stands_is_known_until_it_was_gone_for_a_second() -> None:
 
 
 @pytest.mark.parametrize("first_s", [0.0, 0.3])
-def test_of_several_that_stand_the_gravest_is_named(first_s: float) -> None:
+def test_of_several_active_findings_the_most_severe_is_named(first_s: float) -> None:
     """The arm is lost before or after the vehicle comes near the wall."""
     monitors, near = Monitors(VEHICLE), at(1.6, 0.0, 1.0, vx=0.8)
     lost = [i if i.t_s - START_S < first_s else stopped("arm")(i) for i in map(healthy, range(120))]
@@ -901,7 +899,7 @@ def test_of_several_that_stand_the_gravest_is_named(first_s: float) -> None:
     assert "joint state" in (monitors.standing() or "")
 
 
-def test_a_warning_and_peoples_own_words_are_no_reason_to_hold() -> None:
+def test_a_warning_and_an_operators_command_do_not_prevent_resuming() -> None:
     monitors = Monitors(VEHICLE)
     warm = put("arm", temperature_c=(70.0, 35.0))
     events = watched(VEHICLE, [warm(healthy(k)) for k in range(150)], flying(), monitors)
@@ -911,7 +909,7 @@ def test_a_warning_and_peoples_own_words_are_no_reason_to_hold() -> None:
     assert monitors.standing() is None
 
 
-def test_people_may_ask_for_the_same_again() -> None:
+def test_an_operator_may_repeat_a_command() -> None:
     asked = [
         OperatorCommand.HOLD,
         OperatorCommand.RESUME,
@@ -924,7 +922,7 @@ def test_people_may_ask_for_the_same_again() -> None:
     assert told == ["operator_hold", "operator_resume", "operator_hold", "operator_hold"]
 
 
-def test_while_inputs_are_missing_only_people_and_broken_values_are_heard() -> None:
+def test_while_inputs_are_missing_only_commands_and_invalid_values_are_reported() -> None:
     nothing = replace(healthy(), vehicle=None, status=None, mocap=None, force=None)
     waiting = standing(waiting=True)
     inputs: list[Inputs] = [replace(nothing, tick=k, t_s=START_S + k) for k in range(10)]
