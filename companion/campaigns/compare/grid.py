@@ -13,7 +13,7 @@ ADAPTATION = ("on", "off")
 ADAPTATION_OFF = f"{LESS}adaptation off"
 """Suffix of the name of a preset that is flown without its adaptation."""
 ABLATIONS: dict[str, tuple[str, ...]] = {
-    # rho = min(H . b + zeta, rho_max): the first override removes all that H and zeta learn, which is the paper's adaptation; the others
+    # rho = min(H . b + zeta, rho_max): the first override removes all that H and zeta learn, the paper's adaptation; the others
     # remove the adaptive loads.
     "adaptation off": (
         "controller.rho_max=1.0e-9",
