@@ -30,10 +30,10 @@ from companion.analysis.plot_style import (
     write_png,
 )
 from companion.analysis.time_axes import legend, line, stack
-from companion.analysis.timing import end_s
 from companion.model.best_pose import best_pose
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import tilt_rad
+from companion.model.tick_times import end_s
 
 
 def write_plots(log: FlightLog, out_dir: Path) -> list[Picture]:

@@ -47,12 +47,11 @@ def run(arguments: argparse.Namespace) -> int:
     """
     from companion.commissioning.identify.identification import identify
     from companion.commissioning.identify.proposal import remarks, vehicle_changes, world_text
-    from companion.commissioning.identify.samples import IdentifyError
     from companion.commissioning.patch import propose
 
     try:
         found = identify(FlightLog.read(arguments.log))
-    except (LogError, IdentifyError) as error:
+    except LogError as error:
         print_error(error)
         return EXIT_BAD_INPUT
     vehicle_file = _vehicle_file(arguments, found.flight.vehicle_file)
