@@ -27,7 +27,7 @@ from companion.analysis.plot_style import (
     new_figure,
     path_panes,
     scale_path,
-    write_png,
+    write_pictures,
 )
 from companion.analysis.time_axes import legend, line, stack
 from companion.model.best_pose import best_pose
@@ -88,14 +88,7 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Picture]:
             _timing,
         ),
     )
-    written: list[Picture] = []
-    for name, title, caption, make in makers:
-        figure = make(log)
-        if figure is not None:
-            path = out_dir / f"{name}.png"
-            write_png(figure, path)
-            written.append(Picture(path, title, caption))
-    return written
+    return write_pictures(((name, title, caption, make(log)) for name, title, caption, make in makers), out_dir)
 
 
 def _tracking(log: FlightLog) -> Figure | None:

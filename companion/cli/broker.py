@@ -25,7 +25,6 @@ VEHICLE = "tarot650-2r"
 
 
 def add_parser(commands: Any) -> None:
-    """Add `broker` to the sub-parsers of `companion`."""
     broker = commands.add_parser("broker", help="a broker for several computers: users, certificates, permissions")
     parts = broker.add_subparsers(dest="part", required=True, metavar="PART")
     init = parts.add_parser(

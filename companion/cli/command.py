@@ -33,7 +33,6 @@ _HELP = {
 
 
 def add_parser(commands: Any) -> None:
-    """Add `command` to the sub-parsers of `companion`."""
     command = commands.add_parser(
         "command",
         help="command a vehicle from the ground: hold, land, abort, resume, start",
@@ -53,7 +52,6 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Send the command; return the exit code."""
     only = vehicle_option(arguments)
     access = broker_access(arguments.broker, arguments.login, arguments.ca)
     signer = signer_of(access, arguments.operators, arguments.operator)

@@ -24,7 +24,6 @@ _FIRST_SEED_MAX = 900_000
 
 
 def add_parser(commands: Any) -> None:
-    """Add `compare` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "compare",
         help="compare controllers in the fast closed loop",
@@ -90,7 +89,6 @@ def _numbers(text: str, most: float, what: str) -> tuple[float, ...]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fly the comparison; return the exit code."""
     return fly(_campaign(arguments), arguments, "comparisons")
 
 

@@ -24,7 +24,6 @@ CONTACT_MISSION, SLIDING_MISSION, CONTACT_WORLD = "press", "slide", "wall"
 
 
 def add_parser(commands: Any) -> None:
-    """Add `faults` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "faults",
         help="fly a mission with every fault of the simulated world",
@@ -68,7 +67,6 @@ def _known(known: Sequence[str], what: str) -> Callable[[str], tuple[str, ...]]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fly the faults, or list their kinds; return the exit code."""
     if not arguments.list:
         return fly(_campaign(arguments), arguments, "faults")
     if arguments.json:

@@ -18,7 +18,6 @@ WORLD, RESULT = "identified_world.yaml", "identified.json"
 
 
 def add_parser(commands: Any) -> None:
-    """Add `identify` to the sub-parsers of `companion`."""
     identify = commands.add_parser(
         "identify",
         help="find the parameters of a machine in a flight's log; write a world fitted to it",

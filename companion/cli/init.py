@@ -13,7 +13,6 @@ from companion.model.exit_codes import EXIT_OK
 
 
 def add_parser(commands: Any) -> None:
-    """Add `init` to the sub-parsers of `companion`."""
     init = commands.add_parser(
         "init",
         help="copy the shipped missions, vehicle, control laws, worlds and layouts into a new folder, to edit them",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
 import re
@@ -24,6 +23,7 @@ from companion.install.record import RECORD_PATH, load, under_root
 from companion.install.state import InstallError
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import print_error
+from companion.runtime.subprocesses import signals_call
 
 USER = "companion"
 MISSION = "/etc/companion/mission.yaml"
@@ -36,7 +36,6 @@ _HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 
 
 def add_parser(commands: Any) -> None:
-    """Add `install` to the sub-parsers of `companion`."""
     install = commands.add_parser(
         "install",
         help="set up the vehicle's computer: service, adapter names and latency, limits, full CPU clock; or undo this",
@@ -85,7 +84,6 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Plan, show, ask and apply; return the exit code."""
     root = Path(os.path.abspath(arguments.root))
     if not root.is_dir():
         print_error(f"companion install: --root {arguments.root}: expected the root folder of a system")
@@ -99,7 +97,8 @@ def run(arguments: argparse.Namespace) -> int:
         )
         return EXIT_REFUSED
     try:
-        with _terminable():
+        # As at Ctrl-C, unfinished changes are rolled back.
+        with signals_call((signal.SIGTERM, signal.SIGHUP), _cancel):
             return _undo(arguments, root) if arguments.undo else _install(arguments, root)
     except InstallError as error:
         print_error(f"companion install: {error}")
@@ -293,16 +292,5 @@ def _agreed(question: str) -> bool:
     return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
 
 
-@contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """Context in which SIGTERM and SIGHUP act like Ctrl-C, so that unfinished changes are rolled back."""
-
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def _cancel() -> None:
+    raise KeyboardInterrupt

@@ -8,7 +8,6 @@ from companion.commissioning.tool import add_tool, number
 
 
 def add_parser(commands: Any) -> None:
-    """Add `latency` to the sub-parsers of `companion`."""
     latency = add_tool(
         commands, "latency", "companion.commissioning.latency.tools",
         help="measure the delay of motion capture (EKF2_EV_DELAY) by tapping the airframe",

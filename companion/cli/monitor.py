@@ -32,7 +32,6 @@ PORT = 8642
 
 
 def add_parser(commands: Any) -> None:
-    """Add `monitor` to the sub-parsers of `companion`."""
     monitor = commands.add_parser(
         "monitor",
         help="watch and command from the ground: a page in the browser, or --text in the terminal",
@@ -85,7 +84,6 @@ def vehicle_option(arguments: argparse.Namespace) -> str | None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run until Ctrl-C; return the exit code."""
     _check(arguments)
     try:
         if arguments.text:

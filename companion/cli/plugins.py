@@ -13,7 +13,6 @@ from companion.plugins import CONTROL_LAWS, KINDS, PluginError, installed
 
 
 def add_parser(commands: Any) -> None:
-    """Add `plugins` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "plugins",
         help="list the installed control laws, motion-capture systems, force sensors and arms, and the packages that provide them",

@@ -30,7 +30,6 @@ _HEARTBEAT_DEADLINE_S = 5.0
 
 
 def add_parser(commands: Any) -> None:
-    """Add `px4` to the sub-parsers of `companion`."""
     px4 = commands.add_parser("px4", help="compare PX4's parameters with a file, or write them")
     parts = px4.add_subparsers(dest="part", required=True, metavar="PART")
     params = parts.add_parser(

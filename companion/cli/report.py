@@ -30,7 +30,6 @@ _NAME_BYTES_MAX = 200
 
 
 def add_parser(commands: Any) -> None:
-    """Add `report` to the sub-parsers of `companion`."""
     report = commands.add_parser(
         "report",
         help="write summary and report of a log, or compare several flights side by side",

@@ -15,7 +15,6 @@ from companion.config.shipped import DEFAULT_MISSION
 
 
 def add_parser(commands: Any) -> None:
-    """Add `robustness` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "robustness",
         help="fly a mission in many randomly drawn worlds",
@@ -58,7 +57,6 @@ def _model_error_override(text: str) -> str:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fly the draws or cases; return the exit code."""
     return fly(_campaign(arguments), arguments, "robustness")
 
 

@@ -14,7 +14,6 @@ from companion.config.shipped import DEFAULT_MISSION
 
 
 def add_parser(commands: Any) -> None:
-    """Add `tune` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "tune",
         help="find the gains of a control law for a machine",

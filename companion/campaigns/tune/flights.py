@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any, Self
 
 from companion.campaigns.process import CampaignProcess, Message
-from companion.campaigns.runner import Row, interrupted_by, progress_bar
+from companion.campaigns.runner import INTERRUPTS, Row, progress_bar
 from companion.config.document import ConfigError
+from companion.runtime.subprocesses import signals_call
 
 FILE = "flights.jsonl"
 """Name of the file in the folder of results: a line with the settings of the search, then one for each flight."""
@@ -49,7 +50,7 @@ class Flights(AbstractContextManager["Flights"]):
             self._open(self._path, settings)
 
     def __enter__(self) -> Self:
-        self._stack.enter_context(interrupted_by(self._stop))
+        self._stack.enter_context(signals_call(INTERRUPTS, self._stop))
         self._stack.enter_context(self._bar)
         return self
 

@@ -36,6 +36,7 @@ from companion.ground.broker.certificates import (
 from companion.ground.broker.mosquitto_config import INSTALLED, acl_text, profile_text
 from companion.ground.protocol.keys import OPERATOR_NAME, Operator, new_key, operators_text, write_private
 from companion.runtime.files import write_whole
+from companion.runtime.subprocesses import captured
 
 DAYS_MAX = 3000
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
@@ -167,15 +168,7 @@ def _hash_passwords(path: Path) -> None:
     if tool is None:
         raise SetupError("mosquitto_passwd is not installed: apt install mosquitto")
     try:
-        done = subprocess.run(
-            [tool, "-U", str(path)],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            encoding="utf-8",
-            errors="replace",
-            timeout=_HASH_DEADLINE_S,
-            check=False,
-        )
+        done = captured([tool, "-U", str(path)], _HASH_DEADLINE_S)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise SetupError(f"{tool} -U: {error}") from None
     hashed = [line.split(":", 1)[-1].startswith("$") for line in path.read_text(encoding="utf-8").splitlines()]
