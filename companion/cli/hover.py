@@ -64,10 +64,7 @@ def lines(fit: HoverFit, vehicle_file: str) -> list[str]:
         f"hover thrust      {fit.hover_thrust:.{_DIGITS}f} ± {fit.standard_error:.{_DIGITS}f} (standard error){at}, "
         f"from {fit.used_s:.1f} s of steady flight"
     ]
-    for name, value in (
-        ("value at the start", fit.configured),
-        ("value at the end  ", fit.last_estimate),
-    ):
+    for name, value in (("value at the start", fit.configured), ("value at the end  ", fit.last_estimate)):
         relative = _relative(value, fit)
         if value is not None and relative is not None:
             compared.append(f"{name} {value:.{_DIGITS}f}, {100 * relative:+.2f} % of the fitted value")

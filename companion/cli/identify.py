@@ -90,22 +90,19 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _vehicle_file(arguments: argparse.Namespace, flown: Path | None) -> Path | None:
-    """Return the vehicle file to change, or None if there is none."""
     if arguments.vehicle is not None and not arguments.vehicle.strip():
-        raise ConfigError(["companion identify: --vehicle: expected the name of a file, got an empty one"])
+        raise ConfigError("companion identify: --vehicle: expected the name of a file, got an empty one")
     path = named_file("vehicles", arguments.vehicle, "--vehicle") if arguments.vehicle is not None else flown
     if path is None or (arguments.vehicle is None and not path.is_file()):
         if arguments.apply:
             raise ConfigError(
-                ["companion identify: --apply: the vehicle file of this flight is not here; add --vehicle FILE"]
+                "companion identify: --apply: the vehicle file of this flight is not here; add --vehicle FILE"
             )
         return None
     if arguments.apply and path.resolve().is_relative_to(FILES.resolve()):
         raise ConfigError(
-            [
-                f"companion identify: --apply: {path} is part of the installation; name your own vehicle file with --vehicle "
-                "(companion init DIR writes copies of all files)"
-            ]
+            f"companion identify: --apply: {path} is part of the installation; name your own vehicle file with --vehicle "
+            "(companion init DIR writes copies of all files)"
         )
     return path
 
@@ -116,6 +113,4 @@ def _write(folder: Path, files: dict[str, str]) -> None:
         for name, text in files.items():
             (folder / name).write_text(text, encoding="utf-8")
     except OSError as error:
-        raise ConfigError(
-            [f"companion identify: --out {folder}: cannot be written: {error.strerror or error}"]
-        ) from None
+        raise ConfigError(f"companion identify: --out {folder}: cannot be written: {error.strerror or error}") from None

@@ -167,12 +167,12 @@ def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tupl
 
     live = root == Path("/")
     if _NAME.fullmatch(arguments.user) is None or arguments.user == "root":
-        raise ConfigError([f"--user {arguments.user!r:.60}: expected a user name such as {USER}, not root"])
+        raise ConfigError(f"--user {arguments.user!r:.60}: expected a user name such as {USER}, not root")
     for option in ("arm_serial", "force_serial"):
         given = getattr(arguments, option)
         if given is not None and _SERIAL.fullmatch(given) is None:
             raise ConfigError(
-                [f"--{option.replace('_', '-')} {given!r:.80}: expected a serial number as udevadm info prints it"]
+                f"--{option.replace('_', '-')} {given!r:.80}: expected a serial number as udevadm info prints it"
             )
     program = arguments.program or (str(Path(sys.prefix) / "bin/companion") if live else PROGRAM)
     files = {"--program": program, "--mission": arguments.mission, "--vehicle": arguments.vehicle}
@@ -189,7 +189,7 @@ def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tupl
     if mqtt is None or not mqtt.commands:
         key = "vehicle.ground.mqtt is null" if mqtt is None else "vehicle.ground.mqtt.commands is false"
         raise ConfigError(
-            [f"{vehicle or mission}: the service waits for an operator's START, but commands are not possible: {key}"]
+            f"{vehicle or mission}: the service waits for an operator's START, but commands are not possible: {key}"
         )
     arm, force, explanations = choose_adapters(adapters() if live else (), arguments.arm_serial, arguments.force_serial)
     return Settings(
@@ -211,24 +211,22 @@ def _seen_by_the_service(option: str, file: str, root: Path) -> str:
     """
     path = os.path.abspath(file)
     if any(ord(c) < 32 for c in path):
-        raise ConfigError([f"{option} {file!r:.80}: expected a path without control characters"])
+        raise ConfigError(f"{option} {file!r:.80}: expected a path without control characters")
     if any(path.startswith(f"{folder}/") for folder in _HIDDEN):
         raise ConfigError(
-            [
-                f"{option} {path}: the service cannot see {'/'.join(path.split('/')[:2])}; copy the file below /etc/companion or /opt"
-            ]
+            f"{option} {path}: the service cannot see {'/'.join(path.split('/')[:2])}; copy the file below /etc/companion or /opt"
         )
     here = under_root(root, path)
     if option == "--program" and root != Path("/"):
         return path
     if not here.is_file():
         raise ConfigError(
-            [f"{option} {here}: no such file; copy a mission and its vehicle file there, or give another path"]
+            f"{option} {here}: no such file; copy a mission and its vehicle file there, or give another path"
         )
     for part in (here.resolve(), *here.resolve().parents):
         wanted = stat.S_IROTH if part == here.resolve() else stat.S_IXOTH
         if part.is_relative_to(root) and part != root and not part.stat().st_mode & wanted:
-            raise ConfigError([f"{option} {path}: the service's user cannot read it: chmod o+rX {part}"])
+            raise ConfigError(f"{option} {path}: the service's user cannot read it: chmod o+rX {part}")
     return path
 
 
@@ -249,7 +247,6 @@ def _summary(wanted: Plan, found: Changes, live: bool) -> Iterator[tuple[str, st
 
 
 def _shown(wanted: Plan, found: Changes, live: bool) -> Iterator[str]:
-    """Yield the summary with the contents of every file."""
     content = {item.path: item.content if item.link is None else f"-> {item.link}" for item in wanted.items}
     for path, line in _summary(wanted, found, live):
         yield line
@@ -259,7 +256,6 @@ def _shown(wanted: Plan, found: Changes, live: bool) -> Iterator[str]:
 
 
 def _afterwards(settings: Settings, live: bool) -> Iterator[str]:
-    """Yield the remaining steps for the user."""
     arm, force = (
         ("/dev/companion-arm" if settings.arm_serial else None),
         ("/dev/companion-force" if settings.force_serial else None),

@@ -20,9 +20,5 @@ def add_parser(commands: Any) -> None:
         "--taps", type=number(5, 60, "", int), default=8, metavar="N", help="number of taps (default: 8)"
     )
     latency.add_argument(
-        "--seconds",
-        type=number(5.0, 600.0, " s"),
-        default=90.0,
-        metavar="N",
-        help="timeout for the taps (default: 90)",
+        "--seconds", type=number(5.0, 600.0, " s"), default=90.0, metavar="N", help="timeout for the taps (default: 90)"
     )

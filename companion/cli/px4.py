@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
         try:
             parse_address(arguments.address)
         except ValueError as error:
-            raise ConfigError([f"--address: {error}"]) from None
+            raise ConfigError(f"--address: {error}") from None
         device = AutopilotDevice(address=arguments.address)
     try:
         return asyncio.run(_run(arguments, file, device, path))

@@ -58,7 +58,7 @@ def _tune(arguments: argparse.Namespace) -> Tune:
     """
     for override in arguments.overrides:
         if override.partition("=")[0].strip() == "world.seed":
-            raise ConfigError(["companion tune: --set world.seed: the search sets this key; use --seed"])
+            raise ConfigError("companion tune: --set world.seed: the search sets this key; use --seed")
     config = checked(
         arguments.mission,
         arguments.vehicle,

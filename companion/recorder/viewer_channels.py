@@ -124,12 +124,7 @@ class ViewerChannels:
             self._paths(t_s, stamp, stamp_ns, pose, outputs.reference)
 
     def _frames(
-        self,
-        stamp: Timestamp,
-        stamp_ns: int,
-        pose: tuple[Vec3, Quat] | None,
-        inputs: Inputs,
-        outputs: Outputs,
+        self, stamp: Timestamp, stamp_ns: int, pose: tuple[Vec3, Quat] | None, inputs: Inputs, outputs: Outputs
     ) -> None:
         mocap, arm, reference = inputs.mocap, inputs.arm, outputs.reference
         if pose is not None:
@@ -166,12 +161,7 @@ class ViewerChannels:
         self._scene.log(SceneUpdate(entities=[entity]), log_time=stamp_ns)
 
     def _paths(
-        self,
-        t_s: float,
-        stamp: Timestamp,
-        stamp_ns: int,
-        pose: tuple[Vec3, Quat] | None,
-        reference: Reference | None,
+        self, t_s: float, stamp: Timestamp, stamp_ns: int, pose: tuple[Vec3, Quat] | None, reference: Reference | None
     ) -> None:
         if pose is not None:
             self._flown_trail.add(t_s, pose[0])

@@ -104,11 +104,7 @@ def _actuation(comparison: Comparison) -> Figure | None:
 
 
 def _over_time(
-    comparison: Comparison,
-    title: str,
-    panes: tuple[tuple[str, Callable[[Flight], Array]], ...],
-    *,
-    from_zero: bool,
+    comparison: Comparison, title: str, panes: tuple[tuple[str, Callable[[Flight], Array]], ...], *, from_zero: bool
 ) -> Figure | None:
     """Draw panes over the common time, with the events of every flight below; panes without data are left out."""
     flights = comparison.flights
@@ -221,7 +217,6 @@ def _mark_zero(comparison: Comparison, axes: list[Any]) -> None:
 
 
 def _mark_severe_events(comparison: Comparison, axes: list[Any]) -> None:
-    """Draw lines through the panes at warnings and critical events."""
     low, high = axes[0].get_xlim()
     for n, (flight, zero_s) in enumerate(zip(comparison.flights, comparison.zeros_s, strict=True)):
         for event in flight.summary["events"]:

@@ -107,10 +107,8 @@ class Flights(AbstractContextManager["Flights"]):
         for key in sorted(begun.keys() | wanted.keys()):
             if begun.get(key) != wanted.get(key):
                 raise ConfigError(
-                    [
-                        f"companion tune: --out {path.parent}: holds another search: {key} was {_short(begun.get(key))}, "
-                        f"is {_short(wanted.get(key))}; choose another folder"
-                    ]
+                    f"companion tune: --out {path.parent}: holds another search: {key} was {_short(begun.get(key))}, "
+                    f"is {_short(wanted.get(key))}; choose another folder"
                 )
         self._known = {line["flight"]: line["row"] for line in known if "row" in line}
         path.write_text("".join(json.dumps(line) + "\n" for line in read), encoding="utf-8")

@@ -73,10 +73,10 @@ def create(folder: Path, users: BrokerUsers, now: datetime.datetime) -> None:
     """
     _check_names(users)
     if not str(folder).isprintable():
-        raise ConfigError([f"{folder}: the folder's name contains control characters; choose another"])
+        raise ConfigError(f"{folder}: the folder's name contains control characters; choose another")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(
-            [f"{folder}: already exists; nothing was changed. Choose another folder, or use --renew-certificates"]
+            f"{folder}: already exists; nothing was changed. Choose another folder, or use --renew-certificates"
         )
     beside = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}")
     try:
@@ -88,7 +88,7 @@ def create(folder: Path, users: BrokerUsers, now: datetime.datetime) -> None:
         finally:
             shutil.rmtree(beside, ignore_errors=True)
     except OSError as error:
-        raise ConfigError([f"{folder}: cannot be created: {error.strerror or error}"]) from None
+        raise ConfigError(f"{folder}: cannot be created: {error.strerror or error}") from None
 
 
 def renew_certificate(folder: Path, hosts: Sequence[str], days: int, now: datetime.datetime) -> tuple[str, ...]:
@@ -115,10 +115,10 @@ def renew_certificate(folder: Path, hosts: Sequence[str], days: int, now: dateti
             write_whole(named, data, mode=0o600, durable=True)
     except OSError as error:
         raise ConfigError(
-            [f"{error.filename or named}: {error.strerror or error}; expected a folder that broker init created"]
+            f"{error.filename or named}: {error.strerror or error}; expected a folder that broker init created"
         ) from None
     except CertificateError as error:
-        raise ConfigError([f"{named}: {error}"]) from None
+        raise ConfigError(f"{named}: {error}") from None
     return known
 
 
@@ -133,7 +133,7 @@ def _fill(folder: Path, later: Path, users: BrokerUsers, now: datetime.datetime)
     try:
         server = make_server(authority, _all_hosts(users.hosts), users.days, now)
     except CertificateError as error:
-        raise ConfigError([f"--days {users.days}: {error}"]) from None
+        raise ConfigError(f"--days {users.days}: {error}") from None
     logins = {name: secrets.token_urlsafe(24) for name in (*users.vehicles, *users.operators, *users.viewers)}
     operators = [Operator(name, new_key()) for name in users.operators]
     files = {

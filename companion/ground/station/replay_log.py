@@ -72,7 +72,6 @@ def _reference_path(log: FlightLog) -> list[Vec3]:
 
 
 def _preflight(log: FlightLog) -> tuple[PreflightRow, ...]:
-    """Return the preflight rows; empty for a log without them."""
     try:
         rows = json.loads(log.metadata.get("preflight", {}).get("json", "[]"))
         return tuple(PreflightRow(str(row["id"]), str(row["level"]), str(row["text"])) for row in rows)

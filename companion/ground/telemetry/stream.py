@@ -312,12 +312,7 @@ def _tether(state: TetherState | None) -> TetherView | None:
         return None
     slack_m, stop_slack_m, pull_n, turns = numbers
     return TetherView(
-        slack_m=slack_m,
-        stop_slack_m=stop_slack_m,
-        pull_n=pull_n,
-        turns=turns,
-        taut=state.taut,
-        snagged=state.snagged,
+        slack_m=slack_m, stop_slack_m=stop_slack_m, pull_n=pull_n, turns=turns, taut=state.taut, snagged=state.snagged
     )
 
 
@@ -368,7 +363,6 @@ def _fits(value: float) -> bool:
 
 
 def _number(value: float | None, digits: int) -> float | None:
-    """Return the rounded number, or None if it is not finite."""
     return round(value, digits) if value is not None and _fits(value) else None
 
 
