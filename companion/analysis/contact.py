@@ -185,7 +185,6 @@ def presses(state: ContactState) -> bool:
 
 
 def _radius_m(log: FlightLog) -> float:
-    """Return the radius of the tool's tip."""
     tool = (log.config.get("vehicle") or {}).get("tool") or {}
     return float(tool.get("tip_radius_m") or 0.0)
 

@@ -18,15 +18,18 @@ import numpy.typing as npt
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError
 from mcap.records import Channel, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader
+from pydantic import ValidationError
 from zstandard import ZstdError
 
 from companion import DISTRIBUTION
 from companion.analysis.timing import Stopwatch, Timing, timing_of
+from companion.config.loader import FlightConfig, logged_flight
 from companion.model.best_pose import best_pose
 from companion.model.codec import RecordError, from_json
 from companion.model.constants import GRADED_POSE_MAX_AGE_S
 from companion.model.frames import euler_zyx_from_quat
 from companion.model.types import Inputs, MocapPose, Outputs, Sent
+from companion.plugins import PluginError
 
 Array = npt.NDArray[np.float64]
 _RECORDS: dict[str, type] = {"/inputs": Inputs, "/outputs": Outputs, "/sent": Sent}
@@ -116,6 +119,25 @@ class FlightLog:
     def config_json(self) -> str | None:
         """Return the effective configuration as recorded, or None."""
         return self.metadata.get("config", {}).get("json") or None
+
+    def flight_config(self) -> FlightConfig:
+        """Return the recorded configuration, checked.
+
+        Raises:
+            LogError: the log has none, or one that does not fit this version or the installed packages.
+        """
+        if self.config_json is None:
+            raise LogError(f"{self.path}: has no configuration (metadata record 'config')")
+        try:
+            return logged_flight(self.config_json)
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise LogError(
+                f"{self.path}: its configuration is not compatible with this version ({'.'.join(map(str, first['loc']))}: "
+                f"{first['msg']}); it was written by {writer(self.metadata)}"
+            ) from None
+        except (PluginError, ValueError) as error:
+            raise LogError(f"{self.path}: {error}") from None
 
     @cached_property
     def config(self) -> dict[str, Any]:

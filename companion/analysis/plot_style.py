@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -11,6 +11,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+
+from companion.analysis.page import Picture
 
 _T = TypeVar("_T")
 DPI = 150
@@ -37,6 +39,19 @@ def new_figure(height_in: float, *, layout: Literal["constrained"] | None = "con
 def write_png(figure: Figure, path: Path) -> None:
     """Write the figure as PNG."""
     FigureCanvasAgg(figure).print_png(path)
+
+
+def write_pictures(
+    figures: Iterable[tuple[str, str, str, Figure | None]], out: Path, prefix: str = ""
+) -> list[Picture]:
+    """Write the figures that are not None as PNG into a folder. Each has a name, a title and a caption."""
+    written = []
+    for name, title, caption, figure in figures:
+        if figure is not None:
+            path = out / f"{prefix}{name}.png"
+            write_png(figure, path)
+            written.append(Picture(path, title, caption))
+    return written
 
 
 def write_svg(figure: Figure, path: Path) -> None:

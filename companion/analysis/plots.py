@@ -27,13 +27,13 @@ from companion.analysis.plot_style import (
     new_figure,
     path_panes,
     scale_path,
-    write_png,
+    write_pictures,
 )
 from companion.analysis.time_axes import legend, line, stack
-from companion.analysis.timing import end_s
 from companion.model.best_pose import best_pose
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import tilt_rad
+from companion.model.tick_times import end_s
 
 
 def write_plots(log: FlightLog, out_dir: Path) -> list[Picture]:
@@ -88,14 +88,7 @@ def write_plots(log: FlightLog, out_dir: Path) -> list[Picture]:
             _timing,
         ),
     )
-    written: list[Picture] = []
-    for name, title, caption, make in makers:
-        figure = make(log)
-        if figure is not None:
-            path = out_dir / f"{name}.png"
-            write_png(figure, path)
-            written.append(Picture(path, title, caption))
-    return written
+    return write_pictures(((name, title, caption, make(log)) for name, title, caption, make in makers), out_dir)
 
 
 def _tracking(log: FlightLog) -> Figure | None:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from companion.analysis.log import FlightLog, writer
 from companion.config.controller import AdaptiveConfig
-from companion.config.loader import logged_flight
 from companion.control.scaled_gains import controller_yaml, written_for
 from companion.model.types import PhaseKind
 
@@ -27,7 +26,7 @@ def write_proposal(log: FlightLog, path: Path) -> None:
     ]
     if not flown or (scale := flown[-1]) is None or abs(scale - 1.0) < CHANGE_MIN or log.config_json is None:
         return
-    config = logged_flight(log.config_json)
+    config = log.flight_config()
     controller = config.controller
     if not isinstance(controller, AdaptiveConfig):
         return

@@ -166,7 +166,6 @@ def _vector(values: Sequence[float]) -> str:
 
 
 def _pairs(title: str, rows: Sequence[tuple[str, ...]], *heads: str) -> Table:
-    """Return a table of names and their values."""
     columns = [Column(head, lambda row, k=k: row[k], left=k == 0) for k, head in enumerate(("", *(heads or ("",))))]  # type: ignore[misc]
     return table(columns, rows, title=title)
 

@@ -15,10 +15,9 @@ import numpy as np
 
 from companion.analysis.arm_skeleton import pose
 from companion.analysis.log import Array
-from companion.model.arm_skeleton import NO_ARM, logged_skeleton
 from companion.model.frames import quat_rotate
 from companion.model.hanging_line import hanging_line_m
-from companion.model.rotors import disk_radius_m, logged_layout
+from companion.model.logged_geometry import TetherGeometry, logged_geometry
 from companion.model.types import Joints, Quat, Vec2, Vec3
 
 FRAME, LEG, ROTOR, FRONT, LINK, NET, BALL, TETHER = (
@@ -113,17 +112,12 @@ class Scene:
         Raises:
             KeyError, TypeError, ValueError, AttributeError: the section lacks a value or has an invalid one.
         """
-        airframe, tool = vehicle["airframe"], vehicle["tool"]
-        rotors = logged_layout(airframe)
-        self._rotors_m = rotors.positions_body_m
-        self._hub_m: float = rotors.arm_m * math.sqrt(0.5)
-        self._disk_m = disk_radius_m(rotors, airframe["radius_m"])
-        self._foot_m: float = airframe["ground_clearance_m"]
-        self._arm = logged_skeleton(vehicle) or NO_ARM
-        self._net_radius_m: float = (tool or {}).get("net_radius_m") or 0.0
-        self._tether_line: dict[str, Any] | None = vehicle["tether"]
-        room = vehicle["room"]
-        self._low, self._high = (np.array([room[axis][k] for axis in ("x_m", "y_m", "z_m")]) for k in (0, 1))
+        found = logged_geometry(vehicle)
+        self._rotors_m = found.rotors.positions_body_m
+        self._hub_m: float = found.rotors.arm_m * math.sqrt(0.5)
+        self._disk_m, self._foot_m = found.disk_radius_m, found.ground_clearance_m
+        self._arm, self._net_radius_m, self._tether_line = found.arm, found.net_radius_m, found.tether
+        self._low, self._high = np.array(found.room_min_world_m), np.array(found.room_max_world_m)
 
     @property
     def standing_height_m(self) -> float:
@@ -178,11 +172,10 @@ class Scene:
         below = np.array([point[0], point[1], self._low[2]])
         return Shape(camera.pixels(_circle(below, _X, _Y, radius_m), closed=True), FRAME, 0.0, alpha)
 
-    def _tether(self, camera: Camera, pose: Pose, tether: dict[str, Any]) -> tuple[float, list[Shape]]:
-        end = self._world(pose, np.array(tether["attachment_body_m"]))
+    def _tether(self, camera: Camera, pose: Pose, tether: TetherGeometry) -> tuple[float, list[Shape]]:
+        end = self._world(pose, np.array(tether.attachment_body_m))
         x, y, z = end.tolist()
-        anchor: Vec3 = tuple(tether["anchor_world_m"])
-        line = np.array(hanging_line_m(anchor, (x, y, z), tether["length_m"], float(self._low[2])))
+        line = np.array(hanging_line_m(tether.anchor_world_m, (x, y, z), tether.length_m, float(self._low[2])))
         return camera.depth_m(end) + 0.2, [
             Shape(camera.pixels(line), TETHER, 2.0),
             Shape(camera.pixels(line[:1]), FRAME, 9.0),

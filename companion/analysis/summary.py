@@ -126,10 +126,7 @@ def effective_config(log: FlightLog, summary: dict[str, Any]) -> dict[str, Any]:
     if not log.config or not world:
         return log.config
     # The drawn values are in the configuration, too; the contact is what happened.
-    return {
-        **log.config,
-        "world": {key: value for key, value in world.items() if key not in ("drawn", "contact")},
-    }
+    return {**log.config, "world": {key: value for key, value in world.items() if key not in ("drawn", "contact")}}
 
 
 def world_text(world: dict[str, Any] | None) -> str:

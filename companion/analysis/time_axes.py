@@ -14,11 +14,7 @@ from companion.model.types import Outputs, PhaseKind
 
 _PHASES_NAMED_MAX = 40
 """Number of phases above which only kinds of phases are distinguished."""
-_PHASES = {
-    PhaseKind.TAKEOFF: "#eaf3fb",
-    PhaseKind.FLIGHT: "#ffffff",
-    PhaseKind.LANDING: "#f6f0e3",
-}
+_PHASES = {PhaseKind.TAKEOFF: "#eaf3fb", PhaseKind.FLIGHT: "#ffffff", PhaseKind.LANDING: "#f6f0e3"}
 
 
 def stack(

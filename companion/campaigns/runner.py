@@ -12,7 +12,7 @@ import signal
 import sys
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,8 +26,10 @@ from companion.analysis.page import Page, Picture, Section, write_page
 from companion.campaigns.process import CampaignError, CampaignProcess, Message
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK
 from companion.runtime.console import print_error
+from companion.runtime.subprocesses import signals_call
 from companion.sitl_config.loader import SitlConfig
 
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 Row = dict[str, Any]
 """The results of one flight as plain data, as `--json` prints it."""
 
@@ -173,7 +175,7 @@ def fly(campaign: Campaign, out: Path) -> Flown:
     results: dict[int, Message] = {}
     notes: list[str] = []
     code, whole, bad = EXIT_OK, len(campaign.flights), 0
-    with campaign.start(out) as flights, interrupted_by(flights.ask_to_stop), progress_bar() as bar:
+    with campaign.start(out) as flights, signals_call(INTERRUPTS, flights.ask_to_stop), progress_bar() as bar:
         task = bar.add_task("", total=whole)
         try:
             for message in flights.results():
@@ -209,17 +211,6 @@ def progress_bar() -> Progress:
         transient=True,
         disable=not console.is_terminal,
     )
-
-
-@contextlib.contextmanager
-def interrupted_by(stop: Callable[[], None]) -> Iterator[None]:
-    """Call `stop` at Ctrl-C and SIGTERM instead of ending the process."""
-    handlers = {number: signal.signal(number, lambda *_: stop()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
 
 
 def _publish(campaign: Campaign, flown: Flown, out: Path, console: Console | None) -> None:

@@ -11,7 +11,6 @@ _TOOLS = "companion.commissioning.arm.tools"
 
 
 def add_parser(commands: Any) -> None:
-    """Add `arm` to the sub-parsers of `companion`."""
     arm = commands.add_parser("arm", help="commission the arm: find, set up, zero, move and measure its servos")
     parts = arm.add_subparsers(dest="part", required=True, metavar="PART")
     scan = add_tool(

@@ -25,7 +25,6 @@ VEHICLE = "tarot650-2r"
 
 
 def add_parser(commands: Any) -> None:
-    """Add `broker` to the sub-parsers of `companion`."""
     broker = commands.add_parser("broker", help="a broker for several computers: users, certificates, permissions")
     parts = broker.add_subparsers(dest="part", required=True, metavar="PART")
     init = parts.add_parser(
@@ -115,7 +114,6 @@ def _init(arguments: argparse.Namespace) -> int:
 
 
 def _instructions(folder: Path, users: BrokerUsers, ends: str) -> list[str]:
-    """Return the instructions to the user: which files to copy where."""
     host = (*users.hosts, "localhost")[0]
     url = f"mqtts://{f'[{host}]' if ':' in host else host}:8883"
     here = shlex.quote(str(folder))
@@ -167,7 +165,7 @@ def _check(arguments: argparse.Namespace) -> int:
     from companion.ground.protocol.access import broker_access
 
     if arguments.vehicle is not None and VEHICLE_NAME.fullmatch(arguments.vehicle) is None:
-        raise ConfigError([f"--vehicle {arguments.vehicle!r:.60}: expected 1 to 40 letters, digits, '_', '-' or '.'"])
+        raise ConfigError(f"--vehicle {arguments.vehicle!r:.60}: expected 1 to 40 letters, digits, '_', '-' or '.'")
     access = broker_access(arguments.url, arguments.login, arguments.ca)
     try:
         found = check(access, arguments.vehicle)

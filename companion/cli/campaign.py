@@ -138,7 +138,7 @@ def results_folder(arguments: argparse.Namespace, parent: str, result: str | Non
     empty_name = "expected the name of a folder, got an empty one" if arguments.out == "" else None
     problem = empty_name or why_unusable(folder, result)
     if problem is not None:
-        raise ConfigError([f"companion {arguments.command}: --out {folder}: {problem}"])
+        raise ConfigError(f"companion {arguments.command}: --out {folder}: {problem}")
     try:
         yield folder
     finally:

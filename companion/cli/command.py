@@ -33,7 +33,6 @@ _HELP = {
 
 
 def add_parser(commands: Any) -> None:
-    """Add `command` to the sub-parsers of `companion`."""
     command = commands.add_parser(
         "command",
         help="command a vehicle from the ground: hold, land, abort, resume, start",
@@ -53,15 +52,14 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Send the command; return the exit code."""
     only = vehicle_option(arguments)
     access = broker_access(arguments.broker, arguments.login, arguments.ca)
     signer = signer_of(access, arguments.operators, arguments.operator)
     if isinstance(signer, str):
-        raise ConfigError([f"companion command: {signer}"])
+        raise ConfigError(f"companion command: {signer}")
     name = OperatorCommand(arguments.name)
     if arguments.hold is not None and (name is not OperatorCommand.RESUME or arguments.hold < 1):
-        raise ConfigError([f"--hold {arguments.hold}: expected the number of a hold, 1 or more, and only with resume"])
+        raise ConfigError(f"--hold {arguments.hold}: expected the number of a hold, 1 or more, and only with resume")
     commander = _Commander(name, only, arguments.hold)
     station = Station(
         access,

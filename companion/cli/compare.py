@@ -24,7 +24,6 @@ _FIRST_SEED_MAX = 900_000
 
 
 def add_parser(commands: Any) -> None:
-    """Add `compare` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "compare",
         help="compare controllers in the fast closed loop",
@@ -90,7 +89,6 @@ def _numbers(text: str, most: float, what: str) -> tuple[float, ...]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fly the comparison; return the exit code."""
     return fly(_campaign(arguments), arguments, "comparisons")
 
 
@@ -103,7 +101,7 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
     for override in arguments.overrides:
         for key, option in _OPTIONS.items():
             if override.partition("=")[0].strip() == key:
-                raise ConfigError([f"companion compare: --set {key}: the grid sets this key; use {option}"])
+                raise ConfigError(f"companion compare: --set {key}: the grid sets this key; use {option}")
     files = [name for name in arguments.controllers if is_controller_file(name)]
     laws = [name for name in arguments.controllers if name not in files]
     variants = [Variant(file, preset := preset_of_file(file), preset) for file in files]
@@ -111,7 +109,7 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
         if laws or not files:
             variants += variants_of(PRESETS, laws, arguments.presets, arguments.ablation, arguments.adaptation)
     except ValueError as error:
-        raise ConfigError([f"companion compare: {error}"]) from None
+        raise ConfigError(f"companion compare: {error}") from None
     configs: list[SitlConfig] = []
     for variant in variants:
         load = load_sitl if configs else checked  # the same mission and vehicle: checked once
@@ -144,7 +142,6 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
 
 
 def _first_seed(text: str) -> int:
-    """Parse the first seed, for argparse."""
     if not text.isdecimal() or not 1 <= int(text) <= _FIRST_SEED_MAX:
         raise argparse.ArgumentTypeError(f"expected a number from 1 to {_FIRST_SEED_MAX}, got '{text}'")
     return int(text)

@@ -24,7 +24,6 @@ CONTACT_MISSION, SLIDING_MISSION, CONTACT_WORLD = "press", "slide", "wall"
 
 
 def add_parser(commands: Any) -> None:
-    """Add `faults` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "faults",
         help="fly a mission with every fault of the simulated world",
@@ -68,7 +67,6 @@ def _known(known: Sequence[str], what: str) -> Callable[[str], tuple[str, ...]]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fly the faults, or list their kinds; return the exit code."""
     if not arguments.list:
         return fly(_campaign(arguments), arguments, "faults")
     if arguments.json:
@@ -88,19 +86,15 @@ def _campaign(arguments: argparse.Namespace) -> Faults:
     if touching and not arguments.phases:
         if len(touching) < len(arguments.kinds):
             raise ConfigError(
-                [
-                    f"companion faults: --kinds: {', '.join(touching)} need a mission with a contact, got other kinds as well; choose "
-                    f"--phases {','.join(CONTACT_PHASES)}, or fly two campaigns"
-                ]
+                f"companion faults: --kinds: {', '.join(touching)} need a mission with a contact, got other kinds as well; choose "
+                f"--phases {','.join(CONTACT_PHASES)}, or fly two campaigns"
             )
         arguments.phases = tuple(phase for phase in CONTACT_PHASES if phase != "slide")
     if touches(arguments.phases):
         if not set(arguments.phases) <= set(CONTACT_PHASES):
             raise ConfigError(
-                [
-                    f"companion faults: --phases: {', '.join(CONTACT_PHASES)} need a mission with a contact, got other phases as well; "
-                    "fly two campaigns"
-                ]
+                f"companion faults: --phases: {', '.join(CONTACT_PHASES)} need a mission with a contact, got other phases as well; "
+                "fly two campaigns"
             )
         if arguments.mission == DEFAULT_MISSION:
             arguments.mission = SLIDING_MISSION if "slide" in arguments.phases else CONTACT_MISSION
@@ -110,20 +104,18 @@ def _campaign(arguments: argparse.Namespace) -> Faults:
     if not flights:
         where = " with --wires" if arguments.wires else ""
         kinds, phases = " or ".join(arguments.kinds) or "any", " or ".join(arguments.phases) or "any"
-        raise ConfigError([f"companion faults: no fault to fly{where}: kind {kinds}, phase {phases}"])
+        raise ConfigError(f"companion faults: no fault to fly{where}: kind {kinds}, phase {phases}")
     for override in arguments.overrides:
         if override.partition("=")[0].strip().partition("[")[0] == "world.faults":
             raise ConfigError(
-                ["companion faults: --set world.faults: the campaign sets this key; use --kinds and --phases"]
+                "companion faults: --set world.faults: the campaign sets this key; use --kinds and --phases"
             )
     given = arguments.vehicle, arguments.controller, arguments.preset
     config = checked(arguments.mission, *given, arguments.overrides, world=arguments.world)
     if arguments.wires and config.vehicle.devices.mocap.external:
         raise ConfigError(
-            [
-                "companion faults: --wires needs frames of motion capture to relate the log to the simulated world, but "
-                "devices.mocap.type is external; fly without --wires"
-            ]
+            "companion faults: --wires needs frames of motion capture to relate the log to the simulated world, but "
+            "devices.mocap.type is external; fly without --wires"
         )
     absent = {v.kind: key for v, _ in flights if (key := absent_part(v.kind, config.vehicle)) is not None}
     if absent:
@@ -131,7 +123,7 @@ def _campaign(arguments: argparse.Namespace) -> Faults:
         text = f"companion faults: not flown, because the vehicle has no {missing}: {', '.join(absent)}"
         flights = [(v, phase) for v, phase in flights if v.kind not in absent]
         if not flights:
-            raise ConfigError([text])
+            raise ConfigError(text)
         print_error(text)
     return Faults(
         configs=[config],

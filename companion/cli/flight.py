@@ -11,14 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from companion.cli.options import (
-    MISSION_HELP,
-    MISSION_OR_DEFAULT_HELP,
-    add_law,
-    add_seed,
-    add_world,
-    time_stamp,
-)
+from companion.cli.options import MISSION_HELP, MISSION_OR_DEFAULT_HELP, add_law, add_seed, add_world, time_stamp
 from companion.cli.planning_progress import PlanningProgress
 from companion.cli.schema import schema_json
 from companion.config.document import ConfigError
@@ -66,9 +59,7 @@ def add_parser(commands: Any) -> None:
         help=f"show the flight live in Foxglove, which opens ws://HOST:PORT (without a value: {FOXGLOVE_DEFAULT})",
     )
     fly.add_argument(
-        "--wait-for-start",
-        action="store_true",
-        help="when ready, wait on the ground until an operator commands start",
+        "--wait-for-start", action="store_true", help="when ready, wait on the ground until an operator commands start"
     )
     fly.set_defaults(run=_fly)
 
@@ -79,9 +70,7 @@ def add_parser(commands: Any) -> None:
     )
     _add_flight_options(check, mission_default=True)
     check.add_argument(
-        "--sitl",
-        metavar="stub|px4",
-        help="check the simulated world's devices, with the PX4 stub or a real PX4",
+        "--sitl", metavar="stub|px4", help="check the simulated world's devices, with the PX4 stub or a real PX4"
     )
     check.add_argument("--hand", action="store_true", help="also run the guided hand test, which a new set-up requires")
     check.add_argument("--json", action="store_true", help="print only the rows, as JSON")
@@ -121,7 +110,7 @@ def _add_flight_options(parser: argparse.ArgumentParser, mission_default: bool =
 def _load(arguments: argparse.Namespace, *, hardware: bool, real_px4: bool = False) -> SitlConfig:
     for name, path in (("MISSION", arguments.mission), ("--vehicle", arguments.vehicle)):
         if path is not None and not path.strip():
-            raise ConfigError([f"companion {arguments.command}: {name}: expected the name of a file, got an empty one"])
+            raise ConfigError(f"companion {arguments.command}: {name}: expected the name of a file, got an empty one")
     return load_sitl(
         arguments.mission,
         arguments.vehicle,

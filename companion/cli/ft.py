@@ -10,7 +10,6 @@ _TOOLS = "companion.commissioning.force_torque.tools"
 
 
 def add_parser(commands: Any) -> None:
-    """Add `ft` to the sub-parsers of `companion`."""
     ft = commands.add_parser("ft", help="check the force sensor with a known weight; measure its drift and bias")
     parts = ft.add_subparsers(dest="part", required=True, metavar="PART")
     check = add_tool(

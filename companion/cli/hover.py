@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ _DIGITS = 4
 
 
 def add_parser(commands: Any) -> None:
-    """Add `hover` to the sub-parsers of `companion`."""
     hover = commands.add_parser("hover", help="fit the hover thrust to a flight log")
     parts = hover.add_subparsers(dest="part", required=True, metavar="PART")
     fit = parts.add_parser(
@@ -31,7 +31,6 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fit and print; return the exit code."""
     try:
         log = FlightLog.read(arguments.log)
         fit = fit_hover_thrust(log)
@@ -47,16 +46,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 def jsonable(fit: HoverFit) -> dict[str, Any]:
     """Return the result for scripts; None where a value is unknown. Thrust is normalised, 0 to 1."""
-    slope = fit.slope
+    slope, known = fit.slope, asdict(fit)
+    del known["slope"]
     return {
-        "hover_thrust": fit.hover_thrust,
-        "standard_error": fit.standard_error,
-        "used_s": fit.used_s,
-        "configured": fit.configured,
+        **known,
         "configured_error": _relative(fit.configured, fit),
-        "last_estimate": fit.last_estimate,
-        "voltage_mean_v": fit.voltage_mean_v,
-        "voltage_span_v": fit.voltage_span_v,
         "slope_per_v": slope.per_v if slope else None,
         "slope_standard_error_per_v": slope.standard_error_per_v if slope else None,
         "patch": {"airframe": {"hover_thrust": round(fit.hover_thrust, _DIGITS)}},
@@ -70,10 +64,7 @@ def lines(fit: HoverFit, vehicle_file: str) -> list[str]:
         f"hover thrust      {fit.hover_thrust:.{_DIGITS}f} ± {fit.standard_error:.{_DIGITS}f} (standard error){at}, "
         f"from {fit.used_s:.1f} s of steady flight"
     ]
-    for name, value in (
-        ("value at the start", fit.configured),
-        ("value at the end  ", fit.last_estimate),
-    ):
+    for name, value in (("value at the start", fit.configured), ("value at the end  ", fit.last_estimate)):
         relative = _relative(value, fit)
         if value is not None and relative is not None:
             compared.append(f"{name} {value:.{_DIGITS}f}, {100 * relative:+.2f} % of the fitted value")

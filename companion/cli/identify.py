@@ -18,7 +18,6 @@ WORLD, RESULT = "identified_world.yaml", "identified.json"
 
 
 def add_parser(commands: Any) -> None:
-    """Add `identify` to the sub-parsers of `companion`."""
     identify = commands.add_parser(
         "identify",
         help="find the parameters of a machine in a flight's log; write a world fitted to it",
@@ -47,12 +46,11 @@ def run(arguments: argparse.Namespace) -> int:
     """
     from companion.commissioning.identify.identification import identify
     from companion.commissioning.identify.proposal import remarks, vehicle_changes, world_text
-    from companion.commissioning.identify.samples import IdentifyError
     from companion.commissioning.patch import propose
 
     try:
         found = identify(FlightLog.read(arguments.log))
-    except (LogError, IdentifyError) as error:
+    except LogError as error:
         print_error(error)
         return EXIT_BAD_INPUT
     vehicle_file = _vehicle_file(arguments, found.flight.vehicle_file)
@@ -92,22 +90,19 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _vehicle_file(arguments: argparse.Namespace, flown: Path | None) -> Path | None:
-    """Return the vehicle file to change, or None if there is none."""
     if arguments.vehicle is not None and not arguments.vehicle.strip():
-        raise ConfigError(["companion identify: --vehicle: expected the name of a file, got an empty one"])
+        raise ConfigError("companion identify: --vehicle: expected the name of a file, got an empty one")
     path = named_file("vehicles", arguments.vehicle, "--vehicle") if arguments.vehicle is not None else flown
     if path is None or (arguments.vehicle is None and not path.is_file()):
         if arguments.apply:
             raise ConfigError(
-                ["companion identify: --apply: the vehicle file of this flight is not here; add --vehicle FILE"]
+                "companion identify: --apply: the vehicle file of this flight is not here; add --vehicle FILE"
             )
         return None
     if arguments.apply and path.resolve().is_relative_to(FILES.resolve()):
         raise ConfigError(
-            [
-                f"companion identify: --apply: {path} is part of the installation; name your own vehicle file with --vehicle "
-                "(companion init DIR writes copies of all files)"
-            ]
+            f"companion identify: --apply: {path} is part of the installation; name your own vehicle file with --vehicle "
+            "(companion init DIR writes copies of all files)"
         )
     return path
 
@@ -118,6 +113,4 @@ def _write(folder: Path, files: dict[str, str]) -> None:
         for name, text in files.items():
             (folder / name).write_text(text, encoding="utf-8")
     except OSError as error:
-        raise ConfigError(
-            [f"companion identify: --out {folder}: cannot be written: {error.strerror or error}"]
-        ) from None
+        raise ConfigError(f"companion identify: --out {folder}: cannot be written: {error.strerror or error}") from None

@@ -13,7 +13,6 @@ from companion.model.exit_codes import EXIT_OK
 
 
 def add_parser(commands: Any) -> None:
-    """Add `init` to the sub-parsers of `companion`."""
     init = commands.add_parser(
         "init",
         help="copy the shipped missions, vehicle, control laws, worlds and layouts into a new folder, to edit them",
@@ -31,11 +30,11 @@ def run(arguments: argparse.Namespace) -> int:
     """
     folder: Path = arguments.folder
     if folder.exists():
-        raise ConfigError([f"companion init: {folder} exists; expected the name of a new folder; nothing was written"])
+        raise ConfigError(f"companion init: {folder} exists; expected the name of a new folder; nothing was written")
     try:
         shutil.copytree(FILES, folder, copy_function=shutil.copyfile)
     except OSError as error:
-        raise ConfigError([f"companion init: {folder}: cannot be written: {error}"]) from None
+        raise ConfigError(f"companion init: {folder}: cannot be written: {error}") from None
     print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
     print(f"try: companion fly {folder / 'missions' / DEFAULT_MISSION}.yaml --sitl")
     return EXIT_OK

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
 import re
@@ -24,6 +23,7 @@ from companion.install.record import RECORD_PATH, load, under_root
 from companion.install.state import InstallError
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import print_error
+from companion.runtime.subprocesses import signals_call
 
 USER = "companion"
 MISSION = "/etc/companion/mission.yaml"
@@ -36,7 +36,6 @@ _HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
 
 
 def add_parser(commands: Any) -> None:
-    """Add `install` to the sub-parsers of `companion`."""
     install = commands.add_parser(
         "install",
         help="set up the vehicle's computer: service, adapter names and latency, limits, full CPU clock; or undo this",
@@ -85,7 +84,6 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Plan, show, ask and apply; return the exit code."""
     root = Path(os.path.abspath(arguments.root))
     if not root.is_dir():
         print_error(f"companion install: --root {arguments.root}: expected the root folder of a system")
@@ -99,7 +97,8 @@ def run(arguments: argparse.Namespace) -> int:
         )
         return EXIT_REFUSED
     try:
-        with _terminable():
+        # As at Ctrl-C, unfinished changes are rolled back.
+        with signals_call((signal.SIGTERM, signal.SIGHUP), _cancel):
             return _undo(arguments, root) if arguments.undo else _install(arguments, root)
     except InstallError as error:
         print_error(f"companion install: {error}")
@@ -168,12 +167,12 @@ def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tupl
 
     live = root == Path("/")
     if _NAME.fullmatch(arguments.user) is None or arguments.user == "root":
-        raise ConfigError([f"--user {arguments.user!r:.60}: expected a user name such as {USER}, not root"])
+        raise ConfigError(f"--user {arguments.user!r:.60}: expected a user name such as {USER}, not root")
     for option in ("arm_serial", "force_serial"):
         given = getattr(arguments, option)
         if given is not None and _SERIAL.fullmatch(given) is None:
             raise ConfigError(
-                [f"--{option.replace('_', '-')} {given!r:.80}: expected a serial number as udevadm info prints it"]
+                f"--{option.replace('_', '-')} {given!r:.80}: expected a serial number as udevadm info prints it"
             )
     program = arguments.program or (str(Path(sys.prefix) / "bin/companion") if live else PROGRAM)
     files = {"--program": program, "--mission": arguments.mission, "--vehicle": arguments.vehicle}
@@ -190,7 +189,7 @@ def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tupl
     if mqtt is None or not mqtt.commands:
         key = "vehicle.ground.mqtt is null" if mqtt is None else "vehicle.ground.mqtt.commands is false"
         raise ConfigError(
-            [f"{vehicle or mission}: the service waits for an operator's START, but commands are not possible: {key}"]
+            f"{vehicle or mission}: the service waits for an operator's START, but commands are not possible: {key}"
         )
     arm, force, explanations = choose_adapters(adapters() if live else (), arguments.arm_serial, arguments.force_serial)
     return Settings(
@@ -212,24 +211,22 @@ def _seen_by_the_service(option: str, file: str, root: Path) -> str:
     """
     path = os.path.abspath(file)
     if any(ord(c) < 32 for c in path):
-        raise ConfigError([f"{option} {file!r:.80}: expected a path without control characters"])
+        raise ConfigError(f"{option} {file!r:.80}: expected a path without control characters")
     if any(path.startswith(f"{folder}/") for folder in _HIDDEN):
         raise ConfigError(
-            [
-                f"{option} {path}: the service cannot see {'/'.join(path.split('/')[:2])}; copy the file below /etc/companion or /opt"
-            ]
+            f"{option} {path}: the service cannot see {'/'.join(path.split('/')[:2])}; copy the file below /etc/companion or /opt"
         )
     here = under_root(root, path)
     if option == "--program" and root != Path("/"):
         return path
     if not here.is_file():
         raise ConfigError(
-            [f"{option} {here}: no such file; copy a mission and its vehicle file there, or give another path"]
+            f"{option} {here}: no such file; copy a mission and its vehicle file there, or give another path"
         )
     for part in (here.resolve(), *here.resolve().parents):
         wanted = stat.S_IROTH if part == here.resolve() else stat.S_IXOTH
         if part.is_relative_to(root) and part != root and not part.stat().st_mode & wanted:
-            raise ConfigError([f"{option} {path}: the service's user cannot read it: chmod o+rX {part}"])
+            raise ConfigError(f"{option} {path}: the service's user cannot read it: chmod o+rX {part}")
     return path
 
 
@@ -250,7 +247,6 @@ def _summary(wanted: Plan, found: Changes, live: bool) -> Iterator[tuple[str, st
 
 
 def _shown(wanted: Plan, found: Changes, live: bool) -> Iterator[str]:
-    """Yield the summary with the contents of every file."""
     content = {item.path: item.content if item.link is None else f"-> {item.link}" for item in wanted.items}
     for path, line in _summary(wanted, found, live):
         yield line
@@ -260,7 +256,6 @@ def _shown(wanted: Plan, found: Changes, live: bool) -> Iterator[str]:
 
 
 def _afterwards(settings: Settings, live: bool) -> Iterator[str]:
-    """Yield the remaining steps for the user."""
     arm, force = (
         ("/dev/companion-arm" if settings.arm_serial else None),
         ("/dev/companion-force" if settings.force_serial else None),
@@ -293,16 +288,5 @@ def _agreed(question: str) -> bool:
     return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
 
 
-@contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """Context in which SIGTERM and SIGHUP act like Ctrl-C, so that unfinished changes are rolled back."""
-
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def _cancel() -> None:
+    raise KeyboardInterrupt

@@ -8,7 +8,6 @@ from companion.commissioning.tool import add_tool, number
 
 
 def add_parser(commands: Any) -> None:
-    """Add `latency` to the sub-parsers of `companion`."""
     latency = add_tool(
         commands, "latency", "companion.commissioning.latency.tools",
         help="measure the delay of motion capture (EKF2_EV_DELAY) by tapping the airframe",
@@ -21,9 +20,5 @@ def add_parser(commands: Any) -> None:
         "--taps", type=number(5, 60, "", int), default=8, metavar="N", help="number of taps (default: 8)"
     )
     latency.add_argument(
-        "--seconds",
-        type=number(5.0, 600.0, " s"),
-        default=90.0,
-        metavar="N",
-        help="timeout for the taps (default: 90)",
+        "--seconds", type=number(5.0, 600.0, " s"), default=90.0, metavar="N", help="timeout for the taps (default: 90)"
     )

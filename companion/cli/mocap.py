@@ -13,7 +13,6 @@ _TOOLS = "companion.commissioning.mocap.tools"
 
 
 def add_parser(commands: Any) -> None:
-    """Add `mocap` to the sub-parsers of `companion`."""
     mocap = commands.add_parser("mocap", help="motion capture: check the stream, find its axes and the pivot")
     parts = mocap.add_subparsers(dest="part", required=True, metavar="PART")
     check = add_tool(

@@ -32,7 +32,6 @@ PORT = 8642
 
 
 def add_parser(commands: Any) -> None:
-    """Add `monitor` to the sub-parsers of `companion`."""
     monitor = commands.add_parser(
         "monitor",
         help="watch and command from the ground: a page in the browser, or --text in the terminal",
@@ -79,13 +78,12 @@ def vehicle_option(arguments: argparse.Namespace) -> str | None:
     name: str | None = arguments.vehicle
     if name is not None and VEHICLE_NAME.fullmatch(name) is None:
         raise ConfigError(
-            [f"--vehicle {name!r:.60}: expected a vehicle name as used in topics: letters, digits, '_', '-' or '.'"]
+            f"--vehicle {name!r:.60}: expected a vehicle name as used in topics: letters, digits, '_', '-' or '.'"
         )
     return name
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run until Ctrl-C; return the exit code."""
     _check(arguments)
     try:
         if arguments.text:
@@ -121,14 +119,12 @@ def _check(arguments: argparse.Namespace) -> None:
     """
     if arguments.text and arguments.logs:
         raise ConfigError(
-            [
-                "companion monitor: --text shows only live flights; to view logs, leave out --text or use companion report"
-            ]
+            "companion monitor: --text shows only live flights; to view logs, leave out --text or use companion report"
         )
     if not 0 <= arguments.port <= 65535:
-        raise ConfigError([f"companion monitor: --port {arguments.port}: expected 0 to 65535"])
+        raise ConfigError(f"companion monitor: --port {arguments.port}: expected 0 to 65535")
     if (arguments.cert is None) != (arguments.key is None):
-        raise ConfigError(["companion monitor: --cert and --key must be given together"])
+        raise ConfigError("companion monitor: --cert and --key must be given together")
 
 
 def _station_settings(arguments: argparse.Namespace) -> tuple[BrokerAccess, Signer | str, str | None]:
@@ -166,7 +162,7 @@ def _serve(arguments: argparse.Namespace) -> None:
     except web.WebError as error:
         raise _Refusal(str(error)) from None
     except LogError as error:
-        raise ConfigError([str(error)]) from None
+        raise ConfigError(str(error)) from None
 
 
 def _read(paths: Sequence[Path]) -> list[ReplayLog]:
@@ -193,17 +189,15 @@ def _tls(cert: str | None, key: str | None) -> ssl.SSLContext | None:
         try:
             Path(file).read_bytes()
         except OSError as error:
-            raise ConfigError([f"companion monitor: {option} {file}: cannot be read: {error.strerror}"]) from None
+            raise ConfigError(f"companion monitor: {option} {file}: cannot be read: {error.strerror}") from None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     try:
         context.load_cert_chain(cert, key, password=_no_password)
     except (ssl.SSLError, ValueError) as error:
         raise ConfigError(
-            [
-                f"companion monitor: --cert {cert}, --key {key}: expected a certificate and its private key without password, "
-                f"both PEM: {error}"
-            ]
+            f"companion monitor: --cert {cert}, --key {key}: expected a certificate and its private key without password, "
+            f"both PEM: {error}"
         ) from None
     return context
 

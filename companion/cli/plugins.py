@@ -14,7 +14,6 @@ from companion.plugins import CONTROL_LAWS, KINDS, PHASES, PluginError, installe
 
 
 def add_parser(commands: Any) -> None:
-    """Add `plugins` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "plugins",
         help="list the installed control laws, devices and phases of missions, and the packages that provide them",

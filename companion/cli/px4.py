@@ -30,7 +30,6 @@ _HEARTBEAT_DEADLINE_S = 5.0
 
 
 def add_parser(commands: Any) -> None:
-    """Add `px4` to the sub-parsers of `companion`."""
     px4 = commands.add_parser("px4", help="compare PX4's parameters with a file, or write them")
     parts = px4.add_subparsers(dest="part", required=True, metavar="PART")
     params = parts.add_parser(
@@ -78,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
         try:
             parse_address(arguments.address)
         except ValueError as error:
-            raise ConfigError([f"--address: {error}"]) from None
+            raise ConfigError(f"--address: {error}") from None
         device = AutopilotDevice(address=arguments.address)
     try:
         return asyncio.run(_run(arguments, file, device, path))

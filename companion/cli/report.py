@@ -30,7 +30,6 @@ _NAME_BYTES_MAX = 200
 
 
 def add_parser(commands: Any) -> None:
-    """Add `report` to the sub-parsers of `companion`."""
     report = commands.add_parser(
         "report",
         help="write summary and report of a log, or compare several flights side by side",
@@ -57,9 +56,7 @@ def add_parser(commands: Any) -> None:
         help="one log: also write the animation of report.html as a GIF, 800 pixels wide",
     )
     report.add_argument(
-        "--json",
-        action="store_true",
-        help="print only the summary or comparison, as JSON; write files only with --out",
+        "--json", action="store_true", help="print only the summary or comparison, as JSON; write files only with --out"
     )
     report.set_defaults(run=run)
 
@@ -82,11 +79,11 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         return _one(logs[0], arguments) if len(logs) == 1 else _several(logs, arguments)
     except (LogError, NotAlignable) as error:
-        raise ConfigError([str(error)]) from None
+        raise ConfigError(str(error)) from None
 
 
 def _refusal(text: str) -> ConfigError:
-    return ConfigError([f"companion report: {text}"])
+    return ConfigError(f"companion report: {text}")
 
 
 # One flight

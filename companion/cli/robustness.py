@@ -15,7 +15,6 @@ from companion.config.shipped import DEFAULT_MISSION
 
 
 def add_parser(commands: Any) -> None:
-    """Add `robustness` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "robustness",
         help="fly a mission in many randomly drawn worlds",
@@ -58,7 +57,6 @@ def _model_error_override(text: str) -> str:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fly the draws or cases; return the exit code."""
     return fly(_campaign(arguments), arguments, "robustness")
 
 
@@ -69,14 +67,14 @@ def _campaign(arguments: argparse.Namespace) -> Robustness:
         ConfigError: one line per problem.
     """
     if arguments.case and arguments.cases is None:
-        raise ConfigError(["companion robustness: --case needs --cases FILE, the file that contains the case"])
+        raise ConfigError("companion robustness: --case needs --cases FILE, the file that contains the case")
     kept: Cases | None = None
     cases: tuple[Case, ...] = ()
     if arguments.cases is not None:
         kept = read_cases(Path(arguments.cases))
         cases = kept.named(arguments.case)
         if not cases:
-            raise ConfigError([f"{arguments.cases}: cases: expected at least one case, found none"])
+            raise ConfigError(f"{arguments.cases}: cases: expected at least one case, found none")
     mission = arguments.mission or (kept.mission if kept is not None else DEFAULT_MISSION)
     # The file's preset belongs to the file's control law.
     preset = arguments.preset or (kept.preset if kept is not None and arguments.controller is None else None)

@@ -14,7 +14,6 @@ from companion.config.shipped import DEFAULT_MISSION
 
 
 def add_parser(commands: Any) -> None:
-    """Add `tune` to the sub-parsers of `companion`."""
     parser = commands.add_parser(
         "tune",
         help="find the gains of a control law for a machine",
@@ -59,7 +58,7 @@ def _tune(arguments: argparse.Namespace) -> Tune:
     """
     for override in arguments.overrides:
         if override.partition("=")[0].strip() == "world.seed":
-            raise ConfigError(["companion tune: --set world.seed: the search sets this key; use --seed"])
+            raise ConfigError("companion tune: --set world.seed: the search sets this key; use --seed")
     config = checked(
         arguments.mission,
         arguments.vehicle,

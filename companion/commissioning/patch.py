@@ -90,13 +90,13 @@ class Patch:
         try:
             if path.read_bytes() != self.before:
                 raise ConfigError(
-                    [f"{self.shown}: has changed since it was read; nothing was written; run the tool again"]
+                    f"{self.shown}: has changed since it was read; nothing was written; run the tool again"
                 )
             backup = _back_up(path, self.before)
             write_whole(path, self.after, mode=stat.S_IMODE(path.stat().st_mode), durable=True)
         except OSError as error:
             raise ConfigError(
-                [f"{self.shown}: cannot be written: {error.strerror or error}; change it by hand as printed"]
+                f"{self.shown}: cannot be written: {error.strerror or error}; change it by hand as printed"
             ) from None
         return backup
 
@@ -122,7 +122,7 @@ def propose(vehicle_path: str | Path, changes: Mapping[Location, Data]) -> Patch
     try:
         new_text = edited(text, {change.location: change.new for change in wanted})
     except EditError as error:
-        raise ConfigError([f"{shown}: {error}"]) from None
+        raise ConfigError(f"{shown}: {error}") from None
     _check(shown, new_text, wanted)
     bom = _BOM if before.startswith(_BOM.encode()) else ""
     return Patch(path=path, shown=shown, changes=wanted, before=before, after=(bom + new_text).encode())
@@ -141,13 +141,12 @@ def _same(old: Data, new: Data) -> bool:
 
 
 def _check(shown: str, text: str, changes: tuple[Change, ...]) -> None:
-    """Check that the text has the new values and is a valid vehicle file."""
     data = parse_value(text, Origin(shown))
     assert isinstance(data, dict)
     document = Document(shown, data)
     for change in changes:
         if not _same(document.get(change.location), change.new):
-            raise ConfigError([f"{shown}: {change.key} cannot be changed by this tool; write it by hand: {change.new}"])
+            raise ConfigError(f"{shown}: {change.key} cannot be changed by this tool; write it by hand: {change.new}")
     if validate(Vehicle, document) is None:
         raise ConfigError([f"{line} (after the proposed change)" for line in problem_lines(document.problems)])
 

@@ -84,14 +84,12 @@ class Session:
     def __init__(self, arguments: argparse.Namespace, family: Family) -> None:
         if not str(arguments.vehicle).strip():
             raise ConfigError(
-                [f"companion {arguments.command}: --vehicle: expected the name of a file, got an empty one"]
+                f"companion {arguments.command}: --vehicle: expected the name of a file, got an empty one"
             )
         if arguments.writes_vehicle_file and arguments.write and arguments.vehicle in names("vehicles"):
             raise ConfigError(
-                [
-                    f"companion {arguments.command}: --write: {arguments.vehicle} is part of the installation; name your own vehicle "
-                    "file with --vehicle (companion init DIR writes copies of all files)"
-                ]
+                f"companion {arguments.command}: --write: {arguments.vehicle} is part of the installation; name your own vehicle "
+                "file with --vehicle (companion init DIR writes copies of all files)"
             )
         self.arguments = arguments
         self.vehicle = load_vehicle(arguments.vehicle, arguments.overrides)
@@ -148,9 +146,7 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
     session = Session(arguments, tool.family)
     bus = session.vehicle.devices.arm
     if tool.servos_only and bus is not None and bus.type != DYNAMIXEL:
-        raise ConfigError(
-            [f"companion {tool.name}: works with {DYNAMIXEL} servos only; devices.arm.type is {bus.type}"]
-        )
+        raise ConfigError(f"companion {tool.name}: works with {DYNAMIXEL} servos only; devices.arm.type is {bus.type}")
     try:
         collected = tool.collect(session)
         if isinstance(collected, Coroutine):

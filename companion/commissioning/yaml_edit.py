@@ -136,6 +136,5 @@ def _is_flow(node: yaml.Node) -> bool:
 
 
 def _line_end(text: str, index: int) -> int:
-    """Return the index after the end of the line."""
     end = text.find("\n", index)
     return len(text) if end < 0 else end + 1

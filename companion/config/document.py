@@ -16,10 +16,10 @@ LINE_MAX = 1000
 
 
 class ConfigError(Exception):
-    """The input is invalid. `lines` contains one message per problem, the most important first."""
+    """The input is invalid. `lines` contains one message per problem, the most important first; a text is one message."""
 
     def __init__(self, lines: Sequence[str]) -> None:
-        self.lines = tuple(map(_shown, lines))
+        self.lines = tuple(map(_shown, [lines] if isinstance(lines, str) else lines))
         super().__init__("\n".join(self.lines))
 
 

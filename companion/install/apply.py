@@ -21,6 +21,7 @@ from companion.install.plan import PERFORMANCE, SERVICE, Command, Plan
 from companion.install.record import RECORD_PATH, Entry, Record, load, save, under_root
 from companion.install.state import InstallError, PathState, read_state, write_state
 from companion.install.templates import STATE_DIRECTORY
+from companion.runtime.subprocesses import captured
 
 GROUP = "dialout"
 COMMAND_TIMEOUT_S = 60.0
@@ -291,14 +292,7 @@ def _service_active() -> bool:
     tool = shutil.which("systemctl", path=_TOOLS)
     if tool is None:
         return False
-    ended = subprocess.run(
-        [tool, "is-active", SERVICE],
-        capture_output=True,
-        encoding="utf-8",
-        errors="replace",
-        timeout=COMMAND_TIMEOUT_S,
-        check=False,
-    )
+    ended = captured([tool, "is-active", SERVICE], COMMAND_TIMEOUT_S)
     return ended.stdout.strip() in ("active", "activating", "deactivating", "reloading")
 
 
@@ -314,16 +308,8 @@ def _run(command: Command, report: Report) -> None:
         why = "no such program"
     else:
         try:
-            ended = subprocess.run(
-                [tool, *command.argv[1:]],
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                encoding="utf-8",
-                errors="replace",
-                timeout=COMMAND_TIMEOUT_S,
-                env={**os.environ, "LC_ALL": "C", "PATH": _TOOLS},
-                check=False,
-            )
+            env = {**os.environ, "LC_ALL": "C", "PATH": _TOOLS}
+            ended = captured([tool, *command.argv[1:]], COMMAND_TIMEOUT_S, env)
             if ended.returncode != 0:
                 why = (ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"])[-1]
         except (OSError, subprocess.TimeoutExpired) as error:

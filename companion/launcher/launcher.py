@@ -15,7 +15,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -97,17 +97,6 @@ class FlightResult:
         return EXIT_CODES[self.outcome]
 
 
-@contextlib.contextmanager
-def landing_signals(land: Callable[[], None]) -> Iterator[None]:
-    """Context in which SIGINT, SIGTERM and SIGHUP call `land` instead of ending the process."""
-    handlers = {number: signal.signal(number, lambda *_: land()) for number in _LAND_SIGNALS}
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-
-
 class Launcher:
     """Runs one flight.
 
@@ -156,7 +145,7 @@ class Launcher:
             ipc.send(self._channel, Land())
 
     def run(self) -> FlightResult:
-        """Run the flight. Call it inside `landing_signals(launcher.request_landing)`.
+        """Run the flight. Call it while `LAND_SIGNALS` call `request_landing`.
 
         This process and its children leave the cores of `computer.cpus`; only the flight process returns to them.
 
@@ -273,7 +262,7 @@ class Launcher:
         elif self._result is not None and code >= 0:
             outcome = self._result.outcome
             expected = EXIT_CODES[outcome]
-        elif self._recorder_pid is None and self._stop_requested and -code in _LAND_SIGNALS:
+        elif self._recorder_pid is None and self._stop_requested and -code in LAND_SIGNALS:
             outcome, expected = Outcome.ABORTED, code  # Ctrl-C reached it directly, as in `run`
         elif self._recorder_pid is None:
             outcome, expected = Outcome.REFUSED, None  # it never started, so nothing was armed
@@ -453,7 +442,7 @@ class Launcher:
         os.close(pidfd)
 
 
-_LAND_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+LAND_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def replace_device_settings(config: FlightConfig, addresses: dict[str, dict[str, Any]]) -> FlightConfig:

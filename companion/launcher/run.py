@@ -12,10 +12,10 @@ from companion.analysis.contact import PROBE, contact_lines, write_probe
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.proposal import PROPOSAL, write_proposal
 from companion.analysis.summary import empty_summary, summarise, write_summary
-from companion.launcher.launcher import FlightResult, Launcher, Sitl, landing_signals
+from companion.launcher.launcher import LAND_SIGNALS, FlightResult, Launcher, Sitl
 from companion.model.types import Outcome
 from companion.runtime.console import FlightDisplay, print_error, print_result
-from companion.runtime.subprocesses import LaunchError
+from companion.runtime.subprocesses import LaunchError, signals_call
 from companion.sitl_config.loader import SitlConfig
 
 TICKS_MAX = 60_000
@@ -49,7 +49,7 @@ def run_flight(
 
     launcher = Launcher(config, out, sitl=sitl, on_message=display.on_message, speed=speed)
     # A second Ctrl-C after the end of a short flight must not lose the summary.
-    with landing_signals(launcher.request_landing):
+    with signals_call(LAND_SIGNALS, launcher.request_landing):
         with display:
             try:
                 result = launcher.run()

@@ -56,7 +56,7 @@ class ParamsFile:
             text = (
                 f"expected parameters of vehicle {vehicle_id} (MAV_SYS_ID of this PX4), found those of vehicle {found}"
             )
-            raise ConfigError([f"{self.source}: {text}; export them from this vehicle, or correct the first column"])
+            raise ConfigError(f"{self.source}: {text}; export them from this vehicle, or correct the first column")
         skipped = {(vehicle, COMPONENT_ID): list(of) for vehicle, of in self.values.items() if vehicle != vehicle_id}
         return self.values[vehicle_id], skipped | self.others
 
@@ -70,9 +70,9 @@ def read(path: str | Path) -> ParamsFile:
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ConfigError([f"{path}: expected UTF-8 text, found byte {error.object[error.start]:#04x}"]) from None
+        raise ConfigError(f"{path}: expected UTF-8 text, found byte {error.object[error.start]:#04x}") from None
     except OSError as error:
-        raise ConfigError([f"{path}: cannot be read: {error.strerror or error}"]) from None
+        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from None
     return parse(text, str(path))
 
 

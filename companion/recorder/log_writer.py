@@ -123,15 +123,7 @@ class LogWriter:
         return foxglove.Channel(topic, schema=json_schema(cls), context=self._context)
 
     def _event(self, stamp_ns: int, mission_t_s: float, event: Event) -> None:
-        line = EventLine(
-            t_s=event.t_s,
-            mission_t_s=mission_t_s,
-            id=event.id,
-            severity=event.severity.value,
-            action=event.action.value,
-            text=event.text,
-        )
-        self._events.log(to_json(line), log_time=stamp_ns)
+        self._events.log(to_json(EventLine.of(event, mission_t_s)), log_time=stamp_ns)
         self._line(stamp_ns, event.severity.value, event.id, event.text)
 
     def _line(self, stamp_ns: int, severity: str, source: str, text: str) -> None:

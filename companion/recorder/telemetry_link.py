@@ -341,7 +341,6 @@ def run(config_json: str, session: str, simulated: bool, recorder: RecorderSide)
 
 
 def _verifier(config: FlightConfig, mqtt: Mqtt, session: str) -> tuple[Verifier | None, str | None]:
-    """Return the command verifier, or the reason why commands are not accepted."""
     if not mqtt.commands:
         return None, "commands are disabled in the vehicle file (ground.mqtt.commands)"
     address = mqtt.address

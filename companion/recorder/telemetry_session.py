@@ -31,7 +31,7 @@ from companion.ground.protocol.proof import with_proof, with_proofs
 from companion.ground.telemetry.scene import scene_of
 from companion.ground.telemetry.stream import StreamBuilder, truncated
 from companion.model.packets import Close, CommandAnswer, LogLine, Metadata, Tick, read_packet
-from companion.model.types import Outcome
+from companion.model.types import Outcome, SafetyAction
 
 SILENT_S = 0.5
 """Time without a tick after which the vehicle is reported as silent."""
@@ -191,22 +191,14 @@ class TelemetrySession:
 
     def reject(self, command: Command, text: str, now_s: float) -> None:
         """Queue a negative acknowledgement for a command with a valid signature that is not executed."""
-        newest = self._stream.newest_outputs
-        self._acks.append(
-            Ack(
-                v=VERSION,
-                session=self.session,
-                nonce=command.nonce,
-                operator=command.operator,
-                command=command.command,
-                accepted=False,
-                text=text,
-                t_s=self.flight_s(now_s) or 0.0,
-                phase=newest.phase if newest is not None else "",
-                action=newest.action.value if newest is not None else "nominal",
-                proof="",
+        newest, t_s = self._stream.newest_outputs, self.flight_s(now_s) or 0.0
+        phase, action = ("", SafetyAction.NOMINAL) if newest is None else (newest.phase, newest.action)
+        self._answered(
+            CommandAnswer(
+                number=0, nonce=command.nonce, operator=command.operator, command=command.command, accepted=False, text=text,
+                t_s=t_s, phase=phase, action=action,
             )
-        )
+        )  # fmt: skip
 
     def end(self, *, normally: bool) -> None:
         """End the session after the last tick.
@@ -270,22 +262,13 @@ class TelemetrySession:
         if outputs.outcome is not None:
             self._outcome = outputs.outcome
 
-    def _answered(self, answer: CommandAnswer) -> None:
+    def _answered(self, of: CommandAnswer) -> None:
         self._acks.append(
             Ack(
-                v=VERSION,
-                session=self.session,
-                nonce=answer.nonce,
-                operator=answer.operator,
-                command=answer.command,
-                accepted=answer.accepted,
-                text=answer.text,
-                t_s=answer.t_s,
-                phase=answer.phase,
-                action=answer.action.value,
-                proof="",
+                v=VERSION, session=self.session, nonce=of.nonce, operator=of.operator, command=of.command, accepted=of.accepted,
+                text=of.text, t_s=of.t_s, phase=of.phase, action=of.action.value, proof="",
             )
-        )
+        )  # fmt: skip
 
     def _proven(self, ack: Ack) -> Ack:
         """Return the ack with a proof for the operator who sent the command."""

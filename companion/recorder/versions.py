@@ -9,6 +9,7 @@ import subprocess
 from pathlib import Path
 
 from companion import __version__
+from companion.runtime.subprocesses import captured
 
 _PACKAGES = (
     "mavsdk",
@@ -47,14 +48,8 @@ def _git_revision() -> str | None:
     if not (root / ".git").exists():
         return None
     try:
-        done = subprocess.run(
-            ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],
-            capture_output=True,
-            encoding="utf-8",
-            errors="replace",
-            timeout=5.0,
-            check=True,
-        )
+        command = ("git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+        done = captured(command, timeout_s=5.0)
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip() or None
+    return (done.returncode == 0 and done.stdout.strip()) or None

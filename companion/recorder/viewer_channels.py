@@ -38,18 +38,12 @@ from foxglove.messages import (
     Vector3,
 )
 
+from companion.model.arm_skeleton import NO_ARM, ArmSkeleton
 from companion.model.frames import quat_rotate
 from companion.model.hanging_line import hanging_line_m
+from companion.model.logged_geometry import Geometry, logged_geometry
 from companion.model.types import Inputs, Outputs, Quat, Reference, TetherState, Vec3
-from companion.recorder.viewer_scene import (
-    Machine,
-    machine_of,
-    path_of,
-    point3,
-    static_entities,
-    tether_colour,
-    trail,
-)
+from companion.recorder.viewer_scene import path_of, point3, static_entities, tether_colour, trail
 
 PERIOD_S = 0.02
 SCENE_PERIOD_S = 0.05
@@ -78,8 +72,8 @@ class ViewerChannels:
         self._scene = SceneUpdateChannel("/scene", context=context)
         self._path = SceneUpdateChannel("/scene_path", context=context)
         self._static = SceneUpdateChannel("/scene_static", context=context)
-        self._machine = machine_of(None)
-        self._joints = _Joints(self._machine)
+        self._geometry: Geometry | None = None
+        self._joints = _Joints(NO_ARM)
         self._planned: tuple[Vec3, ...] = ()
         self._static_due = False
         self._due_s = self._scene_due_s = self._path_due_s = -math.inf
@@ -87,8 +81,11 @@ class ViewerChannels:
 
     def configure(self, config: Any) -> None:
         """Set the effective configuration (nested dicts); the scene of an invalid one is empty."""
-        self._machine = machine_of(config)
-        self._joints = _Joints(self._machine)
+        try:
+            self._geometry = logged_geometry(config["vehicle"])
+        except (KeyError, TypeError, ValueError, AttributeError):
+            self._geometry = None
+        self._joints = _Joints(self._geometry.arm if self._geometry is not None else NO_ARM)
         self._static_due = True
 
     def plan(self, path: Any) -> None:
@@ -114,7 +111,7 @@ class ViewerChannels:
         stamp = timestamp(stamp_ns)
         if self._static_due:
             self._static_due = False
-            entities = static_entities(self._machine, self._planned, stamp)
+            entities = static_entities(self._geometry, self._planned, stamp)
             self._static.log(SceneUpdate(entities=entities), log_time=stamp_ns)
         pose = _vehicle_pose(inputs)
         if frames_due:
@@ -127,12 +124,7 @@ class ViewerChannels:
             self._paths(t_s, stamp, stamp_ns, pose, outputs.reference)
 
     def _frames(
-        self,
-        stamp: Timestamp,
-        stamp_ns: int,
-        pose: tuple[Vec3, Quat] | None,
-        inputs: Inputs,
-        outputs: Outputs,
+        self, stamp: Timestamp, stamp_ns: int, pose: tuple[Vec3, Quat] | None, inputs: Inputs, outputs: Outputs
     ) -> None:
         mocap, arm, reference = inputs.mocap, inputs.arm, outputs.reference
         if pose is not None:
@@ -155,26 +147,21 @@ class ViewerChannels:
             _log_pose(self._reference, stamp, stamp_ns, reference.position_world_m, turned)
 
     def _tether(self, stamp: Timestamp, stamp_ns: int, pose: tuple[Vec3, Quat], watched: TetherState | None) -> None:
-        tether = self._machine.tether
-        if tether is None:
+        geometry = self._geometry
+        if geometry is None or (tether := geometry.tether) is None:
             return
         (px, py, pz), attitude = pose
         bx, by, bz = quat_rotate(attitude, tether.attachment_body_m)
         end = (px + bx, py + by, pz + bz)
         slack_m = tether.length_m - math.dist(tether.anchor_world_m, end)
         held = watched is not None and (watched.taut or watched.snagged)
-        points = hanging_line_m(tether.anchor_world_m, end, tether.length_m, self._machine.floor_m)
+        points = hanging_line_m(tether.anchor_world_m, end, tether.length_m, geometry.room_min_world_m[2])
         line = trail([point3(p) for p in points], tether_colour(tether, slack_m, held=held), 4.0)
         entity = SceneEntity(timestamp=stamp, frame_id="world", id="tether", lifetime=_LIFETIME, lines=[line])
         self._scene.log(SceneUpdate(entities=[entity]), log_time=stamp_ns)
 
     def _paths(
-        self,
-        t_s: float,
-        stamp: Timestamp,
-        stamp_ns: int,
-        pose: tuple[Vec3, Quat] | None,
-        reference: Reference | None,
+        self, t_s: float, stamp: Timestamp, stamp_ns: int, pose: tuple[Vec3, Quat] | None, reference: Reference | None
     ) -> None:
         if pose is not None:
             self._flown_trail.add(t_s, pose[0])
@@ -198,18 +185,15 @@ class ViewerChannels:
 class _Joints:
     """Writes the arm's frames; their constant parts are built once."""
 
-    def __init__(self, machine: Machine) -> None:
-        arm = machine.arm
+    def __init__(self, arm: ArmSkeleton) -> None:
         self._links: list[tuple[str, str, Vector3]] = []
         """Parent, child and position in the parent of each link's frame."""
-        if arm is None:
-            return
-        x, y, z = arm.skeleton.shoulder_body_m
+        x, y, z = arm.shoulder_body_m
         parent, offset = "body", Vector3(x=x, y=y, z=z)
-        for number, (x, y, z) in enumerate(arm.skeleton.links_body_m, start=1):
+        for number, (x, y, z) in enumerate(arm.links_body_m, start=1):
             self._links.append((parent, f"link{number}", offset))
             parent, offset = f"link{number}", Vector3(x=x, y=y, z=z)
-        self._axes = arm.skeleton.joint_axes
+        self._axes = arm.joint_axes
         self._net = (parent, "net", offset)
 
     def log(self, channel: FrameTransformsChannel, stamp: Timestamp, stamp_ns: int, angle_rad: Sequence[float]) -> None:

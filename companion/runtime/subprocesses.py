@@ -12,7 +12,7 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,38 @@ def use_default_signals() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in (signal.SIGTERM, signal.SIGCHLD):
         signal.signal(number, signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def signals_call(numbers: Iterable[int], action: Callable[[], object]) -> Iterator[None]:
+    """Call `action` at these signals instead of ending the process."""
+    handlers = {number: signal.signal(number, lambda *_: action()) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+def captured(
+    argv: Sequence[str], timeout_s: float, env: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run a program that reads no input to its end, whatever its exit code; return it with its output as text.
+
+    Raises:
+        OSError: the program cannot be run.
+        subprocess.TimeoutExpired: it did not end in time.
+    """
+    return subprocess.run(
+        argv,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        encoding="utf-8",
+        errors="replace",
+        timeout=timeout_s,
+        check=False,
+        env=env,
+    )
 
 
 def terminate(process: subprocess.Popen[bytes], patience_s: float = 3.0) -> None:

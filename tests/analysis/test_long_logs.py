@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.analysis import plots
+from companion.analysis import plot_style
 from companion.analysis.log import FlightLog
 from companion.analysis.metrics import catch_index
 from companion.analysis.report import write_report
@@ -80,7 +80,7 @@ def test_the_summary_says_that_it_is_thinned_out_and_grades_nearly_the_same(whol
 
 
 def test_the_report_says_so_too(thin: FlightLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plots, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
+    monkeypatch.setattr(plot_style, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
     summary = summarise(thin, outcome="completed", controller="adaptive", preset="recommended")
     assert f"one in {thin.stride} (long flight)" in write_report(thin, summary, tmp_path).read_text()
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from companion.analysis import plots
+from companion.analysis import plot_style
 from companion.analysis.summary import summarise
 from companion.campaigns.side_by_side import plots as side_by_side_plots
 from companion.campaigns.side_by_side.comparison import Comparison, Figure, NotAlignable, compare, jsonable
@@ -357,7 +357,7 @@ def test_a_law_without_a_switching_gain_has_no_line_of_it_and_two_have_no_pane()
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures without a stroke: for tests that are about files and figures."""
-    monkeypatch.setattr(side_by_side_plots, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
+    monkeypatch.setattr(plot_style, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -423,7 +423,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
         end_s = 5.0 if name == "short" else LANDED_S
         assert record_flight(log, config=config, end_s=end_s, rate_hz=50.0).error is None
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(plots, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
+        patched.setattr(plot_style, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
         assert main(["report", str(root / "whole/flight.mcap")]) == EXIT_OK
     return root
 

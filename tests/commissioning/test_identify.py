@@ -10,11 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from companion.analysis.log import FlightLog
+from companion.analysis.log import FlightLog, LogError
 from companion.cli import main as cli
 from companion.cli.identify import RESULT, WORLD
 from companion.commissioning.identify.identification import identify
-from companion.commissioning.identify.samples import IdentifyError
 from companion.config.loader import load_vehicle
 from companion.sitl_config.loader import load_sitl, load_world
 from sitl.campaigns.flights import log_of
@@ -129,7 +128,7 @@ def cut(log: FlightLog, begin: int, end: int) -> FlightLog:
 def test_a_log_that_shows_nothing_is_refused_in_one_line(
     flown: tuple[FlightLog, dict[str, float]], spoil: Callable[[FlightLog], FlightLog], why: str
 ) -> None:
-    with pytest.raises(IdentifyError, match=why) as refused:
+    with pytest.raises(LogError, match=why) as refused:
         identify(spoil(flown[0]))
     assert "\n" not in str(refused.value)
 

@@ -23,7 +23,7 @@ from companion.model.hanging_line import hanging_line_m
 from companion.model.types import Inputs, Joints, MocapPose, Outputs, Quat, Sent, TetherState, Vec3
 from companion.recorder.log_file import LogFile
 from companion.recorder.log_writer import LogWriter
-from companion.recorder.viewer_scene import machine_of, path_of
+from companion.recorder.viewer_scene import path_of
 from tests.machines import overrides_with_joints
 from tests.recorder.flights import EPOCH_NS, Row, config_json, tethered
 from tests.recorder.viewers import Seen, Viewed, view
@@ -395,18 +395,8 @@ def test_any_configuration_gives_a_log_and_at_least_the_frame(tmp_path: Path, co
     assert not viewed.by_topic["/scene"]
 
 
-def test_geometry_is_taken_where_it_is_whole() -> None:
-    whole = machine_of(json.loads(config_json()))
-    assert None not in (whole.arm, whole.tether, whole.room_min_world_m, whole.radius_m, whole.rotors)
-    airframe = {"radius_m": 0.5, "rotor_arm_m": 0.34, "layout": "octa_plus"}
-    octocopter = machine_of({"vehicle": {"airframe": airframe}}).rotors
-    assert octocopter is not None
-    assert octocopter.count == 8
-    assert machine_of({"vehicle": {"airframe": {**airframe, "rotor_arm_m": NAN}}}).rotors is None
-    assert machine_of({"vehicle": {"airframe": {**airframe, "layout": "round"}}}).rotors is None
-    assert machine_of({"vehicle": {"tether": {"anchor_world_m": [0, 0, 0], "length_m": 0}}}).tether is None
-    assert machine_of({"vehicle": {"tether": {"anchor_world_m": [0, NAN, 0], "length_m": 1}}}).tether is None
-    assert path_of([[0, 0, 1], [1, 0, "1"]]) == ()
+def test_a_path_is_points() -> None:
+    assert path_of([[0, 0, 1], [1, 0]]) == path_of("no") == path_of(None) == ()
     assert path_of([[0, 0, 1], [1, 0, 1]]) == ((0.0, 0.0, 1.0), (1.0, 0.0, 1.0))
 
 

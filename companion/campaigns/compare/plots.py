@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from companion.analysis import plot_style
 from companion.analysis.log import Array
 from companion.analysis.page import Picture
 from companion.analysis.plot_style import (
@@ -50,12 +51,8 @@ def write_pictures(messages: Sequence[Message], groups: Sequence[Group], out: Pa
         groups: aggregated rows of the flights.
         out: folder for the PNG files.
     """
-    written = []
+    written = plot_style.write_pictures(distributions(groups), out)
     colours = _colours(group.label for group in sorted(groups, key=lambda group: is_ablation(group.preset)))
-    for name, title, caption, figure in distributions(groups):
-        path = out / f"{name}.png"
-        write_png(figure, path)
-        written.append(Picture(path, title, caption))
     drawn = [message for message in messages if message["series"] is not None]
     for payload_kg in sorted({message["row"]["payload_kg"] for message in drawn}):
         these = [message for message in drawn if message["row"]["payload_kg"] == payload_kg]

@@ -178,15 +178,5 @@ def kinds_table() -> Table:
 
 def kinds_list() -> list[dict[str, Any]]:
     """Return the kinds of faults as plain data, for `companion faults --list --json`."""
-    return [
-        {
-            "kind": name,
-            "what": kind.what,
-            "size": kind.size,
-            "unit": kind.unit,
-            "default": kind.default,
-            "named_by": list(kind.named_by),
-            "phases": list(kind.phases),
-        }
-        for name, kind in KINDS.items()
-    ]
+    keys = ("what", "size", "unit", "default", "named_by", "phases")
+    return [{"kind": name, **{key: getattr(kind, key) for key in keys}} for name, kind in KINDS.items()]

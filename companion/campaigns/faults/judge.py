@@ -199,7 +199,6 @@ def _contact_n(course: Sequence[Point]) -> float | None:
 def _problems(
     row: Row, variant: Variant, phase: FlightPhase, course: Sequence[Point], abort: Event | None, vehicle: Vehicle
 ) -> list[str]:
-    """Return the safety requirements that the flight violated."""
     found = []
     if row["outcome"] not in GOOD and not (row["outcome"] == "refused" and phase == "ground"):
         found.append(str(row["outcome"]))

@@ -33,12 +33,8 @@ class Variant:
 
     def fault(self, phase: FlightPhase) -> dict[str, Any]:
         """Return an entry of `world.faults`."""
-        found: dict[str, Any] = {"kind": self.kind, "phase": phase}
-        if self.size is not None:
-            found["size"] = self.size
-        if self.duration_s is not None:
-            found["duration_s"] = self.duration_s
-        return found
+        values = {"size": self.size, "duration_s": self.duration_s}
+        return {"kind": self.kind, "phase": phase, **{key: known for key, known in values.items() if known is not None}}
 
 
 def _durations(kind: FaultKind, *durations_s: float | None) -> list[Variant]:

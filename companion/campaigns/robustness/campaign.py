@@ -145,7 +145,6 @@ class Robustness(Campaign):
         return f"Rank correlation with e_p: {text or 'too few flights'}."
 
     def _flights_table(self, rows: Sequence[Row]) -> Table:
-        """Return the cases that were flown, or the worst draws."""
         if self.cases:
             return flights_table(rows, self.cases)
         hardest = worst(rows)

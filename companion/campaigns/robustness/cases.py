@@ -93,9 +93,7 @@ def read_cases(path: Path) -> Cases:
         raise ConfigError(problem_lines(document.problems))
     names = [case.name for case in cases.cases]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ConfigError(
-            [f"{path}: cases: expected distinct names, but these occur more than once: {', '.join(twice)}"]
-        )
+        raise ConfigError(f"{path}: cases: expected distinct names, but these occur more than once: {', '.join(twice)}")
     return cases
 
 
@@ -170,9 +168,7 @@ def as_cases(rows: Sequence[Row]) -> tuple[Case, ...]:
         unique = name if taken[name] == 1 else f"{name}_{taken[name]}"
         error_m = row["e_p_m"] if row["outcome"] == Outcome.COMPLETED.value else None
         kept = Kept(
-            outcome=Outcome(row["outcome"]),
-            caught=row["caught"],
-            e_p_m=None if error_m is None else round(error_m, 4),
+            outcome=Outcome(row["outcome"]), caught=row["caught"], e_p_m=None if error_m is None else round(error_m, 4)
         )
         cases.append(Case(name=unique, world=World.model_validate(row["world"]), kept=kept))
     return tuple(cases)

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
+from companion.analysis import plot_style
 from companion.analysis.log import Array
 from companion.analysis.page import Picture
 from companion.analysis.plot_style import (
@@ -27,7 +28,6 @@ from companion.analysis.plot_style import (
     new_figure,
     path_panes,
     scale_path,
-    write_png,
 )
 from companion.analysis.table import Line
 from companion.campaigns.side_by_side.comparison import Comparison
@@ -73,14 +73,8 @@ def write_pictures(comparison: Comparison, out_dir: Path) -> list[Picture]:
             _lateness,
         ),
     )  # fmt: skip
-    written = []
-    for name, title, caption, make in makers:
-        figure = make(comparison)
-        if figure is not None:
-            path = out_dir / f"side_by_side_{name}.png"
-            write_png(figure, path)
-            written.append(Picture(path, title, caption))
-    return written
+    figures = ((name, title, caption, make(comparison)) for name, title, caption, make in makers)
+    return plot_style.write_pictures(figures, out_dir, "side_by_side_")
 
 
 def _errors(comparison: Comparison) -> Figure | None:
@@ -110,11 +104,7 @@ def _actuation(comparison: Comparison) -> Figure | None:
 
 
 def _over_time(
-    comparison: Comparison,
-    title: str,
-    panes: tuple[tuple[str, Callable[[Flight], Array]], ...],
-    *,
-    from_zero: bool,
+    comparison: Comparison, title: str, panes: tuple[tuple[str, Callable[[Flight], Array]], ...], *, from_zero: bool
 ) -> Figure | None:
     """Draw panes over the common time, with the events of every flight below; panes without data are left out."""
     flights = comparison.flights
@@ -227,7 +217,6 @@ def _mark_zero(comparison: Comparison, axes: list[Any]) -> None:
 
 
 def _mark_severe_events(comparison: Comparison, axes: list[Any]) -> None:
-    """Draw lines through the panes at warnings and critical events."""
     low, high = axes[0].get_xlim()
     for n, (flight, zero_s) in enumerate(zip(comparison.flights, comparison.zeros_s, strict=True)):
         for event in flight.summary["events"]:

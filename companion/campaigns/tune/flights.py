@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any, Self
 
 from companion.campaigns.process import CampaignProcess, Message
-from companion.campaigns.runner import Row, interrupted_by, progress_bar
+from companion.campaigns.runner import INTERRUPTS, Row, progress_bar
 from companion.config.document import ConfigError
+from companion.runtime.subprocesses import signals_call
 
 FILE = "flights.jsonl"
 """Name of the file in the folder of results: a line with the settings of the search, then one for each flight."""
@@ -49,7 +50,7 @@ class Flights(AbstractContextManager["Flights"]):
             self._open(self._path, settings)
 
     def __enter__(self) -> Self:
-        self._stack.enter_context(interrupted_by(self._stop))
+        self._stack.enter_context(signals_call(INTERRUPTS, self._stop))
         self._stack.enter_context(self._bar)
         return self
 
@@ -106,10 +107,8 @@ class Flights(AbstractContextManager["Flights"]):
         for key in sorted(begun.keys() | wanted.keys()):
             if begun.get(key) != wanted.get(key):
                 raise ConfigError(
-                    [
-                        f"companion tune: --out {path.parent}: holds another search: {key} was {_short(begun.get(key))}, "
-                        f"is {_short(wanted.get(key))}; choose another folder"
-                    ]
+                    f"companion tune: --out {path.parent}: holds another search: {key} was {_short(begun.get(key))}, "
+                    f"is {_short(wanted.get(key))}; choose another folder"
                 )
         self._known = {line["flight"]: line["row"] for line in known if "row" in line}
         path.write_text("".join(json.dumps(line) + "\n" for line in read), encoding="utf-8")

@@ -66,7 +66,7 @@ class Tune:
         if len(self.space.axes) < 2:
             law = find(CONTROL_LAWS, self.config.controller.law)
             text = f"companion tune: {law}: expected a law that declares two or more gains to tune, found "
-            raise ConfigError([f"{text}{len(self.space.axes)} (tuned_gains of its settings; docs/internals/tune.md)"])
+            raise ConfigError(f"{text}{len(self.space.axes)} (tuned_gains of its settings; docs/internals/tune.md)")
 
     @property
     def space(self) -> Space:
@@ -157,7 +157,6 @@ def _flights(settings: Sequence[ControllerConfig], draws: Draws, numbers: Sequen
 
 
 def _judge(search: Search, space: Space, draws: Draws, flights: Flights) -> HeldOut:
-    """Fly start and found gains in the held-out laboratories."""
 
     def rows_of(one: Evaluation, about: str) -> list[Row]:
         return flights.fly(_flights([space.settings(one.point)], draws, range(draws.count)), about)

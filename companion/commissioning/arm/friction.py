@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.commissioning.arm.sweep import Sample
+from companion.config.arm import Arm
 from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.vehicle import Vehicle
@@ -94,9 +95,7 @@ class FrictionFit:
         """Return the values to change in the vehicle file; empty if the data do not contradict it."""
         wanted: dict[Location, Data] = {}
         arm = vehicle.arm
-        together = len({joint.servo for joint in arm.joints}) == 1 and not any(
-            joint.torque_per_amp_nm_a for joint in arm.joints
-        )
+        together = one_constant(arm)
         for index, (found, has_nm_a) in enumerate(
             zip(self.torque_constants_nm_a, arm.torque_constants_nm_a, strict=True)
         ):
@@ -107,6 +106,13 @@ class FrictionFit:
         if friction is not None and _differs(friction, arm.joint_friction_nm, FRICTION_SAME_NM):
             wanted["arm", "joint_friction_nm"] = max(0.0, round(friction.value, 3))
         return wanted
+
+
+def one_constant(arm: Arm) -> bool:
+    """Return whether the vehicle file has one torque constant for all joints, whose servos are of one model."""
+    return len({joint.servo for joint in arm.joints}) == 1 and not any(
+        joint.torque_per_amp_nm_a for joint in arm.joints
+    )
 
 
 def _differs(found: Estimate, has: float, same: float) -> bool:

@@ -58,10 +58,8 @@ def steps_of(arm: Arm) -> tuple[Step, ...]:
     straight = next((pose for pose in _STRAIGHT_DEG if _within(first, pose[0]) and _within(second, pose[1])), None)
     if straight is None:
         raise ConfigError(
-            [
-                "arm.joints[].angle_deg: the limits allow neither straight forward (0, 0) nor straight down (90, 0), and one of "
-                "the two is needed to find the zeros; widen the limits to the arm's real range"
-            ]
+            "arm.joints[].angle_deg: the limits allow neither straight forward (0, 0) nor straight down (90, 0), and one of "
+            "the two is needed to find the zeros; widen the limits to the arm's real range"
         )
     elbow_deg, elbow_exact = _turn(second, straight[1], 1)
     shoulder_deg, shoulder_exact = _turn(first, straight[0], 0)
@@ -152,8 +150,8 @@ def _turn(joint: Joint, from_deg: float, index: int) -> tuple[float, bool]:
     by_deg = min(SWING_DEG, high - from_deg) if high - from_deg >= from_deg - low else -min(SWING_DEG, from_deg - low)
     if abs(by_deg) < SWING_MIN_DEG:
         raise ConfigError(
-            [f"arm.joints[{index}].angle_deg: from {from_deg:g} deg, the limits allow a turn of only {abs(by_deg):.0f} deg; at "
-             f"least {SWING_MIN_DEG:g} deg is needed to determine which way the servo counts"]
+            f"arm.joints[{index}].angle_deg: from {from_deg:g} deg, the limits allow a turn of only {abs(by_deg):.0f} deg; at "
+             f"least {SWING_MIN_DEG:g} deg is needed to determine which way the servo counts"
         )  # fmt: skip
     return by_deg, False
 

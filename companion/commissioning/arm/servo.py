@@ -180,7 +180,7 @@ def joint_in(arm: Arm, index: int | None) -> int | None:
     """
     count = len(arm.joints)
     if index is not None and index >= count:
-        raise ConfigError([f"--joint {index + 1}: expected 1 to {count}, the arm's joints from the shoulder outwards"])
+        raise ConfigError(f"--joint {index + 1}: expected 1 to {count}, the arm's joints from the shoulder outwards")
     return index
 
 

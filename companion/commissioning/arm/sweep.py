@@ -89,7 +89,7 @@ def legs_of(vehicle: Vehicle) -> tuple[Leg, ...]:
         if end - begin < REACH_MIN_DEG:
             room = f"about the hanging pose and within its limits joint {joint + 1} can turn {max(0.0, end - begin):.0f} deg"
             why = f"at least {REACH_MIN_DEG:g} deg are needed to separate gravity from friction"
-            raise ConfigError([f"arm.joints[{joint}].angle_deg: {room}; {why}"])
+            raise ConfigError(f"arm.joints[{joint}].angle_deg: {room}; {why}")
         legs.append(Leg(joint, begin, fast))
         for speed in SPEEDS_DEG_S:
             legs += [Leg(joint, end, speed, True), Leg(joint, begin, speed, True)]

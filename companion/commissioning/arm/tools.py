@@ -41,7 +41,7 @@ def _stand_text(vehicle: Vehicle) -> str:
 def _scan(session: Session) -> Scan:
     baud = session.arguments.baud
     if baud not in (None, *BAUDS):
-        raise ConfigError([f"--baud {baud}: expected one of {', '.join(map(str, BAUDS))}"])
+        raise ConfigError(f"--baud {baud}: expected one of {', '.join(map(str, BAUDS))}")
     return arm_scan.scan_for(session, baud)
 
 
@@ -92,7 +92,6 @@ def _judge_zero(result: ZeroResult, vehicle: Vehicle) -> Report:
 
 
 async def _drive(session: Session, leader: Leader, what: str) -> Driven:
-    """Announce the motion, ask the user, and move the arm."""
     part = session.arguments.part
     session.say(f"{part}: {what}", "bold")
     session.say(f"  propellers off; {_stand_text(session.vehicle)}")
@@ -103,7 +102,7 @@ async def _drive(session: Session, leader: Leader, what: str) -> Driven:
     session.say("  at the end the arm always goes limp: keep hands and objects out of the space below it")
     answer = session.ask("may the arm move now?")
     if answer is None:
-        raise ConfigError([f"companion arm {part}: there is no terminal to ask whether the arm may move; add --yes"])
+        raise ConfigError(f"companion arm {part}: there is no terminal to ask whether the arm may move; add --yes")
     if not answer:
         raise Cancelled("the arm was not moved")
     with Bars(session.console, [f"joint {number}" for number in range(1, len(session.vehicle.arm.joints) + 1)]) as bars:
@@ -114,19 +113,17 @@ async def _jog(session: Session) -> Driven:
     arguments, arm = session.arguments, session.vehicle.arm
     joint, goal_deg = joint_in(arm, arguments.joint), arguments.to
     if (goal_deg is None) != (joint is None):
-        raise ConfigError(
-            ["companion arm jog: --joint N and --to DEG belong together; without both, keys move the arm"]
-        )
+        raise ConfigError("companion arm jog: --joint N and --to DEG belong together; without both, keys move the arm")
     if goal_deg is not None and joint is not None:
         low, high = limits_deg(arm, joint)
         if not low <= goal_deg <= high:
             expected = f"expected {low:g} to {high:g} deg, joint {joint + 1}'s limits minus a margin"
-            raise ConfigError([f"companion arm jog: --to {goal_deg:g}: {expected}"])
+            raise ConfigError(f"companion arm jog: --to {goal_deg:g}: {expected}")
         leader = Sweeper([Leg(joint, goal_deg, SPEED_MAX_DEG_S)], arm.torque_constants_nm_a)
         return await _drive(session, leader, f"joint {joint + 1} moves to {goal_deg:g} deg")
     if sys.stdin is None or not sys.stdin.isatty():
         raise ConfigError(
-            ["companion arm jog: no terminal to read keys from; --joint N --to DEG --yes moves without keys"]
+            "companion arm jog: no terminal to read keys from; --joint N --to DEG --yes moves without keys"
         )
     joints = f"1 to {len(arm.joints)}" if len(arm.joints) > 2 else "1, 2"
     keys = f"{joints}: select the joint; arrows or + and -: move it while held; any other key: stop; q: end"

@@ -142,7 +142,6 @@ def judge(seen: Watched, vehicle: Vehicle) -> Report:
 
 
 def _rest_rows(seen: Watched, vehicle: Vehicle) -> list[Row]:
-    """Return the preflight's rows."""
     samples, tool = seen.empty, tool_of(vehicle)
     duration_s = samples[-1].stamp_s - samples[0].stamp_s
     bias_fix = (
@@ -179,7 +178,7 @@ async def watch_drift(session: Session) -> Tared:
     if (arguments.sensor or arguments.clear) and device.type != RFT60:
         option = "--sensor" if arguments.sensor else "--clear"
         text = f"{option}: only the {RFT60} has a zero of its own to set; devices.force.type is {device.type}"
-        raise ConfigError([f"companion ft tare: {text}"])
+        raise ConfigError(f"companion ft tare: {text}")
     for wanted, question in (
         (arguments.sensor, "set the sensor's own zero to the current reading?"),
         (arguments.clear, "clear the sensor's own zero?"),

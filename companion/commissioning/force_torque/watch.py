@@ -89,12 +89,12 @@ def pose_rad(text: str | None, vehicle: Vehicle) -> Joints | None:
     except ValueError:
         such_as = ",".join(f"{angle:g}" for angle in vehicle.safety.fold_arm_deg)
         raise ConfigError(
-            [f"--arm-pose {text}: expected the angle of each joint in deg, {len(joints)} in all, such as {such_as}"]
+            f"--arm-pose {text}: expected the angle of each joint in deg, {len(joints)} in all, such as {such_as}"
         ) from None
     for number, (angle, joint) in enumerate(zip(angles_deg, joints, strict=True), 1):
         low, high = joint.angle_deg
         if not low <= angle <= high:
-            raise ConfigError([f"--arm-pose {text}: joint {number} goes from {low:g} to {high:g} deg, got {angle:g}"])
+            raise ConfigError(f"--arm-pose {text}: joint {number} goes from {low:g} to {high:g} deg, got {angle:g}")
     return tuple(map(math.radians, angles_deg))
 
 

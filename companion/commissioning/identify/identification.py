@@ -31,7 +31,7 @@ def identify(log: FlightLog) -> Identification:
     """Find everything that the flight shows.
 
     Raises:
-        IdentifyError: the log holds no flight that ended regularly and was long enough.
+        LogError: the log holds no flight that ended regularly and was long enough.
     """
     flight = Flight.of(log)
     hover, fit = hover_thrust(flight)

@@ -57,5 +57,4 @@ def payload(flight: Flight) -> Quantity:
 
 
 def _mean_sigma(values: Array) -> float:
-    """Return the standard error of the mean of correlated values."""
     return math.sqrt(float(long_run((values - values.mean())[:, None], _LAGS)[0, 0])) / len(values)

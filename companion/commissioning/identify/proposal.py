@@ -7,6 +7,7 @@ import statistics
 from collections.abc import Mapping
 from typing import Any
 
+from companion.commissioning.arm.friction import one_constant
 from companion.commissioning.identify.identification import Identification
 from companion.commissioning.identify.quantity import SIGMAS_95, Quantity
 from companion.config.base import Location
@@ -37,9 +38,7 @@ def vehicle_changes(found: Identification) -> dict[Location, Data]:
     if hover.value is not None and configured is not None and not hover.contains(configured):
         changes["airframe", "hover_thrust"] = round(hover.value, 4)
     arm = vehicle.arm
-    together = len({joint.servo for joint in arm.joints}) == 1 and not any(
-        joint.torque_per_amp_nm_a for joint in arm.joints
-    )
+    together = one_constant(arm)
     constants = [found[f"joint{number + 1}_torque_per_amp_nm_a"] for number in range(len(arm.joints))]
     wrong = [one.known and not one.contains(has) for one, has in zip(constants, arm.torque_constants_nm_a, strict=True)]
     if together and constants and all(wrong):

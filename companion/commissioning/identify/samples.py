@@ -8,12 +8,10 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from pydantic import ValidationError
 
-from companion.analysis.log import Array, FlightLog
+from companion.analysis.log import Array, FlightLog, LogError
 from companion.analysis.metrics import catch_index
 from companion.commissioning.identify.response import STEP_S
-from companion.config.loader import FlightConfig
 from companion.config.vehicle import Vehicle
 from companion.control.hover_thrust import AIRBORNE_M
 from companion.model.frames import euler_zyx_from_quat
@@ -26,10 +24,6 @@ _BEFORE_CATCH_S, _AFTER_CATCH_S = 0.1, 1.5
 """Time around the catch that is left out: impact and swinging."""
 _GAP_MAX_S = 0.03
 """Longest gap between ticks that is interpolated."""
-
-
-class IdentifyError(ValueError):
-    """Nothing can be found in this log. The text is one line for the user."""
 
 
 Row = tuple[Inputs, Outputs, Sent]
@@ -54,19 +48,19 @@ class Flight:
         """Return the flight of a log.
 
         Raises:
-            IdentifyError: the log has no configuration, or no flight that ended regularly and was long enough.
+            LogError: the log has no configuration, or no flight that ended regularly and was long enough.
         """
-        vehicle = _vehicle(log)
+        vehicle = log.flight_config().vehicle
         outcome = next((o.outcome for o in reversed(log.outputs) if o.outcome is not None), None)
         parts = _airborne(log, vehicle)
         if not parts and not any(o.phase_kind is PhaseKind.FLIGHT for o in log.outputs):
-            raise IdentifyError(f"{log.path}: the vehicle did not fly; expected the log of a flight")
+            raise LogError(f"{log.path}: the vehicle did not fly; expected the log of a flight")
         if outcome not in (Outcome.COMPLETED, Outcome.ABORTED):
             how = "was killed or its log is cut off" if outcome is None else f"ended as {outcome.value}"
-            raise IdentifyError(f"{log.path}: the flight {how}; expected one that ended with a landing")
+            raise LogError(f"{log.path}: the flight {how}; expected one that ended with a landing")
         log_s = sum(end - begin for begin, end in parts) * STEP_S
         if log_s < FLIGHT_MIN_S:
-            raise IdentifyError(
+            raise LogError(
                 f"{log.path}: too short: {log_s:.1f} s in the air under the companion's control, expected {FLIGHT_MIN_S:g} s or more"
             )
         return Flight(log, vehicle, parts, catch_index(log) if vehicle.has_net else None)
@@ -129,20 +123,6 @@ class Flight:
         """Return values, one per tick, interpolated on a grid."""
         known = np.isfinite(stamps_s) & np.isfinite(values)
         return np.interp(grid_s, stamps_s[known], values[known])
-
-
-def _vehicle(log: FlightLog) -> Vehicle:
-    if log.config_json is None:
-        raise IdentifyError(f"{log.path}: has no configuration (metadata record 'config'); expected a flight log")
-    own = {name: value for name, value in log.config.items() if name in FlightConfig.model_fields}
-    try:
-        return FlightConfig.model_validate(own).vehicle
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise IdentifyError(
-            f"{log.path}: the recorded configuration does not fit this version: {key}: {first['msg']}"
-        ) from None
 
 
 def _airborne(log: FlightLog, vehicle: Vehicle) -> tuple[tuple[int, int], ...]:

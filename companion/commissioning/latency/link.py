@@ -13,7 +13,6 @@ import statistics
 import struct
 from bisect import bisect_left
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Final, Self
 
 from companion.config.devices import AutopilotDevice
@@ -74,14 +73,12 @@ class LatencyLink(MavsdkAutopilot):
             raise
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Stop the requests, then close the link."""
         if self._asking is not None:
             self._asking.cancel()
             await asyncio.wait((self._asking,))
-        await super().__aexit__(kind, error, trace)
+        await super().__aexit__(None, None, None)
 
     def imu(self, last_s: float = math.inf) -> list[ImuAt]:
         """Return all samples so far on the companion's clock, or those of the last `last_s`."""

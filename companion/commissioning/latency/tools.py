@@ -87,10 +87,7 @@ async def measure(session: Session) -> Measured:
     arguments, vehicle = session.arguments, session.vehicle
     clock, devices = flight_clock(), vehicle.devices
     poses: list[MocapPose] = []
-    async with (
-        open_mocap(devices.mocap, clock, poses.append),
-        LatencyLink(devices.autopilot, clock) as link,
-    ):
+    async with open_mocap(devices.mocap, clock, poses.append), LatencyLink(devices.autopilot, clock) as link:
         _refuse_armed(link, devices.autopilot.address)
         # As in flight, because a busy computer stamps motion capture late.
         claim_realtime(FLIGHT_PRIORITY, cpus=vehicle.computer.cpus, lock_memory=False)

@@ -112,4 +112,4 @@ def _probed(folder: Path, point_m: Vec3, normal: Vec3) -> Probed:
 
 
 def _wrong(text: str) -> ConfigError:
-    return ConfigError([f"companion mocap pivot: {text}"])
+    return ConfigError(f"companion mocap pivot: {text}")

@@ -36,6 +36,7 @@ from companion.ground.broker.certificates import (
 from companion.ground.broker.mosquitto_config import INSTALLED, acl_text, profile_text
 from companion.ground.protocol.keys import OPERATOR_NAME, Operator, new_key, operators_text, write_private
 from companion.runtime.files import write_whole
+from companion.runtime.subprocesses import captured
 
 DAYS_MAX = 3000
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
@@ -72,10 +73,10 @@ def create(folder: Path, users: BrokerUsers, now: datetime.datetime) -> None:
     """
     _check_names(users)
     if not str(folder).isprintable():
-        raise ConfigError([f"{folder}: the folder's name contains control characters; choose another"])
+        raise ConfigError(f"{folder}: the folder's name contains control characters; choose another")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(
-            [f"{folder}: already exists; nothing was changed. Choose another folder, or use --renew-certificates"]
+            f"{folder}: already exists; nothing was changed. Choose another folder, or use --renew-certificates"
         )
     beside = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}")
     try:
@@ -87,7 +88,7 @@ def create(folder: Path, users: BrokerUsers, now: datetime.datetime) -> None:
         finally:
             shutil.rmtree(beside, ignore_errors=True)
     except OSError as error:
-        raise ConfigError([f"{folder}: cannot be created: {error.strerror or error}"]) from None
+        raise ConfigError(f"{folder}: cannot be created: {error.strerror or error}") from None
 
 
 def renew_certificate(folder: Path, hosts: Sequence[str], days: int, now: datetime.datetime) -> tuple[str, ...]:
@@ -114,10 +115,10 @@ def renew_certificate(folder: Path, hosts: Sequence[str], days: int, now: dateti
             write_whole(named, data, mode=0o600, durable=True)
     except OSError as error:
         raise ConfigError(
-            [f"{error.filename or named}: {error.strerror or error}; expected a folder that broker init created"]
+            f"{error.filename or named}: {error.strerror or error}; expected a folder that broker init created"
         ) from None
     except CertificateError as error:
-        raise ConfigError([f"{named}: {error}"]) from None
+        raise ConfigError(f"{named}: {error}") from None
     return known
 
 
@@ -132,7 +133,7 @@ def _fill(folder: Path, later: Path, users: BrokerUsers, now: datetime.datetime)
     try:
         server = make_server(authority, _all_hosts(users.hosts), users.days, now)
     except CertificateError as error:
-        raise ConfigError([f"--days {users.days}: {error}"]) from None
+        raise ConfigError(f"--days {users.days}: {error}") from None
     logins = {name: secrets.token_urlsafe(24) for name in (*users.vehicles, *users.operators, *users.viewers)}
     operators = [Operator(name, new_key()) for name in users.operators]
     files = {
@@ -167,15 +168,7 @@ def _hash_passwords(path: Path) -> None:
     if tool is None:
         raise SetupError("mosquitto_passwd is not installed: apt install mosquitto")
     try:
-        done = subprocess.run(
-            [tool, "-U", str(path)],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            encoding="utf-8",
-            errors="replace",
-            timeout=_HASH_DEADLINE_S,
-            check=False,
-        )
+        done = captured([tool, "-U", str(path)], _HASH_DEADLINE_S)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise SetupError(f"{tool} -U: {error}") from None
     hashed = [line.split(":", 1)[-1].startswith("$") for line in path.read_text(encoding="utf-8").splitlines()]

@@ -55,14 +55,14 @@ def broker_access(url: str, login_file: str | None, ca_file: str | None, named: 
     try:
         address = broker_address(url)
     except ValueError as error:
-        raise ConfigError([f"{named.url}: {error}"]) from None
+        raise ConfigError(f"{named.url}: {error}") from None
     if ca_file is not None and not address.tls and not named.ca_without_tls:
         expected = f"expected {named.url} mqtts://HOST:PORT"
-        raise ConfigError([f"{named.ca_file} {ca_file}: has no effect without TLS; {expected}"])
+        raise ConfigError(f"{named.ca_file} {ca_file}: has no effect without TLS; {expected}")
     login = None if login_file is None else load_login(login_file)
     if login is not None and not (address.tls or address.loopback):
         text = f"the connection to {address} is not encrypted: others on the network could read the password"
-        raise ConfigError([f"{named.login_file} {login_file}: {text}; expected {named.url} mqtts://HOST:PORT"])
+        raise ConfigError(f"{named.login_file} {login_file}: {text}; expected {named.url} mqtts://HOST:PORT")
     tls = _tls(ca_file, f"{named.ca_file} {ca_file}") if address.tls else None
     return BrokerAccess(address, login.username if login else None, login.password if login else None, tls)
 
@@ -71,10 +71,10 @@ def _tls(ca_file: str | None, where: str) -> ssl.SSLContext:
     try:
         context = ssl.create_default_context(cafile=str(Path(ca_file).expanduser()) if ca_file is not None else None)
     except FileNotFoundError:
-        raise ConfigError([f"{where}: no such file"]) from None
+        raise ConfigError(f"{where}: no such file") from None
     except ssl.SSLError:
-        raise ConfigError([f"{where}: not a certificate in PEM form (-----BEGIN CERTIFICATE-----)"]) from None
+        raise ConfigError(f"{where}: not a certificate in PEM form (-----BEGIN CERTIFICATE-----)") from None
     except OSError as error:
-        raise ConfigError([f"{where}: cannot be read: {error.strerror}"]) from None
+        raise ConfigError(f"{where}: cannot be read: {error.strerror}") from None
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     return context

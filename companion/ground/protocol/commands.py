@@ -168,7 +168,6 @@ def _mac(command: Command, key: bytes) -> str:
 
 
 def _field_problem(command: Command) -> str | None:
-    """Return the problem of a field of the signed text, or None."""
     if command.command is OperatorCommand.NONE:
         return "command: 'none', expected a command"
     if VEHICLE_NAME.fullmatch(command.vehicle) is None:
@@ -312,7 +311,6 @@ class Verifier:
         return Accepted(command)
 
     def _problem(self, command: Command, history: _History, who: str) -> tuple[Reason, str] | None:
-        """Return why a new command is refused, or None."""
         now_t_s, t_s = self._now_t_s, command.t_ms / 1000.0
         if now_t_s == float("-inf"):
             return Reason.EARLY, "the flight has not started"

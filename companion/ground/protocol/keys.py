@@ -153,7 +153,7 @@ class Operators:
         """
         operator = self._by_name.get(name)
         if operator is None:
-            raise ConfigError([f"{self.source}: no operator {name!r:.60}; expected one of {', '.join(self.names)}"])
+            raise ConfigError(f"{self.source}: no operator {name!r:.60}; expected one of {', '.join(self.names)}")
         return operator.key
 
     def find_key(self, name: str) -> bytes | None:
@@ -207,7 +207,7 @@ def default_operators_file() -> Path:
         return Path.home() / ".config/companion/operators.yaml"
     except RuntimeError:
         raise ConfigError(
-            ["operators: this user has no home folder; give a file (operators_file, --operators)"]
+            "operators: this user has no home folder; give a file (operators_file, --operators)"
         ) from None
 
 
@@ -249,7 +249,7 @@ def _create_default(path: Path) -> None:
     except OSError as error:
         reason = error.strerror or error
         raise ConfigError(
-            [f"{path}: cannot be created: {reason}; give another file (operators_file, --operators)"]
+            f"{path}: cannot be created: {reason}; give another file (operators_file, --operators)"
         ) from None
 
 
@@ -269,15 +269,15 @@ def _read(model: type[M], path: str | Path) -> M:
         expanded = Path(path).expanduser()
         mode = stat.S_IMODE(expanded.stat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
-        raise ConfigError([f"{shown}: no such file"]) from None
+        raise ConfigError(f"{shown}: no such file") from None
     except RuntimeError:
-        raise ConfigError([f"{shown}: '~' cannot be expanded: this user has no home folder"]) from None
+        raise ConfigError(f"{shown}: '~' cannot be expanded: this user has no home folder") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise ConfigError([f"{shown}: not readable: {reason}"]) from None
+        raise ConfigError(f"{shown}: not readable: {reason}") from None
     if mode & 0o077 and not expanded.is_dir():
         raise ConfigError(
-            [f"{shown}: contains secrets and is accessible to others (mode {mode:04o}); run: chmod 600 {shown}"]
+            f"{shown}: contains secrets and is accessible to others (mode {mode:04o}); run: chmod 600 {shown}"
         )
     document = read_document(expanded, shown)
     built = validate(model, document)

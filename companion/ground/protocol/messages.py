@@ -25,7 +25,7 @@ from typing import TypeVar
 
 from companion.ground.protocol.strict_json import StrictJsonError, parse
 from companion.model.codec import Record, RecordError, from_jsonable, to_json
-from companion.model.types import Joints, OperatorCommand, Quat, Vec3, Vec4
+from companion.model.types import Event, Joints, OperatorCommand, Quat, Vec3, Vec4
 
 VERSION = 2
 ROOT = "companion"
@@ -164,6 +164,14 @@ class EventLine(Record, frozen=True, kw_only=True):
     action: str
     """`companion.model.types.SafetyAction`."""
     text: str
+
+    @staticmethod
+    def of(event: Event, mission_t_s: float) -> EventLine:
+        """Return the line of an event."""
+        severity, action = event.severity.value, event.action.value
+        return EventLine(
+            t_s=event.t_s, mission_t_s=mission_t_s, id=event.id, severity=severity, action=action, text=event.text
+        )
 
 
 EVENTS_KEPT = 100

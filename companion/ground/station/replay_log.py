@@ -7,17 +7,14 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from companion.analysis.log import FlightLog, LogError, writer
 from companion.config.ground import topic_name
-from companion.config.loader import FlightConfig, logged_flight
+from companion.config.loader import FlightConfig
 from companion.ground.protocol.messages import VERSION, Preflight, PreflightRow, Presence, State
 from companion.ground.telemetry.scene import PATH_POINTS_MAX, scene_of
 from companion.ground.telemetry.stream import replay
 from companion.model.codec import to_json
 from companion.model.types import Vec3
-from companion.plugins import PluginError
 
 STREAMS_MAX = 12_000
 """Maximum number of stream messages: ten minutes at 20 Hz; longer logs are shown at a lower rate."""
@@ -47,19 +44,7 @@ def read_for_page(path: Path, number: int) -> ReplayLog:
     log = FlightLog.read(path, ticks_max=TICKS_MAX)
     if not log.inputs:
         raise LogError(f"{path}: has no ticks")
-    if log.config_json is None:
-        raise LogError(f"{path}: has no configuration (metadata record 'config'), which the page needs")
-    try:
-        config = logged_flight(log.config_json)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise LogError(
-            f"{path}: its configuration is not compatible with this version ({where}: {first['msg']}); "
-            f"it was written by {writer(log.metadata)}"
-        ) from None
-    except PluginError as error:
-        raise LogError(f"{path}: {error}") from None
+    config = log.flight_config()
     session = f"log-{number}"
     streams, events = replay(log.rows(), config, session, _epoch_offset_s(log), max_records=STREAMS_MAX)
     parts = {
@@ -87,7 +72,6 @@ def _reference_path(log: FlightLog) -> list[Vec3]:
 
 
 def _preflight(log: FlightLog) -> tuple[PreflightRow, ...]:
-    """Return the preflight rows; empty for a log without them."""
     try:
         rows = json.loads(log.metadata.get("preflight", {}).get("json", "[]"))
         return tuple(PreflightRow(str(row["id"]), str(row["level"]), str(row["text"])) for row in rows)

@@ -191,7 +191,6 @@ class _Screen:
 
 
 def _target(vehicle: Vehicle | None) -> tuple[object, ...]:
-    """Return the vehicle, flight and hold that are displayed."""
     if vehicle is None:
         return ()
     session = vehicle.session if vehicle.proven is None else vehicle.proven.session
@@ -199,5 +198,4 @@ def _target(vehicle: Vehicle | None) -> tuple[object, ...]:
 
 
 def _hold(vehicle: Vehicle | None) -> int:
-    """Return the number of the displayed hold, 0 if there is none."""
     return 0 if vehicle is None or vehicle.stream is None else vehicle.stream.hold or 0

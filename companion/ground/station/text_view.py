@@ -173,7 +173,6 @@ def _lights(vehicle: Vehicle, old: bool) -> list[RenderableType]:
 
 
 def _light(name: str, light: HealthLevel, text: str, old: bool) -> Text:
-    """Return one device's health; it is dimmed if the data is stale."""
     cell = Text()
     cell.append("● " if light is not HealthLevel.BAD else "■ ", style="dim" if old else _LIGHT_STYLE[light])
     cell.append(f"{printable(name):<15}", style="dim" if old else "")

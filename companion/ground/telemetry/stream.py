@@ -99,18 +99,9 @@ class StreamBuilder:
             if self._first_frame_s is None:
                 self._first_frame_s = mocap.stamp_s
             self._frames_s.append(mocap.stamp_s)
-        self._worst.add_tick(before, inputs, sent, fresh)
+        self._worst.add_tick(inputs, sent)
         for event in outputs.events:
-            self._append(
-                EventLine(
-                    t_s=event.t_s,
-                    mission_t_s=outputs.mission_t_s,
-                    id=event.id,
-                    severity=event.severity.value,
-                    action=event.action.value,
-                    text=truncated(event.text),
-                )
-            )
+            self._append(EventLine.of(msgspec.structs.replace(event, text=truncated(event.text)), outputs.mission_t_s))
 
     def add_line(self, t_s: float, severity: str, source: str, text: str, *, replace_last: bool = False) -> None:
         """Add a line from a source other than the core: PX4, the guardian or the telemetry.
@@ -126,14 +117,10 @@ class StreamBuilder:
             kept = [line for line in self.events if line.id != source]
             self.events.clear()
             self.events.extend(kept)
+        action = SafetyAction.NOMINAL.value
         self._append(
             EventLine(
-                t_s=t_s,
-                mission_t_s=mission_t_s,
-                id=source,
-                severity=severity,
-                action=SafetyAction.NOMINAL.value,
-                text=truncated(text),
+                t_s=t_s, mission_t_s=mission_t_s, id=source, severity=severity, action=action, text=truncated(text)
             )
         )
 
@@ -166,7 +153,7 @@ class StreamBuilder:
             recorder_error=recorder_error,
         )
         timing = self._worst.message(self._missed, lost)
-        self._ages, self._worst = WorstAges(), WorstTimings()
+        self._ages = WorstAges()
         self._seq += 1
         pose_from, position, attitude, age_s = _pose(i, o)
         reference, status = o.reference, i.status
@@ -325,12 +312,7 @@ def _tether(state: TetherState | None) -> TetherView | None:
         return None
     slack_m, stop_slack_m, pull_n, turns = numbers
     return TetherView(
-        slack_m=slack_m,
-        stop_slack_m=stop_slack_m,
-        pull_n=pull_n,
-        turns=turns,
-        taut=state.taut,
-        snagged=state.snagged,
+        slack_m=slack_m, stop_slack_m=stop_slack_m, pull_n=pull_n, turns=turns, taut=state.taut, snagged=state.snagged
     )
 
 
@@ -381,7 +363,6 @@ def _fits(value: float) -> bool:
 
 
 def _number(value: float | None, digits: int) -> float | None:
-    """Return the rounded number, or None if it is not finite."""
     return round(value, digits) if value is not None and _fits(value) else None
 
 

@@ -11,7 +11,6 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import ClassVar, Final, Generic, Self, TypeVar
 
 from msgspec.structs import replace
@@ -99,9 +98,7 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
         )
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self._thread.stop()
 
     def latest(self) -> ArmState | None:

@@ -7,7 +7,6 @@ import errno
 import logging
 import os
 from contextlib import suppress
-from types import TracebackType
 from typing import Final, Self
 
 import serial
@@ -101,9 +100,7 @@ class RobotousForceTorque(SampleStream):
             raise
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Stop the output and close the port; never raises."""
         self._shut()
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import logging
 from contextlib import suppress
-from types import TracebackType
 from typing import Any, Final, Self
 
 from companion.config.device_plugins import RFT60, device_class
@@ -78,9 +77,7 @@ class PluginForceTorque(SampleStream):
             raise
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Close the sensor; never raises."""
         await self._thread.stop()
 

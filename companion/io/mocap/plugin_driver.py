@@ -7,7 +7,6 @@ import logging
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import fields
-from types import TracebackType
 from typing import Final, Self, TypeVar
 
 from companion.config.device_plugins import NATNET, device_class
@@ -140,9 +139,7 @@ class PluginMocap:
             ) from None
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Close the client; never raises."""
         self._close()
 

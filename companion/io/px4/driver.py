@@ -14,7 +14,6 @@ import logging
 import math
 import socket
 from collections.abc import Callable, Iterable
-from types import TracebackType
 from typing import Any, Self
 
 from mavsdk import ComponentType, Configuration, Mavsdk
@@ -147,9 +146,7 @@ class MavsdkAutopilot:
             raise
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Close the connection at once, then let MAVSDK's threads end. Nothing is sent after that; PX4 stays in its mode."""
         await self._close()
 

@@ -14,7 +14,6 @@ import re
 import socket
 import subprocess
 import sys
-from types import TracebackType
 from typing import Any, Protocol, Self
 
 from companion.io.protocols import DeviceError
@@ -116,9 +115,7 @@ class GroundStation:
             raise
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Stop the relay's output. Forwarding ends with the autopilot's link."""
         self._send({"bye": True})
         await self._close()
