@@ -5,15 +5,16 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import Iterator
-from typing import Literal, get_args
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal, get_args
 
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
 
 from companion.config.devices import AutopilotDevice
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.io.px4.setpoints import DirectSetpoints, OffboardSetpoints
-from companion.model.frames import quat_from_euler_zyx
+from companion.model.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
 from companion.model.types import AttitudeSetpoint, FlightMode, Vec3
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import Px4Peer
@@ -129,15 +130,56 @@ def test_a_setpoint_that_the_link_does_not_take_counts_as_not_sent() -> None:
             raise result
         return result
 
+    path = path_with(lambda setpoint: [setpoint], write)
+    assert [path.send(LEVEL, 0.0) for _ in range(4)] == [True, False, True, False]
+
+
+def test_a_repetition_of_the_setpoint_before_does_not_leave_in_place_of_the_new_one() -> None:
+    """A thread of the plugin repeats at 20 Hz: its frame may come between the call and the new frame."""
+    before: list[AttitudeSetpoint] = [LEVEL]
+    sent: list[float] = []
+
+    def frames(setpoint: AttitudeSetpoint) -> list[AttitudeSetpoint]:
+        before.append(setpoint)
+        return before[-2:]
+
+    def write(frame: bytes) -> bool:
+        sent.append(parsed(frame).thrust)
+        return True
+
+    path = path_with(frames, write)
+    tilted = quat_from_euler_zyx(0.1, -0.2, 2.0)
+    for k in range(5):
+        assert path.send(AttitudeSetpoint(tilted, 0.25 + 0.125 * k), 0.0)
+    assert sent == [0.25 + 0.125 * k for k in range(5)]
+
+
+def parsed(frame: bytes) -> Any:
+    return mavlink.MAVLink(None).parse_char(frame)
+
+
+def path_with(
+    frames: Callable[[AttitudeSetpoint], Sequence[AttitudeSetpoint]], write: Callable[[bytes], bool]
+) -> OffboardSetpoints:
+    """Return a path whose plugin sends the given setpoints when it is given one, as frames that MAVSDK would send."""
+    now: list[AttitudeSetpoint] = []
+
     class Plugin:
         def set_attitude(self, attitude: object) -> None:
-            with contextlib.suppress(OSError):
-                path.pass_on(b"")
+            for setpoint in frames(now[-1]):
+                q = attitude_ned_frd_from_enu_flu(setpoint.attitude_wxyz)
+                message = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0.0, 0.0, 0.0, setpoint.thrust)
+                with contextlib.suppress(OSError):
+                    path.pass_on(bytes(message.pack(mavlink.MAVLink(None))))
 
-    direct = DirectSetpoints(lambda number, payload: True, 1)
-    path = OffboardSetpoints(None, write, direct)
+    class Path(OffboardSetpoints):
+        def send(self, setpoint: AttitudeSetpoint, t_s: float) -> bool:
+            now.append(setpoint)
+            return super().send(setpoint, t_s)
+
+    path = Path(None, write, DirectSetpoints(lambda number, payload: True, 1))
     path._plugin = Plugin()
-    assert [path.send(LEVEL, 0.0) for _ in range(4)] == [True, False, True, False]
+    return path
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -6,6 +6,8 @@ Both send SET_ATTITUDE_TARGET once per call, and nothing when the caller is sile
 from __future__ import annotations
 
 import logging
+import math
+import struct
 import threading
 from collections.abc import Callable
 from typing import Any, Final, Literal, Protocol
@@ -21,6 +23,12 @@ PLUGIN_MAX_S: Final = 0.002
 """Time after which a setpoint that the plugin has not sent is written straight onto the link."""
 _PLUGIN_MAX_SIMULATED_S: Final = 2.0
 """The same if the flight lives in simulated time, which stands meanwhile."""
+_TARGET_AT: Final = 10 + 4
+"""Place of the quaternion in a MAVLink 2 frame of SET_ATTITUDE_TARGET, behind the header and the time."""
+_TARGET = struct.Struct("<4f12xf")
+"""Quaternion and thrust; between them are the body rates."""
+_SAME = 1e-4
+"""Largest difference of a value of one setpoint: the plugin computes the quaternion from Euler angles in single precision."""
 _log = logging.getLogger(__name__)
 
 
@@ -84,9 +92,9 @@ class OffboardSetpoints:
     """Setpoints through the Offboard plugin, which takes Euler angles and does not check values.
 
     A thread of MAVSDK sends them, and another one repeats the last setpoint at 20 Hz when the caller is silent. Everything that MAVSDK
-    sends passes through the driver, which lets one setpoint leave for each call of `send`. So nothing is repeated, and PX4's
-    offboard-loss failsafe triggers if the companion hangs. The plugin's own `start` and `stop` are never used: the request queue
-    changes modes, and `stop` would command HOLD.
+    sends passes through the driver, which lets one setpoint leave for each call of `send`: the one of the call, not a repetition of an
+    earlier one that comes in between. So nothing is repeated, and PX4's offboard-loss failsafe triggers if the companion hangs. The
+    plugin's own `start` and `stop` are never used: the request queue changes modes, and `stop` would command HOLD.
 
     Args:
         system: the MAVSDK system.
@@ -101,12 +109,15 @@ class OffboardSetpoints:
         self._plugin: Any = None
         self._lock = threading.Lock()
         self._wanted = self._sent = False
+        self._target: tuple[float, ...] = ()
+        """Quaternion FRD -> NED and thrust of the newest call."""
         self._left = threading.Event()
         self._max_s = PLUGIN_MAX_S if simulated_time.current() is None else _PLUGIN_MAX_SIMULATED_S
 
     def send(self, setpoint: AttitudeSetpoint, t_s: float) -> bool:
         """Send roll, pitch, yaw and thrust, stamped by MAVSDK, and wait until they have left."""
         attitude = Attitude(*messages.attitude_target_deg(setpoint), setpoint.thrust)
+        self._target = (*messages.attitude_target_ned(setpoint), setpoint.thrust)
         if self._plugin is None:
             self._plugin = Offboard(self._system)
         self._left.clear()
@@ -122,15 +133,24 @@ class OffboardSetpoints:
         return self._direct.send(setpoint, t_s) if late else self._sent
 
     def pass_on(self, frame: bytes) -> None:
-        """Send the frame if `send` waits for one; called in a thread of MAVSDK."""
+        """Send the frame if it is the one that `send` waits for; called in a thread of MAVSDK."""
         with self._lock:
-            if not self._wanted:
+            if not self._wanted or not self._is_target(frame):
                 return
             self._wanted = self._sent = False
             try:
                 self._sent = self._write(frame)
             finally:
                 self._left.set()
+
+    def _is_target(self, frame: bytes) -> bool:
+        if len(frame) < _TARGET_AT + _TARGET.size:
+            return False
+        *q, thrust = _TARGET.unpack_from(frame, _TARGET_AT)
+        *target_q, target_thrust = self._target
+        sign = math.copysign(1.0, sum(a * b for a, b in zip(q, target_q, strict=True)))  # q and -q are one attitude
+        apart = max(abs(sign * a - b) for a, b in zip(q, target_q, strict=True))
+        return bool(apart < _SAME and abs(thrust - target_thrust) < _SAME)
 
     def stop(self) -> None:
         """Destroy the plugin, so that its thread stops repeating the last setpoint."""
