@@ -48,7 +48,7 @@ def test_plots_show_every_joint_and_no_joint_of_an_absent_arm(
     def keep(figure: object, path: Path) -> None:
         drawn[path.stem] = [str(line.get_label()) for ax in figure.axes for line in ax.lines]  # type: ignore[attr-defined]
 
-    monkeypatch.setattr("companion.analysis.plots.write_png", keep)
+    monkeypatch.setattr("companion.analysis.plot_style.write_png", keep)
     write_plots(flight(count), tmp_path)
     angles = [label for label in drawn["tracking"] if "alpha" in label and "reference" not in label]
     sent = [label for label in drawn["actuation"] if label.endswith("sent")]

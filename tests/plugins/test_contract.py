@@ -86,7 +86,7 @@ def test_a_law_that_breaks_the_contract_is_told_how(tmp_path: Path, line: str, f
     [
         (
             "1 / (state.position_world_m[2] < 0.5 or state.position_world_m[2] == 1.0)",
-            "lift: the law raises in flight: ZeroDivisionError",
+            "lift: raises in flight: ZeroDivisionError",
         ),
         ("wrench = replace(wrench, collective_n=0.1 * wrench.collective_n)", "lift: no catch was detected: "),
     ],
