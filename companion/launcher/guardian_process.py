@@ -71,16 +71,13 @@ class GuardianProcess:
         self._pid_file = out / "guardian.pid"
         write_text(self._pid_file, str(self.process.pid))
         self.events: list[FlightEvent] = []
+        self.took_over = False
+        """Whether the guardian has taken over the vehicle. Any of its messages says so, because the first may be lost."""
         self.takeover: TookOver | None = None
         self.result: GuardianEnded | None = None
         self.open = True
         """Whether the guardian's end of the channel is open."""
         self._heard_s = time.monotonic()
-
-    @property
-    def took_over(self) -> bool:
-        """Whether the guardian has taken over the vehicle."""
-        return self.takeover is not None
 
     @property
     def outcome(self) -> Outcome | None:
@@ -101,6 +98,7 @@ class GuardianProcess:
                 self.open = False
                 break
             self._heard_s = time.monotonic()
+            self.took_over = True
             heard.append(message)
             match message:
                 case TookOver():

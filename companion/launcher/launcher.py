@@ -333,6 +333,8 @@ class Launcher:
                     process.kill()
                     return
             for message in guardian.receive():
+                if isinstance(message, Unreadable):
+                    self._failures.append(f"guardian: an internal error: {message.text}")
                 self._on_message(message)
                 self._check_cpu_contention(message)
             now_s = time.monotonic()

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from companion.launcher.shared_time import SharedTime
-from companion.model.codec import from_jsonable
+from companion.model.codec import RecordError, from_jsonable
 from companion.model.launcher_messages import WorldAtRest, WorldEnded, WorldFailed, WorldMessage, WorldReady
 from companion.runtime.subprocesses import JsonLines, LaunchError, how_it_ended, last_line, terminate, write_text
 from companion.sitl_config.loader import SitlConfig
@@ -118,7 +118,10 @@ class SitlProcess:
         those that have already arrived.
         """
         for line in self._lines.read(deadline_s):
-            message: WorldMessage = from_jsonable(cast(Any, WorldMessage), line)
+            try:
+                message: WorldMessage = from_jsonable(cast(Any, WorldMessage), line)
+            except RecordError as error:  # the flight goes on
+                message = WorldFailed(f"sitl: {error}")
             self._update(message)
             yield message
 

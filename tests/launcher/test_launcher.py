@@ -21,10 +21,19 @@ import pytest
 from pymavlink import mavutil
 
 from companion.analysis.log import FlightLog
+from companion.launcher.guardian_process import GuardianProcess
 from companion.launcher.launcher import Launcher
 from companion.launcher.sitl_process import SitlProcess
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_REFUSED
-from companion.model.launcher_messages import AnyMessage, RefusedFlight, WorldAtRest
+from companion.model.launcher_messages import (
+    AnyMessage,
+    GuardianEnded,
+    GuardianStatus,
+    Message,
+    RefusedFlight,
+    TookOver,
+    WorldAtRest,
+)
 from companion.runtime import ipc
 from companion.sitl_config.loader import load_sitl
 from tests.runtime.test_cores import CORES, affinities
@@ -226,6 +235,19 @@ def test_a_flight_process_that_ends_while_the_launcher_is_busy_is_heard_to_its_l
     with ours, theirs:
         launcher._watch(process, ours, guardian, None)
     assert heard == [RefusedFlight(("because",))]
+
+
+@pytest.mark.parametrize("message", [TookOver(hangs=True), GuardianStatus(), GuardianEnded(True, False)], ids=str)
+def test_each_message_of_the_guardian_says_that_it_has_taken_over(message: Message) -> None:
+    """The first may be lost in a full channel: the launcher would kill a guardian that lands the vehicle."""
+    guardian = GuardianProcess.__new__(GuardianProcess)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setblocking(False)
+    guardian.channel, guardian.open, guardian.events, guardian.took_over = ours, True, [], False
+    with ours, theirs:
+        assert guardian.receive() == [] and not guardian.took_over
+        assert ipc.send(theirs, message)
+        assert guardian.receive() == [message] and guardian.took_over
 
 
 def test_a_world_that_does_not_leave_is_heard_to_its_last_word(tmp_path: Path) -> None:
