@@ -25,7 +25,7 @@ from tests.support import CATCH, DEADLINE_S, HOVER, Ended, Sandbox, read_summary
 SLACK = "[data-figure='tether']"
 TOO_OLD = " s old (limit"
 """In the refusal of a command that has waited for a core: it is given again."""
-ROOM = {"mission.phases[3].duration_s": 20.0}
+ROOM = {"mission.phases[3].duration_s": 60.0}
 """Time over the place after the catch for all that is commanded there, on a loaded machine."""
 
 
@@ -102,14 +102,15 @@ def test_the_catch_is_started_watched_held_let_go_on_and_landed_from_the_ground(
             refused = answered(lambda: sandbox.run("command", "resume", "--broker", broker.url))
             assert refused.code == EXIT_REFUSED and "resume refused: on the ground" in refused.err, refused
             given(page, lambda: sandbox.run("command", "start", "--broker", broker.url), "FLYING")
-            first_m = float(page.inner_text(SLACK).split()[0])
             until_text(page, "#event-list", "payload caught")
-            assert 0.0 < float(page.inner_text(SLACK).split()[0]) != first_m, "the slack on the page is not live"
             given(page, lambda: page.click("[data-command=hold]"), "HOLDING")
+            in_the_air_m = float(page.inner_text(SLACK).split()[0])
             given(page, lambda: sandbox.run("command", "resume", "--broker", broker.url), "FLYING")
             given(page, lambda: page.click("[data-command=land]"), "LANDING")
             ended = flight.end()
             until_text(page, "#word", "ENDED")
+            on_the_ground_m = float(page.inner_text(SLACK).split()[0])
+            assert abs(in_the_air_m - on_the_ground_m) > 0.1, "the slack on the page is not live"
     assert ended.code == EXIT_ABORTED, ended
     assert ended.err == ""
     for line in (
