@@ -17,7 +17,7 @@ from companion.model.types import ContactMode, ControlLog, Vec3
 
 _LEAVE, _MOVE = ("leave", "#f8eed8"), ("move", "#f1e9f7")
 _BANDS = {
-    ContactMode.WEIGH: ("weigh", "#eceff2"),
+    ContactMode.TARE: ("tare", "#eceff2"),
     ContactMode.APPROACH: ("approach", "#dcebf9"),
     ContactMode.PRESS: ("press", "#dff3e6"),
     ContactMode.SLIDE: ("slide", "#cfe9f0"),
@@ -174,10 +174,10 @@ def _in_surface_frame(log: FlightLog, force_n: Any) -> Array:
         direction = np.array(o.contact.direction_world)
         right, up = surface_axes(direction)
         rows[k] = (-np.dot(force, direction), np.dot(force, right), np.dot(force, up))
-        if o.contact.mode is ContactMode.WEIGH:
+        if o.contact.mode is ContactMode.TARE:
             since = (
                 k
-                if k == 0 or (before := log.outputs[k - 1].contact) is None or before.mode is not ContactMode.WEIGH
+                if k == 0 or (before := log.outputs[k - 1].contact) is None or before.mode is not ContactMode.TARE
                 else since
             )
             mean = np.nanmean(rows[since : k + 1], axis=0)

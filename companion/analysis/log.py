@@ -35,8 +35,14 @@ Array = npt.NDArray[np.float64]
 _RECORDS: dict[str, type] = {"/inputs": Inputs, "/outputs": Outputs, "/sent": Sent}
 _TOPICS = tuple(_RECORDS)
 """Topics in the order of a tick's records in the file."""
-_FORMER_KEY, _KEY = b'"bent_by"', b'"limited_by"'
-"""A key of /outputs in logs of the previous release, and its current name."""
+_FORMER_NAMES = (
+    (b'"bent_by"', b'"limited_by"'),
+    (b'"mode":"weigh"', b'"mode":"tare"'),
+    (b'"id":"reattached"', b'"id":"armed_externally"'),
+    (b'"id":"called_off"', b'"id":"takeoff_cancelled"'),
+    (b'"id":"arm_let_go"', b'"id":"servo_watchdog_tripped"'),
+)
+"""Keys and ids of logs of the previous release, and their current names."""
 
 
 class LogError(Exception):
@@ -88,7 +94,10 @@ class FlightLog:
                 elif isinstance(record, Message):
                     topic = channels[record.channel_id]
                     if topic in _RECORDS:
-                        rows.take(topic, from_json(_RECORDS[topic], record.data.replace(_FORMER_KEY, _KEY)))
+                        data = record.data
+                        for former, name in _FORMER_NAMES:
+                            data = data.replace(former, name)
+                        rows.take(topic, from_json(_RECORDS[topic], data))
                 elif isinstance(record, Metadata):
                     metadata[record.name] = dict(record.metadata)
                 elif isinstance(record, Footer):

@@ -135,7 +135,7 @@ class Campaign(ABC):
 
 
 @dataclass
-class Flown:
+class CampaignResult:
     """Results of a whole campaign."""
 
     messages: list[Message]
@@ -170,7 +170,7 @@ def run(campaign: Campaign, out: Path, console: Console | None) -> int:
     return flown.code
 
 
-def fly(campaign: Campaign, out: Path) -> Flown:
+def fly(campaign: Campaign, out: Path) -> CampaignResult:
     """Fly the campaign and show a progress bar. Ctrl-C and SIGTERM end it; the results of flights that have ended are kept."""
     results: dict[int, Message] = {}
     notes: list[str] = []
@@ -190,7 +190,7 @@ def fly(campaign: Campaign, out: Path) -> Flown:
             notes.append("interrupted")
             code = EXIT_ABORTED
         notes.append(f"{len(results)} of {whole} flights were flown")
-    return Flown([results[index] for index in sorted(results)], notes, code)
+    return CampaignResult([results[index] for index in sorted(results)], notes, code)
 
 
 def _progress(campaign: Campaign, newest: Message, bad: int) -> str:
@@ -213,7 +213,7 @@ def progress_bar() -> Progress:
     )
 
 
-def _publish(campaign: Campaign, flown: Flown, out: Path, console: Console | None) -> None:
+def _publish(campaign: Campaign, flown: CampaignResult, out: Path, console: Console | None) -> None:
     table = {"rows": flown.rows, **campaign.summary(flown.rows)}
     try:
         _write(campaign, flown, table, out)
@@ -229,7 +229,7 @@ def _publish(campaign: Campaign, flown: Flown, out: Path, console: Console | Non
     print_lines(console, f"\nreport  {page}")
 
 
-def _write(campaign: Campaign, flown: Flown, table: dict[str, Any], out: Path) -> None:
+def _write(campaign: Campaign, flown: CampaignResult, table: dict[str, Any], out: Path) -> None:
     rows, settings, used = flown.rows, campaign.settings(), versions()
     write_csv((campaign.csv_row(row) for row in rows), out / campaign.csv_name)
     try:

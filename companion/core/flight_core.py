@@ -40,13 +40,13 @@ from companion.model.types import (
     VehicleState,
 )
 from companion.safety import notices
+from companion.safety.armed_externally import found_armed
+from companion.safety.flight_context import FlightContext
 from companion.safety.gate import ARM_FRESH_S, Gate, Refusal
 from companion.safety.governor import Governor
 from companion.safety.monitors import Monitors
 from companion.safety.pose_filter import PoseFilter
-from companion.safety.reattach import found_armed
 from companion.safety.rules import OPERATOR_RESUME
-from companion.safety.situation import Situation
 from companion.safety.tether import TetherWatch
 
 _DT_MIN_S: Final = 0.001
@@ -54,7 +54,7 @@ _DT_MAX_S: Final = 0.05
 _POSE_AGE_MAX_S: Final = 0.1
 """Age of the last trusted pose beyond which the target impedance is not optimised."""
 # Looking up members of an enum costs time in every tick.
-_PLAN: Final = Stage.PLAN
+_MISSION: Final = Stage.MISSION
 _SPOOL: Final = Stage.SPOOL
 _TOUCHDOWN: Final = Stage.TOUCHDOWN
 _NO_COMMAND: Final = OperatorCommand.NONE
@@ -82,9 +82,9 @@ class FlightCore:
         self._gate = Gate(vehicle)
         self._parameters = Parameters.of(config)
         self._state = self._parameters.initial_state()
-        self._situation = Situation(False, False, None)
-        self._situation_stage: Stage | None = None
-        """The stage for which the situation was built."""
+        self._context = FlightContext(False, False, None)
+        self._context_stage: Stage | None = None
+        """The stage for which the context was built."""
         self._tether_watched = False
         self._last_t_s: float | None = None
         self._pose_s = -math.inf
@@ -145,7 +145,7 @@ class FlightCore:
             control=command.log,
             outcome=state.over,
             mocap_trusted=self._monitors.mocap_trusted,
-            tether=self._situation.tether,
+            tether=self._context.tether,
             limited_by=self._limited_by,
             mocap_innovation_m=self._monitors.mocap_innovation_m,
             contact=state.expected.contact,
@@ -172,33 +172,33 @@ class FlightCore:
 
     def _observe(self, inputs: Inputs, dt_s: float) -> tuple[tuple[Event, ...], Observation]:
         """Run the monitors and the tether watch. Return this tick's events and the observation for the transition."""
-        situation, stage = self._situation, self._state.stage
-        if stage is not self._situation_stage:
-            self._situation_stage = stage
-            situation.airborne = stage in seq.LIFTING
-            situation.offboard_expected = stage in seq.COMMANDING
+        context, stage = self._context, self._state.stage
+        if stage is not self._context_stage:
+            self._context_stage = stage
+            context.airborne = stage in seq.LIFTING
+            context.offboard_expected = stage in seq.COMMANDING
             self._tether_watched = stage not in seq.BEFORE_LIFT
-            situation.found_armed = None
-        situation.tracking_error_m = self._control.tracking_error_m if stage is _PLAN else None
-        situation.control, situation.disturbance_world_n = self._log, self._control.disturbance_world_n
-        situation.contact_n = self._state.expected.contact_n
-        situation.waiting = stage is Stage.WAIT and bool(missing_inputs(inputs, self._vehicle))
+            context.found_armed = None
+        context.tracking_error_m = self._control.tracking_error_m if stage is _MISSION else None
+        context.control, context.disturbance_world_n = self._log, self._control.disturbance_world_n
+        context.contact_n = self._state.expected.contact_n
+        context.waiting = stage is Stage.WAIT and bool(missing_inputs(inputs, self._vehicle))
         armed_by_others = stage in seq.BEFORE_ARMING and seq.is_armed(inputs.status)
         if armed_by_others:
-            situation.airborne, situation.found_armed = found_armed(inputs, self._parameters.clearance_m)
+            context.airborne, context.found_armed = found_armed(inputs, self._parameters.clearance_m)
         # The monitors evaluate the tether of the previous tick: this tick's state is not validated yet.
-        events = self._monitors.check(inputs, situation)
+        events = self._monitors.check(inputs, context)
         i = self._monitors.trusted
         assert i is not None
         self._watch_tether(i)
         resume = bool(events) and any(event.id == OPERATOR_RESUME for event in events)
         return events, Observation(
             inputs=i,
-            airborne=situation.airborne,
+            airborne=context.airborne,
             armed_by_others=armed_by_others,
             standing=self._monitors.standing() if resume else None,
             reference=self._reference,
-            tether=situation.tether,
+            tether=context.tether,
             thrust_share=self._control.thrust_share,
             pose_s=self._pose_s,
             dt_s=dt_s,
@@ -215,7 +215,7 @@ class FlightCore:
         v, watch = i.vehicle, self._watch
         if v is None or watch is None or not self._tether_watched:
             return
-        log, flying = self._log, self._state.stage is _PLAN
+        log, flying = self._log, self._state.stage is _MISSION
         # The observer's force contains the tether's pull: subtracted, it would hide the pull.
         expected = self._state.expected
         into = expected.into_world
@@ -228,7 +228,7 @@ class FlightCore:
             tool_n = log.force_measured_world_n if expected.touches or self._observes else log.force_ext_world_n
         if tool_n is not None and into is not None and expected.friction_max_n is not None:
             tool_n = within_friction(into, expected.friction_max_n, tool_n)
-        self._situation.tether = state = watch.update(
+        self._context.tether = state = watch.update(
             i.t_s,
             v.position_world_m,
             v.velocity_world_m_s,
@@ -258,7 +258,7 @@ class FlightCore:
         before = {refusal.kind for refusal in self._refused}
         events += [event_of(notices.GATE, t_s, refusal.text) for refusal in refused if refusal.kind not in before]
         self._refused = refused
-        self._situation.torque_refused = next((refusal.text for refusal in refused if refusal.limp), None)
+        self._context.torque_refused = next((refusal.text for refusal in refused if refusal.limp), None)
 
     # -- command ---------------------------------------------------------------------------------------------------
 
@@ -266,7 +266,7 @@ class FlightCore:
         self._limited_by = ()
         state, stage = self._state, self._state.stage
         course = state.course
-        if course is None or not (stage is _PLAN or stage is _SPOOL or stage is _TOUCHDOWN):
+        if course is None or not (stage is _MISSION or stage is _SPOOL or stage is _TOUCHDOWN):
             return None, self._without_reference(stage, dt_s, i)
         reference = course.plan.reference(0.0) if stage is _SPOOL else course.reference(i.t_s)
         expected, engaged = state.expected, state.engaged
@@ -274,8 +274,8 @@ class FlightCore:
         self._control.press_direction = expected.into_world if expected.touches else None
         if state.own is not None and engaged is not None:
             reference = self._parameters.phases[engaged.index].reference(reference, state.own)
-        if stage is _PLAN:
-            governed = self._governor.constrain(dt_s, reference, self._situation.tether)
+        if stage is _MISSION:
+            governed = self._governor.constrain(dt_s, reference, self._context.tether)
             reference, self._limited_by = governed.reference, governed.limited_by
         self._reference = reference
         if self._control.online is not None:
@@ -321,11 +321,11 @@ class FlightCore:
         caught_s = self._control.catch_s(t_s, log, self._monitors.arm_swings)
         start_s = self._state.mission_start_s
         if caught_s is not None and start_s is not None:
-            self._situation.caught = True
+            self._context.caught = True
             text = f"payload caught at t = {caught_s - start_s:.2f} s"
             events.append(event_of(notices.CATCH, caught_s, text))
         elif self._control.payload_left(t_s):
-            self._situation.caught = False
+            self._context.caught = False
             events.append(event_of(notices.PAYLOAD_LEFT, t_s, "the payload has left the net"))
 
 

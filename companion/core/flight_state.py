@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from enum import Enum
 
-from companion.mission.active_plan import Course
+from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.air import NOTHING, Expectation
 from companion.mission.plan import Plan
 from companion.mission.segments import Segment
@@ -62,7 +62,7 @@ class FlightState(Record, frozen=True):
     outcome: Outcome | None = None
     plan: Plan | None = None
     """Plan of the mission from the measured start."""
-    course: Course | None = None
+    course: ActiveTrajectory | None = None
     """The plan being flown with its start time and rate; None before arming."""
     aborting: bool = False
     """Whether `course` is an abort instead of the mission."""
@@ -97,7 +97,7 @@ class FlightState(Record, frozen=True):
         """Return the phase's name for the operator, its kind for programs, and the completed fraction of the plan, 0 to 1."""
         stage, course = self.stage, self.course
         begun = self.mission_start_s is not None and course is not None
-        if stage is Stage.PLAN and course is not None:
+        if stage is Stage.MISSION and course is not None:
             plan_s = course.pace(t_s)[0]
             segment = course.plan.segment(plan_s)
             name = f"abort: {segment.name}" if self.aborting else segment.name

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from companion.core.transition import Transition
-from companion.mission.active_plan import Course
+from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.air import NOTHING, Air
 from companion.mission.phase import Phase
 from companion.mission.segments import Segment
 from companion.model.codec import Record
 from companion.model.types import Outcome, Reference, SafetyAction
-from companion.safety.notices import Notice
+from companion.safety.notices import EventDefinition
 
 _BEFORE_END_S = 1e-6
 
@@ -84,7 +84,7 @@ class _PhaseTick(Air):
         self._t = t
 
     @property
-    def _course(self) -> Course:
+    def _course(self) -> ActiveTrajectory:
         course = self._t.state.course
         assert course is not None
         return course
@@ -93,11 +93,11 @@ class _PhaseTick(Air):
         """Return the plan's reference, without what the phase adds."""
         return self._course.reference(self.t_s)
 
-    def report(self, notice: Notice, text: str) -> None:
+    def report(self, notice: EventDefinition, text: str) -> None:
         """Add an event."""
         self._t.report(notice, text)
 
-    def fail(self, notice: Notice, text: str) -> None:
+    def fail(self, notice: EventDefinition, text: str) -> None:
         """Report a failure: the flight counts as aborted, and the plan's time stops until the state ends."""
         self._t.report(notice, text)
         self._t.finish(Outcome.ABORTED)

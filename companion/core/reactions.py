@@ -17,7 +17,7 @@ from companion.safety.supervisor import update
 
 HOLD_ABOVE_M = 0.3
 """Margin over standing height below which the vehicle lands instead of holding."""
-_BY_OPERATOR = (OPERATOR_LAND, OPERATOR_ABORT, notices.CALLED_OFF.id)
+_BY_OPERATOR = (OPERATOR_LAND, OPERATOR_ABORT, notices.TAKEOFF_CANCELLED.id)
 _PILOT_FLIES = frozenset(rule.id for rule in RULES if rule.pilot_flies)
 _EXPIRED = {
     notices.HOLD_EXPIRED.id: (notices.HOLD_EXPIRED, "no command ended the hold in time; landing"),
@@ -84,7 +84,7 @@ def _react(t: Transition) -> None:
     elif state.stage is Stage.SPOOL:
         t.finish(Outcome.ABORTED)
         t.enter(Stage.TOUCHDOWN)
-    elif state.stage is Stage.PLAN:
+    elif state.stage is Stage.MISSION:
         if action is _HOLD:
             _hold(t)
         elif action is _RETRACT:
@@ -99,7 +99,7 @@ def _hold_on_ground(t: Transition) -> None:
     if not waits and not t.state.armed_by_others:
         asked = t.state.stage is Stage.ARM
         where = f"PX4 was asked to arm: {ROTORS_MAY_START}" if asked else "the vehicle stays on the ground"
-        t.report(notices.CALLED_OFF, f"hold commanded before take-off; {where}")
+        t.report(notices.TAKEOFF_CANCELLED, f"hold commanded before take-off; {where}")
 
 
 def _hold(t: Transition) -> None:

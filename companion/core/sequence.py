@@ -9,7 +9,7 @@ from companion.config.vehicle import Vehicle
 from companion.core.flight_state import Tare
 from companion.core.phase_tick import advance_phase
 from companion.core.transition import Transition
-from companion.mission.active_plan import Course
+from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.check import check_start
 from companion.mission.plan import Plan
 from companion.mission.settled import SettledEstimate
@@ -21,7 +21,7 @@ from companion.model.types import AutopilotRequest, Inputs, Joints, Outcome, Pha
 from companion.safety import notices, rules
 from companion.safety.autopilot_landing import FLIPPED, KILLED, TIPPED
 from companion.safety.mocap import unfused
-from companion.safety.notices import Notice
+from companion.safety.notices import EventDefinition
 from companion.safety.px4 import DISARMED_ABOVE_M
 from companion.safety.rules import CRASHED, PILOT_TOOK_OVER
 
@@ -169,7 +169,7 @@ def _decline_start(t: Transition) -> None:
     t.report(notices.START_DECLINED, text)
 
 
-def _refuse(t: Transition, notice: Notice, text: str) -> None:
+def _refuse(t: Transition, notice: EventDefinition, text: str) -> None:
     t.report(notice, text)
     t.stand_down(Outcome.REFUSED)
 
@@ -189,7 +189,7 @@ def _arm(t: Transition, elapsed_s: float) -> AutopilotRequest:
     t_s = t.i.t_s
     if seq.is_armed(t.i.status):
         assert t.state.plan is not None
-        t.change(course=Course(t.state.plan, t_s + seq.SPOOL_S))
+        t.change(course=ActiveTrajectory(t.state.plan, t_s + seq.SPOOL_S))
         t.enter(Stage.SPOOL)
     elif elapsed_s > seq.ARM_TIMEOUT_S:
         _refuse(t, notices.ARMING_REFUSED, "PX4 did not arm")
@@ -219,8 +219,8 @@ def _stand_down(t: Transition, elapsed_s: float) -> AutopilotRequest:
 def _spool(t: Transition, elapsed_s: float) -> AutopilotRequest:
     if elapsed_s >= seq.SPOOL_S:
         assert t.state.plan is not None
-        t.change(mission_start_s=t.i.t_s, course=Course(t.state.plan, t.i.t_s))
-        t.enter(Stage.PLAN)
+        t.change(mission_start_s=t.i.t_s, course=ActiveTrajectory(t.state.plan, t.i.t_s))
+        t.enter(Stage.MISSION)
         t.report(notices.TAKEOFF, "take-off")
     return _NONE
 
@@ -354,7 +354,7 @@ _STAGES: Final[Mapping[Stage, Callable[[Transition, float], AutopilotRequest]]] 
     Stage.OFFBOARD: _offboard,
     Stage.ARM: _arm,
     Stage.SPOOL: _spool,
-    Stage.PLAN: _fly,
+    Stage.MISSION: _fly,
     Stage.TOUCHDOWN: _touchdown,
     Stage.DISARM: _disarm,
     Stage.AUTOPILOT_LAND: _autopilot_land,

@@ -13,7 +13,7 @@ from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
 from companion.control.manipulator import Manipulator
 from companion.core.flight_state import FlightState, Tare
-from companion.mission.active_plan import Course
+from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.air import NOTHING, Observation
 from companion.mission.phase import Phase, phases_of
 from companion.mission.plan import Plan
@@ -22,9 +22,9 @@ from companion.model.flight_stage import Stage
 from companion.model.negative_zero import without_negative_zero
 from companion.model.types import Event, Joints, Outcome, SafetyAction, Severity
 from companion.safety.autopilot_landing import AutopilotLanding
-from companion.safety.notices import Notice
+from companion.safety.notices import EventDefinition
 from companion.safety.rotor_stop import RotorStop
-from companion.safety.supervisor import LadderTimes
+from companion.safety.supervisor import EscalationTimeouts
 from companion.safety.touchdown import Touchdown
 
 
@@ -39,7 +39,7 @@ class Parameters:
     tilt_max_rad: float
     """`safety.tilt_abort_deg`, in rad."""
     fold_rad: Joints
-    times: LadderTimes
+    times: EscalationTimeouts
     waits_for_start: bool
     """Whether the take-off waits for the operator's start command."""
     manipulator: Manipulator
@@ -57,7 +57,7 @@ class Parameters:
             clearance_m=vehicle.airframe.ground_clearance_m,
             tilt_max_rad=math.radians(safety.tilt_abort_deg),
             fold_rad=tuple(map(math.radians, vehicle.fold_arm_deg)),
-            times=LadderTimes.of(safety),
+            times=EscalationTimeouts.of(safety),
             waits_for_start=config.mission.start.takeoff == "by_operator",
             manipulator=manipulator_of(vehicle),
             phases=phases,
@@ -69,7 +69,7 @@ class Parameters:
         return FlightState(Touchdown.begin(self.clearance_m), RotorStop.begin(self.clearance_m, self.tilt_max_rad))
 
 
-def event_of(notice: Notice, t_s: float, text: str, severity: Severity | None = None) -> Event:
+def event_of(notice: EventDefinition, t_s: float, text: str, severity: Severity | None = None) -> Event:
     """Return the event of a notice, by default with the severity of its row."""
     return Event(
         t_s=t_s,
@@ -115,7 +115,7 @@ class Transition:
         """Replace fields of `FlightState.waiting`."""
         self.state = replace(self.state, waiting=replace(self.state.waiting, **fields))
 
-    def report(self, notice: Notice, text: str, severity: Severity | None = None) -> None:
+    def report(self, notice: EventDefinition, text: str, severity: Severity | None = None) -> None:
         """Add an event, by default with the severity of its row."""
         self.events.append(event_of(notice, self.i.t_s, text, severity))
 
@@ -160,4 +160,4 @@ class Transition:
     def leave_mission(self, plan: Plan) -> None:
         """Replace the mission with this plan."""
         self.finish(Outcome.ABORTED)
-        self.change(course=Course(plan, self.i.t_s), aborting=True, own=None, expected=NOTHING)
+        self.change(course=ActiveTrajectory(plan, self.i.t_s), aborting=True, own=None, expected=NOTHING)

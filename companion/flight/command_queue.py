@@ -36,7 +36,7 @@ class Dropped(NamedTuple):
     """Reason for the operator."""
 
 
-class Turn(NamedTuple):
+class TickCommand(NamedTuple):
     """The command of one tick."""
 
     command: OperatorCommand
@@ -87,7 +87,7 @@ class Operator:
         del self._waiting[WAITING_MAX:]
         return dropped
 
-    def next(self) -> Turn:
+    def next(self) -> TickCommand:
         """Return the command of this tick.
 
         A landing requested by the launcher or a signal stays requested, and every other command is refused. A command from the ground
@@ -98,27 +98,29 @@ class Operator:
         if self._land.is_set():
             asked = waiting.pop(0) if waiting else None
             if asked is None or asked.command in (OperatorCommand.LAND, OperatorCommand.ABORT):
-                return Turn(OperatorCommand.LAND, asked)
-            return Turn(OperatorCommand.LAND, asked, f"{asked.command.value} refused: a landing was commanded before")
+                return TickCommand(OperatorCommand.LAND, asked)
+            return TickCommand(
+                OperatorCommand.LAND, asked, f"{asked.command.value} refused: a landing was commanded before"
+            )
         if not waiting or waiting[0].command is self._given:
             self._given = OperatorCommand.NONE
-            return Turn(OperatorCommand.NONE, None)
+            return TickCommand(OperatorCommand.NONE, None)
         if waiting[0].command is OperatorCommand.START and self.recheck is not None:
             checking = self._checking = self._checking or asyncio.ensure_future(self.recheck())
             self._given = OperatorCommand.NONE
             if not checking.done():
-                return Turn(OperatorCommand.NONE, None)
+                return TickCommand(OperatorCommand.NONE, None)
             self._checking = None
             if text := checking.result():
-                return Turn(OperatorCommand.NONE, waiting.pop(0), text)
+                return TickCommand(OperatorCommand.NONE, waiting.pop(0), text)
         asked = waiting.pop(0)
         if asked.command is OperatorCommand.RESUME and self.hold is not None and asked.hold != self.hold:
             self._given = OperatorCommand.NONE
             meant = f"hold {asked.hold}" if asked.hold else "no hold"
             text = f"resume refused: it names {meant}, but hold {self.hold} is active; check the situation, then command it again"
-            return Turn(OperatorCommand.NONE, asked, text)
+            return TickCommand(OperatorCommand.NONE, asked, text)
         self._given = asked.command
-        return Turn(asked.command, asked)
+        return TickCommand(asked.command, asked)
 
     def judged(self, command: OperatorCommand, outputs: Outputs) -> int | None:
         """Update `hold`, the number of the active hold, and return it. A new hold begins with `SafetyAction.HOLD`, and with every

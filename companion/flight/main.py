@@ -65,7 +65,7 @@ from companion.runtime.clock import Clock, clock_origin_s, flight_clock
 from companion.runtime.event_loop import run, start_over
 from companion.runtime.realtime import FLIGHT_PRIORITY, claim_realtime, collect_no_garbage
 from companion.runtime.simulated_time import SimulatedTime
-from companion.safety.rules import REATTACHED
+from companion.safety.rules import ARMED_EXTERNALLY
 
 STATUS_EVERY = 20
 JOINT_READ_TIMEOUT_S = 0.002
@@ -239,7 +239,7 @@ class Flight:
         """Report how a flight with a PX4 that was found armed goes on. Return False if PX4 has disarmed since, which ends the
         flight.
         """
-        goes_on = any(event.id == REATTACHED for event in outputs.events)
+        goes_on = any(event.id == ARMED_EXTERNALLY for event in outputs.events)
         lines = [f"landing without this device: {line}" for line in self._devices.failures]
         if not goes_on:
             lines = [
@@ -249,9 +249,11 @@ class Flight:
             self._tell(
                 0,
                 outputs,
-                Event(t_s=outputs.t_s, id=REATTACHED, severity=Severity.WARNING, action=SafetyAction.WARN, text=text),
+                Event(
+                    t_s=outputs.t_s, id=ARMED_EXTERNALLY, severity=Severity.WARNING, action=SafetyAction.WARN, text=text
+                ),
             )
-            self._recorder.client.text(outputs.t_s, Severity.WARNING, REATTACHED, text)
+            self._recorder.client.text(outputs.t_s, Severity.WARNING, ARMED_EXTERNALLY, text)
         return goes_on
 
     def _report(self, tick: int, outputs: Outputs, sent: Sent) -> None:

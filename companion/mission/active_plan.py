@@ -33,7 +33,7 @@ class Change:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class ActiveTrajectory:
     """One plan on the flight clock."""
 
     plan: Plan
@@ -71,22 +71,22 @@ class Course:
         now_s = change.plan_s + duration_s * (before * u + rise * way)
         return now_s, before + rise * rate, rise * slope * once, rise * jerk * twice
 
-    def hold(self, t_s: float) -> Course:
+    def hold(self, t_s: float) -> ActiveTrajectory:
         """Return the course that brakes to rest on the planned path from `t_s`."""
         return self if self.held else self._turned_to(0.0, t_s)
 
-    def resume(self, t_s: float) -> Course:
+    def resume(self, t_s: float) -> ActiveTrajectory:
         """Return the course that continues from the point of the hold."""
         return self._turned_to(1.0, t_s) if self.held else self
 
-    def moved_to(self, plan_s: float, t_s: float) -> Course:
+    def moved_to(self, plan_s: float, t_s: float) -> ActiveTrajectory:
         """Return the course with another plan time at `t_s`, held if this one is held. The plan must be at rest at both times."""
         if not self.held:
             return replace(self, start_s=t_s - plan_s, change=None)
         change = Change(begin_s=t_s, plan_s=plan_s, duration_s=STOP_MIN_S, before=0.0, after=0.0)
         return replace(self, change=change)
 
-    def _turned_to(self, after: float, t_s: float) -> Course:
+    def _turned_to(self, after: float, t_s: float) -> ActiveTrajectory:
         plan_s, rate, _, _ = self.pace(t_s)
         speed_m_s = math.hypot(*self.plan.reference(plan_s).velocity_world_m_s)
         duration_s = max(STOP_MIN_S, REST_TO_REST_PEAK_SPEED * speed_m_s / HOLD_DECELERATION_M_S2)

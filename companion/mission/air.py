@@ -10,7 +10,7 @@ from companion.control.manipulator import Manipulator
 from companion.mission.segments import Segment
 from companion.model.codec import Record
 from companion.model.types import ContactState, Inputs, Reference, TetherState, Vec3
-from companion.safety.notices import Notice
+from companion.safety.notices import EventDefinition
 
 
 class Expectation(Record, frozen=True):
@@ -101,11 +101,11 @@ class Air:
         """Return the plan's reference, without what the phase adds."""
         raise NotImplementedError
 
-    def report(self, notice: Notice, text: str) -> None:
+    def report(self, notice: EventDefinition, text: str) -> None:
         """Add an event."""
         raise NotImplementedError
 
-    def fail(self, notice: Notice, text: str) -> None:
+    def fail(self, notice: EventDefinition, text: str) -> None:
         """Report a failure: the flight counts as aborted, and the plan's time stops until the state ends."""
         raise NotImplementedError
 

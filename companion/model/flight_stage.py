@@ -38,7 +38,7 @@ class Stage(Enum):
     OFFBOARD = "offboard"
     ARM = "arm"
     SPOOL = "spool up"
-    PLAN = "plan"
+    MISSION = "mission"
     TOUCHDOWN = "touchdown"
     DISARM = "disarm"
     AUTOPILOT_LAND = "autopilot land"
@@ -52,9 +52,9 @@ class Stage(Enum):
 BEFORE_LIFT = frozenset({Stage.WAIT, Stage.READY, Stage.OFFBOARD, Stage.ARM})
 BEFORE_ARMING = frozenset({Stage.WAIT, Stage.READY, Stage.OFFBOARD})
 """If PX4 is armed in these stages, the companion has not armed it."""
-LIFTING = frozenset({Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN, Stage.AUTOPILOT_LAND})
+LIFTING = frozenset({Stage.SPOOL, Stage.MISSION, Stage.TOUCHDOWN, Stage.AUTOPILOT_LAND})
 DISARMING = frozenset({Stage.DISARM, Stage.STAND_DOWN})
-COMMANDING = frozenset({Stage.ARM, Stage.SPOOL, Stage.PLAN, Stage.TOUCHDOWN})
+COMMANDING = frozenset({Stage.ARM, Stage.SPOOL, Stage.MISSION, Stage.TOUCHDOWN})
 """Stages in which the companion commands the vehicle, so that PX4 must be in OFFBOARD."""
 ROTORS_MAY_START = "its rotors may start until it is disarmed, keep away"
 """Part of the answer to a command that ends a flight while PX4 arms, which HEARTBEAT shows up to a second later."""

@@ -275,7 +275,7 @@ class Inputs(Record, frozen=True, kw_only=True):
 class ContactMode(Enum):
     """What the flight does about a surface during its contact phases."""
 
-    WEIGH = "weigh"  # at rest before the approach: average the force that is there without contact
+    TARE = "tare"  # at rest before the approach: average the force that is there without contact
     APPROACH = "approach"  # move along the direction until the surface is touched
     PRESS = "press"  # touched: hold the force
     SLIDE = "slide"  # move the tip along the surface while the force is held

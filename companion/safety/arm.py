@@ -14,8 +14,8 @@ from companion.model.constants import TICK_PERIOD_S
 from companion.model.listing import listed
 from companion.model.servos import WATCHDOG_ERROR, hardware_error_text
 from companion.model.types import ArmState, ForceSample, Inputs, Joints, Vec2, Vec3
+from companion.safety.flight_context import HOLDS, Age, FlightContext, Values
 from companion.safety.joint_swing import JointSwing
-from companion.safety.situation import HOLDS, Age, Situation, Values
 
 AT_LIMIT: Final = 0.97
 """Fraction of the torque limit at which a joint counts as being at its limit."""
@@ -155,7 +155,7 @@ def servo_error(a: ArmTracker, _: None) -> Values | None:
     return None
 
 
-def arm_let_go(a: ArmTracker, _: None) -> Values | None:
+def servo_watchdog_tripped(a: ArmTracker, _: None) -> Values | None:
     """Fires if a servo's bus watchdog has switched the torque off."""
     arm = a.arm
     if arm is not None and any(arm.hardware_error):
@@ -284,15 +284,15 @@ class ForceTracker:
         """Return whether samples are passed on: not while they repeat themselves, nor after they disagreed with the motion."""
         return not self._repeats and self.off_n is None
 
-    def update(self, i: Inputs, situation: Situation, awake_s: float, dt_s: float, moving: bool) -> None:
+    def update(self, i: Inputs, context: FlightContext, awake_s: float, dt_s: float, moving: bool) -> None:
         """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle is moving."""
         force = self.force = i.force
         self.age_s = self._age.update(awake_s, force.stamp_s if force else None)
         self.stuck = False
         if force is not None:
-            self._compare(force, situation, awake_s, moving)
-        control, felt_n = situation.control, situation.disturbance_world_n
-        if control is None or situation.contact_n is not None or not situation.airborne:
+            self._compare(force, context, awake_s, moving)
+        control, felt_n = context.control, context.disturbance_world_n
+        if control is None or context.contact_n is not None or not context.airborne:
             self.mean_n, self._measured, self._felt = _NO_FORCE, _Change(), _Change()
             return
         measured_n = control.force_measured_world_n or control.force_ext_world_n
@@ -301,7 +301,7 @@ class ForceTracker:
             self._measured, self._felt = _Change(), _Change()
         elif self.trusted:
             self._disagree(dt_s, self._measured.update(dt_s, measured_n), self._felt.update(dt_s, felt_n))
-        if situation.caught:
+        if context.caught:
             self.mean_n = _NO_FORCE
         else:
             self.mean_n = _lowpassed(self.mean_n, measured_n, dt_s / DRIFT_TIME_S)
@@ -317,14 +317,14 @@ class ForceTracker:
         else:
             self._off_s = 0.0
 
-    def _compare(self, force: ForceSample, situation: Situation, awake_s: float, moving: bool) -> None:
+    def _compare(self, force: ForceSample, context: FlightContext, awake_s: float, moving: bool) -> None:
         before = self._before
         self._before = force
         if before is not None and force.stamp_s != before.stamp_s:
             if (
                 force.force_sensor_n != before.force_sensor_n
                 or force.torque_sensor_nm != before.torque_sensor_nm
-                or not situation.airborne
+                or not context.airborne
             ):
                 self._same_since_s, self._repeats = None, False
             elif self._same_since_s is None:

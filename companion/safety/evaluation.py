@@ -9,9 +9,9 @@ from typing import Any
 from companion.config.vehicle import Vehicle
 from companion.model.negative_zero import without_negative_zero
 from companion.model.types import ActiveRule, Event, SafetyAction
+from companion.safety.flight_context import Values
 from companion.safety.rule import Repeat, Rule, Subject, hold_time_s, thresholds_of
 from companion.safety.rules import RULES
-from companion.safety.situation import Values
 
 QUIET_S = 1.0
 """A rule that held raises its event again only after it has not held for this long; until then it is active."""

@@ -12,10 +12,10 @@ from companion.config.vehicle import Vehicle
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import tilt_rad
 from companion.model.types import ControlLog, Inputs, TetherState, VehicleState
+from companion.safety.flight_context import FlightContext, Values
 from companion.safety.governor import BODY_TOP_M
 from companion.safety.oscillation import Oscillation
 from companion.safety.rotor_stop import FLIPPED_TILT_RAD, seems_flipped
-from companion.safety.situation import Situation, Values
 from companion.safety.stop import StopModel
 
 
@@ -56,7 +56,7 @@ class FlightTracker:
         self.saturated_s = 0.0
         """Counter that rises while the vertical force is limited and falls otherwise, because noise makes the limit flicker."""
 
-    def update(self, i: Inputs, situation: Situation, dt_s: float) -> None:
+    def update(self, i: Inputs, context: FlightContext, dt_s: float) -> None:
         """Update with the inputs of one tick in the air; `i` holds only trusted inputs."""
         self._inputs, vehicle = i, i.vehicle
         self.vehicle = vehicle
@@ -65,10 +65,10 @@ class FlightTracker:
             _, x, y, _ = vehicle.attitude_wxyz
             if x * x + y * y > self._upright_max:
                 self.tilt_rad = tilt_rad(vehicle.attitude_wxyz)
-        self.tracking_error_m = situation.tracking_error_m
-        self.tether = situation.tether
-        self.contact_n = situation.contact_n
-        control = situation.control
+        self.tracking_error_m = context.tracking_error_m
+        self.tether = context.tether
+        self.contact_n = context.contact_n
+        control = context.control
         self._count_saturation(control, dt_s)
         if control is None or vehicle is None or self.tracking_error_m is None:
             self.oscillation.rate_rad_s = None

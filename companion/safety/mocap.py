@@ -15,9 +15,9 @@ from companion.config.safety import Safety
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_rotate, wrap_rad
 from companion.model.types import Inputs, MocapPose, Quat, Vec2, VehicleState
+from companion.safety.flight_context import HOLDS, FlightContext, Values
 from companion.safety.inertial_check import IMU_LATE_MAX_S, InertialCheck, RemoteClock
 from companion.safety.pose_filter import FORGET_S, PoseFilter, PoseLimits, dot, is_repeated
-from companion.safety.situation import HOLDS, Situation, Values
 from companion.safety.stream_watch import StreamWatch
 
 FUSED_WITHIN_M: Final = 0.10
@@ -117,7 +117,7 @@ class MocapTracker:
         self.repeats = False
         """Whether the newest pose equals the last tracked one bit for bit, which no measurement does in the air."""
 
-    def update(self, i: Inputs, situation: Situation, awake_s: float, moving: bool) -> None:
+    def update(self, i: Inputs, context: FlightContext, awake_s: float, moving: bool) -> None:
         """Update with the inputs of one tick; `moving` is True if PX4's velocity or rates show that the vehicle is moving."""
         pose, vehicle, s = i.mocap, i.vehicle, self._s
         self._awake_s = awake_s
@@ -126,22 +126,22 @@ class MocapTracker:
         if vehicle is not None and vehicle.imu_boot_s is not None:
             self._predict(vehicle, vehicle.imu_boot_s)
         if pose is not None and (self.frame is None or pose.stamp_s != self.frame.stamp_s):
-            self._judge(pose, vehicle, awake_s, situation.airborne)
+            self._judge(pose, vehicle, awake_s, context.airborne)
         self.frame_age_s = awake_s - self._frame_awake_s
         self.trusted_age_s = awake_s - self._trusted_awake_s
         self.frozen = (
             self._same_since_s is not None
             and self._moved
-            and situation.airborne
+            and context.airborne
             and awake_s - self._same_since_s > s.mocap_frozen_s
         )
         self.two_streams = self._streams.two(awake_s)
-        self.dragged = self.dragged or (self._against_imu and situation.airborne and situation.offboard_expected)
+        self.dragged = self.dragged or (self._against_imu and context.airborne and context.offboard_expected)
         self.trusted = self.plausible and not self.frozen and not self.two_streams and not self.dragged
         self._count(awake_s)
-        if not situation.airborne or awake_s - self._compared_awake_s > s.mocap_timeout_s:
+        if not context.airborne or awake_s - self._compared_awake_s > s.mocap_timeout_s:
             self.compared = None
-        if pose is not None and vehicle is not None and situation.airborne and self.trusted and not self.too_late:
+        if pose is not None and vehicle is not None and context.airborne and self.trusted and not self.too_late:
             if pose.tracking_valid and self.frame_age_s < s.mocap_timeout_s:
                 self.compared, self._compared_awake_s = (pose, vehicle), awake_s
 

@@ -14,12 +14,12 @@ from companion.model.types import ActiveRule, Event, Inputs, MocapPose, VehicleS
 from companion.safety.arm import ArmTracker, ForceTracker
 from companion.safety.evaluation import Evaluation
 from companion.safety.flight import FlightTracker
+from companion.safety.flight_context import FlightContext
 from companion.safety.mocap import MocapTracker
 from companion.safety.pose_filter import PoseFilter
 from companion.safety.process import ProcessTracker
 from companion.safety.px4 import Px4Tracker
 from companion.safety.rule import Subject
-from companion.safety.situation import Situation
 from companion.safety.validity import InputFilter
 from companion.safety.vision import VisionTracker
 
@@ -108,32 +108,32 @@ class Monitors:
         """Return the message of the most severe active rule, as of the last tick; None if no active rule requires HOLD or more."""
         return self._evaluation.standing()
 
-    def check(self, inputs: Inputs, situation: Situation) -> tuple[Event, ...]:
+    def check(self, inputs: Inputs, context: FlightContext) -> tuple[Event, ...]:
         """Update with the inputs of one tick and return the new events."""
-        self._airborne = airborne = situation.airborne
+        self._airborne = airborne = context.airborne
         gap_s = inputs.t_s - self._last_t_s if self._last_t_s is not None else 0.0
         self._last_t_s = inputs.t_s
         awake_s = self._awake_s = self._awake_s + min(gap_s, AWAKE_STEP_MAX_S)
         i = self._filter.clean(inputs)
         self._process.update(i, gap_s)
-        self._px4.situation = situation
-        if not situation.waiting:
+        self._px4.context = context
+        if not context.waiting:
             moving = i.vehicle is not None and _moves(i.vehicle)
-            self._mocap.update(i, situation, awake_s, moving)
+            self._mocap.update(i, context, awake_s, moving)
             if self._vision is not None:
                 self._vision.update(i, awake_s)
             seen = i.mocap if self._mocap.trusted and not self._mocap.too_late else None
-            self._px4.update(i, situation, awake_s, moving, seen)
-            self._arm.update(i, awake_s, situation.torque_refused)
-            self._force.update(i, situation, awake_s, gap_s, moving)
+            self._px4.update(i, context, awake_s, moving, seen)
+            self._arm.update(i, awake_s, context.torque_refused)
+            self._force.update(i, context, awake_s, gap_s, moving)
             if not self._mocap.trusted or self._mocap.too_late:
                 i = msgspec.structs.replace(i, mocap=self._mocap.last_trusted)
             if airborne:
-                self._flight.update(i, situation, gap_s)
+                self._flight.update(i, context, gap_s)
             if not self._force.trusted:
                 i = msgspec.structs.replace(i, force=None)
         self.trusted = i
-        return self._evaluation.events(inputs.t_s, airborne, situation.waiting)
+        return self._evaluation.events(inputs.t_s, airborne, context.waiting)
 
 
 def _moves(v: VehicleState) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from companion.model.types import Inputs, OperatorCommand
-from companion.safety.situation import HOLDS, Values
+from companion.safety.flight_context import HOLDS, Values
 
 
 class ProcessTracker:

@@ -11,9 +11,9 @@ from typing import Final
 from companion.model.algebra import minus
 from companion.model.flight_stage import chosen_by_pilot, failsafe_chose, is_killed
 from companion.model.types import AutopilotStatus, FlightMode, Inputs, MocapPose, Vec2, VehicleState
+from companion.safety.flight_context import HOLDS, Age, FlightContext, Values
 from companion.safety.inertial_check import CLOCK_GROWTH
 from companion.safety.motion_lag import MotionLag
-from companion.safety.situation import HOLDS, Age, Situation, Values
 
 DISARMED_ABOVE_M = 0.15
 """Margin over standing height below which PX4's own disarm after a landing is not a fault."""
@@ -45,7 +45,7 @@ class Px4Tracker:
         self._lag_awake_s = 0.0
         self.vehicle: VehicleState | None = None
         self.status: AutopilotStatus | None = None
-        self.situation = Situation(False, False, None)
+        self.context = FlightContext(False, False, None)
         self.state_age_s = self.heartbeat_age_s = 0.0
         """Age of the oldest of position, attitude and IMU sample; `heartbeat_age_s` is the age of the newest heartbeat."""
         self.battery_age_s = 0.0
@@ -63,13 +63,13 @@ class Px4Tracker:
         """PX4's status if PX4 has left OFFBOARD without a request; else None."""
 
     def update(
-        self, i: Inputs, situation: Situation, awake_s: float, moving: bool, pose: MocapPose | None = None
+        self, i: Inputs, context: FlightContext, awake_s: float, moving: bool, pose: MocapPose | None = None
     ) -> None:
         """Update with the inputs of one tick.
 
         Args:
             i: inputs.
-            situation: activity of the core.
+            context: activity of the core.
             awake_s: awake time of this process.
             moving: True if PX4's velocity or rates show that the vehicle is moving.
             pose: the newest pose of motion capture, if it is trusted.
@@ -88,20 +88,20 @@ class Px4Tracker:
             if imu_s > age_s:
                 age_s = imu_s
             self.state_age_s = age_s
-            self._compare(v, situation, awake_s, moving)
-            if situation.airborne:
+            self._compare(v, context, awake_s, moving)
+            if context.airborne:
                 if pose is not None and pose.tracking_valid and pose.stamp_s > self._pose_s:
                     dt_s, self._pose_s = min(GAP_MAX_S, pose.stamp_s - self._pose_s), pose.stamp_s
                     self._motion.update(dt_s, minus(v.position_world_m, pose.position_world_m), v.velocity_world_m_s)
                 self.lag_s = max(self.lag_s, self._motion.one_way_s)
         reported_s = status.battery_stamp_s if status is not None else None
         self.battery_age_s = i.t_s - reported_s if reported_s is not None else 0.0
-        left = situation.offboard_expected and status is not None and status.mode is not FlightMode.OFFBOARD
+        left = context.offboard_expected and status is not None and status.mode is not FlightMode.OFFBOARD
         # PX4 reports its flight termination as MANUAL, which no pilot has chosen.
         self.left_offboard = status if left and not is_killed(status) else None
         self.heartbeat_age_s = self._heartbeat.update(awake_s, status.heartbeat_stamp_s if status else None)
 
-    def _compare(self, v: VehicleState, situation: Situation, awake_s: float, moving: bool) -> None:
+    def _compare(self, v: VehicleState, context: FlightContext, awake_s: float, moving: bool) -> None:
         before, self._seen = self._seen, v
         if v.boot_s is not None:
             if self._boot_s is not None and v.boot_s < self._boot_s - CLOCK_BACK_S:
@@ -119,14 +119,14 @@ class Px4Tracker:
                 self._same_since_s = None
             elif self._same_since_s is None:
                 self._same_since_s, self._moved = awake_s, False
-        if self._same_since_s is not None and situation.airborne:
+        if self._same_since_s is not None and context.airborne:
             self._moved = self._moved or moving
             self.repeats = self._moved
 
 
-def reattached(p: Px4Tracker, _: None) -> Values | None:
+def armed_externally(p: Px4Tracker, _: None) -> Values | None:
     """Fires if PX4 is armed although the companion has not requested it."""
-    found = p.situation.found_armed
+    found = p.context.found_armed
     return None if found is None else (found,)
 
 
@@ -185,7 +185,7 @@ def px4_disarmed(p: Px4Tracker, _: None) -> Values | None:
     if status is None or status.armed or vehicle is None:
         return None
     height_m = vehicle.position_world_m[2]
-    flies = p.situation.offboard_expected and p.situation.airborne and height_m > p.high_m
+    flies = p.context.offboard_expected and p.context.airborne and height_m > p.high_m
     return (height_m,) if flies else None
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from companion.config.vehicle import Vehicle
 from companion.model.types import SafetyAction, Severity
-from companion.safety.situation import Values
+from companion.safety.flight_context import Values
 
 
 class Subject(Enum):

@@ -24,7 +24,7 @@ _TERMINATE: Final = SafetyAction.TERMINATE
 
 MOCAP_DRAGGED, MOCAP_FROZEN = "mocap_dragged", "mocap_frozen"
 MOCAP_SWAPPED, MOCAP_TWO_STREAMS = "mocap_swapped", "mocap_two_streams"
-REATTACHED: Final = "reattached"
+ARMED_EXTERNALLY: Final = "armed_externally"
 PILOT_TOOK_OVER: Final = "pilot_took_over"
 KILLED: Final = "killed"
 CRASHED: Final = "crashed"
@@ -89,9 +89,9 @@ RULES: tuple[Rule, ...] = (
         message="PX4's kill switch or flight termination has stopped the rotors; nothing is sent to PX4 any more",
     ),
     Rule(
-        id=REATTACHED, subject=Subject.PX4,
+        id=ARMED_EXTERNALLY, subject=Subject.PX4,
         what="PX4 was armed without a request from the companion: the companion was started in the air, or a pilot armed it",
-        predicate=px4.reattached, ground=_LAND, air=_PX4_LANDS, message="{}", severity=Severity.CRITICAL,
+        predicate=px4.armed_externally, ground=_LAND, air=_PX4_LANDS, message="{}", severity=Severity.CRITICAL,
         repeat=Repeat.NEVER, while_waiting=True,
     ),
 
@@ -281,8 +281,8 @@ RULES: tuple[Rule, ...] = (
         predicate=arm.servo_error, ground=_LAND, air=_LAND, message="hardware error (register 70) of {}",
     ),
     Rule(
-        id="arm_let_go", subject=Subject.ARM, what="a servo's bus watchdog has switched its torque off",
-        predicate=arm.arm_let_go, ground=_WARN, air=_WARN,
+        id="servo_watchdog_tripped", subject=Subject.ARM, what="a servo's bus watchdog has switched its torque off",
+        predicate=arm.servo_watchdog_tripped, ground=_WARN, air=_WARN,
         message="a servo's bus watchdog had switched its torque off; it is on again",
     ),
     Rule(

@@ -17,14 +17,14 @@ from companion.safety.rules import OPERATOR_RESUME
 
 
 @dataclass(frozen=True, slots=True)
-class LadderTimes:
+class EscalationTimeouts:
     """Maximum durations of a HOLD and of a RETRACT, s."""
 
     hold_max_s: float
     retract_max_s: float
 
     @classmethod
-    def of(cls, safety: Safety) -> LadderTimes:
+    def of(cls, safety: Safety) -> EscalationTimeouts:
         """Return the times of the vehicle file."""
         return cls(safety.hold_max_s, safety.retract_max_s)
 
@@ -40,7 +40,7 @@ class SupervisorState:
 
 
 def update(
-    state: SupervisorState, events: Iterable[Event], t_s: float, times: LadderTimes, standing: str | None = None
+    state: SupervisorState, events: Iterable[Event], t_s: float, times: EscalationTimeouts, standing: str | None = None
 ) -> SupervisorState:
     """Return the ladder's state after the events of a tick; the same object if nothing changes.
 

@@ -9,7 +9,7 @@ import msgspec
 
 from companion.model.listing import listed
 from companion.model.types import ArmState, AutopilotStatus, ForceSample, Inputs, MocapPose, Quat, Vec3, VehicleState
-from companion.safety.situation import Values
+from companion.safety.flight_context import Values
 
 OUT_OF_RANGE: Final = 1.0e4
 """Largest permitted value; no valid quantity reaches it in any unit."""

@@ -10,7 +10,7 @@ import math
 
 from companion.model.estimator import EstimatorReport
 from companion.model.types import Inputs
-from companion.safety.situation import Age, Values
+from companion.safety.flight_context import Age, Values
 
 RATIO_MAX = 1.0
 """Innovation test ratio from which EKF2 rejects a measurement."""

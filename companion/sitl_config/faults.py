@@ -98,7 +98,7 @@ _MOCAP_WRONG = (
     "tracking_hold", "tracking_error", "vision_rejected",
 )  # fmt: skip
 _PX4_GONE = ("vehicle_state_lost", "heartbeat_lost", "px4_rebooted", "px4_disarmed", "estimate_frozen", "offboard_left")
-_ARM_GONE = ("arm_lost", "arm_read_failures", "arm_let_go")
+_ARM_GONE = ("arm_lost", "arm_read_failures", "servo_watchdog_tripped")
 _PULLED = (
     "tether_taut", "tether_short", "tether_snagged", "tether_near", "tracking_warn", "tracking_hold", "tracking_error",
     "thrust_saturated", "tilt",
@@ -178,7 +178,9 @@ KINDS: dict[FaultKind, Kind] = {
     ),
     "arming_refused": Kind("PX4 refuses to arm", named_by=("arming_refused",), phases=("ground",)),
     "servo_loss": Kind("a servo neither receives nor answers", named_by=_ARM_GONE),
-    "servo_overload": Kind("a servo reports overload and releases its torque", named_by=("servo_error", "arm_let_go")),
+    "servo_overload": Kind(
+        "a servo reports overload and releases its torque", named_by=("servo_error", "servo_watchdog_tripped")
+    ),
     "servo_hot": Kind(
         what="a servo is hot; above 80 degC it releases its torque",
         size="temperature",

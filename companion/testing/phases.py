@@ -17,7 +17,7 @@ from companion.mission.segments import Segment
 from companion.model.codec import Record, differences
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.types import ForceSample, Inputs, OperatorCommand, Reference, Vec3
-from companion.safety.notices import Notice
+from companion.safety.notices import EventDefinition
 
 TICKS = 2000
 """Most ticks for which a phase acts on random inputs."""
@@ -126,11 +126,11 @@ class _Still(Air):
         """Return the plan's reference at the start of the phase."""
         return self._reference
 
-    def report(self, notice: Notice, text: str) -> None:
+    def report(self, notice: EventDefinition, text: str) -> None:
         """Record an event."""
         self.reports += [notice.id, text]
 
-    def fail(self, notice: Notice, text: str) -> None:
+    def fail(self, notice: EventDefinition, text: str) -> None:
         """Record a failure."""
         self.report(notice, text)
 

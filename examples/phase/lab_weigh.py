@@ -11,9 +11,11 @@ from companion.mission.phase import Checking, Phase, Planning
 from companion.model.codec import Record
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import SafetyAction, Severity
-from companion.safety.notices import Notice
+from companion.safety.notices import EventDefinition
 
-WEIGHED = Notice("weighed", Severity.INFO, SafetyAction.NOMINAL, "the phase `weigh` has ended; the text gives the mass")
+WEIGHED = EventDefinition(
+    "weighed", Severity.INFO, SafetyAction.NOMINAL, "the phase `weigh` has ended; the text gives the mass"
+)
 
 
 class Weighing(Record, frozen=True):

@@ -481,6 +481,18 @@ def rewritten(source: Path, target: Path, message: Callable[[str, dict[str, Any]
     return target
 
 
+def test_the_former_names_of_events_are_read_as_todays(brief: FlightLog, tmp_path: Path) -> None:
+    former = ("reattached", "called_off", "arm_let_go")
+
+    def renamed(topic: str, data: dict[str, Any]) -> None:
+        if topic == "/outputs" and data.get("events"):
+            data["events"] = [{**data["events"][0], "id": name} for name in former]
+
+    log = FlightLog.read(rewritten(brief.path, tmp_path / "older.mcap", renamed, "0" * 16))
+    ids = {event.id for outputs in log.outputs for event in outputs.events}
+    assert ids == {"armed_externally", "takeoff_cancelled", "servo_watchdog_tripped"}
+
+
 def test_a_log_from_before_a_field_that_may_be_none_opens_but_is_not_replayed(brief: FlightLog, tmp_path: Path) -> None:
     """`None` is left out of a log, so the ticks of such a log are those of today; what the core makes of them is not."""
 

@@ -191,7 +191,7 @@ def test_report_and_ground_station_show_the_force_and_the_report_the_true_one(
     assert drawn is not None and contact_path(log) is not None
     assert [line.get_label() for line in drawn.axes[0].get_lines()] == ["measured", "wanted"]
     bands = {text.get_text() for text in drawn.legends[0].get_texts()}
-    assert bands == {"weigh", "approach", "press", "leave", "move"}
+    assert bands == {"tare", "approach", "press", "leave", "move"}
     assert found_surface(log) is None  # a plane fits any three points
     last = max(k for k, o in enumerate(log.outputs) if o.contact is not None)
     contact = log.outputs[last].contact

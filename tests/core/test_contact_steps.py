@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from companion.config.loader import load_flight
 from companion.core.flight_state import FlightState, Request
 from companion.core.transition import Parameters
-from companion.mission.active_plan import Course
+from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.plan import Plan
 from companion.model.flight_stage import Stage
 from companion.model.types import ContactMode, ContactState, Inputs, Outcome, TouchedPoint, Vec3
@@ -40,10 +40,10 @@ def contact(mode: ContactMode, since_s: float = 0.0, **fields: Any) -> ContactSt
 def at_plan(plan_s: float, now: ContactState | None, segment: Any = APPROACH, **fields: Any) -> FlightState:
     state = replace(
         P.initial_state(),
-        stage=Stage.PLAN,
+        stage=Stage.MISSION,
         entered_s=NOW_S - plan_s,
         plan=PLAN,
-        course=Course(PLAN, NOW_S - plan_s),
+        course=ActiveTrajectory(PLAN, NOW_S - plan_s),
         mission_start_s=NOW_S - plan_s,
         own=now,
         engaged=None if now is None else segment,
@@ -76,7 +76,7 @@ def plan_s(state: FlightState) -> float:
 
 def test_a_contact_begins_with_its_approach_and_the_rest_of_a_failed_one_is_skipped() -> None:
     state, _ = step(at_plan(IN_APPROACH, None))
-    assert mode_of(state) is ContactMode.WEIGH and state.expected.contact is not None
+    assert mode_of(state) is ContactMode.TARE and state.expected.contact is not None
     assert state.expected.contact.direction_world == INTO
     for inside, segment in ((IN_APPROACH, APPROACH), (IN_PRESS, PRESS), (DETACH.start_s + 0.01, DETACH)):
         state, _ = step(at_plan(inside, None, skips=True))
@@ -86,10 +86,10 @@ def test_a_contact_begins_with_its_approach_and_the_rest_of_a_failed_one_is_skip
 
 
 @pytest.mark.parametrize(
-    ("since_s", "mode"), [(0.99, ContactMode.WEIGH), (1.01, ContactMode.APPROACH)], ids=["weighing", "weighed"]
+    ("since_s", "mode"), [(0.99, ContactMode.TARE), (1.01, ContactMode.APPROACH)], ids=["weighing", "weighed"]
 )
 def test_the_force_is_averaged_for_a_second_before_the_approach(since_s: float, mode: ContactMode) -> None:
-    state, _ = step(at_plan(IN_APPROACH, contact(ContactMode.WEIGH, since_s)))
+    state, _ = step(at_plan(IN_APPROACH, contact(ContactMode.TARE, since_s)))
     assert mode_of(state) is mode
     assert plan_s(state) == pytest.approx(IN_APPROACH)
 

@@ -13,7 +13,7 @@ from companion.config.loader import load_flight
 from companion.core.flight_state import FlightState, Request
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters
-from companion.mission.active_plan import Course
+from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.air import Observation
 from companion.mission.phase import phases_of
 from companion.mission.plan import Plan
@@ -48,10 +48,10 @@ HERE: Vec3 = (0.0, 0.3, 1.0)
 def in_plan(plan_s: float = 6.0) -> FlightState:
     """In the air, some time into the mission."""
     now_s = healthy().t_s
-    course = Course(PLAN, now_s - plan_s)
+    course = ActiveTrajectory(PLAN, now_s - plan_s)
     return replace(
         P.initial_state(),
-        stage=Stage.PLAN,
+        stage=Stage.MISSION,
         entered_s=now_s - plan_s,
         plan=PLAN,
         course=course,
@@ -180,7 +180,7 @@ def test_a_landing_that_has_begun_is_not_interrupted(action: SafetyAction) -> No
     assert PLAN.reference(landing.start_s).position_world_m[2] > 0.7, "high enough to hold"
     before = in_plan(landing.start_s + 0.1)
     state, request = after(before, "tether_taut", action, tether=PULLS[0])
-    assert state.stage is Stage.PLAN and state.course is not None and not state.course.held
+    assert state.stage is Stage.MISSION and state.course is not None and not state.course.held
     if action is SafetyAction.HOLD:
         assert state.course == before.course and "no_room_to_stay" not in ids(request)
     else:
@@ -221,7 +221,7 @@ def test_a_resume_ends_a_hold_unless_a_rule_still_requires_one(standing: str | N
 
 
 @pytest.mark.parametrize(
-    ("stage", "waits", "by_others", "called_off"),
+    ("stage", "waits", "by_others", "takeoff_cancelled"),
     [
         (Stage.WAIT, True, False, False),
         (Stage.READY, True, False, False),
@@ -232,14 +232,14 @@ def test_a_resume_ends_a_hold_unless_a_rule_still_requires_one(standing: str | N
     ],
 )
 def test_a_hold_before_take_off_calls_it_off_unless_the_flight_waits_for_its_start(
-    stage: Stage, waits: bool, by_others: bool, called_off: bool
+    stage: Stage, waits: bool, by_others: bool, takeoff_cancelled: bool
 ) -> None:
     before = replace(in_plan(), stage=stage, entered_s=healthy().t_s, armed_by_others=by_others)
     held = replace(put("status", armed=False)(healthy()), command=OperatorCommand.HOLD)
     parameters = dataclasses.replace(P, waits_for_start=waits)
     waiting = replace(before.waiting, tare_start_s=healthy().t_s)
     _, request = tick(replace(before, waiting=waiting), parameters=parameters, inputs=held, airborne=False)
-    assert ("called_off" in ids(request)) is called_off
+    assert ("takeoff_cancelled" in ids(request)) is takeoff_cancelled
 
 
 def test_before_take_off_a_fault_refuses_the_flight_and_the_operators_word_ends_it() -> None:
@@ -252,7 +252,7 @@ def test_before_take_off_a_fault_refuses_the_flight_and_the_operators_word_ends_
 def test_armed_by_others_and_unseen_by_motion_capture_px4s_height_counts_for_nothing() -> None:
     """The companion has sent PX4 no pose, so PX4's height may have drifted."""
     state, unseen = replace(P.initial_state(), entered_s=healthy().t_s), replace(healthy(), mocap=None)
-    state, _ = after(state, "reattached", SafetyAction.AUTOPILOT_LAND, armed_by_others=True, inputs=unseen)
+    state, _ = after(state, "armed_externally", SafetyAction.AUTOPILOT_LAND, armed_by_others=True, inputs=unseen)
     assert state.stage is Stage.AUTOPILOT_LAND and state.landing is not None
     assert state.landing.pose_s == state.landing.stop.pose_s == -math.inf
 
@@ -262,5 +262,5 @@ def test_armed_by_others_a_flip_is_not_taken_as_known_from_before() -> None:
     over = {"attitude_wxyz": (0.0, 1.0, 0.0, 0.0), "specific_force_body_m_s2": (0.0, 0.0, 0.0)}
     i = replace(put("vehicle", **over)(healthy()), mocap=None)
     state = replace(P.initial_state(), entered_s=healthy().t_s)
-    _, request = after(state, "reattached", SafetyAction.AUTOPILOT_LAND, armed_by_others=True, inputs=i)
+    _, request = after(state, "armed_externally", SafetyAction.AUTOPILOT_LAND, armed_by_others=True, inputs=i)
     assert request.autopilot is AutopilotRequest.LAND

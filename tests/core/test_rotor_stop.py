@@ -312,7 +312,7 @@ def test_in_manual_a_pilot_flies_whatever_failsafe_acts() -> None:
 
 
 @pytest.mark.parametrize("mode", [FlightMode.MANUAL, FlightMode.HOLD])
-@pytest.mark.parametrize("phase", [*PHASES, "autopilot land", "reattached"])
+@pytest.mark.parametrize("phase", [*PHASES, "autopilot land", "armed_externally"])
 def test_in_every_stage_a_pilot_who_takes_over_is_in_the_heartbeat_to_the_guardian(
     phase: str, mode: FlightMode
 ) -> None:
@@ -324,7 +324,7 @@ def test_in_every_stage_a_pilot_who_takes_over_is_in_the_heartbeat_to_the_guardi
             beat = heartbeats.of(i, core.step(i))
         return beat.pilot
 
-    if phase == "reattached":
+    if phase == "armed_externally":
         core, machine, _ = machine_from("wait", armed=True)
         machine.position = (*machine.position[:2], 1.0)
     elif phase == "autopilot land":

@@ -11,7 +11,7 @@ import pytest
 
 from companion.core.flight_state import FlightState, Tare
 from companion.core.sequence import missing_inputs
-from companion.mission.active_plan import Course
+from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.plan import Plan
 from companion.mission.settled import SettledEstimate
 from companion.model.flight_stage import PILOT_FLIES, Stage
@@ -41,7 +41,7 @@ DISARM, FORCE_DISARM, LAND = AutopilotRequest.DISARM, AutopilotRequest.FORCE_DIS
 
 def in_stage(stage: Stage, elapsed_s: float, **changes: Any) -> FlightState:
     plan = Plan.build(CONFIG.mission, CONFIG.vehicle)
-    course = Course(plan, NOW_S - elapsed_s)
+    course = ActiveTrajectory(plan, NOW_S - elapsed_s)
     fields = {"stage": stage, "entered_s": NOW_S - elapsed_s, "plan": plan, "course": course, **changes}
     return replace(P.initial_state(), **fields)
 
@@ -68,7 +68,7 @@ OTHER = FlightMode.OTHER
         (Stage.ARM, 10.01, px4(armed=False), NONE, Stage.STAND_DOWN, "arming_refused"),
         (Stage.ARM, 1.0, px4(), NONE, Stage.SPOOL, None),
         (Stage.SPOOL, 1.19, px4(), NONE, Stage.SPOOL, None),
-        (Stage.SPOOL, 1.21, px4(), NONE, Stage.PLAN, "takeoff"),
+        (Stage.SPOOL, 1.21, px4(), NONE, Stage.MISSION, "takeoff"),
         (Stage.TOUCHDOWN, 0.39, px4(), NONE, Stage.TOUCHDOWN, None),
         (Stage.TOUCHDOWN, 0.41, px4(), NONE, Stage.DISARM, None),
         (Stage.DISARM, 1.0, px4(armed=False), NONE, Stage.DONE, None),
@@ -148,9 +148,9 @@ def test_a_plan_that_ends_without_touchdown_is_landed_by_px4_after_five_seconds(
 def test_spool_up_and_touchdown_scale_the_thrust() -> None:
     assert in_stage(Stage.SPOOL, 0.6).vertical_scale(NOW_S) == pytest.approx(0.35)
     assert in_stage(Stage.SPOOL, 2.0).vertical_scale(NOW_S) == pytest.approx(0.7)
-    assert in_stage(Stage.PLAN, 0.2).vertical_scale(NOW_S) == pytest.approx(0.85)
-    assert in_stage(Stage.PLAN, 0.5).vertical_scale(NOW_S) == 1.0
-    assert in_stage(Stage.PLAN, 0.2, aborting=True).vertical_scale(NOW_S) == 1.0
+    assert in_stage(Stage.MISSION, 0.2).vertical_scale(NOW_S) == pytest.approx(0.85)
+    assert in_stage(Stage.MISSION, 0.5).vertical_scale(NOW_S) == 1.0
+    assert in_stage(Stage.MISSION, 0.2, aborting=True).vertical_scale(NOW_S) == 1.0
     assert in_stage(Stage.TOUCHDOWN, 0.1).vertical_scale(NOW_S) == pytest.approx(0.7 * 0.75)
     assert in_stage(Stage.TOUCHDOWN, 0.5).vertical_scale(NOW_S) == 0.0
     relieved = dataclasses.replace(P.initial_state().touchdown, relief=0.3)

@@ -12,7 +12,7 @@ from companion.config.loader import load_flight
 from companion.core.flight_core import within_friction
 from companion.core.flight_state import FlightState, Request
 from companion.core.transition import Parameters
-from companion.mission.active_plan import Course
+from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.plan import Plan
 from companion.model.flight_stage import Stage
 from companion.model.frames import quat_from_euler_zyx
@@ -56,10 +56,10 @@ def step(
     plan_s = SLIDE.start_s + 2.0
     state = replace(
         P.initial_state(),
-        stage=Stage.PLAN,
+        stage=Stage.MISSION,
         entered_s=NOW_S - plan_s,
         plan=PLAN,
-        course=Course(PLAN, NOW_S - plan_s),
+        course=ActiveTrajectory(PLAN, NOW_S - plan_s),
         mission_start_s=NOW_S - plan_s,
         own=contact,
         engaged=SLIDE,

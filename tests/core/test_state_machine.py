@@ -13,7 +13,7 @@ from companion.core.flight_core import force_on_tool_n
 from companion.core.flight_state import FlightState, Request
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters
-from companion.mission.active_plan import Course
+from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.air import Observation
 from companion.mission.plan import Plan
 from companion.model.flight_stage import Stage
@@ -27,7 +27,7 @@ def plain(value: object) -> object:
     """A copy of a record as dictionaries, down to its last value; plans left out, because each is another object."""
     if isinstance(value, Plan):
         return None
-    if isinstance(value, Course):
+    if isinstance(value, ActiveTrajectory):
         return (value.start_s, value.change)
     if isinstance(value, msgspec.Struct):
         return {name: plain(getattr(value, name)) for name in value.__struct_fields__}
@@ -86,7 +86,7 @@ def test_a_transition_done_twice_gives_the_same_and_leaves_its_arguments_alone(m
         Stage.OFFBOARD,
         Stage.ARM,
         Stage.SPOOL,
-        Stage.PLAN,
+        Stage.MISSION,
         Stage.TOUCHDOWN,
         Stage.AUTOPILOT_LAND,
     }

@@ -372,7 +372,7 @@ def test_armed_by_somebody_else_while_it_waits_it_is_not_flown() -> None:
         return put("status", armed=True, mode=FlightMode.OFFBOARD)(i) if 5.0 < i.t_s < 6.0 else i
 
     flown = commanded(change=change, sets=WAITS)
-    assert flown.ids == ["reattached"]
+    assert flown.ids == ["armed_externally"]
     assert flown.outcome is Outcome.REFUSED
 
 

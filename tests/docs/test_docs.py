@@ -223,7 +223,7 @@ def test_monitors_and_ladder_match() -> None:
 def test_every_notice_is_reported_by_the_core_or_a_phase() -> None:
     paths = [path for part in ("core", "phases") for path in sorted((ROOT / "companion" / part).rglob("*.py"))]
     core = "".join(map(text_of, paths))
-    names = {name for name, value in vars(notices).items() if isinstance(value, notices.Notice)}
+    names = {name for name, value in vars(notices).items() if isinstance(value, notices.EventDefinition)}
     assert len(names) == len({notice.id for notice in notices.NOTICES}) == len(notices.NOTICES)
     assert names == set(re.findall(r"\bnotices\.([A-Z_]+)\b", core))
 

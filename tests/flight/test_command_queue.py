@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import msgspec
 import pytest
 
-from companion.flight.command_queue import WAITING_MAX, Operator, StartCancelled, Turn
+from companion.flight.command_queue import WAITING_MAX, Operator, StartCancelled, TickCommand
 from companion.model.launcher_messages import Land
 from companion.model.types import AutopilotRequest, GroundCommand, OperatorCommand, Outputs, PhaseKind, SafetyAction
 from companion.runtime import ipc
@@ -103,16 +103,16 @@ def test_a_resume_ends_the_hold_that_it_names_and_no_other(
             == f"resume refused: it names {meant}, but hold 2 is active; check the situation, then command it again"
         )
     operator.ask([resume(2)])
-    assert operator.next() == Turn(RESUME, resume(2))
+    assert operator.next() == TickCommand(RESUME, resume(2))
     assert operator.judged(RESUME, in_tick(SafetyAction.NOMINAL)) is None
     operator.ask([resume(2)])
     assert operator.next().command is NONE, "the same command again begins a tick later"
-    assert operator.next() == Turn(RESUME, resume(2)), "nothing stands: the core says so"
+    assert operator.next() == TickCommand(RESUME, resume(2)), "nothing stands: the core says so"
     assert operator.judged(RESUME, in_tick(SafetyAction.LAND)) is None
     assert operator.judged(NONE, in_tick(SafetyAction.HOLD)) == 3
 
 
-async def _turns(operator: Operator, ticks: int = 6) -> list[Turn]:
+async def _turns(operator: Operator, ticks: int = 6) -> list[TickCommand]:
     turns = []
     for _ in range(ticks):
         turns.append(operator.next())
@@ -137,14 +137,16 @@ def test_a_start_waits_until_px4s_parameters_are_read_again(
     for _ in range(2):  # again after a refusal: they may have been set back
         operator.ask([start])
         first, *later = asyncio.run(_turns(operator))
-        assert first == Turn(NONE, None)
-        assert [turn for turn in later if turn.asked] == [Turn(NONE, start, why) if why else Turn(START, start)]
+        assert first == TickCommand(NONE, None)
+        assert [turn for turn in later if turn.asked] == [
+            TickCommand(NONE, start, why) if why else TickCommand(START, start)
+        ]
     assert len(reads) == 2
     operator.ask([start, *asked(HOLD)])
     assert [turn.command for turn in asyncio.run(_turns(operator)) if turn.asked] == [HOLD], "no START after the HOLD"
     operator.judged(NONE, msgspec.structs.replace(in_tick(SafetyAction.NOMINAL), phase_kind=PhaseKind.FLIGHT))
     operator.ask([start])
-    assert operator.next() == Turn(START, start), "in the air nothing is read: the core refuses it"
+    assert operator.next() == TickCommand(START, start), "in the air nothing is read: the core refuses it"
 
 
 def test_a_resume_that_comes_right_behind_a_hold_does_not_undo_it(
@@ -208,4 +210,4 @@ def test_the_launchers_landing_stays_and_commands_are_still_answered(
 
     assert asyncio.run(heard()) == [LAND] * 5
     operator.ask(asked(RESUME))
-    assert operator.next() == Turn(LAND, asked(RESUME)[0], "resume refused: a landing was commanded before")
+    assert operator.next() == TickCommand(LAND, asked(RESUME)[0], "resume refused: a landing was commanded before")

@@ -1,6 +1,6 @@
 """The launcher outlives its children and leaves nothing behind: Ctrl-C, a killed launcher, a world that dies.
 
-A flight that hangs beside its guardian: tests/flights/test_reattach.py.
+A flight that hangs beside its guardian: tests/flights/test_armed_externally.py.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.config.loader import load_flight
-from companion.mission.active_plan import HOLD_DECELERATION_M_S2, Course
+from companion.mission.active_plan import HOLD_DECELERATION_M_S2, ActiveTrajectory
 from companion.mission.plan import Plan
 from companion.model.types import Reference
 
@@ -54,7 +54,7 @@ def test_any_holds_and_resumptions_are_smooth_and_on_the_planned_way(
     name: str, first_s: float, pauses_s: list[float]
 ) -> None:
     whole = plan(name)
-    course = Course(whole, START_S)
+    course = ActiveTrajectory(whole, START_S)
     t_s = START_S + first_s
     samples = [course.reference(t_s)]
     for count, pause_s in enumerate(pauses_s):
@@ -72,7 +72,7 @@ def test_any_holds_and_resumptions_are_smooth_and_on_the_planned_way(
 @pytest.mark.parametrize("at_s", [1.0, 2.9, 3.2, 6.5, 9.4, 14.0])
 def test_a_hold_comes_to_rest_and_stays_and_the_rest_of_the_plan_follows(at_s: float) -> None:
     whole = plan("catch")
-    course = Course(whole, START_S)
+    course = ActiveTrajectory(whole, START_S)
     before = course.reference(START_S + at_s)
     course = course.hold(START_S + at_s)
     course = course.hold(START_S + at_s + 0.1)  # asked again: nothing new
@@ -92,7 +92,7 @@ def test_a_hold_comes_to_rest_and_stays_and_the_rest_of_the_plan_follows(at_s: f
 
 def test_untouched_it_is_the_plan_itself() -> None:
     whole = plan("catch")
-    course = Course(whole, START_S)
+    course = ActiveTrajectory(whole, START_S)
     for k in range(200):
         t_s = START_S + 0.1 * k
         assert course.reference(t_s) == whole.reference(t_s - START_S)

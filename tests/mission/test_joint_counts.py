@@ -7,7 +7,7 @@ import math
 import pytest
 
 from companion.config.loader import FlightConfig, load_flight
-from companion.mission.active_plan import Course
+from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.check import check_mission, check_start
 from companion.mission.plan import Plan, landing_from
 from tests.machines import overrides_with_joints
@@ -39,7 +39,7 @@ def test_every_joint_reaches_the_pose_and_a_hold_stops_it(count: int) -> None:
         key=lambda found: max(map(abs, found[1].arm_rate_rad_s)),
     )
     assert all(moving.arm_rate_rad_s)
-    held = Course(plan, 0.0).hold(t_s).reference(t_s + 10.0)
+    held = ActiveTrajectory(plan, 0.0).hold(t_s).reference(t_s + 10.0)
     assert held.arm_rate_rad_s == (0.0,) * count
 
 

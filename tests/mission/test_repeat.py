@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from companion.config.loader import load_flight
 from companion.config.mission import Mission
-from companion.mission.active_plan import Course
+from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.check import check_mission
 from companion.mission.plan import Plan
 from companion.mission.sample_check import SampleCheck
@@ -105,7 +105,7 @@ def test_every_seam_belongs_to_one_segment_and_the_machine_rests_there(period_s:
         f"{{type: hold, name: stay, duration_s: {period_s}}}, {{type: land, speed_m_s: 0.35}}]"
     )
     plan = Plan.build(mission("catch", change, "mission.catch=null", "mission.repeat=1000"), VEHICLE)
-    course = Course(plan, 0.0)
+    course = ActiveTrajectory(plan, 0.0)
     for repetition in range(1, 1001):
         middle_s = 3.0 + (repetition - 0.5) * period_s
         assert plan.segment(middle_s).name == f"stay ({repetition} of 1000)"

@@ -25,8 +25,8 @@ from companion.model.types import (
     TetherState,
     VehicleState,
 )
+from companion.safety.flight_context import FlightContext
 from companion.safety.monitors import Monitors
-from companion.safety.situation import Situation
 
 TICK_S = 0.005
 START_S = 10.0
@@ -117,13 +117,15 @@ def fed_by_another(i: Inputs) -> Inputs:
     return msgspec.structs.replace(i, mocap=None, estimator=i.estimator or report)
 
 
-def flying(**changes: object) -> Situation:
-    situation = Situation(airborne=True, offboard_expected=True, tracking_error_m=0.02, control=control(), tether=SLOW)
-    return dataclasses.replace(situation, **changes)  # type: ignore[arg-type]
+def flying(**changes: object) -> FlightContext:
+    context = FlightContext(
+        airborne=True, offboard_expected=True, tracking_error_m=0.02, control=control(), tether=SLOW
+    )
+    return dataclasses.replace(context, **changes)  # type: ignore[arg-type]
 
 
-def standing(**changes: object) -> Situation:
-    return dataclasses.replace(Situation(False, False, None), **changes)  # type: ignore[arg-type]
+def standing(**changes: object) -> FlightContext:
+    return dataclasses.replace(FlightContext(False, False, None), **changes)  # type: ignore[arg-type]
 
 
 def control(**changes: object) -> ControlLog:
@@ -161,11 +163,11 @@ def stopped(*parts: str) -> Change:
 
 
 def watched(
-    vehicle: Vehicle, inputs: Iterable[Inputs], situation: Situation, monitors: Monitors | None = None
+    vehicle: Vehicle, inputs: Iterable[Inputs], context: FlightContext, monitors: Monitors | None = None
 ) -> list[Event]:
     """Events of a whole stream."""
     monitors = monitors or Monitors(vehicle)
-    return [event for i in inputs for event in monitors.check(i, situation)]
+    return [event for i in inputs for event in monitors.check(i, context)]
 
 
 def after_a_moment(change: Change, ticks: int = 700, sound: int = 3) -> list[Inputs]:

@@ -71,8 +71,8 @@ def test_every_rule_of_the_arm_covers_the_last_joint(
 @pytest.mark.parametrize("count", [0, *COUNTS])
 def test_a_healthy_arm_and_the_absence_of_one_raise_no_event(count: int) -> None:
     vehicle = vehicle_with_joints(count)
-    for situation in (flying(), standing()):
-        assert [event for event in watched(vehicle, ticks(vehicle), situation) if "force" not in event.id] == []
+    for context in (flying(), standing()):
+        assert [event for event in watched(vehicle, ticks(vehicle), context) if "force" not in event.id] == []
 
 
 @pytest.mark.parametrize("count", COUNTS)

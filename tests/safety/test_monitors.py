@@ -25,12 +25,12 @@ from companion.model.types import (
     Severity,
 )
 from companion.safety.arm import error_text
+from companion.safety.flight_context import FlightContext
 from companion.safety.mocap import unfused
 from companion.safety.monitors import Monitors
 from companion.safety.oscillation import Oscillation
 from companion.safety.rule import Rule, Subject
 from companion.safety.rules import RULES
-from companion.safety.situation import Situation
 from tests.safety.healthy import (
     SLOW,
     START_S,
@@ -60,7 +60,7 @@ NAN = math.nan
 RULE = {rule.id: rule for rule in RULES}
 
 
-def tethered(**fields: object) -> Situation:
+def tethered(**fields: object) -> FlightContext:
     return flying(tether=replace(SLOW, **fields))
 
 
@@ -127,7 +127,7 @@ class Fault:
     """How a rule's finding is made, and what else is found with it."""
 
     change: Change = lambda i: i
-    situation: Callable[[], Situation] = flying
+    context: Callable[[], FlightContext] = flying
     sound: int = 3
     """Healthy ticks before it."""
     also: frozenset[str] = field(default_factory=frozenset)
@@ -165,7 +165,7 @@ def estimator(**fields: float) -> Change:
     return lambda i: put("estimator", **fields)(fed_by_another(i))
 
 
-class Swinging(Situation):
+class Swinging(FlightContext):
     """The position error swings by 0.24 m to and fro, twice a second: it is read twice in each tick."""
 
     _reads = 0
@@ -180,7 +180,7 @@ class Swinging(Situation):
     def control(self, _: ControlLog) -> None: ...
 
 
-def swinging() -> Situation:
+def swinging() -> FlightContext:
     return Swinging(**{name: getattr(flying(), name) for name in ("airborne", "offboard_expected", "tracking_error_m")})
 
 
@@ -218,7 +218,7 @@ FAULTS: dict[str, Fault] = {
     "link_slow": Fault(lambda i: put("vehicle", boot_s=i.t_s - 0.03)(i)),
     "link_late": Fault(slow_link),
     "killed": Fault(put("status", system_status=8)),
-    "reattached": Fault(situation=lambda: flying(found_armed=FOUND)),
+    "armed_externally": Fault(context=lambda: flying(found_armed=FOUND)),
     "px4_disarmed": Fault(put("status", armed=False)),
     "pilot_took_over": Fault(put("status", mode=FlightMode.MANUAL)),
     "offboard_left": Fault(put("status", mode=FlightMode.LAND)),
@@ -231,9 +231,9 @@ FAULTS: dict[str, Fault] = {
     "joint_states_late": Fault(lambda i: put("arm", stamp_s=i.t_s - 0.012)(i)),
     "joint_swings": Fault(swinging_joint, also=frozenset({"joint_swings_on"})),
     "joint_swings_on": Fault(swinging_joint, also=frozenset({"joint_swings"})),
-    "torque_refused": Fault(situation=lambda: flying(torque_refused="joint torque (nan, 0.0) is not finite")),
+    "torque_refused": Fault(context=lambda: flying(torque_refused="joint torque (nan, 0.0) is not finite")),
     "servo_error": Fault(put("arm", hardware_error=(0, 32))),
-    "arm_let_go": Fault(put("arm", hardware_error=(0x80, 0))),
+    "servo_watchdog_tripped": Fault(put("arm", hardware_error=(0x80, 0))),
     "servo_warm": Fault(put("arm", temperature_c=(35.0, 68.0))),
     "servo_hot": Fault(put("arm", temperature_c=(76.0, 35.0))),
     "servo_overload": Fault(put("arm", torque_nm=(-2.5, 0.1))),
@@ -246,27 +246,25 @@ FAULTS: dict[str, Fault] = {
     "force_lost": Fault(lambda i: replace(i, force=None)),
     "force_overload": Fault(put("force", overload=True)),
     "force_stuck": Fault(frozen_values("force", "force_sensor_n", "torque_sensor_nm")),
-    "force_drift": Fault(situation=lambda: flying(control=control(force_ext_world_n=(3.5, 0.0, 0.0)))),
+    "force_drift": Fault(context=lambda: flying(control=control(force_ext_world_n=(3.5, 0.0, 0.0)))),
     "force_disagrees": Fault(
-        situation=lambda: flying(
-            control=control(force_ext_world_n=(0.0, 0.0, 1.5)), disturbance_world_n=(0.0, 0.0, -1.5)
-        )
+        context=lambda: flying(control=control(force_ext_world_n=(0.0, 0.0, 1.5)), disturbance_world_n=(0.0, 0.0, -1.5))
     ),
     "loop_late": Fault(),
     "loop_stalled": Fault(),
     "recorder_drops": Fault(lambda i: replace(i, recorder_dropped=3)),
     "guardian_lost": Fault(lambda i: replace(i, guardian_ready=False)),
     "tilt": Fault(leaning(45.0), sound=0),
-    "oscillates": Fault(put("vehicle", angular_rate_body_rad_s=(0.0, 0.4, 0.0)), situation=swinging),
+    "oscillates": Fault(put("vehicle", angular_rate_body_rad_s=(0.0, 0.4, 0.0)), context=swinging),
     "crashed": Fault(leaning(120.0), sound=0, also=frozenset({"tilt"})),
-    "tracking_warn": Fault(situation=lambda: flying(tracking_error_m=0.5)),
-    "tracking_hold": Fault(situation=lambda: flying(tracking_error_m=0.7), also=frozenset({"tracking_warn"})),
+    "tracking_warn": Fault(context=lambda: flying(tracking_error_m=0.5)),
+    "tracking_hold": Fault(context=lambda: flying(tracking_error_m=0.7), also=frozenset({"tracking_warn"})),
     "tracking_error": Fault(
-        situation=lambda: flying(tracking_error_m=1.2), also=frozenset({"tracking_warn", "tracking_hold"})
+        context=lambda: flying(tracking_error_m=1.2), also=frozenset({"tracking_warn", "tracking_hold"})
     ),
-    "contact_force_high": Fault(situation=lambda: flying(contact_n=15.0)),
+    "contact_force_high": Fault(context=lambda: flying(contact_n=15.0)),
     "thrust_saturated": Fault(
-        situation=lambda: flying(
+        context=lambda: flying(
             control=control(saturated=(True, False, False), tau=(0.0, 0.0, 54.0, 0.0, 0.0, 0.0, 0.0, 0.0))
         )
     ),
@@ -275,12 +273,12 @@ FAULTS: dict[str, Fault] = {
     "sinks_too_fast": Fault(at(0.0, 0.0, 1.5, vz=-1.6), sound=0),
     "geofence_near": Fault(at(1.6, 0.0, 1.0, vx=0.8), sound=0),
     "geofence_left": Fault(at(-1.9, 0.0, 1.0), sound=0, also=frozenset({"geofence_near"})),
-    "tether_short": Fault(situation=lambda: tethered(stop_slack_m=0.05)),
-    "tether_taut": Fault(situation=lambda: tethered(taut=True)),
-    "tether_snagged": Fault(situation=lambda: tethered(snagged=True)),
-    "tether_near": Fault(situation=lambda: tethered(clearance_m=0.0)),
-    "tether_wound": Fault(situation=lambda: tethered(turns=-1.6)),
-    "tether_separated": Fault(situation=lambda: tethered(separated=True)),
+    "tether_short": Fault(context=lambda: tethered(stop_slack_m=0.05)),
+    "tether_taut": Fault(context=lambda: tethered(taut=True)),
+    "tether_snagged": Fault(context=lambda: tethered(snagged=True)),
+    "tether_near": Fault(context=lambda: tethered(clearance_m=0.0)),
+    "tether_wound": Fault(context=lambda: tethered(turns=-1.6)),
+    "tether_separated": Fault(context=lambda: tethered(separated=True)),
     "operator_hold": Fault(lambda i: replace(i, command=OperatorCommand.HOLD)),
     "operator_resume": Fault(lambda i: replace(i, command=OperatorCommand.RESUME)),
     "operator_start": Fault(lambda i: replace(i, command=OperatorCommand.START)),
@@ -322,7 +320,7 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
         PX4_LANDS,
         0.015,
     ),  # nothing is sent after it: what would be, would act when the switch is released
-    "reattached": (LAND, PX4_LANDS, 0.000),  # on the ground it is disarmed; in the air nobody else lands it
+    "armed_externally": (LAND, PX4_LANDS, 0.000),  # on the ground it is disarmed; in the air nobody else lands it
     "mocap_lost": (PX4_LANDS, PX4_LANDS, 0.220),  # PX4's estimate holds for 4.5 s, the companion has none
     "mocap_invalid": (PX4_LANDS, PX4_LANDS, 0.210),
     "mocap_swapped": (PX4_LANDS, PX4_LANDS, 0.210),
@@ -358,7 +356,7 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "joint_swings_on": (LAND, LAND, 1.695),
     "torque_refused": (LAND, PX4_LANDS, 0.105),  # the law itself computes nonsense: not even its landing can be trusted
     "servo_error": (LAND, LAND, 0.015),
-    "arm_let_go": (WARN, WARN, 0.015),  # its torque is on again
+    "servo_watchdog_tripped": (WARN, WARN, 0.015),  # its torque is on again
     "joint_jump": (LAND, LAND, 0.015),
     "servo_warm": (WARN, WARN, 0.515),
     "servo_hot": (LAND, LAND, 0.515),
@@ -401,7 +399,7 @@ in s, its event must come. Written from the hazards, not from the table of the r
 
 
 READS = """
-    reattached 1.00; mocap_lost 0.20; mocap_invalid 0.20; mocap_swapped 0.30 0; mocap_jump 0.40 0;
+    armed_externally 1.00; mocap_lost 0.20; mocap_invalid 0.20; mocap_swapped 0.30 0; mocap_jump 0.40 0;
     mocap_dragged 91 40; mocap_slow 31 50; mocap_late 80 50; mocap_too_late 200 120; estimate_disagrees 0.34 0.30;
     yaw_disagrees 20 15; estimator_silent 0.25; vision_rejected 1.2 1; px4_rebooted 2.0; link_slow 30 20; link_late 100 35;
     vehicle_state_lost 0.25; heartbeat_lost 2.5; px4_disarmed 1.00; battery_warn 25 30; battery_low 10 20;
@@ -424,7 +422,7 @@ def severity_of(rule_id: str, action: SafetyAction, *, airborne: bool) -> Severi
     if rule_id.startswith("operator_"):
         return Severity.INFO
     ends_the_mission = airborne and action in (RETRACT, LAND, PX4_LANDS, TERMINATE)
-    return Severity.CRITICAL if ends_the_mission or rule_id in ("killed", "reattached") else Severity.WARNING
+    return Severity.CRITICAL if ends_the_mission or rule_id in ("killed", "armed_externally") else Severity.WARNING
 
 
 def test_every_rule_has_its_fault() -> None:
@@ -435,7 +433,7 @@ def test_every_rule_has_its_fault() -> None:
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
 def test_each_fault_is_reported_once_by_name_in_time_and_requests_its_action(rule: Rule) -> None:
     fault = FAULTS[rule.id]
-    events = watched(*seen_by(rule), fault.situation())
+    events = watched(*seen_by(rule), fault.context())
     assert {event.id for event in events} == {rule.id, *fault.also}
     assert len(events) == 1 + len(fault.also), "told again"
     for event in events:
@@ -451,26 +449,26 @@ def test_each_fault_is_reported_once_by_name_in_time_and_requests_its_action(rul
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)
 def test_on_the_ground_only_what_matters_there_is_reported(rule: Rule) -> None:
     fault = FAULTS[rule.id]
-    situation = standing(
+    context = standing(
         offboard_expected=rule.id in ("pilot_took_over", "offboard_left"),
-        found_armed=FOUND if rule.id == "reattached" else None,
+        found_armed=FOUND if rule.id == "armed_externally" else None,
         torque_refused="joint torque (nan, 0.0) is not finite" if rule.id == "torque_refused" else None,
     )
-    events = watched(*seen_by(rule), situation)
+    events = watched(*seen_by(rule), context)
     assert {event.id for event in events} == {id_ for id_ in (rule.id, *fault.also) if REQUIRED[id_][0] is not None}
     for event in events:
         assert event.action is REQUIRED[event.id][0]
         assert event.severity is severity_of(event.id, event.action, airborne=False)
 
 
-@pytest.mark.parametrize("situation", [flying, standing])
-def test_a_healthy_machine_raises_no_event(situation: Callable[[], Situation]) -> None:
-    assert watched(VEHICLE, [healthy(k) for k in range(4000)], situation()) == []
+@pytest.mark.parametrize("context", [flying, standing])
+def test_a_healthy_machine_raises_no_event(context: Callable[[], FlightContext]) -> None:
+    assert watched(VEHICLE, [healthy(k) for k in range(4000)], context()) == []
 
 
-@pytest.mark.parametrize("situation", [flying, standing])
-def test_a_machine_that_another_program_feeds_misses_no_motion_capture(situation: Callable[[], Situation]) -> None:
-    assert watched(EXTERNAL, [fed_by_another(healthy(k)) for k in range(700)], situation()) == []
+@pytest.mark.parametrize("context", [flying, standing])
+def test_a_machine_that_another_program_feeds_misses_no_motion_capture(context: Callable[[], FlightContext]) -> None:
+    assert watched(EXTERNAL, [fed_by_another(healthy(k)) for k in range(700)], context()) == []
 
 
 def test_vision_that_has_never_been_fused_is_not_lost() -> None:
@@ -711,12 +709,12 @@ def test_on_the_ground_the_vehicle_may_be_carried_while_it_is_not_seen_for_a_sec
     assert monitors.mocap_trusted is trusted
 
 
-def after_a_gap(gap_s: float, situation: Situation) -> tuple[Monitors, int]:
+def after_a_gap(gap_s: float, context: FlightContext) -> tuple[Monitors, int]:
     """Monitors that have seen no frame for a while, and the tick of the next one."""
     monitors = Monitors(VEHICLE)
     ticks = 20 + round(gap_s / TICK_S)
     gone = [replace(healthy(k), mocap=healthy(min(k, 19)).mocap) for k in range(ticks)]
-    watched(VEHICLE, gone, situation, monitors)
+    watched(VEHICLE, gone, context, monitors)
     return monitors, ticks
 
 
@@ -789,7 +787,7 @@ def test_a_pose_is_compared_with_where_px4s_velocity_has_carried_the_last_one(co
 
 
 @pytest.mark.parametrize(
-    ("height_m", "situation", "reported"),
+    ("height_m", "context", "reported"),
     [
         (0.46, flying(), True),
         (0.44, flying(), False),
@@ -798,11 +796,11 @@ def test_a_pose_is_compared_with_where_px4s_velocity_has_carried_the_last_one(co
     ],
 )
 def test_disarmed_is_reported_only_high_in_the_air_and_while_the_companion_flies(
-    height_m: float, situation: Situation, reported: bool
+    height_m: float, context: FlightContext, reported: bool
 ) -> None:
     """It stands at 0.3 m; from 0.15 m above that it flies."""
     disarmed = both(at(0.0, 0.0, height_m), put("status", armed=False))
-    found = [event.id for event in watched(VEHICLE, after_a_moment(disarmed, ticks=20, sound=0), situation)]
+    found = [event.id for event in watched(VEHICLE, after_a_moment(disarmed, ticks=20, sound=0), context)]
     assert ("px4_disarmed" in found) is reported
 
 
@@ -1035,12 +1033,12 @@ def test_values_that_repeat_are_a_fault_only_while_the_vehicle_moves(
     assert [event.id for event in events] == ([found] if moves else [])
 
 
-@pytest.mark.parametrize(("situation", "trusted"), [(flying, False), (standing, True)])
+@pytest.mark.parametrize(("context", "trusted"), [(flying, False), (standing, True)])
 def test_on_the_ground_a_force_that_repeats_itself_is_still_one(
-    situation: Callable[[], Situation], trusted: bool
+    context: Callable[[], FlightContext], trusted: bool
 ) -> None:
     monitors = Monitors(VEHICLE)
-    watched(VEHICLE, after_a_moment(REPEATS["force_stuck"], ticks=200), situation(), monitors)
+    watched(VEHICLE, after_a_moment(REPEATS["force_stuck"], ticks=200), context(), monitors)
     assert monitors.trusted is not None and (monitors.trusted.force is not None) is trusted
 
 
@@ -1099,9 +1097,9 @@ def test_every_threshold_of_the_table_is_one_that_runs(rule: Rule) -> None:
 
         def reported(vehicle: Vehicle, inputs: list[Inputs], fault: Fault = fault) -> int | None:
             """Return the number of the tick in which the rule's event is first reported."""
-            monitors, situation = Monitors(vehicle), fault.situation()
+            monitors, context = Monitors(vehicle), fault.context()
             return next(
-                (k for k, i in enumerate(inputs) if any(e.id == rule.id for e in monitors.check(i, situation))), None
+                (k for k, i in enumerate(inputs) if any(e.id == rule.id for e in monitors.check(i, context))), None
             )
 
         expected = reported(machine, inputs)

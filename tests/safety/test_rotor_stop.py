@@ -10,7 +10,7 @@ import pytest
 
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import FlightMode, Inputs, LandedState
-from companion.safety.reattach import found_armed
+from companion.safety.armed_externally import found_armed
 from companion.safety.rotor_stop import RotorStop
 from tests.safety.test_autopilot_landing import CLEARANCE_M, LEVEL, TILT_MAX_RAD, seen
 

@@ -60,7 +60,7 @@ def test_a_silent_servo_lets_go_and_that_is_reported_when_it_answers_again() -> 
     assert errors == {(0, 0), (WATCHDOG_ERROR, 0)}
     back = next(i for i in result.inputs if i.arm is not None and any(i.arm.hardware_error))
     assert back.arm is not None and back.arm.torque_nm[0] == 0.0
-    assert any(event.id == "arm_let_go" for o in result.outputs for event in o.events)
+    assert any(event.id == "servo_watchdog_tripped" for o in result.outputs for event in o.events)
 
 
 @pytest.mark.parametrize(

@@ -149,11 +149,13 @@ def test_timers_of_the_event_loop_follow_simulated_time(pair: Pair) -> None:
     task = loop.create_task(sleeper())
 
     def world() -> None:
-        """Grant the process an instant after its timer."""
-        time.sleep(0.05)
-        pair.keeper.processes["flight"].read()
+        """Grant the process the instant of its timer, once it has reported it."""
+        flight = pair.keeper.processes["flight"]
+        while not flight.wants(101.0, data=False):
+            select.select([flight], [], [])
+            flight.read()
         pair.keeper.page.now_s = 101.0
-        pair.keeper.processes["flight"].grant()
+        flight.grant()
 
     loop.run_in_executor(None, world)
     loop.run_until_complete(task)

@@ -17,11 +17,11 @@ from companion.model.types import Event, SafetyAction, Severity
 from companion.safety.notices import HOLD_EXPIRED, NO_ROOM_TO_STAY, NOTICES, RETRACT_DONE, RETRACT_EXPIRED
 from companion.safety.rule import Repeat, Rule, Subject
 from companion.safety.rules import RULES
-from companion.safety.supervisor import LadderTimes, SupervisorState, update
+from companion.safety.supervisor import EscalationTimeouts, SupervisorState, update
 from tools.docs.tables import write_page
 
 _SECTIONS: dict[str, type[BaseModel]] = {"": Safety, "tether.": Tether, "devices.force.": ForceDevice}
-_TIMES = LadderTimes(1.0, 1.0)
+_TIMES = EscalationTimeouts(1.0, 1.0)
 
 
 def _default(key: str) -> str:

@@ -16,12 +16,12 @@ from msgspec.structs import replace
 from companion.model.frames import wrap_rad
 from companion.model.types import ContactMode, ContactShift, ContactState, Joints, Reference, Vec3
 
-WEIGH_S = 1.0
+TARE_S = 1.0
 """Time at rest before the approach, in which the force without contact is averaged."""
 ACCELERATION_M_S2 = 0.1
 STOP_M_S2 = 0.05
 """Deceleration of the offset after a touch."""
-WEIGH_OBSERVED_S = 3.0
+TARE_OBSERVED_S = 3.0
 """The same without a force sensor, where gusts of some tenths of a second are part of the force."""
 TOUCH_S, TOUCH_OBSERVED_S = 0.015, 0.2
 """Time for which the force must exceed the touch's threshold, with and without a force sensor."""
@@ -79,7 +79,7 @@ FREE_M = 0.08
 def begun(t_s: float, direction_world: Vec3, tip_per_n_m: Vec3) -> ContactState:
     """Return the state at the beginning of an approach."""
     return ContactState(
-        mode=ContactMode.WEIGH,
+        mode=ContactMode.TARE,
         since_s=t_s,
         direction_world=direction_world,
         offset_m=0.0,
@@ -184,9 +184,9 @@ def measured(
     force_world_n: Vec3 | None,
     disturbance_world_n: Vec3 | None,
     disagreement_max_n: float,
-    weigh_s: float = WEIGH_S,
+    tare_s: float = TARE_S,
 ) -> ContactState:
-    """Return the state with this tick's force. While it weighs, the force is averaged; no force counts as none.
+    """Return the state with this tick's force. During the tare, the force is averaged; no force counts as none.
 
     Args:
         contact: state of the last tick.
@@ -194,19 +194,19 @@ def measured(
         force_world_n: force on the tool.
         disturbance_world_n: force on the vehicle that its motion shows, to compare the force with; None to compare with nothing.
         disagreement_max_n: `safety.contact_disagreement_n`.
-        weigh_s: time of the weighing.
+        tare_s: duration of the tare.
     """
     against_n = -_along(contact.direction_world, force_world_n or _NO_FORCE)
     contact = replace(contact, tilting_n=contact.tilting_n + dt_s / TILT_S * (contact.push_n - contact.tilting_n))
-    if contact.mode is ContactMode.WEIGH:
-        contact = replace(contact, bias_n=contact.bias_n + 3.0 * dt_s / weigh_s * (against_n - contact.bias_n))
+    if contact.mode is ContactMode.TARE:
+        contact = replace(contact, bias_n=contact.bias_n + 3.0 * dt_s / tare_s * (against_n - contact.bias_n))
     contact = replace(contact, force_n=against_n - contact.bias_n + contact.unseen_n)
     if disturbance_world_n is None:
         return contact
     unlike_n = -_along(contact.direction_world, disturbance_world_n) - against_n
     mean_n, disagreement_n, unopposed_n = contact.disagreement_bias_n, contact.disagreement_n, contact.unopposed_n
-    if contact.mode is ContactMode.WEIGH:
-        return replace(contact, disagreement_bias_n=mean_n + 3.0 * dt_s / weigh_s * (unlike_n - mean_n))
+    if contact.mode is ContactMode.TARE:
+        return replace(contact, disagreement_bias_n=mean_n + 3.0 * dt_s / tare_s * (unlike_n - mean_n))
     shown_n = sensed_n(contact) + unlike_n - mean_n
     disagreement_n += dt_s / DISAGREEMENT_S * (unlike_n - mean_n - disagreement_n)
     unopposed_n += dt_s / DISAGREEMENT_S * (contact.push_n - shown_n - unopposed_n)

@@ -21,9 +21,9 @@ from companion.phases.contact import points, sliding
 from companion.phases.contact.sliding import Stroke
 from companion.phases.contact.way import Way
 from companion.safety import notices
-from companion.safety.notices import Notice
+from companion.safety.notices import EventDefinition
 
-_WEIGH, _APPROACH, _PRESS = ContactMode.WEIGH, ContactMode.APPROACH, ContactMode.PRESS
+_WEIGH, _APPROACH, _PRESS = ContactMode.TARE, ContactMode.APPROACH, ContactMode.PRESS
 _SLIDE = ContactMode.SLIDE
 _LOST, _BACK, _SHIFT = ContactMode.LOST, ContactMode.BACK, ContactMode.SHIFT
 _LEAVE, _RETURN = ContactMode.LEAVE, ContactMode.RETURN
@@ -46,14 +46,14 @@ def advance(
         slides: whether the present phase slides.
     """
     dt_s, t_s = air.dt_s, air.t_s
-    weigh_s = c.WEIGH_OBSERVED_S if _observes(air) else c.WEIGH_S
+    tare_s = c.TARE_OBSERVED_S if _observes(air) else c.TARE_S
     contact = c.measured(
         contact,
         dt_s,
         air.o.force_world_n,
         air.o.disturbance_world_n,
         air.vehicle.safety.contact_disagreement_n,
-        weigh_s,
+        tare_s,
     )
     if not (slides and (contact.mode is _PRESS or contact.mode is _SLIDE)):
         contact = sliding.released(contact, dt_s)
@@ -73,7 +73,7 @@ def advance(
         contact = _failed(air, contact, notices.CONTACT_SLIPPED, text)
     elif contact.mode is _WEIGH:
         air.stay(engaged)
-        if t_s - contact.since_s >= weigh_s:
+        if t_s - contact.since_s >= tare_s:
             contact = points.weighed(air, contact, way)
     elif contact.mode is _APPROACH:
         contact = _approached(air, contact, way, dt_s)
@@ -181,7 +181,7 @@ def _is_force_known(air: Air) -> bool:
     return force is not None and air.t_s - force.stamp_s <= vehicle.safety.force_timeout_s
 
 
-def _contradiction(air: Air, contact: ContactState) -> tuple[Notice, str] | None:
+def _contradiction(air: Air, contact: ContactState) -> tuple[EventDefinition, str] | None:
     """Return how the vehicle's motion contradicts the measured force or the push; None if it does not."""
     ahead_m, limit_n = c.along_m(contact, air.o.position_error_m), air.vehicle.safety.contact_disagreement_n
     if ahead_m < -c.ASTRAY_M:
@@ -243,6 +243,6 @@ def _approached(air: Air, contact: ContactState, way: Way, dt_s: float) -> Conta
     return contact
 
 
-def _failed(air: Air, contact: ContactState, notice: Notice, text: str) -> ContactState:
+def _failed(air: Air, contact: ContactState, notice: EventDefinition, text: str) -> ContactState:
     air.fail(notice, text)
     return c.entered(contact, air.t_s, _LEAVE, failed=True)

@@ -88,7 +88,7 @@ def shifting(air: Air, contact: ContactState, way: Way) -> ContactState:
     contact = c.shifted(contact, air.dt_s, c.SHIFT_M_S)
     if not c.is_shifted(contact):
         return contact
-    mode = ContactMode.APPROACH if seeks_points(contact, way) else ContactMode.WEIGH
+    mode = ContactMode.APPROACH if seeks_points(contact, way) else ContactMode.TARE
     return c.entered(contact, air.t_s, mode)
 
 

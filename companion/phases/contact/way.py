@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from companion.model.types import Vec2, Vec3
-from companion.phases.contact.force import ACCELERATION_M_S2, SHIFT_M_S, TOUCH_MEAN_S, TOUCH_SETTLE_S, WEIGH_S
+from companion.phases.contact.force import ACCELERATION_M_S2, SHIFT_M_S, TARE_S, TOUCH_MEAN_S, TOUCH_SETTLE_S
 
 FROM_POINT_M, FROM_POINT_SHARE = 0.03, 0.4
 """Distance to which the tip moves back from a point, and additionally as a fraction of the way to the next point: a surface may be
@@ -38,7 +38,7 @@ def travel_s(distance_m: float, speed_m_s: float) -> float:
 
 def approach_s(way: Way) -> float:
     """Return the duration of an approach or a probe, s: the largest of an approach, about that of what touches points."""
-    duration_s = WEIGH_S + travel_s(way.distance_max_m, way.speed_m_s)
+    duration_s = TARE_S + travel_s(way.distance_max_m, way.speed_m_s)
     if not way.points:
         return duration_s
     back_m = back_from_point_m(way)

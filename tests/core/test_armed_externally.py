@@ -71,8 +71,8 @@ def test_every_mode_landed_state_and_height(mode: FlightMode, landed: LandedStat
     outputs = stepped([found(mode, landed, height, tick) for tick in range(150)])
     ours = mode in (FlightMode.OFFBOARD, FlightMode.LAND)
     stands = landed is LandedState.ON_GROUND and where == "standing" and ours
-    assert ids(outputs).count("reattached") == 1
-    event = next(event for event in outputs[0].events if event.id == "reattached")
+    assert ids(outputs).count("armed_externally") == 1
+    event = next(event for event in outputs[0].events if event.id == "armed_externally")
     assert event.severity is Severity.CRITICAL
     assert f"{height[2]:.2f} m" in event.text and mode.value.upper() in event.text
     assert all(o.attitude is None for o in outputs), "no setpoint, with thrust or without"
@@ -102,7 +102,7 @@ def test_whatever_else_is_wrong_it_lands(mode: FlightMode, command: OperatorComm
     outputs = stepped([tick(k) for k in range(60)])
     assert {o.request for o in outputs} == {AutopilotRequest.LAND}
     assert all(o.attitude is None and o.outcome is None for o in outputs)
-    assert "reattached" in ids(outputs[:1])
+    assert "armed_externally" in ids(outputs[:1])
 
 
 def test_armed_by_somebody_else_while_the_companion_waits_it_does_not_take_off() -> None:
@@ -115,7 +115,7 @@ def test_armed_by_somebody_else_while_the_companion_waits_it_does_not_take_off()
             i = put("status", armed=True, mode=FlightMode.OFFBOARD)(i)
         outputs.append(core.step(i))
     assert outputs[-1].request is AutopilotRequest.DISARM
-    assert ids(outputs) == ["reattached"]
+    assert ids(outputs) == ["armed_externally"]
     last = stepped_on(core, inputs[-1], armed=False)
     assert last.outcome is Outcome.REFUSED
 
@@ -179,7 +179,7 @@ def test_started_again_in_the_air_it_lands_what_still_flies(died_s: float, gone_
     """PX4 has been without motion capture: after 4.5 s it descends blindly and never finds that it stands."""
     flight, result = flown(died_s, died_s + gone_s)
     after = [o for o in result.outputs if o.t_s >= died_s + gone_s]
-    assert ids(after)[0] == "reattached"
+    assert ids(after)[0] == "armed_externally"
     assert result.outputs[-1].outcome is Outcome.ABORTED
     assert not result.crashed and not flight.px4.armed
     assert result.truth[-1].position_world_m[2] < STANDING[2] + 0.05
@@ -215,7 +215,7 @@ def test_a_pilot_who_flies_is_only_given_motion_capture() -> None:
     _, result = flown(11.6, 11.8, change)
     after = [o for o in result.outputs if o.t_s >= 11.8]
     assert all(o.attitude is None and o.request is AutopilotRequest.NONE for o in after)
-    assert ids(after).count("reattached") == 1
+    assert ids(after).count("armed_externally") == 1
     assert after[-1].outcome is Outcome.ABORTED, "PX4 disarmed"
 
 
@@ -225,4 +225,4 @@ def test_a_vehicle_found_killed_is_only_given_motion_capture() -> None:
     inputs = [put("status", system_status=8 if i.tick < 50 else 4)(i) for i in inputs]
     outputs = stepped(inputs)
     assert all(o.attitude is None and o.request is AutopilotRequest.NONE for o in outputs)
-    assert {"killed", "reattached"} <= set(ids(outputs))
+    assert {"killed", "armed_externally"} <= set(ids(outputs))

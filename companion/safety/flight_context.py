@@ -15,7 +15,7 @@ HOLDS: Final[Values] = ()
 
 
 @dataclass(slots=True)
-class Situation:
+class FlightContext:
     """The part of the core's activity on which rules depend. The core keeps one object and updates it in every tick."""
 
     airborne: bool

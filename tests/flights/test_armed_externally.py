@@ -60,7 +60,7 @@ class Paused:
 
 
 def test_started_again_in_the_air_without_the_arm_it_lands_what_it_finds(sandbox: Sandbox) -> None:
-    """With the arm: tests/core/test_reattach.py."""
+    """With the arm: tests/core/test_armed_externally.py."""
     with World(sandbox, HOVER, ["world.payload_kg=0", SLOW]) as world:
         fly_until_hover(sandbox, world, LONG)
         # Limp, the arm may hang past its walls, and then its edge refuses it.
@@ -75,7 +75,7 @@ def test_started_again_in_the_air_without_the_arm_it_lands_what_it_finds(sandbox
             ended = second.end()
         assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
         summary = read_summary(sandbox.cwd / "second")
-        assert ids(summary)[0] == "reattached", ids(summary)
+        assert ids(summary)[0] == "armed_externally", ids(summary)
         assert "but not by the companion" in ended.out
         assert "takeoff" not in ids(summary)
         log = FlightLog.read(sandbox.cwd / "second/flight.mcap")
