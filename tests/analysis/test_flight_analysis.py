@@ -476,7 +476,12 @@ def rewritten(source: Path, target: Path, message: Callable[[str, dict[str, Any]
                 channels[channel.topic] = writer.register_channel(channel.topic, "json", schema_id)
             data = json.loads(row.data)
             message(channel.topic, data)
-            writer.add_message(channels[channel.topic], row.log_time, json.dumps(data).encode(), row.publish_time)
+            writer.add_message(
+                channels[channel.topic],
+                row.log_time,
+                json.dumps(data, separators=(",", ":")).encode(),
+                row.publish_time,
+            )
         writer.finish()
     return target
 
