@@ -15,6 +15,7 @@ _NEEDS = {
     "robustness": _WORLD,
     "faults": _WORLD,
     "tune": (*_WORLD, ("the search", "cma")),
+    "identify": (("the fit", "scipy"),),
 }
 """What needs which package of the extra `sitl`, by command. `monitor` and `broker init` check their own."""
 

@@ -11,7 +11,7 @@ from companion import DISTRIBUTION
 from companion.cli.main import _normalised, make_parser
 from companion.install.extras import missing_extra
 
-EXTRAS = ("mujoco", "joblib", "cma", "dask", "distributed", "matplotlib", "aiohttp", "cryptography")
+EXTRAS = ("mujoco", "joblib", "cma", "scipy", "dask", "distributed", "matplotlib", "aiohttp", "cryptography")
 
 
 @pytest.mark.parametrize(
@@ -40,9 +40,12 @@ def test_what_lacks_the_world_says_so(words: str, what: str | None) -> None:
     assert missing_extra(arguments, here=lambda package: True) is None
 
 
-def test_a_search_needs_cma_too() -> None:
-    said = missing_extra(make_parser().parse_args(["tune"]), here=lambda package: package == "mujoco")
-    assert said == f"companion tune: the search needs cma: pip install '{DISTRIBUTION}[sitl]'"
+@pytest.mark.parametrize(
+    ("words", "missing"), [("tune", "the search needs cma"), ("identify log.mcap", "the fit needs scipy")]
+)
+def test_what_else_a_command_needs_is_named(words: str, missing: str) -> None:
+    said = missing_extra(make_parser().parse_args(words.split()), here=lambda package: package == "mujoco")
+    assert said == f"companion {words.split()[0]}: {missing}: pip install '{DISTRIBUTION}[sitl]'"
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,8 @@ from companion.mission.minsnap import (
     PEAK_JERK,
     PEAK_SPEED,
     VehicleLimits,
-    fast_coefficients,
     least_line_s,
-    library_coefficients,
+    least_snap,
     route,
 )
 from companion.mission.reference import Curve, minimum_snap
@@ -102,10 +101,16 @@ def test_a_path_without_a_duration_uses_its_limits_and_keeps_them(
 
 @costly
 @given(ways())
-def test_the_fast_solution_is_the_librarys(points_m: tuple[Vec3, ...]) -> None:
+def test_a_path_is_the_one_that_minsnap_trajectories_finds(points_m: tuple[Vec3, ...]) -> None:
     shares = tuple(0.3 + 0.17 * index for index in range(len(points_m) - 1))
-    library = library_coefficients(points_m, shares)
-    assert np.abs(fast_coefficients(points_m, shares) - library).max() < 1e-6 * (1.0 + np.abs(library).max())
+    rest = np.zeros(3)
+    at_rest = {"velocity": rest, "acceleration": rest, "jerk": rest}
+    waypoints = [
+        Waypoint(sum(shares[:k]), np.subtract(point, points_m[0]), **(at_rest if k in (0, len(shares)) else {}))
+        for k, point in enumerate(points_m)
+    ]
+    found = generate_trajectory(waypoints, degree=7, idx_minimized_orders=4, num_continuous_orders=4).coefficients
+    assert np.abs(least_snap(points_m, shares) - found).max() < 1e-6 * (1.0 + np.abs(found).max())
 
 
 def test_a_line_is_what_the_library_finds_between_two_points() -> None:
