@@ -1,8 +1,7 @@
 """The law keeps the contract of every control law, and completes the catch."""
 
-from lab_lqr import lqr_gains
+from lab_lqr import LqrConfig, lqr_gains
 
-from companion.config.controller import PRESETS
 from companion.testing import check_law
 from sitl.testing import check_catch
 
@@ -12,7 +11,7 @@ def test_it_keeps_the_contract() -> None:
 
 
 def test_it_completes_the_catch() -> None:
-    for preset in PRESETS["lqr"]:
+    for preset in LqrConfig.presets:
         check_catch("lqr", preset)
 
 

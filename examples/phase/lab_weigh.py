@@ -5,13 +5,18 @@ from typing import Any, ClassVar, Literal
 
 from msgspec.structs import replace
 
-from companion.config.phase import Duration
-from companion.mission.air import Air
-from companion.mission.phase import Checking, Phase, Planning
-from companion.model.codec import Record
-from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import SafetyAction, Severity
-from companion.safety.notices import EventDefinition
+from companion.api.phases import (
+    GRAVITY_M_S2,
+    Air,
+    Checking,
+    Duration,
+    EventDefinition,
+    Phase,
+    Planning,
+    Record,
+    SafetyAction,
+    Severity,
+)
 
 WEIGHED = EventDefinition(
     "weighed", Severity.INFO, SafetyAction.NOMINAL, "the phase `weigh` has ended; the text gives the mass"

@@ -5,6 +5,7 @@ A flight over wires and its log: tests/flights/test_shared_flight.py.
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import shutil
@@ -54,6 +55,13 @@ def test_the_page_shows_the_files_as_they_are() -> None:
     for name in FILES:
         kind = {".toml": "toml", ".py": "python", ".yaml": "yaml"}[Path(name).suffix]
         assert f"`{name}`:\n\n```{kind}\n{(EXAMPLE / name).read_text(encoding='utf-8')}```\n" in page, name
+
+
+def test_laws_and_phases_of_others_need_nothing_but_the_public_api() -> None:
+    for path in (*EXAMPLE.rglob("*.py"), *(ROOT / "examples" / "phase").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module is not None and node.module.startswith("companion"):
+                assert node.module.startswith(("companion.api.", "companion.testing")), f"{path}:{node.lineno}"
 
 
 def test_its_own_tests_pass(site: Path, tmp_path: Path) -> None:

@@ -4,16 +4,27 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from companion.config.base import Positive3
-from companion.config.controller import LawConfig, PositiveJoints, fitted
-from companion.config.tuned_gain import TunedGain
-from companion.config.vehicle import Vehicle
-from companion.control.arm_model import manipulator_of
-from companion.control.common import Actuation, ForceFilter, tracking_errors, wrench_of
-from companion.control.types import PlantState, Wrench
-from companion.model.constants import GRAVITY_M_S2
-from companion.model.frames import body_x_z_axes_world, yaw_from_quat
-from companion.model.types import Joints, Reference, Vec3
+from companion.api.laws import (
+    GRAVITY_M_S2,
+    Actuation,
+    ForceFilter,
+    Joints,
+    LawConfig,
+    PlantState,
+    Positive3,
+    PositiveJoints,
+    Reference,
+    TunedGain,
+    Vec3,
+    Vehicle,
+    Wrench,
+    body_x_z_axes_world,
+    fitted,
+    manipulator_of,
+    tracking_errors,
+    wrench_of,
+    yaw_from_quat,
+)
 
 
 class LqrConfig(LawConfig):
