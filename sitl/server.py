@@ -18,7 +18,7 @@ from typing import Any
 from companion.config.device_plugins import DYNAMIXEL, NATNET, RFT60
 from companion.config.vehicle import Vehicle
 from companion.model.launcher_messages import WorldAtRest, WorldEvent, WorldMessage, WorldProgress, WorldSlipped
-from companion.model.types import IDENTITY_QUAT, Joints, Vec2
+from companion.model.types import IDENTITY_QUAT
 from companion.sitl_config.faults import FaultKind
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.backend import AutopilotBackend, StubBackend
@@ -29,13 +29,14 @@ from sitl.faults.processes import SIGNALS, ProcessFaults, environment, inject_pr
 from sitl.force_torque import ForceTorqueServer
 from sitl.lockstep import CATCH_UP_S, LockstepLoop, TimeKeeper
 from sitl.natnet import OTHER_BODY, OTHER_PLACE_M, BodyPose, NatNetServer
+from sitl.plant import MocapFrame, Plant
 from sitl.px4.hil_link import Px4Error
 from sitl.servo.bus import ServoBus
 from sitl.servo.from_config import plugged_in, servos_of
 from sitl.servo.model import ServoModel
 from sitl.world.arm_handling import ArmHandling
-from sitl.world.plant import MocapFrame, Plant
-from sitl.world.world import PHYSICS_DT_S
+from sitl.world.start import Start
+from sitl.world.state import PHYSICS_DT_S
 
 COURSE_PERIOD_S, FRAMES_PERIOD_S = 0.01, 0.5
 BEFORE_S = -3600.0
@@ -62,15 +63,6 @@ class Ports:
     mocap_command: int = 0
     mocap_data: int = 0
     multicast: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """Pose of the vehicle at the start, on the floor."""
-
-    position_m: Vec2
-    yaw_rad: float
-    arm_rad: Joints
 
 
 class Sitl:
@@ -145,15 +137,15 @@ class Sitl:
         self._lost_servo: ServoModel | None = None
 
     def _make_plant(self) -> None:
-        vehicle, config, start = self._vehicle, self._config, self._start
-        pose = (start.position_m, start.yaw_rad, start.arm_rad)
+        vehicle, config = self._vehicle, self._config
         # In lockstep as in the fast closed loop: cameras expose at the end of a step, and all else happens there, too.
         between_steps = self._keeper is None
-        self.plant = Plant(vehicle, config, self.autopilot, self.servos, pose, between_steps=between_steps)
-        self.autopilot.attach(self.plant.world)
+        self.plant = Plant(vehicle, config, self.autopilot, self.servos, self._start, between_steps=between_steps)
+        self.autopilot.attach(self.plant.machine)
         self.faults = Faults(
             config,
-            self.plant.world,
+            self.plant.scene,
+            self.plant.machine,
             self.autopilot.fault_target,
             [servo.drive for servo in self.servos],
             vehicle.tether,
@@ -367,7 +359,7 @@ class Sitl:
             self.modes.append((plant.t_s, mode, armed))
         if self.flight.watch(plant.t_s, *observed, armed):
             self.flight.sample(plant.truth.position_world_m, plant.truth.attitude_wxyz)
-        for event in plant.world.take_events():
+        for event in plant.scene.take_events():
             self._on_message(WorldEvent(event.kind, event.t_s))
         at_rest = not armed
         if at_rest != self._at_rest:
@@ -375,16 +367,16 @@ class Sitl:
             self._on_message(WorldAtRest(at_rest))
 
     def _hold_arm(self, hand: ArmHandling) -> None:
-        servos, world = self.servos, self.plant.world
+        servos, machine = self.servos, self.plant.machine
         held = hand.angles_rad(
             self.plant.t_s,
             not any(servo.drive.torque_on for servo in servos),
-            tuple(world.q[index] for index in world.layout.joint_q),
+            tuple(machine.q[index] for index in machine.layout.joint_q),
             max(servo.lights for servo in servos),
             any(servo.lit for servo in servos),
         )
         if held is not None:
-            world.hold_arm(held)
+            machine.hold_arm(held)
 
     def _publish(self, frame: MocapFrame, t_s: float) -> None:
         self._sent_frame = True
@@ -443,7 +435,7 @@ class Sitl:
         if self.faults.begun_s is None or plant.t_s < self._course_due_s:
             return
         self._course_due_s = plant.t_s + COURSE_PERIOD_S
-        self.course.append(sample(plant.world, self._vehicle.tether))
+        self.course.append(sample(plant.machine, self._vehicle.tether))
 
     def ground_truth(self) -> dict[str, Any]:
         """Return the true course of a flight with faults, for a campaign's table (file `world.json`)."""
@@ -458,8 +450,8 @@ class Sitl:
 
     def final(self) -> dict[str, Any]:
         """Return the world's report at the end of a flight, for `summary.json`."""
-        world, armed = self.plant.world, self.plant.armed_t_s
-        caught = world.payload.caught_t_s
+        machine, armed, payload = self.plant.machine, self.plant.armed_t_s, self.plant.scene.payload
+        caught = payload.caught_t_s
 
         def since_arming(t_s: float | None) -> float | None:
             return None if t_s is None or armed is None else t_s - armed
@@ -468,19 +460,14 @@ class Sitl:
             "autopilot": self.autopilot.about(),
             "payload_kg": self._config.payload_kg,
             "knobs": self._config.model_dump(mode="json"),
-            "thrown": world.payload.thrown_t_s is not None,
+            "thrown": payload.thrown_t_s is not None,
             "caught": caught is not None,
             "caught_after_arming_s": since_arming(caught),
-            "missed": world.payload.missed,
-            "throws": world.payload.throws,
-            "catches": world.payload.catches,
-            "crashed": world.crashed,
-            "contact": world.surfaces.report() if world.surfaces is not None else None,
+            "missed": payload.missed,
+            "throws": payload.throws,
+            "catches": payload.catches,
+            "crashed": machine.crashed,
+            "contact": machine.contact.report() if machine.contact is not None else None,
             "slipped_s": self.slipped_s,
             "flight_fault": self.flight.report(),
         }
-
-
-def start_of(position_m: Vec2, yaw_deg: float, arm_deg: Joints) -> Start:
-    """Return a start pose, given a mission's angles in degrees."""
-    return Start(position_m, math.radians(yaw_deg), tuple(map(math.radians, arm_deg)))

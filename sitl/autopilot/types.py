@@ -5,9 +5,10 @@ The records are named tuples: they are created at 250 Hz, and a named tuple cost
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from companion.model.types import Quat, Vec3
+from sitl.autopilot.modes import NavState
 
 
 class ImuSample(NamedTuple):
@@ -65,3 +66,17 @@ class AttitudeTarget(NamedTuple):
 
 RotorCommands = tuple[float, ...]
 """Normalised rotor commands in PX4's order."""
+
+
+class FaultTarget(Protocol):
+    """An autopilot on which faults act (`sitl.autopilot.autopilot.Px4Stub`)."""
+
+    refuses_offboard: bool
+    refuses_arming: bool
+    kill_switch: bool
+
+    def reboot(self, for_s: float) -> None:
+        """Restart the autopilot; it runs again after `for_s`."""
+
+    def pilot_sets_mode(self, state: NavState) -> None:
+        """Change the mode as a pilot does by radio control."""

@@ -18,9 +18,9 @@ from sitl.autopilot.autopilot import Px4Stub, gains_from_params
 from sitl.autopilot.cascade import Cascade
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.params import Params
-from sitl.server import start_of
+from sitl.plant import Plant
 from sitl.servo.drive import ServoDrive
-from sitl.world.plant import Plant
+from sitl.world.start import start_of
 from tests.support import CATCH
 
 TICK_S = 0.005
@@ -42,8 +42,7 @@ class Standing:
         self.px4 = Px4Stub(params, Estimator(), Cascade(gains_from_params(params)))
         pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
         drives = [ServoDrive() for _ in config.vehicle.arm.joints]
-        where = (pose.position_m, pose.yaw_rad, pose.arm_rad)
-        self.plant = Plant(config.vehicle, config.world, self.px4, drives, where)
+        self.plant = Plant(config.vehicle, config.world, self.px4, drives, pose)
         self._pose: MocapPose | None = None
 
     def samples(self, until_s: float) -> Iterator[HandSample]:

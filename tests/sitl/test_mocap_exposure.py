@@ -6,7 +6,7 @@ import pytest
 
 from companion.model.frames import quat_conjugate, quat_multiply
 from companion.model.types import Quat, Vec3
-from sitl.world.plant import MocapFrame
+from sitl.plant import MocapFrame
 from tests.preflight.hand_rig import world
 from tests.sitl.plants import plant_of
 

@@ -13,9 +13,9 @@ from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.model import base_mass_kg
-from sitl.world.world import PHYSICS_DT_S, World
+from sitl.world.state import PHYSICS_DT_S
 from tests.pinocchio_or_skip import pin
-from tests.sitl.plants import run
+from tests.sitl.plants import OneMachine, run
 from tests.support import tether_of, tool_of
 
 Array = NDArray[np.float64]
@@ -65,8 +65,8 @@ def random_state(rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def test_mass_coriolis_gravity_and_jacobian_agree_with_pinocchio(vehicle: Vehicle) -> None:
-    world = World(vehicle, NO_PAYLOAD, (0.0, 0.0), 0.0, ARM_START)
-    world.release_arm()
+    world = OneMachine(vehicle, NO_PAYLOAD, (0.0, 0.0), 0.0, ARM_START)
+    world.machine.release_arm()
     m, d = world.model, world.data
     model = oracle(vehicle)
     data = model.createData()
@@ -110,8 +110,8 @@ def test_mass_coriolis_gravity_and_jacobian_agree_with_pinocchio(vehicle: Vehicl
 def test_the_catch_conserves_momentum(vehicle: Vehicle, payload_kg: float) -> None:
     """In weightlessness, without air: total linear momentum before and after the catch."""
     config = NO_PAYLOAD.model_copy(update={"payload_kg": payload_kg})
-    world = World(vehicle, config, (0.0, 0.0), 0.0, ARM_START)
-    world.release_arm()
+    world = OneMachine(vehicle, config, (0.0, 0.0), 0.0, ARM_START)
+    world.machine.release_arm()
     m, d = world.model, world.data
     m.opt.gravity[:] = 0
     d.qpos[2] = 1.5
@@ -139,13 +139,13 @@ def test_the_catch_conserves_momentum(vehicle: Vehicle, payload_kg: float) -> No
 
 
 def test_a_taut_tether_pulls_and_a_slack_one_does_not(vehicle: Vehicle) -> None:
-    world = World(vehicle, NO_PAYLOAD, (0.0, 0.0), 0.0, ARM_START)
-    hover = world.hover_command * 1.3
+    world = OneMachine(vehicle, NO_PAYLOAD, (0.0, 0.0), 0.0, ARM_START)
+    hover = world.machine.hover_command * 1.3
     rotors = (hover, hover, hover, hover)
     tension = []
     for _ in range(int(2.5 / PHYSICS_DT_S)):
-        world.step(rotors, (0, 0), False)
-        truth = world.truth()
+        world.fly(rotors, (0, 0), False)
+        truth = world.machine.truth()
         tension.append(truth.tether_tension_n)
         away = math.dist(truth.position_world_m, tether_of(vehicle).anchor_world_m)
         assert away < tether_of(vehicle).length_m + 0.1

@@ -87,8 +87,10 @@ TOGETHER: dict[str, Settings] = {
 }
 """Further settings of both worlds that make the setting act early in a flight."""
 
-BESIDE_PART: dict[str, Settings] = {"net": {"catch_at_m": (0.2, 0.0)}}
-"""Settings of both worlds beside a part: at this place the short catch does not accelerate, and the throw meets the net's middle."""
+BESIDE_PART: dict[str, Settings] = {"net": {"catch_at_m": (0.2, 0.0)}, "thrower": {"seed": 7}}
+"""Settings of both worlds beside a part: at this place the short catch does not accelerate, and the throw meets the net's middle; the
+throw with this seed is caught.
+"""
 
 TOGETHER_IN_PART: dict[str, Settings] = {
     "faults.phase": {"t_s": None, "phase": "line"},
