@@ -114,7 +114,10 @@ class Surfaces:
 
     def set_friction(self, number: int, friction: float) -> None:
         """Change a surface's coefficient of friction."""
-        self._model.pair_friction[number :: len(self.placed), 0:2] = friction
+        model = self._model
+        for pair in range(model.npair):
+            if self._geoms[number] in (model.pair_geom1[pair], model.pair_geom2[pair]):
+                model.pair_friction[pair, 0:2] = friction
 
     def give_way(self, number: int) -> None:
         """Remove a surface."""

@@ -121,6 +121,9 @@ def test_the_tip_sticks_below_the_friction_cone_and_slides_above_it(stiffness_n_
     assert math.hypot(y, z) == pytest.approx(MU * -x, rel=0.01)
     assert y < 0.0
     assert contact(slides)[0][1] > 0.003
+    touch(stuck).surfaces.set_friction(0, 0.1)
+    x, y, z = pushed(stuck, (5.0, 0.8 * MU * 5.0, 0.0), 0.06)[-1]
+    assert math.hypot(y, z) == pytest.approx(-0.1 * x, rel=0.01)
 
 
 def test_the_force_sensor_feels_the_contact_and_the_lever_of_the_rod() -> None:
