@@ -20,8 +20,7 @@ from companion.sitl_config.faults import Fault, FaultKind
 from companion.sitl_config.per_joint import of_joints
 from companion.sitl_config.world import Push, Servo
 from companion.sitl_config.world import World as WorldConfig
-from sitl.autopilot.autopilot import Battery
-from sitl.autopilot.types import ImuSample, RotorCommands
+from sitl.autopilot.types import Battery, ImuSample, RotorCommands
 from sitl.faults.injector import Faults
 from sitl.servo.from_config import torque_constants_nm_a
 from sitl.world.effects.force_sensor import ForceSensor

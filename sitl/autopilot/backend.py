@@ -12,13 +12,13 @@ from companion.config.airframe import Airframe
 from companion.px4.rotors import geometry_of
 from companion.sitl_config.effects.imu import Imu
 from companion.sitl_config.world import World as WorldConfig
-from sitl.autopilot.autopilot import Battery, Px4Stub, gains_from_params
-from sitl.autopilot.cascade import Cascade
+from sitl.autopilot.autopilot import Px4Stub
+from sitl.autopilot.cascade import Cascade, gains_from_params
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.mavlink import GROUND_PORTS, VISION_PORTS, MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Params, mav_type
-from sitl.autopilot.types import FaultTarget, ImuSample, LearnedBias, RotorCommands
+from sitl.autopilot.types import Battery, FaultTarget, ImuSample, LearnedBias, RotorCommands
 from sitl.udp import Address
 from sitl.world.machine import Machine
 

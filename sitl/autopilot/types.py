@@ -64,6 +64,18 @@ class AttitudeTarget(NamedTuple):
     yaw_rate_rad_s: float = 0.0
 
 
+class Battery(NamedTuple):
+    """Measurement of the power module."""
+
+    voltage_v: float = 16.2
+    current_a: float = 0.5
+    remaining: float = 1.0
+    """State of charge, 0 to 1."""
+    consumed_mah: float = 0.0
+
+
+Command7 = tuple[float, float, float, float, float, float, float]
+"""param1 to param7 of a MAV_CMD."""
 RotorCommands = tuple[float, ...]
 """Normalised rotor commands in PX4's order."""
 

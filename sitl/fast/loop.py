@@ -39,11 +39,10 @@ from companion.model.types import (
 )
 from companion.sitl_config.faults import FaultKind
 from companion.sitl_config.loader import SitlConfig
-from sitl.autopilot.autopilot import Command7
 from sitl.autopilot.backend import LINK_DELAY_S, set_hover_thrust, stub_of
 from sitl.autopilot.commander import FORCE_MAGIC, Command
 from sitl.autopilot.modes import NavState
-from sitl.autopilot.types import AttitudeTarget
+from sitl.autopilot.types import AttitudeTarget, Command7
 from sitl.fast.bus import FastBus, scales_of
 from sitl.fast.guardian import TAKE_OVER_S, FastGuardian, Landing
 from sitl.fast.link import FastLink

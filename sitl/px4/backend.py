@@ -15,11 +15,10 @@ from companion.config.airframe import Airframe
 from companion.px4.versions import varies
 from companion.sitl_config.faults import FaultKind
 from companion.sitl_config.world import World as WorldConfig
-from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.backend import Observation
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Value
-from sitl.autopilot.types import FaultTarget, ImuSample, RotorCommands
+from sitl.autopilot.types import Battery, FaultTarget, ImuSample, RotorCommands
 from sitl.px4.control_link import ControlLink, Version, same
 from sitl.px4.hil_link import HilSensors, Px4Error, SimulatorLink
 from sitl.px4.parameter_file import restore, stored

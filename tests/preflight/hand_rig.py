@@ -14,8 +14,8 @@ from companion.model.frames import (
 from companion.model.types import MocapPose, VehicleState
 from companion.preflight.hand_test.steps import HandSample
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.autopilot.autopilot import Px4Stub, gains_from_params
-from sitl.autopilot.cascade import Cascade
+from sitl.autopilot.autopilot import Px4Stub
+from sitl.autopilot.cascade import Cascade, gains_from_params
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.params import Params
 from sitl.plant import Plant

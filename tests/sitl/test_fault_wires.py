@@ -16,7 +16,8 @@ from sitl.autopilot.backend import StubBackend
 from sitl.autopilot.mavlink import Ports as LinkPorts
 from sitl.fast.link import FastLink
 from sitl.fast.loop import FastFlight
-from sitl.server import OTHER_PROCESS_FAULTS, Ports, Sitl
+from sitl.faults.processes import OTHER_PROCESS_FAULTS
+from sitl.server import Ports, Sitl
 from sitl.world.start import start_of
 from tests.support import CATCH
 
@@ -30,7 +31,7 @@ def test_the_server_begins_and_ends_each_fault_of_a_wire_or_a_process(monkeypatc
         struck.append(kind)
         return True
 
-    monkeypatch.setattr("sitl.server.inject_process_fault", strike)
+    monkeypatch.setattr("sitl.faults.processes.inject_process_fault", strike)
     kinds = ("link_loss", "link_delay", "bus_noise", "bus_delay", "force_loss", "servo_loss", "clock_step")
     sizes = {"link_delay": 0.05, "bus_noise": 1.0, "bus_delay": 0.02, "clock_step": 5.0}
     common = {"after": "start", "t_s": 0.01, "duration_s": 0.02}

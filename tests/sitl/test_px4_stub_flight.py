@@ -9,9 +9,9 @@ from functools import cache
 import pytest
 
 from companion.model.frames import quat_from_euler_zyx, tilt_rad
-from sitl.autopilot.autopilot import Origin
 from sitl.autopilot.commander import Command, Result
 from sitl.autopilot.modes import NavState
+from sitl.autopilot.origin import Origin
 from sitl.autopilot.setpoints import PositionTarget, RateTarget
 from sitl.autopilot.types import AttitudeTarget
 from tests.sitl.px4_rig import PERIOD_S, Rig
