@@ -166,7 +166,7 @@ class Plant:
         self._seed_noise()
         self._mocap_noise_rad = math.radians(config.mocap_noise_deg)
         self._misalignment = MocapMisalignment.of(config)
-        self._handling = Handling(config, self.machine.weight_n) if config.hand else None
+        self._handling = Handling(config, self.machine.weight_n) if config.handling else None
         self._weight = HungWeight(config) if config.net_weight_kg > 0.0 else None
         self.force_is_read = True
         """Whether the force sensor is being read; always true in the fast closed loop."""

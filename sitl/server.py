@@ -109,7 +109,7 @@ class Sitl:
         """The emulated force sensor; None if the vehicle has none, or while the links are not open."""
         other = config.mocap_other_id
         self._others = () if other is None else ((other, OTHER_BODY),)
-        self._arm_handling = ArmHandling(vehicle.arm, start.arm_rad) if config.arm_hand and self.servos else None
+        self._arm_handling = ArmHandling(vehicle.arm, start.arm_rad) if config.arm_handling and self.servos else None
         self.flight = ProcessFaults()
         self._course = TrueCourse()
         self._ports = ports

@@ -142,7 +142,7 @@ def test_another_seed_draws_the_laboratory_anew_but_keeps_what_was_set(file: str
         ("wind_m_s: [0, {uniform: [1, 1]}, 0]", "1:15: wind_m_s[1]: uniform: expected [low, high] with low < high, got [1, 1]"),
         ("throws: {uniform: [1, 5]}", "1:9: throws: expected a whole number from 1 to 1000, got a mapping"),
         ("rotor_lg_s: {uniform: [1, 5]}", "1:1: rotor_lg_s: unknown key; did you mean rotor_lag_s?"),
-        ("hand: {uniform: [0, 1]}", "1:7: hand: expected true or false, got a mapping"),
+        ("handling: {uniform: [0, 1]}", "1:11: handling: expected true or false, got a mapping"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_reported_once_with_its_place_whatever_the_seed(tmp_path: Path, text: str, line: str) -> None:

@@ -28,7 +28,7 @@ TICK_S = 0.005
 
 def world(*overrides: str) -> SitlConfig:
     """The catch mission's machine with its world set otherwise, nothing thrown, a hand that begins after 4 s."""
-    words = ["world.payload_kg=0", "world.hand_t_s=4", *(f"world.{text}" for text in overrides)]
+    words = ["world.payload_kg=0", "world.handling_t_s=4", *(f"world.{text}" for text in overrides)]
     return load_sitl(CATCH, overrides=words)
 
 

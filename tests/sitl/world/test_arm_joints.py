@@ -295,7 +295,7 @@ def test_a_vehicle_with_any_number_of_joints_and_any_axes_flies(joints: int, mis
 
 
 def test_without_an_arm_the_server_opens_no_servo_bus_and_no_force_sensor() -> None:
-    config = WorldConfig(payload_kg=0.0, arm_hand=True, faults=(Fault(kind="gust", t_s=0.0, after="start"),))
+    config = WorldConfig(payload_kg=0.0, arm_handling=True, faults=(Fault(kind="gust", t_s=0.0, after="start"),))
     server = Sitl(vehicle_with_joints(0), config, start_of((0.0, 0.0), 0.0, ()), Ports(), lambda _: None)
 
     async def served() -> set[str]:
