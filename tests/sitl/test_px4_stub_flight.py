@@ -155,18 +155,6 @@ def test_offboard_follows_position_and_velocity_setpoints() -> None:
     assert rig.plant.velocity_ned_m_s == pytest.approx((0.3, 0.0, 0.0), abs=0.08)
 
 
-def test_offboard_loss_lands_after_com_of_loss_t() -> None:
-    rig = hovering(COM_OF_LOSS_T=0.3)
-    stream(rig, 0.3, AttitudeTarget(LEVEL, HOVER))
-    rig.mode(6)
-    stream(rig, 0.5, AttitudeTarget(LEVEL, HOVER))
-    last_s = rig.t_s
-    run_until(rig, lambda: rig.stub.nav_state is NavState.LAND, 2.0)
-    assert rig.t_s - last_s == pytest.approx(0.35, abs=0.04)
-    run_until(rig, lambda: not rig.stub.armed, 20.0)
-    assert rig.stub.nav_state is NavState.OFFBOARD, "as PX4: back in the mode of before"
-
-
 def test_land_without_mocap_descends_blindly_to_the_ground() -> None:
     rig = hovering(MPC_LAND_SPEED=0.3)
     rig.vision = False

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.model.types import Outcome, Outputs
+from companion.model.types import Outcome
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from sitl.plant import Plant
@@ -52,10 +52,6 @@ def events(result: FastResult) -> list[tuple[str, float]]:
     return [(event.id, event.t_s - begun_s) for output in result.outputs for event in output.events]
 
 
-def at(result: FastResult, mission_t_s: float) -> Outputs:
-    return next(output for output in result.outputs if output.mission_t_s >= mission_t_s)
-
-
 def test_each_pass_catches_a_throw_until_all_are_thrown() -> None:
     result, payload = repeated("mission.repeat=3", "world.throws=2")
     assert result.outputs[-1].outcome is Outcome.COMPLETED
@@ -81,14 +77,6 @@ def test_the_second_catch_is_flown_as_well_as_the_first() -> None:
             )
         )
     assert worst[1] < 1.5 * worst[0]
-
-
-def test_the_phase_says_which_repetition_it_is() -> None:
-    result, _ = repeated("mission.repeat=3", "world.throws=2")
-    assert at(result, 1.0).phase == "take-off"
-    assert at(result, CATCH_S).phase == "catch (1 of 3)"
-    assert at(result, CATCH_S + 2 * PERIOD_S).phase == "catch (3 of 3)"
-    assert "land" in {output.phase for output in result.outputs}
 
 
 def test_the_committed_soak_mission_catches_in_the_fast_loop() -> None:

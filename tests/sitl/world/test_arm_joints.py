@@ -18,7 +18,6 @@ from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import dynamics_of, manipulator_of
 from companion.control.dynamics import euler_rate_matrices
-from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, rotation_matrix
 from companion.model.types import Joints, Outcome, Severity
 from companion.sitl_config.effects.compliance import Compliance
@@ -95,7 +94,7 @@ def free(vehicle: Vehicle, config: WorldConfig = NO_FRICTION) -> OneMachine:
 
 @pytest.mark.parametrize(
     "vehicle",
-    [vehicle_with_joints(joints) for joints in (0, 1, 3, 4)]
+    [load_vehicle("tarot650_2r"), *(vehicle_with_joints(joints) for joints in (0, 1, 3, 4))]
     + [with_random_links(joints, np.random.default_rng(joints)) for joints in (1, 2, 3, 4)]
     + [with_rod(with_random_links(3, np.random.default_rng(7))), load_vehicle("configs/vehicles/tarot650_2r_rod.yaml")],
     ids=lambda vehicle: (
@@ -306,21 +305,3 @@ def test_without_an_arm_the_server_opens_no_servo_bus_and_no_force_sensor() -> N
 
     assert asyncio.run(served()) == {"autopilot", "mocap"}
     assert server.plant.t_s == pytest.approx(0.01)
-
-
-def test_a_level_vehicle_holds_each_joint_against_the_weight_of_the_links_beyond_it() -> None:
-    vehicle = vehicle_with_joints(3)
-    arm, world = vehicle.arm, free(vehicle)
-    alpha = (1.7, 0.6, -0.4)
-    world.data.qpos[list(world.machine.layout.joint_q)] = alpha
-    mujoco.mj_forward(world.model, world.data)
-    pitch = [alpha[0], alpha[0] - alpha[1], alpha[0] - alpha[1] - alpha[2]]  # of each link, below the body's x axis
-    joint_m = np.concatenate(
-        [[0.0], np.cumsum([length * math.cos(p) for length, p in zip(arm.link_lengths_m, pitch, strict=True)])]
-    )
-    centre_m = [x + c * math.cos(p) for x, c, p in zip(joint_m, arm.link_com_m, pitch, strict=False)]
-    masses_kg, places_m = [*arm.link_masses_kg, vehicle.tool_mass_kg], [*centre_m, joint_m[3]]
-    for joint, sign in enumerate((1.0, -1.0, -1.0)):
-        beyond = zip(masses_kg[joint:], places_m[joint:], strict=True)
-        held_nm = -sign * GRAVITY_M_S2 * sum(mass * (place - joint_m[joint]) for mass, place in beyond)
-        assert world.data.qfrc_bias[6 + joint] == pytest.approx(held_nm, abs=1e-9)
