@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             changes = [f"world.seed={seed}", f"world.payload_kg={payload_kg}", "vehicle.force_source=observer"]
             flight = FastFlight(load_sitl(MISSIONS / f"{mission}.yaml", overrides=[*changes, *options.set]))
             result = flight.run()
-            caught_s = flight.plant.world.payload.caught_t_s
+            caught_s = flight.plant.scene.payload.caught_t_s
             for part, error in zip(parts, errors(result, np.inf if caught_s is None else caught_s), strict=True):
                 part.append(error)
             outcome = result.outputs[-1].outcome

@@ -87,7 +87,7 @@ def flown(mission: str, seed: int, *, respond: bool = True) -> Flown:
 def truth_of(fast: FastFlight, found: Identification) -> dict[str, float]:
     """Return what the world knows of the quantities."""
     config, plant = fast.config, fast.plant
-    world, vehicle, weight_n = config.world, config.vehicle, plant.world.weight_n
+    world, vehicle, weight_n = config.world, config.vehicle, plant.machine.weight_n
     truth = {"mocap_delay_s": world.mocap_latency_s + world.mocap.delivery_jitter_s}
     truth["drag_1_s"] = world.rotors.drag_s_m * GRAVITY_M_S2 + BODY_DRAG_N_PER_M_S * GRAVITY_M_S2 / weight_n
     if found.hover is not None and found.hover.voltage_mean_v is not None:
@@ -97,7 +97,7 @@ def truth_of(fast: FastFlight, found: Identification) -> dict[str, float]:
         share = (found.hover.voltage_mean_v / world.battery.full_thrust_v) ** 2
         full_n = vehicle.airframe.thrust_max_n / layout.count * share
         truth["hover_thrust"] = rotors.hover_command(each_n, full_n, world.thr_mdl_fac)
-    if plant.world.payload.caught_t_s is not None:
+    if plant.scene.payload.caught_t_s is not None:
         truth["payload_kg"] = world.payload_kg
     return truth | _servo_truth(world, config, found)
 

@@ -75,9 +75,9 @@ def flown(seed: int, mission: str = "press", datum: bool = False, more: Sequence
         sets.append(f"world.mocap.pivot_offset_m={json.dumps(_moved_pivot_m(seed))}")
     flight = FastFlight(load_sitl(f"configs/missions/{mission}.yaml", world="lab", overrides=sets))
     result = flight.run(300.0)
-    surfaces, layout = flight.plant.world.surfaces, result.layout
-    assert surfaces is not None and layout is not None
-    placed = surfaces.placed[0]
+    contact, layout = flight.plant.machine.contact, result.layout
+    assert contact is not None and layout is not None
+    placed = contact.surfaces.placed[0]
     contacts = [outputs.contact for outputs in result.outputs]
     true_n = np.array([layout.contact(snapshot.sensors)[1] for snapshot in result.snapshots]) @ np.array(placed.normal)
     measured_n = np.array([math.nan if c is None else c.force_n for c in contacts])
@@ -98,10 +98,10 @@ def flown(seed: int, mission: str = "press", datum: bool = False, more: Sequence
         else _error(measured_n[steady], most_n),
         largest_true_n=float(true_n[pressing].max(initial=0.0)),
         largest_measured_n=float(measured_n[pressing].max(initial=0.0)),
-        largest_in_flight_n=surfaces.force_max_n,
+        largest_in_flight_n=contact.force_max_n,
         beside_mm=math.nan if beside_m is None else 1e3 * beside_m,
         events=" ".join(e.id for o in result.outputs for e in o.events if e.severity is not Severity.INFO),
-        rotor_distance_m=surfaces.rotor_distance_min_m,
+        rotor_distance_m=contact.rotor_distance_min_m,
         normal_error_deg=math.nan
         if found is None
         else math.degrees(math.acos(min(1.0, float(np.dot(found.normal_world, placed.normal))))),
@@ -118,8 +118,8 @@ def _moved_pivot_m(seed: int) -> list[float]:
         flight = FastFlight(load_sitl(PROBE, world="lab", overrides=sets))
         outputs = reversed(flight.run(300.0).outputs)
         found = next(o.contact.surface for o in outputs if o.contact and o.contact.surface)
-        assert flight.plant.world.surfaces is not None
-        placed = flight.plant.world.surfaces.placed[0]
+        assert flight.plant.scene.surfaces is not None
+        placed = flight.plant.scene.surfaces.placed[0]
         probes.append(Probed(placed.normal, math.radians(yaw_deg), placed.local_m(found.point_world_m)[2]))
     pivot_m = flight.config.world.mocap.pivot_offset_m
     return [at - off for at, off in zip(pivot_m, tip_off_m(probes), strict=True)]

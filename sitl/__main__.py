@@ -37,7 +37,8 @@ from sitl.faults.timing import FaultError, with_fault_times
 from sitl.lockstep import LockstepLoop, TimeKeeper
 from sitl.px4.backend import RealPx4
 from sitl.px4.hil_link import Px4Error
-from sitl.server import Ports, Sitl, start_of
+from sitl.server import Ports, Sitl
+from sitl.world.start import start_of
 
 _STANDARD = Ports(autopilot_local=14580, autopilot_remote=14540, mocap_command=1510, mocap_data=1511, multicast=True)
 

@@ -12,8 +12,8 @@ from typing import Self
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.model.frames import attitude_ned_frd_from_enu_flu, euler_zyx_from_quat, ned_from_enu
+from sitl.plant import MocapFrame
 from sitl.udp import Address, UdpEndpoint
-from sitl.world.plant import MocapFrame
 
 _COVARIANCE_FROM_PARAMS = [math.nan] * 21
 

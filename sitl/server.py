@@ -8,43 +8,39 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import math
 import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from typing import Any
 
-from companion.config.device_plugins import DYNAMIXEL, NATNET, RFT60
 from companion.config.vehicle import Vehicle
 from companion.model.launcher_messages import WorldAtRest, WorldEvent, WorldMessage, WorldProgress, WorldSlipped
-from companion.model.types import IDENTITY_QUAT, Joints, Vec2
-from companion.sitl_config.faults import FaultKind
+from companion.model.types import IDENTITY_QUAT
 from companion.sitl_config.world import World as WorldConfig
+from sitl.addresses import replaced, settings_of
 from sitl.autopilot.backend import AutopilotBackend, StubBackend
 from sitl.autopilot.mavlink import Ports as LinkPorts
 from sitl.external_vision import ExternalVision
-from sitl.faults.injector import Faults, Sample, sample
-from sitl.faults.processes import SIGNALS, ProcessFaults, environment, inject_process_fault
+from sitl.faults.injector import Faults
+from sitl.faults.processes import SIGNALS, ProcessFaults, environment
 from sitl.force_torque import ForceTorqueServer
 from sitl.lockstep import CATCH_UP_S, LockstepLoop, TimeKeeper
 from sitl.natnet import OTHER_BODY, OTHER_PLACE_M, BodyPose, NatNetServer
+from sitl.plant import MocapFrame, Plant
 from sitl.px4.hil_link import Px4Error
+from sitl.record import TrueCourse, final_report
 from sitl.servo.bus import ServoBus
 from sitl.servo.from_config import plugged_in, servos_of
 from sitl.servo.model import ServoModel
 from sitl.world.arm_handling import ArmHandling
-from sitl.world.plant import MocapFrame, Plant
-from sitl.world.world import PHYSICS_DT_S
+from sitl.world.start import Start
+from sitl.world.state import PHYSICS_DT_S
 
-COURSE_PERIOD_S, FRAMES_PERIOD_S = 0.01, 0.5
 BEFORE_S = -3600.0
 """Simulated time when a world in lockstep starts; it jumps to zero when the flight begins."""
 BUS_PATIENCE_S = 1.0
 """Wall time that bytes take at most from the companion's end of a serial line to the world's."""
-INJECT_RETRY_S = 0.2
-"""Time between two searches for the target process of a fault."""
-OTHER_PROCESS_FAULTS: tuple[FaultKind, ...] = ("kill_recorder", "kill_guardian", "disk_full")
 _LEAVE_S = 30.0
 SLIP_REPORTED_S = 0.1
 """A world in real time reports its pauses each time that they have grown by this much."""
@@ -62,15 +58,6 @@ class Ports:
     mocap_command: int = 0
     mocap_data: int = 0
     multicast: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """Pose of the vehicle at the start, on the floor."""
-
-    position_m: Vec2
-    yaw_rad: float
-    arm_rad: Joints
 
 
 class Sitl:
@@ -122,17 +109,9 @@ class Sitl:
         """The emulated force sensor; None if the vehicle has none, or while the links are not open."""
         other = config.mocap_other_id
         self._others = () if other is None else ((other, OTHER_BODY),)
-        self._arm_handling = ArmHandling(vehicle.arm, start.arm_rad) if config.arm_hand and self.servos else None
+        self._arm_handling = ArmHandling(vehicle.arm, start.arm_rad) if config.arm_handling and self.servos else None
         self.flight = ProcessFaults()
-        self.course: list[Sample] = []
-        """True position, tilt and tether of the vehicle, sampled from the first fault."""
-        self._course_due_s = 0.0
-        self.frames: list[tuple[int, float]] = []
-        """(number, world time) of some of the motion-capture frames; they relate the clock of a log to world time."""
-        self.modes: list[tuple[float, str | None, bool]] = []
-        """(world time, mode, armed) at every change of the autopilot's state."""
-        self._injected: set[FaultKind] = set()
-        self._inject_due_s = 0.0
+        self._course = TrueCourse()
         self._ports = ports
         self.slipped_s = self._slip_reported_s = 0.0
         self._origin_s = 0.0
@@ -145,15 +124,15 @@ class Sitl:
         self._lost_servo: ServoModel | None = None
 
     def _make_plant(self) -> None:
-        vehicle, config, start = self._vehicle, self._config, self._start
-        pose = (start.position_m, start.yaw_rad, start.arm_rad)
+        vehicle, config = self._vehicle, self._config
         # In lockstep as in the fast closed loop: cameras expose at the end of a step, and all else happens there, too.
         between_steps = self._keeper is None
-        self.plant = Plant(vehicle, config, self.autopilot, self.servos, pose, between_steps=between_steps)
-        self.autopilot.attach(self.plant.world)
+        self.plant = Plant(vehicle, config, self.autopilot, self.servos, self._start, between_steps=between_steps)
+        self.autopilot.attach(self.plant.machine)
         self.faults = Faults(
             config,
-            self.plant.world,
+            self.plant.scene,
+            self.plant.machine,
             self.autopilot.fault_target,
             [servo.drive for servo in self.servos],
             vehicle.tether,
@@ -176,10 +155,8 @@ class Sitl:
             self.force.start_over()
         if isinstance(self.mocap, NatNetServer):
             self.mocap.start_over()
-        self.course.clear()
-        self.frames.clear()
-        self.modes.clear()
-        self._course_due_s = self._inject_due_s = 0.0
+        self._course = TrueCourse()
+        self.flight.start_over()
         self._keeper.set(0.0)
 
     @contextlib.asynccontextmanager
@@ -193,27 +170,18 @@ class Sitl:
             if device.force is not None:
                 sensor = ForceTorqueServer(in_lockstep=self._keeper is not None)
                 self.force = await stack.enter_async_context(sensor)
-            addresses: dict[str, dict[str, Any]] = {}
             if not device.mocap.external:
-                self.mocap = server = await stack.enter_async_context(self._natnet_server())
-                addresses["mocap"] = self._mocap_settings(server)
-            addresses["autopilot"] = {"address": await stack.enter_async_context(self.autopilot.wires())}
+                self.mocap = await stack.enter_async_context(self._natnet_server())
+            px4 = await stack.enter_async_context(self.autopilot.wires())
             if device.mocap.external:
-                vision = ExternalVision(self.autopilot.vision_address)
-                self.mocap = await stack.enter_async_context(vision)
-            if self.bus is not None:
-                addresses["arm"] = {"port": self.bus.path}
-                if device.arm is not None and device.arm.type != DYNAMIXEL:
-                    addresses["arm"] |= {"type": DYNAMIXEL, "options": {}}
-            if self.force is not None:
-                addresses["force"] = {"port": self.force.port}
-                if device.force is not None and device.force.type != RFT60:
-                    addresses["force"] |= {"type": RFT60, "options": {}, "rate_hz": self.force.rate_hz}
-            for name in ("mocap", "arm", "force"):
-                if "type" in addresses.get(name, ()):
-                    ours, theirs = addresses[name]["type"], getattr(device, name).type
-                    text = f"devices.{name}.type: the simulated world has a {ours}, which is used in place of {theirs}"
-                    self._on_message(WorldProgress(text))
+                self.mocap = await stack.enter_async_context(ExternalVision(self.autopilot.vision_address))
+            natnet = self.mocap if isinstance(self.mocap, NatNetServer) else None
+            rate_hz, multicast = self._config.mocap_rate_hz, self._ports.multicast
+            addresses = {"autopilot": {"address": px4}} | settings_of(
+                device, natnet, rate_hz, multicast, self.bus, self.force
+            )
+            for text in replaced(device, addresses):
+                self._on_message(WorldProgress(text))
             yield addresses
 
     def _natnet_server(self) -> NatNetServer:
@@ -236,21 +204,6 @@ class Sitl:
     @property
     def _ahead_s(self) -> float:
         return 0.0 if self.autopilot.lockstep else self.slipped_s
-
-    def _mocap_settings(self, server: NatNetServer) -> dict[str, Any]:
-        settings: dict[str, Any] = {
-            "server": "127.0.0.1",
-            "interface": "127.0.0.1",
-            "transport": "multicast" if self._ports.multicast else "unicast",
-            "command_port": server.command_port,
-            "up_axis": "z",
-            "rate_hz": self._config.mocap_rate_hz,
-        }
-        if self._vehicle.devices.mocap.type != NATNET:
-            settings |= {"type": NATNET, "options": {}}
-        if self._ports.multicast:
-            settings["data_port"] = server.data_port
-        return settings
 
     def flight_environment(self) -> dict[str, str]:
         """Return the environment variables that the flight process needs for faults that hang it."""
@@ -363,11 +316,10 @@ class Sitl:
         autopilot.pump(plant.t_s, plant.battery())
         observed, armed = autopilot.observe(), autopilot.armed
         mode = None if observed.nav_state is None else observed.nav_state.name
-        if not self.modes or self.modes[-1][1:] != (mode, armed):
-            self.modes.append((plant.t_s, mode, armed))
+        self._course.watch_mode(plant.t_s, mode, armed)
         if self.flight.watch(plant.t_s, *observed, armed):
             self.flight.sample(plant.truth.position_world_m, plant.truth.attitude_wxyz)
-        for event in plant.world.take_events():
+        for event in plant.scene.take_events():
             self._on_message(WorldEvent(event.kind, event.t_s))
         at_rest = not armed
         if at_rest != self._at_rest:
@@ -375,16 +327,16 @@ class Sitl:
             self._on_message(WorldAtRest(at_rest))
 
     def _hold_arm(self, hand: ArmHandling) -> None:
-        servos, world = self.servos, self.plant.world
+        servos, machine = self.servos, self.plant.machine
         held = hand.angles_rad(
             self.plant.t_s,
             not any(servo.drive.torque_on for servo in servos),
-            tuple(world.q[index] for index in world.layout.joint_q),
+            tuple(machine.q[index] for index in machine.layout.joint_q),
             max(servo.lights for servo in servos),
             any(servo.lit for servo in servos),
         )
         if held is not None:
-            world.hold_arm(held)
+            machine.hold_arm(held)
 
     def _publish(self, frame: MocapFrame, t_s: float) -> None:
         self._sent_frame = True
@@ -408,8 +360,9 @@ class Sitl:
                 injected = self.flight.inject(kind, plant.t_s, plant.truth.position_world_m, seen.vision_received)
                 if injected and self._keeper is not None:
                     self._keeper.do_not_wait_for("flight")
-        self._inject_process_faults()
-        self._record_course()
+        self.flight.inject_others(self.faults.active.keys(), plant.t_s)
+        frame = self.mocap.frame_number if isinstance(self.mocap, NatNetServer) else 0
+        self._course.watch(plant, self.faults, self._vehicle.tether, frame)
         down = plant.fault("link_loss") is not None or self.autopilot.down
         self.autopilot.set_link(down, self.faults.size("link_delay"))
         if self.bus is not None:
@@ -425,62 +378,22 @@ class Sitl:
             self._lost_servo.fail_silent(False)
             self._lost_servo = None
 
-    def _inject_process_faults(self) -> None:
-        """Inject each due fault of the recorder and the guardian once, and resume the flight process when its SIGSTOP fault ends."""
-        active, plant = self.faults.active, self.plant
-        due = [kind for kind in OTHER_PROCESS_FAULTS if kind in active and kind not in self._injected]
-        if due and self.flight.pid is not None and plant.t_s >= self._inject_due_s:
-            self._inject_due_s = plant.t_s + INJECT_RETRY_S
-            self._injected.update(kind for kind in due if inject_process_fault(kind, self.flight.pid))
-        if self.flight.kind == "stop_flight" and "stop_flight" not in active and "stop_flight" not in self._injected:
-            self._injected.add("stop_flight")
-            self.flight.resume()
-
-    def _record_course(self) -> None:
-        plant, frame = self.plant, self.mocap.frame_number if isinstance(self.mocap, NatNetServer) else 0
-        if not self.frames or (frame > self.frames[-1][0] and plant.t_s >= self.frames[-1][1] + FRAMES_PERIOD_S):
-            self.frames.append((frame, plant.t_s))
-        if self.faults.begun_s is None or plant.t_s < self._course_due_s:
-            return
-        self._course_due_s = plant.t_s + COURSE_PERIOD_S
-        self.course.append(sample(plant.world, self._vehicle.tether))
-
     def ground_truth(self) -> dict[str, Any]:
         """Return the true course of a flight with faults, for a campaign's table (file `world.json`)."""
         return {
             **self.final(),
             "armed": self.autopilot.armed,
             "fault_begun_s": self.faults.begun_s,
-            "mocap_frames": self.frames,
-            "modes": self.modes,
-            "course": [dataclasses.astuple(point) for point in self.course],
+            **self._course.report(),
         }
 
     def final(self) -> dict[str, Any]:
         """Return the world's report at the end of a flight, for `summary.json`."""
-        world, armed = self.plant.world, self.plant.armed_t_s
-        caught = world.payload.caught_t_s
-
-        def since_arming(t_s: float | None) -> float | None:
-            return None if t_s is None or armed is None else t_s - armed
-
         return {
             "autopilot": self.autopilot.about(),
             "payload_kg": self._config.payload_kg,
             "knobs": self._config.model_dump(mode="json"),
-            "thrown": world.payload.thrown_t_s is not None,
-            "caught": caught is not None,
-            "caught_after_arming_s": since_arming(caught),
-            "missed": world.payload.missed,
-            "throws": world.payload.throws,
-            "catches": world.payload.catches,
-            "crashed": world.crashed,
-            "contact": world.surfaces.report() if world.surfaces is not None else None,
+            **final_report(self.plant),
             "slipped_s": self.slipped_s,
             "flight_fault": self.flight.report(),
         }
-
-
-def start_of(position_m: Vec2, yaw_deg: float, arm_deg: Joints) -> Start:
-    """Return a start pose, given a mission's angles in degrees."""
-    return Start(position_m, math.radians(yaw_deg), tuple(map(math.radians, arm_deg)))

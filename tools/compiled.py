@@ -53,6 +53,7 @@ COMPILED = (
     "sitl/faults/injector.py",
     "sitl/fast/*.py",
     "sitl/force_torque.py",
+    "sitl/plant.py",
     "sitl/servo/*.py",
     "sitl/world/**/*.py",
 )

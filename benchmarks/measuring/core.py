@@ -19,7 +19,8 @@ from companion.model.constants import TICK_PERIOD_S
 from companion.model.types import Inputs, Outcome, Reference
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
-from sitl.world.world import PHYSICS_DT_S, World
+from sitl.plant import Plant
+from sitl.world.state import PHYSICS_DT_S
 from tests.support import CATCH
 from tools.compiled import is_current
 
@@ -41,7 +42,7 @@ def measure(say: Callable[[str], None], repeats: int = REPEATS, mission: Path = 
     tick_us, flight, result = flight_us(load_sitl(mission), repeats)
     plain = flight.config.controller.model_copy(update=NO_LOADS)
     say("core, law, raw MuJoCo")
-    raw_us = raw_step_us(flight.config, flight.plant.world, result, repeats)
+    raw_us = raw_step_us(flight.config, flight.plant, result, repeats)
     return {
         "core_ms": asdict(Latency.of(core_s(flight.config, result.inputs))),
         "tick_us": tick_us,
@@ -93,16 +94,17 @@ def flight_us(config: SitlConfig, repeats: int) -> tuple[float, FastFlight, Fast
     return median(times_us), flight, result
 
 
-def raw_step_us(config: SitlConfig, world: World, result: FastResult, repeats: int) -> float:
+def raw_step_us(config: SitlConfig, plant: Plant, result: FastResult, repeats: int) -> float:
     """Return the CPU time of `mj_step` on the flight's model, in batches from states all along the flight."""
-    model, data = world.model, mujoco.MjData(world.model)
+    model = plant.scene.model
+    data = mujoco.MjData(model)
     snapshots = result.snapshots[:: max(1, len(result.snapshots) // _RAW_STARTS)]
-    hover_n = world.hover_command * config.vehicle.airframe.thrust_max_n / 4.0
+    hover_n = plant.machine.hover_command * config.vehicle.airframe.thrust_max_n / 4.0
     times_us = []
     for _ in range(repeats):
         used_s = 0.0
         for snapshot in snapshots:
-            data.qpos[:], data.qvel[:] = snapshot.q, snapshot.v
+            data.qpos[: len(snapshot.q)], data.qvel[: len(snapshot.v)] = snapshot.q, snapshot.v
             data.ctrl[0:4] = hover_n
             begun_s = time.process_time()
             mujoco.mj_step(model, data, _RAW_STEPS)

@@ -119,6 +119,15 @@ class Document:
                 del origins[known]
             origins[location] = origin
 
+    def rename(self, parent: Location, old: str, new: str) -> None:
+        """Move the value of a key's old spelling to its present one, unless the file has both; an option of the command line wins."""
+        data = self.find(parent)
+        if not isinstance(data, dict) or old not in data:
+            return
+        origin = self.key_origin((*parent, old))
+        if new not in data or origin.line == 0:
+            self.replace((*parent, new), data.pop(old), origin)
+
     def report(self, location: Location, text: str, rank: int = RANK_VALUE) -> None:
         """Add a problem with the value at a location."""
         self.problems.append(Problem(rank, self.origin(location), f"{key_path(location)}: {text}"))

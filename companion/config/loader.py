@@ -30,6 +30,7 @@ from companion.config.document import (
 from companion.config.explain import nearest, validate
 from companion.config.mission import ControllerChoice, Mission
 from companion.config.overrides import Override, Section, apply_overrides, parse_overrides
+from companion.config.phase import phase_classes
 from companion.config.shipped import named_file, near
 from companion.config.urdf import read_urdf
 from companion.config.vehicle import Vehicle
@@ -98,6 +99,7 @@ def load_flight(
     of_vehicle: list[str] = []
     mission_file = read_document(named_file("missions", mission_path, "mission"))
     _override(mission_file, "mission", parsed, lines)
+    _rename_phase_keys(mission_file)
 
     vehicle: Vehicle | None = None
     vehicle_file = _open_named(mission_file, ("vehicle",), vehicle_path, of_vehicle)
@@ -169,6 +171,8 @@ def logged_flight(config_json: str) -> FlightConfig:
         data.pop("world", None)
         if isinstance(data.get("vehicle"), dict):
             _move_keys(Document("log", data["vehicle"]))
+        if isinstance(data.get("mission"), dict):
+            _rename_phase_keys(Document("log", data["mission"]))
     return FlightConfig.model_validate_json(json.dumps(data))
 
 
@@ -210,6 +214,15 @@ def _move_keys(document: Document) -> None:
         if isinstance(old, dict) and isinstance(new, dict) and old_key in old and key not in new:
             document.replace((part, key), old[old_key], document.origin((old_part, old_key)))
             del old[old_key]
+
+
+def _rename_phase_keys(document: Document) -> None:
+    """Replace old spellings of keys in the phases of a mission file or of a log."""
+    phases = document.data.get("phases")
+    for index, phase in enumerate(phases if isinstance(phases, list) else ()):
+        if isinstance(phase, dict) and isinstance(name := phase.get("type"), str):
+            for old, new in getattr(phase_classes().get(name), "renamed", {}).items():
+                document.rename(("phases", index), old, new)
 
 
 def _place_arm(document: Document, vehicle: Vehicle | None) -> None:

@@ -26,6 +26,8 @@ Name = Annotated[str, Field(min_length=1, max_length=60)]
 class PhaseSettings(Model):
     """Keys that every phase has. `companion.mission.phase.Phase` adds what it does."""
 
+    renamed: ClassVar[dict[str, str]] = {}
+    """Old spellings of keys that are still accepted, and the present ones."""
     place: ClassVar[Literal["first", "last"] | None] = None
     """The only place in a mission at which phases of this type can be; None for every place between the first and the last."""
 

@@ -20,9 +20,10 @@ class Path(Phase):
     """Fly through points without stopping, from rest to rest with minimum snap; the arm keeps its pose."""
 
     slow_to_plan: ClassVar[bool] = True
+    renamed: ClassVar[dict[str, str]] = {"through_m": "waypoints_m"}
 
     type: Literal["path"]
-    through_m: Annotated[tuple[Vector3, ...], Field(min_length=1, max_length=30)]
+    waypoints_m: Annotated[tuple[Vector3, ...], Field(min_length=1, max_length=30)]
     """Points of the path in order, with its end but without its start."""
     duration_s: Duration | None = None
     """Duration. If it is absent, the shortest duration that the limits allow is used."""
@@ -30,18 +31,18 @@ class Path(Phase):
     @property
     def description(self) -> str:
         """What the phase does, for a phase without a name."""
-        return f"path to ({', '.join(f'{value:g}' for value in self.through_m[-1])}) m"
+        return f"path to ({', '.join(f'{value:g}' for value in self.waypoints_m[-1])}) m"
 
     def points_m(self, start_m: Vector2) -> tuple[Vector3, ...]:
         """Return the points of the path."""
-        return self.through_m
+        return self.waypoints_m
 
     def way_problems(self, from_m: Vector3) -> list[tuple[Location, str]]:
         """Return the points that repeat the one before them."""
         text = f"repeats the previous point of the path; points must be {POINTS_APART_M:g} m apart or more"
-        pairs = enumerate(pairwise((from_m, *self.through_m)))
-        return [(("through_m", number), text) for number, (a, b) in pairs if math.dist(a, b) < POINTS_APART_M]
+        pairs = enumerate(pairwise((from_m, *self.waypoints_m)))
+        return [(("waypoints_m", number), text) for number, (a, b) in pairs if math.dist(a, b) < POINTS_APART_M]
 
     def plan(self, p: Planning) -> None:
         """Append the path."""
-        p.builder.t_s += p.builder.follow(self.through_m, self.duration_s, p.limits, p.progress)
+        p.builder.t_s += p.builder.follow(self.waypoints_m, self.duration_s, p.limits, p.progress)

@@ -23,6 +23,14 @@ WORLDS = names("worlds")
 """Names of the built-in worlds."""
 DEFAULT_WORLD = "ideal"
 """The world of a configuration that names none."""
+RENAMED = {
+    "hand": "handling",
+    "hand_t_s": "handling_t_s",
+    "hand_taps": "handling_taps",
+    "hand_tap_n": "handling_tap_n",
+    "arm_hand": "arm_handling",
+}
+"""Old spellings of keys that are still accepted, and the present ones."""
 COMMAND_LINE_WORLD = "lab"
 """The world of a simulated flight or campaign whose command names none."""
 
@@ -126,6 +134,8 @@ def load_world(
     """
     document = _extended(read_document(named_file("worlds", world, "--world")))
     apply_overrides(document, "world", parse_overrides(overrides))
+    for old, new in RENAMED.items():
+        document.rename((), old, new)
     repeat_for_joints(document, joints)
     repeat_for_rotors(document, rotors)
     ranges = take_ranges(document)

@@ -143,7 +143,7 @@ class World(Model):
     """Settings of the servos, from the shoulder outwards. Servos that are not listed have the defaults of `Servo`; surplus settings are
     ignored. null for the defaults.
     """
-    arm_hand: bool = False
+    arm_handling: bool = False
     """Whether a simulated user holds the limp arm and, whenever a servo's LED is switched on, moves it as `companion arm zero`
     requests.
     """
@@ -172,13 +172,13 @@ class World(Model):
     """Errors of the rigid body's streamed roll and pitch."""
     mocap_other_id: Annotated[int, Field(ge=0)] | None = None
     """Streaming id of another rigid body, which lies on the floor; null for none."""
-    hand: bool = False
+    handling: bool = False
     """Whether a simulated user repeatedly carries the vehicle through the guided hand test, with the rotors off."""
-    hand_t_s: NonNegative = 20.0
+    handling_t_s: NonNegative = 20.0
     """World time at which the first hand test begins."""
-    hand_taps: Annotated[int, Field(ge=0, le=100)] = 0
+    handling_taps: Annotated[int, Field(ge=0, le=100)] = 0
     """Number of taps on the frame per round. If it is above 0, the vehicle is only lifted and held, for latency measurement."""
-    hand_tap_n: Positive = 30.0
+    handling_tap_n: Positive = 30.0
     """Peak force of a tap."""
     px4_params: Px4Params = Field(default={})
     """PX4 parameters by name; they override the parameters of the simulated vehicle. The stub has fewer of them than a real PX4."""

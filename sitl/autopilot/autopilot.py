@@ -8,28 +8,34 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 from companion.model.frames import quat_multiply
 from companion.model.rotors import motor_signal
 from companion.model.types import Quat, Vec3
-from sitl.autopilot.cascade import Cascade, CascadeGains
+from sitl.autopilot.cascade import Cascade
 from sitl.autopilot.commander import Command, Commander, Notice, Result, Severity
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.land_detector import LandDetector
 from sitl.autopilot.modes import Health, NavState, OffboardKind
 from sitl.autopilot.navigator import Navigator
+from sitl.autopilot.origin import Origin
 from sitl.autopilot.params import Params
 from sitl.autopilot.position_control import heading_rad
 from sitl.autopilot.setpoints import OffboardTarget, PositionTarget, RateTarget
-from sitl.autopilot.types import AttitudeTarget, Estimate, Fusion, ImuSample, LearnedBias, RotorCommands
-
-Command7 = tuple[float, float, float, float, float, float, float]
+from sitl.autopilot.types import (
+    AttitudeTarget,
+    Battery,
+    Command7,
+    Estimate,
+    Fusion,
+    ImuSample,
+    LearnedBias,
+    RotorCommands,
+)
 
 _COMMANDER_PERIOD_S: Final = 0.01
 _POSITION_PERIOD_S: Final = 0.004
-_EARTH_RADIUS_M = 6371000.0
 _EV_POSITION_AND_YAW: Final = 1 | 2 | 8
 """Bits of EKF2_EV_CTRL for horizontal position, vertical position and yaw. Without magnetometer, barometer and GPS, PX4 needs all of
 them.
@@ -40,61 +46,7 @@ _OFFBOARD: Final = NavState.OFFBOARD
 _TERMINATION: Final = NavState.TERMINATION
 
 
-class Battery(NamedTuple):
-    """Measurement of the power module."""
-
-    voltage_v: float = 16.2
-    current_a: float = 0.5
-    remaining: float = 1.0
-    """State of charge, 0 to 1."""
-    consumed_mah: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class Origin:
-    """Global position of the local origin (SET_GPS_GLOBAL_ORIGIN)."""
-
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
-
-    def local_ned_m(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vec3:
-        """Return the local NED position of a nearby point in m (equirectangular projection)."""
-        north = math.radians(latitude_deg - self.latitude_deg) * _EARTH_RADIUS_M
-        east = math.radians(longitude_deg - self.longitude_deg) * _EARTH_RADIUS_M * self._shrink()
-        return (north, east, self.altitude_m - altitude_m)
-
-    def global_deg_m(self, position_ned_m: Vec3) -> Vec3:
-        """Return the latitude and longitude in degrees and the altitude in m of a local position."""
-        north, east, down = position_ned_m
-        latitude = self.latitude_deg + math.degrees(north / _EARTH_RADIUS_M)
-        longitude = self.longitude_deg + math.degrees(east / (_EARTH_RADIUS_M * self._shrink()))
-        return (latitude, longitude, self.altitude_m - down)
-
-    def _shrink(self) -> float:
-        return max(math.cos(math.radians(self.latitude_deg)), 1e-6)
-
-
 _SOMEWHERE = Origin(47.4, 8.5, 480.0)
-
-
-def gains_from_params(params: Params) -> CascadeGains:
-    """Return the gains of the attitude and rate loops, given by the MC_* parameters."""
-    real = params.real
-
-    def axes(pattern: str) -> Vec3:
-        return (real(pattern.format("ROLL")), real(pattern.format("PITCH")), real(pattern.format("YAW")))
-
-    roll_max, pitch_max, yaw_max = axes("MC_{}RATE_MAX")
-    return CascadeGains(
-        attitude_p=axes("MC_{}_P"),
-        rate_p=axes("MC_{}RATE_P"),
-        rate_i=axes("MC_{}RATE_I"),
-        rate_d=axes("MC_{}RATE_D"),
-        rate_max_rad_s=(math.radians(roll_max), math.radians(pitch_max), math.radians(yaw_max)),
-        integrator_max=real("MC_RR_INT_LIM"),
-        d_cutoff_hz=real("IMU_GYRO_CUTOFF"),
-    )
 
 
 class Px4Stub:

@@ -12,16 +12,15 @@ from companion.config.airframe import Airframe
 from companion.px4.rotors import geometry_of
 from companion.sitl_config.effects.imu import Imu
 from companion.sitl_config.world import World as WorldConfig
-from sitl.autopilot.autopilot import Battery, Px4Stub, gains_from_params
-from sitl.autopilot.cascade import Cascade
+from sitl.autopilot.autopilot import Px4Stub
+from sitl.autopilot.cascade import Cascade, gains_from_params
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.mavlink import GROUND_PORTS, VISION_PORTS, MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Params, mav_type
-from sitl.autopilot.types import ImuSample, LearnedBias, RotorCommands
-from sitl.faults.injector import Autopilot as FaultyAutopilot
+from sitl.autopilot.types import Battery, FaultTarget, ImuSample, LearnedBias, RotorCommands
 from sitl.udp import Address
-from sitl.world.world import World
+from sitl.world.machine import Machine
 
 LINK_DELAY_S = 0.002
 """Time from sending a setpoint to its arrival at PX4 where the link itself takes no simulated time."""
@@ -50,7 +49,7 @@ class AutopilotBackend(Protocol):
         """Whether the rotors may turn."""
 
     @property
-    def fault_target(self) -> FaultyAutopilot:
+    def fault_target(self) -> FaultTarget:
         """The object through which autopilot faults are injected."""
 
     @property
@@ -61,8 +60,8 @@ class AutopilotBackend(Protocol):
     def vision_address(self) -> Address:
         """Address of the MAVLink link on which another program may send external vision, while the links are open."""
 
-    def attach(self, world: World) -> None:
-        """Set the world in which the autopilot flies; call this method before all others."""
+    def attach(self, machine: Machine) -> None:
+        """Set the machine that the autopilot flies; call this method before all others."""
 
     def wires(self) -> AbstractAsyncContextManager[str]:
         """Open the autopilot's links and yield the value for the companion's `devices.autopilot.address`."""
@@ -139,13 +138,13 @@ def _learned(imu: Imu) -> LearnedBias | None:
     return LearnedBias((p, -q, -r), max(-most_m_s2, min(most_m_s2, -imu.accel_bias_m_s2[2])))
 
 
-def set_hover_thrust(px4: Px4Stub, config: WorldConfig, world: World) -> float:
+def set_hover_thrust(px4: Px4Stub, config: WorldConfig, machine: Machine) -> float:
     """Set MPC_THR_HOVER to this vehicle's hover thrust times 1 + `hover_thrust_error`, unless `px4_params` overrides it.
 
     Returns:
         The hover thrust before any override by `px4_params`.
     """
-    hover_thrust = world.hover_command * (1.0 + config.hover_thrust_error)
+    hover_thrust = machine.hover_command * (1.0 + config.hover_thrust_error)
     if "MPC_THR_HOVER" not in config.px4_params:
         px4.params.set("MPC_THR_HOVER", hover_thrust)
     return hover_thrust
@@ -177,7 +176,7 @@ class StubBackend:
         return self.px4.commander.armed
 
     @property
-    def fault_target(self) -> FaultyAutopilot:
+    def fault_target(self) -> FaultTarget:
         """The stub itself."""
         return self.px4
 
@@ -191,9 +190,9 @@ class StubBackend:
         """Address of the link that is opened if the stub was made with `external_vision`."""
         return ("127.0.0.1", self._mavlink.vision_port)
 
-    def attach(self, world: World) -> None:
-        """Set MPC_THR_HOVER to the hover thrust of this world's vehicle."""
-        set_hover_thrust(self.px4, self._config, world)
+    def attach(self, machine: Machine) -> None:
+        """Set MPC_THR_HOVER to the hover thrust of this machine."""
+        set_hover_thrust(self.px4, self._config, machine)
 
     @contextlib.asynccontextmanager
     async def wires(self) -> AsyncIterator[str]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from companion.model.rotors import RotorLayout, standard_layout
 from companion.model.types import Quat, Vec3
 from sitl.autopilot.mixer import Mixer
+from sitl.autopilot.params import Params
 from sitl.autopilot.types import AttitudeTarget, Estimate, RotorCommands
 
 
@@ -25,6 +26,25 @@ class CascadeGains:
     rate_max_rad_s: Vec3 = (3.84, 3.84, 3.5)
     integrator_max: float = 0.3
     d_cutoff_hz: float = 30.0
+
+
+def gains_from_params(params: Params) -> CascadeGains:
+    """Return the gains of the attitude and rate loops, given by the MC_* parameters."""
+    real = params.real
+
+    def axes(pattern: str) -> Vec3:
+        return (real(pattern.format("ROLL")), real(pattern.format("PITCH")), real(pattern.format("YAW")))
+
+    roll_max, pitch_max, yaw_max = axes("MC_{}RATE_MAX")
+    return CascadeGains(
+        attitude_p=axes("MC_{}_P"),
+        rate_p=axes("MC_{}RATE_P"),
+        rate_i=axes("MC_{}RATE_I"),
+        rate_d=axes("MC_{}RATE_D"),
+        rate_max_rad_s=(math.radians(roll_max), math.radians(pitch_max), math.radians(yaw_max)),
+        integrator_max=real("MC_RR_INT_LIM"),
+        d_cutoff_hz=real("IMU_GYRO_CUTOFF"),
+    )
 
 
 class Cascade:

@@ -14,11 +14,13 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import Vec3
 from sitl.autopilot import telemetry
-from sitl.autopilot.autopilot import Command7, Origin, Px4Stub
+from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.commander import Command, Result
+from sitl.autopilot.origin import Origin
 from sitl.autopilot.params import HASH_CHECK, MAV_PARAM_TYPE_INT32
 from sitl.autopilot.setpoints import decode_attitude_target, decode_position_target
 from sitl.autopilot.streams import STREAMS, Schedule
+from sitl.autopilot.types import Command7
 
 Message = Any
 

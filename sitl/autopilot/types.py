@@ -5,9 +5,10 @@ The records are named tuples: they are created at 250 Hz, and a named tuple cost
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from companion.model.types import Quat, Vec3
+from sitl.autopilot.modes import NavState
 
 
 class ImuSample(NamedTuple):
@@ -63,5 +64,31 @@ class AttitudeTarget(NamedTuple):
     yaw_rate_rad_s: float = 0.0
 
 
+class Battery(NamedTuple):
+    """Measurement of the power module."""
+
+    voltage_v: float = 16.2
+    current_a: float = 0.5
+    remaining: float = 1.0
+    """State of charge, 0 to 1."""
+    consumed_mah: float = 0.0
+
+
+Command7 = tuple[float, float, float, float, float, float, float]
+"""param1 to param7 of a MAV_CMD."""
 RotorCommands = tuple[float, ...]
 """Normalised rotor commands in PX4's order."""
+
+
+class FaultTarget(Protocol):
+    """An autopilot on which faults act (`sitl.autopilot.autopilot.Px4Stub`)."""
+
+    refuses_offboard: bool
+    refuses_arming: bool
+    kill_switch: bool
+
+    def reboot(self, for_s: float) -> None:
+        """Restart the autopilot; it runs again after `for_s`."""
+
+    def pilot_sets_mode(self, state: NavState) -> None:
+        """Change the mode as a pilot does by radio control."""

@@ -20,7 +20,7 @@ from sitl.campaigns.flights import Flown, fly_to_end, laboratory_of, with_world
 from sitl.campaigns.runner import Data
 from sitl.fast.loop import FastResult
 from sitl.faults.timing import FaultError, with_fault_times
-from sitl.world.world import Snapshot
+from sitl.world.state import Snapshot
 
 
 def prepare(job: Data, configs: Sequence[SitlConfig]) -> list[Data]:

@@ -36,7 +36,7 @@ class Flown:
     @property
     def caught_t_s(self) -> float | None:
         """World time of the true catch; None if the payload was not caught."""
-        return None if self.fast is None else self.fast.plant.world.payload.caught_t_s
+        return None if self.fast is None else self.fast.plant.scene.payload.caught_t_s
 
 
 def with_world(config: SitlConfig, changes: Data) -> SitlConfig:

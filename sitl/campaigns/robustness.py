@@ -155,7 +155,7 @@ def fly(config: SitlConfig, flight: Data) -> Data:
             "world": _world_of(flown.config),
             **laboratory_of(flown.config),
             **_graded(flown),
-            "thrown": flown.fast is not None and flown.fast.plant.world.payload.thrown_t_s is not None,
+            "thrown": flown.fast is not None and flown.fast.plant.scene.payload.thrown_t_s is not None,
             "felt": caught_t_s is not None and _felt(flown, caught_t_s),
             "caught_s": mission_s(flown.result, caught_t_s),
         }

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from companion.model.types import AutopilotStatus, VehicleState
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.faults.injector import Faults
-from sitl.world.world import World
+from sitl.world.scene import Scene
 
 MEMORY = 400
 """Longest possible delay of received states, in control ticks."""
@@ -21,13 +21,13 @@ class FastLink:
 
     Args:
         faults: faults of the world.
-        world: simulated world, which provides the time.
+        scene: simulated physics, which provides the time.
         px4: the stub; while it boots, the link is dead.
         tick_s: period of the control tick.
     """
 
-    def __init__(self, faults: Faults, world: World, px4: Px4Stub, tick_s: float) -> None:
-        self._faults, self._world, self._px4, self._tick_s = faults, world, px4, tick_s
+    def __init__(self, faults: Faults, scene: Scene, px4: Px4Stub, tick_s: float) -> None:
+        self._faults, self._scene, self._px4, self._tick_s = faults, scene, px4, tick_s
         self._in_flight: deque[tuple[float, Callable[[], None]]] = deque()
         self._received: deque[tuple[VehicleState | None, AutopilotStatus | None]] = deque(maxlen=MEMORY)
         """States that PX4 sent in the last ticks, newest first."""
@@ -38,7 +38,7 @@ class FastLink:
     @property
     def alive(self) -> bool:
         """Whether messages arrive."""
-        return "link_loss" not in self._faults.active and self._world.t_s >= self._px4.booted_at_s
+        return "link_loss" not in self._faults.active and self._scene.t_s >= self._px4.booted_at_s
 
     def send(self, deliver: Callable[[], None]) -> None:
         """Send a message to PX4; `deliver` is called when the message arrives."""
@@ -46,13 +46,13 @@ class FastLink:
             return
         delay_s = self._faults.size("link_delay")
         if delay_s or self._in_flight:
-            self._in_flight.append((self._world.t_s + delay_s, deliver))
+            self._in_flight.append((self._scene.t_s + delay_s, deliver))
         else:
             deliver()
 
     def deliver_due(self) -> None:
         """Deliver delayed messages that are due; call this method in every tick."""
-        late, t_s = self._in_flight, self._world.t_s
+        late, t_s = self._in_flight, self._scene.t_s
         while late and late[0][0] <= t_s + 1e-9:
             deliver = late.popleft()[1]
             if self.alive:

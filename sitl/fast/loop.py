@@ -39,11 +39,10 @@ from companion.model.types import (
 )
 from companion.sitl_config.faults import FaultKind
 from companion.sitl_config.loader import SitlConfig
-from sitl.autopilot.autopilot import Command7
 from sitl.autopilot.backend import LINK_DELAY_S, set_hover_thrust, stub_of
 from sitl.autopilot.commander import FORCE_MAGIC, Command
 from sitl.autopilot.modes import NavState
-from sitl.autopilot.types import AttitudeTarget
+from sitl.autopilot.types import AttitudeTarget, Command7
 from sitl.fast.bus import FastBus, scales_of
 from sitl.fast.guardian import TAKE_OVER_S, FastGuardian, Landing
 from sitl.fast.link import FastLink
@@ -51,10 +50,10 @@ from sitl.fast.telemetry import FastTelemetry
 from sitl.faults.injector import Faults
 from sitl.faults.timing import with_fault_times
 from sitl.force_torque import TIME_EPSILON_S, overloaded, quantised
-from sitl.server import start_of
+from sitl.plant import MocapFrame, Plant
 from sitl.servo.from_config import plugged_in, servos_of
-from sitl.world.plant import MocapFrame, Plant
-from sitl.world.world import Layout, Snapshot, Truth
+from sitl.world.start import start_of
+from sitl.world.state import Layout, Snapshot, Truth
 
 START_S: Final = SIMULATED_START_S
 """World time at the first tick, as over the wires."""
@@ -136,13 +135,13 @@ class FastFlight:
         servos = servos_of(vehicle, world)
         drives = [servo.drive for servo in servos]
         pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
-        self.plant = Plant(vehicle, world, self.px4, drives, (pose.position_m, pose.yaw_rad, pose.arm_rad))
-        self.faults = Faults(world, self.plant.world, self.px4, drives, vehicle.tether)
+        self.plant = Plant(vehicle, world, self.px4, drives, pose)
+        self.faults = Faults(world, self.plant.scene, self.plant.machine, self.px4, drives, vehicle.tether)
         if world.faults:
             self.plant.faults = self.faults
         self._guardian = FastGuardian(vehicle, self.px4) if world.faults else None
-        self._link = FastLink(self.faults, self.plant.world, self.px4, TICK_PERIOD_S)
-        hover = set_hover_thrust(self.px4, world, self.plant.world)
+        self._link = FastLink(self.faults, self.plant.scene, self.px4, TICK_PERIOD_S)
+        hover = set_hover_thrust(self.px4, world, self.plant.machine)
         if vehicle.airframe.hover_thrust is None:
             airframe = vehicle.airframe.model_copy(update={"hover_thrust": hover})
             vehicle = vehicle.model_copy(update={"airframe": airframe})
@@ -168,33 +167,33 @@ class FastFlight:
 
     def run(self, limit_s: float = 90.0, until_mission_s: float = math.inf) -> FastResult:
         """Fly until the mission ends, the vehicle crashes, world time reaches `limit_s` or the mission's clock `until_mission_s`."""
-        world = self.plant.world
-        result = FastResult(layout=world.layout)
+        machine = self.plant.machine
+        result = FastResult(layout=machine.layout)
         with _garbage_collection_paused():
             self._run(result, limit_s, until_mission_s)
-        result.crashed = world.crashed
-        result.caught = world.payload.caught_t_s is not None
+        result.crashed = machine.crashed
+        result.caught = self.plant.scene.payload.caught_t_s is not None
         return result
 
     def _run(self, result: FastResult, limit_s: float, until_mission_s: float = math.inf) -> None:
         plant, core, px4 = self.plant, self.core, self.px4
-        world, guardian = plant.world, self._guardian
+        scene, machine, guardian = plant.scene, plant.machine, self._guardian
         period, tick = round(START_S / TICK_PERIOD_S), 0
-        while world.t_s < START_S - 1e-9:
+        while scene.t_s < START_S - 1e-9:
             self._step()
-            self._bus.keep_alive(world.t_s)
+            self._bus.keep_alive(scene.t_s)
         self._telemetry.start_sums()
-        while world.t_s < limit_s:
+        while scene.t_s < limit_s:
             period += 1
             due_s = period * TICK_PERIOD_S - 1e-9
-            while world.t_s < due_s:
+            while scene.t_s < due_s:
                 self._step()
             if guardian is not None and self._flight_process_stalled(guardian):
-                if guardian.decides_to_take_over(world.t_s, False, plant.fault("kill_flight") is not None):
+                if guardian.decides_to_take_over(scene.t_s, False, plant.fault("kill_flight") is not None):
                     self._guardian_lands(guardian, result, limit_s)
                     break
-                result.after.append(world.snapshot())
-                if world.crashed:
+                result.after.append(machine.snapshot())
+                if machine.crashed:
                     break
                 continue
             inputs = self._inputs(tick)
@@ -202,12 +201,12 @@ class FastFlight:
             self._carry_out(outputs)
             if guardian is not None:
                 guardian.heartbeat(inputs, outputs)
-                guardian.decides_to_take_over(world.t_s, True, False)
+                guardian.decides_to_take_over(scene.t_s, True, False)
             result.inputs.append(inputs)
             result.outputs.append(outputs)
-            result.snapshots.append(world.snapshot())
+            result.snapshots.append(machine.snapshot())
             tick += 1
-            if outputs.outcome is not None or world.crashed or outputs.mission_t_s >= until_mission_s:
+            if outputs.outcome is not None or machine.crashed or outputs.mission_t_s >= until_mission_s:
                 break
         if guardian is not None:
             result.guardian_events = guardian.events
@@ -219,13 +218,13 @@ class FastFlight:
         plant = self.plant
         plant.step(self.px4.armed)
         if plant.faults is not None:
-            self._bus.step(plant.world.t_s)
+            self._bus.step(plant.scene.t_s)
         for frame in plant.take_mocap()[-1:]:  # of frames that wait, the driver delivers the newest
             self._deliver(frame)
-        if self._force_period_s is not None and plant.world.t_s >= self._force_due_s - TIME_EPSILON_S:
+        if self._force_period_s is not None and plant.scene.t_s >= self._force_due_s - TIME_EPSILON_S:
             self._force_due_s += self._force_period_s
             self._sample_force()
-        self._telemetry.pump(plant.world.t_s)
+        self._telemetry.pump(plant.scene.t_s)
 
     def _sample_force(self) -> None:
         """Take a sample of the force sensor, which the next tick reads."""
@@ -238,22 +237,22 @@ class FastFlight:
 
     def _settle(self, result: FastResult) -> None:
         """Let PX4 finish the landing of a flight that has ended in the air."""
-        world, px4 = self.plant.world, self.px4
-        end_s = world.t_s + SETTLE_S
-        period_s = world.t_s
-        while px4.armed and not world.crashed and world.t_s < end_s:
+        scene, machine, px4 = self.plant.scene, self.plant.machine, self.px4
+        end_s = scene.t_s + SETTLE_S
+        period_s = scene.t_s
+        while px4.armed and not machine.crashed and scene.t_s < end_s:
             self.plant.step(px4.armed)
             if self._external:
                 self._poses_for_guardian()
-            if world.t_s >= period_s + TICK_PERIOD_S - 1e-9:
+            if scene.t_s >= period_s + TICK_PERIOD_S - 1e-9:
                 period_s += TICK_PERIOD_S
-                result.after.append(world.snapshot())
+                result.after.append(machine.snapshot())
 
     def _flight_process_stalled(self, guardian: FastGuardian) -> bool:
         """Return whether a fault stops the control ticks of the flight process. If only its event loop is stalled, also do what its bus
         thread still does.
         """
-        active, t_s = self.faults.active, self.plant.world.t_s
+        active, t_s = self.faults.active, self.plant.scene.t_s
         guardian.alive = "kill_guardian" not in active
         if "stall_loop" in active:
             self._bus.keep_alive(t_s)
@@ -261,20 +260,20 @@ class FastFlight:
 
     def _guardian_lands(self, guardian: FastGuardian, result: FastResult, limit_s: float) -> None:
         plant, px4 = self.plant, self.px4
-        world = plant.world
-        open_s = world.t_s + TAKE_OVER_S
+        scene, machine = plant.scene, plant.machine
+        open_s = scene.t_s + TAKE_OVER_S
         landing: Landing | None = None
-        period_s = world.t_s
-        while world.t_s < limit_s and not world.crashed and (landing is None or landing.landed is None):
+        period_s = scene.t_s
+        while scene.t_s < limit_s and not machine.crashed and (landing is None or landing.landed is None):
             plant.step(px4.armed)
             poses = self._poses_for_guardian()
-            if landing is None and world.t_s >= open_s:
-                landing = guardian.take_over(world.t_s)
+            if landing is None and scene.t_s >= open_s:
+                landing = guardian.take_over(scene.t_s)
             if landing is not None:
-                landing.step(world.t_s, poses)
-            if world.t_s >= period_s + TICK_PERIOD_S - 1e-9:
+                landing.step(scene.t_s, poses)
+            if scene.t_s >= period_s + TICK_PERIOD_S - 1e-9:
                 period_s += TICK_PERIOD_S
-                result.after.append(world.snapshot())
+                result.after.append(machine.snapshot())
         result.guardian_landed = landing.landed if landing is not None else False
 
     def _poses_for_guardian(self) -> list[MocapPose]:
@@ -298,10 +297,10 @@ class FastFlight:
                 self._link.send(lambda: self._see(position, attitude))
 
     def _see(self, position_ned_m: Vec3, attitude_ned_frd: Quat) -> None:
-        self.px4.on_vision(self.plant.world.t_s, position_ned_m, attitude_ned_frd)
+        self.px4.on_vision(self.plant.scene.t_s, position_ned_m, attitude_ned_frd)
 
     def _pose(self, frame: MocapFrame) -> MocapPose:
-        t_s = self.plant.world.t_s
+        t_s = self.plant.scene.t_s
         number, exposure_s, position, attitude, valid, network_s = frame
         latency_s, exposure_server_s = t_s - exposure_s, exposure_s
         if self.plant.faults is not None:
@@ -324,7 +323,7 @@ class FastFlight:
         )
 
     def _inputs(self, tick: int) -> Inputs:
-        plant, t_s = self.plant, self.plant.world.t_s
+        plant, t_s = self.plant, self.plant.scene.t_s
         dropped, guardian_ready = 0, None
         if plant.faults is None:
             vehicle, status = self._telemetry.vehicle(t_s), self._telemetry.status(t_s)
@@ -360,10 +359,10 @@ class FastFlight:
         if setpoint is not None:
             target = AttitudeTarget(attitude_ned_frd_from_enu_flu(setpoint.attitude_wxyz), setpoint.thrust)
             if with_faults:
-                self._link.send(lambda: self.px4.on_setpoint(self.plant.world.t_s, target))
+                self._link.send(lambda: self.px4.on_setpoint(self.plant.scene.t_s, target))
             else:
-                self.px4.on_setpoint(self.plant.world.t_s, target)
-        self._bus.write(self.plant.world.t_s, outputs.arm_torque_nm)
+                self.px4.on_setpoint(self.plant.scene.t_s, target)
+        self._bus.write(self.plant.scene.t_s, outputs.arm_torque_nm)
         if request is not _NO_REQUEST:
             if with_faults:
                 self._link.send(lambda: self._request(request))

@@ -30,9 +30,9 @@ from companion.model.types import (
     VehicleState,
 )
 from sitl.autopilot import telemetry
-from sitl.autopilot.autopilot import Battery, Px4Stub
+from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.streams import STREAMS, Schedule
-from sitl.autopilot.types import Estimate
+from sitl.autopilot.types import Battery, Estimate
 
 _POSITION, _ATTITUDE = mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
 _IMU = mavlink.MAVLINK_MSG_ID_HIGHRES_IMU

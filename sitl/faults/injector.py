@@ -21,11 +21,13 @@ from companion.model.types import Quat, Vec3
 from companion.sitl_config.faults import Fault, FaultKind
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.modes import NavState
+from sitl.autopilot.types import FaultTarget
 from sitl.servo.drive import COUNTS_PER_TURN, ServoDrive
+from sitl.world.machine import Machine
 from sitl.world.model import SECOND, SECOND_CATCH
 from sitl.world.payload import Ball
-from sitl.world.surfaces import Surfaces
-from sitl.world.world import World
+from sitl.world.scene import Scene
+from sitl.world.tool_contact import ToolContact
 
 CELL_FULL_V: Final = 4.15
 OVERHEATED_C = 80.0
@@ -50,26 +52,13 @@ class Servo(Protocol):
         """Set the motor temperature."""
 
 
-class Autopilot(Protocol):
-    """An autopilot on which faults act (`sitl.autopilot.autopilot.Px4Stub`)."""
-
-    refuses_offboard: bool
-    refuses_arming: bool
-    kill_switch: bool
-
-    def reboot(self, for_s: float) -> None:
-        """Restart the autopilot; it runs again after `for_s`."""
-
-    def pilot_sets_mode(self, state: NavState) -> None:
-        """Change the mode as a pilot does by radio control."""
-
-
 class Faults:
     """The faults of one world.
 
     Args:
         config: configuration of the world; every fault has a time (`with_fault_times`).
-        world: simulated physics.
+        scene: simulated physics.
+        machine: the machine of that scene on which the faults act.
         px4: the autopilot.
         drives: motors of the servos.
         tether: the vehicle's tether, or None if it has none.
@@ -79,8 +68,9 @@ class Faults:
     def __init__(
         self,
         config: WorldConfig,
-        world: World,
-        px4: Autopilot,
+        scene: Scene,
+        machine: Machine,
+        px4: FaultTarget,
         drives: Sequence[ServoDrive],
         tether: Tether | None,
         servos: Sequence[Servo] = (),
@@ -88,10 +78,11 @@ class Faults:
         self._faults = config.faults
         self._on = [False] * len(config.faults)
         self._begins_s: list[float | None] = [None] * len(config.faults)
-        self._world, self._px4, self._drives, self._servos = world, px4, drives, servos
+        self._scene, self._machine = scene, machine
+        self._px4, self._drives, self._servos = px4, drives, servos
         self._tether = tether
-        self._wind_m_s = world.wind_m_s
-        self._tether_m = world.tether_length_m
+        self._wind_m_s = machine.wind_m_s
+        self._tether_m = machine.tether.length_m
         self._chance = np.random.default_rng([config.seed, len(config.faults)])
         self.active: dict[FaultKind, Fault] = {}
         self.begun_s: float | None = None
@@ -120,13 +111,13 @@ class Faults:
             armed_t_s: world time of arming, or None.
         """
         self._now_s = t_s
-        surfaces = self._world.surfaces
+        contact, payload = self._machine.contact, self._scene.payload
         origins = {
             "start": 0.0,
             "arming": armed_t_s,
-            "catch": self._world.payload.caught_t_s,
-            "touch": surfaces.touched_s if surfaces is not None else None,
-            "press": surfaces.pressed_s if surfaces is not None else None,
+            "catch": payload.caught_t_s,
+            "touch": contact.touched_s if contact is not None else None,
+            "press": contact.pressed_s if contact is not None else None,
         }
         for index, fault in enumerate(self._faults):
             origin_s = origins[fault.after]
@@ -141,7 +132,7 @@ class Faults:
             if on is not self._on[index]:
                 self._on[index] = on
                 self._switch(fault, on, t_s)
-        if self._second is not None and self._world.payload.catch(self._second):
+        if self._second is not None and payload.catch(self._second, t_s):
             self._second = None
         if t_s >= self._pilot_lands_s:
             self._pilot_lands_s = math.inf
@@ -165,7 +156,7 @@ class Faults:
 
     def _act(self, fault: Fault, on: bool, t_s: float) -> None:
         """Apply the start (`on`) or the end of a fault that acts on the physics, the servos or PX4."""
-        world, px4, size = self._world, self._px4, fault.magnitude
+        machine, payload, px4, size = self._machine, self._scene.payload, self._px4, fault.magnitude
         match fault.kind:
             case "motor_weak" | "battery_sag":
                 self._set_rotor_share()
@@ -173,28 +164,28 @@ class Faults:
                 self._set_gust(size if on else 0.0)
             case "tether_taut":
                 assert self._tether is not None, "refused when the configuration is loaded"
-                away_m = math.dist(world.attachment_world_m, self._tether.anchor_world_m)
-                world.tether_length_m = min(self._tether_m, away_m + size) if on else self._tether_m
+                away_m = math.dist(machine.tether.attachment_world_m, self._tether.anchor_world_m)
+                machine.tether.length_m = min(self._tether_m, away_m + size) if on else self._tether_m
             case "tether_cut":
-                world.tether_length_m = _FOREVER_M if on else self._tether_m
+                machine.tether.length_m = _FOREVER_M if on else self._tether_m
             case "tether_snag":
-                x, y, z = world.attachment_world_m
-                world.snag = ((x, y, 0.0), z + size) if on else None
+                x, y, z = machine.tether.attachment_world_m
+                machine.tether.snag = ((x, y, 0.0), z + size) if on else None
             case "payload_missed":
-                world.payload.aside_m = size if on else 0.0
+                payload.aside_m = size if on else 0.0
             case "payload_double" if on:
-                self._second = Ball.of(world.model, SECOND, SECOND_CATCH)
-                world.payload.throw(self._second)
+                self._second = Ball.of(self._scene.model, SECOND, SECOND_CATCH)
+                payload.throw(self._second)
             case "payload_dropped" if on:
-                world.payload.drop()
+                payload.drop()
             case "surface_gone" if on:
-                for number in range(len(self._surfaces.placed)):
-                    self._surfaces.give_way(number)
+                for number in range(len(self._contact.surfaces.placed)):
+                    self._contact.surfaces.give_way(number)
             case "surface_slippery":
-                for number, placed in enumerate(self._surfaces.placed):
-                    self._surfaces.set_friction(number, size if on else placed.config.friction)
+                for number, placed in enumerate(self._contact.surfaces.placed):
+                    self._contact.surfaces.set_friction(number, size if on else placed.config.friction)
             case "tool_broken" if on:
-                self._surfaces.break_tool()
+                self._contact.break_tool()
             case "servo_overload" if on:
                 self._shut_down_servo(fault.servo - 1, OVERLOAD)
             case "servo_hot":
@@ -213,7 +204,7 @@ class Faults:
                 px4.pilot_sets_mode(NavState.LOITER)
                 self._pilot_lands_s = t_s + size
             case "mocap_swap":
-                x, y, _ = world.q[0:3]
+                x, y, _ = machine.q[0:3]
                 there = (x, y + size, _OTHER_BODY_Z_M)
                 self._other = (there, quat_from_euler_zyx(0.0, 0.0, _OTHER_BODY_YAW_RAD)) if on else None
             case "mocap_drag":
@@ -228,30 +219,30 @@ class Faults:
                 pass
 
     @property
-    def _surfaces(self) -> Surfaces:
-        surfaces = self._world.surfaces
-        assert surfaces is not None, "refused when the configuration is loaded"
-        return surfaces
+    def _contact(self) -> ToolContact:
+        contact = self._machine.contact
+        assert contact is not None, "refused when the configuration is loaded"
+        return contact
 
     def _set_rotor_share(self) -> None:
         weak, sag = self.active.get("motor_weak"), self.active.get("battery_sag")
         self.sag_v = sag.magnitude if sag is not None else 0.0
-        every = (1.0 - self.sag_v / (CELL_FULL_V * self._world.battery_cells)) ** 2
+        every = (1.0 - self.sag_v / (CELL_FULL_V * self._machine.battery_cells)) ** 2
         first = every * (1.0 - weak.magnitude) if weak is not None else every
-        share = (first, *[every] * (self._world.rotor_count - 1))
-        self._world.rotor_share = None if min(share) == 1.0 else share
+        share = (first, *[every] * (self._machine.rotor_count - 1))
+        self._machine.rotor_share = None if min(share) == 1.0 else share
 
     def _set_gust(self, speed_m_s: float) -> None:
         """Add wind into the first surface; without one away from the tether's anchor, or without a tether from the world's origin."""
-        if self._world.surfaces is not None:
-            (nx, ny, nz), (wx, wy, wz) = self._world.surfaces.placed[0].normal, self._wind_m_s
-            self._world.wind_m_s = (wx - speed_m_s * nx, wy - speed_m_s * ny, wz - speed_m_s * nz)
+        if self._scene.surfaces is not None:
+            (nx, ny, nz), (wx, wy, wz) = self._scene.surfaces.placed[0].normal, self._wind_m_s
+            self._machine.wind_m_s = (wx - speed_m_s * nx, wy - speed_m_s * ny, wz - speed_m_s * nz)
             return
         ax, ay = self._tether.anchor_world_m[0:2] if self._tether is not None else (0.0, 0.0)
-        x, y = self._world.q[0] - ax, self._world.q[1] - ay
+        x, y = self._machine.q[0] - ax, self._machine.q[1] - ay
         away_m = math.hypot(x, y) or 1.0
         wx, wy, wz = self._wind_m_s
-        self._world.wind_m_s = (wx + speed_m_s * x / away_m, wy + speed_m_s * y / away_m, wz)
+        self._machine.wind_m_s = (wx + speed_m_s * x / away_m, wy + speed_m_s * y / away_m, wz)
 
     def _shut_down_servo(self, index: int, error: int) -> None:
         """Shut a servo down as its own protection would."""
@@ -339,17 +330,17 @@ class Sample:
     """Force of a surface on the tip."""
 
 
-def sample(world: World, tether: Tether | None) -> Sample:
+def sample(machine: Machine, tether: Tether | None) -> Sample:
     """Return the present true state of the vehicle and its tether."""
-    x, y, z, *attitude = world.q[0:7]
-    slack_m = None
+    x, y, z, *attitude = machine.q[0:7]
+    state, slack_m = machine.snapshot(), None
     if tether is not None:
-        slack_m = world.tether_length_m - math.dist(world.attachment_world_m, tether.anchor_world_m)
+        slack_m = machine.tether.length_m - math.dist(machine.tether.attachment_world_m, tether.anchor_world_m)
     return Sample(
-        t_s=world.t_s,
+        t_s=state.t_s,
         position_world_m=(x, y, z),
         tilt_rad=tilt_rad((attitude[0], attitude[1], attitude[2], attitude[3])),
         slack_m=slack_m,
-        tension_n=world.layout.tension_n(world.sensors()),
-        contact_n=math.hypot(*world.layout.contact(world.sensors())[1]) if world.surfaces is not None else 0.0,
+        tension_n=machine.layout.tension_n(state.sensors),
+        contact_n=math.hypot(*machine.layout.contact(state.sensors)[1]) if machine.contact is not None else 0.0,
     )

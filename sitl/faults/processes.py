@@ -7,7 +7,7 @@ import math
 import os
 import resource
 import signal
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +25,9 @@ SIGNALS: dict[FlightFaultKind, signal.Signals] = {
 }
 STALL_VARIABLE = "COMPANION_SITL_STALL_S"
 """Environment variable for sitl/faults/hang: duration of the event loop's stall."""
+OTHER_PROCESS_FAULTS: tuple[FaultKind, ...] = ("kill_recorder", "kill_guardian", "disk_full")
+INJECT_RETRY_S = 0.2
+"""Time between two searches for the target process of a fault."""
 _VISION_WINDOW_S = 2.0
 _SAMPLE_S = 0.01
 
@@ -80,7 +83,9 @@ def _command(pid: int) -> list[str]:
 
 
 class ProcessFaults:
-    """Injects one fault into the flight process, then records PX4's inputs and the vehicle's motion."""
+    """Injects one fault into the flight process, then records PX4's inputs and the vehicle's motion; injects each fault of the recorder
+    and the guardian once.
+    """
 
     def __init__(self) -> None:
         self.pid: int | None = None
@@ -99,6 +104,12 @@ class ProcessFaults:
         self._disarmed_s: float | None = None
         self._worst_tilt_rad = 0.0
         self._due_s = -math.inf
+        self._injected: set[FaultKind] = set()
+        self._inject_due_s = 0.0
+
+    def start_over(self) -> None:
+        """Continue at the start of world time."""
+        self._inject_due_s = 0.0
 
     def inject(self, kind: FlightFaultKind, t_s: float, position_m: Vec3, vision_count: int | None) -> bool:
         """Signal the flight process; return False if a fault was already injected or the pid is not known.
@@ -118,6 +129,21 @@ class ProcessFaults:
         self._start_m = self._position_m = position_m
         self._vision_count = vision_count
         return True
+
+    def inject_others(self, active: Collection[FaultKind], t_s: float) -> None:
+        """Inject each due fault of the recorder and the guardian once, and resume the flight process when its SIGSTOP fault ends.
+
+        Args:
+            active: kinds of the active faults.
+            t_s: world time.
+        """
+        due = [kind for kind in OTHER_PROCESS_FAULTS if kind in active and kind not in self._injected]
+        if due and self.pid is not None and t_s >= self._inject_due_s:
+            self._inject_due_s = t_s + INJECT_RETRY_S
+            self._injected.update(kind for kind in due if inject_process_fault(kind, self.pid))
+        if self.kind == "stop_flight" and "stop_flight" not in active and "stop_flight" not in self._injected:
+            self._injected.add("stop_flight")
+            self.resume()
 
     def resume(self) -> None:
         """Continue a process that was stopped for a limited time."""

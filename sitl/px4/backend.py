@@ -15,12 +15,10 @@ from companion.config.airframe import Airframe
 from companion.px4.versions import varies
 from companion.sitl_config.faults import FaultKind
 from companion.sitl_config.world import World as WorldConfig
-from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.backend import Observation
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Value
-from sitl.autopilot.types import ImuSample, RotorCommands
-from sitl.faults.injector import Autopilot as FaultyAutopilot
+from sitl.autopilot.types import Battery, FaultTarget, ImuSample, RotorCommands
 from sitl.px4.control_link import ControlLink, Version, same
 from sitl.px4.hil_link import HilSensors, Px4Error, SimulatorLink
 from sitl.px4.parameter_file import restore, stored
@@ -36,7 +34,7 @@ from sitl.px4.process import (
 )
 from sitl.px4.relay import Relay
 from sitl.udp import Address
-from sitl.world.world import World
+from sitl.world.machine import Machine
 
 BOOT_DEADLINE_S = 30.0
 END_DEADLINE_S = 6.0
@@ -130,13 +128,13 @@ class RealPx4:
         return self._instance.gimbal_address
 
     @property
-    def fault_target(self) -> FaultyAutopilot:
+    def fault_target(self) -> FaultTarget:
         """The object through which the faults that a real PX4 can have are injected."""
         return _Faulty(self._control)
 
-    def attach(self, world: World) -> None:
-        """Set the world that PX4's simulated sensors measure."""
-        self._world = world
+    def attach(self, machine: Machine) -> None:
+        """Set the machine that PX4's simulated sensors measure."""
+        self._machine = machine
 
     @contextlib.asynccontextmanager
     async def wires(self) -> AsyncIterator[str]:
@@ -173,7 +171,7 @@ class RealPx4:
         await self._boot(BOOT_DEADLINE_S if self._process is not None else BY_HAND_DEADLINE_S)
         self._version = await self._control.version()
         self._progress(f"PX4 {self._version}, instance {self.number}: setting its parameters")
-        wanted = parameters(self._airframe, self._config, self._world.hover_command)
+        wanted = parameters(self._airframe, self._config, self._machine.hover_command)
         changed = await self._write_parameters(wanted)
         if changed:
             await self._restart(changed)
@@ -254,7 +252,7 @@ class RealPx4:
     def sense(self, imu: ImuSample) -> None:
         """Send HIL_SENSOR with this IMU sample and the present true height and attitude."""
         self._imu = imu
-        q = self._world.q
+        q = self._machine.q
         self._link.send(imu, q[2], (q[3], q[4], q[5], q[6]))
 
     async def answered(self) -> None:

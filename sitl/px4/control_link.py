@@ -15,9 +15,9 @@ from typing import Any, Self
 from pymavlink.dialects.v20 import development as mavlink  # common, and CURRENT_MODE
 
 from companion.px4.params_file import single
-from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.modes import NavState, nav_state_from_custom
 from sitl.autopilot.params import MAV_PARAM_TYPE_INT32, Value, decode_bytewise, encode_bytewise
+from sitl.autopilot.types import Battery
 from sitl.px4.hil_link import Px4Error
 from sitl.px4.process import Instance
 from sitl.udp import UdpEndpoint

@@ -82,14 +82,14 @@ class Handling:
     """Computes the force and torque that handling applies to the vehicle.
 
     Args:
-        config: configuration of the world; `hand_t_s`, `hand_taps`, `hand_tap_n`, and `seed` for the hand's sway are used.
+        config: configuration of the world; `handling_t_s`, `handling_taps`, `handling_tap_n`, and `seed` for the hand's sway are used.
         weight_n: weight of the whole vehicle.
     """
 
     def __init__(self, config: WorldConfig, weight_n: float) -> None:
         self._weight_n = weight_n
-        self._from_s = config.hand_t_s
-        self._taps, self._tap_n = config.hand_taps, config.hand_tap_n
+        self._from_s = config.handling_t_s
+        self._taps, self._tap_n = config.handling_taps, config.handling_tap_n
         self._legs = _LEGS if not self._taps else _holding(self._taps * TAP_EVERY_S)
         self._round_s = sum(leg.duration_s for leg in self._legs)
         self._origin: tuple[Vec3, float] | None = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import mujoco
 
 from companion.model.types import Vec3
@@ -37,3 +39,18 @@ class Loads:
                 fx, fy, fz, tx, ty, tz = fx + ax, fy + ay, fz + az, tx + bx, ty + by, tz + bz
             self._rows[body].write((fx, fy, fz, tx, ty, tz))
         self._changed.clear()
+
+
+class Bodies(NamedTuple):
+    """The model of a scene, as one machine sees it."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    loads: Loads
+    prefix: str
+    """Prefix of the machine's names in the model."""
+
+    def body(self, name: str) -> int:
+        """Return the index of one of the machine's bodies."""
+        index: int = self.model.body(self.prefix + name).id
+        return index

@@ -1,8 +1,13 @@
-"""The MuJoCo model of the vehicle, its tether and the thrown payload, built from the vehicle file."""
+"""The MuJoCo model of a scene: the machines with their tethers, the floor, the surfaces and the thrown payload.
+
+The parts of the first machine have the names below, such as `base` and `alpha1`; `prefix_of` returns the prefix of the others.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 from companion.config.arm import Tool
 from companion.config.arm_chain import rod_of
@@ -15,12 +20,17 @@ from companion.sitl_config.effects.rotors import of_rotors
 from companion.sitl_config.world import World
 from sitl.world import surfaces
 from sitl.world.effects import machine, transmission
+from sitl.world.state import PAYLOAD_RADIUS_M
 
-PAYLOAD_RADIUS_M = 0.035
 SECOND, SECOND_CATCH = "payload2", "catch2"
 """Names of the second ball, which a fault throws after the payload, and of its constraint."""
 _FEET_M = ((0.18, -0.18), (-0.18, 0.18), (0.18, 0.18), (-0.18, -0.18))
 """Positions of the feet along the body's x and y axes."""
+
+
+def prefix_of(number: int) -> str:
+    """Return the prefix of the names of a machine's parts, given the machine's index."""
+    return "" if number == 0 else f"machine{number + 1}/"
 
 
 def base_mass_kg(vehicle: Vehicle, world: World) -> float:
@@ -53,7 +63,7 @@ def _quat(attitude: Quat) -> str:
     return "" if attitude == IDENTITY_QUAT else f'quat="{" ".join(map(str, attitude))}"'
 
 
-def _links(vehicle: Vehicle, world: World) -> str:
+def _links(vehicle: Vehicle, world: World, prefix: str) -> str:
     """Return the bodies of the links, the sensor and the net, each inside the previous one.
 
     Without a tool, sensor and net are massless bodies at the tip, or without an arm at the origin of the base, so that every model has
@@ -71,11 +81,11 @@ def _links(vehicle: Vehicle, world: World) -> str:
         )
         if not tool.is_net:
             net = _rod(vehicle, tool)
-    bodies = f"""<body name="sensor" pos="{_xyz(chain.tip_m)}" {_quat(chain.tip_wxyz)}>
+    bodies = f"""<body name="{prefix}sensor" pos="{_xyz(chain.tip_m)}" {_quat(chain.tip_wxyz)}>
         {sensor}
-        <body name="net" {turn}>
+        <body name="{prefix}net" {turn}>
           {net}
-          <site name="net"/>{_tip(vehicle, world)}
+          <site name="{prefix}net"/>{_tip(vehicle, world, prefix)}
         </body>
       </body>"""
     friction_nm, damping_nms = world.joint_friction_nm, world.joint_damping_nms
@@ -84,8 +94,8 @@ def _links(vehicle: Vehicle, world: World) -> str:
     for number in range(len(chain.links), 0, -1):
         link = chain.links[number - 1]
         armature = 0.0 if transmission.acts(world) else link.armature_kg_m2
-        bodies = f"""<body name="link{number}" pos="{_xyz(link.position_m)}" {_turn(link, number, world)}>
-        <joint name="alpha{number}" axis="{_xyz(link.axis)}" frictionloss="{friction_nm}" damping="{damping_nms}"
+        bodies = f"""<body name="{prefix}link{number}" pos="{_xyz(link.position_m)}" {_turn(link, number, world)}>
+        <joint name="{prefix}alpha{number}" axis="{_xyz(link.axis)}" frictionloss="{friction_nm}" damping="{damping_nms}"
                armature="{armature}"/>
         {_inertial(link)}
         {bodies}
@@ -101,15 +111,17 @@ def _rod(vehicle: Vehicle, tool: Tool) -> str:
     return f'<inertial pos="{_xyz(centre_m)}" {_quat(back)} mass="{max(tool.beyond_sensor_kg, 1e-4)}" diaginertia="{_xyz(moments)}"/>'
 
 
-def _tip(vehicle: Vehicle, world: World) -> str:
+def _tip(vehicle: Vehicle, world: World, prefix: str) -> str:
     """Return the massless body at the tip, which touches the surfaces; it is left out where the net is the tip and touches nothing."""
     if not has_tip(vehicle, world):
         return ""
     back = quat_conjugate(surfaces.sensor_turn(vehicle))
-    ball = f'<geom name="tip" type="sphere" size="{vehicle.tip_radius_m}" mass="0" contype="0" conaffinity="0"/>'
+    ball = (
+        f'<geom name="{prefix}tip" type="sphere" size="{vehicle.tip_radius_m}" mass="0" contype="0" conaffinity="0"/>'
+    )
     return f"""
-          <body name="tip" pos="{_xyz(surfaces.tip_offset_m(vehicle))}" {_quat(back)}>
-            <site name="tip"/>
+          <body name="{prefix}tip" pos="{_xyz(surfaces.tip_offset_m(vehicle))}" {_quat(back)}>
+            <site name="{prefix}tip"/>
             {ball if world.surfaces else ""}
           </body>"""
 
@@ -130,87 +142,134 @@ def _turn(link: ChainLink, number: int, world: World) -> str:
     return _quat(quat_multiply(quat_from_euler_zyx(roll, pitch, yaw), link.attitude_wxyz))
 
 
-def mjcf(vehicle: Vehicle, world: World, timestep_s: float) -> str:
-    """Return the MuJoCo model of the true vehicle as MJCF text."""
-    airframe, joints = vehicle.airframe, range(1, len(vehicle.arm.joints) + 1)
-    layout = airframe.rotor_layout
-    clearance = airframe.ground_clearance_m
-    rotors = "\n".join(
-        f'<site name="rotor{i}" pos="{x} {y} {z}"/>' for i, (x, y, z) in enumerate(layout.positions_body_m)
-    )
+class _Parts(NamedTuple):
+    """MJCF of one machine, by the section of the model to which it belongs."""
+
+    worldbody: str
+    equality: str
+    tendon: str
+    pairs: str
+    actuator: str
+    sensor: str
+
+    @classmethod
+    def of(cls, vehicle: Vehicle, world: World, p: str) -> _Parts:
+        """Return the parts of a machine, whose names begin with the prefix `p`."""
+        joints, tether = range(1, len(vehicle.arm.joints) + 1), vehicle.tether
+        anchor = tendon = tension = tip = ""
+        feet = "".join(
+            f'<pair geom1="floor" geom2="{p}foot{i}" friction="1 1 0.02 0.001 0.001"/>' for i in range(len(_FEET_M))
+        )
+        if tether is not None:
+            anchor = f'<site name="{p}anchor" pos="{_xyz(tether.anchor_world_m)}"/>'
+            tendon = f"""
+    <spatial name="{p}tether" limited="true" range="0 {tether.length_m}" solreflimit="0.02 1">
+      <site site="{p}anchor"/><site site="{p}tether"/>
+    </spatial>"""
+            tension = f'<tendonlimitfrc name="{p}tether" tendon="{p}tether"/>'
+        if has_tip(vehicle, world):
+            tip = f"""
+    <force name="{p}contact" site="{p}tip"/>
+    <framepos name="{p}tip" objtype="site" objname="{p}tip"/>
+    <framequat name="{p}tip attitude" objtype="site" objname="{p}tip"/>"""
+        return cls(
+            worldbody=f"""
+    {anchor}{_base(vehicle, world, p)}""",
+            equality="".join(f'<joint name="{p}park{i}" joint1="{p}alpha{i}" solref="0.01 1"/>' for i in joints),
+            tendon=tendon,
+            pairs=feet + surfaces.pairs(world, p),
+            actuator=_motors(vehicle, world, p)
+            + "".join(f'<motor name="{p}alpha{i}" joint="{p}alpha{i}"/>' for i in joints),
+            sensor=f"""
+    <accelerometer name="{p}accel" site="{p}imu"/>
+    <gyro name="{p}gyro" site="{p}imu"/>
+    <force name="{p}force" site="{p}net"/>
+    <torque name="{p}torque" site="{p}net"/>
+    {tension}{tip}""",
+        )
+
+
+def _motors(vehicle: Vehicle, world: World, p: str) -> str:
+    airframe, layout = vehicle.airframe, vehicle.airframe.rotor_layout
     yaw_errors = of_rotors(world.rotors.yaw_torque_error if world.rotors.on else (0.0,), layout.count)
-    motors = "\n".join(
-        f'<motor name="rotor{i}" site="rotor{i}" gear="0 0 1 0 0 {-spin * airframe.yaw_torque_per_thrust_m * (1.0 + error)}"/>'
+    return "\n".join(
+        f'<motor name="{p}rotor{i}" site="{p}rotor{i}" '
+        f'gear="0 0 1 0 0 {-spin * airframe.yaw_torque_per_thrust_m * (1.0 + error)}"/>'
         for i, (spin, error) in enumerate(zip(layout.spins, yaw_errors, strict=True))
     )
+
+
+def _base(vehicle: Vehicle, world: World, p: str) -> str:
+    """Return the body of the base with its feet and its arm."""
+    airframe, tether = vehicle.airframe, vehicle.tether
+    clearance = airframe.ground_clearance_m
+    rotors = "\n".join(
+        f'<site name="{p}rotor{i}" pos="{x} {y} {z}"/>'
+        for i, (x, y, z) in enumerate(airframe.rotor_layout.positions_body_m)
+    )
     feet = "\n".join(
-        f'<geom name="foot{i}" type="sphere" size="0.02" pos="{x} {y} {-clearance + 0.02}" contype="1" '
-        f'conaffinity="2" friction="0.8 0.02 0.001" solref="0.02 1"/>'
+        f'<geom name="{p}foot{i}" type="sphere" size="0.02" pos="{x} {y} {-clearance + 0.02}" contype="0" conaffinity="0"/>'
         for i, (x, y) in enumerate(_FEET_M)
     )
-    anchor = tendon = tension = ""
-    if vehicle.tether is not None:
-        anchor = f'<site name="anchor" pos="{_xyz(vehicle.tether.anchor_world_m)}"/>'
-        tendon = f"""<tendon>
-    <spatial name="tether" limited="true" range="0 {vehicle.tether.length_m}" solreflimit="0.02 1">
-      <site site="anchor"/><site site="tether"/>
-    </spatial>
-  </tendon>"""
-        tension = '<tendonlimitfrc name="tether" tendon="tether"/>'
-    tip = ""
-    if has_tip(vehicle, world):
-        tip = """
-    <force name="contact" site="tip"/>
-    <framepos name="tip" objtype="site" objname="tip"/>
-    <framequat name="tip attitude" objtype="site" objname="tip"/>"""
-    options = surfaces.OPTIONS if world.surfaces else 'cone="pyramidal"'
-    payload = ""
-    connect = ""
+    return f"""
+    <body name="{p}base" pos="0 0 {clearance}">
+      <freejoint name="{p}base"/>
+      <inertial pos="{_xyz(machine.centre_of_mass_m(world.machine))}" mass="{base_mass_kg(vehicle, world)}"
+                diaginertia="{_xyz(machine.inertia_kg_m2(airframe.inertia_kg_m2, world.machine))}"/>
+      <site name="{p}imu"/>
+      <site name="{p}tether" pos="{_xyz(tether.attachment_body_m if tether is not None else (0.0, 0.0, 0.0))}"/>
+      {rotors}
+      {feet}
+      {_links(vehicle, world, p)}
+    </body>"""
+
+
+def _balls(world: World) -> tuple[str, str, str]:
+    """Return the bodies of the balls, their contacts with the floor, and the constraints that hold them in the net of the first
+    machine.
+    """
+    bodies = pairs = connect = ""
     balls = [("payload", "catch", world.payload_kg)]
     balls += [(SECOND, SECOND_CATCH, f.magnitude) for f in world.faults if f.kind == "payload_double"][:1]
     for row, (name, catch, mass_kg) in enumerate(balls):
         if mass_kg <= 0:
             continue
-        payload += f"""
+        bodies += f"""
     <body name="{name}" pos="{row} 50 {PAYLOAD_RADIUS_M}">
       <freejoint name="{name}"/>
-      <geom name="{name}" type="sphere" size="{PAYLOAD_RADIUS_M}" mass="{mass_kg}" contype="1" conaffinity="2"/>
+      <geom name="{name}" type="sphere" size="{PAYLOAD_RADIUS_M}" mass="{mass_kg}" contype="0" conaffinity="0"/>
     </body>"""
+        pairs += f'<pair geom1="floor" geom2="{name}" friction="1 1 0.005 0.0001 0.0001"/>'
         connect += f"""
     <connect name="{catch}" body1="net" body2="{name}" anchor="0 0 0" active="false" solref="0.025 1"
              solimp="0.95 0.99 0.01"/>"""
+    return bodies, pairs, connect
+
+
+def mjcf(machines: Sequence[tuple[Vehicle, World]], timestep_s: float) -> str:
+    """Return the MuJoCo model of a scene as MJCF text. Bodies touch only where a pair says so, which costs less than a search.
+
+    Args:
+        machines: vehicle file and configuration of each machine; the configuration of the first has the objects of the scene, and its
+            machine catches the payload.
+        timestep_s: physics step.
+    """
+    vehicle, world = machines[0]
+    parts = [_Parts.of(*each, prefix_of(number)) for number, each in enumerate(machines)]
+    worldbody, equality, tendon, pairs, actuator, sensor = ("".join(texts) for texts in zip(*parts, strict=True))
+    balls, ball_pairs, connect = _balls(world)
+    options = surfaces.OPTIONS if world.surfaces else 'cone="pyramidal"'
     return f"""
 <mujoco model="{vehicle.name}">
   <compiler angle="radian" eulerseq="zyx" inertiafromgeom="auto"/>
   <option timestep="{timestep_s}" gravity="0 0 -{GRAVITY_M_S2}" integrator="implicitfast" {options}/>
   <size memory="2M"/>
   <worldbody>
-    <geom name="floor" type="plane" size="20 20 1" contype="2" conaffinity="1"/>{surfaces.geoms(world)}
-    {anchor}
-    <body name="base" pos="0 0 {clearance}">
-      <freejoint name="base"/>
-      <inertial pos="{_xyz(machine.centre_of_mass_m(world.machine))}" mass="{base_mass_kg(vehicle, world)}"
-                diaginertia="{_xyz(machine.inertia_kg_m2(airframe.inertia_kg_m2, world.machine))}"/>
-      <site name="imu"/>
-      <site name="tether" pos="{_xyz(vehicle.tether.attachment_body_m if vehicle.tether is not None else (0.0, 0.0, 0.0))}"/>
-      {rotors}
-      {feet}
-      {_links(vehicle, world)}
-    </body>{payload}
+    <geom name="floor" type="plane" size="20 20 1" contype="0" conaffinity="0"/>{surfaces.geoms(world)}{worldbody}{balls}
   </worldbody>
-  <equality>
-    {"".join(f'<joint name="park{i}" joint1="alpha{i}" solref="0.01 1"/>' for i in joints)}{connect}
-  </equality>
-  {tendon}{surfaces.pairs(world)}
-  <actuator>
-    {motors}
-    {"".join(f'<motor name="alpha{i}" joint="alpha{i}"/>' for i in joints)}
-  </actuator>
-  <sensor>
-    <accelerometer name="accel" site="imu"/>
-    <gyro name="gyro" site="imu"/>
-    <force name="force" site="net"/>
-    <torque name="torque" site="net"/>
-    {tension}{tip}
-  </sensor>
+  <equality>{equality}{connect}</equality>
+  <tendon>{tendon}</tendon>
+  <contact>{pairs}{ball_pairs}</contact>
+  <actuator>{actuator}</actuator>
+  <sensor>{sensor}</sensor>
 </mujoco>"""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import mujoco
 import numpy as np
@@ -12,10 +12,9 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.net import Net
 from sitl.world.effects.thrower import Thrower
-from sitl.world.model import PAYLOAD_RADIUS_M
-
-if TYPE_CHECKING:
-    from sitl.world.world import World
+from sitl.world.loads import Bodies
+from sitl.world.machine import Machine
+from sitl.world.state import PAYLOAD_RADIUS_M, Events
 
 THROW_LEAD_S: Final = 0.45
 """Time from the throw to the catch."""
@@ -41,20 +40,24 @@ class Ball(NamedTuple):
 
 
 class Payload:
-    """The payload and the net that catches it; call `step` once per physics step."""
+    """The payload and the net that catches it; call `step` once per physics step.
 
-    def __init__(self, world: World, vehicle: Vehicle, config: WorldConfig) -> None:
-        self._world, self._config = world, config
-        model, data = world.model, world.data
-        self._model, self._data = model, data
-        self._net = model.body("net").id
+    Args:
+        machine: the machine with the net.
+        bodies: the model of the scene, as that machine sees it.
+        vehicle: vehicle file of that machine.
+        config: configuration of the world.
+        events: where throws and catches are reported.
+    """
+
+    def __init__(self, machine: Machine, bodies: Bodies, vehicle: Vehicle, config: WorldConfig, events: Events) -> None:
+        self._machine, self._config, self._events = machine, config, events
+        model, self._data = bodies.model, bodies.data
+        self._model = model
+        self._net = bodies.body("net")
         self._net_radius_m = vehicle.tip_radius_m
         self._thrower = Thrower.of(config.thrower, config.seed)
-        self.bag = (
-            Net.of(config.net, model, data, world.loads, self._net_radius_m, PAYLOAD_RADIUS_M)
-            if vehicle.has_net
-            else None
-        )
+        self.bag = Net.of(config.net, bodies, self._net_radius_m, PAYLOAD_RADIUS_M) if vehicle.has_net else None
         """The bag of the net, or None if its effect is off or there is no net."""
         self.ball = Ball.of(model, "payload", "catch") if vehicle.has_net and config.payload_kg > 0 else None
         """Indices of the payload; None if no payload is configured, or the vehicle has no net to throw it into."""
@@ -73,56 +76,58 @@ class Payload:
         self._missed = False
         """Whether the throw in flight has missed the net."""
         self._last_x = 0.0
+        self.await_pass()
 
-    def step(self, airborne: bool) -> None:
+    def step(self, t_s: float, airborne: bool) -> None:
         """Throw, catch or remove the payload if that is due in this step.
 
         Args:
+            t_s: world time.
             airborne: whether a payload may be thrown.
         """
-        ball, world, kept_since_s = self.ball, self._world, self._kept_since_s
+        ball, kept_since_s = self.ball, self._kept_since_s
         if ball is None or (kept_since_s is not None and self.throws == self._config.throws):
             return
         if kept_since_s is not None:
-            if world.t_s - kept_since_s >= self._config.keep_s:
-                self._take_out(ball)
+            if t_s - kept_since_s >= self._config.keep_s:
+                self._take_out(ball, t_s)
             return
         if self._flies_since_s is None:
-            vx = world.v[0]
-            ahead = world.q[0] + vx * THROW_LEAD_S
+            q, vx = self._machine.q, self._machine.v[0]
+            ahead = q[0] + vx * THROW_LEAD_S
             at_x, at_y = self._config.catch_at_m
-            if airborne and vx > 0.05 and self._last_x < at_x <= ahead and abs(world.q[1] - at_y) <= _THROW_BESIDE_M:
-                self._throw_payload(ball)
+            if airborne and vx > 0.05 and self._last_x < at_x <= ahead and abs(q[1] - at_y) <= _THROW_BESIDE_M:
+                self._throw_payload(ball, t_s)
             self._last_x = ahead
             return
-        caught_s = self._caught_s(ball)
+        caught_s = self._caught_s(ball, t_s)
         if caught_s is not None:
             self.catches += 1
             if self.throws == 1:
                 self.caught_t_s = caught_s
             self._flies_since_s, self._kept_since_s = None, caught_s
-            world.report("caught")
+            self._events.report(t_s, "caught")
         elif (
             not self._missed
-            and world.t_s - self._flies_since_s > 2 * THROW_LEAD_S
+            and t_s - self._flies_since_s > 2 * THROW_LEAD_S
             and not (self.bag is not None and self.bag.in_bag(ball.body))
         ):
             self._missed = True
             self.missed = self.missed or self.throws == 1
-            world.report("missed")
+            self._events.report(t_s, "missed")
             if self.throws < self._config.throws:
                 self._flies_since_s = None
                 self.await_pass()
 
-    def _throw_payload(self, ball: Ball) -> None:
+    def _throw_payload(self, ball: Ball, t_s: float) -> None:
         if self.throws == 0:
-            self.thrown_t_s = self._world.t_s
+            self.thrown_t_s = t_s
         self.throws += 1
-        self._flies_since_s, self._missed = self._world.t_s, False
+        self._flies_since_s, self._missed = t_s, False
         self.throw(ball, self.aside_m)
-        self._world.report("thrown")
+        self._events.report(t_s, "thrown")
 
-    def _take_out(self, ball: Ball) -> None:
+    def _take_out(self, ball: Ball, t_s: float) -> None:
         """Take the payload out of the net, so that it can be thrown again."""
         d = self._data
         self.drop()
@@ -130,17 +135,17 @@ class Payload:
         d.qpos[ball.q : ball.q + 7] = self._model.qpos0[ball.q : ball.q + 7]
         d.qvel[ball.v : ball.v + 6] = 0.0
         self.await_pass()
-        self._world.report("taken")
+        self._events.report(t_s, "taken")
 
     def await_pass(self) -> None:
         """Delay the next throw until the vehicle passes `catch_at_m` again."""
-        self._last_x = self._world.q[0] + self._world.v[0] * THROW_LEAD_S
+        self._last_x = self._machine.q[0] + self._machine.v[0] * THROW_LEAD_S
 
     def throw(self, ball: Ball, aside_m: float = 0.0) -> None:
         """Launch a ball at a point `aside_m` to the left (world y) of the net, with the errors of the thrower."""
         d, thrower = self._data, self._thrower
         lead_s = THROW_LEAD_S if thrower is None else THROW_LEAD_S + thrower.prediction_error_s()
-        target = d.xpos[self._net] + d.qvel[0:3] * lead_s + np.array([0.0, aside_m, 0.0])
+        target = d.xpos[self._net] + np.array(self._machine.v[0:3]) * lead_s + np.array([0.0, aside_m, 0.0])
         arrival = np.array(self._config.throw_velocity_m_s)
         gravity = np.array([0.0, 0.0, -GRAVITY_M_S2])
         velocity = arrival - gravity * THROW_LEAD_S
@@ -157,17 +162,21 @@ class Payload:
         if self.bag is not None:
             self.bag.watch(ball.body, ball.q, ball.v)
 
-    def catch(self, ball: Ball) -> bool:
+    def catch(self, ball: Ball, t_s: float) -> bool:
         """Return whether the ball is caught: with a bag, once it has settled in the bag; without, once it touches the net, to which
         this call attaches it.
-        """
-        return self._caught_s(ball) is not None
 
-    def _caught_s(self, ball: Ball) -> float | None:
+        Args:
+            ball: indices of the ball.
+            t_s: world time.
+        """
+        return self._caught_s(ball, t_s) is not None
+
+    def _caught_s(self, ball: Ball, t_s: float) -> float | None:
         """Return the time of the catch if the ball is caught; otherwise None."""
         if self.bag is not None:
-            return self.bag.caught_s(ball.body, self._world.t_s)
-        return self._world.t_s if self._attach(ball) else None
+            return self.bag.caught_s(ball.body, t_s)
+        return t_s if self._attach(ball) else None
 
     def _attach(self, ball: Ball) -> bool:
         """Attach the ball to the net if it touches the net; return whether it does."""

@@ -1,14 +1,13 @@
-"""Surfaces that the tool can push against: their true place, their contact in MuJoCo, and their distance from the rotors."""
+"""Surfaces that a tool can push against: their true place, and their bodies in MuJoCo."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
-import numpy as np
 
 from companion.config.vehicle import Vehicle
 from companion.model.algebra import cross, dot
@@ -17,24 +16,10 @@ from companion.model.types import IDENTITY_QUAT, Mat3, Quat, Vec3
 from companion.sitl_config.surfaces import Surface
 from companion.sitl_config.world import World as WorldConfig
 
-if TYPE_CHECKING:
-    from sitl.world.world import World
-
 THICKNESS_M = 0.2
-_FRICTION_RATIO = 1e4
-OPTIONS = f'cone="elliptic" impratio="{_FRICTION_RATIO:g}"'
+FRICTION_RATIO = 1e4
+OPTIONS = f'cone="elliptic" impratio="{FRICTION_RATIO:g}"'
 """MuJoCo's options in a world with surfaces: a round friction cone, and friction that is stiffer than the normal direction."""
-_CREEP_NS_M = 1e4
-"""Friction force that is not enough to slide, divided by the speed with which the tip creeps. A large value lifts a sliding tip."""
-APART_S = 0.05
-"""Shortest time without contact after which a contact is a new touch."""
-PRESSED_S, SAME_S = 2.5, 0.5
-_DAMPED_KG = 1.0
-"""Mass to which `damping_ratio` refers."""
-_WATCH_STEPS = 5
-"""Physics steps between two measurements of the rotors' distance, and between two samples of the contact force."""
-_RIM_POINTS = 36
-_NO_MASS_KG = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,169 +88,60 @@ def geoms(config: WorldConfig) -> str:
     return text
 
 
-def pairs(config: WorldConfig) -> str:
-    """Return the MJCF of the contacts between tip and surfaces, whose stiffness `Surfaces` sets."""
-    rows = "".join(
-        f'\n    <pair name="surface{number}" geom1="surface{number}" geom2="tip" condim="3" '
+def pairs(config: WorldConfig, prefix: str) -> str:
+    """Return the MJCF of the contacts between a machine's tip and the surfaces, whose stiffness `ToolContact` sets."""
+    return "".join(
+        f'\n    <pair name="{prefix}surface{number}" geom1="surface{number}" geom2="{prefix}tip" condim="3" '
         f'friction="{surface.friction} {surface.friction} 0 0 0"/>'
         for number, surface in enumerate(config.surfaces)
     )
-    return f"<contact>{rows}\n  </contact>" if rows else ""
 
 
 class Surfaces:
-    """The surfaces of a world; call `step` after each physics step.
+    """The surfaces of a scene, which every tip can touch.
 
-    A contact is a spring and a damper whose force MuJoCo evaluates at the end of the step (implicit Euler), which is stable at any
-    stiffness. With f = -K (r + dt v + dt^2 a) - C (v + dt a) and MuJoCo's f = (-b v - k d r - a) / R follow R = 1 / (K dt^2 + C dt),
-    k d = K R and b = (C + K dt) R. MuJoCo computes R = A (1 - d) / d from the impedance d and the inverse weight A of the tip's body.
+    Args:
+        config: configuration of the world; `surfaces` is used.
+        model: MuJoCo model with `geoms` and, for each machine, `pairs`.
     """
 
-    def __init__(self, vehicle: Vehicle, config: WorldConfig, model: mujoco.MjModel) -> None:
+    def __init__(self, config: WorldConfig, model: mujoco.MjModel) -> None:
         self.placed = tuple(map(Placed.of, config.surfaces))
         self._model = model
         self._geoms = [model.geom(f"surface{number}").id for number in range(len(self.placed))]
-        tip = model.body("tip").id
-        self._inverse_kg = float(model.body_invweight0[tip, 0])
-        tool = vehicle.tool
-        tip_n_m = tool.stiffness_n_m if tool is not None else None
-        for number, surface in enumerate(config.surfaces):
-            own = surface.stiffness_n_m
-            self._set_contact(
-                number, own if tip_n_m is None else own * tip_n_m / (own + tip_n_m), surface.damping_ratio
-            )
-        layout = vehicle.airframe.rotor_layout
-        angles = np.linspace(0.0, 2.0 * math.pi, _RIM_POINTS, endpoint=False)
-        rim = vehicle.airframe.disk_radius_m * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
-        self._disks_body_m = (np.array(layout.positions_body_m)[:, None, :] + rim[None]).reshape(-1, 3)
         self.gone = [False] * len(self.placed)
         """Whether each surface has given way."""
-        self.touches = 0
-        """Number of touches of any surface by the tip."""
-        self.touched_s: float | None = None
-        """World time of the first touch; None before it."""
-        self.pressed_s: float | None = None
-        """World time at which the first touch that lasted for `PRESSED_S` began; None before. Interruptions of up to `SAME_S` count."""
-        self._run_begin_s = -math.inf
-        self.force_max_n = 0.0
-        """Largest contact force."""
-        self._forces_n: list[Vec3] = []
-        self.rotor_distance_m = self.rotor_distance_min_m = math.inf
-        """Smallest distance of a rotor's disk from a surface, now and so far."""
-        self._last_touch_s = -math.inf
-        self._step = 0
-
-    @classmethod
-    def of(cls, vehicle: Vehicle, config: WorldConfig, model: mujoco.MjModel) -> Surfaces | None:
-        """Return the surfaces, or None if the world has none."""
-        return cls(vehicle, config, model) if config.surfaces else None
-
-    def _set_contact(self, number: int, stiffness_n_m: float, damping_ratio: float) -> None:
-        model, dt_s, inverse_kg = self._model, float(self._model.opt.timestep), self._inverse_kg
-        damping_ns_m = 2.0 * damping_ratio * math.sqrt(stiffness_n_m * _DAMPED_KG)
-        r = 1.0 / (stiffness_n_m * dt_s * dt_s + damping_ns_m * dt_s)
-        d = inverse_kg / (inverse_kg + r)
-        model.pair_solimp[number] = (d, d, 1.0, 0.5, 1.0)
-        model.pair_solref[number] = (-stiffness_n_m * r * d, -(damping_ns_m + stiffness_n_m * dt_s) * r * d)
-        model.pair_solreffriction[number] = (-1.0, -min(_CREEP_NS_M * r / _FRICTION_RATIO, 1.0 / dt_s) * d)
 
     def set_friction(self, number: int, friction: float) -> None:
         """Change a surface's coefficient of friction."""
-        self._model.pair_friction[number, 0:2] = friction
+        model = self._model
+        for pair in range(model.npair):
+            if self._geoms[number] in (model.pair_geom1[pair], model.pair_geom2[pair]):
+                model.pair_friction[pair, 0:2] = friction
 
     def give_way(self, number: int) -> None:
         """Remove a surface."""
         self.gone[number] = True
         self._model.geom_pos[self._geoms[number]] = (0.0, 0.0, -100.0)
 
-    def break_tool(self) -> None:
-        """Remove the rod or brush: its mass, and its tip, which touches the surfaces."""
-        model = self._model
-        tip = model.geom("tip").id
-        model.geom_pos[tip] = (0.0, 0.0, -100.0)
-        model.geom_sameframe[tip] = (
-            mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-        )  # or MuJoCo takes the body's place for the geom's
-        rod = model.body("net").id
-        model.body_mass[rod] = _NO_MASS_KG
-        model.body_inertia[rod] *= 0.0
-
-    def step(self, world: World) -> None:
-        """Watch the contact and the rotors."""
-        tip_m, force_n = world.layout.contact(world.sensors())
-        size_n = math.sqrt(dot(force_n, force_n))
-        if size_n > 0.0:
-            if world.t_s - self._last_touch_s > APART_S:
-                self.touches += 1
-                self.touched_s = world.t_s if self.touched_s is None else self.touched_s
-                world.report("touched")
-            if world.t_s - self._last_touch_s > SAME_S:
-                self._run_begin_s = world.t_s
-            if self.pressed_s is None and world.t_s - self._run_begin_s > PRESSED_S:
-                self.pressed_s = self._run_begin_s
-            self._last_touch_s = world.t_s
-            self.force_max_n = max(self.force_max_n, size_n)
-            number = self.touched(tip_m)
-            surface = self.placed[number]
-            if 0.0 < surface.config.gives_way_n < dot(force_n, surface.normal):
-                self.give_way(number)
-                world.report("gave_way")
-            if self._step % _WATCH_STEPS == 0:
-                self._forces_n.append(force_n)
-        if self._step % _WATCH_STEPS == 0:
-            self._watch_rotors(world)
-        self._step += 1
-
     def touched(self, tip_m: Vec3) -> int:
         """Return the index of the surface in which the tip is deepest, of those that have not given way."""
         there = [number for number, gone in enumerate(self.gone) if not gone]
         return min(there or [0], key=lambda number: self.placed[number].local_m(tip_m)[2])
 
-    def _watch_rotors(self, world: World) -> None:
-        q = world.q
-        rotation = np.empty(9)
-        mujoco.mju_quat2Mat(rotation, np.array(q[3:7]))
-        points = self._disks_body_m @ rotation.reshape(3, 3).T + np.array(q[0:3])
-        nearest_m = math.inf
-        for placed, gone in zip(self.placed, self.gone, strict=True):
-            if gone:
-                continue
-            local = (points - np.array(placed.point_m)) @ np.array(placed.axes).T
-            width_m, height_m = placed.config.size_m
-            half = np.array([0.5 * width_m, 0.5 * height_m, 0.5 * THICKNESS_M])
-            beyond = np.abs(local + np.array([0.0, 0.0, 0.5 * THICKNESS_M])) - half
-            outside_m = np.sqrt((np.maximum(beyond, 0.0) ** 2).sum(axis=1))
-            nearest_m = min(nearest_m, float((outside_m + np.minimum(beyond.max(axis=1), 0.0)).min()))
-        self.rotor_distance_m = nearest_m
-        self.rotor_distance_min_m = min(self.rotor_distance_min_m, nearest_m)
-        if nearest_m <= 0.0:
-            world.crash("rotor_touched")
-
-    def _force_held_n(self) -> list[float] | None:
-        """Return the median of the contact forces of more than half the largest one: without touch and release."""
-        held = [force_n for force_n in self._forces_n if 2.0 * math.hypot(*force_n) > self.force_max_n]
-        return np.median(held, axis=0).tolist() if held else None
-
-    def report(self) -> dict[str, Any]:
-        """Return the truth about the surfaces for `summary.json`."""
-        distance_m = self.rotor_distance_min_m
-        return {
-            "touches": self.touches,
-            "force_max_n": self.force_max_n,
-            "force_held_world_n": self._force_held_n(),
-            "rotor_distance_min_m": distance_m if math.isfinite(distance_m) else None,
-            "surfaces": [
-                {
-                    "name": placed.config.name,
-                    "point_m": placed.point_m,
-                    "normal": placed.normal,
-                    "stiffness_n_m": placed.config.stiffness_n_m,
-                    "friction": placed.config.friction,
-                    "gave_way": gone,
-                }
-                for placed, gone in zip(self.placed, self.gone, strict=True)
-            ],
-        }
+    def report(self) -> list[dict[str, Any]]:
+        """Return the truth about each surface for `summary.json`."""
+        return [
+            {
+                "name": placed.config.name,
+                "point_m": placed.point_m,
+                "normal": placed.normal,
+                "stiffness_n_m": placed.config.stiffness_n_m,
+                "friction": placed.config.friction,
+                "gave_way": gone,
+            }
+            for placed, gone in zip(self.placed, self.gone, strict=True)
+        ]
 
 
 def _unit(v: Sequence[float]) -> Vec3:

@@ -28,7 +28,7 @@ ERROR = 0.05
 def flown() -> tuple[FlightLog, float]:
     """A flight, and the true hover thrust of its world."""
     flight = FastFlight(load_sitl("configs/missions/catch.yaml", overrides=(f"world.hover_thrust_error={ERROR}",)))
-    truth = flight.plant.world.hover_command
+    truth = flight.plant.machine.hover_command
     return log_of(flight.config, flight.run(until_mission_s=15.0), None), truth
 
 

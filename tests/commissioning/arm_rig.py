@@ -28,12 +28,12 @@ from companion.preflight.observe import observe
 from companion.runtime.clock import flight_clock
 from companion.runtime.realtime import WORLD_PRIORITY
 from companion.sitl_config.loader import load_sitl
-from sitl.server import start_of
 from sitl.servo.bus import ServoBus
 from sitl.servo.from_config import plugged_in, servos_of
+from sitl.world.start import start_of
 from tests.support import CATCH, ROOT, Ended, Running, Sandbox, World, run_here, sandbox_in
 
-HAND = "world.arm_hand=true"
+HAND = "world.arm_handling=true"
 FILES = "3000000"
 """The shipped vehicle file's baud rate: to look at it alone takes a second."""
 SHIPPED = ROOT / "configs/vehicles/tarot650_2r.yaml"

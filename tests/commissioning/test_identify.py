@@ -41,15 +41,15 @@ def flown() -> tuple[FlightLog, dict[str, float]]:
     """A flight's log, which holds nothing of the world, and the truth."""
     flight = FastFlight(load_sitl(CATCH, overrides=OVERRIDES, world="lab"))
     log = log_of(flight.config.flight, flight.run(), None)
-    world, plant = flight.config.world, flight.plant.world
+    world, machine = flight.config.world, flight.plant.machine
     near_floor = 0.985  # ground effect at 1 m
     truth = {
-        "hover_thrust": near_floor * plant.hover_command,
+        "hover_thrust": near_floor * machine.hover_command,
         "thrust_lag_s": LAG_S + DELAY_S,
         "roll_lag_s": 1.0 / 6.5 + DELAY_S,  # MC_ROLL_P, and the rate loop follows at low frequencies
         "pitch_lag_s": 1.0 / 6.5 + DELAY_S,
         "mocap_delay_s": world.mocap_latency_s + world.mocap.delivery_jitter_s,
-        "drag_1_s": (world.rotors.drag_s_m * plant.weight_n + 0.25) / (plant.weight_n / 9.81),
+        "drag_1_s": (world.rotors.drag_s_m * machine.weight_n + 0.25) / (machine.weight_n / 9.81),
         "joint1_torque_per_amp_nm_a": 1.3 / (1.0 + world.servo_mechanics.torque_per_amp_error[0]),
         "joint2_torque_per_amp_nm_a": 1.3 / (1.0 + world.servo_mechanics.torque_per_amp_error[1]),
         "payload_kg": PAYLOAD_KG,

@@ -10,7 +10,7 @@ from companion.model.exit_codes import EXIT_OK
 from tests.commissioning.test_mocap_wires import VEHICLE, bad, document
 from tests.support import Ended, Sandbox, World
 
-TAPPED = ("world.hand=true", "world.hand_t_s=2", "world.hand_taps=60", "world.payload_kg=0")
+TAPPED = ("world.handling=true", "world.handling_t_s=2", "world.handling_taps=60", "world.payload_kg=0")
 FEWEST = ("--taps", 5)
 """As few as the tool accepts."""
 STEP_MS = 1.0

@@ -18,7 +18,7 @@ from tests.preflight.hand_rig import Standing, world
 
 def measured(*overrides: str) -> HandResult:
     test = HandTest()
-    for sample in Standing(world("hand=true", *overrides)).samples(40.0):
+    for sample in Standing(world("handling=true", *overrides)).samples(40.0):
         view = test.update(sample)
         assert not view.ended, view.ended
         if view.result is not None:

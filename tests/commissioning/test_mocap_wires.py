@@ -78,8 +78,8 @@ def test_wrong_body_half_the_rate_and_more_latency_are_found_and_the_patch_is_ri
         "world.mocap_latency_s": 0.035,
         "world.mocap_other_id": 1,
         "vehicle.devices.mocap.rigid_body_id": 7,
-        "world.hand": True,
-        "world.hand_t_s": 0.5,
+        "world.handling": True,
+        "world.handling_t_s": 0.5,
     }
     overrides = [word for word in set_options(**knobs) if word != "--set"]
     with World(sandbox, overrides=overrides) as world:
@@ -117,7 +117,7 @@ def test_a_server_at_another_address_is_found_by_broadcast(sandbox: Sandbox, veh
 
 def test_a_y_up_stream_is_found_and_written(sandbox: Sandbox, vehicle: Path) -> None:
     """The machine stands while the devices open and the test begins; then the hand lifts it."""
-    knobs = ("world.hand=true", "world.hand_t_s=6", "world.payload_kg=0", 'world.mocap_axes=["x","z","-y"]')
+    knobs = ("world.handling=true", "world.handling_t_s=6", "world.payload_kg=0", 'world.mocap_axes=["x","z","-y"]')
     with World(sandbox, overrides=knobs) as world:
         options = ["--json", "--write", "--yes", "--vehicle", vehicle, *addresses(world, "up_axis")]
         ended = run_here("mocap", "align", CATCH, *options)

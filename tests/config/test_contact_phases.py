@@ -12,7 +12,7 @@ from companion.config.mission import Mission
 
 APPROACH = {"type": "approach", "direction": [1.0, 0.0, 0.0], "distance_max_m": 0.3, "speed_m_s": 0.04}
 PRESS = {"type": "press", "force_n": 5.0, "duration_s": 5.0}
-SLIDE = {"type": "slide", "force_n": 3.0, "by_m": [0.0, -0.5], "speed_m_s": 0.05}
+SLIDE = {"type": "slide", "force_n": 3.0, "displacement_m": [0.0, -0.5], "speed_m_s": 0.05}
 DETACH = {"type": "detach", "speed_m_s": 0.1}
 HOLD = {"type": "hold", "duration_s": 1.0}
 
@@ -51,7 +51,7 @@ def test_a_contact_that_is_left_is_accepted(phases: tuple[dict[str, Any], ...]) 
     [
         ((PRESS,), "a press must follow an approach"),
         ((SLIDE,), "a slide must follow an approach"),
-        (({**SLIDE, "by_m": [0.0, 0.0]},), "is shorter than"),
+        (({**SLIDE, "displacement_m": [0.0, 0.0]},), "is shorter than"),
         ((DETACH,), "a detach must follow a press"),
         ((APPROACH, DETACH), "a detach must follow a press"),
         ((APPROACH, HOLD), "a press or a slide must follow the approach, not a hold"),

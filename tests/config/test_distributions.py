@@ -23,8 +23,9 @@ from companion.sitl_config.per_joint import of_joints
 from companion.sitl_config.world import World
 from sitl.campaigns.flights import with_world
 from sitl.fast.loop import FastFlight
-from sitl.server import Ports, Sitl, start_of
+from sitl.server import Ports, Sitl
 from sitl.world.model import base_mass_kg, link_masses_kg
+from sitl.world.start import start_of
 from tests.support import HOVER, tool_of
 
 FILE = """\
@@ -141,7 +142,7 @@ def test_another_seed_draws_the_laboratory_anew_but_keeps_what_was_set(file: str
         ("wind_m_s: [0, {uniform: [1, 1]}, 0]", "1:15: wind_m_s[1]: uniform: expected [low, high] with low < high, got [1, 1]"),
         ("throws: {uniform: [1, 5]}", "1:9: throws: expected a whole number from 1 to 1000, got a mapping"),
         ("rotor_lg_s: {uniform: [1, 5]}", "1:1: rotor_lg_s: unknown key; did you mean rotor_lag_s?"),
-        ("hand: {uniform: [0, 1]}", "1:7: hand: expected true or false, got a mapping"),
+        ("handling: {uniform: [0, 1]}", "1:11: handling: expected true or false, got a mapping"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_reported_once_with_its_place_whatever_the_seed(tmp_path: Path, text: str, line: str) -> None:
@@ -247,11 +248,11 @@ def test_a_model_error_without_the_section_machine_changes_nothing_else_of_the_m
 
 def test_both_loops_fly_the_machine_with_the_model_error() -> None:
     config = load_sitl(HOVER, overrides=["world.model_error=0.2"])
-    true, believed = (FastFlight(c).plant.world.weight_n for c in (config, load_sitl(HOVER)))
+    true, believed = (FastFlight(c).plant.machine.weight_n for c in (config, load_sitl(HOVER)))
     plant = Sitl(
         config.vehicle, config.world, start_of((0.0, 0.0), 0.0, (90.0, 90.0)), Ports(), lambda message: None
     ).plant
-    assert plant.world.weight_n == true
+    assert plant.machine.weight_n == true
     tool, errs = tool_of(config.vehicle), with_model_error(config.world, 2)
     links_kg = link_masses_kg(config.vehicle, errs)
     true_kg = base_mass_kg(config.vehicle, errs) + sum(links_kg) + tool.sensor_mass_kg + tool.beyond_sensor_kg

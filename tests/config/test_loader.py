@@ -14,7 +14,7 @@ import yaml
 
 from companion.config.controller import LAWS, AdaptiveConfig
 from companion.config.document import ConfigError
-from companion.config.loader import PRESETS, FlightConfig, load_vehicle, logged_flight
+from companion.config.loader import PRESETS, FlightConfig, load_flight, load_vehicle, logged_flight
 from companion.model.link_address import parse_address
 from companion.sitl_config.loader import SitlConfig, load_sitl, load_world
 from tests.machines import overrides_with_joints
@@ -468,6 +468,41 @@ def test_a_part_that_may_be_absent_is_not_left_out_by_mistake(project: Path, key
 def test_the_configuration_in_a_log_of_version_0_1_opens() -> None:
     config = logged_flight((Path(__file__).parent / "data" / "logged_0.1.0.json").read_text(encoding="utf-8"))
     assert (config.vehicle.safety.joint_limit_max_deg, config.vehicle.safety.react_time_s) == (10.0, 0.18)
+
+
+@pytest.mark.parametrize(
+    ("mission", "index", "old", "new"),
+    [("slide", 4, "by_m", "displacement_m"), ("circuit", 2, "through_m", "waypoints_m")],
+)
+def test_old_spellings_of_phase_keys_are_accepted_in_files_options_and_logs(
+    tmp_path: Path, mission: str, index: int, old: str, new: str
+) -> None:
+    shipped = ROOT / "configs" / "missions" / f"{mission}.yaml"
+    text = shipped.read_text(encoding="utf-8")
+    assert text.count(f"{new}:") == 1
+    file = tmp_path / "old.yaml"
+    file.write_text(text.replace(f"{new}:", f"{old}:").replace("../", f"{ROOT}/configs/"), encoding="utf-8")
+    as_shipped, as_old = load_flight(shipped), load_flight(file)
+    assert as_old.mission == as_shipped.mission.model_copy(update={"vehicle": as_old.mission.vehicle})
+    value = getattr(as_shipped.mission.phases[index], new)
+    changed = [[0.1, 0.7, 1.0]] if new == "waypoints_m" else [0.0, -0.2]
+    changed_in = load_flight(shipped, overrides=[f"mission.phases[{index}].{old}={changed}"])
+    assert getattr(changed_in.mission.phases[index], new) != value
+    assert logged_flight(as_shipped.model_dump_json().replace(f'"{new}"', f'"{old}"')) == as_shipped
+
+
+def test_old_spellings_of_the_worlds_keys_are_accepted() -> None:
+    old = ("world.hand=true", "world.hand_t_s=3", "world.hand_taps=4", "world.hand_tap_n=9", "world.arm_hand=true")
+    world, _ = load_world(old)
+    assert (world.handling, world.handling_t_s, world.handling_taps, world.handling_tap_n) == (True, 3.0, 4, 9.0)
+    assert world.arm_handling
+
+
+def test_a_key_in_both_spellings_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "both.yaml"
+    file.write_text("handling_t_s: 3\nhand_t_s: 4\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"both.yaml:2:1: hand_t_s: unknown key"):
+        load_world((), str(file))
 
 
 def test_a_flights_configuration_holds_nothing_of_the_simulated_world(project: Path) -> None:

@@ -14,8 +14,10 @@ from companion.control.arm_model import dynamics_of
 from companion.control.dynamics import Dynamics, DynamicsTerms, chi_rate_from_body_rate
 from companion.model.frames import quat_from_euler_zyx, rotation_matrix
 from companion.model.types import Chi, Joints, Vec3
+from companion.sitl_config.world import World
+from sitl.world.model import base_mass_kg
 from tests.pinocchio_or_skip import pin
-from tests.sitl.test_world_dynamics import oracle
+from tests.support import tool_of
 
 Array = NDArray[np.float64]
 
@@ -27,6 +29,35 @@ def vehicle() -> Vehicle:
     return loaded.model_copy(
         update={"arm": loaded.arm.model_copy(update={"shoulder_body_m": (0.03, 0.02, -0.05)})},
     )
+
+
+def oracle(vehicle: Vehicle) -> pin.Model:
+    """The same machine in Pinocchio, from the vehicle file and nothing of MuJoCo's."""
+    arm, tool = vehicle.arm, tool_of(vehicle)
+    model = pin.Model()
+    base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "base")
+    base_mass = base_mass_kg(vehicle, World())
+    model.appendBodyToJoint(
+        base, pin.Inertia(base_mass, np.zeros(3), np.diag(vehicle.airframe.inertia_kg_m2)), pin.SE3.Identity()
+    )
+
+    def rod(mass: float, com: float, length: float) -> pin.Inertia:
+        across = mass * length**2 / 12
+        return pin.Inertia(mass, np.array([com, 0, 0]), np.diag([0.1 * across + 1e-5, across, across]))
+
+    (l1, l2), (m1, m2), (c1, c2) = arm.link_lengths_m, arm.link_masses_kg, arm.link_com_m
+    shoulder = pin.SE3(np.eye(3), np.array(arm.shoulder_body_m))
+    link1 = model.addJoint(base, pin.JointModelRY(), shoulder, "alpha1")
+    model.appendBodyToJoint(link1, rod(m1, c1, l1), pin.SE3.Identity())
+    elbow = pin.SE3(np.eye(3), np.array([l1, 0, 0]))
+    link2 = model.addJoint(link1, pin.JointModelRevoluteUnaligned(np.array([0.0, -1.0, 0.0])), elbow, "alpha2")
+    model.appendBodyToJoint(link2, rod(m2, c2, l2), pin.SE3.Identity())
+    end = pin.SE3(np.eye(3), np.array([l2, 0, 0]))
+    for mass in (tool.sensor_mass_kg, tool.beyond_sensor_kg):
+        model.appendBodyToJoint(link2, pin.Inertia(mass, np.zeros(3), np.eye(3) * 1e-4), end)
+    model.addFrame(pin.Frame("net", link2, end, pin.FrameType.OP_FRAME))
+    model.armature = np.array([0.0] * 6 + [arm.joint_armature_kg_m2] * 2)
+    return model
 
 
 def random_state(rng: np.random.Generator) -> tuple[Vec3, Joints, Chi]:

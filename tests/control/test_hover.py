@@ -127,7 +127,7 @@ def configured(error: float, adapt: bool, faults: str = "[]", mission: Path = CA
 
 @cache
 def true_hover_thrust() -> float:
-    return FastFlight(configured(0.0, True)).plant.world.hover_command
+    return FastFlight(configured(0.0, True)).plant.machine.hover_command
 
 
 def height_errors_m(result: FastResult, from_s: float) -> list[float]:

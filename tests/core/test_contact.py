@@ -106,7 +106,7 @@ def test_the_force_is_held_on_a_slippery_tilted_wall_that_is_not_where_the_missi
     settled = np.flatnonzero(steady)[300:]
     assert abs(force_n(result)[settled].mean() - 5.0) < 0.25
     assert force_n(result)[steady].max() < 7.5
-    assert flight.plant.world.surfaces is not None and flight.plant.world.surfaces.rotor_distance_min_m > 0.1
+    assert flight.plant.machine.contact is not None and flight.plant.machine.contact.rotor_distance_min_m > 0.1
 
 
 def test_after_the_contact_nothing_presses_and_the_vehicle_is_back_on_its_plan(
@@ -139,10 +139,10 @@ def test_the_summary_has_the_contact_and_a_replay_is_identical(pressed: tuple[Fa
     assert found is not None and found["touches"] >= 1
     assert found["wanted_n"] == 5.0 and found["mean_n"] == pytest.approx(5.0, abs=0.1)
     assert 0.0 < found["rms_error_n"] < 0.75 and found["overshoot_n"] < 2.5 and 0.002 < found["path_rms_m"] < 0.05
-    assert flight.plant.world.surfaces is not None
-    off_m = flight.plant.world.surfaces.placed[0].local_m(tuple(found["surface"]["point_m"]))[2]
+    assert flight.plant.scene.surfaces is not None
+    off_m = flight.plant.scene.surfaces.placed[0].local_m(tuple(found["surface"]["point_m"]))[2]
     assert off_m == pytest.approx(0.0, abs=0.005)
-    normal = flight.plant.world.surfaces.placed[0].normal
+    normal = flight.plant.scene.surfaces.placed[0].normal
     assert np.degrees(np.arccos(np.dot(found["surface"]["normal"], normal))) < 1.0
 
 
@@ -171,11 +171,11 @@ def test_report_and_ground_station_show_the_force_and_the_report_the_true_one(
 ) -> None:
     flight, result = pressed
     log = row_of(flight.config.flight, result, None)[1]
-    assert flight.plant.world.surfaces is not None
+    assert flight.plant.machine.contact is not None
     found = contact_summary(log)
     assert found is not None
     about, force, true, rotors, _, surface = contact_lines(
-        {"contact": found, "world": {"contact": flight.plant.world.surfaces.report()}}
+        {"contact": found, "world": {"contact": flight.plant.machine.contact.report()}}
     )
     assert about[1] == "4 touches, 3 of them to find the surface" and force[1].startswith("5.00 N wanted")
     x, y, z = found["surface"]["point_m"]
@@ -216,10 +216,10 @@ def test_a_force_sensor_that_dies_during_approach_or_press_leads_away_from_the_w
     config = load_sitl("press", world="wall", overrides=[faults, "mission.phases[3].face_m=null", *SHORT])
     flight = FastFlight(config)
     result = flight.run(90.0)
-    surfaces = flight.plant.world.surfaces
+    contact = flight.plant.machine.contact
     assert "contact_lost" in events(result) and "tether_snagged" not in events(result)
     assert result.outputs[-1].outcome is Outcome.ABORTED and not result.crashed
-    assert surfaces is not None and surfaces.force_max_n < 7.5 and surfaces.rotor_distance_min_m > 0.15
+    assert contact is not None and contact.force_max_n < 7.5 and contact.rotor_distance_min_m > 0.15
 
 
 def test_a_force_sensor_whose_zero_shifts_during_the_approach_neither_pushes_into_the_wall_nor_stays_at_it() -> None:
@@ -228,10 +228,10 @@ def test_a_force_sensor_whose_zero_shifts_during_the_approach_neither_pushes_int
     sets = [faults, "vehicle.tether=null", "mission.phases[3].face_m=null", *SHORT]
     flight = FastFlight(load_sitl("press", world="wall", overrides=sets))
     result = flight.run(90.0)
-    surfaces = flight.plant.world.surfaces
+    contact = flight.plant.machine.contact
     assert "contact_lost" in events(result)
     assert result.outputs[-1].outcome is Outcome.ABORTED and not result.crashed
-    assert surfaces is not None and surfaces.force_max_n < 7.5 and surfaces.rotor_distance_min_m > 0.15
+    assert contact is not None and contact.force_max_n < 7.5 and contact.rotor_distance_min_m > 0.15
 
 
 def test_without_a_force_sensor_gusts_feign_no_touch_and_the_force_is_held() -> None:
@@ -294,8 +294,8 @@ def test_a_probe_finds_the_surface_and_writes_its_points(tmp_path: Path) -> None
     assert result.outputs[-1].outcome is Outcome.COMPLETED and events(result).count("touched") == 4
     log: FlightLog = row_of(flight.config.flight, result, None)[1]
     summary = contact_summary(log)
-    assert summary is not None and flight.plant.world.surfaces is not None
-    placed, found = flight.plant.world.surfaces.placed[0], summary["surface"]
+    assert summary is not None and flight.plant.scene.surfaces is not None
+    placed, found = flight.plant.scene.surfaces.placed[0], summary["surface"]
     assert abs(placed.local_m(tuple(found["point_m"]))[2]) < 0.003
     assert np.degrees(np.arccos(np.dot(found["normal"], placed.normal))) < 0.7
     write_probe(log, tmp_path / PROBE)

@@ -80,7 +80,7 @@ def test_a_slanted_way_from_where_the_last_one_ended_is_followed_without_lag_or_
     """On a wall right and up are -y and z: by 0.3 m to the right and 0.4 m down, from (0.01, 0.1, 0.2); half of it is done."""
     from_m = (0.01, 0.1, 0.2)
     moved = replace(SLIDING, shift=replace(SLIDING.shift, from_m=from_m, to_m=from_m, way_m=0.0, length_m=0.0))
-    slanted = sliding.begun(moved, PHASE.model_copy(update={"by_m": (0.3, -0.4)}).stroke)
+    slanted = sliding.begun(moved, PHASE.model_copy(update={"displacement_m": (0.3, -0.4)}).stroke)
     assert sliding.way(slanted) == pytest.approx((0.0, -0.6, -0.8))
     half = replace(slanted, mode=ContactMode.SLIDE, shift=replace(slanted.shift, way_m=0.25, rate_m_s=0.05))
     step_m = 0.05 * DT_S

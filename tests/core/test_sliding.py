@@ -46,7 +46,7 @@ def short_slide(friction: float) -> list[str]:
         f"world.surfaces={json.dumps([wall])}",
         "mission.start.position_m=[0.4,0.0]",
         "mission.phases[3]={type: approach, direction: [1.0, 0.0, 0.0], distance_max_m: 0.35, speed_m_s: 0.05}",
-        "mission.phases[4].by_m=[0.0,-0.3]",
+        "mission.phases[4].displacement_m=[0.0,-0.3]",
         "mission.phases[6].to_m=[0.5,0.0,1.35]",
     ]
 
@@ -203,10 +203,13 @@ def test_a_slide_believes_the_motion_of_the_vehicle_within_a_bound_and_a_lost_su
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"by_m": [0.3, 0.0]}, "set friction_max to at most 0.1"),
-        ({"by_m": [0.0, 0.3]}, "of friction (limit 2.12 N m: 0.85 of its torque); lower force_n, or slide downwards"),
-        ({"by_m": [0.0, -1.0]}, "above standing height"),
-        ({"by_m": [-2.0, 0.0], "friction_max": 0.0}, "shorten by_m"),
+        ({"displacement_m": [0.3, 0.0]}, "set friction_max to at most 0.1"),
+        (
+            {"displacement_m": [0.0, 0.3]},
+            "of friction (limit 2.12 N m: 0.85 of its torque); lower force_n, or slide downwards",
+        ),
+        ({"displacement_m": [0.0, -1.0]}, "above standing height"),
+        ({"displacement_m": [-2.0, 0.0], "friction_max": 0.0}, "shorten displacement_m"),
     ],
 )
 def test_the_check_refuses_what_cannot_slide(changes: dict[str, Any], text: str) -> None:

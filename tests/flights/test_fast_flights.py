@@ -181,7 +181,7 @@ def test_refused_on_the_ground(overrides: tuple[str, ...], why: str) -> None:
     if why == "x":
         # The world is built from the same mission, so the machine is moved after it was placed.
         flight = FastFlight(configured(*overrides))
-        flight.plant.world.data.qpos[0] = -1.0
+        flight.plant.scene.data.qpos[0] = -1.0
     else:
         flight = FastFlight(configured(*overrides))
     result = flight.run()

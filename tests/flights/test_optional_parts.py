@@ -66,7 +66,7 @@ def test_without_a_tether_a_commanded_landing_and_a_gust_are_flown() -> None:
 def test_without_all_three_the_path_is_flown_and_nothing_is_thrown() -> None:
     flight, result = flown_without(*NO_PART)
     assert result.outputs[-1].outcome is Outcome.COMPLETED
-    assert flight.plant.world.payload.throws == 0
+    assert flight.plant.scene.payload.throws == 0
     assert [event.id for o in result.outputs for event in o.events] == ["takeoff", "touchdown"]
 
 
@@ -110,7 +110,7 @@ def test_without_a_force_sensor_the_momentum_observer_detects_the_catch() -> Non
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     assert _reported(result) == ["takeoff", "catch", "touchdown"]
     (catch,) = [event for o in result.outputs for event in o.events if event.id == "catch"]
-    contact_s = flight.plant.world.payload.caught_t_s
+    contact_s = flight.plant.scene.payload.caught_t_s
     assert contact_s is not None
     assert 0.0 <= catch.t_s - contact_s < 0.2
     carried = [o.control for o in result.outputs if o.control is not None and o.t_s > contact_s + 1.0]

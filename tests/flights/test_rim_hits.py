@@ -24,7 +24,7 @@ UNTIL_S = 9.0
 def test_a_ball_that_fell_off_the_rim_is_not_reported_as_caught(laboratory: int) -> None:
     flight = FastFlight(load_sitl(CATCH, overrides=[f"world.seed={laboratory}"], world="lab"))
     result = flight.run(until_mission_s=UNTIL_S)
-    payload = flight.plant.world.payload
+    payload = flight.plant.scene.payload
     assert payload.missed and not result.caught
     assert {"catch", "payload_left"}.isdisjoint(event_ids(result))
     log = log_of(flight.config.flight, result, None)
@@ -42,4 +42,4 @@ def test_the_lightest_and_the_heaviest_payload_are_reported(payload_kg: float) -
     flight = FastFlight(load_sitl(CATCH, overrides=changes, world="lab"))
     result = flight.run(until_mission_s=UNTIL_S)
     (event,) = [event for o in result.outputs for event in o.events if event.id == "catch"]
-    assert event.t_s == pytest.approx(flight.plant.world.payload.caught_t_s, abs=0.05)
+    assert event.t_s == pytest.approx(flight.plant.scene.payload.caught_t_s, abs=0.05)

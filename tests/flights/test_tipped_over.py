@@ -11,7 +11,7 @@ from companion.model.types import AutopilotRequest, Outcome
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.world.handling import Wrench
-from sitl.world.world import World
+from sitl.world.machine import Machine
 from tests.support import HOVER, LOW_HOVER
 
 LIES_AT_RAD = math.radians(50.0)
@@ -28,19 +28,19 @@ class TippedOver(FastFlight):
         low = [f"{key}={value}" for key, value in LOW_HOVER.items()]
         super().__init__(load_sitl(HOVER, overrides=[*low, f"world.faults=[{', '.join(faults)}]"]))
         self.begun_s = self.stopped_s = math.inf
-        world, step = self.plant.world, self.plant.step
+        scene, machine, step = self.plant.scene, self.plant.machine, self.plant.step
 
         def tipping(armed: bool) -> None:
-            if armed and world.t_s > after_s and world.q[2] < below_m:
-                self.begun_s = min(self.begun_s, world.t_s)
-            if world.t_s >= self.begun_s:
-                w, x, y, z = world.q[3:7]
+            if armed and scene.t_s > after_s and machine.q[2] < below_m:
+                self.begun_s = min(self.begun_s, scene.t_s)
+            if scene.t_s >= self.begun_s:
+                w, x, y, z = machine.q[3:7]
                 torque_nm = (
-                    STIFFNESS_NM * (LIES_AT_RAD - euler_zyx_from_quat((w, x, y, z))[0]) - DAMPING_NMS * world.v[3]
+                    STIFFNESS_NM * (LIES_AT_RAD - euler_zyx_from_quat((w, x, y, z))[0]) - DAMPING_NMS * machine.v[3]
                 )
-                world.hold(Wrench(force_n=(0.0, 0.0, 0.0), torque_nm=(torque_nm, 0.0, 0.0)))
+                machine.hold(Wrench(force_n=(0.0, 0.0, 0.0), torque_nm=(torque_nm, 0.0, 0.0)))
                 if not armed:
-                    self.stopped_s = min(self.stopped_s, world.t_s)
+                    self.stopped_s = min(self.stopped_s, scene.t_s)
             step(armed)
 
         self.plant.step = tipping  # type: ignore[method-assign]
@@ -69,7 +69,7 @@ def test_tipped_over_on_the_floor_its_rotors_are_stopped_by_the_guardian() -> No
 
 def test_flipped_in_the_air_by_a_lost_rotor_the_others_are_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     """LAND comes first and does not help: PX4 refuses a plain DISARM in the air, and its rotors went on in the wreck."""
-    monkeypatch.setattr(World, "_watch_crash", lambda _: None)  # the fast loop ends with the world's word
+    monkeypatch.setattr(Machine, "watch_crash", lambda *_: None)  # the fast loop ends with the world's word
     # High enough to turn over before it is down.
     high = ("mission.phases[0].height_m=1.6", "mission.phases[0].duration_s=5.0")
     flight = FastFlight(load_sitl(HOVER, overrides=[*high, "world.faults=[{kind: motor_weak, size: 1.0, t_s: 7.0}]"]))

@@ -6,8 +6,8 @@ import asyncio
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 
-from sitl.autopilot.autopilot import Px4Stub, gains_from_params
-from sitl.autopilot.cascade import Cascade
+from sitl.autopilot.autopilot import Px4Stub
+from sitl.autopilot.cascade import Cascade, gains_from_params
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.autopilot.params import Params

@@ -96,7 +96,7 @@ def drawn(number: int, phases_max: int = 4) -> SitlConfig:
             at = to
         elif kind == "path":
             through = [_point(rng, vehicle) for _ in range(rng.randint(1, 2))]
-            phases.append({"type": "path", "through_m": through})
+            phases.append({"type": "path", "waypoints_m": through})
             at = through[-1]
         elif kind == "arm":
             phases.append({"type": "arm", "arm_deg": rng.choice([[100.0, 60.0], [120.0, 90.0], [165.0, 140.0]])})

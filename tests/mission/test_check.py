@@ -131,7 +131,7 @@ REFUSED = [
     (["vehicle.safety.stop_deceleration_m_s2=0.3", "vehicle.room.x_m=[-1.74, 1.74]", "vehicle.safety.react_time_s=0.3"], "phase 'catch' could not stop within the room at t = 7.1 s, (0.41, 0.00, 1.00) m: at 0.65 m/s the vehicle needs 0.96 m to stop, 0.31 m too far with 0.2 m for the catch; fly more slowly towards the edge or turn back earlier"),
     (["vehicle.safety.stop_deceleration_m_s2=0.2", "vehicle.tether.length_m=2.4"], "could not stop within the tether sphere"),
     (["mission.phases[1]={type: line, to_m: [-1, 0, 0.32], duration_s: 2}", "mission.phases[2]={type: line, to_m: [1, 0, 1]}"], "could not stop within the height above the floor"),
-    (["mission.phases[2]={type: path, through_m: [[1, -1.2, 1.2], [0, -2.2, 1.2], [-1, -1.2, 1.2], [0, -0.2, 1.2], [1, -1.2, 1.2], [0, -2.2, 1.2], [-1, -1.2, 1.2], [-1, 0, 1]]}", "vehicle.room.y_m=[-3, 2]"], "winds up the tether at t = "),
+    (["mission.phases[2]={type: path, waypoints_m: [[1, -1.2, 1.2], [0, -2.2, 1.2], [-1, -1.2, 1.2], [0, -0.2, 1.2], [1, -1.2, 1.2], [0, -2.2, 1.2], [-1, -1.2, 1.2], [-1, 0, 1]]}", "vehicle.room.y_m=[-3, 2]"], "winds up the tether at t = "),
     (["vehicle.tether.anchor_world_m=[0, -1.2, 0.95]"], "phase 'take-off' brings the tether too close to the rotors or the arm at t = 0.0 s, (-1.00, 0.00, 0.30) m: -0.188 m between the line and the rotors or the arm (tether.clearance_min_m is 0.01; the anchor is seen -23 deg below the horizon); fly higher"),
     (["mission.catch=null", "vehicle.airframe.thrust_max_n=42"], "needs too much thrust at t = 0.8 s, (-1.00, 0.00, 0.37) m: 35.6 N with 0.4 kg of payload and the tether's weight (limit 33.6 N: 0.8 of 42 N); allow more time or carry less"),
     (["mission.limits.thrust_share_max=1", "vehicle.airframe.thrust_max_n=36"], "34.6 N with 0.3 kg of payload and the tether's weight (limit 32.4 N: 0.9 of 36 N)"),
@@ -214,7 +214,7 @@ def test_what_has_no_duration_takes_the_least_that_the_limits_allow() -> None:
     free = [
         "mission.phases[2]={type: line, to_m: [1, 0, 1], arm_deg: [100, 60]}",
         "mission.phases[3]={type: arm, arm_deg: [120, 90]}",
-        "mission.phases[4]={type: path, through_m: [[0, 0.4, 1.1], [-1, 0, 1]]}",
+        "mission.phases[4]={type: path, waypoints_m: [[0, 0.4, 1.1], [-1, 0, 1]]}",
         "mission.phases[5]={type: arm, arm_deg: [165, 140]}",
     ]
     assert problems(*free, "mission.catch=null") == []
@@ -226,7 +226,7 @@ def test_what_has_no_duration_takes_the_least_that_the_limits_allow() -> None:
 
 
 def test_a_path_that_overshoots_the_room_is_refused() -> None:
-    swing = "mission.phases[2]={type: path, through_m: [[1.2, 0, 1], [1.2, 0.5, 1], [-1, 0, 1]]}"
+    swing = "mission.phases[2]={type: path, waypoints_m: [[1.2, 0, 1], [1.2, 0.5, 1], [-1, 0, 1]]}"
     fits_the_points = 1.2 + load().vehicle.airframe.radius_m + 0.01
     assert any("leaves the room" in p for p in problems(swing, f"vehicle.room.x_m=[-2.2, {fits_the_points}]"))
     assert problems(swing, "mission.catch.expected_at_m=[1.2, 0]") == []

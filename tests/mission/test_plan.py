@@ -99,7 +99,7 @@ def missions(draw: st.DrawFn) -> Mission:
                     phase["arm_duration_s"] = (seconds - delay) * draw(st.floats(0.1, 0.99))
         elif kind == "path":
             # each point a step away from the one before it, wherever that is: no two alike
-            phase["through_m"] = [
+            phase["waypoints_m"] = [
                 (6.0 + 6.0 * len(phases) + k, *draw(st.tuples(length, length))) for k in range(draw(st.integers(1, 4)))
             ]
         elif kind == "arm":
@@ -199,16 +199,16 @@ def test_a_small_difference_at_the_start_is_taken_out_during_take_off() -> None:
 
 
 @pytest.mark.parametrize(
-    ("through_m", "number"),
+    ("waypoints_m", "number"),
     [([(-1.0, 0.0, 1.0), (0.0, 0.0, 1.0)], 0), ([(0.0, 0.0, 1.0), (0.0, 0.0, 1.005)], 1)],
     ids=["where it stands", "twice the same"],
 )
-def test_a_path_that_stays_where_it_is_is_refused(through_m: list[Vec3], number: int) -> None:
+def test_a_path_that_stays_where_it_is_is_refused(waypoints_m: list[Vec3], number: int) -> None:
     document = CONFIG.mission.model_dump(mode="json")
-    document["phases"][1] = {"type": "path", "through_m": through_m}
+    document["phases"][1] = {"type": "path", "waypoints_m": waypoints_m}
     with pytest.raises(ValidationError, match="repeats the previous point of the path") as caught:
         Mission.model_validate(document)
-    assert caught.value.errors()[0]["loc"] == ("phases", 1, "through_m", number)
+    assert caught.value.errors()[0]["loc"] == ("phases", 1, "waypoints_m", number)
 
 
 def test_a_path_with_a_duration_takes_it_and_passes_its_points() -> None:
@@ -218,7 +218,7 @@ def test_a_path_with_a_duration_takes_it_and_passes_its_points() -> None:
     segment = plan.segments[2]
     assert segment.end_s - segment.start_s == 20.0
     flown = [plan.reference(segment.start_s + 0.002 * k).position_world_m for k in range(10001)]
-    for point in document["phases"][2]["through_m"]:
+    for point in document["phases"][2]["waypoints_m"]:
         assert min(math.dist(point, position) for position in flown) < 0.002
     inside = [plan.reference(segment.start_s + 0.1 * k).velocity_world_m_s for k in range(20, 181)]
     assert min(math.hypot(*velocity) for velocity in inside) > 0.05, "it stops on the way"

@@ -195,8 +195,8 @@ def test_with_nothing_in_between_there_is_nothing_to_repeat() -> None:
 
 def test_a_path_that_begins_where_the_last_repetition_ended_is_refused() -> None:
     document = mission("circuit").model_dump(mode="json")
-    document["phases"][2:4] = [{"type": "path", "through_m": [[0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, 0.0, 1.0]]}]
+    document["phases"][2:4] = [{"type": "path", "waypoints_m": [[0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, 0.0, 1.0]]}]
     assert Mission.model_validate(document).repeat == 1
     with pytest.raises(ValidationError, match="repeats the previous point of the path") as refused:
         Mission.model_validate({**document, "repeat": 2})
-    assert [error["loc"] for error in refused.value.errors()] == [("phases", 2, "through_m", 0)]
+    assert [error["loc"] for error in refused.value.errors()] == [("phases", 2, "waypoints_m", 0)]

@@ -38,9 +38,10 @@ from companion.sitl_config.loader import load_sitl
 from companion.testing import check_arm
 from companion.testing.devices import _cycles, _refuse
 from sitl.fast.loop import FastFlight
-from sitl.server import Ports, Sitl, start_of
+from sitl.server import Ports, Sitl
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
+from sitl.world.start import start_of
 from tests.plugins.installed import on_path, write_distribution
 from tests.support import ROOT, SHORT_CATCH
 

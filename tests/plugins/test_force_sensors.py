@@ -30,7 +30,8 @@ from companion.runtime.clock import flight_clock
 from companion.sitl_config.world import World
 from companion.testing import check_force_sensor
 from sitl.force_torque import ForceTorqueServer
-from sitl.server import Ports, Sitl, start_of
+from sitl.server import Ports, Sitl
+from sitl.world.start import start_of
 from tests.plugins.installed import on_path, write_distribution
 from tests.support import ROOT
 

@@ -14,13 +14,13 @@ from companion.model.frames import (
 from companion.model.types import MocapPose, VehicleState
 from companion.preflight.hand_test.steps import HandSample
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.autopilot.autopilot import Px4Stub, gains_from_params
-from sitl.autopilot.cascade import Cascade
+from sitl.autopilot.autopilot import Px4Stub
+from sitl.autopilot.cascade import Cascade, gains_from_params
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.params import Params
-from sitl.server import start_of
+from sitl.plant import Plant
 from sitl.servo.drive import ServoDrive
-from sitl.world.plant import Plant
+from sitl.world.start import start_of
 from tests.support import CATCH
 
 TICK_S = 0.005
@@ -28,7 +28,7 @@ TICK_S = 0.005
 
 def world(*overrides: str) -> SitlConfig:
     """The catch mission's machine with its world set otherwise, nothing thrown, a hand that begins after 4 s."""
-    words = ["world.payload_kg=0", "world.hand_t_s=4", *(f"world.{text}" for text in overrides)]
+    words = ["world.payload_kg=0", "world.handling_t_s=4", *(f"world.{text}" for text in overrides)]
     return load_sitl(CATCH, overrides=words)
 
 
@@ -42,8 +42,7 @@ class Standing:
         self.px4 = Px4Stub(params, Estimator(), Cascade(gains_from_params(params)))
         pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
         drives = [ServoDrive() for _ in config.vehicle.arm.joints]
-        where = (pose.position_m, pose.yaw_rad, pose.arm_rad)
-        self.plant = Plant(config.vehicle, config.world, self.px4, drives, where)
+        self.plant = Plant(config.vehicle, config.world, self.px4, drives, pose)
         self._pose: MocapPose | None = None
 
     def samples(self, until_s: float) -> Iterator[HandSample]:

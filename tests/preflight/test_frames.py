@@ -116,7 +116,7 @@ def test_a_little_too_high_is_reported_but_does_not_refuse() -> None:
 
 
 def test_a_machine_that_is_carried_is_not_judged() -> None:
-    rows = watched("hand=true", "hand_t_s=1.5", until_s=5.0)
+    rows = watched("handling=true", "handling_t_s=1.5", until_s=5.0)
     assert [row.id for row in rows] == ["frames.rest"]
     assert rows[0].refuses
     assert rows[0].fix == "do not touch the vehicle, and check again"

@@ -38,12 +38,12 @@ def samples(*overrides: str) -> tuple[HandSample, ...]:
     """A whole round of the hand in a world set so."""
     if not overrides:
         return tuple(sample for sample in two_rounds() if sample.t_s <= END_S)
-    return tuple(Standing(world("hand=true", *overrides)).samples(END_S))
+    return tuple(Standing(world("handling=true", *overrides)).samples(END_S))
 
 
 @cache
 def two_rounds() -> tuple[HandSample, ...]:
-    return tuple(Standing(world("hand=true")).samples(4.0 + 2 * ROUND_S + 6.0))
+    return tuple(Standing(world("handling=true")).samples(4.0 + 2 * ROUND_S + 6.0))
 
 
 @cache

@@ -42,7 +42,7 @@ def sandbox(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sandbox]:
 
 @pytest.fixture(scope="module")
 def world(sandbox: Sandbox) -> Iterator[World]:
-    knobs = ["world.hand=true", f"world.hand_t_s={FIRST_ROUND_S}", "world.payload_kg=0"]
+    knobs = ["world.handling=true", f"world.handling_t_s={FIRST_ROUND_S}", "world.payload_kg=0"]
     with World(sandbox, overrides=knobs) as made:
         yield made
 

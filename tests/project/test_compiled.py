@@ -35,7 +35,7 @@ FLIGHTS = [
     ("hover", "adaptive", "recommended", "lab", "hexa_2r"),
     ("press", "adaptive", "recommended", "wall", ""),
     ("press", "adaptive", "recommended", "wall", "", "vehicle.force_source=observer"),
-    ("slide", "adaptive", "recommended", "wall", "", "mission.phases[4].by_m=[0.0,-0.2]"),
+    ("slide", "adaptive", "recommended", "wall", "", "mission.phases[4].displacement_m=[0.0,-0.2]"),
     ("probe", "adaptive", "recommended", "wall", "", "mission.phases[3].rows=2", "mission.phases[3].columns=2"),
 ]
 CAMPAIGNS = [

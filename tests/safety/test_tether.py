@@ -20,7 +20,7 @@ from companion.safety.tether_pull import PullEstimate
 from companion.safety.tether_shape import Clearance, steepest_slope
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
-from sitl.world.world import Truth
+from sitl.world.state import Truth
 from tests.support import tether_of
 
 LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
@@ -466,9 +466,9 @@ def snag(flight: FastFlight, at_s: float, anchor: Vec3, extra_m: float) -> None:
         now_s = plant.mission_t_s()
         if not done and now_s is not None and now_s >= at_s:
             done = True
-            world = plant.world
-            world.model.site_pos[world.model.site("anchor").id] = anchor
-            world.model.tendon_range[0, 1] = math.dist(anchor, plant.truth.position_world_m) + extra_m
+            scene = plant.scene
+            scene.model.site_pos[scene.model.site("anchor").id] = anchor
+            scene.model.tendon_range[0, 1] = math.dist(anchor, plant.truth.position_world_m) + extra_m
         step(armed)
 
     flight.plant.step = hooked  # type: ignore[method-assign]

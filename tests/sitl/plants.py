@@ -1,14 +1,19 @@
-"""A simulated plant on its own, for tests of what it measures."""
+"""A simulated plant or a scene on its own, for tests of what it does and measures."""
 
 from __future__ import annotations
 
-from companion.model.types import Vec4
+from collections.abc import Sequence
+
+from companion.config.vehicle import Vehicle
+from companion.model.types import Joints, Vec2, Vec4
 from companion.sitl_config.loader import SitlConfig
+from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.types import ImuSample
-from sitl.server import start_of
+from sitl.plant import Plant
 from sitl.servo.drive import ServoDrive
-from sitl.world.plant import Plant
-from sitl.world.world import PHYSICS_DT_S, World
+from sitl.world.scene import Scene
+from sitl.world.start import MachineSpec, Start, start_of
+from sitl.world.state import PHYSICS_DT_S
 
 
 class FixedRotors:
@@ -21,16 +26,31 @@ class FixedRotors:
         return self._commands
 
 
-def run(world: World, time_s: float, *, drag: bool = True) -> None:
+class OneMachine(Scene):
+    """A scene with one machine."""
+
+    def __init__(
+        self, vehicle: Vehicle, config: WorldConfig, position_m: Vec2, yaw_rad: float, arm_rad: Joints
+    ) -> None:
+        super().__init__([MachineSpec(vehicle, config, Start(position_m, yaw_rad, arm_rad))])
+        self.machine = self.machines[0]
+
+    def fly(self, rotors: Sequence[float], torques_nm: Joints, airborne: bool = True, *, drag: bool = True) -> None:
+        """Advance by one step with these commands of the machine."""
+        self.machine.command(rotors, torques_nm, drag=drag)
+        self.step(airborne)
+
+
+def run(world: OneMachine, time_s: float, *, drag: bool = True) -> None:
     """Let a world run with its rotors and motors off."""
+    machine = world.machine
     for _ in range(round(time_s / PHYSICS_DT_S)):
-        world.step((0.0,) * world.rotor_count, (0.0,) * len(world.layout.joint_q), False, drag=drag)
+        world.fly((0.0,) * machine.rotor_count, (0.0,) * len(machine.layout.joint_q), False, drag=drag)
 
 
 def plant_of(config: SitlConfig, commands: Vec4 = (0.0, 0.0, 0.0, 0.0), *, between_steps: bool = False) -> Plant:
     """Return the plant of this world at the start of its mission."""
     start = config.mission.start
-    pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
-    where = (pose.position_m, pose.yaw_rad, pose.arm_rad)
+    where = start_of(start.position_m, start.yaw_deg, start.arm_deg)
     drives = [ServoDrive() for _ in config.vehicle.arm.joints]
     return Plant(config.vehicle, config.world, FixedRotors(commands), drives, where, between_steps=between_steps)

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_conjugate, quat_multiply, quat_normalize, quat_rotate
 from companion.model.types import Quat, Vec3
-from sitl.autopilot.autopilot import Px4Stub, gains_from_params
-from sitl.autopilot.cascade import Cascade
+from sitl.autopilot.autopilot import Px4Stub
+from sitl.autopilot.cascade import Cascade, gains_from_params
 from sitl.autopilot.commander import Command, Result
 from sitl.autopilot.estimator import Estimator
 from sitl.autopilot.mavlink import MavlinkServer

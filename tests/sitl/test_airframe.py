@@ -18,7 +18,7 @@ from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.mixer import Mixer
 from sitl.fast.loop import FastFlight
-from sitl.world.world import World
+from tests.sitl.plants import OneMachine
 from tests.support import HOVER, LOW_HOVER, SHORT_CATCH
 
 VEHICLE = load_sitl(HOVER).vehicle
@@ -30,7 +30,7 @@ def with_airframe(**changes: Any) -> Vehicle:
 
 def torque_nm(vehicle: Vehicle, thrusts_n: Sequence[float], **settings: Any) -> Vec3:
     """Torque of the rotors on the base, body FLU."""
-    world = World(vehicle, WorldConfig(payload_kg=0.0, **settings), (0.0, 0.0), 0.0, (1.5, 1.5))
+    world = OneMachine(vehicle, WorldConfig(payload_kg=0.0, **settings), (0.0, 0.0), 0.0, (1.5, 1.5))
     model, data = world.model, world.data
     data.ctrl[: len(thrusts_n)] = thrusts_n
     mujoco.mj_forward(model, data)
@@ -116,9 +116,9 @@ WEAK = [
 )
 def test_other_layouts_hover_with_a_weak_rotor_and_catch(layout: str, mission: Path, extra: list[str]) -> None:
     flight = FastFlight(load_sitl(mission, overrides=[f"vehicle.airframe.layout={layout}", *extra]))
-    result, world = flight.run(), flight.plant.world
-    assert world.rotor_count == {"quad_plus": 4, "hexa_x": 6, "octa_plus": 8}[layout]
-    assert world.rotor_share == ((0.8, *[1.0] * 5) if extra else None)
+    result, machine = flight.run(), flight.plant.machine
+    assert machine.rotor_count == {"quad_plus": 4, "hexa_x": 6, "octa_plus": 8}[layout]
+    assert machine.rotor_share == ((0.8, *[1.0] * 5) if extra else None)
     assert result.caught is (mission == SHORT_CATCH)
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     for truth, output in zip(result.truth, result.outputs, strict=True):

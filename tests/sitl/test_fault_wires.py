@@ -16,7 +16,9 @@ from sitl.autopilot.backend import StubBackend
 from sitl.autopilot.mavlink import Ports as LinkPorts
 from sitl.fast.link import FastLink
 from sitl.fast.loop import FastFlight
-from sitl.server import OTHER_PROCESS_FAULTS, Ports, Sitl, start_of
+from sitl.faults.processes import OTHER_PROCESS_FAULTS
+from sitl.server import Ports, Sitl
+from sitl.world.start import start_of
 from tests.support import CATCH
 
 # -- the server --------------------------------------------------------------------------------------------------------
@@ -29,7 +31,7 @@ def test_the_server_begins_and_ends_each_fault_of_a_wire_or_a_process(monkeypatc
         struck.append(kind)
         return True
 
-    monkeypatch.setattr("sitl.server.inject_process_fault", strike)
+    monkeypatch.setattr("sitl.faults.processes.inject_process_fault", strike)
     kinds = ("link_loss", "link_delay", "bus_noise", "bus_delay", "force_loss", "servo_loss", "clock_step")
     sizes = {"link_delay": 0.05, "bus_noise": 1.0, "bus_delay": 0.02, "clock_step": 5.0}
     common = {"after": "start", "t_s": 0.01, "duration_s": 0.02}
@@ -78,7 +80,7 @@ def flight() -> FastFlight:
 
 @pytest.fixture
 def link(flight: FastFlight) -> FastLink:
-    return FastLink(flight.faults, flight.plant.world, flight.px4, TICK_PERIOD_S)
+    return FastLink(flight.faults, flight.plant.scene, flight.px4, TICK_PERIOD_S)
 
 
 def at_rest(t_s: float) -> tuple[VehicleState, AutopilotStatus]:
@@ -105,7 +107,7 @@ def at_rest(t_s: float) -> tuple[VehicleState, AutopilotStatus]:
 
 
 def test_over_a_slow_link_everything_comes_in_order_and_that_much_later(flight: FastFlight, link: FastLink) -> None:
-    world = flight.plant.world
+    world = flight.plant.scene
     arrived: list[tuple[float, float]] = []
     flight.faults.active["link_delay"] = Fault(kind="link_delay", t_s=0.0, size=0.05)
     for tick in range(40):
@@ -125,7 +127,7 @@ def test_a_link_that_slows_down_in_flight_delivers_nothing_twice(flight: FastFli
     """Its messages keep their order: while the delay grows, the last state stays."""
     heard: list[float | None] = []
     for tick in range(60):
-        flight.plant.world.t_s = t_s = round(tick * TICK_PERIOD_S, 4)
+        flight.plant.scene.t_s = t_s = round(tick * TICK_PERIOD_S, 4)
         if tick == 20:
             flight.faults.active["link_delay"] = Fault(kind="link_delay", t_s=0.0, size=0.05)
         if tick == 40:
@@ -140,7 +142,7 @@ def test_a_link_that_slows_down_in_flight_delivers_nothing_twice(flight: FastFli
 def test_over_a_dead_link_nothing_arrives_and_the_last_state_stays(flight: FastFlight, link: FastLink) -> None:
     last = link.receive(*at_rest(0.0))
     flight.faults.active["link_loss"] = Fault(kind="link_loss", t_s=0.0)
-    flight.plant.world.t_s = 1.0
+    flight.plant.scene.t_s = 1.0
     link.send(lambda: pytest.fail("it arrived"))
     link.deliver_due()
     assert link.receive(*at_rest(1.0)) == last == at_rest(0.0)

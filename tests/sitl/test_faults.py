@@ -107,18 +107,18 @@ def test_a_fault_of_a_part_that_vehicle_or_world_do_not_have_is_refused() -> Non
 def test_faults_that_are_over_leave_the_world_as_it_was() -> None:
     over = [{"kind": kind, "after": "start", "t_s": 0.0, "duration_s": 0.4} for kind in KINDS if kind not in _FOR_GOOD]
     flight = FastFlight(with_faults(*over))
-    world, drives = flight.plant.world, [servo.drive for servo in flight.plant._servos]
+    machine, drives = flight.plant.machine, [servo.drive for servo in flight.plant._servos]
     while flight.plant.t_s < 0.2:
         flight.plant.step(False)
     assert len(flight.faults.active) == len(over)
-    assert world.rotor_share is not None and world.snag is not None and world.wind_m_s != (0.0, 0.0, 0.0)
+    assert machine.rotor_share is not None and machine.tether.snag is not None and machine.wind_m_s != (0.0, 0.0, 0.0)
     while flight.plant.t_s < 0.6:
         flight.plant.step(False)
     assert flight.faults.active == {}
-    assert world.rotor_share is None and world.snag is None
-    assert world.wind_m_s == pytest.approx((0.0, 0.0, 0.0))
-    assert world.tether_length_m == CONFIG.vehicle.tether.length_m
-    assert world.payload.aside_m == 0.0
+    assert machine.rotor_share is None and machine.tether.snag is None
+    assert machine.wind_m_s == pytest.approx((0.0, 0.0, 0.0))
+    assert machine.tether.length_m == CONFIG.vehicle.tether.length_m
+    assert flight.plant.scene.payload.aside_m == 0.0
     assert not flight.px4.refuses_offboard and not flight.px4.refuses_arming
     assert flight.faults.sag_v == 0.0
     assert [drive.slip_counts for drive in drives] == [0, 0]
@@ -158,7 +158,7 @@ def test_a_short_fault_whose_catch_is_known_late_lasts_as_long_as_it_should() ->
     while flight.plant.t_s < 0.5:
         flight.plant.step(False)
         if flight.plant.t_s > 0.3:
-            flight.plant.world.payload.caught_t_s = 0.0
+            flight.plant.scene.payload.caught_t_s = 0.0
         acts.append((flight.plant.t_s, "mocap_loss" in flight.faults.active))
     assert {on for t_s, on in acts if 0.31 < t_s < 0.39} == {True}
     assert {on for t_s, on in acts if t_s < 0.3 or t_s > 0.41} == {False}
@@ -252,7 +252,7 @@ class Received:
         flight.px4.on_vision = self.on_vision  # type: ignore[method-assign]
 
     def on_vision(self, t_s: float, position_ned_m: Vec3, attitude_ned_frd: Quat) -> bool:
-        x, y, z, *attitude = self._flight.plant.world.q[0:7]
+        x, y, z, *attitude = self._flight.plant.machine.q[0:7]
         if self._flight.plant.armed_t_s is not None:
             north, east, down = position_ned_m
             self.off_m.append(math.dist((east, north, -down), (x, y, z)))

@@ -62,7 +62,7 @@ def test_a_body_whose_zero_is_off_is_off_by_that() -> None:
 
 
 def test_the_hand_is_away_while_the_rotors_are_armed() -> None:
-    rig = Standing(world("hand=true"))
+    rig = Standing(world("handling=true"))
     for _ in rig.samples(4.0 + 3.0):
         pass
     plant = rig.plant

@@ -6,7 +6,7 @@ import pytest
 
 from companion.model.frames import quat_conjugate, quat_multiply
 from companion.model.types import Quat, Vec3
-from sitl.world.plant import MocapFrame
+from sitl.plant import MocapFrame
 from tests.preflight.hand_rig import world
 from tests.sitl.plants import plant_of
 
@@ -15,7 +15,7 @@ CLIMBS_AND_TUMBLES = (1.0, 0.9, 1.0, 0.95)
 
 def flight(between_steps: bool, rate_hz: float = 200.0) -> tuple[list[MocapFrame], dict[float, tuple[Vec3, Quat]]]:
     """Frames of the first 0.4 s of a flight without noise, and the truth after every step."""
-    config = world("mocap_noise_m=0", "mocap_noise_deg=0", "hand=false", f"mocap_rate_hz={rate_hz:g}")
+    config = world("mocap_noise_m=0", "mocap_noise_deg=0", "handling=false", f"mocap_rate_hz={rate_hz:g}")
     plant = plant_of(config, CLIMBS_AND_TUMBLES, between_steps=between_steps)
     frames, truth = [], {}
     while plant.t_s < 0.4:
@@ -55,7 +55,7 @@ def test_a_frame_between_two_steps_shows_what_is_between_them() -> None:
 
 
 def test_frames_are_handed_out_with_the_time_at_which_they_leave() -> None:
-    config = world("mocap_latency_s=0.005", "hand=false")
+    config = world("mocap_latency_s=0.005", "handling=false")
     plant = plant_of(config, between_steps=True)
     leave_s = []
     while plant.t_s < 0.1:

@@ -15,9 +15,9 @@ from companion.config.loader import load_vehicle
 from companion.sitl_config.effects.battery import Battery as BatteryConfig
 from companion.sitl_config.faults import Fault
 from companion.sitl_config.world import World
-from sitl.autopilot.autopilot import Battery
 from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
+from sitl.autopilot.types import Battery
 from sitl.px4.backend import STUB_ONLY_FAULTS, refuse_stub_only_settings
 from sitl.px4.control_link import ControlLink, same
 from sitl.px4.hil_link import Px4Error

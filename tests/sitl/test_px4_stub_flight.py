@@ -9,9 +9,9 @@ from functools import cache
 import pytest
 
 from companion.model.frames import quat_from_euler_zyx, tilt_rad
-from sitl.autopilot.autopilot import Origin
 from sitl.autopilot.commander import Command, Result
 from sitl.autopilot.modes import NavState
+from sitl.autopilot.origin import Origin
 from sitl.autopilot.setpoints import PositionTarget, RateTarget
 from sitl.autopilot.types import AttitudeTarget
 from tests.sitl.px4_rig import PERIOD_S, Rig
@@ -153,18 +153,6 @@ def test_offboard_follows_position_and_velocity_setpoints() -> None:
     assert rig.stub.heading_rad == pytest.approx(0.5, abs=0.05)
     stream(rig, 3.0, PositionTarget(velocity_ned_m_s=(0.3, 0.0, 0.0), yaw_rad=0.5))
     assert rig.plant.velocity_ned_m_s == pytest.approx((0.3, 0.0, 0.0), abs=0.08)
-
-
-def test_offboard_loss_lands_after_com_of_loss_t() -> None:
-    rig = hovering(COM_OF_LOSS_T=0.3)
-    stream(rig, 0.3, AttitudeTarget(LEVEL, HOVER))
-    rig.mode(6)
-    stream(rig, 0.5, AttitudeTarget(LEVEL, HOVER))
-    last_s = rig.t_s
-    run_until(rig, lambda: rig.stub.nav_state is NavState.LAND, 2.0)
-    assert rig.t_s - last_s == pytest.approx(0.35, abs=0.04)
-    run_until(rig, lambda: not rig.stub.armed, 20.0)
-    assert rig.stub.nav_state is NavState.OFFBOARD, "as PX4: back in the mode of before"
 
 
 def test_land_without_mocap_descends_blindly_to_the_ground() -> None:

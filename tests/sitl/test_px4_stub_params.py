@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl.autopilot.autopilot import gains_from_params
+from sitl.autopilot.cascade import gains_from_params
 from sitl.autopilot.params import (
     MAV_PARAM_TYPE_INT32,
     Params,

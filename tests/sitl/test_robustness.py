@@ -103,7 +103,7 @@ def test_a_row_is_what_the_flight_was(monkeypatch: pytest.MonkeyPatch) -> None:
     row = robustness.fly(SHORT, flight)["row"]
     (whole,) = seen
     assert whole.fast is not None
-    flown, world = whole.result, whole.fast.plant.world
+    flown, payload = whole.result, whole.fast.plant.scene.payload
     assert (row["name"], row["number"]) == ("draw 0", 0)
     unchanged = {"throw_velocity_m_s": [-2.0, 0.15, -1.5], "catch_at_m": [0.0, 0.0]}
     assert row["world"] == {"payload_kg": 0.25, "setpoint_delay_s": 0.03, "seed": 6, **unchanged}
@@ -112,9 +112,9 @@ def test_a_row_is_what_the_flight_was(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (knobs.payload_kg, knobs.setpoint_delay_s, knobs.seed) == (0.25, 0.03, 6)
     assert (row["outcome"], row["why"], row["error"]) == ("completed", None, None)
     assert row["events"] == [event.id for outputs in flown.outputs for event in outputs.events]
-    assert (row["thrown"], row["caught"]) == (True, True) == (world.payload.thrown_t_s is not None, flown.caught)
+    assert (row["thrown"], row["caught"]) == (True, True) == (payload.thrown_t_s is not None, flown.caught)
     begun_s = next(o.t_s - o.mission_t_s for o in flown.outputs if o.mission_t_s > 0)
-    assert row["caught_s"] + begun_s == pytest.approx(world.payload.caught_t_s)
+    assert row["caught_s"] + begun_s == pytest.approx(payload.caught_t_s)
     assert row["felt"] and row["catch_t_s"] is not None
     assert 0.0 < row["peak_e_p_m"] < 0.1
     assert row["home_m"] == pytest.approx(0.6, abs=0.2)

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from companion.model.types import Outcome, Outputs
+from companion.model.types import Outcome
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
-from sitl.server import Ports, Sitl, start_of
-from sitl.world.plant import Plant
-from sitl.world.world import World
+from sitl.plant import Plant
+from sitl.server import Ports, Sitl
+from sitl.world.payload import Payload
+from sitl.world.start import start_of
 from tests.support import SHORT_CATCH
 
 ROOT = Path(__file__).parents[2]
@@ -35,13 +36,13 @@ def configured(*overrides: str, mission: str = "catch") -> SitlConfig:
     return load_sitl(ROOT / f"configs/missions/{mission}.yaml", overrides=overrides)
 
 
-def flown(config: SitlConfig) -> tuple[FastResult, World]:
+def flown(config: SitlConfig) -> tuple[FastResult, Payload]:
     flight = FastFlight(config)
-    return flight.run(limit_s=200.0), flight.plant.world
+    return flight.run(limit_s=200.0), flight.plant.scene.payload
 
 
 @cache
-def repeated(*overrides: str) -> tuple[FastResult, World]:
+def repeated(*overrides: str) -> tuple[FastResult, Payload]:
     return flown(load_sitl(SHORT_CATCH, overrides=(*TO_AND_FRO, *overrides)))
 
 
@@ -51,19 +52,15 @@ def events(result: FastResult) -> list[tuple[str, float]]:
     return [(event.id, event.t_s - begun_s) for output in result.outputs for event in output.events]
 
 
-def at(result: FastResult, mission_t_s: float) -> Outputs:
-    return next(output for output in result.outputs if output.mission_t_s >= mission_t_s)
-
-
 def test_each_pass_catches_a_throw_until_all_are_thrown() -> None:
-    result, world = repeated("mission.repeat=3", "world.throws=2")
+    result, payload = repeated("mission.repeat=3", "world.throws=2")
     assert result.outputs[-1].outcome is Outcome.COMPLETED
-    assert (world.payload.throws, world.payload.catches, world.payload.missed) == (2, 2, False)
+    assert (payload.throws, payload.catches, payload.missed) == (2, 2, False)
     (names, times_s) = zip(*events(result), strict=True)
     assert names == ("takeoff", "catch", "payload_left", "catch", "touchdown"), "the last one stays in the net"
     assert (times_s[1], times_s[3]) == pytest.approx((CATCH_S, CATCH_S + PERIOD_S), abs=0.15)
     assert times_s[1] + KEEP_S + 0.5 <= times_s[2] < times_s[1] + KEEP_S + 1.0, "keep_s after the catch it is taken out"
-    assert world.payload.caught_t_s is not None
+    assert payload.caught_t_s is not None
     assert result.outputs[-1].mission_t_s > CATCH_S + 2 * PERIOD_S
 
 
@@ -82,17 +79,9 @@ def test_the_second_catch_is_flown_as_well_as_the_first() -> None:
     assert worst[1] < 1.5 * worst[0]
 
 
-def test_the_phase_says_which_repetition_it_is() -> None:
-    result, _ = repeated("mission.repeat=3", "world.throws=2")
-    assert at(result, 1.0).phase == "take-off"
-    assert at(result, CATCH_S).phase == "catch (1 of 3)"
-    assert at(result, CATCH_S + 2 * PERIOD_S).phase == "catch (3 of 3)"
-    assert "land" in {output.phase for output in result.outputs}
-
-
 def test_the_committed_soak_mission_catches_in_the_fast_loop() -> None:
     flight = FastFlight(configured("mission.repeat=1", mission="soak"))
-    result, payload = flight.run(until_mission_s=12.0), flight.plant.world.payload
+    result, payload = flight.run(until_mission_s=12.0), flight.plant.scene.payload
     assert not result.crashed
     assert (payload.throws, payload.catches) == (1, 1)
 
@@ -102,16 +91,16 @@ def test_the_battery_lasts_as_long_as_configured() -> None:
     flight = FastFlight(config)
     plant: Plant = flight.plant
     plant.armed_t_s = 0.0
-    plant.world.t_s = 20.0
+    plant.scene.t_s = 20.0
     assert plant.battery().remaining == pytest.approx(0.9 - 20.0 / 50.0)
-    plant.world.t_s = 60.0
+    plant.scene.t_s = 60.0
     assert plant.battery().remaining == 0.0
 
 
 def test_the_final_report_counts_throws_and_catches() -> None:
     config = configured("world.throws=4")
     sitl = Sitl(config.vehicle, config.world, start_of((0.0, 0.0), 0.0, (20.0, 20.0)), Ports(), lambda message: None)
-    sitl.plant.world.payload.throws, sitl.plant.world.payload.catches = 3, 2
+    sitl.plant.scene.payload.throws, sitl.plant.scene.payload.catches = 3, 2
     final = sitl.final()
     assert (final["throws"], final["catches"]) == (3, 2)
     assert (final["thrown"], final["caught"], final["missed"]) == (False, False, False)

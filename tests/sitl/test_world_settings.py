@@ -28,7 +28,7 @@ _SET_UP = "the companion's set-up of the bus writes this register, or a row of i
 ON_WIRES_ONLY = {
     "natnet_version": "the fast loop has no NatNet bytes",
     "mocap_other_id": "an address: the fast loop has no stream of several rigid bodies",
-    "arm_hand": "it holds a limp arm; in the fast loop the arm gives torque from the start",
+    "arm_handling": "it holds a limp arm; in the fast loop the arm gives torque from the start",
     "servos.firmware": _SET_UP,
     "servos.return_delay_us": _SET_UP,
     "servos.operating_mode": _SET_UP,

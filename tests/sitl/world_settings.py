@@ -54,7 +54,7 @@ VALUES: dict[str, Any] = {
     "px4_params": {"MC_ROLLRATE_P": 0.1},
     "net_weight_kg": 0.5,
     "payload_kg": 0.3,
-    "hand_taps": 2,
+    "handling_taps": 2,
     "servos.id": 9,
     "servos.baud": 57600,
     "servos.model": "XM430-W350",
@@ -72,14 +72,14 @@ VALUES: dict[str, Any] = {
 }
 """Other values of settings for which type and default do not suffice."""
 
-_HANDLED: Settings = {"hand": True, "hand_t_s": 0.0}
+_HANDLED: Settings = {"handling": True, "handling_t_s": 0.0}
 _HANDLED_FOR_LONG: Settings = {**_HANDLED, "px4_params": {"EKF2_EV_CTRL": 0}}
 """Handling for long: without an estimate the vehicle does not arm."""
 TOGETHER: dict[str, Settings] = {
-    "hand": {"hand_t_s": 0.0},
-    "hand_t_s": _HANDLED,
-    "hand_taps": _HANDLED_FOR_LONG,
-    "hand_tap_n": {**_HANDLED_FOR_LONG, "hand_taps": 3},
+    "handling": {"handling_t_s": 0.0},
+    "handling_t_s": _HANDLED,
+    "handling_taps": _HANDLED_FOR_LONG,
+    "handling_tap_n": {**_HANDLED_FOR_LONG, "handling_taps": 3},
     "net_weight_kg": {"net_weight_t_s": 0.4},
     "net_weight_t_s": {"net_weight_kg": 0.5, "net_weight_t_s": 0.4},
     "keep_s": {"throws": 2, "keep_s": 0.2},
@@ -87,8 +87,10 @@ TOGETHER: dict[str, Settings] = {
 }
 """Further settings of both worlds that make the setting act early in a flight."""
 
-BESIDE_PART: dict[str, Settings] = {"net": {"catch_at_m": (0.2, 0.0)}}
-"""Settings of both worlds beside a part: at this place the short catch does not accelerate, and the throw meets the net's middle."""
+BESIDE_PART: dict[str, Settings] = {"net": {"catch_at_m": (0.2, 0.0)}, "thrower": {"seed": 7}}
+"""Settings of both worlds beside a part: at this place the short catch does not accelerate, and the throw meets the net's middle; the
+throw with this seed is caught.
+"""
 
 TOGETHER_IN_PART: dict[str, Settings] = {
     "faults.phase": {"t_s": None, "phase": "line"},
@@ -96,7 +98,7 @@ TOGETHER_IN_PART: dict[str, Settings] = {
 }
 """The same for a field of a part: the part's other fields."""
 
-ACTS_LATE = frozenset({"throws", "keep_s", "hand_taps", "hand_tap_n", "faults.phase"})
+ACTS_LATE = frozenset({"throws", "keep_s", "handling_taps", "handling_tap_n", "faults.phase"})
 """Settings that act late in a flight."""
 
 _NEVER = {"kind": "gust", "t_s": 1000.0}

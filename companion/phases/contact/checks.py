@@ -80,8 +80,10 @@ def slide_problems(
     """Check what the largest friction needs, joints, thrust and the rotors' yaw torque, and the room; `slid_m` is the way of the slides
     since the touch, right and up.
     """
-    (right, up), length_m, airframe = axes(way.direction_world), math.hypot(*stroke.by_m), vehicle.airframe
-    along = [(stroke.by_m[0] * a + stroke.by_m[1] * b) / length_m for a, b in zip(right, up, strict=True)]
+    (right, up), length_m, airframe = axes(way.direction_world), math.hypot(*stroke.displacement_m), vehicle.airframe
+    along = [
+        (stroke.displacement_m[0] * a + stroke.displacement_m[1] * b) / length_m for a, b in zip(right, up, strict=True)
+    ]
     most_n, weight_n = stroke.friction_max * stroke.force_n, airframe.mass_kg * GRAVITY_M_S2
     friction = (-most_n * along[0], -most_n * along[1], -most_n * along[2])
     yield from torque_problems(vehicle, reference, way, stroke.force_n, friction)
@@ -103,12 +105,12 @@ def slide_problems(
         )
     low_m = reference.position_world_m[2] + slid_m[1] * up[2] - airframe.ground_clearance_m
     if low_m < FLOOR_M:
-        yield f"ends {low_m:.2f} m above standing height (minimum {FLOOR_M:g} m); shorten by_m or begin higher"
+        yield f"ends {low_m:.2f} m above standing height (minimum {FLOOR_M:g} m); shorten displacement_m or begin higher"
     far, beyond_m = _farthest(vehicle, reference, way, slid_m)
     if beyond_m > 0.0:
         yield (
             f"may move to ({far[0]:.2f}, {far[1]:.2f}, {far[2]:.2f}) m, {beyond_m:.2f} m beyond what room and tether allow with a "
-            f"margin of {TRACKING_M:g} m; shorten by_m or begin elsewhere"
+            f"margin of {TRACKING_M:g} m; shorten displacement_m or begin elsewhere"
         )
 
 

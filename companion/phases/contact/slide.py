@@ -27,9 +27,10 @@ class Slide(Pressing):
     """Move the tip straight along the surface while the force along its normal is held."""
 
     slides: ClassVar[bool] = True
+    renamed: ClassVar[dict[str, str]] = {"by_m": "displacement_m"}
 
     type: Literal["slide"]
-    by_m: Vector2
+    displacement_m: Vector2
     """Way to the right and up in the surface, as seen from the vehicle, from where the tip is."""
     speed_m_s: ContactSpeed
     friction_max: Annotated[float, Field(ge=0, le=2)] = 0.8
@@ -39,30 +40,30 @@ class Slide(Pressing):
 
     @model_validator(mode="after")
     def _goes_somewhere(self) -> Self:
-        if math.hypot(*self.by_m) < SLIDE_MIN_M:
-            refuse("slide", [(("by_m",), f"is shorter than {SLIDE_MIN_M:g} m")])
+        if math.hypot(*self.displacement_m) < SLIDE_MIN_M:
+            refuse("slide", [(("displacement_m",), f"is shorter than {SLIDE_MIN_M:g} m")])
         return self
 
     @property
     def description(self) -> str:
         """What the phase does, for a phase without a name."""
-        return f"slide by ({', '.join(f'{value:g}' for value in self.by_m)}) m with {self.force_n:g} N"
+        return f"slide by ({', '.join(f'{value:g}' for value in self.displacement_m)}) m with {self.force_n:g} N"
 
     @property
     def stroke(self) -> Stroke:
         """The keys as the record of `sliding`."""
-        return Stroke(self.force_n, self.by_m, self.speed_m_s, self.friction_max)
+        return Stroke(self.force_n, self.displacement_m, self.speed_m_s, self.friction_max)
 
     def plan(self, p: Planning) -> None:
         """Append the time of the ramp and of the way."""
-        p.builder.t_s += PRESS_RAMP_S + travel_s(math.hypot(*self.by_m), self.speed_m_s)
+        p.builder.t_s += PRESS_RAMP_S + travel_s(math.hypot(*self.displacement_m), self.speed_m_s)
 
     def problems(self, c: Checking) -> Iterator[str]:
         """Check the reserves for force and friction, and the room for the way since the touch."""
-        opening, (right_m, up_m) = opening_of(c.earlier), self.by_m
+        opening, (right_m, up_m) = opening_of(c.earlier), self.displacement_m
         for phase in takewhile(lambda phase: phase is not opening, reversed(c.earlier)):
             if isinstance(phase, Slide):
-                right_m, up_m = right_m + phase.by_m[0], up_m + phase.by_m[1]
+                right_m, up_m = right_m + phase.displacement_m[0], up_m + phase.displacement_m[1]
         yield from checks.force_problems(c.vehicle, c.begin, opening.way.direction_world, self.force_n)
         yield from checks.slide_problems(
             c.vehicle, c.mission.limits, c.begin, opening.way, self.stroke, (right_m, up_m)

@@ -44,7 +44,7 @@ class Stroke:
     """The keys of a slide."""
 
     force_n: float
-    by_m: Vec2
+    displacement_m: Vec2
     speed_m_s: float
     friction_max: float
 
@@ -56,7 +56,7 @@ class Stroke:
 
 def begun(contact: ContactState, stroke: Stroke) -> ContactState:
     """Return the state with the way of a slide planned; the tip stays until the force is reached."""
-    (r, u), (right, up) = stroke.by_m, axes(contact.direction_world)
+    (r, u), (right, up) = stroke.displacement_m, axes(contact.direction_world)
     rest = c.shift_to(contact, contact.shift.to_m, contact.shift.to_yaw_rad, contact.shift.to_tool_rad).from_m
     x, y, z = (p + r * a + u * b for p, a, b in zip(rest, right, up, strict=True))
     shift = c.shift_to(contact, (x, y, z), contact.shift.to_yaw_rad, contact.shift.to_tool_rad)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from companion.model.types import Vec3
 from companion.sitl_config.effects.air import Air as AirConfig
-from sitl.world.loads import EFFECT_PERIOD_S
+from sitl.world.effects.rotors import Thrusts
+from sitl.world.loads import EFFECT_PERIOD_S, Bodies
 from sitl.world.ornstein_uhlenbeck import OrnsteinUhlenbeck
-
-if TYPE_CHECKING:
-    from sitl.world.world import World
 
 _NOISE = 13
 
@@ -21,30 +19,31 @@ class Air:
     Args:
         config: section `air`.
         seed: seed of the world.
-        base: MuJoCo's index of the base.
+        bodies: the model of the scene.
         weight_n: weight of the vehicle, equal to its thrust in hover.
     """
 
-    def __init__(self, config: AirConfig, seed: int, base: int, weight_n: float) -> None:
-        self._config, self._seed, self._base, self._weight_n = config, seed, base, weight_n
+    def __init__(self, config: AirConfig, seed: int, bodies: Bodies, weight_n: float) -> None:
+        self._config, self._seed, self._weight_n = config, seed, weight_n
+        self._loads, self._base = bodies.loads, bodies.body("base")
         self.restart_noise()
 
     @classmethod
-    def of(cls, config: AirConfig, seed: int, base: int, weight_n: float) -> Air | None:
+    def of(cls, config: AirConfig, seed: int, bodies: Bodies, weight_n: float) -> Air | None:
         """Return the effect, or None if it is off."""
-        return cls(config, seed, base, weight_n) if config.on else None
+        return cls(config, seed, bodies, weight_n) if config.on else None
 
     def restart_noise(self) -> None:
         """Restart the noise sequence."""
         self._gust = OrnsteinUhlenbeck(2, self._config.correlation_time_s, EFFECT_PERIOD_S, self._seed, _NOISE)
 
-    def apply(self, world: World) -> None:
+    def apply(self, thrust_n: Thrusts, q: Sequence[float], v: Sequence[float]) -> None:
         """Set the gusts' force and torque on the base."""
         (x, y, z), (roll, pitch, _) = self._gust.step()
-        strength = self.strength(sum(world.rotor_thrust_n), world.q[2])
+        strength = self.strength(sum(thrust_n), q[2])
         force, torque = strength * self._config.force_rms_n, strength * self._config.torque_rms_nm
         load: tuple[Vec3, Vec3] = ((force * x, force * y, force * z), (torque * roll, torque * pitch, 0.0))
-        world.loads.set(self._base, "air", *load)
+        self._loads.set(self._base, "air", *load)
 
     def strength(self, thrust_n: float, height_m: float) -> float:
         """Return the gusts' strength relative to hover far from the floor.

@@ -11,7 +11,8 @@ middle (cross-flow principle, Hoerner 1965); the whole flow loads net and payloa
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 from companion.config.arm_chain import chain_of, without_tool
 from companion.config.vehicle import Vehicle
@@ -20,13 +21,10 @@ from companion.model.rotors import RotorLayout
 from companion.model.types import Mat3, Vec3
 from companion.sitl_config.effects.downwash import Downwash as DownwashConfig
 from sitl.world.effects.rotors import Thrusts
-from sitl.world.loads import EFFECT_PERIOD_S
-from sitl.world.model import PAYLOAD_RADIUS_M
+from sitl.world.loads import EFFECT_PERIOD_S, Bodies
 from sitl.world.ornstein_uhlenbeck import OrnsteinUhlenbeck
+from sitl.world.state import PAYLOAD_RADIUS_M
 from sitl.world.views import mat3_of, vec3_of
-
-if TYPE_CHECKING:
-    from sitl.world.world import World
 
 _NOISE = 14
 _ROOT_HALF: Final = math.sqrt(0.5)
@@ -103,30 +101,31 @@ class Downwash:
         config: section `downwash`.
         rotor_radius_m: radius of a rotor.
         vehicle: vehicle file.
-        world: the world whose bodies the wakes load.
+        bodies: the model of the scene; the wakes load the arm and the net of the machine, and the payload.
         seed: seed of the world.
     """
 
     def __init__(
-        self, config: DownwashConfig, rotor_radius_m: float, vehicle: Vehicle, world: World, seed: int
+        self, config: DownwashConfig, rotor_radius_m: float, vehicle: Vehicle, bodies: Bodies, seed: int
     ) -> None:
-        model, data = world.model, world.data
+        model, data, self._loads, prefix = bodies
+        self._cause = f"{prefix}downwash"
         self._config, self._seed, self._intensity = config, seed, config.turbulence_intensity
         layout = vehicle.airframe.rotor_layout
         self._wakes, self._height_m = Wakes(layout, rotor_radius_m, config.spread), layout.height_m
         self._radius_m = rotor_radius_m
-        base = model.body("base").id
+        base = bodies.body("base")
         self._base_position, self._base_axes = data.xpos[base], data.xmat[base]
         area = config.link_drag_coefficient * config.link_width_m
         links = _links_of(vehicle)
-        bodies = [model.body(f"link{number}").id for number, _, _ in links]
+        indices = [bodies.body(f"link{number}") for number, _, _ in links]
         self._links = tuple(
             (body, data.xpos[body], data.xmat[body], data.xipos[body], direction, 0.5 * length_m, area * length_m)
-            for body, (_, direction, length_m) in zip(bodies, links, strict=True)
+            for body, (_, direction, length_m) in zip(indices, links, strict=True)
         )
         names = {model.body(k).name: k for k in range(model.nbody)}
         payload_m2 = config.payload_drag_coefficient * math.pi * PAYLOAD_RADIUS_M**2
-        compact = [("net", config.net_drag_area_m2, vehicle.tip_radius_m)] if vehicle.has_net else []
+        compact = [(f"{prefix}net", config.net_drag_area_m2, vehicle.tip_radius_m)] if vehicle.has_net else []
         compact.append(("payload", payload_m2, PAYLOAD_RADIUS_M))
         self._compact = tuple(
             (names[name], data.xipos[names[name]], area_m2, radius_m / 2.0)
@@ -137,10 +136,10 @@ class Downwash:
 
     @classmethod
     def of(
-        cls, config: DownwashConfig, rotor_radius_m: float, vehicle: Vehicle, world: World, seed: int
+        cls, config: DownwashConfig, rotor_radius_m: float, vehicle: Vehicle, bodies: Bodies, seed: int
     ) -> Downwash | None:
         """Return the effect, or None if it is off."""
-        return cls(config, rotor_radius_m, vehicle, world, seed) if config.on else None
+        return cls(config, rotor_radius_m, vehicle, bodies, seed) if config.on else None
 
     def restart_noise(self) -> None:
         """Restart the noise sequence."""
@@ -148,10 +147,9 @@ class Downwash:
             len(self._links) + 1, self._config.correlation_time_s, EFFECT_PERIOD_S, self._seed, _NOISE
         )
 
-    def apply(self, world: World) -> None:
+    def apply(self, thrust_n: Thrusts, q: Sequence[float], v: Sequence[float]) -> None:
         """Set the wakes' forces on links, net and payload."""
         gusts = self._turbulence.step()
-        thrust_n = world.rotor_thrust_n
         origin = vec3_of(self._base_position)
         axes = mat3_of(self._base_axes)
         (_, _, zx), (_, _, zy), (_, _, zz) = axes
@@ -174,13 +172,13 @@ class Downwash:
             fx, fy, fz = k * nx, k * ny, k * nz
             rx, ry, rz = x - cx, y - cy, z - cz
             torque = (ry * fz - rz * fy, rz * fx - rx * fz, rx * fy - ry * fx)
-            world.loads.set(body, "downwash", (fx, fy, fz), torque)
+            self._loads.set(body, self._cause, (fx, fy, fz), torque)
         ux, uy, uz = flow
         speed = math.sqrt(ux * ux + uy * uy + uz * uz)
         for body, centre, area_m2, blur_m in self._compact:
             x, y, z = vec3_of(centre)
             k = area_m2 * speed * self._pressure_pa(thrust_n, origin, axes, (x, y, z), blur_m)
-            world.loads.set(body, "downwash", (k * ux, k * uy, k * uz))
+            self._loads.set(body, self._cause, (k * ux, k * uy, k * uz))
 
     def _pressure_pa(self, thrust_n: Thrusts, origin: Vec3, axes: Mat3, point: Vec3, blur_m: float) -> float:
         """Return the mean dynamic pressure in Pa at a point in the world frame; it falls to zero over the last rotor radius above

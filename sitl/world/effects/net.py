@@ -11,14 +11,14 @@ restitution^2 times that stiffness while it relaxes, which returns the payload w
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Any, Final
 
 import mujoco
 
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Vec3
 from companion.sitl_config.effects.net import Net as NetConfig
-from sitl.world.loads import ZERO, Loads
+from sitl.world.loads import ZERO, Bodies
 from sitl.world.views import mat3_of, vec3_of
 
 RIM_STIFFNESS_N_M = 3000.0
@@ -131,9 +131,7 @@ class Net:
 
     Args:
         config: section `net`.
-        model: MuJoCo model with the bodies base, sensor and net.
-        data: data of that model.
-        loads: external forces and torques on the bodies.
+        bodies: the model of the scene.
         hoop_radius_m: radius of the hoop.
         payload_radius_m: radius of the payloads.
     """
@@ -141,38 +139,36 @@ class Net:
     def __init__(
         self,
         config: NetConfig,
-        model: mujoco.MjModel,
-        data: mujoco.MjData,
-        loads: Loads,
+        bodies: Bodies,
         hoop_radius_m: float,
         payload_radius_m: float,
     ) -> None:
         self._config, self._radii_m = config, (hoop_radius_m, payload_radius_m)
-        self._model, self._data, self._loads = model, data, loads
-        base, link, self._net = (model.body(name).id for name in ("base", "sensor", "net"))
+        self._model, data, self._loads, _ = bodies
+        self._data = data
+        base, link, self._net = (bodies.body(name) for name in ("base", "sensor", "net"))
         self._centre, self._axes = data.xpos[self._net], data.xmat[link]
         self._turning, self._velocity = data.cvel[self._net][:3], data.cvel[self._net][3:]
         self._com, self._net_com = data.subtree_com[base], data.xipos[self._net]
-        self._bags: dict[int, tuple[Bag, int, int]] = {}
+        self._bags: dict[int, tuple[Bag, Any, Any]] = {}
         self._touching: set[int] = set()
 
     @classmethod
     def of(
         cls,
         config: NetConfig,
-        model: mujoco.MjModel,
-        data: mujoco.MjData,
-        loads: Loads,
+        bodies: Bodies,
         hoop_radius_m: float,
         payload_radius_m: float,
     ) -> Net | None:
         """Return the net, or None if the effect is off."""
-        return cls(config, model, data, loads, hoop_radius_m, payload_radius_m) if config.on else None
+        return cls(config, bodies, hoop_radius_m, payload_radius_m) if config.on else None
 
     def watch(self, body: int, q: int, v: int) -> None:
         """Let the net act on a thrown payload, given its body index and its first indices in qpos and qvel."""
         self.let_go(body)
-        self._bags[body] = (Bag(self._config, *self._radii_m), q, v)
+        d = self._data
+        self._bags[body] = (Bag(self._config, *self._radii_m), d.qpos[q : q + 3], d.qvel[v : v + 3])
 
     def let_go(self, body: int) -> None:
         """Stop the net's action on a payload."""
@@ -188,28 +184,31 @@ class Net:
         """Return whether the payload is in the bag, settled or not."""
         return body in self._bags and self._bags[body][0].side > 0
 
-    def step(self, q: list[float], v: list[float], t_s: float) -> bool:
+    def step(self, q: list[float], t_s: float) -> bool:
         """Advance MuJoCo by one step with all loads applied; return whether a payload bounces out of the bag.
 
         Args:
-            q: qpos before the step.
-            v: qvel before the step.
+            q: qpos of the vehicle before the step.
             t_s: world time before the step.
         """
-        near = [(body, of) for body, of in self._bags.items() if _is_near(q, of[1])]
+        near = [
+            (body, bag, vec3_of(at), vec3_of(velocity))
+            for body, (bag, at, velocity) in self._bags.items()
+            if _is_near(q, vec3_of(at))
+        ]
         if not near:
             self._loads.write()
             mujoco.mj_step(self._model, self._data)
             return False
         # The first half brings the net's pose and velocity up to date: forces of the previous step would add energy.
         mujoco.mj_step1(self._model, self._data)
-        for body, (bag, at_q, at_v) in near:
-            self._press(body, bag, q[at_q : at_q + 3], v[at_v : at_v + 3], t_s)
+        for body, bag, position_m, velocity_m_s in near:
+            self._press(body, bag, position_m, velocity_m_s, t_s)
         self._loads.write()
         mujoco.mj_step2(self._model, self._data)
-        return any(bag.bounced for _, (bag, _, _) in near)
+        return any(bag.bounced for _, bag, _, _ in near)
 
-    def _press(self, body: int, bag: Bag, position_m: list[float], velocity_m_s: list[float], t_s: float) -> None:
+    def _press(self, body: int, bag: Bag, position_m: Vec3, velocity_m_s: Vec3, t_s: float) -> None:
         """Apply the contact force to the payload at this position and velocity (world frame), and the opposite force to the net."""
         px, py, pz = position_m
         vx, vy, vz = velocity_m_s
@@ -247,6 +246,6 @@ class Net:
             self._loads.set(self._net, f"payload {body}", ZERO)
 
 
-def _is_near(q: list[float], at: int) -> bool:
-    x, y, z = q[at] - q[0], q[at + 1] - q[1], q[at + 2] - q[2]
+def _is_near(q: list[float], position_m: Vec3) -> bool:
+    x, y, z = position_m[0] - q[0], position_m[1] - q[1], position_m[2] - q[2]
     return x * x + y * y + z * z < _NEAR_M2

@@ -8,15 +8,16 @@ distance. The line's air drag is neglected: at 0.5 m/s it is below 1 mN for one 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 from companion.config.tether import Tether
 from companion.model.constants import GRAVITY_M_S2
 from companion.sitl_config.effects.tether_line import TetherLine as TetherLineConfig
+from sitl.world.effects.rotors import Thrusts
+from sitl.world.loads import Bodies
+from sitl.world.tether import Tether as TautTether
 from sitl.world.views import vec3_of
-
-if TYPE_CHECKING:
-    from sitl.world.world import World
 
 SLACK_MIN_SHARE = 0.005
 _DRAGGED_SHARE = 0.5
@@ -77,33 +78,35 @@ class TetherLine:
     Args:
         config: section `tether_line`.
         tether: tether of the vehicle file.
-        base: MuJoCo's index of the base.
+        taut: that tether in the model, which knows its attachment and present length.
+        bodies: the model of the scene.
     """
 
-    def __init__(self, config: TetherLineConfig, tether: Tether, base: int) -> None:
+    def __init__(self, config: TetherLineConfig, tether: Tether, taut: TautTether, bodies: Bodies) -> None:
         self._weight_n_m = config.mass_g_per_m * 1e-3 * GRAVITY_M_S2
         self._friction = config.floor_friction
         self._anchor, self._whole_m = tether.anchor_world_m, tether.length_m
-        self._base = base
+        self._taut, self._loads, self._base = taut, bodies.loads, bodies.body("base")
+        self._centre = bodies.data.xipos[self._base]
 
     @classmethod
-    def of(cls, config: TetherLineConfig, tether: Tether | None, base: int) -> TetherLine | None:
+    def of(cls, config: TetherLineConfig, tether: Tether | None, taut: TautTether, bodies: Bodies) -> TetherLine | None:
         """Return the effect, or None if it is off or the vehicle has no tether."""
-        return cls(config, tether, base) if config.on and tether is not None else None
+        return cls(config, tether, taut, bodies) if config.on and tether is not None else None
 
     def restart_noise(self) -> None:
         """Do nothing: this effect has no noise."""
 
-    def apply(self, world: World) -> None:
+    def apply(self, thrust_n: Thrusts, q: Sequence[float], v: Sequence[float]) -> None:
         """Set the pull of the tether on the base."""
-        x, y, z = end = world.attachment_world_m
+        x, y, z = end = self._taut.attachment_world_m
         ax, ay, az = self._anchor
         dx, dy, dz = ax - x, ay - y, az - z
         level_m = math.hypot(dx, dy)
         shortest_m = (1.0 + SLACK_MIN_SHARE) * math.hypot(level_m, dz)
-        length_m = max(min(world.tether_length_m, self._whole_m), shortest_m)
+        length_m = max(min(self._taut.length_m, self._whole_m), shortest_m)
         level_n, down_n, on_floor_m = hanging(level_m, -dz, length_m, self._weight_n_m)
-        vx, vy = world.v[0], world.v[1]
+        vx, vy = v[0], v[1]
         k = level_n / level_m if level_n > 0.0 else 0.0
         drag = (
             self._friction
@@ -113,7 +116,7 @@ class TetherLine:
             / math.sqrt(vx * vx + vy * vy + _SLIDES_M_S**2)
         )
         fx, fy, fz = k * dx - drag * vx, k * dy - drag * vy, -down_n
-        cx, cy, cz = vec3_of(world.data.xipos[self._base])
+        cx, cy, cz = vec3_of(self._centre)
         rx, ry, rz = end[0] - cx, end[1] - cy, end[2] - cz
         torque = (ry * fz - rz * fy, rz * fx - rx * fz, rx * fy - ry * fx)
-        world.loads.set(self._base, "tether", (fx, fy, fz), torque)
+        self._loads.set(self._base, "tether", (fx, fy, fz), torque)

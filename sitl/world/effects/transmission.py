@@ -180,34 +180,33 @@ def transmissions_of(vehicle: Vehicle, world: World, start_rad: Joints, dt_s: fl
     )
 
 
-def added_inertia_kg_m2(
-    model: mujoco.MjModel, joint_q: Sequence[int], joint_v: Sequence[int], transmissions: Sequence[Transmission]
-) -> float:
+def added_inertia_kg_m2(model: mujoco.MjModel, at_q: int, at_v: int, transmissions: Sequence[Transmission]) -> float:
     """Return the inertia to add to every link about its joint, so that the physics step can represent the links on their springs; 0 if
     the links are heavy enough, as those of the shipped arm are.
 
     Args:
-        model: the vehicle; the masses of its first 6 + n degrees of freedom are used.
-        joint_q: indices of the joint angles in qpos.
-        joint_v: indices of the joint rates in qvel.
+        model: the scene.
+        at_q: index of the vehicle's first element in qpos; its joint angles follow the pose of the base.
+        at_v: index of the vehicle's first element in qvel.
         transmissions: transmission of each joint.
     """
     data, poses = mujoco.MjData(model), np.random.default_rng(0)
     stiffness, rotor = np.array([each.stiffness() for each in transmissions]).T
-    scale, count = np.sqrt(np.outer(stiffness, stiffness)), 6 + len(joint_v)
+    scale, joints = np.sqrt(np.outer(stiffness, stiffness)), len(transmissions)
+    own, joint_q = slice(at_v, at_v + 6 + joints), slice(at_q + 7, at_q + 7 + joints)
     masses, mass = [], np.zeros((model.nv, model.nv))
     for pose in range(_POSES):
-        data.qpos[joint_q] = poses.uniform(-math.pi, math.pi, len(joint_q)) if pose else 0.0
+        data.qpos[joint_q] = poses.uniform(-math.pi, math.pi, joints) if pose else 0.0
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_crb(model, data)
         mujoco.mj_fullM(model, data, mass)
-        masses.append(mass[:count, :count].copy())
+        masses.append(mass[own, own].copy())
 
     def stiffest(added_kg_m2: float) -> float:
-        added = np.zeros(count)
-        added[joint_v] = added_kg_m2
-        inverse = np.linalg.inv(np.array(masses) + np.diag(added))[:, joint_v][:, :, joint_v]
+        added = np.zeros(6 + joints)
+        added[6:] = added_kg_m2
+        inverse = np.linalg.inv(np.array(masses) + np.diag(added))[:, 6:, 6:]
         return float(np.linalg.eigvalsh((inverse + np.diag(1.0 / rotor)) * scale).max())
 
     if stiffest(0.0) <= STIFF_MAX:

@@ -12,11 +12,11 @@ from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.air import Air
 from sitl.world.ornstein_uhlenbeck import OrnsteinUhlenbeck
-from sitl.world.world import World
+from tests.sitl.plants import OneMachine
 from tests.support import CATCH
 
 VEHICLE = load_sitl(CATCH).vehicle
-HOVER = 30.0
+HOVER = OneMachine(VEHICLE, WorldConfig(), (0.0, 0.0), 0.0, (1.7, 1.0)).machine.weight_n
 """Weight and thrust in these tests, N."""
 
 
@@ -33,8 +33,9 @@ def test_the_process_has_unit_rms_and_forgets_exponentially() -> None:
 
 
 def air(**settings: float) -> Air:
-    effect = Air.of(AirConfig(on=True, **settings), 1, 0, HOVER)
-    assert effect is not None
+    world = OneMachine(VEHICLE, WorldConfig(air=AirConfig(on=True, **settings)), (0.0, 0.0), 0.0, (1.7, 1.0))
+    (effect,) = world.machine.effects
+    assert isinstance(effect, Air)
     return effect
 
 
@@ -50,13 +51,15 @@ def test_the_strength_grows_with_the_thrust_and_towards_the_floor() -> None:
 def gusts(seed: int, rotor_command: float, steps: int = 2000) -> np.ndarray:
     """Force and torque on the base in a world without drag, in every tenth step."""
     config = WorldConfig(payload_kg=0.0, seed=seed, air=AirConfig(on=True, correlation_time_s=0.02, floor_increase=0.0))
-    world = World(VEHICLE, config, (0.0, 0.0), 0.0, (1.7, 1.0))
+    world = OneMachine(VEHICLE, config, (0.0, 0.0), 0.0, (1.7, 1.0))
     base = world.model.body("base").id
     rows = []
     for step in range(steps):
-        world.step((rotor_command,) * 4, (0.0, 0.0), drag=False)
+        world.fly((rotor_command,) * 4, (0.0, 0.0), drag=False)
         if step >= 200 and step % 10 == 0:
-            rows.append(world.data.xfrc_applied[base] / (sum(world.rotor_thrust_n) / world.weight_n or 1.0))
+            rows.append(
+                world.data.xfrc_applied[base] / (sum(world.machine.rotor_thrust_n) / world.machine.weight_n or 1.0)
+            )
     return np.array(rows)
 
 
@@ -76,12 +79,12 @@ def test_gusts_start_again_at_arming() -> None:
     config = WorldConfig(payload_kg=0.0, air=AirConfig(on=True))
     loads = []
     for before in (0, 7):
-        world = World(VEHICLE, config, (0.0, 0.0), 0.0, (1.7, 1.0))
+        world = OneMachine(VEHICLE, config, (0.0, 0.0), 0.0, (1.7, 1.0))
         for _ in range(before):
-            world.step((0.2,) * 4, (0.0, 0.0), drag=False)
-        world.restart_noise()
-        world.step((0.2,) * 4, (0.0, 0.0), drag=False)
-        loads.append(world.data.xfrc_applied[world.model.body("base").id] / sum(world.rotor_thrust_n))
+            world.fly((0.2,) * 4, (0.0, 0.0), drag=False)
+        world.machine.restart_noise()
+        world.fly((0.2,) * 4, (0.0, 0.0), drag=False)
+        loads.append(world.data.xfrc_applied[world.model.body("base").id] / sum(world.machine.rotor_thrust_n))
     # Standing on its springs, the vehicle sinks a little.
     np.testing.assert_allclose(loads[0], loads[1], rtol=1e-2)
     assert loads[0].any()

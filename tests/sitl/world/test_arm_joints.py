@@ -18,7 +18,6 @@ from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import dynamics_of, manipulator_of
 from companion.control.dynamics import euler_rate_matrices
-from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, rotation_matrix
 from companion.model.types import Joints, Outcome, Severity
 from companion.sitl_config.effects.compliance import Compliance
@@ -31,13 +30,13 @@ from sitl.autopilot.backend import stub_of
 from sitl.fast.bus import FastBus, scales_of
 from sitl.fast.loop import FastFlight
 from sitl.faults.injector import Faults
-from sitl.server import Ports, Sitl, start_of
+from sitl.plant import Plant
+from sitl.server import Ports, Sitl
 from sitl.servo.drive import ServoDrive
 from sitl.servo.from_config import servos_of
-from sitl.world.plant import Plant
-from sitl.world.world import World
+from sitl.world.start import Start, start_of
 from tests.machines import ARMS, overrides_with_joints, vehicle_with_joints
-from tests.sitl.plants import FixedRotors
+from tests.sitl.plants import FixedRotors, OneMachine
 from tests.support import HOVER, LOW_HOVER, SHORT_CATCH, tool_of
 
 Array = NDArray[np.float64]
@@ -86,16 +85,16 @@ def with_rod(vehicle: Vehicle) -> Vehicle:
     return vehicle.model_copy(update={"tool": tool})
 
 
-def free(vehicle: Vehicle, config: WorldConfig = NO_FRICTION) -> World:
+def free(vehicle: Vehicle, config: WorldConfig = NO_FRICTION) -> OneMachine:
     """A world whose arm is not held."""
-    world = World(vehicle, config, (0.0, 0.0), 0.0, (0.0,) * len(vehicle.arm.joints))
-    world.release_arm()
+    world = OneMachine(vehicle, config, (0.0, 0.0), 0.0, (0.0,) * len(vehicle.arm.joints))
+    world.machine.release_arm()
     return world
 
 
 @pytest.mark.parametrize(
     "vehicle",
-    [vehicle_with_joints(joints) for joints in (0, 1, 3, 4)]
+    [load_vehicle("tarot650_2r"), *(vehicle_with_joints(joints) for joints in (0, 1, 3, 4))]
     + [with_random_links(joints, np.random.default_rng(joints)) for joints in (1, 2, 3, 4)]
     + [with_rod(with_random_links(3, np.random.default_rng(7))), load_vehicle("configs/vehicles/tarot650_2r_rod.yaml")],
     ids=lambda vehicle: (
@@ -129,7 +128,7 @@ def test_the_sensor_and_the_net_are_at_the_tip_of_any_chain() -> None:
     vehicle = with_random_links(3, np.random.default_rng(5))
     world, chain = free(vehicle), chain_of(vehicle)
     m, d = world.model, world.data
-    d.qpos[list(world.layout.joint_q)] = (0.5, -1.0, 2.0)
+    d.qpos[list(world.machine.layout.joint_q)] = (0.5, -1.0, 2.0)
     mujoco.mj_forward(m, d)
     link, site = m.body("link3").id, m.site("net").id
     last = d.xmat[link].reshape(3, 3)
@@ -144,7 +143,7 @@ def test_the_tip_of_a_rod_is_beyond_the_sensor_along_the_tips_axis() -> None:
     vehicle = with_rod(net)
     world, chain = free(vehicle), chain_of(vehicle)
     m, d = world.model, world.data
-    d.qpos[list(world.layout.joint_q)] = alpha = (0.5, -1.0, 2.0)
+    d.qpos[list(world.machine.layout.joint_q)] = alpha = (0.5, -1.0, 2.0)
     mujoco.mj_forward(m, d)
     link = m.body("link3").id
     last = d.xmat[link].reshape(3, 3)
@@ -194,8 +193,8 @@ def plant_of(joints: int, **config: Any) -> tuple[Plant, FastBus, list[Any], Fau
     world = WorldConfig(payload_kg=0.0, **config)
     servos = servos_of(vehicle, world)
     drives = [servo.drive for servo in servos]
-    plant = Plant(vehicle, world, FixedRotors(), drives, ((0.0, 0.0), 0.0, folded_rad(joints)))
-    faults = Faults(world, plant.world, stub_of(world, vehicle.airframe), drives, vehicle.tether)
+    plant = Plant(vehicle, world, FixedRotors(), drives, Start((0.0, 0.0), 0.0, folded_rad(joints)))
+    faults = Faults(world, plant.scene, plant.machine, stub_of(world, vehicle.airframe), drives, vehicle.tether)
     plant.faults = faults if world.faults else None
     return plant, FastBus(drives, scales_of(vehicle, servos), 0.1, plant.faults), drives, faults
 
@@ -212,8 +211,8 @@ def test_each_servo_reads_its_own_joint_and_turns_it_in_its_own_direction(joints
     bus.write(0.0, wanted_nm)
     plant.step(False)
     plant.step(False)
-    assert not plant.world.parked
-    torque_nm = plant.world.data.ctrl[4:].tolist()
+    assert not plant.machine.parked
+    torque_nm = plant.scene.data.ctrl[4:].tolist()
     assert torque_nm == pytest.approx(wanted_nm, abs=0.002)
 
 
@@ -222,9 +221,9 @@ def test_a_support_holds_the_arm_until_it_is_armed_and_one_servo_pushes() -> Non
     bus.write(0.0, (0.5, 0.0, 0.0))
     for _ in range(3):
         plant.step(False)
-    assert plant.world.parked
+    assert plant.machine.parked
     plant.step(True)
-    assert not plant.world.parked
+    assert not plant.machine.parked
 
 
 def test_a_lost_servo_lets_go_and_the_others_go_on() -> None:
@@ -241,7 +240,7 @@ def sprung(vehicle: Vehicle, config: WorldConfig) -> tuple[Plant, list[ServoDriv
     """A plant with the folded arm, and its drives."""
     joints = len(vehicle.arm.joints)
     drives = [ServoDrive() for _ in range(joints)]
-    return Plant(vehicle, config, FixedRotors(), drives, ((0.0, 0.0), 0.0, folded_rad(joints))), drives
+    return Plant(vehicle, config, FixedRotors(), drives, Start((0.0, 0.0), 0.0, folded_rad(joints))), drives
 
 
 def hold(plant: Plant, drives: list[ServoDrive], until_s: float) -> None:
@@ -249,7 +248,7 @@ def hold(plant: Plant, drives: list[ServoDrive], until_s: float) -> None:
     plant.step(False)
     for drive in drives:
         drive.torque_on, (_, _, drive.goal_position_counts) = True, drive.present()
-    plant.world.release_arm()
+    plant.machine.release_arm()
     while plant.t_s < until_s:
         plant.step(False)
 
@@ -260,7 +259,7 @@ def test_every_joint_has_a_spring_of_its_own() -> None:
     plant, drives = sprung(vehicle, NO_FRICTION.model_copy(update={"compliance": flexible}))
     hold(plant, drives, 3.0)
     for joint, (drive, own, deg_per_nm) in enumerate(zip(drives, vehicle.arm.joints, (1.0, 2.0, 2.0), strict=True)):
-        held_nm = float(plant.world.data.qfrc_bias[6 + joint])
+        held_nm = float(plant.scene.data.qfrc_bias[6 + joint])
         shaft_rad = own.sign * (drive.angle_rad - own.zero_count / 4096.0 * math.tau)
         assert abs(held_nm) > 0.05
         ahead_rad = shaft_rad - plant.truth.joint_angle_rad[joint]
@@ -270,9 +269,9 @@ def test_every_joint_has_a_spring_of_its_own() -> None:
 def test_links_too_light_for_their_springs_get_the_inertia_that_the_physics_step_needs() -> None:
     geared = NO_FRICTION.model_copy(update={"servo_mechanics": ServoMechanics(on=True)})
     two, _ = sprung(load_vehicle("tarot650_2r"), geared)
-    assert not two.world.model.dof_armature.any()
+    assert not two.scene.model.dof_armature.any()
     four, drives = sprung(vehicle_with_joints(4), NO_FRICTION.model_copy(update={"compliance": Compliance(on=True)}))
-    added_kg_m2 = four.world.model.dof_armature[6:10]
+    added_kg_m2 = four.scene.model.dof_armature[6:10]
     assert 0.0 < added_kg_m2.min() == added_kg_m2.max() < 0.001
     hold(four, drives, 2.0)
     assert max(map(abs, four.truth.joint_velocity_rad_s)) < 0.01
@@ -295,7 +294,7 @@ def test_a_vehicle_with_any_number_of_joints_and_any_axes_flies(joints: int, mis
 
 
 def test_without_an_arm_the_server_opens_no_servo_bus_and_no_force_sensor() -> None:
-    config = WorldConfig(payload_kg=0.0, arm_hand=True, faults=(Fault(kind="gust", t_s=0.0, after="start"),))
+    config = WorldConfig(payload_kg=0.0, arm_handling=True, faults=(Fault(kind="gust", t_s=0.0, after="start"),))
     server = Sitl(vehicle_with_joints(0), config, start_of((0.0, 0.0), 0.0, ()), Ports(), lambda _: None)
 
     async def served() -> set[str]:
@@ -306,21 +305,3 @@ def test_without_an_arm_the_server_opens_no_servo_bus_and_no_force_sensor() -> N
 
     assert asyncio.run(served()) == {"autopilot", "mocap"}
     assert server.plant.t_s == pytest.approx(0.01)
-
-
-def test_a_level_vehicle_holds_each_joint_against_the_weight_of_the_links_beyond_it() -> None:
-    vehicle = vehicle_with_joints(3)
-    arm, world = vehicle.arm, free(vehicle)
-    alpha = (1.7, 0.6, -0.4)
-    world.data.qpos[list(world.layout.joint_q)] = alpha
-    mujoco.mj_forward(world.model, world.data)
-    pitch = [alpha[0], alpha[0] - alpha[1], alpha[0] - alpha[1] - alpha[2]]  # of each link, below the body's x axis
-    joint_m = np.concatenate(
-        [[0.0], np.cumsum([length * math.cos(p) for length, p in zip(arm.link_lengths_m, pitch, strict=True)])]
-    )
-    centre_m = [x + c * math.cos(p) for x, c, p in zip(joint_m, arm.link_com_m, pitch, strict=False)]
-    masses_kg, places_m = [*arm.link_masses_kg, vehicle.tool_mass_kg], [*centre_m, joint_m[3]]
-    for joint, sign in enumerate((1.0, -1.0, -1.0)):
-        beyond = zip(masses_kg[joint:], places_m[joint:], strict=True)
-        held_nm = -sign * GRAVITY_M_S2 * sum(mass * (place - joint_m[joint]) for mass, place in beyond)
-        assert world.data.qfrc_bias[6 + joint] == pytest.approx(held_nm, abs=1e-9)

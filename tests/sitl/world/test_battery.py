@@ -13,7 +13,8 @@ from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.fast.loop import FastFlight
 from sitl.world.effects.battery import BatteryPack, open_circuit_v
-from sitl.world.world import PHYSICS_DT_S, World
+from sitl.world.state import PHYSICS_DT_S
+from tests.sitl.plants import OneMachine
 from tests.support import CATCH
 
 VEHICLE = load_sitl(CATCH).vehicle
@@ -86,7 +87,7 @@ def test_thrust_goes_with_the_square_of_the_voltage() -> None:
     config = {"on": True, "full_thrust_v": 16.0, "resistance_ohm": 0.0}
     for rotors, share in (({"on": False}, 0.5), ({"on": True, "thrust_error": (0.0, 0.0, 0.0, 0.0)}, 0.375)):
         for start in (1.0, 0.2):
-            world = World(
+            world = OneMachine(
                 VEHICLE,
                 WorldConfig.model_validate({"battery": config, "rotors": rotors, "battery_start": start}),
                 (0.0, 0.0),
@@ -94,24 +95,28 @@ def test_thrust_goes_with_the_square_of_the_voltage() -> None:
                 (1.0, 1.0),
             )
             for _ in range(300):
-                world.step((0.5,) * 4, (0.0, 0.0))
-            near = 1.0 if world._rotors is None else world._rotors.ground_effect(world.q[2] + 0.03)
+                world.fly((0.5,) * 4, (0.0, 0.0))
+            near = (
+                1.0 if world.machine._rotors is None else world.machine._rotors.ground_effect(world.machine.q[2] + 0.03)
+            )
             wanted = near * VEHICLE.airframe.thrust_max_n * share * (open_circuit_v(start, 4) / 16.0) ** 2
             assert sum(world.data.ctrl[0:4]) == pytest.approx(wanted, rel=2e-3)
 
 
 def test_hover_command_of_linear_rotors_follows_the_voltage() -> None:
-    ideal = World(VEHICLE, WorldConfig(), (0.0, 0.0), 0.0, (1.0, 1.0))
-    real = World(VEHICLE, WorldConfig(battery=BatteryConfig(on=True)), (0.0, 0.0), 0.0, (1.0, 1.0))
-    assert real.battery is not None
-    assert real.hover_command == pytest.approx(ideal.hover_command * (16.0 / real.battery.hover_v) ** 2)
+    ideal = OneMachine(VEHICLE, WorldConfig(), (0.0, 0.0), 0.0, (1.0, 1.0))
+    real = OneMachine(VEHICLE, WorldConfig(battery=BatteryConfig(on=True)), (0.0, 0.0), 0.0, (1.0, 1.0))
+    assert real.machine.battery is not None
+    assert real.machine.hover_command == pytest.approx(
+        ideal.machine.hover_command * (16.0 / real.machine.battery.hover_v) ** 2
+    )
 
 
 def test_power_module_reports_the_pack_and_the_sag_of_a_fault() -> None:
     faults = '[{"kind": "battery_sag", "after": "arming", "t_s": 0.5, "size": 2.0}]'
     start = ("world.battery_start=0.8", "world.battery.on=true", f"world.faults={faults}")
     flight = FastFlight(load_sitl(CATCH, overrides=start))
-    plant, battery = flight.plant, flight.plant.world.battery
+    plant, battery = flight.plant, flight.plant.machine.battery
     assert battery is not None
     while plant.t_s < 0.2:
         plant.step(False)
@@ -127,4 +132,4 @@ def test_power_module_reports_the_pack_and_the_sag_of_a_fault() -> None:
     while plant.t_s < 0.8:
         plant.step(True)
     assert plant.battery().voltage_v == pytest.approx(battery.voltage_v - 2.0)
-    assert plant.world.rotor_share is not None
+    assert plant.machine.rotor_share is not None

@@ -15,7 +15,7 @@ from companion.sitl_config.effects.downwash import Downwash as DownwashConfig
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.downwash import Wakes
-from sitl.world.world import World
+from tests.sitl.plants import OneMachine
 from tests.support import CATCH
 
 VEHICLE = load_sitl(CATCH).vehicle
@@ -76,17 +76,17 @@ def test_the_four_wakes_are_one_jet_where_the_spread_is_the_rotors_distance_from
     assert wakes.pressure_pa(FOUR_N, (0.0, 0.0, -0.4 * depth_m)) < wakes.pressure_pa(FOUR_N, below_rotor(0.4 * depth_m))
 
 
-def under_rotor(arm_rad: tuple[float, float], **settings: Any) -> World:
+def under_rotor(arm_rad: tuple[float, float], **settings: Any) -> OneMachine:
     """A level world at 2 m whose arm is mounted below the front right rotor, with a sharp and steady wake."""
     x, y, _ = LAYOUT.positions_body_m[0]
     arm = VEHICLE.arm.model_copy(update={"shoulder_body_m": (x - 0.1, y, -0.07)})
     return hovering(VEHICLE.model_copy(update={"arm": arm}), arm_rad, **{"spread": SHARP, **settings})
 
 
-def hovering(vehicle: Vehicle, arm_rad: tuple[float, float], height_m: float = 2.0, **settings: Any) -> World:
+def hovering(vehicle: Vehicle, arm_rad: tuple[float, float], height_m: float = 2.0, **settings: Any) -> OneMachine:
     """A world with these settings whose effect has acted once, all thrusts `THRUST_N`."""
     effect = DownwashConfig(on=True, **{"turbulence_intensity": 0.0, **settings})
-    world = World(vehicle, WorldConfig(downwash=effect), (0.0, 0.0), 0.0, arm_rad)
+    world = OneMachine(vehicle, WorldConfig(downwash=effect), (0.0, 0.0), 0.0, arm_rad)
     world.data.qpos[2] = height_m
     mujoco.mj_forward(world.model, world.data)
     world.data.ctrl[0:4] = FOUR_N
@@ -94,13 +94,14 @@ def hovering(vehicle: Vehicle, arm_rad: tuple[float, float], height_m: float = 2
     return world
 
 
-def act(world: World) -> None:
-    (effect,) = world.effects
-    effect.apply(world)
+def act(world: OneMachine) -> None:
+    (effect,) = world.machine.effects
+    machine = world.machine
+    effect.apply(machine.rotor_thrust_n, machine.q, machine.v)
     world.loads.write()
 
 
-def load(world: World, body: str) -> list[float]:
+def load(world: OneMachine, body: str) -> list[float]:
     values: list[float] = world.data.xfrc_applied[world.model.body(body).id].tolist()
     return values
 
@@ -133,7 +134,7 @@ def test_the_force_sensor_reads_the_wake_on_net_and_payload() -> None:
         d.qacc[:] = 0.0
         mujoco.mj_rnePostConstraint(m, d)
         mujoco.mj_sensorAcc(m, d)
-        readings.append(np.array(world.truth().force_sensor_n))
+        readings.append(np.array(world.machine.truth().force_sensor_n))
     rotation = world.data.site_xmat[world.model.site("net").id].reshape(3, 3)
     read_n = rotation @ (readings[1] - readings[0])
     np.testing.assert_allclose(read_n, load(world, "net")[:3], atol=1e-9)

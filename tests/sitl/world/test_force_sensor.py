@@ -14,8 +14,8 @@ from companion.sitl_config.effects.force_sensor import ForceSensor as Config
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.force_torque import ForceTorqueServer, overloaded, quantised
+from sitl.plant import Plant
 from sitl.world.effects.force_sensor import ForceSensor
-from sitl.world.plant import Plant
 from tests.sitl.plants import plant_of
 from tests.support import SHORT_CATCH
 

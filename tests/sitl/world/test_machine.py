@@ -16,8 +16,8 @@ from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.model import base_mass_kg, mjcf
-from sitl.world.world import PHYSICS_DT_S, World
-from tests.sitl.plants import run
+from sitl.world.state import PHYSICS_DT_S
+from tests.sitl.plants import OneMachine, run
 from tests.support import CATCH, tool_of
 
 Array = NDArray[np.float64]
@@ -33,13 +33,13 @@ NOTHING = {
 }
 
 
-def built(vehicle: Vehicle = VEHICLE, **errors: Any) -> World:
+def built(vehicle: Vehicle = VEHICLE, **errors: Any) -> OneMachine:
     """A world with these errors and no others, arm held at `ARM_RAD`."""
     config = WorldConfig(payload_kg=0.0, machine=Machine(on=True, **{**NOTHING, **errors}))
-    return World(vehicle, config, (0.0, 0.0), 0.0, ARM_RAD)
+    return OneMachine(vehicle, config, (0.0, 0.0), 0.0, ARM_RAD)
 
 
-def net_body_m(world: World) -> Array:
+def net_body_m(world: OneMachine) -> Array:
     return np.array(world.data.site_xpos[world.model.site("net").id] - world.data.qpos[:3])
 
 
@@ -53,7 +53,7 @@ def rotation(rpy_deg: tuple[float, float, float]) -> Array:
 
 
 def test_a_section_without_errors_is_the_vehicle_file() -> None:
-    plain = World(VEHICLE, WorldConfig(payload_kg=0.0), (0.0, 0.0), 0.0, ARM_RAD).model
+    plain = OneMachine(VEHICLE, WorldConfig(payload_kg=0.0), (0.0, 0.0), 0.0, ARM_RAD).model
     model = built().model
     for name in ("body_mass", "body_inertia", "body_ipos", "body_pos", "body_quat"):
         assert np.array_equal(getattr(model, name), getattr(plain, name)), name
@@ -63,7 +63,7 @@ def test_a_hover_with_a_shifted_centre_of_mass_needs_the_torque_of_that_shift_an
     shift_m = (0.010, -0.006, 0.008)
     world = built(centre_of_mass_m=shift_m)
     m, d = world.model, world.data
-    world.release_arm()
+    world.machine.release_arm()
     d.qpos[2] = 2.0
     mujoco.mj_forward(m, d)
 
@@ -74,7 +74,7 @@ def test_a_hover_with_a_shifted_centre_of_mass_needs_the_torque_of_that_shift_an
     assert d.qfrc_bias[3:6] - nominal.data.qfrc_bias[3:6] == pytest.approx(shift_nm, abs=1e-9)
 
     # Rotor i at (x_i, y_i) a / sqrt 2 with thrust T_i: sum T = W, sum y T = W c_y, sum x T = W c_x, sum s T = 0, for the level vehicle.
-    weight_n, centre_m = world.weight_n, d.subtree_com[m.body("base").id] - d.qpos[:3]
+    weight_n, centre_m = world.machine.weight_n, d.subtree_com[m.body("base").id] - d.qpos[:3]
     a = VEHICLE.airframe.rotor_arm_m / math.sqrt(2.0)
     places = np.array([(1, -1, -1), (-1, 1, -1), (1, 1, 1), (-1, -1, 1)])  # x, y, sign of the yaw torque
     equations = np.vstack([np.ones(4), a * places[:, 0], a * places[:, 1], places[:, 2]])
@@ -113,7 +113,7 @@ def test_mass_errors_and_the_section_act_together() -> None:
     arm, tool = VEHICLE.arm, tool_of(VEHICLE)
     m1, m2 = arm.link_masses_kg
     base_kg = VEHICLE.airframe.mass_kg - m1 - m2 - tool.sensor_mass_kg - tool.beyond_sensor_kg
-    model = World(VEHICLE, config, (0.0, 0.0), 0.0, ARM_RAD).model
+    model = OneMachine(VEHICLE, config, (0.0, 0.0), 0.0, ARM_RAD).model
     masses = [float(model.body(name).mass[0]) for name in ("base", "link1", "link2", "sensor", "net")]
     assert masses == pytest.approx([1.03 * base_kg, 1.1 * m1, 0.9 * m2, tool.sensor_mass_kg, tool.beyond_sensor_kg])
     assert model.body("base").ipos == pytest.approx(Machine().centre_of_mass_m)
@@ -145,17 +145,17 @@ def test_each_physical_value_of_a_vehicle_file_reaches_the_simulated_machine(key
     part, _, name = key.partition(".")
     changed = getattr(VEHICLE, part).model_copy(update={name: PHYSICAL[part][name]})
     other = VEHICLE.model_copy(update={part: changed})
-    assert mjcf(other, WorldConfig(), PHYSICS_DT_S) != mjcf(VEHICLE, WorldConfig(), PHYSICS_DT_S)
+    assert mjcf([(other, WorldConfig())], PHYSICS_DT_S) != mjcf([(VEHICLE, WorldConfig())], PHYSICS_DT_S)
 
 
 def test_another_vehicle_file_is_another_machine_in_all_its_parts() -> None:
     parts = {part: getattr(VEHICLE, part).model_copy(update=values) for part, values in PHYSICAL.items()}
     airframe = parts["airframe"].model_copy(update={"thrust_max_n": 40.0})
     other = VEHICLE.model_copy(update={**parts, "airframe": airframe})
-    world = World(other, WorldConfig(payload_kg=0.0), (0.0, 0.0), 0.0, ARM_RAD)
+    world = OneMachine(other, WorldConfig(payload_kg=0.0), (0.0, 0.0), 0.0, ARM_RAD)
     model, data = world.model, world.data
-    assert world.weight_n == pytest.approx(2.4 * GRAVITY_M_S2)
-    assert world.hover_command == pytest.approx(2.4 * GRAVITY_M_S2 / 40.0)
+    assert world.machine.weight_n == pytest.approx(2.4 * GRAVITY_M_S2)
+    assert world.machine.hover_command == pytest.approx(2.4 * GRAVITY_M_S2 / 40.0)
     assert data.qpos[2] == 0.2
     assert sorted(model.body("base").inertia) == [0.03, 0.035, 0.05]
     assert model.dof_armature[6:8].tolist() == [0.003, 0.003]
@@ -163,12 +163,12 @@ def test_another_vehicle_file_is_another_machine_in_all_its_parts() -> None:
     assert np.linalg.norm(rotors[:, :2], axis=1) == pytest.approx([0.22] * 4)
     assert np.abs(model.actuator_gear[:4, 5]) == pytest.approx([0.016] * 4)
     assert model.tendon_range[0, 1] == 2.0
-    assert world.attachment_world_m == pytest.approx((0.0, 0.0, 0.3))
+    assert world.machine.tether.attachment_world_m == pytest.approx((0.0, 0.0, 0.3))
     # It stands on its feet at the clearance of its own file.
     run(world, 0.5)
-    assert world.q[2] == pytest.approx(0.2, abs=0.003)
-    assert not world.crashed
+    assert world.machine.q[2] == pytest.approx(0.2, abs=0.003)
+    assert not world.machine.crashed
     # Full command lifts it with the thrust of its own file.
     for _ in range(500):
-        world.step((1.0, 1.0, 1.0, 1.0), (0.0, 0.0), False, drag=False)
+        world.fly((1.0, 1.0, 1.0, 1.0), (0.0, 0.0), False, drag=False)
     assert float(data.ctrl[:4].sum()) == pytest.approx(40.0)

@@ -19,10 +19,10 @@ from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.fast.loop import FastFlight
 from sitl.world.effects.net import SETTLED_S, Bag
-from sitl.world.model import PAYLOAD_RADIUS_M, SECOND, SECOND_CATCH
+from sitl.world.model import SECOND, SECOND_CATCH
 from sitl.world.payload import Ball
-from sitl.world.world import PHYSICS_DT_S, World
-from tests.sitl.plants import run
+from sitl.world.state import PAYLOAD_RADIUS_M, PHYSICS_DT_S
+from tests.sitl.plants import OneMachine, run
 from tests.sitl.test_throws import FIRST_MISSED, TO_AND_FRO
 from tests.support import SHORT_CATCH, tool_of
 
@@ -35,11 +35,11 @@ VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
 LEVEL = (0.0, 0.0)
 
 
-def world_with(config: WorldConfig, arm_rad: Vec2 = LEVEL) -> World:
-    return World(VEHICLE, config, (0.0, 0.0), 0.0, arm_rad)
+def world_with(config: WorldConfig, arm_rad: Vec2 = LEVEL) -> OneMachine:
+    return OneMachine(VEHICLE, config, (0.0, 0.0), 0.0, arm_rad)
 
 
-def ball_of(world: World) -> Ball:
+def ball_of(world: OneMachine) -> Ball:
     ball = world.payload.ball
     assert ball is not None
     return ball
@@ -198,7 +198,7 @@ def test_a_payload_from_below_falls_back() -> None:
     assert payload.bag.side == 0
 
 
-def thrown_at(world: World, ball: Ball, ball_from_net_m: Vec3, velocity_m_s: Vec3) -> None:
+def thrown_at(world: OneMachine, ball: Ball, ball_from_net_m: Vec3, velocity_m_s: Vec3) -> None:
     """Place a payload in the frame of the hoop and let the net act on it."""
     m, d = world.model, world.data
     mujoco.mj_forward(m, d)
@@ -206,7 +206,7 @@ def thrown_at(world: World, ball: Ball, ball_from_net_m: Vec3, velocity_m_s: Vec
     d.qpos[ball.q : ball.q + 3] = d.xpos[m.body("net").id] + axes @ np.array(ball_from_net_m)
     d.qvel[ball.v : ball.v + 3] = axes @ np.array(velocity_m_s)
     mujoco.mj_forward(m, d)
-    world.q, world.v = d.qpos.tolist(), d.qvel.tolist()
+    world.machine.read()
     assert world.payload.bag is not None
     world.payload.bag.watch(*ball[0:3])
     world.payload.throws, world.payload._flies_since_s = 1, world.t_s
@@ -217,7 +217,7 @@ def test_an_off_centre_catch_conserves_both_momenta(payload_kg: float) -> None:
     """In weightlessness, without air: the vehicle takes up the payload's change of momentum."""
     config = WorldConfig(payload_kg=payload_kg, joint_friction_nm=0.0, joint_damping_nms=0.0, net=Net(on=True))
     world = world_with(config, CATCH_POSE)
-    world.release_arm()
+    world.machine.release_arm()
     m, d = world.model, world.data
     m.opt.gravity[:] = 0
     d.qpos[2] = 1.5
@@ -245,11 +245,11 @@ def test_a_payload_that_settles_off_centre_turns_the_force_sensor() -> None:
     thrown_at(world, ball_of(world), (-0.02, 0.06, 0.05), (0.0, 0.0, -1.0))
     run(world, 4.0)
     assert [event.kind for event in world.take_events()] == ["caught"]
-    truth = world.truth()
+    truth = world.machine.truth()
     net_weight_n = tool_of(VEHICLE).beyond_sensor_kg * GRAVITY_M_S2
     weight_n = 0.2 * GRAVITY_M_S2
     assert truth.force_sensor_n[2] == pytest.approx(-weight_n - net_weight_n, rel=0.01)
-    lever_x_m, lever_y_m = world.data.xpos[ball_of(world).body][0:2] - world.data.xpos[world._tip][0:2]
+    lever_x_m, lever_y_m = world.data.xpos[ball_of(world).body][0:2] - world.data.xpos[world.machine._tip][0:2]
     assert lever_y_m == pytest.approx(0.06, abs=0.01)
     assert truth.torque_sensor_nm[0] == pytest.approx(-weight_n * lever_y_m, rel=0.02)
     assert truth.torque_sensor_nm[1] == pytest.approx(weight_n * lever_x_m, rel=0.05)
@@ -282,9 +282,8 @@ def test_a_payload_falls_out_of_the_bag_when_it_is_dropped_and_can_be_thrown_aga
 def test_a_flight_whose_payload_missed_flies_on_and_catches_the_next_one() -> None:
     overrides = ("world.catch_at_m=[0.2, 0]", "mission.repeat=2", "world.throws=2", "world.net.on=true", FIRST_MISSED)
     flight = FastFlight(load_sitl(SHORT_CATCH, overrides=(*TO_AND_FRO, *overrides)))
-    result, world = flight.run(), flight.plant.world
+    result, payload = flight.run(), flight.plant.scene.payload
     assert result.outputs[-1].outcome is Outcome.COMPLETED
-    payload = world.payload
     assert (payload.throws, payload.catches, payload.missed, payload.caught_t_s) == (2, 1, True, None)
     # The impact, 4 N m give or take 1, overloads the sensor (4 N m) or does not; before and after it nothing may.
     ids = [event.id for output in result.outputs for event in output.events]
@@ -311,9 +310,9 @@ def test_two_payloads_lie_in_the_bag() -> None:
     second = Ball.of(world.model, SECOND, SECOND_CATCH)
     thrown_at(world, second, (0.02, 0.0, 0.04), (0.0, 0.0, -1.0))
     thrown_at(world, ball_of(world), (0.0, 0.0, 0.02), (0.0, 0.0, -1.0))
-    assert not world.payload.catch(second)
+    assert not world.payload.catch(second, world.t_s)
     run(world, 3.0)
-    assert world.payload.catch(second)
+    assert world.payload.catch(second, world.t_s)
     assert world.payload.catches == 1
     both_n = GRAVITY_M_S2 * (config.payload_kg + config.faults[0].magnitude + tool_of(VEHICLE).beyond_sensor_kg)
-    assert world.truth().force_sensor_n[2] == pytest.approx(-both_n, rel=0.01)
+    assert world.machine.truth().force_sensor_n[2] == pytest.approx(-both_n, rel=0.01)

@@ -16,7 +16,8 @@ from sitl.autopilot.backend import stub_of
 from sitl.fast.loop import FastFlight
 from sitl.px4.parameters import parameters
 from sitl.world.effects.rotors import LOWEST_RADII, Rotors
-from sitl.world.world import PHYSICS_DT_S, World
+from sitl.world.state import PHYSICS_DT_S
+from tests.sitl.plants import OneMachine
 from tests.support import CATCH
 
 VEHICLE = load_sitl(CATCH).vehicle
@@ -41,8 +42,8 @@ def run(effect: Rotors, signals: Vec4, time_s: float) -> tuple[float, ...]:
     return thrust
 
 
-def standing(**sections: Any) -> World:
-    return World(VEHICLE, WorldConfig(payload_kg=0.0, **sections), (0.0, 0.0), 0.0, (1.0, 1.0))
+def standing(**sections: Any) -> OneMachine:
+    return OneMachine(VEHICLE, WorldConfig(payload_kg=0.0, **sections), (0.0, 0.0), 0.0, (1.0, 1.0))
 
 
 def test_settled_thrust_is_the_curve_times_each_rotors_own_gain() -> None:
@@ -123,11 +124,11 @@ def test_autopilot_assumes_its_own_curve_whether_it_is_the_stub_or_px4() -> None
 
 def test_hover_command_is_the_setpoint_that_carries_the_weight() -> None:
     world = standing(rotors={"on": True, "thrust_error": (0.03, 0.03, 0.03, 0.03)})
-    signal = motor_signal(world.hover_command, 0.3)
+    signal = motor_signal(world.machine.hover_command, 0.3)
     for _ in range(200):
-        near = rotors().ground_effect(world.q[2] + LAYOUT.height_m)
-        world.step((signal,) * 4, (0.0, 0.0))
-    assert sum(world.data.ctrl[0:4]) == pytest.approx(world.weight_n * near, rel=2e-3)
+        near = rotors().ground_effect(world.machine.q[2] + LAYOUT.height_m)
+        world.fly((signal,) * 4, (0.0, 0.0))
+    assert sum(world.data.ctrl[0:4]) == pytest.approx(world.machine.weight_n * near, rel=2e-3)
 
 
 def test_vehicle_hovers_at_the_true_hover_thrust() -> None:
@@ -136,7 +137,7 @@ def test_vehicle_hovers_at_the_true_hover_thrust() -> None:
     flight = FastFlight(config)
     result = flight.run(10.5)
     hover = [o.attitude.thrust for o in result.outputs if o.t_s >= 8.5 and o.attitude is not None]
-    truth = flight.plant.world.hover_command
+    truth = flight.plant.machine.hover_command
     assert flight.px4.params.real("MPC_THR_HOVER") == pytest.approx(truth)
     assert result.snapshots[-1].q[2] > VEHICLE.airframe.ground_clearance_m + 0.5
     assert sum(hover) / len(hover) == pytest.approx(truth, rel=0.02)

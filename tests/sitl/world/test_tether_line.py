@@ -12,7 +12,7 @@ from companion.sitl_config.effects.tether_line import TetherLine as TetherLineCo
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.tether_line import Hanging, hanging
-from sitl.world.world import World
+from tests.sitl.plants import OneMachine
 from tests.support import CATCH, tether_of
 
 VEHICLE = load_sitl(CATCH).vehicle
@@ -57,24 +57,25 @@ def test_the_pull_has_no_jumps() -> None:
     assert np.abs(np.diff(down_n)).max() < 0.02
 
 
-def with_line(height_m: float, velocity_m_s: tuple[float, float] = (0.0, 0.0), **settings: float) -> World:
+def with_line(height_m: float, velocity_m_s: tuple[float, float] = (0.0, 0.0), **settings: float) -> OneMachine:
     """A level world above (0.4, 0) whose effect has acted once."""
     config = WorldConfig(payload_kg=0.0, tether_line=TetherLineConfig(on=True, **settings))
-    world = World(VEHICLE, config, (0.4, 0.0), 0.0, (1.7, 1.0))
+    world = OneMachine(VEHICLE, config, (0.4, 0.0), 0.0, (1.7, 1.0))
     world.data.qpos[2] = height_m
     mujoco.mj_forward(world.model, world.data)
-    world.v[0:2] = velocity_m_s
+    world.machine.v[0:2] = velocity_m_s
     act(world)
     return world
 
 
-def act(world: World) -> None:
-    (effect,) = world.effects
-    effect.apply(world)
+def act(world: OneMachine) -> None:
+    (effect,) = world.machine.effects
+    machine = world.machine
+    effect.apply(machine.rotor_thrust_n, machine.q, machine.v)
     world.loads.write()
 
 
-def load(world: World) -> list[float]:
+def load(world: OneMachine) -> list[float]:
     values: list[float] = world.data.xfrc_applied[world.model.body("base").id].tolist()
     return values
 
@@ -95,20 +96,20 @@ def test_friction_on_the_floor_takes_energy_and_stays_below_that_of_the_dragged_
 
 def test_a_nearly_straight_line_pulls_towards_the_anchor_without_a_pull_that_counts_as_taut() -> None:
     world = with_line(1.0)
-    x, y, z = world.attachment_world_m
+    x, y, z = world.machine.tether.attachment_world_m
     for slack_m in (0.05, 0.0, -0.05):
-        world.tether_length_m = math.dist((x, y, z), ANCHOR) + slack_m
+        world.machine.tether.length_m = math.dist((x, y, z), ANCHOR) + slack_m
         act(world)
         fx, fy, fz, *_ = load(world)
         assert fx * (ANCHOR[1] - y) == pytest.approx(fy * (ANCHOR[0] - x)) and fy < 0.0 and fz < 0.0
         assert math.hypot(fx, fy, fz) < tether_of(VEHICLE).pull_min_n
-    assert world.truth().tether_tension_n == 0.0
+    assert world.machine.truth().tether_tension_n == 0.0
 
 
 def test_a_line_that_was_cut_off_its_anchor_pulls_no_more_than_its_weight() -> None:
     world = with_line(1.0)
     hanging_n = load(world)[2]
-    world.tether_length_m = 1e3
+    world.machine.tether.length_m = 1e3
     act(world)
     assert load(world)[2] == hanging_n
 
@@ -116,6 +117,6 @@ def test_a_line_that_was_cut_off_its_anchor_pulls_no_more_than_its_weight() -> N
 def test_a_pull_beside_the_centre_of_mass_turns_the_vehicle() -> None:
     tether = tether_of(VEHICLE).model_copy(update={"attachment_body_m": (0.1, 0.0, 0.0)})
     config = WorldConfig(payload_kg=0.0, tether_line=TetherLineConfig(on=True))
-    world = World(VEHICLE.model_copy(update={"tether": tether}), config, (0.4, 0.0), 0.0, (1.7, 1.0))
+    world = OneMachine(VEHICLE.model_copy(update={"tether": tether}), config, (0.4, 0.0), 0.0, (1.7, 1.0))
     act(world)
     assert load(world)[3:] == pytest.approx([0.0, -0.1 * load(world)[2], 0.0])

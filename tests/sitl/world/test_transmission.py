@@ -14,7 +14,7 @@ from sitl.servo.drive import AMP_PER_COUNT, MODE_CURRENT
 from sitl.servo.from_config import servos_of
 from sitl.world.effects.transmission import ARMATURE_MIN_KG_M2, Transmission, transmissions_of
 from sitl.world.model import mjcf
-from sitl.world.world import PHYSICS_DT_S
+from sitl.world.state import PHYSICS_DT_S
 from tests.preflight.hand_rig import world
 from tests.sitl.test_airframe import VEHICLE
 
@@ -176,8 +176,8 @@ def test_the_present_current_follows_the_goal_with_the_time_constant_of_the_loop
 def test_without_both_effects_the_joints_are_mujoco_s() -> None:
     plain = WorldConfig(joint_friction_nm=0.03, joint_damping_nms=0.02)
     assert transmissions_of(VEHICLE, plain, (1.0, 1.0), DT_S) is None
-    assert 'frictionloss="0.03" damping="0.02"' in mjcf(VEHICLE, plain, DT_S)
+    assert 'frictionloss="0.03" damping="0.02"' in mjcf([(VEHICLE, plain)], DT_S)
     for effect in ({"servo_mechanics": ServoMechanics(on=True)}, {"compliance": Compliance(on=True)}):
         mine = plain.model_copy(update=effect)
         assert transmissions_of(VEHICLE, mine, (1.0, 1.0), DT_S) is not None
-        assert 'frictionloss="0.0" damping="0.0"' in mjcf(VEHICLE, mine, DT_S)
+        assert 'frictionloss="0.0" damping="0.0"' in mjcf([(VEHICLE, mine)], DT_S)

@@ -14,14 +14,13 @@ from companion.config.arm import Joint
 from companion.config.vehicle import Vehicle
 from companion.model.algebra import scaled
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_normalize
-from companion.model.types import Joints, Quat, Vec2, Vec3
+from companion.model.types import Quat, Vec3
 from companion.sitl_config.distributions import with_model_error
 from companion.sitl_config.faults import Fault, FaultKind
 from companion.sitl_config.per_joint import of_joints
 from companion.sitl_config.world import Push, Servo
 from companion.sitl_config.world import World as WorldConfig
-from sitl.autopilot.autopilot import Battery
-from sitl.autopilot.types import ImuSample, RotorCommands
+from sitl.autopilot.types import Battery, ImuSample, RotorCommands
 from sitl.faults.injector import Faults
 from sitl.servo.from_config import torque_constants_nm_a
 from sitl.world.effects.force_sensor import ForceSensor
@@ -31,7 +30,9 @@ from sitl.world.effects.transmission import Transmission, transmissions_of
 from sitl.world.handling import Handling, HungWeight
 from sitl.world.mocap_misalignment import MocapMisalignment
 from sitl.world.noise import noise
-from sitl.world.world import PHYSICS_DT_S, Truth, World
+from sitl.world.scene import Scene
+from sitl.world.start import MachineSpec, Start
+from sitl.world.state import PHYSICS_DT_S, Truth
 
 IMU_EVERY: Final = 2
 """Physics steps per IMU sample: 250 Hz, the rate of PX4's rate loop."""
@@ -107,7 +108,7 @@ class Plant:
         config: configuration of the world.
         px4: the autopilot.
         drives: motor of each joint.
-        start: horizontal position in m, yaw in rad and joint angles in rad at the start.
+        start: pose of the vehicle at the start.
         between_steps: whether the cameras expose at the exact time between physics steps instead of at the end of a step.
     """
 
@@ -117,23 +118,23 @@ class Plant:
         config: WorldConfig,
         px4: Px4,
         drives: Sequence[JointDrive],
-        start: tuple[Vec2, float, Joints],
+        start: Start,
         *,
         between_steps: bool = False,
     ) -> None:
         self._between_steps = between_steps
-        position_m, yaw_rad, arm_rad = start
         joints = vehicle.arm.joints
         config = with_model_error(config, len(joints))
         self._config = config
         self._px4 = px4
         for drive in drives:
             drive.goal_delay_s = config.arm_delay_s
-        self.world = World(vehicle, config, position_m, yaw_rad, arm_rad)
+        self.scene = Scene([MachineSpec(vehicle, config, start)])
+        self.machine = self.scene.machines[0]
         servos = [config.servo(joint) for joint in range(len(joints))]
         mechanics = config.servo_mechanics
         more = of_joints(mechanics.torque_per_amp_error if mechanics.on else (0.0,), len(joints))
-        transmissions = transmissions_of(vehicle, config, arm_rad, PHYSICS_DT_S)
+        transmissions = transmissions_of(vehicle, config, start.arm_rad, PHYSICS_DT_S)
         gears = transmissions or (None,) * len(joints)
         self._servos = tuple(
             _JointServo(
@@ -152,25 +153,25 @@ class Plant:
                 torque_constants_nm_a(vehicle),
                 more,
                 gears,
-                self.world.layout.joint_q,
-                self.world.layout.joint_v,
+                self.machine.layout.joint_q,
+                self.machine.layout.joint_v,
                 strict=True,
             )
         )
         if transmissions:
-            self.world.add_joint_inertia(transmissions)
-        hover_n = self.world.weight_n / self.world.rotor_count
+            self.machine.add_joint_inertia(transmissions)
+        hover_n = self.machine.weight_n / self.machine.rotor_count
         self._imu_errors = ImuErrors.of(config.imu, IMU_EVERY * PHYSICS_DT_S, hover_n, vehicle.airframe.rotor_layout)
         self._mocap_errors = MocapErrors.of(config.mocap, config.seed)
         self._seed_noise()
         self._mocap_noise_rad = math.radians(config.mocap_noise_deg)
         self._misalignment = MocapMisalignment.of(config)
-        self._handling = Handling(config, self.world.weight_n) if config.hand else None
+        self._handling = Handling(config, self.machine.weight_n) if config.handling else None
         self._weight = HungWeight(config) if config.net_weight_kg > 0.0 else None
         self.force_is_read = True
         """Whether the force sensor is being read; always true in the fast closed loop."""
         self._force_sensor = ForceSensor.of(config.force_sensor, config.seed)
-        self._rotors: RotorCommands = (0.0,) * self.world.rotor_count
+        self._rotors: RotorCommands = (0.0,) * self.machine.rotor_count
         self._tick = 0
         self._imu_sample: ImuSample | None = None
         self._mocap_queue: deque[tuple[float, MocapFrame]] = deque()
@@ -189,17 +190,17 @@ class Plant:
         self._mocap_noise, self._imu_noise, self._force_noise = (
             noise(self._config.seed, sensor) for sensor in (_MOCAP, _IMU, _FORCE)
         )
-        self.world.restart_noise()
+        self.machine.restart_noise()
 
     @property
     def t_s(self) -> float:
         """World time."""
-        return self.world.t_s
+        return self.scene.t_s
 
     @property
     def truth(self) -> Truth:
         """True state after the last step."""
-        return self.world.truth()
+        return self.machine.truth()
 
     def mission_t_s(self) -> float | None:
         """Return the time since arming, or None before arming."""
@@ -217,12 +218,12 @@ class Plant:
         if weight is None:
             return force
         x, y, z = force
-        return (x, y, z - weight.pull_n(self.world.t_s, self.force_is_read))
+        return (x, y, z - weight.pull_n(self.scene.t_s, self.force_is_read))
 
     def step(self, armed: bool) -> None:
         """Advance by one physics step."""
-        world, config = self.world, self._config
-        t_s = world.t_s
+        scene, machine, config = self.scene, self.machine, self._config
+        t_s = scene.t_s
         if armed and self.armed_t_s is None:
             self.armed_t_s = t_s
             self._seed_noise()
@@ -230,11 +231,11 @@ class Plant:
                 self._imu_errors.drift(noise(config.seed, _IMU_DRIFT))
             if self._mocap_errors is not None:
                 self._mocap_errors.restart(t_s)
-            if world.battery is not None:
-                world.battery.restart()
+            if machine.battery is not None:
+                machine.battery.restart()
         if self.faults is not None:
             self.faults.step(t_s, self.armed_t_s)
-        q, v = world.q, world.v
+        q, v = machine.q, machine.v
         torques_nm, pushing = [], 0
         for drive, sign, zero_rad, k_nm_a, gear, at_q, at_v in self._servos:
             angle_rad, rate_rad_s = q[at_q], v[at_v]
@@ -243,19 +244,20 @@ class Plant:
             torque_nm = sign * drive.update(t_s, zero_rad + sign * angle_rad, sign * rate_rad_s) * k_nm_a
             pushing += torque_nm != 0.0
             torques_nm.append(torque_nm if gear is None else gear.step(torque_nm))
-        if world.parked and (pushing == len(torques_nm) or (armed and pushing)):
-            world.release_arm()
+        if machine.parked and (pushing == len(torques_nm) or (armed and pushing)):
+            machine.release_arm()
         if self._tick % IMU_EVERY == 0:
             self._rotors = self._px4.step(self._imu_sample or self._imu())
             self._imu_sample = None
         self._tick += 1
         if config.push is not None or self._weight is not None:
-            world.push(self._load_on_net(config.push, self._weight))
+            machine.push(self._load_on_net(config.push, self._weight))
         if self._handling is not None:
-            world.hold(None if armed else self._handling.wrench(t_s, q, v))
-        world.step(self._rotors, tuple(torques_nm), armed)
-        if world.t_s >= self._mocap_next_s - 1e-9:
-            self._expose_mocap(min(world.t_s, self._mocap_next_s) if self._between_steps else world.t_s)
+            machine.hold(None if armed else self._handling.wrench(t_s, q, v))
+        machine.command(self._rotors, tuple(torques_nm))
+        scene.step(armed)
+        if scene.t_s >= self._mocap_next_s - 1e-9:
+            self._expose_mocap(min(scene.t_s, self._mocap_next_s) if self._between_steps else scene.t_s)
 
     @property
     def imu_due(self) -> bool:
@@ -269,31 +271,31 @@ class Plant:
         return self._imu_sample
 
     def _imu(self) -> ImuSample:
-        world, config = self.world, self._config
-        s, a, g = world.sensors(), world.layout.accel, world.layout.gyro
+        machine, config = self.machine, self._config
+        s, a, g = machine.sensors(), machine.layout.accel, machine.layout.gyro
         gyro, accel = config.gyro_noise_rad_s, config.accel_noise_m_s2
         nx, ny, nz = next(self._imu_noise)
         mx, my, mz = next(self._imu_noise)
         rates = (s[g] + gyro * nx, s[g + 1] + gyro * ny, s[g + 2] + gyro * nz)
         force = (s[a] + accel * mx, s[a + 1] + accel * my, s[a + 2] + accel * mz)
         if self._imu_errors is not None:
-            rates, force = self._imu_errors.measure(world.thrust_n, rates, force)
+            rates, force = self._imu_errors.measure(machine.thrust_n, rates, force)
         p, q, r = rates
         ax, ay, az = force
-        return ImuSample(world.t_s, (p, -q, -r), (ax, -ay, -az))
+        return ImuSample(self.scene.t_s, (p, -q, -r), (ax, -ay, -az))
 
     def _expose_mocap(self, t_s: float) -> None:
-        config, world = self._config, self.world
+        config, machine = self._config, self.machine
         faults, period_s, latency_s, valid = self.faults, 1.0 / config.mocap_rate_hz, config.mocap_latency_s, True
         if faults is not None:
             period_s = faults.mocap_period_s(period_s)
             latency_s += faults.size("mocap_latency")
         self._mocap_next_s += period_s
         self._mocap_number += 1
-        x, y, z, qw, qx, qy, qz = world.q[0:7]
-        since_s = world.t_s - t_s
+        x, y, z, qw, qx, qy, qz = machine.q[0:7]
+        since_s = self.scene.t_s - t_s
         if since_s > 0.0:  # at most a step
-            vx, vy, vz, wx, wy, wz = world.v[0:6]
+            vx, vy, vz, wx, wy, wz = machine.v[0:6]
             x, y, z = x - since_s * vx, y - since_s * vy, z - since_s * vz
             back = (1.0, -0.5 * since_s * wx, -0.5 * since_s * wy, -0.5 * since_s * wz)
             qw, qx, qy, qz = quat_normalize(quat_multiply((qw, qx, qy, qz), back))
@@ -335,7 +337,7 @@ class Plant:
 
     def take_mocap(self) -> list[MocapFrame]:
         """Return and remove the frames that have arrived by now."""
-        return [frame for _, frame in self.mocap_until(self.world.t_s)]
+        return [frame for _, frame in self.mocap_until(self.scene.t_s)]
 
     def mocap_until(self, until_s: float) -> list[tuple[float, MocapFrame]]:
         """Return and remove the frames that arrive until world time `until_s`, each with its time of arrival."""
@@ -351,20 +353,21 @@ class Plant:
         """Return the measurement of the power module. If the battery effect is off, the charge falls linearly with the time since
         arming.
         """
-        pack, sag_v = self.world.battery, 0.0 if self.faults is None else self.faults.sag_v
+        pack, sag_v = self.machine.battery, 0.0 if self.faults is None else self.faults.sag_v
         if pack is not None:
             return Battery(pack.voltage_v - sag_v, pack.current_a, pack.remaining, pack.drawn_as / 3.6)
-        flown_s = 0.0 if self.armed_t_s is None else self.world.t_s - self.armed_t_s
+        flown_s = 0.0 if self.armed_t_s is None else self.scene.t_s - self.armed_t_s
         remaining = max(0.0, self._config.battery_start - flown_s / self._config.battery_life_s)
-        return Battery(voltage_v=battery_voltage_v(remaining, self.world.battery_cells) - sag_v, remaining=remaining)
+        return Battery(voltage_v=battery_voltage_v(remaining, self.machine.battery_cells) - sag_v, remaining=remaining)
 
     def force_torque(self) -> tuple[Vec3, Vec3]:
         """Return a reading of the force-torque sensor in N and N m, in the sensor frame, with noise, bias, faults and scale error."""
-        s, f, tq = self.world.sensors(), self.world.layout.force, self.world.layout.torque
+        machine = self.machine
+        s, f, tq = machine.sensors(), machine.layout.force, machine.layout.torque
         fx, fy, fz = (-s[f], -s[f + 1], -s[f + 2])
         tx, ty, tz = (-s[tq], -s[tq + 1], -s[tq + 2])
         if self._force_sensor is not None:
-            (fx, fy, fz), (tx, ty, tz) = self._force_sensor.measure(self.world.t_s, (fx, fy, fz), (tx, ty, tz))
+            (fx, fy, fz), (tx, ty, tz) = self._force_sensor.measure(self.scene.t_s, (fx, fy, fz), (tx, ty, tz))
         bx, by, bz = self._config.force_bias_n
         noise_n = self._config.force_noise_n
         noise_nm = noise_n * 0.02
