@@ -14,7 +14,7 @@ from companion.config.loader import FlightConfig
 from companion.io.arm.plugin_driver import PluginArm
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.force_torque.plugin_driver import open_force
-from companion.io.mocap.plugin_driver import open_mocap
+from companion.io.mocap.driver import MocapDriver
 from companion.io.protocols import Arm, Autopilot, DeviceError, ForceTorque, GroundLink, Mocap
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.io.px4.streams import ESTIMATOR_RATE_HZ
@@ -212,7 +212,7 @@ def _mocap(config: FlightConfig, clock: Clock, available: AvailableDevices) -> M
         if vision.watch is not None:
             vision.watch(pose)
 
-    return open_mocap(config.vehicle.devices.mocap, clock, on_pose)
+    return MocapDriver(config.vehicle.devices.mocap, clock, on_pose)
 
 
 def _ground(config: FlightConfig, address: str, autopilot: MavsdkAutopilot) -> GroundStation:

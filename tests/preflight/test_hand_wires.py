@@ -18,7 +18,7 @@ from rich.console import Console
 
 from companion.config.devices import MocapDevice
 from companion.io.devices import AvailableDevices, VisionFilter, open_available
-from companion.io.mocap.driver import NatNetMocap
+from companion.io.mocap.driver import MocapDriver
 from companion.model.check_row import Row
 from companion.model.types import AutopilotRequest, FlightMode
 from companion.preflight.hand_test import evaluation as hand_test_evaluation
@@ -154,7 +154,7 @@ def test_it_is_refused_when_px4_is_armed() -> None:
             half.request = AutopilotRequest.ARM
             await half.until(lambda status: status.armed, "ARM")
             half.request = AutopilotRequest.NONE
-            mocap = NatNetMocap(MocapDevice(server="127.0.0.1", rigid_body_id=1), flight_clock(), lambda _: None)
+            mocap = MocapDriver(MocapDevice(server="127.0.0.1", rigid_body_id=1), flight_clock(), lambda _: None)
             edges = AvailableDevices(VisionFilter(), half.autopilot, mocap)
             return await run_hand_test(edges, config, terminal())
 
