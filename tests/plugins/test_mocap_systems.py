@@ -34,6 +34,7 @@ from companion.plugins import MOCAP_SYSTEMS
 from companion.runtime import event_loop
 from companion.runtime.clock import flight_clock
 from companion.testing import check_mocap
+from tests.guardian.rig import Cameras
 from tests.plugins.installed import on_path, write_distribution
 from tests.support import DEADLINE_S, ROOT, free_udp_port
 
@@ -222,6 +223,12 @@ def test_the_example_and_a_system_that_answers_every_call_keep_the_contract() ->
         stop.set()
         tracker.join()
     check_mocap(scripted(), duration_s=0.1)
+
+
+def test_natnet_keeps_the_contract() -> None:
+    with Cameras(1) as cameras:
+        here = {"server": "127.0.0.1", "interface": "127.0.0.1", "transport": "unicast", "command_port": cameras.port}
+        check_mocap(MocapDevice.model_validate(here | {"rigid_body_id": 1}), duration_s=0.3)
 
 
 def test_frame_numbers_that_do_not_increase_break_the_contract() -> None:

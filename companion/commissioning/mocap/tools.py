@@ -144,13 +144,13 @@ class Carried:
 
 async def guide_hand_test(session: Session) -> Carried:
     """Guide the user through the hand test while poses are forwarded to PX4; return its result."""
-    from companion.io.devices import AvailableDevices, VisionFilter  # imports MAVSDK
+    from companion.io.devices import AvailableDevices, PoseForwarder  # imports MAVSDK
     from companion.io.px4.driver import MavsdkAutopilot
     from companion.preflight.hand_test.command import ENDED_BY_HAND, perform
 
     arguments = session.arguments
     config = load_flight(arguments.mission, arguments.vehicle, overrides=arguments.overrides)
-    clock, devices, opened = flight_clock(), config.vehicle.devices, AvailableDevices(VisionFilter())
+    clock, devices, opened = flight_clock(), config.vehicle.devices, AvailableDevices(PoseForwarder())
 
     def forward(pose: MocapPose) -> None:
         if opened.autopilot is not None and pose.tracking_valid:

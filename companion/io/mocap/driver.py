@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import socket
 from collections.abc import Callable
 from dataclasses import fields
 from typing import Any, Final, Self
@@ -157,9 +158,10 @@ class MocapDriver:
         settings = settings_of(self._device)
         try:
             make: Any = self._make_client or device_class(MOCAP_SYSTEMS, self._device.type)
-            if make is not self._make_client and not issubclass(make, ExtendedClient):
+            extended = make is self._make_client or issubclass(make, ExtendedClient)
+            if not extended or _is_address(settings.server):
                 client: PoseClient = make(settings)
-            else:  # may wait for a name server
+            else:  # waits for a name server
                 async with asyncio.timeout(_MAKE_TIMEOUT_S):
                     client = await asyncio.get_running_loop().run_in_executor(None, make, settings)
         except DeviceError:
@@ -240,3 +242,11 @@ class MocapDriver:
             for opened in self._client.extended.sockets:
                 asyncio.get_running_loop().remove_reader(opened.fileno())
             self._client.close()
+
+
+def _is_address(server: str) -> bool:
+    """Return whether the server is given as an IPv4 address, not as a name."""
+    try:
+        return bool(socket.inet_aton(server))
+    except OSError:
+        return False
