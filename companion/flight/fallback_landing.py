@@ -7,7 +7,7 @@ import socket
 from typing import Protocol
 
 from companion.config.loader import FlightConfig
-from companion.flight.heartbeat import FlightGuard
+from companion.flight.heartbeat import HeartbeatSender
 from companion.model.flight_stage import flown_by_pilot
 from companion.model.launcher_messages import HandedOver
 from companion.model.types import AutopilotRequest, AutopilotStatus, Outcome
@@ -34,7 +34,7 @@ class Lander(Protocol):
 
 
 async def land_without_core(
-    autopilot: Lander, channel: socket.socket, clock: Clock, guardian: FlightGuard | None
+    autopilot: Lander, channel: socket.socket, clock: Clock, guardian: HeartbeatSender | None
 ) -> Outcome:
     """Command PX4 to land and monitor it, without interfering with a pilot. PX4 disarms by itself (COM_DISARM_LAND).
 

@@ -102,7 +102,7 @@ class Heartbeats:
         return (share * x, share * y, share * z)
 
 
-class FlightGuard:
+class HeartbeatSender:
     """The flight process's connection to the guardian; sends it a heartbeat in each tick.
 
     Args:

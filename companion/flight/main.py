@@ -26,7 +26,7 @@ from companion.core.flight_core import FlightCore
 from companion.core.verdict import sentence_of
 from companion.flight.command_queue import Operator, StartCancelled
 from companion.flight.fallback_landing import land_without_core, unflown
-from companion.flight.heartbeat import FlightGuard
+from companion.flight.heartbeat import HeartbeatSender
 from companion.flight.startup import Checked, Refused, changed_since, check_before_flight, with_hover_thrust
 from companion.flight.ticker import JOINT_LEAD_MAX_S, SIMULATED_START_S, SimulatedTicker, Ticker
 from companion.guardian.client import GuardianClient
@@ -85,7 +85,7 @@ class Flight:
         channel: socket.socket,
         operator: Operator,
         clock: Clock,
-        guardian: FlightGuard | None,
+        guardian: HeartbeatSender | None,
     ) -> None:
         mocap = config.vehicle.devices.mocap
         self._external = mocap.external
@@ -99,7 +99,7 @@ class Flight:
         self._core = FlightCore(config)
         self._vehicle: VehicleState | None = None
         """PX4's state in the newest tick."""
-        devices.vision.judge = lambda pose: self._core.forwards(pose, self._vehicle)
+        devices.forwarder.judge = lambda pose: self._core.forwards(pose, self._vehicle)
         self._missed = 0
         self._slow: SimulatedTicker | None = None
         """The ticker of simulated time; None in real time."""
@@ -114,7 +114,7 @@ class Flight:
         simulated = simulated_time.current()
         if simulated is None:
             in_real_time = Ticker(self._period_s, self._clock, self._frame_rate_hz)
-            self._devices.vision.on_frame = in_real_time.frame
+            self._devices.forwarder.on_frame = in_real_time.frame
             ticker: Ticker | SimulatedTicker = in_real_time
         else:
             ticker = self._slow = await self._in_simulated_time(simulated)
@@ -160,7 +160,7 @@ class Flight:
     def judge_without_core(self) -> None:
         """Judge each pose on PX4's present state, because no tick evaluates it any more."""
         pose_filter, autopilot = self._core.pose_filter(), self._devices.autopilot
-        self._devices.vision.judge = lambda pose: (
+        self._devices.forwarder.judge = lambda pose: (
             pose_filter is not None and pose_filter.check(pose, autopilot.vehicle())
         )
 
@@ -410,7 +410,7 @@ async def fly(
             if checked is not None:
                 checked.log_to(recorder.client)
                 operator.recheck = partial(changed_since, checked.params, devices.autopilot)
-            guardian = FlightGuard(client, devices.autopilot.identity(), origin_s) if client is not None else None
+            guardian = HeartbeatSender(client, devices.autopilot.identity(), origin_s) if client is not None else None
             if client is not None:
                 client.share_recorder(recorder.client.fileno())
             flight = Flight(config, devices, recorder, channel, operator, clock, guardian)

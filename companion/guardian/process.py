@@ -16,15 +16,15 @@ import socket
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from companion.guardian import heartbeat
 from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
-from companion.guardian.mocap import MocapClient, MocapProblem, open_client
+from companion.guardian.mocap import GuardianMocap
 from companion.guardian.monitors import StallWatch
 from companion.guardian.settings import Settings, read_settings
 from companion.guardian.takeover_landing import Notice, TakeoverLanding
+from companion.io.protocols import DeviceError
 from companion.io.px4.wire import OpenWire, is_udp, open_wire
 from companion.io.reopening import Reopening
 from companion.model.codec import to_packet
@@ -34,9 +34,6 @@ from companion.model.types import SafetyAction, Severity
 from companion.runtime import ipc, simulated_time
 from companion.runtime.clock import monotonic
 from companion.runtime.realtime import GUARDIAN_PRIORITY, claim_realtime
-
-if TYPE_CHECKING:
-    from companion.guardian.plugin_mocap import PluginClient
 
 PERIOD_S = 0.01
 MOCAP_FRESH_S = 0.5
@@ -125,7 +122,7 @@ class Guardian:
         self._channel = channel
         self._flight = flight
         self._external = settings.mocap.type == "external"
-        self._mocap: MocapClient | PluginClient | None = None
+        self._mocap: GuardianMocap | None = None
         """None until it is open, and if another program feeds PX4, which then needs no poses from the guardian."""
         self._problem: str | None = None
         self._status_s = float("-inf")
@@ -144,8 +141,8 @@ class Guardian:
         try:
             try:
                 if not self._external:
-                    self._mocap = open_client(self._settings.mocap)
-            except MocapProblem as problem:
+                    self._mocap = GuardianMocap(self._settings.mocap)
+            except DeviceError as problem:
                 self._problem = str(problem)
             reason = self._stand_by()
             if reason is None or self._heartbeats.last is None:
@@ -173,8 +170,8 @@ class Guardian:
             heard = self._heartbeats.receive()
             last = self._heartbeats.last
             if self._mocap is not None:
-                self._mocap.keep_connected(now_s)
-                self._mocap.poll_newest(now_s)
+                self._mocap.keep_connected()
+                self._mocap.poses()
             if last is not None and last.goodbye:
                 return None
             lifting = last is not None and last.lifting
@@ -302,8 +299,8 @@ class Guardian:
             t_s = now_s - last.origin_s
             with self._contain_errors(last, landing, "motion capture"):
                 if mocap is not None:
-                    landing.take_poses(mocap.poses(now_s, last.origin_s))
-                    mocap.keep_connected(now_s)
+                    landing.take_poses(mocap.poses(last.origin_s))
+                    mocap.keep_connected()
             with self._contain_errors(last, landing, "PX4's messages"):
                 landing.take_messages(t_s, link.receive())
                 self._restore_link(last, link, landing, waiting)

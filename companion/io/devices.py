@@ -14,7 +14,7 @@ from companion.config.loader import FlightConfig
 from companion.io.arm.plugin_driver import PluginArm
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.force_torque.plugin_driver import open_force
-from companion.io.mocap.plugin_driver import open_mocap
+from companion.io.mocap.driver import MocapDriver
 from companion.io.protocols import Arm, Autopilot, DeviceError, ForceTorque, GroundLink, Mocap
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.io.px4.streams import ESTIMATOR_RATE_HZ
@@ -31,7 +31,7 @@ ARM_TIMEOUT_S = 1.5
 
 
 @dataclass(slots=True)
-class VisionFilter:
+class PoseForwarder:
     """Forwards motion-capture poses to PX4. Each is judged before that; until there is a core, every tracked pose is forwarded."""
 
     judge: Callable[[MocapPose], bool] | None = None
@@ -48,7 +48,7 @@ class Devices:
     or if PX4 was found armed and the device could not be opened.
     """
 
-    vision: VisionFilter
+    forwarder: PoseForwarder
     autopilot: Autopilot
     mocap: Mocap | None
     arm: Arm | None
@@ -65,7 +65,7 @@ class Devices:
 class AvailableDevices:
     """Devices that could be opened; the others are None."""
 
-    vision: VisionFilter
+    forwarder: PoseForwarder
     autopilot: Autopilot | None = None
     mocap: Mocap | None = None
     arm: Arm | None = None
@@ -88,7 +88,7 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
     ground_address = config.vehicle.ground.qgroundcontrol
     if ground_address is not None:
         check_address(ground_address)
-    available = AvailableDevices(VisionFilter())
+    available = AvailableDevices(PoseForwarder())
     async with contextlib.AsyncExitStack() as stack:
         problem: DeviceError | None = None
         try:
@@ -100,7 +100,7 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
             available.autopilot = autopilot = await stack.enter_async_context(_autopilot(config, clock))
         except DeviceError as error:
             raise problem or error from None
-        vision, mocap = available.vision, available.mocap
+        forwarder, mocap = available.forwarder, available.mocap
         if await _is_armed(autopilot):
             failures = [] if problem is None else [str(problem)]
             arm: Arm | None = None
@@ -118,7 +118,7 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
                     f"ground.qgroundcontrol {ground_address}: MAVLink is not forwarded because PX4 was found armed"
                 )
             yield Devices(
-                vision=vision,
+                forwarder=forwarder,
                 autopilot=autopilot,
                 mocap=mocap,
                 arm=arm,
@@ -137,7 +137,7 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
             ground = await stack.enter_async_context(_ground(config, ground_address, autopilot))
         driver = _arm(config, clock)
         arm = await stack.enter_async_context(driver) if driver is not None else None
-        yield Devices(vision=vision, autopilot=autopilot, mocap=mocap, arm=arm, force=force, ground=ground)
+        yield Devices(forwarder=forwarder, autopilot=autopilot, mocap=mocap, arm=arm, force=force, ground=ground)
 
 
 @contextlib.asynccontextmanager
@@ -151,7 +151,7 @@ async def open_available(
         clock: the flight clock.
         show: called with the name of each device before it is opened, for the operator.
     """
-    available = AvailableDevices(VisionFilter())
+    available = AvailableDevices(PoseForwarder())
     async with contextlib.AsyncExitStack() as stack:
 
         @contextlib.contextmanager
@@ -195,24 +195,24 @@ def _mocap(config: FlightConfig, clock: Clock, available: AvailableDevices) -> M
     """Return the driver of motion capture, or None if another program feeds PX4."""
     if config.vehicle.devices.mocap.external:
         return None
-    vision = available.vision
+    forwarder = available.forwarder
 
     def forward(pose: MocapPose) -> None:
         autopilot = available.autopilot
-        if autopilot is not None and (pose.tracking_valid if vision.judge is None else vision.judge(pose)):
+        if autopilot is not None and (pose.tracking_valid if forwarder.judge is None else forwarder.judge(pose)):
             autopilot.send_vision(pose)
 
     def on_pose(pose: MocapPose) -> None:
-        if vision.on_frame is not None:
-            vision.on_frame(pose.stamp_s)
+        if forwarder.on_frame is not None:
+            forwarder.on_frame(pose.stamp_s)
             # The control tick that this frame starts comes first; PX4's estimate gets the pose some tenths of a millisecond later.
             asyncio.get_running_loop().call_soon(forward, pose)
         else:
             forward(pose)
-        if vision.watch is not None:
-            vision.watch(pose)
+        if forwarder.watch is not None:
+            forwarder.watch(pose)
 
-    return open_mocap(config.vehicle.devices.mocap, clock, on_pose)
+    return MocapDriver(config.vehicle.devices.mocap, clock, on_pose)
 
 
 def _ground(config: FlightConfig, address: str, autopilot: MavsdkAutopilot) -> GroundStation:

@@ -6,15 +6,15 @@ The companion announces its own parts in the same way, in pyproject.toml.
 from __future__ import annotations
 
 import functools
-import importlib.metadata
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from companion import DISTRIBUTION, __version__
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 CONTROL_LAWS = "companion.control_laws"
 MOCAP_SYSTEMS = "companion.mocap_systems"
@@ -105,19 +105,24 @@ def _own(group: str) -> Iterator[Plugin]:
     """Yield the companion's own parts. In a source tree they are read from pyproject.toml, because an editable installation keeps the
     entry points that existed when it was made.
     """
+    import tomllib  # 0.1 s with importlib.metadata, which a guardian for NatNet does without
+    from importlib.metadata import EntryPoint, entry_points
+
     path = _SOURCE_TREE / "pyproject.toml"
     source = tomllib.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     announced = source.get("project", {}).get("entry-points", {}).get(group)
     if announced is not None:
         entries = [EntryPoint(name, target, group) for name, target in announced.items()]
     else:
-        entries = [entry for entry in importlib.metadata.entry_points(group=group) if _is_own(entry)]
+        entries = [entry for entry in entry_points(group=group) if _is_own(entry)]
     for entry in entries:
         yield Plugin(entry, DISTRIBUTION, __version__)
 
 
 def _of_others(group: str) -> Iterator[Plugin]:
-    for entry in importlib.metadata.entry_points(group=group):
+    from importlib.metadata import entry_points  # as in `_own`
+
+    for entry in entry_points(group=group):
         if entry.dist is not None and not _is_own(entry):
             yield Plugin(entry, entry.dist.name, entry.dist.version)
 

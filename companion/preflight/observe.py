@@ -90,7 +90,7 @@ async def observe(
     base = replace(base, machine=machine_of(config, out), failures=failures)
     async with asyncio.TaskGroup() as group:
         asking = group.create_task(_ask(devices.autopilot, param_names)) if devices.autopilot is not None else None
-        devices.vision.watch = watcher.on_pose
+        devices.forwarder.watch = watcher.on_pose
         try:
             start_s = told_s = clock()
             waiting: Waiting | None = None
@@ -113,7 +113,7 @@ async def observe(
                 while clock() < again_s:
                     await watcher.look()
         finally:
-            devices.vision.watch = None
+            devices.forwarder.watch = None
 
 
 def _words(waiting: Waiting | None, elapsed_s: float, duration_s: float) -> tuple[str, float]:

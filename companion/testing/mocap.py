@@ -7,13 +7,11 @@ import itertools
 import math
 import threading
 import time
-from dataclasses import fields
 
 from companion.config import device_plugins
 from companion.config.devices import MocapDevice
-from companion.guardian.mocap import open_client
-from companion.io.mocap.plugin_driver import open_mocap
-from companion.io.mocap.system import MocapSettings
+from companion.guardian.mocap import GuardianMocap
+from companion.io.mocap.driver import MocapDriver, settings_of
 from companion.model.types import MocapPose
 from companion.plugins import MOCAP_SYSTEMS
 from companion.runtime.clock import flight_clock
@@ -39,7 +37,7 @@ def check_mocap(device: MocapDevice, duration_s: float = 1.0) -> None:
 
     Raises:
         AssertionError: a check fails; the text states what was found.
-        DeviceError, MocapProblem: the client cannot be opened.
+        DeviceError: the client cannot be opened.
     """
     problems = device_plugins.problems(MOCAP_SYSTEMS, device.type, device.options)
     assert not problems, f"devices.mocap: {problems}"
@@ -51,15 +49,13 @@ async def _both_clients(device: MocapDevice, duration_s: float) -> None:
     before, clock = set(threading.enumerate()), flight_clock()
     poses: list[MocapPose] = []
     seen: list[MocapPose] = []
-    settings = MocapSettings(**{each.name: getattr(device, each.name) for each in fields(MocapSettings)})
-    guardian, origin_s = open_client(settings), time.monotonic() - _GUARDIAN_START_S
+    guardian, origin_s = GuardianMocap(settings_of(device)), time.monotonic() - _GUARDIAN_START_S
     try:
-        async with open_mocap(device, clock, poses.append) as driver:
+        async with MocapDriver(device, clock, poses.append) as driver:
             deadline_s, ends_s = clock() + FIRST_POSE_S, clock() + duration_s
             while clock() < ends_s or (not any(pose.tracking_valid for pose in seen) and clock() < deadline_s):
-                now_s = time.monotonic()
-                guardian.keep_connected(now_s)
-                seen += guardian.poses(now_s, origin_s)
+                guardian.keep_connected()
+                seen += guardian.poses(origin_s)
                 await asyncio.sleep(0.01)
             counts, server = driver.counts(), driver.server
             assert server is not None and server.name and server.name.isprintable(), f"server_name: {server}"

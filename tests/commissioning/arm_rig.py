@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from companion.io.devices import AvailableDevices, VisionFilter
+from companion.io.devices import AvailableDevices, PoseForwarder
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.dynamixel.scale import RAD_PER_COUNT
 from companion.io.protocols import DeviceError
@@ -89,7 +89,7 @@ class Rig:
 
     async def _look(self) -> dict[str, Row]:
         config = load_sitl(CATCH, self.vehicle, overrides=self.overrides(_LOOK))
-        vehicle, clock, edges = config.vehicle, flight_clock(), AvailableDevices(VisionFilter())
+        vehicle, clock, edges = config.vehicle, flight_clock(), AvailableDevices(PoseForwarder())
         async with AsyncExitStack() as stack:
             try:
                 edges.arm = await stack.enter_async_context(DynamixelArm(vehicle.arm_device, vehicle.arm, clock))

@@ -14,7 +14,7 @@ from companion.config.loader import FlightConfig, load_flight
 from companion.flight.command_queue import Operator
 from companion.flight.fallback_landing import unflown
 from companion.flight.main import Flight
-from companion.io.devices import Devices, VisionFilter
+from companion.io.devices import Devices, PoseForwarder
 from companion.model.estimator import EstimatorReport
 from companion.model.launcher_messages import Land
 from companion.model.observations import (
@@ -218,7 +218,7 @@ def test_a_flight_with_devices_of_another_make_arms_and_lands(tmp_path: Path) ->
     autopilot, arm = ObedientAutopilot(config, clock), OtherArm(config, clock)
     autopilot.on_armed = lambda: ipc.send(launcher, Land())
     devices = Devices(
-        vision=VisionFilter(),
+        forwarder=PoseForwarder(),
         autopilot=autopilot,
         mocap=OtherMocap(config, clock),
         arm=arm,

@@ -12,9 +12,10 @@ from typing import ClassVar, Self
 
 from companion.config.devices import MocapDevice
 from companion.io.mocap import natnet
-from companion.io.mocap.driver import NatNetMocap
+from companion.io.mocap.client import NatNetClient
+from companion.io.mocap.driver import MocapDriver
 from companion.io.mocap.natnet import Message
-from companion.io.protocols import DeviceError
+from companion.io.mocap.optitrack import OptiTrack
 from companion.io.px4.messages import vision_ned
 from companion.model.types import MocapPose
 from sitl.natnet import BodyPose, NatNetServer, encode_frame, encode_model_definitions
@@ -92,7 +93,7 @@ class _Rig:
             "up_axis": "y" if version == "3.0" else "z",
         }
         deadline_s = DEADLINE_S
-        rig.edge = NatNetMocap(
+        rig.edge = MocapDriver(
             MocapDevice.model_validate(fields), rig.clock, rig.on_pose, connect_timeout_s=deadline_s, body_timeout_s=deadline_s
         )  # fmt: skip
 
@@ -105,9 +106,10 @@ class _Rig:
             publisher = group.create_task(publish())
             await rig.edge.__aenter__()
             publisher.cancel()
-        command = rig.edge._command_socket
-        assert command is not None
-        rig.socket, rig.info = command, rig.edge.server_info
+        system = rig.edge.client._client
+        assert isinstance(system, OptiTrack)
+        rig.system, rig.client = system, system.protocol
+        rig.socket, rig.info = system.sockets[0], rig.client.info
         rig._take_what_waits()
         return rig
 
@@ -125,16 +127,13 @@ class _Rig:
     def feed(self, datagram: bytes, *, fresh: bool) -> None:
         edge = self.edge
         if fresh:
-            edge.client.info = edge.client.version = None
+            self.client.info = self.client.version = None
         self.t_s += 1.0
         self._send(datagram)
         self._wait()
-        edge._drain(self.socket)
-        if fresh and edge.client.info is not None:
-            try:
-                edge._check_server(edge.client.info)
-            except DeviceError as error:
-                one_line(str(error), "the refusal of a server")
+        edge._receive()
+        if fresh and (refusal := self.system.refusal()) is not None:
+            one_line(refusal, "the refusal of a server")
         self._check_state()
         self._check_that_it_goes_on()
 
@@ -150,8 +149,8 @@ class _Rig:
                 raise Wrong(f"a pose that is not finite: {pose}")
             if abs(math.hypot(*pose.attitude_wxyz) - 1.0) > 1e-9:
                 raise Wrong(f"an attitude that is not of unit norm: {pose}")
-        for number, name in edge.client.names.items():
-            one_line(edge._label(number), "the label of a rigid body")
+        for number, name in self.client.names.items():
+            one_line(self.system._label(number), "the label of a rigid body")
             if len(name) > natnet.MAX_NAME_BYTES:
                 raise Wrong(f"a name of {len(name)} characters")
         if health.problem is not None:
@@ -159,17 +158,17 @@ class _Rig:
 
     def _check_that_it_goes_on(self) -> None:
         edge = self.edge
-        client = edge.client
+        client = self.client
         client.info, client.version, client.names = self.info, numbers(self.version), {}
         self.t_s += 1.0  # as after the loss of some frames
         number = ((client._last_number or 0) + 1) & 0xFFFFFFFF
-        x_m = float(number & 0xFFFF)
+        x_m = float(number & 0x1FF)
         body = BodyPose(_BODY_ID, (x_m, 0.0, 0.0), _UPRIGHT)
         self._send(encode_frame(self.version, number, 1.0, [body], 0.99, {_BODY_ID: "b"}))
         while (pose := edge.latest()) is None or pose.frame_number != number or pose.position_world_m[0] != x_m:
             if not self._wait():
                 raise Wrong(f"a valid frame behind it is not understood: {edge.counts()}")
-            edge._drain(self.socket)
+            edge._receive()
 
     def _send(self, datagram: bytes) -> None:
         self.sender.sendto(datagram, self.socket.getsockname())
@@ -181,9 +180,11 @@ class _Rig:
     def _take_what_waits(self) -> None:
         """Read the last frames of the server that the driver connected to."""
         while select.select([self.socket], [], [], 0.0)[0]:
-            self.edge._drain(self.socket)
+            self.edge._receive()
 
-    edge: NatNetMocap
+    edge: MocapDriver
+    client: NatNetClient
+    system: OptiTrack
     socket: socket.socket
     info: natnet.ServerInfo | None
 

@@ -11,7 +11,7 @@ import pytest
 
 from companion.config.loader import load_flight
 from companion.core.flight_core import FlightCore
-from companion.flight.heartbeat import FlightGuard, Heartbeats
+from companion.flight.heartbeat import Heartbeats, HeartbeatSender
 from companion.guardian import heartbeat
 from companion.guardian.client import SILENT_S, GuardianClient
 from companion.io.protocols import DeviceError
@@ -185,7 +185,7 @@ def test_when_the_rotors_may_turn(
     pair: Pair, waiting: Outputs, armed: bool, request_: AutopilotRequest, kind: PhaseKind, lifting: bool
 ) -> None:
     client, guardian = pair
-    guard = FlightGuard(
+    guard = HeartbeatSender(
         client,
         LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=14540, peer=("10.0.0.7", 14580)),
         77.0,
@@ -202,7 +202,9 @@ def test_when_the_rotors_may_turn(
 
 def test_a_pilot_stays_one_and_a_rejected_pose_is_not_passed_on(pair: Pair, waiting: Outputs) -> None:
     client, guardian = pair
-    guard = FlightGuard(client, LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0)
+    guard = HeartbeatSender(
+        client, LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0
+    )
     event = Event(
         t_s=5.0, id="pilot_took_over", severity=Severity.CRITICAL, action=SafetyAction.AUTOPILOT_LAND, text="a pilot"
     )
@@ -220,7 +222,9 @@ def test_a_pilot_stays_one_and_a_rejected_pose_is_not_passed_on(pair: Pair, wait
 def test_while_px4_is_armed_no_goodbye_is_said_to_the_guardian(pair: Pair, waiting: Outputs) -> None:
     """Whatever the outcome, the guardian must stop turning rotors once this process is gone."""
     client, guardian = pair
-    guard = FlightGuard(client, LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0)
+    guard = HeartbeatSender(
+        client, LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0
+    )
     guard.tick(inputs(armed=True), msgspec.structs.replace(waiting, phase_kind=PhaseKind.DONE))
     guard.goodbye(inputs(armed=True).status)
     guard.goodbye(inputs(armed=False).status)

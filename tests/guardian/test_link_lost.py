@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import socket
-import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -14,7 +13,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.guardian.mocap import MocapClient
+from companion.guardian.mocap import GuardianMocap
 from companion.io.mocap.system import MocapSettings
 from companion.model.types import MocapPose
 from sitl.natnet import BodyPose, encode_frame
@@ -176,12 +175,12 @@ def test_of_two_streams_of_motion_capture_at_one_address_none_is_passed_on() -> 
             rigid_body_id=1,
             up_axis="z",
         )
-        with closing(MocapClient(settings)) as client:
+        with closing(GuardianMocap(settings)) as client:
             seen: list[MocapPose] = []
 
             def read() -> bool:
-                client.keep_connected(time.monotonic())
-                seen.extend(client.poses(time.monotonic()))
+                client.keep_connected()
+                seen.extend(client.poses())
                 return len(seen) > 10
 
             wait_until(read, lambda: f"no poses: {client.problem}")

@@ -19,7 +19,7 @@ import pytest
 
 from companion.config.devices import MocapDevice
 from companion.io.mocap import natnet
-from companion.io.mocap.driver import NatNetMocap
+from companion.io.mocap.driver import MocapDriver
 from companion.io.mocap.natnet import Message
 from companion.io.protocols import DeviceError, Mocap
 from companion.model.types import MocapPose
@@ -84,8 +84,8 @@ class Inbox:
 
 def mocap(
     device: MocapDevice, on_pose: Callable[[MocapPose], None] | None = None, body_timeout_s: float = DEADLINE_S
-) -> NatNetMocap:
-    return NatNetMocap(
+) -> MocapDriver:
+    return MocapDriver(
         device, flight_clock(), on_pose or Inbox(), connect_timeout_s=DEADLINE_S, body_timeout_s=body_timeout_s
     )
 
@@ -110,8 +110,7 @@ async def test_pose_arrives(version: str, transport: Transport) -> None:
             first, second = await inbox.next(), await inbox.next()
             assert second.frame_number > first.frame_number
             assert second.stamp_s >= first.stamp_s
-            assert edge.server_info is not None
-            assert edge.server_info.version == version
+            assert edge.server is not None and edge.server.protocol_version == version
             assert set(edge.bodies) == {STRANGER.id, POSE.id}
 
 
@@ -168,7 +167,7 @@ async def test_leaving_unsubscribes_and_frees_the_sockets() -> None:
 @asynccontextmanager
 async def quiet_after_opening(
     on_pose: Callable[[MocapPose], None], **changes: Any
-) -> AsyncIterator[tuple[NatNetServer, NatNetMocap]]:
+) -> AsyncIterator[tuple[NatNetServer, MocapDriver]]:
     """A server that has stopped publishing and an edge that has read everything: what comes next is the test's own."""
     async with NatNetServer() as server:
         async with streaming(server, POSE):
@@ -248,7 +247,7 @@ def test_callback_that_fails_does_not_stop_reception(caplog: pytest.LogCaptureFi
 # -- what can be wrong ---------------------------------------------------------------------------------------------------------
 
 
-async def refusal(edge: NatNetMocap) -> str:
+async def refusal(edge: MocapDriver) -> str:
     with pytest.raises(DeviceError) as caught:
         async with edge:
             pass
@@ -264,7 +263,7 @@ async def test_no_answer() -> None:
         device = MocapDevice(
             server="127.0.0.1", interface="127.0.0.1", transport="unicast", command_port=port, rigid_body_id=1
         )
-        text = await refusal(NatNetMocap(device, flight_clock(), Inbox(), connect_timeout_s=0.3))
+        text = await refusal(MocapDriver(device, flight_clock(), Inbox(), connect_timeout_s=0.3))
         assert f"127.0.0.1:{port}: no answer to the NatNet connect request within 0.3 s" in text
 
 

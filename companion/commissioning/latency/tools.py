@@ -82,12 +82,12 @@ class Measured:
 async def measure(session: Session) -> Measured:
     """Open motion capture and PX4, wait for the taps, and write the parameter on request."""
     from companion.commissioning.latency.link import LatencyLink  # imports MAVSDK
-    from companion.io.mocap.plugin_driver import open_mocap
+    from companion.io.mocap.driver import MocapDriver
 
     arguments, vehicle = session.arguments, session.vehicle
     clock, devices = flight_clock(), vehicle.devices
     poses: list[MocapPose] = []
-    async with open_mocap(devices.mocap, clock, poses.append), LatencyLink(devices.autopilot, clock) as link:
+    async with MocapDriver(devices.mocap, clock, poses.append), LatencyLink(devices.autopilot, clock) as link:
         _refuse_armed(link, devices.autopilot.address)
         # As in flight, because a busy computer stamps motion capture late.
         claim_realtime(FLIGHT_PRIORITY, cpus=vehicle.computer.cpus, lock_memory=False)

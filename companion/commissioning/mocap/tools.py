@@ -13,7 +13,7 @@ from companion.commissioning.mocap import align as mocap_align
 from companion.commissioning.mocap import judge as mocap_judge
 from companion.commissioning.mocap import pivot as mocap_pivot
 from companion.commissioning.mocap.judge import FrameSeen, Watched
-from companion.commissioning.mocap.watch import discover, path_to, watcher
+from companion.commissioning.mocap.watch import WatchedTrack, discover, path_to
 from companion.commissioning.tool import SENSORS, Cancelled, Report, Session, Tool
 from companion.config.base import Location
 from companion.config.device_plugins import NATNET
@@ -22,7 +22,9 @@ from companion.config.document import Data
 from companion.config.loader import load_flight
 from companion.config.mission import Start
 from companion.config.vehicle import Vehicle
+from companion.io.mocap.driver import MocapDriver
 from companion.io.mocap.natnet import ServerInfo
+from companion.io.mocap.system import MocapSettings
 from companion.io.protocols import DeviceError
 from companion.model.check_row import refusals
 from companion.preflight.hand_test import evaluation as hand_evaluation
@@ -61,33 +63,39 @@ async def watch(session: Session) -> Watched | NotStreaming:
         )
     clock = flight_clock()
     frames: list[FrameSeen] = []
-    driver = watcher(device, clock, frames.append)
+    made: list[WatchedTrack] = []
+
+    def make_client(settings: MocapSettings) -> WatchedTrack:
+        made.append(WatchedTrack(settings, frames.append))
+        return made[0]
+
     session.say(f"motion capture: {device.server}, {device.transport}; nothing moves by itself")
     try:
-        async with driver:
+        async with MocapDriver(device, clock, lambda _: None, make_client=make_client):
+            (client,) = made
             with contextlib.suppress(TimeoutError):  # without a description the bodies have no names
                 async with asyncio.timeout(_DESCRIPTION_TIMEOUT_S):
-                    while not driver.client.names:  # noqa: ASYNC110 - the driver signals nothing
+                    while not client.protocol.names:  # noqa: ASYNC110 - the driver signals nothing
                         await asyncio.sleep(0.02)
             move = "; carry the vehicle about 30 cm away and back" if arguments.move else ""
             session.say(f"watching for {arguments.seconds:g} s{move}")
             frames.clear()
             start_s = clock()
             await asyncio.sleep(arguments.seconds)
-            info = driver.server_info
+            info = client.protocol.info
             assert info is not None
-            route = path_to(driver.server_ip, device)
+            route = path_to(client.server_ip, device)
             return Watched(
                 frames=tuple(frames),
-                names=driver.client.names,
+                names=client.protocol.names,
                 info=info,
                 route=route,
                 duration_s=clock() - start_s,
                 moving=arguments.move,
             )
     except DeviceError as error:
-        if driver.server_info is not None:
-            return NotStreaming(str(error), driver.server_info, {})
+        if made and (info := made[0].protocol.info) is not None:
+            return NotStreaming(str(error), info, {})
         session.say("no answer; searching the whole network segment")
         return NotStreaming(str(error), None, await discover(device.interface, device.command_port))
 
@@ -136,14 +144,13 @@ class Carried:
 
 async def guide_hand_test(session: Session) -> Carried:
     """Guide the user through the hand test while poses are forwarded to PX4; return its result."""
-    from companion.io.devices import AvailableDevices, VisionFilter  # imports MAVSDK
-    from companion.io.mocap.plugin_driver import open_mocap
+    from companion.io.devices import AvailableDevices, PoseForwarder  # imports MAVSDK
     from companion.io.px4.driver import MavsdkAutopilot
     from companion.preflight.hand_test.command import ENDED_BY_HAND, perform
 
     arguments = session.arguments
     config = load_flight(arguments.mission, arguments.vehicle, overrides=arguments.overrides)
-    clock, devices, opened = flight_clock(), config.vehicle.devices, AvailableDevices(VisionFilter())
+    clock, devices, opened = flight_clock(), config.vehicle.devices, AvailableDevices(PoseForwarder())
 
     def forward(pose: MocapPose) -> None:
         if opened.autopilot is not None and pose.tracking_valid:
@@ -154,7 +161,7 @@ async def guide_hand_test(session: Session) -> Carried:
     )
     try:
         async with (
-            open_mocap(devices.mocap, clock, forward) as opened.mocap,
+            MocapDriver(devices.mocap, clock, forward) as opened.mocap,
             MavsdkAutopilot(devices.autopilot, clock) as opened.autopilot,
         ):
             outcome = await perform(opened, config, session.console, arguments.json)

@@ -18,10 +18,10 @@ from typing import Final
 from companion.commissioning.mocap.judge import FrameSeen, Route
 from companion.config.devices import MocapDevice
 from companion.io.mocap import natnet
-from companion.io.mocap.driver import NatNetMocap
 from companion.io.mocap.frames import Frame
 from companion.io.mocap.natnet import Message, ServerInfo
-from companion.runtime.clock import Clock
+from companion.io.mocap.optitrack import OptiTrack
+from companion.io.mocap.system import MocapSettings
 
 _SIOCGIFADDR, _SIOCGIFNETMASK = 0x8915, 0x891B
 _ASK_PERIOD_S: Final = 0.25
@@ -29,24 +29,29 @@ _ANSWERS_S: Final = 1.0
 """Time to wait for the answers to a broadcast."""
 
 
-def watcher(device: MocapDevice, clock: Clock, on_frame: Callable[[FrameSeen], None]) -> NatNetMocap:
-    """Return an unopened motion-capture driver that reports every rigid body of every frame and requires none."""
+class WatchedTrack(OptiTrack):
+    """The flight's client, which also reports every rigid body of every frame and requires none."""
 
-    def show(frame: Frame, datagram: bytes, arrived_s: float) -> None:
-        bodies = (driver.client.other_body(datagram, number) for number in frame.body_ids)
-        found = tuple(body for body in bodies if body is not None)
-        on_frame(
+    def __init__(self, settings: MocapSettings, on_frame: Callable[[FrameSeen], None]) -> None:
+        super().__init__(settings)
+        self._on_frame = on_frame
+
+    def refusal(self) -> str | None:
+        """Return why the server's version or transport is not that of the settings."""
+        return self.server_refusal()
+
+    def take(self, frame: Frame, datagram: bytes, stamp_s: float) -> None:
+        """Report a frame."""
+        bodies = (self.protocol.other_body(datagram, number) for number in frame.body_ids)
+        self._on_frame(
             FrameSeen(
-                arrived_s=arrived_s,
+                arrived_s=stamp_s,
                 number=frame.number,
                 timestamp_s=frame.timestamp_s,
                 latency_s=frame.latency_s,
-                bodies=found,
+                bodies=tuple(body for body in bodies if body is not None),
             )
         )
-
-    driver = NatNetMocap(device, clock, lambda _: None, on_frame=show)
-    return driver
 
 
 async def discover(interface: str, command_port: int) -> dict[str, ServerInfo]:

@@ -1,6 +1,6 @@
 """NatNet client without I/O: takes datagrams with arrival times, returns frames, poses and requests.
 
-The flight (`companion.io.mocap.driver`), the guardian (`companion.guardian.mocap`) and the commissioning tools add the sockets.
+`companion.io.mocap.optitrack` adds the sockets, for the flight, the guardian and the commissioning tools.
 """
 
 from __future__ import annotations

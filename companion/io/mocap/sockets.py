@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import socket
 from collections.abc import Iterator
 from typing import Final, NamedTuple
@@ -74,10 +73,3 @@ def waiting(opened: socket.socket) -> Iterator[Datagram]:
         except OSError:  # an ICMP error from an earlier send
             continue
         yield Datagram(data, ancillary, str(address[0]))
-
-
-def send(opened: socket.socket, datagrams: list[bytes], server: tuple[str, int]) -> None:
-    """Send datagrams; while the network is down they are dropped, and the next ones may get through."""
-    with contextlib.suppress(OSError):
-        for datagram in datagrams:
-            opened.sendto(datagram, server)

@@ -1,16 +1,17 @@
-"""What a motion-capture system that is a plug-in provides. `companion.config.device_plugins` checks its settings before a flight.
+"""What a motion-capture system provides: `companion.io.mocap.optitrack`, and every plug-in.
 
 The flight process and the guardian each make a client of their own from the same settings, because the guardian lands the vehicle
-after the flight process has died. `companion.io.mocap.plugin_driver` runs the flight's, `companion.guardian.plugin_mocap` the
-guardian's.
+after the flight process has died. Both run it in `companion.io.mocap.contained`. `companion.config.device_plugins` checks the settings
+before a flight.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import socket
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Final, Protocol
+from typing import Any, ClassVar, Final, NamedTuple, Protocol
 
 import msgspec
 
@@ -20,6 +21,7 @@ _AGE_MAX_S: Final = 1.0
 _AHEAD_MAX_S: Final = 0.001
 _POSITION_MAX_M: Final = 1000.0
 _QUAT_NORM_TOLERANCE: Final = 0.02
+_ROUNDING: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +36,7 @@ class MocapSettings:
     data_port: int
     rigid_body_id: int
     up_axis: str
+    natnet_version: str | None = None
     type: str = "natnet"
     options: Mapping[str, Any] = field(default_factory=dict)
     """`devices.mocap.options`, already checked by the system's model."""
@@ -49,10 +52,16 @@ class PoseClient(Protocol):
 
     options: ClassVar[type[Any]]
     """Subclass of `companion.config.base.Model` that checks `MocapSettings.options`; its docstring describes the system."""
-    server_name: str
-    """Program and protocol, such as "Vicon Tracker, UDP object stream"."""
-    problem: str | None
-    """Why the newest rejected datagram was invalid, as one line; None if none was rejected."""
+
+    @property
+    def server_name(self) -> str:
+        """Program and protocol, such as "Vicon Tracker, UDP object stream". An `ExtendedClient` may return an empty text before the
+        server has answered.
+        """
+
+    @property
+    def problem(self) -> str | None:
+        """Why the newest rejected datagram was invalid, as one line; None if none was rejected."""
 
     def keep_connected(self, now_s: float) -> None:
         """Send what the server needs to go on streaming; called every 10 to 50 ms. It may open, replace and close sockets."""
@@ -60,13 +69,61 @@ class PoseClient(Protocol):
     def poses(self, now_s: float) -> list[MocapPose]:
         """Return the poses that have arrived since the last call, in order, in the world frame (z up) and the body frame FLU.
 
-        The flight process calls it every 1 ms, the guardian every 10 ms; it may open, replace and close sockets. A pose's `stamp_s`
+        The flight process calls it every 1 ms, the guardian every 10 ms, unless the client is an `ExtendedClient` with sockets; it may
+        open, replace and close sockets. A pose's `stamp_s`
         is its arrival, `now_s` or earlier, and `tracking_valid` is False while the body is not tracked. Frame numbers increase.
         `valid_poses` rejects invalid poses.
         """
 
     def close(self) -> None:
         """Close the sockets; never raises."""
+
+
+class Counts(NamedTuple):
+    """Datagrams of a client that were dropped."""
+
+    out_of_order: int = 0
+    """Frames that arrived after a newer one."""
+    malformed: int = 0
+    foreign: int = 0
+    """Datagrams from another address than the server's."""
+
+
+class ExtendedClient:
+    """Base class of a client that provides more than a `PoseClient` must. What it returns here holds for every other client."""
+
+    sockets: Sequence[socket.socket] = ()
+    """Sockets that stay open from the constructor to `close`: `poses` is called as soon as one of them is readable, and reads all."""
+    where = ""
+    """Beginning of a text on this client, such as "mocap 10.0.0.5:1510"; empty for the type and `MocapSettings.server`."""
+
+    def protocol_version(self) -> str:
+        """Return the version that the server uses; empty for the type of the system."""
+        return ""
+
+    def bodies(self) -> Mapping[int, str] | None:
+        """Return the rigid bodies of the newest frame by streaming id, with their names, which are empty if not known; None before the
+        first frame, and if the client does not know them.
+        """
+        return None
+
+    def counts(self) -> Counts:
+        """Return the numbers of dropped datagrams."""
+        return Counts()
+
+    def has_two_streams(self) -> bool:
+        """Return whether the newest poses belong to two mixed streams; the guardian then uses none."""
+        return False
+
+    def refusal(self) -> str | None:
+        """Return why the flight must not start with this server or body, as one line, or None; called once the server's name is known,
+        and again once the body is tracked.
+        """
+        return None
+
+    def silence(self, waited_s: float) -> str | None:
+        """Return why no tracked pose has arrived in `waited_s`, as one line, or None if the client does not know."""
+        return None
 
 
 def valid_poses(poses: list[MocapPose], now_s: float) -> tuple[list[MocapPose], list[str]]:
@@ -89,8 +146,9 @@ def valid_poses(poses: list[MocapPose], now_s: float) -> tuple[list[MocapPose], 
     if not (isinstance(poses, list) and all(isinstance(pose, MocapPose) for pose in poses)):
         raise TypeError(f"poses() returned {poses!r:.80}, expected a list of MocapPose")
     valid, rejected = [], []
-    for returned in poses:
-        pose = msgspec.convert(msgspec.to_builtins(returned), MocapPose)  # a struct's constructor does not check types
+    for pose in poses:
+        if not _has_types(pose):
+            pose = msgspec.convert(msgspec.to_builtins(pose), MocapPose)
         norm = math.hypot(*pose.attitude_wxyz)
         finite = (
             all(abs(value) <= _POSITION_MAX_M for value in pose.position_world_m)
@@ -102,6 +160,8 @@ def valid_poses(poses: list[MocapPose], now_s: float) -> tuple[list[MocapPose], 
                 f"frame {pose.frame_number}: stamped {pose.stamp_s:.3f} s, expected at most {_AGE_MAX_S:g} s before now_s "
                 f"({now_s:.3f} s); the pose is rejected"
             )
+        elif finite and abs(norm - 1.0) <= _ROUNDING:
+            valid.append(pose)
         elif finite:
             w, x, y, z = pose.attitude_wxyz
             valid.append(msgspec.structs.replace(pose, attitude_wxyz=(w / norm, x / norm, y / norm, z / norm)))
@@ -120,3 +180,14 @@ def valid_poses(poses: list[MocapPose], now_s: float) -> tuple[list[MocapPose], 
                 f"values, at most {_POSITION_MAX_M:g} m and norm 1; the pose is rejected"
             )
     return valid, rejected
+
+
+def _has_types(pose: MocapPose) -> bool:
+    """Return whether the values have the types of `MocapPose`: a conversion, which checks them too, takes longer."""
+    position_m, quat = pose.position_world_m, pose.attitude_wxyz
+    return (
+        (type(position_m), type(quat), len(position_m), len(quat)) == (tuple, tuple, 3, 4)
+        and {*map(type, (pose.stamp_s, pose.marker_error_m, *position_m, *quat))} == {float}
+        and {type(pose.latency_s), type(pose.exposure_server_s)} <= {float, type(None)}
+        and (type(pose.frame_number), type(pose.tracking_valid)) == (int, bool)
+    )

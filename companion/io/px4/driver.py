@@ -21,7 +21,7 @@ from mavsdk import ComponentType, Configuration, Mavsdk
 from companion.config.devices import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4 import messages
-from companion.io.px4.claim import LinkClaim
+from companion.io.px4.exclusive_link import ExclusiveLink
 from companion.io.px4.frames import FrameReader, FrameWriter, frames
 from companion.io.px4.inbox import Inbox
 from companion.io.px4.link import check_address, device_error, first_autopilot, open_link, quiet_native_log
@@ -103,7 +103,7 @@ class MavsdkAutopilot:
         self._system_id = 0
         self._own_ids = (0, 0)
         self._reports: list[str] = []
-        self._claim: LinkClaim | None = None
+        self._claim: ExclusiveLink | None = None
 
     async def __aenter__(self) -> Self:
         """Open the link, find PX4, request the streams, and set a global origin if PX4 has none and is not armed.
@@ -121,7 +121,7 @@ class MavsdkAutopilot:
             self._mavsdk = Mavsdk(configuration)
             self._connection = self._mavsdk.add_any_connection_with_handle("raw://")
             self._mavsdk.subscribe_raw_bytes_to_be_sent(self._send_for_mavsdk)
-            self._claim = claim = LinkClaim(address)
+            self._claim = claim = ExclusiveLink(address)
             await claim.find_px4(self._device.discovery_timeout_s)
             self._writer = FrameWriter(*self._own_ids)
             self._reader = FrameReader(stream=claim.peer is None)

@@ -81,7 +81,7 @@ def bind_alone(address: str, host: str, port: int, kind: socket.SocketKind) -> s
 
 
 def open_link(address: str, peer: tuple[str, int] | None, clock: Clock, report: Callable[[str], None]) -> OpenWire:
-    """Return the open wire to PX4; its port is the claim's (`companion.io.px4.claim`). Blocks while a TCP connection is made.
+    """Return the open wire to PX4; its port is the claim's (`companion.io.px4.exclusive_link`). Blocks while a TCP connection is made.
 
     Args:
         address: checked address.

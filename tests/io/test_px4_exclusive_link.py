@@ -18,8 +18,8 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.config.devices import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4 import frames as px4_frames
-from companion.io.px4.claim import LinkClaim
 from companion.io.px4.driver import MavsdkAutopilot
+from companion.io.px4.exclusive_link import ExclusiveLink
 from companion.io.px4.frames import AutopilotHeartbeat
 from companion.model.types import MocapPose
 from companion.runtime.clock import flight_clock
@@ -133,7 +133,7 @@ async def test_calling_px4_leaves_no_task_behind() -> None:
     """It was cancelled and not waited for: it still ran when its port was closed."""
 
     port = free_udp_port()
-    with Px4Peer(port) as px4, closing(LinkClaim(f"udpin://127.0.0.1:{port}")) as claim:
+    with Px4Peer(port) as px4, closing(ExclusiveLink(f"udpin://127.0.0.1:{port}")) as claim:
         await claim.find_px4(DEADLINE_S)
         async with claim.calling((1, 191)):
             await eventually(lambda: bool(px4.of("HEARTBEAT")), "a call")
@@ -158,7 +158,7 @@ def test_little_of_a_strangers_datagram_is_read(
         monkeypatch.setattr(px4_frames, name, _counting(counted, name, getattr(px4_frames, name)))
     port = free_udp_port()
     with (
-        closing(LinkClaim(f"udpin://127.0.0.1:{port}")) as claim,
+        closing(ExclusiveLink(f"udpin://127.0.0.1:{port}")) as claim,
         closing(socket.socket(type=socket.SOCK_DGRAM)) as stranger,
     ):
         stranger.sendto(data, ("127.0.0.1", port))

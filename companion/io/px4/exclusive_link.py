@@ -26,7 +26,7 @@ _RIVALS_REPORTED_MAX = 4
 _CALL_PERIOD_S = 1.0
 
 
-class LinkClaim:
+class ExclusiveLink:
     """This process's hold on a link, besides the wire that carries the data.
 
     A `udpin` port is bound without SO_REUSEADDR, so that no other program has it, and only then shared with the wire. The wire is
