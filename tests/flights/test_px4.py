@@ -96,7 +96,7 @@ def assert_landed_where_it_was(sandbox: Sandbox) -> None:
     assert "LAND" in [mode for _, mode, _ in world["modes"]]
 
 
-@pytest.mark.parametrize("autopilot", [pytest.param("px4", marks=REAL)])  # the stub's: test_wire_flights.py
+@pytest.mark.parametrize("autopilot", [pytest.param("px4", marks=REAL)])  # the stub's: test_ground_commands.py
 def test_the_catch(sandbox: Sandbox, autopilot: str) -> None:
     ended = sandbox.run("fly", CATCH, f"--sitl={autopilot}", "--out", "out")
     sandbox.assert_nobody_left()

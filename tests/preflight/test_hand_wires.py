@@ -1,4 +1,4 @@
-"""The hand test over real wires: the world's hand, NatNet, MAVLink, a terminal."""
+"""The hand test at a terminal: a round of the simulated hand to its record, and its ends over real wires."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import signal
 import termios
 from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,18 +21,20 @@ from companion.config.devices import MocapDevice
 from companion.io.devices import AvailableDevices, PoseForwarder, open_available
 from companion.io.mocap.driver import MocapDriver
 from companion.model.check_row import Row
-from companion.model.types import AutopilotRequest, FlightMode
+from companion.model.types import AutopilotRequest, FlightMode, MocapPose, VehicleState
+from companion.preflight.hand_test import command
 from companion.preflight.hand_test import evaluation as hand_test_evaluation
 from companion.preflight.hand_test import record as hand_record
 from companion.preflight.hand_test.command import run_hand_test
+from companion.preflight.hand_test.steps import HandSample
 from companion.runtime.clock import flight_clock
 from companion.sitl_config.loader import SitlConfig, load_sitl
+from sitl.world.handling import ROUND_S
 from tests.io.stub_rig import standing_stub
 from tests.io.test_px4_stub import companion
+from tests.preflight.hand_rig import Standing
+from tests.preflight.hand_rig import world as simulated
 from tests.support import CATCH, DEADLINE_S, Sandbox, World, free_udp_port, sandbox_in
-
-FIRST_ROUND_S = 8.0
-"""A test that is ready later waits on the floor for the next round, 24 s after the first."""
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +45,7 @@ def sandbox(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sandbox]:
 
 @pytest.fixture(scope="module")
 def world(sandbox: Sandbox) -> Iterator[World]:
-    knobs = ["world.handling=true", f"world.handling_t_s={FIRST_ROUND_S}", "world.payload_kg=0"]
-    with World(sandbox, overrides=knobs) as made:
+    with World(sandbox, overrides=["world.payload_kg=0"]) as made:
         yield made
 
 
@@ -63,18 +65,14 @@ def text_of(console: Console) -> str:
 
 
 async def over_wires(
-    config: SitlConfig,
-    console: Console,
-    record: Path | None = None,
-    beside: Callable[[], Coroutine[Any, Any, None]] | None = None,
+    config: SitlConfig, console: Console, beside: Callable[[], Coroutine[Any, Any, None]]
 ) -> list[Row]:
     """The rows of a test on the world's wires; `beside` runs while it does."""
     async with open_available(config, flight_clock()) as edges:
         assert not edges.failures
         async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
-            if beside is not None:
-                group.create_task(beside())
-            return await run_hand_test(edges, config, console, record=record)
+            group.create_task(beside())
+            return await run_hand_test(edges, config, console)
 
 
 async def said(console: Console, words: str) -> None:
@@ -84,20 +82,37 @@ async def said(console: Console, words: str) -> None:
             await asyncio.sleep(0.01)
 
 
-def test_a_whole_round_passes_and_is_kept(config: SitlConfig, world: World, tmp_path: Path) -> None:
-    while True:
-        console, path, paused = terminal(), tmp_path / "state" / "hand-tests.json", world.pauses
-        path.unlink(missing_ok=True)
-        rows = asyncio.run(over_wires(config, console, path))
-        # A world that paused moved less than the time that the IMU was integrated over; and if this process was held up for 0.3 s, the
-        # world's hand goes on without being asked, and repeats the round alone.
-        if "repeat" not in text_of(console) and world.pauses == paused:
-            break
+class Played:
+    """Motion capture and PX4 of a machine that is carried: each look at the poses is the next of its samples, 5 ms later."""
+
+    server = SimpleNamespace(protocol_version="4.1")
+
+    def __init__(self, samples: Iterator[HandSample]) -> None:
+        self._samples = samples
+
+    def latest(self) -> MocapPose | None:
+        self._now = next(self._samples)
+        return self._now.pose
+
+    def vehicle(self) -> VehicleState | None:
+        return self._now.vehicle
+
+    def status(self) -> Any:
+        return SimpleNamespace(heartbeat_stamp_s=self._now.t_s, armed=self._now.armed)
+
+
+def test_a_whole_round_passes_and_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """In the machine's own time: this computer's stands still."""
+    monkeypatch.setattr(command, "time", SimpleNamespace(monotonic=lambda: 0.0))
+    monkeypatch.setattr(command, "LOOK_PERIOD_S", 0.0)
+    config, console, path = simulated("hand=true"), terminal(), tmp_path / "state" / "hand-tests.json"
+    machine: Any = Played(Standing(config).samples(4.0 + ROUND_S))
+    rows = asyncio.run(run_hand_test(AvailableDevices(VisionFilter(), machine, machine), config, console, record=path))
     assert all(row.ok for row in rows), [row.line() for row in rows if not row.ok]
     assert [row.id for row in rows] == [*(check.id for check in hand_test_evaluation.CHECKS), "hand.record"]
     for words in ("1/4", "2/4", "lift it straight up", "3/4", "forward", "4/4", "to the left", "put it back"):
         assert words in text_of(console)
-    setup = hand_record.Setup.of(config.vehicle, config.world.natnet_version)
+    setup = hand_record.Setup.of(config.vehicle, "4.1")
     passed, changed = hand_record.on_record(setup, hand_record.load(path))
     assert passed.startswith("passed on 20")
     assert not changed
@@ -118,7 +133,7 @@ def test_any_key_ends_it_and_the_terminal_is_as_before(config: SitlConfig, monke
                 assert termios.tcgetattr(tty) != before
                 os.write(keyboard, b" ")
 
-            rows = asyncio.run(over_wires(config, console, beside=press))
+            rows = asyncio.run(over_wires(config, console, press))
             assert termios.tcgetattr(tty) == before
     finally:
         os.close(keyboard)
@@ -135,7 +150,7 @@ def test_ctrl_c_ends_it_and_is_itself_again_afterwards(config: SitlConfig) -> No
 
     async def both() -> list[Row]:
         before = signal.getsignal(signal.SIGINT)
-        rows = await over_wires(config, console, beside=interrupt)
+        rows = await over_wires(config, console, interrupt)
         assert signal.getsignal(signal.SIGINT) == before
         return rows
 

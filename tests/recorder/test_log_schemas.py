@@ -34,7 +34,7 @@ PROTOBUF = {
 
 @pytest.fixture(scope="module")
 def synthetic(tmp_path_factory: pytest.TempPathFactory) -> Viewed:
-    """A short flight of which every message is checked."""
+    """A short flight with messages on every channel."""
     path = tmp_path_factory.mktemp("short") / "flight.mcap"
     return view(record(path, tethered(end_s=6.6), config_json=config_json(), plan_json="[[0, 0, 1], [0.5, 0, 1]]"))
 
@@ -59,10 +59,10 @@ def test_every_channel_says_what_it_holds_in_the_terms_of_the_viewers(synthetic:
     }
 
 
-def test_no_channel_is_silent_and_every_message_keeps_to_its_schema(synthetic: Viewed) -> None:
+def test_no_channel_is_silent_and_messages_keep_to_their_schemas(synthetic: Viewed) -> None:
     counts = {topic: len(messages) for topic, messages in synthetic.by_topic.items()}
     assert min(counts.values()) > 0, counts
-    check(synthetic)
+    check(synthetic, every=5)
 
 
 def test_a_whole_flight_keeps_to_its_schemas(viewed: Viewed) -> None:
@@ -145,7 +145,7 @@ def test_the_log_of_a_killed_recorder_opens_and_keeps_to_its_schemas(tmp_path: P
     recorder.finish(DEADLINE_S)
     found = view(path, whole=False)
     assert found.by_topic.keys() >= topics
-    check(found)
+    check(found, every=50)
     counts = {len(found.by_topic[topic]) for topic in ("/inputs", "/outputs", "/sent")}
     assert len(counts) == 1, "a chunk holds whole ticks"
     log = FlightLog.read(path)
