@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 
 import msgspec
@@ -23,7 +22,7 @@ from companion.model.types import (
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.fast.loop import FastFlight, FastResult
-from tests.safety.healthy import put
+from tests.safety.healthy import healthy, put
 from tests.support import HOVER, SHORT_CATCH
 
 replace = msgspec.structs.replace
@@ -76,12 +75,6 @@ def flown(change: Change = lambda i: i, lift_m: float = 0.0, *, deaf: bool = Fal
     return flight, flight.run()
 
 
-@cache
-def ordinary() -> tuple[FastFlight, FastResult]:
-    """A flight in which nothing is wrong."""
-    return flown()
-
-
 def ids(result: FastResult) -> list[str]:
     return [event.id for o in result.outputs for event in o.events]
 
@@ -102,9 +95,15 @@ def assert_landed(flight: FastFlight, result: FastResult, outcome: Outcome) -> N
 
 
 def test_with_all_sources_it_touches_down() -> None:
-    flight, result = ordinary()
+    flight, result = flown()
     assert_landed(flight, result, Outcome.COMPLETED)
     assert rotors_stopped_at_m(result) < STANDS_M + 0.02
+    inputs, outputs = result.inputs, result.outputs
+    told = next(o for o in outputs if any(event.id == "touchdown" for event in o.events))
+    status = inputs[told.tick].status
+    assert status is not None and status.landed is not LandedState.ON_GROUND, "before PX4 would say so"
+    assert status.mode is FlightMode.OFFBOARD
+    assert outputs[-1].action is SafetyAction.NOMINAL
 
 
 def test_a_floor_that_reads_too_high_is_found_by_thrust_and_px4() -> None:
@@ -169,7 +168,7 @@ def test_nobody_takes_thrust_back_from_what_sinks() -> None:
     from companion.safety.touchdown import Touchdown
 
     detector, z, reliefs = Touchdown.begin(0.3), 0.5, []
-    vehicle = ordinary()[1].inputs[1000].vehicle
+    vehicle = healthy().vehicle
     assert isinstance(vehicle, VehicleState)
     frozen = replace(vehicle, position_world_m=(0.0, 0.0, 0.4), velocity_world_m_s=(0.0, 0.0, 0.0))
     sink_m_s = 0.0
@@ -196,7 +195,7 @@ def test_hanging_on_the_tether_is_no_touchdown() -> None:
     from companion.safety.touchdown import Touchdown
 
     detector = Touchdown.begin(0.3)
-    vehicle = ordinary()[1].inputs[1000].vehicle
+    vehicle = healthy().vehicle
     assert isinstance(vehicle, VehicleState)
     hangs = replace(vehicle, position_world_m=(0.0, 0.0, 1.2), velocity_world_m_s=(0.0, 0.0, 0.0))
     for k in range(1000):
@@ -212,13 +211,3 @@ def test_hanging_on_the_tether_is_no_touchdown() -> None:
         detector = detector.update(t_s, hangs, pose, 0.0, 0.1, landed=True)
         assert not detector.certain
         assert detector.relief == 1.0
-
-
-def test_a_touchdown_in_order_is_reported_before_px4_would_say_so() -> None:
-    _, result = ordinary()
-    inputs, outputs = result.inputs, result.outputs
-    told = next(o for o in outputs if any(event.id == "touchdown" for event in o.events))
-    assert inputs[told.tick].status is not None
-    assert inputs[told.tick].status.landed is not LandedState.ON_GROUND  # type: ignore[union-attr]
-    assert inputs[told.tick].status.mode is FlightMode.OFFBOARD  # type: ignore[union-attr]
-    assert outputs[-1].action is SafetyAction.NOMINAL

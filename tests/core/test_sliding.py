@@ -51,10 +51,10 @@ def short_slide(friction: float) -> list[str]:
     ]
 
 
-def slide(friction: float, *more: str) -> tuple[FastFlight, FastResult]:
+def slide(friction: float, *more: str, until_s: float = 90.0) -> tuple[FastFlight, FastResult]:
     """Fly a short slide in the ideal world."""
     flight = FastFlight(load_sitl(SLIDE, world="ideal", overrides=[*short_slide(friction), *more]))
-    return flight, flight.run(90.0)
+    return flight, flight.run(until_s)
 
 
 @pytest.fixture(scope="module")
@@ -83,8 +83,6 @@ def test_the_tip_follows_its_path_while_the_force_is_held(slid: tuple[FastFlight
     corrected_n = np.asarray(corrected.get_ydata())
     assert corrected_n[sliding].mean() == pytest.approx(summary["mean_n"])
     assert np.isnan(corrected_n[: np.flatnonzero(sliding)[0]]).all()  # before the slide there is only the sensor's
-    core = FlightCore(flight.config.flight)
-    assert all(core.step(i) == o for i, o in zip(result.inputs, result.outputs, strict=True))
 
 
 def test_values_that_are_not_finite_neither_steer_nor_press_and_a_wrong_force_is_still_found(
@@ -102,6 +100,7 @@ def test_values_that_are_not_finite_neither_steer_nor_press_and_a_wrong_force_is
             name, broken = BROKEN[k - first]
             i = replace(i, **{name: replace(getattr(i, name), **broken)})
         o = core.step(i)
+        assert o == result.outputs[k] or k >= first, "replay"
         seen += [event.id for event in o.events]
         a, b = o.contact, result.outputs[k].contact
         if first <= k < first + 200:
@@ -136,9 +135,10 @@ def test_a_tether_that_jams_in_a_slide_is_noticed_before_the_tip_has_lost_the_wa
 
 
 def test_a_tool_that_is_caught_leads_away_from_the_wall() -> None:
-    _, result = slide(2.0)
+    _, result = slide(2.0, until_s=20.0)
     assert "contact_stuck" in [e.id for o in result.outputs for e in o.events]
-    assert result.outputs[-1].outcome is Outcome.ABORTED and not result.crashed
+    assert not result.crashed and result.layout is not None
+    assert result.layout.contact(result.snapshots[-1].sensors)[1] == (0.0, 0.0, 0.0)
 
 
 def test_a_wrong_reading_of_the_force_turns_the_setpoint_by_a_bounded_angle() -> None:
@@ -177,17 +177,13 @@ def test_a_turning_joint_overcomes_the_friction_of_its_gear_and_a_resting_one_ge
     assert torque_nm((5.0, 5.0)) == pytest.approx((-1.0 + loss_nm[0], 0.5 + loss_nm[1]))
 
 
-def test_a_tip_beside_its_path_is_steered_back_and_the_turn_ends_with_the_slide() -> None:
-    _, result = slide(0.5, "world.wind_m_s=[0.0,1.5,0.0]")
+def test_in_side_wind_and_with_a_sensor_that_reads_30_percent_too_little_force_and_path_are_kept() -> None:
+    _, result = slide(0.5, "world.wind_m_s=[0.0,1.5,0.0]", "world.force_scale=0.7")
     pairs = [(o.contact, o.reference) for o in result.outputs if o.contact is not None and o.reference is not None]
     turns = [reference.steer_rad or 0.0 for contact, reference in pairs if contact.mode is ContactMode.SLIDE]
     assert 0.01 < max(map(abs, turns)) <= STEER_MAX_RAD
     assert result.outputs[-1].outcome is Outcome.COMPLETED and abs(pairs[-1][1].steer_rad or 0.0) < 1e-3
-
-
-def test_a_slide_believes_the_motion_of_the_vehicle_within_a_bound_and_a_lost_surface_at_once() -> None:
-    _, result = slide(0.5, "world.force_scale=0.7")
-    assert result.outputs[-1].outcome is Outcome.COMPLETED and result.layout is not None
+    assert result.layout is not None
     sliding = [o.contact for o in result.outputs if o.contact is not None and o.contact.mode is ContactMode.SLIDE]
     assert all(abs(contact.unseen_n) <= UNSEEN_MAX_N for contact in sliding)
     assert sliding[-1].unseen_n > 0.6  # 30 % of 3 N, believed by nine tenths

@@ -44,12 +44,9 @@ def error_after_catch_m(result: FastResult) -> float:
     return math.sqrt(sum(squares) / len(squares))
 
 
-@pytest.mark.parametrize(
-    ("preset", "payload_kg", "limit_m"),
-    [("recommended", 0.3, 0.03), ("paper", 0.3, 0.42)],
-)
-def test_the_payload_is_caught_and_carried_home(preset: str, payload_kg: float, limit_m: float) -> None:
-    result = flown(payload_kg, preset)
+@pytest.mark.parametrize(("preset", "limit_m"), [("recommended", 0.03), ("paper", 0.42)])
+def test_the_payload_is_caught_where_the_paper_has_it_and_carried_home(preset: str, limit_m: float) -> None:
+    result = flown(0.3, preset)
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     assert result.caught
     assert event_ids(result) == ["takeoff", "catch", "touchdown"]
@@ -57,29 +54,26 @@ def test_the_payload_is_caught_and_carried_home(preset: str, payload_kg: float, 
     x, y, _ = result.truth[-1].position_world_m
     assert math.hypot(x + 1.0, y) < 0.1, "it did not come home"
     assert max(tilt_rad(truth.attitude_wxyz) for truth in result.truth) < math.radians(15)
+    begun = next(o.t_s - o.mission_t_s for o in result.outputs if o.mission_t_s > 0)
+    catch = next(e for o in result.outputs for e in o.events if e.id == "catch")
+    assert catch.t_s - begun == pytest.approx(6.5, abs=0.15)
+    at = min(result.truth, key=lambda truth: abs(truth.t_s - catch.t_s))
+    assert at.position_world_m[0] == pytest.approx(0.0, abs=0.1 if preset == "recommended" else 0.5)
+    if preset == "recommended":
+        assert_loads_stand_still_on_the_ground(result)
 
 
-def test_adaptive_loads_do_not_wind_up_while_the_ground_carries_the_vehicle() -> None:
-    result = flown(0.3, "recommended")
+def assert_loads_stand_still_on_the_ground(result: FastResult) -> None:
+    """The adaptive loads do not wind up while the ground carries the vehicle."""
     low_m = configured().vehicle.airframe.ground_clearance_m + AIRBORNE_M
     low = [
         outputs.control.load_estimate_n
         for inputs, outputs in zip(result.inputs, result.outputs, strict=True)
         if outputs.control and inputs.vehicle and inputs.vehicle.position_world_m[2] <= low_m
     ]
-    before_lift, landed = low[0], low[-1]
-    assert before_lift == (0.0, 0.0, 0.0) != landed
+    assert low[0] == (0.0, 0.0, 0.0) != low[-1]
     assert len(low) > 100
-    assert set(low) == {before_lift, landed}
-
-
-def test_the_catch_is_where_and_when_the_paper_has_it() -> None:
-    result = flown(0.3, "recommended")
-    begun = next(o.t_s - o.mission_t_s for o in result.outputs if o.mission_t_s > 0)
-    catch = next(e for o in result.outputs for e in o.events if e.id == "catch")
-    assert catch.t_s - begun == pytest.approx(6.5, abs=0.15)
-    at = min(result.truth, key=lambda truth: abs(truth.t_s - catch.t_s))
-    assert at.position_world_m[0] == pytest.approx(0.0, abs=0.1)
+    assert set(low) == {low[0], low[-1]}
 
 
 def test_the_same_seed_flies_the_same_flight_bit_for_bit() -> None:
@@ -97,8 +91,7 @@ def test_nothing_thrown_is_no_catch() -> None:
 FOLDED_DEG = (165.0, 140.0)
 
 
-@pytest.mark.parametrize("at_s", [2.0, 4.2])
-@pytest.mark.parametrize("kind", ["mocap_loss", "servo_loss", "link_loss"])
+@pytest.mark.parametrize(("kind", "at_s"), [("mocap_loss", 4.2), ("servo_loss", 4.2), ("link_loss", 2.0)])
 def test_a_lost_device_lands_it(kind: str, at_s: float) -> None:
     """In take-off and after the catch; `at_s` is the time since arming. At other times: tests/sitl/test_faults.py."""
     result = FastFlight(short(f"world.faults=[{{kind: {kind}, t_s: {at_s}}}]")).run()
@@ -130,7 +123,7 @@ def test_without_force_sensor_the_mission_goes_on() -> None:
 
 @pytest.mark.parametrize(
     "axes",
-    [(1, 2, -3), (-1, -2, 3), (-1, 2, -3), (1, -2, -3), (3, 2, 1)],
+    [(1, 2, -3), (-1, -2, 3), (3, 2, 1)],
     ids=lambda axes: "".join(map("{:+}".format, axes)),
 )
 def test_a_force_sensor_with_wrong_axes_is_reported_at_the_catch_and_not_used(axes: tuple[int, ...]) -> None:
@@ -144,7 +137,7 @@ def test_a_force_sensor_with_wrong_axes_is_reported_at_the_catch_and_not_used(ax
         return (x, y, z), torque_nm
 
     flight.plant.force_torque = turned  # type: ignore[method-assign]
-    result = flight.run(until_mission_s=9.0)
+    result = flight.run(until_mission_s=8.0)
     assert result.caught
     assert event_ids(result) == ["takeoff", "force_disagrees"]
     last = result.outputs[-1].control
@@ -160,9 +153,9 @@ def test_a_delay_that_makes_the_control_law_swing_is_reported_and_px4_lands() ->
     assert max(tilt_rad(t.attitude_wxyz) for t in result.truth) < math.radians(25)
 
 
-@pytest.mark.parametrize("at_s", [0.5, 2.2, 3.8, 5.0, 8.0])
+@pytest.mark.parametrize("at_s", [0.5, 3.8, 8.0])
 def test_asked_to_land_it_lands(at_s: float) -> None:
-    """Before arming, on the ground with rotors turning, in take-off, in flight, in the landing."""
+    """Before arming, in take-off, in the landing."""
     result = FastFlight(short(), land_at_s=at_s).run()
     assert result.outputs[-1].outcome is Outcome.ABORTED
     assert not result.crashed

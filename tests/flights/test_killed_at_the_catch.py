@@ -53,13 +53,12 @@ def test_a_catch_that_the_flight_could_not_confirm_is_in_the_summary(fault: str)
     )
 
 
-@pytest.mark.parametrize("after_s", [0.05, 0.3, 0.8, 1.2])
+@pytest.mark.parametrize("after_s", [0.8, 1.2])
 def test_a_catch_is_confirmed_by_its_event_alone(after_s: float) -> None:
     summary, ids = summary_of(f"{{kind: kill_flight, after: catch, t_s: {after_s}}}")
     assert summary["catch_confirmed"] is ("catch" in ids) is (after_s > CONFIRMED_S)
 
 
-@pytest.mark.parametrize("t_s", [2.0, 3.4])
-def test_before_the_catch_nothing_was_felt(t_s: float) -> None:
-    summary, _ = summary_of(f"{{kind: kill_flight, t_s: {t_s}}}")
+def test_before_the_catch_nothing_was_felt() -> None:
+    summary, _ = summary_of("{kind: kill_flight, t_s: 3.4}")
     assert (summary["catch_t_s"], summary["catch_confirmed"]) == (None, None)

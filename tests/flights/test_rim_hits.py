@@ -20,9 +20,8 @@ UNTIL_S = 9.0
 """Mission time, 2.5 s after the expected catch."""
 
 
-@pytest.mark.parametrize("laboratory", [2002, 2037])
-def test_a_ball_that_fell_off_the_rim_is_not_reported_as_caught(laboratory: int) -> None:
-    flight = FastFlight(load_sitl(CATCH, overrides=[f"world.seed={laboratory}"], world="lab"))
+def test_a_ball_that_fell_off_the_rim_is_not_reported_as_caught() -> None:
+    flight = FastFlight(load_sitl(CATCH, overrides=["world.seed=2002"], world="lab"))
     result = flight.run(until_mission_s=UNTIL_S)
     payload = flight.plant.scene.payload
     assert payload.missed and not result.caught

