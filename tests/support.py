@@ -512,7 +512,7 @@ def wait_until(condition: Callable[[], bool], why: Callable[[], str], within_s: 
         time.sleep(0.05)
 
 
-async def eventually(condition: Callable[[], bool], what: str, within_s: float = 30.0) -> None:
+async def eventually(condition: Callable[[], bool], what: str, within_s: float = DEADLINE_S) -> None:
     """Let the event loop run until the condition holds, which other threads or the loop's tasks bring about."""
     deadline_s = time.monotonic() + within_s
     while not condition():

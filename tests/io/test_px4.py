@@ -521,10 +521,12 @@ async def test_streams_without_a_reader_are_stopped(forwarding: bool, armed: boo
     with Px4Peer(port) as peer:
         peer.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
         device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
+        unread = (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ODOMETRY)
         async with MavsdkAutopilot(device, flight_clock(), forwarding=forwarding):
-            pass
-        for unread in (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ODOMETRY):
-            assert peer.asked_interval_us.get(unread) == interval_us
+            if not armed:
+                await eventually(lambda: all(stream in peer.asked_interval_us for stream in unread), "streams stopped")
+        peer.packets_so_far()
+        assert [peer.asked_interval_us.get(stream) for stream in unread] == [interval_us, interval_us]
         assert peer.asked_interval_us[mavlink.MAVLINK_MSG_ID_HIGHRES_IMU] > 0.0
 
 
