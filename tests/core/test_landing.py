@@ -99,8 +99,8 @@ def test_with_all_sources_it_touches_down() -> None:
     assert_landed(flight, result, Outcome.COMPLETED)
     assert rotors_stopped_at_m(result) < STANDS_M + 0.02
     inputs, outputs = result.inputs, result.outputs
-    told = next(o for o in outputs if any(event.id == "touchdown" for event in o.events))
-    status = inputs[told.tick].status
+    landed = next(o for o in outputs if any(event.id == "touchdown" for event in o.events))
+    status = inputs[landed.tick].status
     assert status is not None and status.landed is not LandedState.ON_GROUND, "before PX4 would say so"
     assert status.mode is FlightMode.OFFBOARD
     assert outputs[-1].action is SafetyAction.NOMINAL

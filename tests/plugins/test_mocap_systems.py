@@ -8,6 +8,7 @@ import re
 import socket
 import struct
 import threading
+import time
 import tomllib
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
@@ -25,14 +26,16 @@ from companion.config.document import ConfigError
 from companion.config.loader import load_flight, load_vehicle, logged_flight
 from companion.guardian import process
 from companion.guardian.mocap import GuardianMocap
+from companion.io.mocap.contained import ContainedClient
 from companion.io.mocap.driver import MocapDriver, settings_of
+from companion.io.mocap.optitrack import OptiTrack
 from companion.io.protocols import DeviceError
 from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.model.frames import quat_rotate
 from companion.model.types import MocapPose
 from companion.plugins import MOCAP_SYSTEMS
 from companion.runtime import event_loop
-from companion.runtime.clock import flight_clock
+from companion.runtime.clock import flight_clock, monotonic
 from companion.testing import check_mocap
 from tests.guardian.rig import Cameras
 from tests.plugins.installed import on_path, write_distribution
@@ -229,6 +232,31 @@ def test_natnet_keeps_the_contract() -> None:
     with Cameras(1) as cameras:
         here = {"server": "127.0.0.1", "interface": "127.0.0.1", "transport": "unicast", "command_port": cameras.port}
         check_mocap(MocapDevice.model_validate(here | {"rigid_body_id": 1}), duration_s=0.3)
+
+
+def test_a_wait_for_a_core_before_the_read_makes_no_frame_older() -> None:
+    """Frames that arrived during the wait looked older than the read before it, and the server's clock was believed behind."""
+
+    class Interrupted(OptiTrack):
+        read_s = 0.0
+
+        def poses(self, now_s: float) -> list[MocapPose]:
+            time.sleep(0.03)
+            self.read_s = monotonic()
+            return super().poses(now_s)
+
+    stamps: list[bool] = []
+    with Cameras(1) as cameras:
+        here = {"server": "127.0.0.1", "interface": "127.0.0.1", "transport": "unicast", "command_port": cameras.port}
+        settings = settings_of(MocapDevice.model_validate(here | {"rigid_body_id": 1}))
+        camera = Interrupted(settings)
+        client = ContainedClient(camera, settings, monotonic)
+        while len(stamps) < 20:
+            client.keep_connected()
+            before_s = camera.read_s
+            stamps += [pose.stamp_s >= before_s for pose in client.poses()]
+        client.close()
+    assert sum(stamps) > len(stamps) / 2
 
 
 def test_frame_numbers_that_do_not_increase_break_the_contract() -> None:

@@ -36,6 +36,7 @@ class ContainedClient:
         self.extended = client if isinstance(client, ExtendedClient) else ExtendedClient()
         self.where = self.extended.where or f"mocap {settings.type} {settings.server}"
         """Beginning of a text on this client."""
+        self.extended.clock = clock
         self._rejected = 0
         self.problem: str | None = None
         """The newest problem: an exception, or why a pose or datagram was rejected; None if there was none."""
@@ -65,7 +66,7 @@ class ContainedClient:
             self._client.close()
 
     def _receive(self, now_s: float) -> list[MocapPose]:
-        poses, rejected = valid_poses(self._client.poses(now_s), now_s)
+        poses, rejected = valid_poses(self._client.poses(now_s), self._clock())
         self.problem = str(self._client.problem or "") or self.problem
         if rejected:
             self._rejected += len(rejected)

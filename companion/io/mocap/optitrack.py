@@ -116,14 +116,14 @@ class OptiTrack(ExtendedClient):
 
     def poses(self, now_s: float) -> list[MocapPose]:
         """Return the body's poses that have arrived, in order, stamped with their arrival."""
-        found = []
+        found, clock = [], self.clock or (lambda: now_s)
         for opened in self.sockets:
             for data, ancillary, sender_ip in sockets.waiting(opened):
                 if sender_ip != self.server_ip:
                     self._foreign += 1
                     self._foreign_ip = sender_ip
                     continue
-                stamp_s = arrived_s(ancillary, lambda: now_s)
+                stamp_s = arrived_s(ancillary, clock)
                 frame = self.protocol.receive(data, stamp_s)
                 if frame is not None:
                     self.take(frame, data, stamp_s)

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Final, NamedTuple, Protocol
 import msgspec
 
 from companion.model.types import IDENTITY_QUAT, MocapPose
+from companion.runtime.clock import Clock
 
 _AGE_MAX_S: Final = 1.0
 _AHEAD_MAX_S: Final = 0.001
@@ -94,6 +95,10 @@ class ExtendedClient:
 
     sockets: Sequence[socket.socket] = ()
     """Sockets that stay open from the constructor to `close`: `poses` is called as soon as one of them is readable, and reads all."""
+    clock: Clock | None = None
+    """Clock of `now_s`, set before the first call of `poses`. What arrives during a call is stamped by it: `now_s` is older by the time
+    that the process has waited for a core since.
+    """
     where = ""
     """Beginning of a text on this client, such as "mocap 10.0.0.5:1510"; empty for the type and `MocapSettings.server`."""
 
