@@ -257,7 +257,9 @@ def test_a_broker_that_does_not_let_the_vehicle_speak_is_reported(tmp_path: Path
             text = "does not let this vehicle publish its state: Not authorized"
             flight.wait(lambda: any(text in line for line in log_lines(flight.path)), "the log has no line of it")
             text = "does not let this vehicle publish its"
-            flight.wait(lambda: text in (flight.recorder.client.telemetry_status or ""), "the flight has no notice of it")
+            flight.wait(
+                lambda: text in (flight.recorder.client.telemetry_status or ""), "the flight has no notice of it"
+            )
     finally:
         broker.stop()
 
