@@ -17,6 +17,7 @@ from typing import Final
 
 from companion.model.codec import Record
 from companion.model.estimator import EstimatorReport
+from companion.model.markers import MarkerFrame
 from companion.model.verdict import Verdict
 
 Vec2 = tuple[float, float]
@@ -270,6 +271,8 @@ class Inputs(Record, frozen=True, kw_only=True):
     """Whether the guardian has reported within the last second that it can take over; None without a guardian (fast loop)."""
     estimator: EstimatorReport | None = None
     """Newest ESTIMATOR_STATUS, if another program feeds PX4 with poses (`devices.mocap.type: external`); else None."""
+    markers: MarkerFrame | None = None
+    """Single markers of the newest motion-capture frame, if the mission uses them (`devices.mocap.ball`); else None."""
 
 
 class ContactMode(Enum):
