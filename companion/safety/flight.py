@@ -46,6 +46,8 @@ class FlightTracker:
         self.oscillation = Oscillation(self.oscillation_m)
         self._inputs: Inputs | None = None
         self.vehicle: VehicleState | None = None
+        self.located = True
+        """Whether PX4's position means anything; without poses its estimate drifts by metres."""
         self.tilt_rad = 0.0
         """PX4's tilt; 0 while it is below `safety.tilt_abort_deg` and `FLIPPED_TILT_RAD`."""
         self.tracking_error_m: float | None = None
@@ -56,9 +58,12 @@ class FlightTracker:
         self.saturated_s = 0.0
         """Counter that rises while the vertical force is limited and falls otherwise, because noise makes the limit flicker."""
 
-    def update(self, i: Inputs, context: FlightContext, dt_s: float) -> None:
-        """Update with the inputs of one tick in the air; `i` holds only trusted inputs."""
-        self._inputs, vehicle = i, i.vehicle
+    def update(self, i: Inputs, context: FlightContext, dt_s: float, located: bool = True) -> None:
+        """Update with the inputs of one tick in the air; `i` holds only trusted inputs.
+
+        If the vehicle is not `located`, no rule about its place or its tether holds.
+        """
+        self._inputs, vehicle, self.located = i, i.vehicle, located
         self.vehicle = vehicle
         self.tilt_rad = 0.0
         if vehicle is not None:
@@ -66,7 +71,7 @@ class FlightTracker:
             if x * x + y * y > self._upright_max:
                 self.tilt_rad = tilt_rad(vehicle.attitude_wxyz)
         self.tracking_error_m = context.tracking_error_m
-        self.tether = context.tether
+        self.tether = context.tether if located else None
         self.contact_n = context.contact_n
         control = context.control
         self._count_saturation(control, dt_s)
@@ -139,7 +144,7 @@ def sinks_too_fast(f: FlightTracker, sink_max_m_s: float) -> Values | None:
 
 def geofence_left(f: FlightTracker, _: None) -> Values | None:
     """Fires if the rotors are outside the room by more than the tolerance."""
-    if f.vehicle is None:
+    if f.vehicle is None or not f.located:
         return None
     x, y, z = f.vehicle.position_world_m
     return None if f.rotors_in_room(x, y, z) else (x, y, z)
@@ -147,7 +152,7 @@ def geofence_left(f: FlightTracker, _: None) -> Values | None:
 
 def geofence_near(f: FlightTracker, _: None) -> Values | None:
     """Fires if at the predicted stop after a fault the rotors would be outside the room by more than the tolerance."""
-    if f.vehicle is None:
+    if f.vehicle is None or not f.located:
         return None
     x, y, z = f.vehicle.position_world_m
     vx, vy, vz = f.vehicle.velocity_world_m_s

@@ -25,6 +25,8 @@ from companion.safety.vision import VisionTracker
 
 AWAKE_STEP_MAX_S: Final = 0.02
 """Largest time that one tick adds to the age of inputs."""
+LOCATED_S: Final = 1.0
+"""Time without a trusted pose after which PX4's position means nothing: rules about the vehicle's place hold no longer."""
 MOVING_M_S: Final = 0.03
 MOVING_RAD_S: Final = 0.05
 """Motion that exceeds the noise of a vehicle at rest, so that its measurements must change."""
@@ -66,7 +68,7 @@ class Monitors:
         if vehicle.tether is not None:
             trackers[Subject.TETHER] = self._flight
         self._evaluation = Evaluation(vehicle, trackers)
-        self._awake_s = 0.0
+        self._awake_s = self._located_awake_s = 0.0
         self._last_t_s: float | None = None
         self._airborne = False
         self.trusted: Inputs | None = None
@@ -128,8 +130,10 @@ class Monitors:
             self._force.update(i, context, awake_s, gap_s, moving)
             if not self._mocap.trusted or self._mocap.too_late:
                 i = msgspec.structs.replace(i, mocap=self._mocap.last_trusted)
+            if self._vision is not None or self._mocap.last_trusted is not None:
+                self._located_awake_s = awake_s
             if airborne:
-                self._flight.update(i, context, gap_s)
+                self._flight.update(i, context, gap_s, located=awake_s - self._located_awake_s < LOCATED_S)
             if not self._force.trusted:
                 i = msgspec.structs.replace(i, force=None)
         self.trusted = i
