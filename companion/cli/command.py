@@ -1,4 +1,4 @@
-"""`companion command hold|land|abort|resume|start`: send one signed command to one vehicle and print its answer."""
+"""`companion command NAME`: send one signed command to one vehicle and print its answer."""
 
 from __future__ import annotations
 
@@ -16,28 +16,22 @@ from companion.ground.station.command_sender import FALLBACK_ADVICE, Failed, Sen
 from companion.ground.station.link import BrokerRefused
 from companion.ground.station.station import Station
 from companion.ground.station.vehicles import LIVE_S
+from companion.model.commands import COMMANDS, SAFER_COMMANDS, TABLE
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
-from companion.model.types import COMMANDS, SAFER_COMMANDS, OperatorCommand
+from companion.model.types import OperatorCommand
 from companion.runtime.console import print_error
 from companion.runtime.tasks import until_first
 
 FOUND_S = 5.0
 """Timeout for connecting to the broker and for the vehicle's first message."""
-_HELP = {
-    OperatorCommand.HOLD: "stop and hold position",
-    OperatorCommand.LAND: "land",
-    OperatorCommand.ABORT: "abort the mission and land immediately",
-    OperatorCommand.RESUME: "continue after a hold, if the supervisor allows it",
-    OperatorCommand.START: "take off; for flights that wait for START",
-}
 
 
 def add_parser(commands: Any) -> None:
     command = commands.add_parser(
         "command",
-        help="command a vehicle from the ground: hold, land, abort, resume, start",
+        help="command a vehicle from the ground: " + ", ".join(COMMANDS),
         description="Send one signed command and wait for the vehicle's answer. Exit code 0: done, 3: refused, 5: no answer. "
-        + "; ".join(f"{name.value}: {text}" for name, text in _HELP.items())
+        + "; ".join(f"{row.command.value}: {row.what}" for row in TABLE)
         + ".",
     )
     command.add_argument("name", choices=list(COMMANDS), metavar="NAME", help="see above")

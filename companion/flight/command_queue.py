@@ -9,10 +9,9 @@ import socket
 from collections.abc import Callable, Coroutine, Iterable, Iterator
 from typing import Any, NamedTuple, TypeVar
 
+from companion.model.commands import COMMANDS, SAFER_COMMANDS
 from companion.model.launcher_messages import Land
 from companion.model.types import (
-    COMMANDS,
-    SAFER_COMMANDS,
     GroundCommand,
     OperatorCommand,
     Outputs,

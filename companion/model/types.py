@@ -13,7 +13,6 @@ Conventions:
 from __future__ import annotations
 
 from enum import Enum
-from typing import Final
 
 from companion.model.codec import Record
 from companion.model.estimator import EstimatorReport
@@ -122,7 +121,7 @@ class PhaseKind(Enum):
 
 
 class OperatorCommand(Enum):
-    """A command from the ground."""
+    """A command from the ground; `companion.model.commands` has the table of them."""
 
     NONE = "none"
     HOLD = "hold"
@@ -130,21 +129,6 @@ class OperatorCommand(Enum):
     START = "start"  # take off; only for a flight that waits for its start
     LAND = "land"
     ABORT = "abort"  # fold the arm and land now; the outcome is ABORTED
-
-
-COMMANDS: Final = {
-    command.value: command
-    for command in (
-        OperatorCommand.ABORT,
-        OperatorCommand.LAND,
-        OperatorCommand.HOLD,
-        OperatorCommand.RESUME,
-        OperatorCommand.START,
-    )
-}
-"""Each command by its name, gravest first."""
-SAFER_COMMANDS: Final = frozenset({OperatorCommand.ABORT, OperatorCommand.LAND, OperatorCommand.HOLD})
-"""Commands that every operator may give, and that overtake all others."""
 
 
 class GroundCommand(Record, frozen=True, kw_only=True):

@@ -24,9 +24,9 @@ from typing import Any
 
 from companion.io.protocols import DeviceError
 from companion.model.codec import to_packet
+from companion.model.commands import COMMANDS
 from companion.model.packets import Close, CommandAnswer, LogLine, Metadata, Packet, Tick
 from companion.model.types import (
-    COMMANDS,
     GroundCommand,
     Inputs,
     OperatorCommand,

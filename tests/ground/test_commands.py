@@ -14,7 +14,6 @@ from msgspec.structs import replace
 from companion.ground.protocol.commands import (
     ACKS_PER_S,
     AHEAD_MAX_S,
-    LIMITS,
     REFUSED_MAX,
     Accepted,
     Reason,
@@ -28,10 +27,12 @@ from companion.ground.protocol.commands import (
 from companion.ground.protocol.flight_clock import FlightClock
 from companion.ground.protocol.keys import Operator, Operators, Permission, new_key
 from companion.ground.protocol.messages import COMMAND_MAX_BYTES, Command, encode
-from companion.model.types import COMMANDS, OperatorCommand
+from companion.model.commands import COMMANDS, TABLE
+from companion.model.types import OperatorCommand
 
 VEHICLE, SESSION, NOW_T_S = "tarot", "f3a9", 100.0
 ANNA, BERT, VIEWER = new_key(), new_key(), new_key()
+LIMITS = {row.command: row for row in TABLE}
 OPERATORS = Operators([Operator("anna", ANNA), Operator("bert", BERT, Permission.SAFER_COMMANDS)], "operators.yaml")
 SAFE = [OperatorCommand.HOLD, OperatorCommand.LAND, OperatorCommand.ABORT]
 OTHERS = [OperatorCommand.RESUME, OperatorCommand.START]

@@ -15,7 +15,8 @@ from companion.ground.protocol.messages import Presence
 from companion.ground.protocol.proof import Signer
 from companion.ground.station.command_sender import ATTEMPTS, NO_ANSWER, signer_of
 from companion.ground.station.vehicles import LIVE_S
-from companion.model.types import COMMANDS, OperatorCommand
+from companion.model.commands import COMMANDS
+from companion.model.types import OperatorCommand
 from tests.broker import Broker, loopback_broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, on_page, played, token_of, viewer_of
 from tests.ground.vehicle import PlayedVehicle, played_vehicle

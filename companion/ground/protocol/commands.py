@@ -20,7 +20,7 @@ import secrets
 from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 from msgspec.structs import replace
 
@@ -29,7 +29,8 @@ from companion.ground.protocol.keys import OPERATOR_NAME, Operators
 from companion.ground.protocol.messages import COMMAND_MAX_BYTES, VERSION, Command
 from companion.ground.protocol.strict_json import StrictJsonError, parse
 from companion.model.codec import RecordError, from_jsonable
-from companion.model.types import SAFER_COMMANDS, OperatorCommand
+from companion.model.commands import SAFER_COMMANDS, TABLE, CommandRow
+from companion.model.types import OperatorCommand
 
 DOMAIN = "companion command 2"
 """First line of every signed text; it makes a signature for any other purpose invalid for commands."""
@@ -49,24 +50,6 @@ _SESSION = re.compile(r"[\x21-\x7e]{1,64}")
 _HOLD_MAX = 2**31
 _NONCE = re.compile(r"[0-9a-f]{32}")
 _MAC = re.compile(r"[0-9a-f]{64}")
-
-
-class Limits(NamedTuple):
-    """Age and rate limits of a command."""
-
-    age_max_s: float
-    per_s: int
-    """Maximum number of accepted commands per operator and second."""
-
-
-LIMITS = {
-    OperatorCommand.HOLD: Limits(5.0, 20),
-    OperatorCommand.LAND: Limits(5.0, 20),
-    OperatorCommand.ABORT: Limits(5.0, 20),
-    OperatorCommand.RESUME: Limits(2.0, 1),
-    OperatorCommand.START: Limits(2.0, 1),
-}
-"""Limits of each command name, kept separately: a flood of HOLDs does not block LAND."""
 
 
 class Reason(StrEnum):
@@ -188,7 +171,7 @@ def _field_problem(command: Command) -> str | None:
 class _History:
     """Bounded history of one operator's commands of one name."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: CommandRow) -> None:
         self.limits = limits
         self.accepted_t_s: deque[float] = deque(maxlen=limits.per_s)
         """Flight clock of the newest accepted commands."""
@@ -249,9 +232,7 @@ class Verifier:
         self._swept_t_s = float("-inf")
         self._stopped_t_s = float("-inf")
         """Newest time of an accepted HOLD, LAND or ABORT of any operator."""
-        self._histories = {
-            (name, command): _History(limits) for name in operators.names for command, limits in LIMITS.items()
-        }
+        self._histories = {(name, row.command): _History(row) for name in operators.names for row in TABLE}
         """One history per operator and command, so that a flood of one does not affect another."""
         self._answered_t_s: deque[float] = deque(maxlen=ACKS_PER_S)
 

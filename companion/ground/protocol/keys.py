@@ -32,7 +32,8 @@ from companion.config.base import Model, refuse
 from companion.config.document import ConfigError, problem_lines
 from companion.config.explain import validate
 from companion.config.yaml_strict import read_document
-from companion.model.types import SAFER_COMMANDS, OperatorCommand
+from companion.model.commands import SAFER_COMMANDS
+from companion.model.types import OperatorCommand
 from companion.runtime.files import write_whole
 
 OPERATOR_NAME = re.compile(r"[A-Za-z0-9_.-]{1,40}")

@@ -14,7 +14,8 @@ from companion.ground.protocol.messages import Ack, Topic, encode
 from companion.ground.protocol.proof import Signer
 from companion.ground.station.link import Link, LinkError
 from companion.ground.station.vehicles import Vehicle, VehicleTracker
-from companion.model.types import SAFER_COMMANDS, OperatorCommand
+from companion.model.commands import SAFER_COMMANDS
+from companion.model.types import OperatorCommand
 
 ANSWER_S = 1.5
 """Timeout for the vehicle's `Ack`."""

@@ -22,6 +22,7 @@ from companion.ground.station.command_sender import Failed, Sent, ack_text
 from companion.ground.station.station import Station
 from companion.ground.station.text_view import Notice, StationStatus, render, status_line
 from companion.ground.station.vehicles import ReceivedRecord, Vehicle
+from companion.model.commands import SAFER_COMMANDS, TABLE
 from companion.model.types import OperatorCommand
 from companion.runtime.console import terminal_console
 from companion.runtime.tasks import until_first
@@ -31,8 +32,7 @@ LINE_PERIOD_S = 1.0
 CONFIRM_S = 3.0
 """Time within which the key of a command that needs confirmation must be pressed again."""
 KEYS_MAX = 100
-IMMEDIATE_KEYS = {"h": OperatorCommand.HOLD, "l": OperatorCommand.LAND, "a": OperatorCommand.ABORT}
-CONFIRMED_KEYS = {"r": OperatorCommand.RESUME, "s": OperatorCommand.START}
+KEYS = {row.key: row.command for row in TABLE}
 
 
 async def watch_in_terminal(access: BrokerAccess, signer: Signer | str, only: str | None) -> None:
@@ -120,9 +120,9 @@ class _Screen:
             names = sorted(station.tracker.vehicles)
             if self._chosen in names:
                 self._chosen = names[(names.index(self._chosen) + 1) % len(names)]
-        if key in IMMEDIATE_KEYS:
-            return IMMEDIATE_KEYS[key]
-        command = CONFIRMED_KEYS.get(key)
+        command = KEYS.get(key)
+        if command in SAFER_COMMANDS:
+            return command
         unconfirmed, self._unconfirmed = self._unconfirmed, None
         if command is None:
             return None

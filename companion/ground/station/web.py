@@ -47,7 +47,8 @@ from companion.ground.station.web_guard import (
     origin_allowed,
     same_token,
 )
-from companion.model.types import COMMANDS, OperatorCommand
+from companion.model.commands import COMMANDS
+from companion.model.types import OperatorCommand
 from companion.runtime.tasks import until_first
 
 PAGE = Path(__file__).parent / "page"

@@ -7,8 +7,9 @@ const PRESS_MS = 800;
 const NO_ANSWER_MS = 2500; // the monitor reports a missing answer after 1.5 s
 const FRESH_MS = 8000; // a button shows its result for this long
 const LIVE_S = 1; // same limit as in the monitor
-const SAFE = new Set(["hold", "land", "abort"]);
-const KEYS = { H: "hold", L: "land", A: "abort" };
+const BUTTONS = [...byId("commands").querySelectorAll("[data-command]")];
+const SAFE = new Set(BUTTONS.filter((button) => button.dataset.press !== "long").map((button) => button.dataset.command));
+const KEYS = Object.fromEntries(BUTTONS.map((button) => [button.getAttribute("aria-keyshortcuts")?.replace("Shift+", ""), button.dataset.command]));
 const HELP = "use Ctrl-C in the flight's terminal, or the pilot's switch";
 
 /**
@@ -40,7 +41,7 @@ export class Commands {
     this._results = new Map(); // "vehicle command" -> {state, text, atMs, nonces, sent}
     this._pressedMs = new Map();
     this._buttons = new Map();
-    for (const button of byId("commands").querySelectorAll("[data-command]")) this._wire(button);
+    for (const button of BUTTONS) this._wire(button);
     addEventListener("keydown", (event) => this._key(event));
   }
 
@@ -48,7 +49,9 @@ export class Commands {
     const name = button.dataset.command;
     const hint = make("small", { className: "hint" });
     button.replaceChildren(make("span", { className: "label", text: button.textContent }), hint);
-    this._buttons.set(name, { button, hint, output: byId("answers").querySelector(`[data-for="${name}"]`) });
+    const output = make("output", { data: { for: name } });
+    byId("answers").append(output);
+    this._buttons.set(name, { button, hint, output });
     if (button.dataset.press === "long") new LongPress(button, this._now, () => this._target(), () => this.press(name));
     else button.addEventListener("click", () => this.press(name));
   }
