@@ -12,7 +12,7 @@ from companion import __version__
 from companion.analysis.log import FlightLog, LogError, writer
 from companion.model.codec import differences, fingerprint, from_packet, to_packet
 from companion.model.types import Inputs, Outputs, Sent
-from companion.plugins import CONTROL_LAWS, installed
+from companion.plugins import CONTROL_LAWS, KINDS, PHASES, installed
 
 OLDER_FINGERPRINTS = (
     "1e7b00d5cd62de28",  # versions up to 0.2.0: every arm has two joints
@@ -103,7 +103,7 @@ def check_replayable(log: FlightLog) -> str:
             f"{log.path}: the fields of its records differ from those of this version; it was written by "
             f"{writer(log.metadata)}; replay it with that version"
         )
-    _check_law(log)
+    _check_plugins(log)
     config_json = log.config_json
     if config_json is None:
         raise LogError(f"{log.path}: has no configuration (metadata record 'config'); it cannot be replayed")
@@ -120,17 +120,20 @@ def check_replayable(log: FlightLog) -> str:
     return config_json
 
 
-def _check_law(log: FlightLog) -> None:
+def _check_plugins(log: FlightLog) -> None:
+    """Check that the packages are installed that flew: the law's, and those of the types of phases of others."""
     flight = log.metadata.get("flight", {})
-    if "law_distribution" not in flight:  # an older log, of one of the companion's own laws
-        return
-    law, distribution, version = flight["law"], flight["law_distribution"], flight["law_version"]
-    plugin = installed(CONTROL_LAWS).get(law)
-    if plugin is None or (plugin.distribution, plugin.version) != (distribution, version):
-        found = "it is not installed" if plugin is None else f"{plugin.distribution} {plugin.version} is installed"
-        raise LogError(
-            f"{log.path}: was flown by control law '{law}' of {distribution} {version}, but {found}; install that version to replay it"
-        )
+    flew = [(PHASES, key.removeprefix("phase_"), value) for key, value in flight.items() if key.startswith("phase_")]
+    if "law_distribution" in flight:  # not in older logs, of one of the companion's own laws
+        flew.insert(0, (CONTROL_LAWS, flight["law"], f"{flight['law_distribution']} {flight['law_version']}"))
+    for group, name, package in flew:
+        plugin = installed(group).get(name)
+        here = None if plugin is None else f"{plugin.distribution} {plugin.version}"
+        if here != package:
+            found = "it is not installed" if here is None else f"{here} is installed"
+            raise LogError(
+                f"{log.path}: was flown by {KINDS[group]} '{name}' of {package}, but {found}; install that version to replay it"
+            )
 
 
 def flight_core(config_json: str) -> Core:

@@ -21,7 +21,6 @@ from pathlib import Path
 from companion import plugins
 from companion.config.device_plugins import BUILT_IN
 from companion.config.loader import FlightConfig
-from companion.config.vehicle import Vehicle
 from companion.core.flight_core import FlightCore
 from companion.core.verdict import sentence_of
 from companion.flight.command_queue import Operator, StartCancelled
@@ -329,16 +328,19 @@ def _claim_computer(config: FlightConfig) -> str:
     return str(claim_realtime(FLIGHT_PRIORITY, cpus=computer.cpus, lock_memory=computer.lock_memory))
 
 
-def _device_plugins(vehicle: Vehicle) -> dict[str, str]:
-    """Return name, distribution and version of each device that a plug-in provides, for the log."""
-    devices = vehicle.devices
+def plugins_of_others(config: FlightConfig) -> dict[str, str]:
+    """Return name, distribution and version of each device and each type of phase that another package provides, for the log."""
+    devices = config.vehicle.devices
     named = [
         (plugins.MOCAP_SYSTEMS, devices.mocap.type),
         (plugins.FORCE_SENSORS, devices.force and devices.force.type),
         (plugins.ARMS, devices.arm and devices.arm.type),
     ]
     found = [str(plugins.find(group, name)) for group, name in named if name and name not in BUILT_IN[group]]
-    return {"device_plugins": "; ".join(found)} if found else {}
+    types = sorted({phase.type for phase in config.mission.phases})
+    phases = [plugin for plugin in (plugins.find(plugins.PHASES, name) for name in types) if not plugin.own]
+    versions = {f"phase_{plugin.entry.name}": f"{plugin.distribution} {plugin.version}" for plugin in phases}
+    return ({"device_plugins": "; ".join(found)} if found else {}) | versions
 
 
 async def fly(
@@ -393,7 +395,7 @@ async def fly(
                     "preset": config.controller.preset,
                     "simulated": str(sitl).lower(),
                     "clock": "real" if simulated_time.current() is None else "simulated",
-                    **_device_plugins(config.vehicle),
+                    **plugins_of_others(config),
                 },
                 simulated=sitl,
             )

@@ -53,6 +53,11 @@ class Plugin:
     def __str__(self) -> str:
         return f"{KINDS[self.entry.group]} '{self.entry.name}' ({self.distribution} {self.version})"
 
+    @property
+    def own(self) -> bool:
+        """Whether the companion itself provides it."""
+        return self.distribution == DISTRIBUTION
+
     def load(self) -> Any:
         """Import the module and return the announced object.
 

@@ -109,10 +109,10 @@ def test_one_that_cannot_be_used_is_refused_by_name_and_does_not_disturb_the_oth
 AN_INPUT = Inputs(tick=0, t_s=0.0, recorder_dropped=0, command=OperatorCommand.NONE)
 
 
-def log_by(distribution: str, version: str) -> FlightLog:
-    """The head of a log that the law `lift` flew."""
+def log_by(distribution: str, version: str, **phases: str) -> FlightLog:
+    """The head of a log that the law `lift` flew, with phases of others."""
     about = {"version_companion": __version__, "records": fingerprint(Inputs, Outputs, Sent)}
-    flight = {"law": "lift", "law_distribution": distribution, "law_version": version}
+    flight = {"law": "lift", "law_distribution": distribution, "law_version": version, **phases}
     return FlightLog(
         path=Path("flight.mcap"),
         inputs=(),
@@ -130,6 +130,12 @@ def test_a_log_is_not_replayed_by_another_version_of_the_law(other: tuple[str, s
         check_replayable(log_by(*other))
     with pytest.raises(LogError, match="has no configuration"):
         check_replayable(log_by("lab-a", "1.0"))
+
+
+@pytest.mark.usefixtures("site")
+def test_a_log_is_not_replayed_without_the_phase_that_flew() -> None:
+    with pytest.raises(LogError, match=r"was flown by phase 'weigh' of lab-weigh 0\.2, but it is not installed"):
+        check_replayable(log_by("lab-a", "1.0", phase_weigh="lab-weigh 0.2"))
 
 
 def test_a_log_is_neither_replayed_nor_shown_without_its_law(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

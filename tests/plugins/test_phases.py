@@ -12,6 +12,7 @@ from companion.cli.main import main
 from companion.config.document import ConfigError
 from companion.config.loader import load_flight
 from companion.config.phase import PhaseSettings, phase_classes
+from companion.flight.main import plugins_of_others
 from companion.mission.check import check_mission
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.plugins import PHASES
@@ -58,6 +59,8 @@ def test_a_phase_of_another_package_keeps_the_contract_and_weighs_the_payload(si
     events = check_flight(MISSION, "world.payload_kg=0.25")
     (text,) = [event.text for event in events if event.id == "weighed"]
     assert float(text.split()[-2]) == pytest.approx(0.25, abs=0.015)
+    assert plugins_of_others(load_flight(MISSION)) == {"phase_weigh": "lab-weigh 0.1.0"}, "in the log, for the replay"
+    assert plugins_of_others(load_flight("catch")) == {}
 
 
 def test_its_checks_are_part_of_those_before_take_off(site: Path) -> None:
