@@ -15,6 +15,7 @@ from companion.config.vehicle import OBSERVER
 from companion.control.types import Tuning
 from companion.control.vehicle_control import Command, VehicleControl
 from companion.core.flight_state import Request, Tare
+from companion.core.phase_tick import failed
 from companion.core.sequence import missing_inputs
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters, event_of
@@ -90,6 +91,7 @@ class FlightCore:
         self._pose_s = -math.inf
         """Time at which PX4 last used a trusted pose, s."""
         self._reference: Reference | None = None
+        self._phase_error: str | None = None
         """The last reference that the controller followed, constrained by the governor."""
         self._limited_by: tuple[str, ...] = ()
         self._log: ControlLog | None = None
@@ -208,6 +210,7 @@ class FlightCore:
             if self._log is None
             else (self._log.error[0], self._log.error[1], self._log.error[2]),
             yaw_error_rad=0.0 if self._log is None else self._log.error[5],
+            phase_error=self._phase_error,
         )
 
     def _watch_tether(self, i: Inputs) -> None:
@@ -273,7 +276,12 @@ class FlightCore:
         self._control.near_surface = expected.into_world is not None
         self._control.press_direction = expected.into_world if expected.touches else None
         if state.own is not None and engaged is not None:
-            reference = self._parameters.phases[engaged.index].reference(reference, state.own)
+            phase = self._parameters.phases[engaged.index]
+            try:
+                reference = phase.reference(reference, state.own)
+            except Exception as error:  # the next tick lands
+                self._phase_error = str(failed(phase, error))
+                reference = self._reference or reference
         if stage is _MISSION:
             governed = self._governor.constrain(dt_s, reference, self._context.tether)
             reference, self._limited_by = governed.reference, governed.limited_by

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from companion.core.transition import Transition
 from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.air import NOTHING, Air
@@ -9,13 +11,42 @@ from companion.mission.phase import Phase
 from companion.mission.segments import Segment
 from companion.model.codec import Record
 from companion.model.types import Outcome, Reference, SafetyAction
+from companion.plugins import one_line
 from companion.safety.notices import EventDefinition
 
 _BEFORE_END_S = 1e-6
 
 
+class PhaseFailed(Exception):
+    """The code of a phase raised an exception; the text names the phase, the exception and its place."""
+
+
+def failed(phase: Phase, error: Exception) -> PhaseFailed:
+    """Return the error of a phase that raised `error`."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    place = "" if trace is None else f" ({Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno})"
+    return PhaseFailed(f"phase '{phase.title}' failed: {one_line(error)}{place}")
+
+
 def advance_phase(t: Transition) -> None:
-    """Advance the phase at the plan's time by one tick; called in every tick of a mission with a phase that acts."""
+    """Advance the phase at the plan's time by one tick; called in every tick of a mission with a phase that acts.
+
+    Raises:
+        PhaseFailed: a phase, perhaps of another package, raised an exception.
+    """
+    if t.o.phase_error is not None:
+        raise PhaseFailed(t.o.phase_error)
+    engaged = t.state.engaged if t.state.own is not None else None
+    try:
+        _advance(t)
+    except Exception as error:
+        assert t.state.course is not None
+        raise failed(_phase_of(t, engaged or t.state.course.segment(t.i.t_s)), error) from error
+
+
+def _advance(t: Transition) -> None:
     state, t_s = t.state, t.i.t_s
     course = state.course
     assert course is not None
@@ -43,12 +74,19 @@ def advance_phase(t: Transition) -> None:
 
 
 def leave(t: Transition) -> None:
-    """Leave what the phase does, because the flight is to hold."""
+    """Leave what the phase does, because the flight is to hold.
+
+    Raises:
+        PhaseFailed: as in `advance_phase`.
+    """
     own, engaged = t.state.own, t.state.engaged
     if own is None or engaged is None:
         return
     phase = _phase_of(t, engaged)
-    left = phase.leave(own, t.i.t_s)
+    try:
+        left = phase.leave(own, t.i.t_s)
+    except Exception as error:
+        raise failed(phase, error) from error
     if left is None:
         t.change(own=None, skips=True, expected=NOTHING)
     else:

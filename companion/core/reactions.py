@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from companion.core.phase_tick import leave
+from companion.core.phase_tick import PhaseFailed, leave
 from companion.core.transition import Transition
 from companion.mission.plan import landing_from
 from companion.mission.retract import inward_only, retract_from
@@ -12,6 +12,7 @@ from companion.model import flight_stage as seq
 from companion.model.flight_stage import ROTORS_MAY_START, Stage
 from companion.model.types import OperatorCommand, Outcome, PhaseKind, Reference, SafetyAction, Vec3
 from companion.safety import notices
+from companion.safety.notices import EventDefinition
 from companion.safety.rules import OPERATOR_ABORT, OPERATOR_LAND, OPERATOR_RESUME, RULES
 from companion.safety.supervisor import update
 
@@ -108,20 +109,23 @@ def _hold(t: Transition) -> None:
     if course is None or course.segment(t_s).kind is PhaseKind.LANDING:
         return
     if course.reference(t_s).position_world_m[2] < t.parameters.clearance_m + HOLD_ABOVE_M:
-        _land_instead(t, "too low to hold; landing")
+        land_instead(t, "too low to hold; landing")
     else:
         t.change(course=course.hold(t_s))
-        leave(t)
+        try:
+            leave(t)
+        except PhaseFailed as failure:
+            land_instead(t, str(failure), notices.PHASE_FAILED)
 
 
 def _retract(t: Transition) -> None:
     now, course, tether = t.o.reference, t.state.course, t.parameters.vehicle.tether
     assert tether is not None, "only a tether's rule requests a retract"
     if now is None or course is None or course.segment(t.i.t_s).kind is PhaseKind.LANDING:
-        _land_instead(t, "already landing; no retract")
+        land_instead(t, "already landing; no retract")
         return
     if _faces_the_anchor(t):
-        _land_instead(t, "the surface is between vehicle and anchor; no retract")
+        land_instead(t, "the surface is between vehicle and anchor; no retract")
         return
     t.leave_mission(
         retract_from(
@@ -155,8 +159,9 @@ def _before_surface_m(t: Transition, now: Reference) -> Vec3 | None:
     return (x + bx, y + by, z + bz)
 
 
-def _land_instead(t: Transition, text: str) -> None:
-    t.report(notices.NO_ROOM_TO_STAY, text)
+def land_instead(t: Transition, text: str, notice: EventDefinition = notices.NO_ROOM_TO_STAY) -> None:
+    """Land for a reason that the monitors do not know, and report it."""
+    t.report(notice, text)
     t.change(supervisor=update(t.state.supervisor, t.events, t.i.t_s, t.parameters.times))
     _land(t)
 

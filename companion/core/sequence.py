@@ -7,7 +7,8 @@ from typing import Final
 
 from companion.config.vehicle import Vehicle
 from companion.core.flight_state import Tare
-from companion.core.phase_tick import advance_phase
+from companion.core.phase_tick import PhaseFailed, advance_phase
+from companion.core.reactions import land_instead
 from companion.core.transition import Transition
 from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.check import check_start
@@ -227,7 +228,11 @@ def _spool(t: Transition, elapsed_s: float) -> AutopilotRequest:
 
 def _fly(t: Transition, _: float) -> AutopilotRequest:
     if t.parameters.acts and not t.state.aborting:
-        advance_phase(t)
+        try:
+            advance_phase(t)
+        except PhaseFailed as failure:
+            land_instead(t, str(failure), notices.PHASE_FAILED)
+            return _NONE
     i, course, vehicle = t.i, t.state.course, t.i.vehicle
     assert course is not None
     plan_s = course.pace(i.t_s)[0]

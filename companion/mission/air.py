@@ -62,6 +62,8 @@ class Observation(Record, frozen=True):
     """Position minus reference in the last tick, world frame; 0 if the law did not run."""
     yaw_error_rad: float
     """Yaw minus reference in the last tick; 0 if the law did not run."""
+    phase_error: str | None = None
+    """Why the phase gave no reference in the last tick; None if it did."""
 
 
 class Air:

@@ -7,16 +7,21 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from companion.cli.main import main
 from companion.config.document import ConfigError
 from companion.config.loader import load_flight
 from companion.config.phase import PhaseSettings, phase_classes
+from companion.core.flight_core import FlightCore
 from companion.flight.main import plugins_of_others
 from companion.mission.check import check_mission
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
+from companion.model.types import OperatorCommand, Outcome, SafetyAction
 from companion.plugins import PHASES
+from companion.sitl_config.loader import load_sitl
 from companion.testing import check_phases
+from sitl.fast.loop import FastFlight
 from sitl.testing import check_flight
 from tests.plugins.installed import on_path, write_distribution
 from tests.support import ROOT
@@ -123,3 +128,30 @@ def test_a_phase_that_breaks_the_contract_is_told_how(site: Path, right: str, wr
     with pytest.raises(AssertionError) as caught:
         check_phases(MISSION)
     assert "phases[4], weigh" in str(caught.value) and found in str(caught.value)
+
+
+RAISES = {
+    "step": ("        air.stay(air.engaged)\n", "        1 / (air.t_s < self.duration_s)\n"),
+    "reference": ("    def begin(", "    def reference(self, reference, own):\n        return own.n\n\n    def begin("),
+    "leave": ("    def begin(", "    def leave(self, own, t_s):\n        return own.n\n\n    def begin("),
+}
+
+
+@pytest.mark.parametrize("method", list(RAISES))
+def test_a_phase_that_raises_in_the_air_is_named_and_the_vehicle_lands(site: Path, method: str) -> None:
+    right, wrong = RAISES[method]
+    assert right in CODE
+    (site / "lab_weigh.py").write_text(CODE.replace(right, wrong))
+    flight = FastFlight(load_sitl(MISSION))
+    result = flight.run()
+    outputs = result.outputs
+    if method == "leave":  # a hold during the phase
+        core, during = FlightCore(flight.config.flight), [o.phase for o in outputs].index("weigh") + 20
+        outputs = [core.step(inputs) for inputs in result.inputs[:during]]
+        outputs.append(core.step(replace(result.inputs[during], command=OperatorCommand.HOLD)))
+    else:
+        assert not result.crashed and outputs[-1].outcome is Outcome.ABORTED
+        assert SafetyAction.AUTOPILOT_LAND not in {output.action for output in outputs}, "lands under its own control"
+    (event,) = [event for output in outputs for event in output.events if event.id == "phase_failed"]
+    assert event.text.startswith("phase 'weigh' failed: ") and "(lab_weigh.py:" in event.text
+    assert SafetyAction.LAND in {output.action for output in outputs}
