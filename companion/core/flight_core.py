@@ -210,6 +210,7 @@ class FlightCore:
             if self._log is None
             else (self._log.error[0], self._log.error[1], self._log.error[2]),
             yaw_error_rad=0.0 if self._log is None else self._log.error[5],
+            late_pose=self._monitors.late_pose,
             phase_error=self._phase_error,
         )
 

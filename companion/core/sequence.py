@@ -289,7 +289,7 @@ def _autopilot_land(t: Transition, _: float) -> AutopilotRequest:
     if seq.is_killed(i.status) and i.vehicle is not None:
         if i.vehicle.position_world_m[2] > t.parameters.clearance_m + DISARMED_ABOVE_M:
             t.finish(Outcome.CRASHED)  # without rotors it falls
-    landing, step = t.state.landing.step(i)
+    landing, step = t.state.landing.step(i, t.o.late_pose)
     t.change(landing=landing, zero_thrust=step.zero_thrust)
     if landing.overturned and t.state.outcome is not Outcome.CRASHED:
         _crash(t, step.text or TIPPED)

@@ -9,7 +9,7 @@ from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
 from companion.mission.segments import Segment
 from companion.model.codec import Record
-from companion.model.types import ContactState, Inputs, Reference, TetherState, Vec3
+from companion.model.types import ContactState, Inputs, MocapPose, Reference, TetherState, Vec3
 from companion.safety.notices import EventDefinition
 
 
@@ -62,6 +62,8 @@ class Observation(Record, frozen=True):
     """Position minus reference in the last tick, world frame; 0 if the law did not run."""
     yaw_error_rad: float
     """Yaw minus reference in the last tick; 0 if the law did not run."""
+    late_pose: MocapPose | None = None
+    """Newest pose, if it is trusted but too late for PX4."""
     phase_error: str | None = None
     """Why the phase gave no reference in the last tick; None if it did."""
 

@@ -3,8 +3,9 @@
 PX4 lands using its own estimate. Without vision its height becomes invalid 4.5 s after the last pose; from then on it descends at
 constant thrust and never detects the ground (measured). The companion therefore watches for touchdown as long as the dead-reckoned
 height is valid, returns PX4 to OFFBOARD with zero thrust once the vehicle has landed, and disarms. No single source decides: PX4's
-estimate and motion capture must both show a vehicle at rest while PX4 descends. The vehicle is disarmed even if PX4's land detector
-alone does not respond. `companion.safety.rotor_stop` decides when a stop of the rotors may be requested, including that of a vehicle
+estimate and motion capture must both show a vehicle at rest while PX4 descends. Poses that are too late for PX4 still show where the
+vehicle was: they show a touchdown that a drifting estimate does not. The vehicle is disarmed even if PX4's land detector alone does
+not respond. `companion.safety.rotor_stop` decides when a stop of the rotors may be requested, including that of a vehicle
 that is flipped or tipped over. Pure; time is an argument.
 """
 
@@ -15,7 +16,7 @@ from typing import Final
 
 from companion.model.best_pose import pose_used_s
 from companion.model.flight_stage import chosen_by_pilot, in_offboard, is_armed, is_killed, on_ground
-from companion.model.types import AutopilotRequest, FlightMode, Inputs
+from companion.model.types import AutopilotRequest, FlightMode, Inputs, MocapPose
 from companion.safety.rotor_stop import (
     ESTIMATE_TRUSTED_S,
     FORCE_DISARM_S,
@@ -59,6 +60,8 @@ IMPACT_KEPT_M_S: Final = 0.1
 IMPACT_HOLD_S: Final = 0.6
 DRIFT_M_S2 = 0.5
 """Without motion capture the estimated height may be off by half of this times the square of the time."""
+LATE_STANDS_S: Final = 1.5
+"""Poses that are too late for PX4 show a touchdown after this time near the floor without vertical motion."""
 STANDING_S = 3.0
 TIMEOUT_S = 30.0
 FLIPPED: Final = "flipped: FORCE_DISARM is requested at once"
@@ -137,6 +140,9 @@ class AutopilotLanding:
     height: HeightEvidence
     sinking: Sinking = field(default_factory=Sinking)
     arrest: Arrest = field(default_factory=Arrest)
+    late_sinking: Sinking = field(default_factory=Sinking)
+    late_rest_since_s: float | None = None
+    """Time since which poses that are too late for PX4 have shown the vehicle near the floor without vertical motion."""
     was_landing: bool = False
     standing_since_s: float | None = None
     touched_s: float | None = None
@@ -176,11 +182,18 @@ class AutopilotLanding:
             height=HeightEvidence(low_below_m(clearance_m)),
         )
 
-    def step(self, i: Inputs) -> tuple[AutopilotLanding, LandingStep]:
-        """Return the landing after one more tick, and what that tick requests."""
+    def step(self, i: Inputs, late: MocapPose | None = None) -> tuple[AutopilotLanding, LandingStep]:
+        """Return the landing after one more tick, and what that tick requests.
+
+        Args:
+            i: inputs of the tick, with trusted records only.
+            late: newest pose, if it is trusted but too late for PX4.
+        """
         elapsed = i.t_s - self.start_s
         heard = hears_px4(i)
         now = replace(self, stop=self.stop.update(i))
+        if late is not None or self.late_rest_since_s is not None:
+            now = now._watch_late(i.t_s, late)
         if not now.pilot and heard:
             now, takes_over = now._watch_mode(i)
             if takes_over:
@@ -231,6 +244,18 @@ class AutopilotLanding:
         wait = i.t_s - touched_s < ZERO_THRUST_STREAM_S or in_offboard(i.status)
         return now, LandingStep(AutopilotRequest.NONE if wait else AutopilotRequest.OFFBOARD, True, False, False)
 
+    def _watch_late(self, t_s: float, late: MocapPose | None) -> AutopilotLanding:
+        sinking = self.late_sinking.update(t_s, late)
+        speed_m_s = sinking.speed_m_s
+        low = late is not None and late.position_world_m[2] < self.clearance_m + HEIGHT_MARGIN_M
+        since_s = None
+        if low and speed_m_s is not None and abs(speed_m_s) < STILL_M_S:
+            since_s = t_s if self.late_rest_since_s is None else self.late_rest_since_s
+        return replace(self, late_sinking=sinking, late_rest_since_s=since_s)
+
+    def _late_rest(self, t_s: float, least_s: float) -> bool:
+        return self.late_rest_since_s is not None and t_s - self.late_rest_since_s >= least_s
+
     def _watch_mode(self, i: Inputs) -> tuple[AutopilotLanding, bool]:
         """Return whether a pilot has taken over: PX4 is in a manual mode or, after it began to land, in any mode that only a pilot
         selects, or its rotors were stopped by the kill switch.
@@ -256,6 +281,8 @@ class AutopilotLanding:
         begun = since_s is not None and t_s - since_s > BEGUN_S
         fresh = vehicle is not None and t_s - vehicle.position_stamp_s < STATE_FRESH_S
         now = replace(self, pose_s=pose_s, sinking=sinking, landing_since_s=since_s)
+        if begun and now._late_rest(t_s, LATE_STANDS_S):
+            return now, True
         if vehicle is None or not fresh or since_s is None or t_s - pose_s > ESTIMATE_TRUSTED_S:
             return replace(now, height=replace(self.height, since_s=None), arrest=Arrest()), False
         height_m, up_m_s = vehicle.position_world_m[2], vehicle.velocity_world_m_s[2]
@@ -280,7 +307,8 @@ class AutopilotLanding:
             since_s = None
         elif since_s is None:
             since_s = i.t_s
-        unnoticed = since_s is not None and i.t_s - since_s >= FORCE_DISARM_S and self.stop.may_force
+        rests = self.stop.may_force or self._late_rest(i.t_s, FORCE_DISARM_S)
+        unnoticed = since_s is not None and i.t_s - since_s >= FORCE_DISARM_S and rests
         return replace(self, zero_thrust_since_s=since_s), unnoticed
 
     def _watch_standing(self, i: Inputs) -> tuple[AutopilotLanding, bool]:

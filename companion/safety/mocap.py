@@ -158,6 +158,12 @@ class MocapTracker:
         rejected = self.frozen or self.two_streams or self.dragged
         return None if rejected or self._awake_s - self._timely_awake_s > self._s.mocap_timeout_s else self._timely
 
+    @property
+    def late(self) -> MocapPose | None:
+        """Return the newest pose if it is trusted but too late, else None."""
+        frame, shown = self.frame, self.too_late and self.trusted and not self.repeats
+        return frame if shown and frame is not None and frame.tracking_valid else None
+
     def pose_filter(self) -> PoseFilter | None:
         """Return a filter for a landing without the core; None if the stream is rejected, so that no pose may be passed on."""
         rejected = self.frozen or self.two_streams or self.dragged

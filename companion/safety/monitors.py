@@ -80,6 +80,11 @@ class Monitors:
         mocap = self._mocap
         return mocap.trusted and not mocap.too_late and not (mocap.repeats and self._airborne)
 
+    @property
+    def late_pose(self) -> MocapPose | None:
+        """Return the newest pose if it is trusted but too late for PX4, else None."""
+        return self._mocap.late
+
     def forwards(self, pose: MocapPose, vehicle: VehicleState | None) -> bool:
         """Return whether a pose that has arrived since the last tick may be passed on to PX4. Changes nothing."""
         return self._mocap.forwards(pose, vehicle, airborne=self._airborne)

@@ -93,7 +93,7 @@ class FastResult:
     """Whether the guardian landed the vehicle; None if it did not act or has not finished."""
     armed: bool = False
     """Whether the vehicle is still armed at the end."""
-    _truth: list[Truth] | None = field(default=None, init=False, repr=False)
+    _truth: list[Truth] | None = field(default=None, repr=False)  # mypyc sets no default with init=False
 
     @property
     def truth(self) -> list[Truth]:

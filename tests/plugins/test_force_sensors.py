@@ -20,7 +20,7 @@ from companion.cli.main import main
 from companion.config.devices import ForceDevice
 from companion.config.document import ConfigError
 from companion.config.loader import load_flight, load_vehicle, logged_flight
-from companion.flight.main import _device_plugins
+from companion.flight.main import plugins_of_others
 from companion.io.force_torque.plugin_driver import PluginForceTorque, open_force
 from companion.io.protocols import DeviceError
 from companion.model.exit_codes import EXIT_BAD_INPUT
@@ -403,6 +403,6 @@ def test_the_simulated_world_has_the_built_in_devices_and_says_so() -> None:
 
 
 def test_a_log_names_the_plug_ins_that_flew() -> None:
-    vehicle = load_flight("hover", overrides=["vehicle.devices.force.type=ati"]).vehicle
-    assert _device_plugins(vehicle) == {"device_plugins": "force sensor 'ati' (companion-ati 0.1.0)"}
-    assert _device_plugins(load_flight("hover").vehicle) == {}
+    flight = load_flight("hover", overrides=["vehicle.devices.force.type=ati"])
+    assert plugins_of_others(flight) == {"device_plugins": "force sensor 'ati' (companion-ati 0.1.0)"}
+    assert plugins_of_others(load_flight("hover")) == {}
