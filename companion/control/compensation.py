@@ -31,7 +31,7 @@ class Compensation:
     """
 
     def __init__(
-        self, config: LawConfig, vehicle: Vehicle, answered_xyz: Vec3, inertia_xy_kg: tuple[float, float]
+        self, config: LawConfig, vehicle: Vehicle, answered_xyz: Vec3, inertia_xy_kg: tuple[float, ...]
     ) -> None:
         mass_kg = vehicle.airframe.mass_kg
         self._weight_n = mass_kg * GRAVITY_M_S2
