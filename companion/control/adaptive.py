@@ -102,9 +102,11 @@ class Row:
 
 
 def rows_of(config: AdaptiveConfig, joint_count: int) -> list[Row]:
-    """Return x, y, z, roll, pitch, yaw and one row for each joint. S of the attitude is 0: PX4 controls it."""
-    S = (*config.row_weights_s[:3], 0.0, 0.0, 0.0, *config.row_weights_s[6:])
-    lists = (config.inertia_md, config.damping_kd, config.phi, config.lambda_gain, S, config.robust_scale)
+    """Return x, y, z, roll, pitch, yaw and one row for each joint."""
+    lists = (
+        *(config.inertia_md, config.damping_kd, config.phi, config.lambda_gain),
+        *(config.row_weights_s, config.robust_scale),
+    )
     return [Row(*gains) for gains in zip(*(fitted(gains, 6 + joint_count) for gains in lists), strict=True)]
 
 
@@ -163,7 +165,9 @@ class AdaptiveController:
     for_vehicle: ClassVar = staticmethod(for_vehicle)
 
     def __init__(self, config: AdaptiveConfig, vehicle: Vehicle, hover_thrust: float) -> None:
-        self._rows = rows_of(config, len(vehicle.arm.joints))
+        self._rows = rows = rows_of(config, len(vehicle.arm.joints))
+        self._controlled = [(i, row) for i, row in enumerate(rows) if i < 3 or i > 5]
+        """All rows but those of the attitude, which PX4 controls, with their numbers."""
         self._adaptation = Adaptation(config)
         self._compliance = config.base_compliance_xyz
         self._acceleration_cap = config.acceleration_cap
@@ -200,8 +204,8 @@ class AdaptiveController:
         e, e_dot = tracking_errors(state, reference, math.atan2(body_x[1], body_x[0]))
         # 3: tau_ext = [0; 0; J' F_ext] and tau_d = [0; 0; J' F_d], plus the share of F_ext that the base is to comply with
         arm.set_pose(state.arm_rad, body_x, body_z)
-        x, y, z = [share * f for share, f in zip(self._compliance, F_ext, strict=True)]
-        tau_ext = (x, y, z, 0.0, 0.0, 0.0, *arm.joint_torque_nm(F_ext))
+        (x, y, z), (share_x, share_y, share_z) = F_ext, self._compliance
+        tau_ext = (share_x * x, share_y * y, share_z * z, 0.0, 0.0, 0.0, *arm.joint_torque_nm(F_ext))
         tau_d = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *arm.joint_torque_nm(F_d))
         # 4: s_general
         for i, row in enumerate(rows):
@@ -211,19 +215,22 @@ class AdaptiveController:
         norm_s, norm_xi, norm_chi_ddot = self._norms(chi_ddot)
         b: Vec4 = (1.0, norm_xi, norm_xi * norm_xi, min(norm_chi_ddot, self._acceleration_cap))
         rho = adaptation.rho(b)
-        # 7: tau and del_tau; those of the attitude are left to PX4
+        # 7: tau and del_tau; PX4 controls the attitude
         chi_d_ddot = (*reference.acceleration_world_m_s2, 0.0, 0.0, 0.0, *reference.arm_acceleration_rad_s2)
         rho_over_norm = rho / max(norm_s, adaptation.varpi)
-        tau = [row.tau(chi_d_ddot[i], rho_over_norm) for i, row in enumerate(rows)]
+        tau = [0.0] * len(rows)
+        for i, row in self._controlled:
+            tau[i] = row.tau(chi_d_ddot[i], rho_over_norm)
 
         # Beyond the paper: loads Y theta, disturbance and feed-forward, weight; gravity, inertia and friction of the joints, for the
         # motion with s = 0: alpha*' = alpha' - s and alpha*''
         compensation.observe(dt_s, state, learn)
         star_rate = tuple([rate - s[6 + joint] for joint, rate in enumerate(state.arm_rate_rad_s)])
-        star_ddot = tuple([row.chi_star_ddot(chi_d_ddot[6 + joint]) for joint, row in enumerate(rows[6:])])
-        loads, inertia = load.tau(arm.levers_m_s2, star_rate), arm.inertia_nm(state, star_ddot)
+        loads = load.tau(arm.levers_m_s2, star_rate)
         x, y, z = compensation.base_force_n((tau[0] + loads[0], tau[1] + loads[1], tau[2] + loads[2]), F_ext, reference)
-        joints = tuple([tau[6 + j] + gravity + loads[6 + j] + inertia[j] for j, gravity in enumerate(arm.gravity_nm)])
+        joints = tuple([tau[6 + joint] + gravity + loads[6 + joint] for joint, gravity in enumerate(arm.gravity_nm)])
+        star_ddot = tuple([row.chi_star_ddot(chi_d_ddot[6 + joint]) for joint, row in enumerate(rows[6:])])
+        joints = arm.with_inertia(joints, state, star_ddot)
         joints = compensation.joint_torque_nm(joints, star_rate)
         # 8: saturation, attitude and thrust
         sent.step(dt_s, (x, y, z + self._weight_n), joints, body_z, reference.yaw_rad, vertical_scale)
@@ -231,7 +238,7 @@ class AdaptiveController:
 
         # 9: adaptive_law_full, adaptive_1; beyond the paper F_d and the loads
         adaptation.advance(dt_s, norm_s, b, saturated_before)
-        for row in rows:
+        for _, row in self._controlled:
             row.advance(dt_s)
         self._desired.advance(dt_s, F_ext)
         if learn:
@@ -267,7 +274,7 @@ class AdaptiveController:
     def _norms(self, chi_ddot: Sequence[float]) -> tuple[float, float, float]:
         """Return ||S s||, ||S xi|| with xi = [e; e'], and ||S chi''||."""
         s_squared = xi_squared = a_squared = 0.0
-        for i, row in enumerate(self._rows):
+        for i, row in self._controlled:
             weight, a = row.S_squared, chi_ddot[i]
             s_squared += weight * row.s * row.s
             xi_squared += weight * (row.e * row.e + row.e_dot * row.e_dot)

@@ -19,11 +19,10 @@ class NominalArm:
         self._dynamics = dynamics_of(vehicle) if config.arm_inertia_nominal else None
         self._knows_gravity = config.arm_gravity_nominal
         self._M_d = fitted(config.inertia_md, 6 + self.manipulator.joint_count)[6:]
-        self._nothing: Joints = (0.0,) * self.manipulator.joint_count
         self._axes_world: Mat3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
         """The body's axes: rows of R'."""
         self._J_alpha: Matrix = ((), (), ())
-        self.gravity_nm = self._nothing
+        self.gravity_nm: Joints = (0.0,) * self.manipulator.joint_count
         """Torques that hold the arm against gravity."""
         self.levers_m_s2: Matrix = ()
         """See `Manipulator.gravity_levers_m_s2`."""
@@ -40,11 +39,13 @@ class NominalArm:
     def joint_torque_nm(self, force_world_n: Vec3) -> list[float]:
         """Return J_alpha' F for a force F on the tool."""
         x, y, z = mat_vec(self._axes_world, force_world_n)
-        return [jx * x + jy * y + jz * z for jx, jy, jz in zip(*self._J_alpha, strict=True)]
+        rows_x, rows_y, rows_z = self._J_alpha
+        return [jx * x + rows_y[joint] * y + rows_z[joint] * z for joint, jx in enumerate(rows_x)]
 
-    def inertia_nm(self, state: PlantState, star_rad_s2: Joints) -> Joints:
-        """Return (M_arm - M_d) alpha*'' + C alpha': the law's tau contains M_d alpha*'' already (`Row.chi_star_ddot`)."""
+    def with_inertia(self, tau: Joints, state: PlantState, star_rad_s2: Joints) -> Joints:
+        """Return tau + (M_arm - M_d) alpha*'' + C alpha': tau contains M_d alpha*'' already (`Row.chi_star_ddot`)."""
         if self._dynamics is None:
-            return self._nothing
+            return tau
         inertial = self._dynamics.arm_torque_nm(state.arm_rad, state.arm_rate_rad_s, star_rad_s2)
-        return tuple([nm - m_d * a for nm, m_d, a in zip(inertial, self._M_d, star_rad_s2, strict=True)])
+        terms = zip(tau, inertial, self._M_d, star_rad_s2, strict=True)
+        return tuple([known + (nm - m_d * a) for known, nm, m_d, a in terms])
