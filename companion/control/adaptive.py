@@ -14,9 +14,10 @@ All matrices of the paper are diagonal, so that each row of chi = [x y z | roll 
 | `adaptive_law_full`, `zeta`               | `Adaptation.advance` |
 | `control_law` and its order in a tick     | `AdaptiveController.step` |
 | `tab:control_parameters`                  | configs/controllers/adaptive_paper.yaml |
-| `deviation_error`, `step1` to `step4`, `I_cl` | derived, not computed: tests/control/test_errata.py |
+| `General_EL_dynamics`, `deviation_error`, `step1` to `boundness` | derivation, not computed; tests/control/test_errata.py |
 
-What is corrected and what is added are the pages Errata and Options beyond the paper of docs/internals/control-law.md.
+What is corrected is in the section Errata of docs/internals/control-law.md, what is added in Options beyond the paper. A diagonal S,
+which the paper does not have, weights all norms; it is 1 in the preset `paper`.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class Row:
     def __init__(self, M_d: float, K_d: float, Phi: float, Lambda: float, S: float, robust_scale: float) -> None:
         self.M_d: Final = M_d
         self.D: Final = K_d - M_d * Phi
-        """Positive (`gain_new`). It stays when `scale` changes Phi: K_d and K_p then follow."""
+        """The paper's K_d - M_d Phi, positive (`gain_new`). It stays when `scale` changes Phi: K_d and K_p then follow."""
         self.Phi, self.Lambda = Phi, Lambda
         self._mission_Phi: Final = Phi
         self._mission_Lambda: Final = Lambda
@@ -65,19 +66,19 @@ class Row:
         self.e = self.e_dot = self.s = self.e_tau = self.tau_d = 0.0
 
     def set_error(self, e: float, e_dot: float, tau_ext: float, tau_d: float) -> None:
-        """Set e, e', s (`s_general`), and e_tau."""
+        """Set e, e', s, tau_d and e_tau = tau_ext - tau_d."""
         self.e, self.e_dot = e, e_dot
-        self.s = e_dot + self.Phi * e - self.gamma
+        self.s = e_dot + self.Phi * e - self.gamma  # s_general
         self.e_tau, self.tau_d = tau_ext - tau_d, tau_d
 
     def tau(self, chi_d_ddot: float, rho_over_norm: float) -> float:
-        """Return -Lambda s + dtau + M_d (chi_d'' - Phi e') - D gamma - tau_d (`tau`, corrected).
+        """Return -Lambda s - tau_d + dtau + M_d (chi_d'' - Phi e') - D gamma (`tau`; printed: - D).
 
         Args:
             chi_d_ddot: acceleration of the reference.
-            rho_over_norm: rho / max(||S s||, varpi), so that dtau = -rho_over_norm S^2 s (`del_tau`, both cases, corrected).
+            rho_over_norm: rho / max(||S s||, varpi), so that dtau = -rho_over_norm S^2 s: both cases of `del_tau` (printed: + rho).
         """
-        gain_of_dtau = rho_over_norm * self._S_squared_scaled
+        gain_of_dtau = rho_over_norm * self._S_squared_scaled  # dtau = -gain_of_dtau s
         return (
             -(self.Lambda + gain_of_dtau) * self.s
             + self.M_d * (chi_d_ddot - self.Phi * self.e_dot)
@@ -90,7 +91,9 @@ class Row:
         return chi_d_ddot - self.Phi * self.e_dot + (self.e_tau - self.D * self.gamma) / self.M_d
 
     def advance(self, dt_s: float) -> None:
-        """Integrate gamma' = M_d^-1 (e_tau - D gamma) over one step with e_tau held (`adaptive_1`, corrected; exact)."""
+        """Integrate gamma' = M_d^-1 (e_tau - D gamma) exactly over one step with e_tau held (`adaptive_1`;
+        printed: (e_tau + D) gamma).
+        """
         if dt_s != self._dt_s:  # most ticks have the same
             self._dt_s, self._decay = dt_s, math.exp(-self.D / self.M_d * dt_s)
             self._growth = (1.0 - self._decay) / self.D
