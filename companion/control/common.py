@@ -18,14 +18,21 @@ from companion.control.thrust import (
     saturate_force,
 )
 from companion.control.types import PlantState, Wrench
+from companion.model.algebra import minus
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import wrap_rad
 from companion.model.types import IDENTITY_QUAT, Chi, ControlLog, Joints, Quat, Reference, Vec3
 
 
 def tracking_errors(state: PlantState, reference: Reference, yaw_rad: float) -> tuple[Chi, Chi]:
-    """Return e = chi - chi_d and e'. Rows 3 and 4 (roll, pitch) are 0 because their reference is the law's own output."""
-    error, error_rate = base_errors(state, reference, yaw_rad)
+    """Return e = chi - chi_d and e'. Rows 3 and 4 (roll, pitch) are 0 because their reference is the law's own output; e' of yaw is the
+    body's rate r less that of the reference.
+    """
+    yaw_error = wrap_rad(yaw_rad - reference.yaw_rad)
+    yaw_error_rate = state.angular_rate_body_rad_s[2] - reference.yaw_rate_rad_s
+    position, velocity = reference.position_world_m, reference.velocity_world_m_s
+    error = [*minus(state.position_world_m, position), 0.0, 0.0, yaw_error]
+    error_rate = [*minus(state.velocity_world_m_s, velocity), 0.0, 0.0, yaw_error_rate]
     angles_d, rates, rates_d = reference.arm_rad, state.arm_rate_rad_s, reference.arm_rate_rad_s
     for joint, angle in enumerate(state.arm_rad):
         error.append(angle - angles_d[joint])
@@ -33,18 +40,31 @@ def tracking_errors(state: PlantState, reference: Reference, yaw_rad: float) -> 
     return tuple(error), tuple(error_rate)
 
 
-def base_errors(state: PlantState, reference: Reference, yaw_rad: float) -> tuple[list[float], list[float]]:
-    """Return the rows of the base of `tracking_errors`."""
-    px, py, pz = state.position_world_m
-    vx, vy, vz = state.velocity_world_m_s
-    px_d, py_d, pz_d = reference.position_world_m
-    vx_d, vy_d, vz_d = reference.velocity_world_m_s
-    yaw_error = wrap_rad(yaw_rad - reference.yaw_rad)
-    yaw_error_rate = state.angular_rate_body_rad_s[2] - reference.yaw_rate_rad_s
-    return (
-        [px - px_d, py - py_d, pz - pz_d, 0.0, 0.0, yaw_error],
-        [vx - vx_d, vy - vy_d, vz - vz_d, 0.0, 0.0, yaw_error_rate],
-    )
+class AccelerationFilter:
+    """First-order low-pass filter of chi'', exact for a held input; it starts at its first sample.
+
+    The acceleration of the base is measured, that of the joints differentiated numerically; the rows of the attitude are 0.
+    """
+
+    def __init__(self, cutoff_hz: float) -> None:
+        self._w = 2.0 * math.pi * cutoff_hz
+        self._rates_before_rad_s: Joints | None = None
+        self._filtered: list[float] = []
+
+    def step(self, dt_s: float, state: PlantState) -> list[float]:
+        """Return the filtered chi''."""
+        rates, before = state.arm_rate_rad_s, self._rates_before_rad_s
+        self._rates_before_rad_s = rates
+        if before is None:
+            self._filtered = [*state.acceleration_world_m_s2, 0.0, 0.0, 0.0, *(0.0,) * len(rates)]
+            return self._filtered
+        sample = [*state.acceleration_world_m_s2, 0.0, 0.0, 0.0]
+        for joint, rate in enumerate(rates):
+            sample.append((rate - before[joint]) / dt_s)
+        k, filtered = 1.0 - math.exp(-self._w * dt_s), self._filtered
+        for i, new in enumerate(sample):
+            filtered[i] += k * (new - filtered[i])
+        return filtered
 
 
 class ForceFilter:

@@ -31,18 +31,16 @@ class Compensation:
     """
 
     def __init__(
-        self, config: LawConfig, vehicle: Vehicle, answered_xyz: Vec3, inertia_xy_kg: tuple[float, float]
+        self, config: LawConfig, vehicle: Vehicle, answered_xyz: Vec3, inertia_xy_kg: tuple[float, ...]
     ) -> None:
         mass_kg = vehicle.airframe.mass_kg
         self._weight_n = mass_kg * GRAVITY_M_S2
         self._observer = DisturbanceObserver(
             mass_kg, config.disturbance_time_xyz_s, config.disturbance_lag_s, config.disturbance_max_n
         )
-        self._force_share, self._lead_s, self._inertia = (
-            config.force_feedforward_xyz,
-            config.feedforward_lead_s,
-            inertia_xy_kg,
-        )
+        self._force_share = config.force_feedforward_xyz
+        self._lead_s = config.feedforward_lead_s
+        self._inertia_xy_kg = inertia_xy_kg
         x, y, z = (min(1.0, fed + own) for fed, own in zip(self._force_share, answered_xyz, strict=True))
         self._accounted: Vec3 = (x, y, z)
         self._known_n: Vec3 = (0.0, 0.0, 0.0)
@@ -59,23 +57,14 @@ class Compensation:
         """Return `wanted_n` less the share of the measured force and the estimated disturbance, plus inertia times lead times jerk, and
         plus the push on a surface, world frame.
         """
-        x, y, z = wanted_n
-        f0, f1, f2 = force
-        d0, d1, d2 = self._observer.force_n
-        c0, c1, c2 = self._force_share
-        x -= c0 * f0 + d0
-        y -= c1 * f1 + d1
-        z -= c2 * f2 + d2
-        lead_s = self._lead_s
-        if lead_s > 0.0:
-            jerk = reference.jerk_world_m_s3
-            mx, my = self._inertia
-            x += mx * lead_s * jerk[0]
-            y += my * lead_s * jerk[1]
-        if (push := reference.push_world_n) is not None:
-            x, y, z = x + push[0], y + push[1], z + push[2]
-        if (slide := reference.slide_world_n) is not None:
-            x, y, z = x + slide[0], y + slide[1], z + slide[2]
+        shares, disturbance = self._force_share, self._observer.force_n
+        x, y, z = [w - (shares[i] * force[i] + disturbance[i]) for i, w in enumerate(wanted_n)]
+        if self._lead_s > 0.0:
+            x += self._inertia_xy_kg[0] * self._lead_s * reference.jerk_world_m_s3[0]
+            y += self._inertia_xy_kg[1] * self._lead_s * reference.jerk_world_m_s3[1]
+        for push in (reference.push_world_n, reference.slide_world_n):
+            if push is not None:
+                x, y, z = x + push[0], y + push[1], z + push[2]
         return (x, y, z)
 
     def joint_torque_nm(self, torque_nm: Joints, wanted_rate_rad_s: Joints) -> Joints:

@@ -44,28 +44,17 @@ class DisturbanceObserver:
         """
         if not self.on or not math.isfinite(sum((*known_n, *acceleration_world_m_s2))):
             return self.force_n
-        lx, ly, lz = self._lagged or known_n
-        kx, ky, kz = known_n
         k = 1.0 - math.exp(-dt_s / self._lag_s) if self._lag_s > 0 else 1.0
-        lx += k * (kx - lx)
-        ly += k * (ky - ly)
-        lz += k * (kz - lz)
-        self._lagged = (lx, ly, lz)
+        x, y, z = [lagged + k * (known_n[i] - lagged) for i, lagged in enumerate(self._lagged or known_n)]
+        self._lagged = lagged_n = (x, y, z)
         if learn:
-            x, y, z = self.force_n
-            ax, ay, az = acceleration_world_m_s2
-            tx, ty, tz = self._times_s
-            mass_kg, most = self._mass_kg, self._max_n
             # d' = (m a - F - d) / T, implicit Euler; an axis without time constant stays 0.
-            if tx > 0.0:
-                x += dt_s / (dt_s + tx) * (mass_kg * ax - lx - x)
-            if ty > 0.0:
-                y += dt_s / (dt_s + ty) * (mass_kg * ay - ly - y)
-            if tz > 0.0:
-                z += dt_s / (dt_s + tz) * (mass_kg * az - lz - z)
-            if not (-most <= x <= most and -most <= y <= most and -most <= z <= most):
-                x, y, z = max(-most, min(most, x)), max(-most, min(most, y)), max(-most, min(most, z))
-            self.force_n = (x, y, z)
+            force, most = [*self.force_n], self._max_n
+            for i, time_s in enumerate(self._times_s):
+                if time_s > 0.0:
+                    rate = self._mass_kg * acceleration_world_m_s2[i] - lagged_n[i] - force[i]
+                    force[i] = max(-most, min(most, force[i] + dt_s / (dt_s + time_s) * rate))
+            self.force_n = (force[0], force[1], force[2])
         return self.force_n
 
     def reset(self) -> None:

@@ -18,7 +18,7 @@ from typing import Final
 from companion.config.controller import AdaptiveConfig, fitted
 from companion.control.compensation import FRICTION_RATE_RAD_S
 from companion.control.manipulator import Manipulator
-from companion.model.types import Joints, Matrix, Vec3
+from companion.model.types import Chi, Joints, Matrix, Vec3
 
 
 class Estimate:
@@ -51,7 +51,7 @@ class Estimate:
 
 
 class LoadAdaptation:
-    """The estimated load on x, y and z and on the joints.
+    """Y theta on all rows.
 
     Args:
         config: rates, leakage and bounds.
@@ -64,14 +64,18 @@ class LoadAdaptation:
         moment_rates, friction_rates = fitted(config.moment_rate, count), fitted(config.friction_rate, count)
         most_n, most_kg_m, most_nm = config.load_max_n, config.moment_max_kg_m, config.friction_max_nm
         self.on = sum(map(sum, (config.load_rate_xyz, moment_rates, friction_rates))) > 0.0
-        self._x, self._y, self._z = (Estimate(rate, leakage, -most_n, most_n) for rate in config.load_rate_xyz)
+        self._forces = [Estimate(rate, leakage, -most_n, most_n) for rate in config.load_rate_xyz]
         self._moments = [Estimate(rate, leakage, -most_kg_m, most_kg_m) for rate in moment_rates]
         self._frictions = [Estimate(rate, leakage, 0.0, most_nm) for rate in friction_rates]
+        self._nothing = [0.0] * (6 + count)
+        self._levers_m_s2: Matrix = ()
+        self._directions: Joints = ()
 
     @property
     def force_n(self) -> Vec3:
         """Return the estimated additional force that the rotors must produce, world frame."""
-        return (self._x.theta, self._y.theta, self._z.theta)
+        x, y, z = self._forces
+        return (x.theta, y.theta, z.theta)
 
     @property
     def moments_kg_m(self) -> Joints:
@@ -83,26 +87,24 @@ class LoadAdaptation:
         """Return the estimated dry friction of each joint."""
         return tuple([estimate.theta for estimate in self._frictions])
 
-    def joint_torque_nm(self, levers_m_s2: Matrix, directions: Joints) -> list[float]:
-        """Return the joint torques that hold the estimated moments against gravity and overcome the estimated friction.
+    def tau(self, levers_m_s2: Matrix, rates_rad_s: Joints) -> list[float]:
+        """Return Y theta for all rows: force, and torques that hold the moments against gravity and overcome friction. Y is kept.
 
         Args:
             levers_m_s2: joint torques of gravity per first moment of each link (`Manipulator.gravity_levers_m_s2`).
-            directions: direction of the requested rate of each joint, -1 to 1.
+            rates_rad_s: requested rate of each joint.
         """
-        torque = []
-        for joint, gravity_nm in enumerate(self._manipulator.moment_torque_nm(levers_m_s2, self.moments_kg_m)):
-            torque.append(gravity_nm + self._frictions[joint].theta * directions[joint])
-        return torque
+        if not self.on:
+            return self._nothing
+        self._levers_m_s2 = levers_m_s2
+        self._directions = tuple([math.tanh(rate / FRICTION_RATE_RAD_S) for rate in rates_rad_s])
+        tau = [*self.force_n, 0.0, 0.0, 0.0, *self._manipulator.moment_torque_nm(levers_m_s2, self.moments_kg_m)]
+        for joint, direction in enumerate(self._directions):
+            tau[6 + joint] += self._frictions[joint].theta * direction
+        return tau
 
-    def advance_base(self, dt_s: float, s: Vec3) -> None:
-        """Integrate the force over one step with s of x, y and z held."""
-        self._x.advance(dt_s, s[0])
-        self._y.advance(dt_s, s[1])
-        self._z.advance(dt_s, s[2])
-
-    def advance_joints(self, dt_s: float, s: Joints, rates: Joints, levers_m_s2: Matrix, directions: Joints) -> None:
-        """Integrate moments and frictions over one step with s of the joints held.
+    def advance(self, dt_s: float, s: Chi, rates_rad_s: Joints) -> None:
+        """Integrate theta over one step with Y of the last `tau` and s held.
 
         The friction of a joint changes only while the joint turns in the requested direction, faster than `FRICTION_RATE_RAD_S`. At
         rest static friction takes any value up to its limit, so s contains no information about that limit, and s Y = -s tanh(s /
@@ -110,12 +112,15 @@ class LoadAdaptation:
 
         Args:
             dt_s: step.
-            s: rows of the joints.
-            rates: measured rates of the joints, rad/s.
-            levers_m_s2, directions: as for `joint_torque_nm` in the same tick.
+            s: all rows.
+            rates_rad_s: measured rates of the joints.
         """
-        y_s = self._manipulator.projected_on_moments(levers_m_s2, s)
-        for joint, direction in enumerate(directions):
+        if not self.on:
+            return
+        for i, force in enumerate(self._forces):
+            force.advance(dt_s, s[i])
+        y_s = self._manipulator.projected_on_moments(self._levers_m_s2, s[6:])
+        for joint, direction in enumerate(self._directions):
             self._moments[joint].advance(dt_s, y_s[joint])
-            if rates[joint] * direction > FRICTION_RATE_RAD_S * abs(direction):
-                self._frictions[joint].advance(dt_s, s[joint] * direction)
+            if rates_rad_s[joint] * direction > FRICTION_RATE_RAD_S * abs(direction):
+                self._frictions[joint].advance(dt_s, s[6 + joint] * direction)

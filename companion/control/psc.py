@@ -11,13 +11,11 @@ is estimated from the commanded thrust and the acceleration measured by the IMU.
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar
 
-from companion.config.controller import PscConfig, fitted
+from companion.config.controller import PscConfig
 from companion.config.vehicle import Vehicle
-from companion.control.common import tracking_errors
-from companion.control.model_based import ModelBasedLaw
+from companion.control.model_based import ModelBasedLaw, TargetImpedance
 from companion.control.payload_mass import PayloadEstimator
 from companion.control.scaled_gains import for_vehicle
 from companion.control.thrust import collective_n
@@ -39,66 +37,53 @@ class PscController(ModelBasedLaw):
         self._mass_kg = vehicle.airframe.mass_kg
         self._estimator = PayloadEstimator(config, self._mass_kg)
         self._integral_m_s2 = [0.0, 0.0, 0.0]
-        self._commanded_n = 0.0
-        lists = (config.arm_inertia_md, config.arm_damping_kd, config.arm_stiffness_kp)
-        joints = len(vehicle.arm.joints)
-        self._arm_gains = list(zip(range(joints), *(fitted(gains, joints) for gains in lists), strict=True))
-        """Number, M_d, K_d and K_p of each joint."""
+        self._target = TargetImpedance(
+            config.arm_inertia_md, config.arm_damping_kd, config.arm_stiffness_kp, len(vehicle.arm.joints)
+        )
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
-        """Run one tick of `dt_s`; see `companion.control.types.Controller`."""
-        airborne = state.airborne
-        felt = state.acceleration_world_m_s2
-        body_x, body_z = body_x_z_axes_world(state.attitude_wxyz)
-        specific_z = collective_n((felt[0], felt[1], felt[2] + GRAVITY_M_S2), body_z)
-        payload_kg = self._estimator.step(dt_s, self._commanded_n, specific_z, airborne)
+        """Run one tick of `dt_s`; the position error is integrated except on the ground and in saturation."""
+        wrench = super().step(dt_s, state, reference, vertical_scale)
+        limit, (clipped_z, clipped_xy, _) = self._c.integral_max_m_s2, wrench.log.saturated
+        for i, held in enumerate((clipped_xy, clipped_xy, clipped_z)):
+            if state.airborne and not held:
+                grown = self._integral_m_s2[i] + dt_s * self._c.position_ki_xyz[i] * wrench.log.error[i]
+                self._integral_m_s2[i] = max(-limit, min(limit, grown))
+        return wrench
 
-        force = self._force.step(dt_s, state.force_ext_world_n)
-        error, error_rate = tracking_errors(state, reference, math.atan2(body_x[1], body_x[0]))
-        e_tau, torque = self._arm(state, reference, error, error_rate, force)
-        wanted = self._vehicle(reference, error, error_rate, self._mass_kg + payload_kg)
-        self._send(dt_s, state, reference, wanted, torque, force, vertical_scale)
-        sent = self._actuation
-        self._commanded_n = sent.collective_n
-        self._integrate(dt_s, error, airborne, sent.clipped)
-        rows = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *e_tau)
-        return self._end(dt_s, error, error_rate, rows, force, payload_kg)
+    def _tau(
+        self, dt_s: float, state: PlantState, reference: Reference, e: Chi, e_dot: Chi, F_ext: Vec3
+    ) -> tuple[Vec3, Joints, Chi]:
+        """Return the force of the PID, the torques of the arm, and tau_ext - tau_d."""
+        ax, ay, az = state.acceleration_world_m_s2
+        felt_z = collective_n((ax, ay, az + GRAVITY_M_S2), body_x_z_axes_world(state.attitude_wxyz)[1])
+        self._payload_kg = payload_kg = self._estimator.step(dt_s, self._actuation.collective_n, felt_z, state.airborne)
+        base_n = self._vehicle(reference, e, e_dot, self._mass_kg + payload_kg)
+        arm_nm, e_tau = self._arm(state, reference, e[6:], e_dot[6:], F_ext)
+        return base_n, arm_nm, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *e_tau)
 
-    def _vehicle(self, reference: Reference, error: Chi, error_rate: Chi, mass_kg: float) -> Vec3:
+    def _vehicle(self, reference: Reference, e: Chi, e_dot: Chi, mass_kg: float) -> Vec3:
         """Return the force on the vehicle, world frame, N."""
-        c = self._c
-        x, y, z = (
-            mass_kg * (feed - c.position_kd_xyz[i] * error_rate[i] - c.position_kp_xyz[i] * error[i] - integral)
-            for i, (feed, integral) in enumerate(
-                zip(reference.acceleration_world_m_s2, self._integral_m_s2, strict=True)
-            )
-        )
+        k_d, k_p, integral = self._c.position_kd_xyz, self._c.position_kp_xyz, self._integral_m_s2
+        x, y, z = [
+            mass_kg * (feed - k_d[i] * e_dot[i] - k_p[i] * e[i] - integral[i])
+            for i, feed in enumerate(reference.acceleration_world_m_s2)
+        ]
         return (x, y, z + mass_kg * GRAVITY_M_S2)
 
-    def _integrate(self, dt_s: float, error: Chi, airborne: bool, clipped: tuple[bool, bool, bool]) -> None:
-        """Integrate the position error, except on the ground and while the actuators are saturated."""
-        limit = self._c.integral_max_m_s2
-        for i, held in enumerate((clipped[1], clipped[1], clipped[0])):
-            if airborne and not held:
-                grown = self._integral_m_s2[i] + dt_s * self._c.position_ki_xyz[i] * error[i]
-                self._integral_m_s2[i] = max(-limit, min(limit, grown))
-
     def _arm(
-        self, state: PlantState, reference: Reference, error: Chi, error_rate: Chi, force: Vec3
+        self, state: PlantState, reference: Reference, e: Joints, e_dot: Joints, F_ext: Vec3
     ) -> tuple[Joints, Joints]:
-        """Return tau_ext - tau_d and the motor torques, N m."""
-        ext, desired = self._joint_torques_nm(state, force)
-        feed = reference.arm_acceleration_rad_s2
-        e_tau, acceleration = [], []
-        for joint, m_d, k_d, k_p in self._arm_gains:
-            e_tau.append(t := ext[joint] - desired[joint])
-            acceleration.append(feed[joint] - (k_d * error_rate[6 + joint] + k_p * error[6 + joint] - t) / m_d)
+        """Return the motor torques and tau_ext - tau_d, N m."""
+        tau_ext, tau_d = self._joint_torques_nm(state, F_ext)
+        e_tau = tuple([ext - desired for ext, desired in zip(tau_ext, tau_d, strict=True)])
+        alpha_ddot = self._target.acceleration(reference.arm_acceleration_rad_s2, e, e_dot, e_tau)
         terms = self._dynamics.arm_terms(state.arm_rad, state.arm_rate_rad_s)
         gravity = self._manipulator.gravity_torque_nm(state.arm_rad, state.attitude_wxyz)
         torque = []
         for joint, row in enumerate(terms.mass):
             inertial = 0.0
-            for other, a in enumerate(acceleration):
+            for other, a in enumerate(alpha_ddot):
                 inertial += row[other] * a
-            torque.append(inertial + terms.coriolis[joint] + gravity[joint] - ext[joint])
-        return tuple(e_tau), tuple(torque)
+            torque.append(inertial + terms.coriolis[joint] + gravity[joint] - tau_ext[joint])
+        return tuple(torque), e_tau

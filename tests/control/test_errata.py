@@ -17,10 +17,8 @@ from msgspec.structs import replace
 
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import FlightConfig, load_flight
-from companion.control.adaptation import Adaptation
-from companion.control.adaptive import AdaptiveController
+from companion.control.adaptive import Adaptation, AdaptiveController, Row, rows_of
 from companion.control.arm_model import manipulator_of
-from companion.control.impedance import Row, rows_of
 from companion.control.types import PlantState
 from companion.mission.reference import at_rest
 from companion.model.constants import GRAVITY_M_S2
@@ -73,8 +71,8 @@ INERTIA: Array = np.diag([3.3, 3.2, 3.1, 0.05, 0.03]) + 0.01 * np.ones((5, 5))
 def advanced(rows: list[Row], gamma: Sequence[float], dt_s: float, e_tau: Sequence[float]) -> list[float]:
     """gamma after a step of the law's own rows from a given gamma."""
     for row, start, held in zip(rows, gamma, e_tau, strict=True):
-        row.gamma = start
-        row.advance(dt_s, held)
+        row.gamma, row.e_tau = start, held
+        row.advance(dt_s)
     return [row.gamma for row in rows]
 
 
@@ -357,7 +355,7 @@ def fly(
         regressor = (1.0, x, x * x, min(float(np.linalg.norm(acceleration)), law.acceleration_cap))
         dtau = robust(adaptation.rho(regressor), s, max(norm, law.boundary_layer))
         tau = -lam * s + dtau - m_d * phi * rate + tau_term(d, gamma)
-        rows.append((e.copy(), s, gamma.copy(), list(adaptation.h), adaptation.zeta))
+        rows.append((e.copy(), s, gamma.copy(), list(adaptation.H), adaptation.zeta))
         if lost_s is None and np.abs(e).max() > 1.0:
             lost_s = tick * DT_S
             break

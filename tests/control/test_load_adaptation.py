@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,13 @@ from msgspec.structs import replace
 
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import load_flight
-from companion.control.adaptation import Adaptation
-from companion.control.adaptive import AdaptiveController
+from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.arm_model import manipulator_of
 from companion.control.load_adaptation import LoadAdaptation
 from companion.mission.reference import at_rest
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import ControlLog, Joints, Matrix
-from tests.control.states import POSE, at
+from tests.control.states import POSE, ZERO, at
 
 CONFIG = load_flight("configs/missions/catch.yaml", preset="recommended")
 MANIPULATOR = manipulator_of(CONFIG.vehicle)
@@ -35,21 +35,17 @@ def law(**changes: Any) -> AdaptiveConfig:
     return AdaptiveConfig.model_validate(CONFIG.controller.model_dump() | changes)
 
 
-class Arm:
-    """Two joints with an estimated load; it keeps levers and requested rates from the torque of a tick to its end."""
-
-    def __init__(self, load: LoadAdaptation) -> None:
-        self.load = load
-
-    def torque_nm(self, levers_m_s2: Matrix, wanted_rate_rad_s: Joints) -> list[float]:
-        self._levers, self._wanted = levers_m_s2, wanted_rate_rad_s
-        self._directions = tuple(math.tanh(rate / 0.1) for rate in wanted_rate_rad_s)
-        return self.load.joint_torque_nm(levers_m_s2, self._directions)
-
-    def advance(self, s: Joints) -> None:
-        """The measured rate is the requested one plus s."""
-        rates = tuple(wanted + row for wanted, row in zip(self._wanted, s, strict=True))
-        self.load.advance_joints(DT_S, s, rates, self._levers, self._directions)
+def ticked(
+    load: LoadAdaptation,
+    s: Sequence[float],
+    s_joints: Sequence[float] = (0.0, 0.0),
+    wanted_rate_rad_s: Joints = (0.0, 0.0),
+    levers_m_s2: Matrix = ((0.0, 0.0), (0.0, 0.0)),
+) -> None:
+    """One tick with s of x, y, z and of two joints; the measured rate is the requested one plus s."""
+    load.tau(levers_m_s2, wanted_rate_rad_s)
+    rates = tuple(wanted + row for wanted, row in zip(wanted_rate_rad_s, s_joints, strict=True))
+    load.advance(DT_S, (*s, 0.0, 0.0, 0.0, *s_joints), rates)
 
 
 def test_a_constant_force_is_cancelled_and_s_returns_to_zero() -> None:
@@ -58,7 +54,7 @@ def test_a_constant_force_is_cancelled_and_s_returns_to_zero() -> None:
     pull_n = np.array([0.5, -0.3, -2.0])
     for _ in range(4000):
         s += DT_S / MASS_KG * (pull_n + np.array(load.force_n) - DAMPING * s)
-        load.advance_base(DT_S, (float(s[0]), float(s[1]), float(s[2])))
+        ticked(load, s.tolist())
     np.testing.assert_allclose(load.force_n, -pull_n, atol=1e-3)
     np.testing.assert_allclose(s, 0.0, atol=1e-3)
 
@@ -69,14 +65,13 @@ def test_leakage_leaves_the_error_of_its_balance() -> None:
     s = 0.0
     for _ in range(8000):
         s += DT_S / MASS_KG * (-2.0 + load.force_n[2] - DAMPING * s)
-        load.advance_base(DT_S, (0.0, 0.0, s))
+        ticked(load, (0.0, 0.0, s))
     assert s == pytest.approx(-2.0 / (DAMPING + 20.0 / 0.5), rel=1e-3)
 
 
 def test_moments_and_friction_are_found_while_the_arm_moves() -> None:
     """A 2R arm with unknown link moments and friction, swinging: the torque error goes to zero and the estimates to the truth."""
     load = LoadAdaptation(law(moment_rate=0.05, friction_rate=0.5), MANIPULATOR)
-    arm = Arm(load)
     moments, friction = np.array([0.06, 0.05]), np.array([0.08, 0.05])
     s = np.zeros(2)
     for tick in range(12000):
@@ -86,9 +81,9 @@ def test_moments_and_friction_are_found_while_the_arm_moves() -> None:
         levers = MANIPULATOR.gravity_levers_m_s2(angle, (0.0, 0.0, GRAVITY_M_S2))
         turning = np.tanh(np.array(rate) / 0.1)
         needed = np.array(levers) @ moments + friction * turning
-        given_nm = np.array(arm.torque_nm(levers, rate))
+        given_nm = np.array(load.tau(levers, rate)[6:])
         s += DT_S / 0.1 * (given_nm - needed - 1.0 * s)
-        arm.advance((float(s[0]), float(s[1])))
+        ticked(load, ZERO, s.tolist(), rate, levers)
     np.testing.assert_allclose(load.moments_kg_m, moments, rtol=0.05)
     np.testing.assert_allclose(load.friction_nm, friction, rtol=0.1)
     np.testing.assert_allclose(s, 0.0, atol=5e-3)
@@ -98,22 +93,18 @@ def test_moments_and_friction_are_found_while_the_arm_moves() -> None:
 def test_static_friction_that_holds_a_joint_with_an_error_does_not_raise_the_friction_estimate(held_nm: float) -> None:
     """At rest s = Phi e is constant and the wanted rate is -s, so that s times tanh(wanted rate) has one sign for either error."""
     load = LoadAdaptation(law(friction_rate=0.5), MANIPULATOR)
-    arm = Arm(load)
     s = held_nm
     for _ in range(400):
-        arm.torque_nm(((0.0, 0.0), (0.0, 0.0)), (-s, -s))
-        arm.advance((s, s))
+        ticked(load, ZERO, (s, s), (-s, -s))
     assert load.friction_nm == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("rate_rad_s", [0.4, -0.4])
 def test_friction_of_a_joint_that_turns_slower_than_wanted_grows_by_the_integral_of_its_lag(rate_rad_s: float) -> None:
     load = LoadAdaptation(law(friction_rate=0.5), MANIPULATOR)
-    arm = Arm(load)
     s = -0.05 * math.copysign(1.0, rate_rad_s)
     for _ in range(200):
-        arm.torque_nm(((0.0, 0.0), (0.0, 0.0)), (rate_rad_s - s, rate_rad_s - s))
-        arm.advance((s, s))
+        ticked(load, ZERO, (s, s), (rate_rad_s - s, rate_rad_s - s))
     grown_nm = 0.5 * 200 * DT_S * 0.05 * math.tanh(0.45 / 0.1)
     assert load.friction_nm == pytest.approx((grown_nm, grown_nm), rel=1e-9)
 
@@ -125,11 +116,8 @@ row = st.floats(-1e3, 1e3)
 def test_estimates_stay_inside_their_bounds_for_any_input(inputs: list[tuple[float, ...]]) -> None:
     config = law(load_rate_xyz=(5.0, 5.0, 20.0), moment_rate=1.0, friction_rate=1.0)
     load = LoadAdaptation(config, MANIPULATOR)
-    arm = Arm(load)
     for s0, s1, s2, s6, s7, lever, rate in inputs:
-        arm.torque_nm(((lever, -lever), (0.0, lever)), (rate, -rate))
-        load.advance_base(DT_S, (s0, s1, s2))
-        arm.advance((s6, s7))
+        ticked(load, (s0, s1, s2), (s6, s7), (rate, -rate), ((lever, -lever), (0.0, lever)))
         assert max(map(abs, load.force_n)) <= config.load_max_n
         assert max(map(abs, load.moments_kg_m)) <= config.moment_max_kg_m
         assert 0.0 <= min(load.friction_nm) <= max(load.friction_nm) <= config.friction_max_nm
@@ -168,20 +156,16 @@ def test_nothing_is_learned_in_saturation() -> None:
 
 def test_a_sample_that_is_not_a_number_leaves_the_estimates() -> None:
     load = LoadAdaptation(law(load_rate_xyz=(5.0, 5.0, 20.0), moment_rate=1.0, friction_rate=1.0), MANIPULATOR)
-    arm = Arm(load)
-    arm.torque_nm(((1.0, 1.0), (0.0, -1.0)), (2.0, 2.0))
-    load.advance_base(DT_S, (-1.0, -1.0, -1.0))
-    arm.advance((-1.0, -0.5))
+    levers: Matrix = ((1.0, 1.0), (0.0, -1.0))
+    ticked(load, (-1.0, -1.0, -1.0), (-1.0, -0.5), (2.0, 2.0), levers)
     before = (load.force_n, load.moments_kg_m, load.friction_nm)
     assert all(map(all, before))
-    load.advance_base(DT_S, (math.nan,) * 3)
-    arm.advance((math.nan, math.nan))
+    ticked(load, (math.nan,) * 3, (math.nan, math.nan), (2.0, 2.0), levers)
     assert (load.force_n, load.moments_kg_m, load.friction_nm) == before
 
 
 def test_the_paper_bound_of_h_holds_for_slow_leakage() -> None:
-    bound = (1.0, 2.0, 3.0, 4.0)
-    adaptation = Adaptation(law(nu=(0.1, 0.1, 0.1, 0.1), h_max=bound))
+    adaptation = Adaptation(law(nu=(0.1, 0.1, 0.1, 0.1), h_max=(1.0, 2.0, 3.0, 4.0)))
     for _ in range(2000):
         adaptation.advance(DT_S, 5.0, (1.0, 2.0, 4.0, 3.0), False)
-    assert adaptation.h == bound
+    assert list(adaptation.H) == [1.0, 2.0, 3.0, 4.0]
