@@ -143,7 +143,7 @@ async def test_vehicle_state_is_complete_in_the_companions_frames_and_outlives_v
         peer.attitude_ned_frd = quat_from_euler_zyx(LEAN_RAD, -LEAN_RAD, math.radians(60))
         expected: Quat = quat_from_euler_zyx(LEAN_RAD, LEAN_RAD, math.radians(30))
         await eventually(
-            lambda: (state := autopilot.vehicle()) and state.attitude_wxyz == pytest.approx(expected, abs=1e-6),
+            lambda: (s := autopilot.vehicle()) is not None and s.attitude_wxyz == pytest.approx(expected, abs=1e-6),
             "a complete vehicle state",
         )
         first = autopilot.vehicle()

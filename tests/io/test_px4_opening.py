@@ -7,6 +7,7 @@ import logging
 import math
 import socket
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
@@ -76,7 +77,7 @@ async def test_px4_without_an_origin_is_given_one_unless_it_is_armed() -> None:
         peer.base_mode &= ~mavlink.MAV_MODE_FLAG_SAFETY_ARMED
         await eventually(lambda: not armed(autopilot), "disarmed")
         assert await autopilot.ensure_origin()
-        origin = peer.origin
+        origin: Any = peer.origin
         assert (origin.latitude, origin.longitude, origin.altitude) == (
             0,
             0,
