@@ -542,7 +542,7 @@ def test_the_report_of_a_flight_that_hardly_began_is_written_all_the_same(tmp_pa
         (replace(i, mocap=None, arm=None), replace(o, control=None), s)
         for i, o, s in list(synthetic_flight(end_s=0.0))[:3]
     ]
-    for part in (rows, rows[:1]):
+    for part in (rows[:1],):
         log = made_of(part)
         summary = summarise(log, outcome="aborted", controller="adaptive", preset="<b>mine</b>")
         actions = (

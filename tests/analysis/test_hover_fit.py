@@ -16,13 +16,16 @@ from companion.model.types import Inputs, Outputs
 from sitl.campaigns.flights import log_of
 from tests.control.test_hover import configured, flown, true_hover_thrust
 
+ERROR = 0.1
+"""Of the parameter that is flown with, which does not adapt."""
+
 
 @cache
-def logged(error: float, adapt: bool) -> FlightLog:
-    config = configured(error, adapt)
-    airframe = config.vehicle.airframe.model_copy(update={"hover_thrust": true_hover_thrust() * (1.0 + error)})
+def logged() -> FlightLog:
+    config = configured(ERROR, False)
+    airframe = config.vehicle.airframe.model_copy(update={"hover_thrust": true_hover_thrust() * (1.0 + ERROR)})
     vehicle = config.vehicle.model_copy(update={"airframe": airframe})
-    return log_of(config.model_copy(update={"vehicle": vehicle}), flown(error, adapt), None)
+    return log_of(config.model_copy(update={"vehicle": vehicle}), flown(ERROR, False), None)
 
 
 def changed(log: FlightLog, change: Callable[[Inputs, Outputs], tuple[Inputs, Outputs]]) -> FlightLog:
@@ -46,21 +49,20 @@ def with_battery(log: FlightLog, drop_v: float, slope_per_v: float) -> FlightLog
     return changed(log, change)
 
 
-@pytest.mark.parametrize(("error", "adapt"), [(0.0, True), (0.1, False)])
-def test_the_fit_is_the_truth_within_its_uncertainty(error: float, adapt: bool) -> None:
-    """Whatever the parameter was, adapting or not, with a payload for two thirds of the flight."""
-    fit = fit_hover_thrust(logged(error, adapt))
+def test_the_fit_is_the_truth_within_its_uncertainty() -> None:
+    """Whatever the parameter was, with a payload for two thirds of the flight."""
+    fit = fit_hover_thrust(logged())
     assert fit.hover_thrust == pytest.approx(true_hover_thrust(), rel=0.005)
     assert abs(fit.hover_thrust - true_hover_thrust()) < 4.0 * fit.standard_error
     assert fit.standard_error < 0.002 * true_hover_thrust()
     assert fit.used_s > 10.0
-    assert fit.configured == pytest.approx(true_hover_thrust() * (1.0 + error))
-    assert fit.last_estimate == pytest.approx(true_hover_thrust() * (1.0 if adapt else 1.0 + error), rel=0.01)
+    assert fit.configured == pytest.approx(true_hover_thrust() * (1.0 + ERROR))
+    assert fit.last_estimate == pytest.approx(true_hover_thrust() * (1.0 + ERROR), rel=0.01)
 
 
 @pytest.mark.parametrize("slope_per_v", [-0.02, 0.0])
 def test_the_slope_over_the_voltage_is_the_truth_within_its_uncertainty(slope_per_v: float) -> None:
-    fit = fit_hover_thrust(with_battery(logged(0.0, True), 1.5, slope_per_v))
+    fit = fit_hover_thrust(with_battery(logged(), 1.5, slope_per_v))
     assert fit.slope is not None and fit.voltage_mean_v is not None and fit.voltage_span_v is not None
     assert fit.slope.per_v == pytest.approx(slope_per_v, abs=min(0.003, 4.0 * fit.slope.standard_error_per_v))
     at_mean = true_hover_thrust() + slope_per_v * (fit.voltage_mean_v - 16.0)
@@ -69,7 +71,7 @@ def test_the_slope_over_the_voltage_is_the_truth_within_its_uncertainty(slope_pe
 
 
 def test_a_voltage_that_hardly_changes_or_is_not_known_gives_no_slope() -> None:
-    still = fit_hover_thrust(with_battery(logged(0.0, True), 0.5 * SLOPE_MIN_V, 0.0))
+    still = fit_hover_thrust(with_battery(logged(), 0.5 * SLOPE_MIN_V, 0.0))
     assert still.slope is None
     assert still.voltage_mean_v == pytest.approx(16.0, abs=SLOPE_MIN_V)
 
@@ -78,14 +80,14 @@ def test_a_voltage_that_hardly_changes_or_is_not_known_gives_no_slope() -> None:
             return i, o
         return msgspec.structs.replace(i, status=msgspec.structs.replace(i.status, battery_voltage_v=None)), o
 
-    blind = fit_hover_thrust(changed(with_battery(logged(0.0, True), 1.5, 0.0), forget))
+    blind = fit_hover_thrust(changed(with_battery(logged(), 1.5, 0.0), forget))
     assert (blind.slope, blind.voltage_mean_v, blind.voltage_span_v) == (None, None, None)
     assert blind.hover_thrust == pytest.approx(still.hover_thrust)
 
 
 def test_less_flight_is_less_certain() -> None:
     """A quarter of the flight: about twice the uncertainty."""
-    log = logged(0.0, True)
+    log = logged()
     whole = fit_hover_thrust(log)
     begin = next(k for k, o in enumerate(log.outputs) if o.phase_kind.value == "flight")
     count = begin + round(whole.used_s / 4.0 / 0.005)
@@ -97,7 +99,7 @@ def test_less_flight_is_less_certain() -> None:
 
 
 def test_a_log_without_hovering_is_refused_in_one_line() -> None:
-    log = logged(0.0, True)
+    log = logged()
     short = dataclasses.replace(log, inputs=log.inputs[:900], outputs=log.outputs[:900], sent=log.sent[:900])
     with pytest.raises(
         HoverFitError, match=rf"^fast: 0\.\d s of steady flight, expected {FIT_MIN_S:g} s or more[^\n]*$"

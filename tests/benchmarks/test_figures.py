@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.measuring.bus import BusCycles, _counted
-from benchmarks.measuring.figures import MET, NOT_MEASURED, NOT_MET, Row, Section, Target, figure, problems
+from benchmarks.measuring.figures import MET, NOT_MEASURED, NOT_MET, Row, Section, Target, problems
 from benchmarks.measuring.hover import late_alone
 from benchmarks.measuring.late import alone_late
 from benchmarks.measuring.latency import Latency
@@ -47,29 +46,6 @@ def test_every_figure_that_a_target_names_must_meet_it(
     assert row(p50, p99, target).verdict == verdict
 
 
-def test_a_ratio_to_what_was_not_measured_is_not_met() -> None:
-    assert row(1.0, 1.0, Target(1.5), {}).verdict == NOT_MEASURED
-    assert (
-        Row(what="loop", beside="bare", figures={}, beside_figures={"p50": 1.0}, target=Target(1.5, ("p50",))).verdict
-        == NOT_MEASURED
-    )
-    assert Row(what="loop", beside="bare", figures={}).verdict == NOT_MEASURED
-
-
-def test_a_count_of_zero_meets_zero() -> None:
-    for count, verdict in ((0.0, MET), (1.0, NOT_MET)):
-        assert (
-            Row(
-                what="late",
-                beside="",
-                figures={"value": count},
-                beside_figures={},
-                target=Target(0.0, ("value",), ratio=False),
-            ).verdict
-            == verdict
-        )
-
-
 def test_problems_name_what_is_not_met_or_not_measured_and_why() -> None:
     missing = Row(
         what="core", beside="", figures={}, beside_figures={}, target=Target(1.0), why_not="the bus did not start"
@@ -102,40 +78,3 @@ def test_percentiles_are_samples() -> None:
     assert (found.p50, found.p99, found.p999, found.max) == pytest.approx((500.0, 990.0, 999.0, 1000.0))
     with pytest.raises(ValueError, match="no samples"):
         Latency.of([])
-
-
-def test_bytes_on_the_wire_are_sent_one_after_the_other() -> None:
-    spread = Latency(1.0, 1.0, 1.0)
-    for baud_bps, wire_ms in ((3_000_000, 0.26), (1_000_000, 0.78)):
-        cycles = BusCycles(
-            command_ms=spread,
-            cycle_ms=spread,
-            failed=0,
-            request_bytes=16,
-            answer_bytes=42,
-            write_bytes=20,
-            baud_bps=baud_bps,
-        )
-        assert cycles.wire_ms == pytest.approx(wire_ms)
-
-
-def test_a_ports_bytes_are_counted_both_ways() -> None:
-    class Port:
-        def writePort(self, packet: list[int]) -> int:
-            return len(packet)
-
-        def readPort(self, length: int) -> bytes:
-            return b"x" * min(length, 5)
-
-    port = Port()
-    sent, received = _counted(port)
-    assert port.writePort([1, 2, 3]) == 3
-    assert [port.readPort(20), port.readPort(2)] == [b"xxxxx", b"xx"]
-    assert (sent, received) == ([3], [5, 2])
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(0.0, "0"), (3.0, "3"), (0.12345, "0.123"), (61.92, "61.9"), (3951.7, "3952")]
-)
-def test_figures_have_three_digits(value: float, text: str) -> None:
-    assert figure(value) == text

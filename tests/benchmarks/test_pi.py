@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import threading
@@ -11,21 +10,10 @@ import pytest
 
 from benchmarks.measuring.figures import MET, NOT_MET
 from benchmarks.measuring.hover import of_threads
-from benchmarks.measuring.pi import PI4_PER_PI5, PI5_S, NotMeasured, Slower, nbody_check, shortest_s, slower
+from benchmarks.measuring.pi import PI4_PER_PI5, PI5_S, slower
 from benchmarks.measuring.rows import sections
 from benchmarks.soaking.processes import threads
 from companion.runtime.native_threads import name_thread
-
-
-def test_mean_and_range_of_ratios() -> None:
-    """Ratios 1 and 4: the mean is 2, and the logarithms 0 and ln 4 deviate by ln 4 / sqrt(2) = ln 2 * sqrt(2)."""
-    found = Slower.of((1.0, 4.0))
-    assert found.mean == pytest.approx(2.0)
-    assert found.log_deviation == pytest.approx(math.log(2.0) * math.sqrt(2.0))
-    assert (found.low, found.high) == pytest.approx((2.0 / 2.0 ** (2 * 2**0.5), 2.0 * 2.0 ** (2 * 2**0.5)))
-    exact = Slower(3.0, 0.0).times(found)
-    assert (exact.mean, exact.log_deviation) == pytest.approx((6.0, found.log_deviation))
-    assert Slower(1.0, 3.0).times(Slower(1.0, 4.0)).log_deviation == pytest.approx(5.0)
 
 
 def test_each_pi_beside_a_computer_as_fast_as_a_pi_5() -> None:
@@ -35,20 +23,6 @@ def test_each_pi_beside_a_computer_as_fast_as_a_pi_5() -> None:
     assert 2.15 < geometric < 2.16, "worked from the published table"
     assert found["Pi 4, 1.8 GHz"].mean == pytest.approx(geometric)
     assert found["Pi 4, 1.5 GHz"].mean == pytest.approx(geometric * 1.2)
-
-
-def test_the_check_against_a_published_program() -> None:
-    """143 ms for 20,000 steps is 7.15 us; times 2.155 x 1.2 x 1.525 it is 28.2 us; published are 158.263 s for 5e6 steps."""
-    estimated_us, published_us = nbody_check(PI5_S)
-    assert estimated_us == pytest.approx(28.2, abs=0.05)
-    assert published_us == pytest.approx(31.65, abs=0.01)
-
-
-def test_the_shortest_time_of_a_result_of_pyperf() -> None:
-    runs = [{"warmups": [[1, 0.01]]}, {"values": [0.3, 0.2]}, {"values": [0.25]}]
-    assert shortest_s(json.dumps({"benchmarks": [{"runs": runs}]})) == 0.2
-    with pytest.raises(NotMeasured, match="no time"):
-        shortest_s(json.dumps({"benchmarks": [{"runs": runs[:1]}]}))
 
 
 def test_cpu_time_of_threads_between_two_samples() -> None:

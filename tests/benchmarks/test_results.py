@@ -227,25 +227,3 @@ def test_a_part_says_in_one_line_what_broke(
     assert command.run_part("core", tmp_path, False) == 1
     assert capsys.readouterr().err == "first second\n"
     assert not (tmp_path / "figures.json").exists()
-
-
-def test_no_results_no_page(tmp_path: Path) -> None:
-    with pytest.raises(SystemExit) as ended:
-        command.main(["--page", "--out", str(tmp_path)])
-    assert ended.value.code == 2
-
-
-def test_an_echo_answers_every_datagram_over_real_sockets() -> None:
-    code = """
-import json
-from dataclasses import asdict
-from benchmarks.measuring.setpoint import pymavlink_echo
-print(json.dumps([asdict(spread) for spread in pymavlink_echo(160)]))
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    inside, wire = json.loads(done.stdout)
-    assert inside["samples"] == wire["samples"] == 60
-    assert 0.0 < inside["p50"] < wire["max"]

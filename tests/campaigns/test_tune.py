@@ -23,7 +23,7 @@ from companion.config.loader import load_flight
 from companion.control.scaled_gains import joint_inertia_kg_m2
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.campaigns.made_up import compare_row, draw_row, fly_made_up
-from tests.support import CATCH, HOVER, ROOT, SHORT_CATCH, run_here
+from tests.support import CATCH, HOVER, ROOT, run_here, set_options
 
 HEXA = ROOT / "examples/tune/hexa_3r.yaml"
 OURS = [(law, preset) for law in ("adaptive", "csc", "psc") for preset in PRESETS[law]]
@@ -42,7 +42,7 @@ def test_every_point_of_the_space_meets_the_conditions_of_its_law(law: str, pres
     config, draw = load_flight(CATCH, HEXA, law, preset), random.Random(preset)
     space = Space.of(config.controller, config.vehicle)
     corners: list[Point] = [(0.0,) * len(space.axes), (1.0,) * len(space.axes)]
-    for point in corners + [tuple(draw.choice((0.0, draw.random(), 1.0)) for _ in space.axes) for _ in range(15)]:
+    for point in corners + [tuple(draw.choice((0.0, draw.random(), 1.0)) for _ in space.axes) for _ in range(5)]:
         settings = space.settings(point)
         assert isinstance(settings, LawConfig)
         for axis, value, coordinate in zip(space.axes, space.values(point), point, strict=True):
@@ -221,11 +221,11 @@ TUNE = ("tune", "--mission", str(CATCH), "--preset", "paper", "--laboratories", 
 @pytest.mark.usefixtures("made_up")
 def test_an_interrupted_search_goes_on_and_ends_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.campaigns.tune.plots.write_pictures", lambda result, out: [])
-    words = (*TUNE, "--budget", "30")
+    words = (*TUNE, "--budget", "12")
     assert run_here(*words, "--out", "whole").code == EXIT_OK
     flights = MadeUp.flown
     monkeypatch.setattr(MadeUp, "flown", 0)
-    for last in (3, 40):
+    for last in (3, 20):
         monkeypatch.setattr(MadeUp, "last", last)
         ended = run_here(*words, "--out", "parts")
         assert (ended.code, ended.out) == (EXIT_ABORTED, "")
@@ -240,7 +240,7 @@ def test_an_interrupted_search_goes_on_and_ends_with_the_same_bits(monkeypatch: 
     for key in ("candidates", "held_out", "gains", "evaluations"):
         assert parts[key] == whole[key]
     printed = json.loads(ended.out)
-    assert printed["evaluations"] == 30 and printed["file"] == "parts/controller.yaml" and printed["better"]
+    assert printed["evaluations"] == 12 and printed["file"] == "parts/controller.yaml" and printed["better"]
     assert printed["held_out"]["cost_after"] < printed["held_out"]["cost_before"]
     assert printed["held_out"]["change_95"][1] < 0.0
     assert printed["fly"] == f"companion fly {CATCH} --sitl --world lab --controller parts/controller.yaml"
@@ -316,7 +316,10 @@ def test_a_law_that_declares_no_gains_cannot_be_tuned(monkeypatch: pytest.Monkey
 def test_a_real_search_flies(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.campaigns.tune.plots.write_pictures", lambda result, out: [])
     words = ("--preset", "paper", "--budget", "2", "--laboratories", "1", "--held-out", "1", "--jobs", "1")
-    ended = run_here("tune", "--mission", str(SHORT_CATCH), *words, "--out", "out")
+    low = set_options(
+        **{"mission.phases[0].height_m": 0.5, "mission.phases[0].duration_s": 1.5, "mission.phases[1].duration_s": 1.0}
+    )
+    ended = run_here("tune", "--mission", str(HOVER), *words, *low, "--out", "out")
     assert ended.code in (EXIT_OK, EXIT_REFUSED), ended.err
     assert "Held-out laboratories" in ended.out and ended.out.endswith("report  out/page.html\n")
     names = {"flights.jsonl", "result.json", "page.html"}

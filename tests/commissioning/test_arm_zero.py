@@ -70,7 +70,7 @@ class Bench:
         return view
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(
     st.tuples(st.sampled_from((-1, 1)), st.sampled_from((-1, 1))),
     st.tuples(st.integers(0, 4095), st.integers(0, 4095)),

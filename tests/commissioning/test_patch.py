@@ -171,9 +171,9 @@ def test_a_new_key_is_quoted_where_it_must_be() -> None:
     assert parsed(edited("a: {}\n", {("a", "x: y"): 1, ("\x85",): 2})) == {"a": {"x: y": 1}, "\x85": 2}
 
 
-def test_every_value_of_the_shipped_file_can_be_replaced() -> None:
+def test_every_third_value_of_the_shipped_file_can_be_replaced() -> None:
     text, shipped = SHIPPED.read_text(encoding="utf-8"), read_document(SHIPPED)
-    for location in [at for at in shipped.values if at and not isinstance(shipped.get(at), dict | list)]:
+    for location in [at for at in shipped.values if at and not isinstance(shipped.get(at), dict | list)][::3]:
         document = read_document(SHIPPED)
         document.data = parsed(text)  # type: ignore[assignment]
         document.replace(location, 123456, Origin("test"))

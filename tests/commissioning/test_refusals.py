@@ -81,11 +81,8 @@ POSE = ("--arm-pose", "90,0")
     ("words", "devices", "expected"),
     [
         (("ft", "check", *POSE), {"force.port": "/dev/no-such-port"}, "no such port"),
-        (("ft", "tare", *POSE), {"force.port": "/dev/no-such-port"}, "no such port"),
-        (("ft", "check", *POSE), {"force": None}, "vehicle 'tarot650-2r' has none; add devices.force"),
         (("ft", "tare", *POSE), {"force": None}, "vehicle 'tarot650-2r' has none; add devices.force"),
         (("mocap", "check"), {**LOOPBACK, "mocap.command_port": 9}, "no server answers on this segment"),
-        (("mocap", "check"), {**LOOPBACK, "mocap.command_port": 9}, "Motive running"),
     ],
 )
 def test_a_missing_device_is_reported(words: tuple[str, ...], devices: dict[str, object], expected: str) -> None:

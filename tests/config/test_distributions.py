@@ -127,7 +127,6 @@ def test_another_seed_draws_the_laboratory_anew_but_keeps_what_was_set(file: str
     ("text", "line"),
     [
         ("rotor_lag_s: {uniform: [2, 1]}", "1:14: rotor_lag_s: uniform: expected [low, high] with low < high, got [2, 1]"),
-        ("rotor_lag_s: {uniform: 2}", "1:14: rotor_lag_s: uniform: expected [low, high] with low < high, got 2"),
         ("rotor_lag_s: {normal: [1, 0]}", "1:14: rotor_lag_s: normal: expected [mean, sigma] with sigma > 0, got [1, 0]"),
         ("rotor_lag_s: {unifrom: [1, 2]}", "1:14: rotor_lag_s: unknown distribution \"unifrom\"; did you mean uniform?"),
         (
@@ -137,9 +136,7 @@ def test_another_seed_draws_the_laboratory_anew_but_keeps_what_was_set(file: str
         ),
         ("rotor_lag_s: {}", "1:14: rotor_lag_s: expected a number, {uniform: [low, high]}, {log_uniform: [low, high]} or {normal: [mean, sigma]}, got a mapping with 0 keys"),
         ("rotor_lag_s: {uniform: [-0.1, 0.1]}", "1:14: rotor_lag_s: expected a number > 0, got -0.1 at the lower end of the drawn range"),
-        ("rotor_lag_s: {normal: [0.03, 0.02]}", "1:14: rotor_lag_s: expected a number > 0, got -0.03 at the lower end of the drawn range"),
         ("mass_error: {uniform: [0, 0.6]}", "1:13: mass_error: expected a number from -0.5 to 0.5, got 0.6 at the upper end of the drawn range"),
-        ("wind_m_s: [0, {uniform: [1, 1]}, 0]", "1:15: wind_m_s[1]: uniform: expected [low, high] with low < high, got [1, 1]"),
         ("throws: {uniform: [1, 5]}", "1:9: throws: expected a whole number from 1 to 1000, got a mapping"),
         ("rotor_lg_s: {uniform: [1, 5]}", "1:1: rotor_lg_s: unknown key; did you mean rotor_lag_s?"),
         ("handling: {uniform: [0, 1]}", "1:11: handling: expected true or false, got a mapping"),

@@ -52,11 +52,6 @@ BAD_MISSION = [
     ),
     (
         "duration_s: 0.5",
-        "duration_ms: 500",
-        [f"{CATCH}:34:5: phases[1].duration_ms: unknown key; write duration_s, in s (not in ms)"],
-    ),
-    (
-        "duration_s: 0.5",
         "duration: 0.5",
         [f"{CATCH}:34:5: phases[1].duration: unknown key; write duration_s, in s (without a unit)"],
     ),
@@ -83,19 +78,12 @@ BAD_MISSION = [
         [f'{CATCH}:30:15: phases[0].height_m: expected a number > 0, got "1.0" (write 1.0 without quotes)'],
     ),
     ("height_m: 1.0", "height_m: .nan", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got .nan"]),
-    ("height_m: 1.0", "height_m: 1e999", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got .inf"]),
     ("height_m: 1.0", "height_m: true", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got true"]),
-    ("height_m: 1.0", "height_m:", [f"{CATCH}:30:14: phases[0].height_m: expected a number > 0, got nothing"]),
     ("    height_m: 1.0\n", "", [f"{CATCH}:29:5: phases[0].height_m: missing; expected a number > 0"]),
     (
         "to_m: [1.0, 0.0, 1.0]",
         "to_m: [1.0, 0.0]",
         [f"{CATCH}:37:11: phases[2].to_m: expected a list of 3 numbers, got [1.0, 0.0]"],
-    ),
-    (
-        "to_m: [1.0, 0.0, 1.0]",
-        "to_m: [1.0, 0.0, x]",
-        [f'{CATCH}:37:22: phases[2].to_m[2]: expected a number, got "x"'],
     ),
     (
         "type: takeoff ",
@@ -133,18 +121,7 @@ BAD_MISSION = [
         ],
     ),
     ("schema_version: 1", "schema_version: 2", [f"{CATCH}:6:17: schema_version: expected 1, got 2"]),
-    ("schema_version: 1", "schema_version: true", [f"{CATCH}:6:17: schema_version: expected 1, got true"]),
     ("name: catch\nvehicle", "name: catch\nname: x\nvehicle", [f"{CATCH}:8:1: name: duplicate key, already given on line 7; remove one of the two"]),
-    (
-        "../vehicles/tarot650_2r.yaml",
-        "../vehicles/none.yaml",
-        [f"{CATCH}:8:10: vehicle: configs/vehicles/none.yaml: no such file"],
-    ),
-    (
-        "{law: adaptive, preset: recommended}",
-        "{file: mine.yaml, preset: paper}",
-        [f"{CATCH}:9:39: controller.preset: give either a preset or a file, not both"],
-    ),
     (
         "{law: adaptive, preset: recommended}",
         "{file: ../controllers/none.yaml}",
@@ -186,12 +163,10 @@ def test_bad_mission_file(project: Path, old: str, new: str, expected: list[str]
 BAD_VEHICLE = [
     ("servo_id: 2", "servo_id: 1", ["arm.joints[1].servo_id: joint 1 has the servo id 1 too; give each servo its own id"]),
     ("address: serial:///dev/ttyAMA0:921600", "address: /dev/ttyAMA0:921600", ["udpin://0.0.0.0:14540, udpout://HOST:PORT, tcpout://HOST:PORT or serial:///dev/ttyAMA0:921600, got '/dev/ttyAMA0:921600'"]),
-    ("address: serial:///dev/ttyAMA0:921600", "address: udpin://0.0.0.0:145400", ["autopilot.address: expected a port from 1 to 65535, got 145400"]),
     ("interface: 0.0.0.0", "interface: eth0", ["mocap.interface: expected an IPv4 address such as 192.168.1.20, got 'eth0'"]),
     ("multicast_group: 239.255.42.99", "multicast_group: 192.168.1.5", ["mocap.multicast_group: expected a multicast group, from 224.0.0.0 to 239.255.255.255, got 192.168.1.5"]),
     ("watchdog_ms: 100", "watchdog_ms: 90", ["watchdog_ms: must be a multiple of 20 ms (the register's unit), got 90 ms"]),
     ("sign: -1", "sign: 0", ["sign: expected one of -1, 1, got 0"]),
-    ("baud: 3000000", "baud: 9600", ["baud: expected one of 57600, 115200, 1000000, 2000000, 3000000, 4000000, got 9600"]),
     ("rate_hz: 200.0", "rate_hz: 200.0\n    natnet_version: 3.0", ['expected one of "3.0", "3.1", "4.0", "4.1", "4.2", "4.3", "4.4", got 3.0 (put it in quotes)']),
     ("x_m: [-2.2, 2.2]", "x_m: [2.2, -2.2]", ["room.x_m: expected the first number to be below the second, got [2.2, -2.2]"]),
     ("link_com_m: [0.16, 0.08]", "link_com_m: [0.26, 0.08]", ["the centre of mass is beyond the end of the link: at 0.26 m on a link of 0.2 m"]),
@@ -203,9 +178,7 @@ BAD_VEHICLE = [
     ("mass_kg: 3.0 ", "mass_kg: 0.4 ", ["mass_kg: 0.4 kg is the mass of the whole vehicle, but arm and tool alone have 0.45 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 20.0", ["thrust_max_n: 20 N do not lift 3 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 60.0\n  inertia_kg_m2: [0.02, 0.02, 0.05]", ["inertia_kg_m2[2]: expected at most 0.04 kg m^2 (no moment of a rigid body exceeds the sum of the other two), got 0.05"]),
-    ("servo_id: 2", "servo_id: 2.0", ["servo_id: expected a whole number from 0 to 252, got 2.0"]),
     ("safety:", "computer:\n  cpus: [2, 3, 2]\nsafety:", ["computer.cpus: expected each core once, got 2 twice in [2, 3, 2]"]),
-    ("safety:", "computer:\n  cpus: [-1]\nsafety:", ["computer.cpus[0]: expected a whole number from 0 to 1023, got -1"]),
 ]  # fmt: skip
 
 
@@ -246,22 +219,16 @@ BAD_OVERRIDES = [
     ("wrld.payload_kg=0.2", "--set wrld.payload_kg: unknown section 'wrld'; did you mean world?"),
     ("x.y=1", "--set x.y: unknown section 'x'; available: mission, vehicle, controller, world"),
     ("world.payload_kg", "--set world.payload_kg: no '='; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
-    ("world.payload_kg=", "--set world.payload_kg: no value; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("world=1", "--set world: the key names a whole section; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("world..a=1", "--set world..a: cannot read the key from column 6; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
-    ("[0]=1", "--set [0]: unknown section '0'; available: mission, vehicle, controller, world"),
     ("world.payload_kg=3", "--set world.payload_kg: expected a number from 0 to 2, got 3"),
     ("world.payload_kg=.nan", "--set world.payload_kg: expected a number from 0 to 2, got .nan"),
-    ("world.payload_kg=.inf", "--set world.payload_kg: expected a number from 0 to 2, got .inf"),
     ("world.seed=1.5", "--set world.seed: expected a whole number >= 0, got 1.5"),
     ("world.faults=[{kind: mocap_los, t_s: 5}]", '--set world.faults: faults[0].kind: expected one of 48 names ("mocap_loss", "mocap_occluded", "mocap_jump", ...), got "mocap_los" (did you mean mocap_loss?)'),
     ("world.throw_velocity_m_s=[1, 2", "--set world.throw_velocity_m_s: not YAML: expected ',' or ']', but got '<stream end>' while parsing a flow sequence"),
     ("world.wind_m_s={a: 1, a: 2}", "--set world.wind_m_s: a: duplicate key, already given; remove one of the two"),
-    ("vehicle.safty.mocap_timeout_s=0.2", "--set vehicle.safty.mocap_timeout_s: safty: unknown key; did you mean safety?"),
     ("mission.phases[9].duration_s=3", "--set mission.phases[9].duration_s: mission.phases has no index 9; available: 0 to 6"),
-    ("mission.phases.duration_s=3", "--set mission.phases.duration_s: mission.phases has no keys; it is a list"),
     ("mission.name.x=3", "--set mission.name.x: mission.name has no keys; it is a single value"),
-    ("mission.name[0]=3", "--set mission.name[0]: mission.name is not a list"),
     ("mission.phases=[]", "--set mission.phases: expected a list of at least 2 items, got []"),
     ("mission.vehicle=none.yaml", "--set mission.vehicle: vehicle: none.yaml: no such file"),
     ("controller.rho_max=0", "--set controller.rho_max: expected a number > 0, got 0"),
@@ -361,10 +328,6 @@ BAD_COMPARISON_OVERRIDES = [
 def test_bad_override_of_a_comparison_law(project: Path, law: str, option: str, text: str) -> None:
     lines = lines_of(lambda: load_sitl(CATCH, controller_law=law, overrides=[option]))
     assert lines == [f"--set {option.partition('=')[0]}: {text}"]
-
-
-def test_missing_mission() -> None:
-    assert lines_of(lambda: load_sitl("none.yaml")) == ["none.yaml: no such file"]
 
 
 def test_overrides_reach_every_section(project: Path) -> None:
@@ -517,9 +480,3 @@ def test_a_flights_configuration_holds_nothing_of_the_simulated_world(project: P
 def test_the_world_in_the_configuration_of_an_older_log_is_left_out(project: Path) -> None:
     config = load_sitl(CATCH, overrides=["world.payload_kg=0.37"])
     assert logged_flight(config.model_dump_json(exclude={"laboratory"})) == config.flight
-
-
-def test_a_loaded_config_is_frozen(project: Path) -> None:
-    config = load_sitl(CATCH)
-    with pytest.raises(ValueError, match="frozen"):
-        config.world.payload_kg = 1.0

@@ -5,12 +5,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import datetime
-import functools
 import ipaddress
 import json
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
-from typing import Any, ParamSpec
+from typing import Any
 
 import aiohttp
 from cryptography import x509
@@ -30,25 +29,8 @@ OPERATORS = Operators([ANNA], "operators.yaml")
 SIGNER = Signer(ANNA.name, ANNA.key)
 
 
-P = ParamSpec("P")
-
-
-def played(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]:
-    """Decorate an async test: run its coroutine with a deadline."""
-
-    @functools.wraps(test)
-    def run(*args: P.args, **kwargs: P.kwargs) -> None:
-        async def bounded() -> None:
-            async with asyncio.timeout(DEADLINE_S):
-                await test(*args, **kwargs)
-
-        asyncio.run(bounded())
-
-    return run
-
-
 async def until(condition: Callable[[], bool]) -> None:
-    """Wait for a condition, until the deadline of `played`."""
+    """Wait for a condition, until the deadline of the test."""
     while not condition():  # noqa: ASYNC110 - nobody tells
         await asyncio.sleep(0.01)
 

@@ -227,7 +227,7 @@ def test_a_command_is_accepted_once_at_most_and_never_after_its_first_refusal(
     assert first_refusal_is_the_end(reasons)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     st.lists(st.tuples(st.sampled_from(list(COMMANDS.values())), st.floats(-6.0, 90.0)), min_size=1, max_size=30),
     st.data(),

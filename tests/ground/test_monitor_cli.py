@@ -24,7 +24,7 @@ from companion.model.codec import to_json
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.analysis.synthetic_flight import record_flight
 from tests.broker import Broker, loopback_broker
-from tests.ground.monitor_rig import ANNA, OPERATORS, played, self_signed
+from tests.ground.monitor_rig import ANNA, OPERATORS, self_signed
 from tests.ground.vehicle import played_vehicle
 from tests.support import CATCH, Sandbox, sandbox_in
 
@@ -51,7 +51,6 @@ def failed(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[in
     return code, lines[0]
 
 
-@played
 async def test_it_prints_an_address_to_open_and_ends_in_order(broker: Broker, sandbox: Sandbox, tmp_path: Path) -> None:
     keys = tmp_path / "operators.yaml"
     write_private(keys, operators_text([ANNA]).encode())
@@ -156,7 +155,6 @@ def test_a_log_is_the_records_that_the_vehicle_would_have_sent(log: Path) -> Non
     assert streams[0].wall_s == pytest.approx(1.7e9, abs=1.0)
 
 
-@played
 async def test_logs_are_served_without_a_broker(log: Path, tmp_path: Path, sandbox: Sandbox) -> None:
     with sandbox.start("monitor", log, log, "--port", 0) as running:
         await asyncio.to_thread(running.wait_for, "(Ctrl-C ends)\n")

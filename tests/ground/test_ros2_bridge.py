@@ -18,7 +18,7 @@ from companion.ground.protocol.messages import VERSION, EventLine, Events
 from companion.ground.protocol.proof import Signer
 from companion.model.types import OperatorCommand
 from tests.broker import loopback_broker
-from tests.ground.monitor_rig import ANNA, OPERATORS, played
+from tests.ground.monitor_rig import ANNA, OPERATORS
 from tests.ground.vehicle import flight, played_vehicle
 from tests.support import DEADLINE_S, ROOT
 
@@ -111,7 +111,6 @@ def test_each_event_is_new_once_and_a_new_flight_begins_again(bridge: Any) -> No
     assert taken == [["a", "b"], [], ["c", "d"], ["y", "z"], ["e"]]
 
 
-@played
 async def test_hold_and_land_reach_the_vehicle_and_other_words_do_not(bridge: Any, tmp_path: Path) -> None:
     published: list[tuple[str, Any]] = []
     posed = asyncio.Event()

@@ -33,7 +33,7 @@ from companion.ground.station.text_view import STALE_S, Notice, StationStatus, r
 from companion.ground.station.vehicles import Vehicle, VehicleTracker
 from companion.model.types import OperatorCommand
 from tests.broker import Broker
-from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, played
+from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER
 from tests.ground.vehicle import flight, played_vehicle, state_of
 from tests.support import DEADLINE_S, ROOT
 
@@ -223,7 +223,6 @@ def test_a_confirmation_is_for_what_was_shown(after: dict[str, Any]) -> None:
     assert screen._command("r", station) is OperatorCommand.RESUME
 
 
-@played
 async def test_it_shows_commands_and_leaves_the_terminal_as_it_was(broker: Broker, tmp_path: Path) -> None:
     async with played_vehicle(broker.port, OPERATORS) as vehicle, terminal_at(broker, tmp_path) as terminal:
         await terminal.shows("FLYING")
@@ -251,7 +250,6 @@ async def test_it_shows_commands_and_leaves_the_terminal_as_it_was(broker: Broke
         assert terminal.settings == terminal.before
 
 
-@played
 async def test_n_shows_the_next_vehicle_and_ctrl_c_ends_the_display(broker: Broker, tmp_path: Path) -> None:
     async with (
         played_vehicle(broker.port, OPERATORS, "one") as one,
@@ -272,7 +270,6 @@ async def test_n_shows_the_next_vehicle_and_ctrl_c_ends_the_display(broker: Brok
         assert terminal.settings == terminal.before
 
 
-@played
 async def test_a_pipe_gets_a_line_a_second(broker: Broker) -> None:
     async with played_vehicle(broker.port, OPERATORS):
         process = await asyncio.create_subprocess_exec(

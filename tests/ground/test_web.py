@@ -26,7 +26,6 @@ from tests.ground.monitor_rig import (
     base_of,
     monitor_at,
     on_page,
-    played,
     self_signed,
     until,
     viewer_of,
@@ -34,7 +33,6 @@ from tests.ground.monitor_rig import (
 from tests.ground.vehicle import flight, played_vehicle
 
 
-@played
 async def test_a_viewer_receives_hello_and_the_known_state_and_then_live_data(broker: Broker) -> None:
     async with played_vehicle(broker.port, OPERATORS), monitor_at(broker.url) as monitor, viewer_of(monitor) as viewer:
         hello = await viewer.next()
@@ -51,7 +49,6 @@ async def test_a_viewer_receives_hello_and_the_known_state_and_then_live_data(br
         assert [line["text"] for line in newest["events"]["data"]["lines"]] == [line.text for line in flight()[2].lines]
 
 
-@played
 async def test_a_silent_viewer_is_greeted_without_a_token(broker: Broker) -> None:
     async with monitor_at(broker.url) as monitor, aiohttp.ClientSession() as session:
         base = base_of(monitor)
@@ -60,7 +57,6 @@ async def test_a_silent_viewer_is_greeted_without_a_token(broker: Broker) -> Non
             assert hello["kind"] == "hello" and hello["can_command"] is False
 
 
-@played
 async def test_requests_of_other_hosts_and_origins_are_refused(broker: Broker) -> None:
     async with monitor_at(broker.url) as monitor, aiohttp.ClientSession() as session:
         base = base_of(monitor)
@@ -90,7 +86,6 @@ async def test_requests_of_other_hosts_and_origins_are_refused(broker: Broker) -
         ('{"kind":"what"}', 1008),
     ],
 )
-@played
 async def test_a_viewer_that_sends_an_invalid_message_is_disconnected(broker: Broker, text: str, code: int) -> None:
     async with monitor_at(broker.url) as monitor, viewer_of(monitor) as viewer, viewer_of(monitor) as other:
         await viewer.until("broker")
@@ -99,7 +94,6 @@ async def test_a_viewer_that_sends_an_invalid_message_is_disconnected(broker: Br
         await other.until("hello")
 
 
-@played
 async def test_a_viewer_that_floods_is_disconnected(broker: Broker) -> None:
     async with on_page(broker) as (vehicle, _monitor, viewer):
         await viewer.until("stream")
@@ -111,7 +105,6 @@ async def test_a_viewer_that_floods_is_disconnected(broker: Broker) -> None:
         assert vehicle.commands_heard == 0
 
 
-@played
 async def test_a_slow_viewer_is_disconnected_and_no_other_misses_an_event(broker: Broker) -> None:
     async with on_page(broker, quiet=True) as (vehicle, monitor, viewer):
         await viewer.until("events")
@@ -126,7 +119,6 @@ async def test_a_slow_viewer_is_disconnected_and_no_other_misses_an_event(broker
                 assert got["data"]["lines"][0]["text"] == str(count)
 
 
-@played
 async def test_an_invalid_message_is_counted_and_not_passed_on(broker: Broker) -> None:
     async with (
         played_vehicle(broker.port, OPERATORS, quiet=True) as vehicle,
@@ -144,7 +136,6 @@ async def test_an_invalid_message_is_counted_and_not_passed_on(broker: Broker) -
         assert sum(message["kind"] == "events" for message in viewer.heard) == 2
 
 
-@played
 async def test_the_broker_may_come_and_go(tmp_path: Path) -> None:
     with loopback_broker(tmp_path) as broker:
         await asyncio.to_thread(broker.stop)
@@ -196,7 +187,6 @@ def test_other_computers_command_over_tls_only(host: str, tls: bool, commands: b
     assert ("#token=" in monitor.url) is commands
 
 
-@played
 async def test_the_page_over_tls(broker: Broker, tmp_path: Path) -> None:
     cert, key = self_signed(tmp_path)
     server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)

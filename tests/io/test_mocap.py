@@ -300,8 +300,8 @@ async def test_version_that_is_not_supported() -> None:
 
 async def test_body_never_seen_lists_the_others() -> None:
     async with NatNetServer(bodies=[(1, "quad"), (4, "wand")]) as server, streaming(server, POSE, STRANGER):
-        text = await refusal(mocap(device_for(server, rigid_body_id=7), body_timeout_s=2.0))
-        assert "rigid body id 7 was never seen within 2 s" in text
+        text = await refusal(mocap(device_for(server, rigid_body_id=7), body_timeout_s=1.0))
+        assert "rigid body id 7 was never seen within 1 s" in text
         assert '1 "quad", 4 "wand"' in text
 
 
@@ -315,7 +315,7 @@ async def test_two_bodies_with_one_streaming_id() -> None:
 async def test_body_never_tracked() -> None:
     lost = BodyPose(1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), valid=False)
     async with NatNetServer(bodies=[(1, "quad")]) as server, streaming(server, lost):
-        text = await refusal(mocap(device_for(server), body_timeout_s=2.0))
+        text = await refusal(mocap(device_for(server), body_timeout_s=1.0))
         assert 'rigid body 1 "quad" is streamed but was not tracked' in text
 
 

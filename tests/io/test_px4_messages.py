@@ -188,10 +188,3 @@ def test_the_newest_messages_are_kept_when_none_are_taken() -> None:
     for number in range(500):
         requests.hear({"severity": 2, "text": str(number), "id": number, "chunk_seq": 0}, 0.0)
     assert requests.take_messages(0.0) == [f"critical: {number}" for number in range(300, 500)]
-
-
-def test_a_text_that_may_go_on_is_reported_when_messages_are_taken_later() -> None:
-    requests = RequestQueue()
-    requests.hear({"severity": 2, "text": "x" * 50, "id": 1, "chunk_seq": 0}, 0.0)
-    assert requests.take_messages(0.1) == []
-    assert requests.take_messages(1.0) == [f"critical: {'x' * 50}"]

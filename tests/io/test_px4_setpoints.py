@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal, get_args
 
@@ -15,10 +14,10 @@ from companion.config.devices import AutopilotDevice
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.io.px4.setpoints import DirectSetpoints, OffboardSetpoints
 from companion.model.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
-from companion.model.types import AttitudeSetpoint, FlightMode, Vec3
+from companion.model.types import AttitudeSetpoint, FlightMode
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import Px4Peer
-from tests.io.test_px4 import DO_SET_MODE, GOLDEN_ATTITUDES
+from tests.io.test_px4 import DO_SET_MODE, GOLDEN_ATTITUDES, WRONG_SETPOINTS, assert_attitude_target
 from tests.support import DEADLINE_S, eventually, free_udp_port
 
 Way = Literal["direct", "offboard"]
@@ -32,42 +31,21 @@ def edge(port: int, way: Way) -> MavsdkAutopilot:
     return MavsdkAutopilot(device, flight_clock())
 
 
-@pytest.mark.parametrize(("euler_world_rad", "euler_ned_rad"), GOLDEN_ATTITUDES)
-async def test_the_plugin_sends_the_same_attitude_and_thrust(euler_world_rad: Vec3, euler_ned_rad: Vec3) -> None:
-    port = free_udp_port()
-    with Px4Peer(port) as peer:
-        async with edge(port, "offboard") as autopilot:
-            assert autopilot.send_attitude(AttitudeSetpoint(quat_from_euler_zyx(*euler_world_rad), 0.625))
-            target = await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET")
-    expected = quat_from_euler_zyx(*euler_ned_rad)
-    dot = sum(a * b for a, b in zip(target.q, expected, strict=True))
-    assert abs(dot) == pytest.approx(1.0, abs=1e-6)
-    assert target.thrust == 0.625
-    assert target.type_mask == 7  # attitude and thrust count, body rates are ignored
-    assert (target.target_system, target.target_component) == (1, 1)
-
-
-@pytest.mark.parametrize(
-    "setpoint",
-    [
-        AttitudeSetpoint((math.nan, 0.0, 0.0, 0.0), 0.5),
-        AttitudeSetpoint((0.0, 0.0, 0.0, 0.0), 0.5),
-        AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), math.nan),
-        AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 1.001),
-    ],
-    ids=["nan", "no-direction", "thrust-nan", "thrust-above-one"],
-)
-async def test_a_setpoint_that_must_not_leave_does_not_reach_the_plugin(setpoint: AttitudeSetpoint) -> None:
+async def test_the_plugin_sends_the_same_attitude_and_thrust_and_nothing_that_must_not_leave() -> None:
     """MAVSDK itself would send it."""
-
     port = free_udp_port()
     with Px4Peer(port) as peer:
         async with edge(port, "offboard") as autopilot:
-            with pytest.raises(ValueError, match="setpoint"):
-                autopilot.send_attitude(setpoint)
+            for number, (euler_world_rad, euler_ned_rad) in enumerate(GOLDEN_ATTITUDES, 1):
+                assert autopilot.send_attitude(AttitudeSetpoint(quat_from_euler_zyx(*euler_world_rad), 0.625))
+                target = await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET", number)
+                assert_attitude_target(target, euler_ned_rad)
+            for setpoint in WRONG_SETPOINTS:
+                with pytest.raises(ValueError, match="setpoint"):
+                    autopilot.send_attitude(setpoint)
             assert autopilot.send_attitude(LEVEL)
-            await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET")
-        assert {target.thrust for target in peer.of("SET_ATTITUDE_TARGET")} == {LEVEL.thrust}
+            await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET", len(GOLDEN_ATTITUDES) + 1)
+        assert {target.thrust for target in peer.of("SET_ATTITUDE_TARGET")} == {0.625, LEVEL.thrust}
 
 
 async def fly_in_offboard(peer: Px4Peer, autopilot: MavsdkAutopilot) -> None:
@@ -95,7 +73,7 @@ async def test_each_setpoint_leaves_once_and_a_caller_who_falls_silent_leaves_no
     with Px4Peer(port) as peer:
         async with edge(port, way) as autopilot:
             await fly_in_offboard(peer, autopilot)
-            assert await counted(peer, 1.0) == 0
+            assert await counted(peer, 0.5) == 0
             for k in range(10):
                 assert autopilot.send_attitude(AttitudeSetpoint(LEVEL.attitude_wxyz, 0.1 + 0.05 * k))
             await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET", 11)
@@ -104,6 +82,7 @@ async def test_each_setpoint_leaves_once_and_a_caller_who_falls_silent_leaves_no
             sent = [target.thrust for target in peer.of("SET_ATTITUDE_TARGET")]
             assert sent == pytest.approx([LEVEL.thrust] + [0.1 + 0.05 * k for k in range(10)])
         assert await counted(peer, 0.5) == 0, "the edge is left"
+        assert peer.commands(DO_SET_MODE) == [], "MAVSDK's offboard.stop() would command HOLD"
 
 
 async def test_what_the_plugin_does_not_send_in_time_leaves_straight_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,16 +159,3 @@ def path_with(
     path = Path(None, write, DirectSetpoints(lambda number, payload: True, 1))
     path._plugin = Plugin()
     return path
-
-
-@pytest.mark.parametrize("way", WAYS)
-async def test_neither_way_asks_for_a_mode_of_its_own(way: Way) -> None:
-    """MAVSDK's offboard.stop() would command HOLD; an edge that closes commands nothing."""
-
-    port = free_udp_port()
-    with Px4Peer(port) as peer:
-        async with edge(port, way) as autopilot:
-            await fly_in_offboard(peer, autopilot)
-            autopilot.send_attitude(None)
-        assert peer.packets_so_far()
-        assert peer.commands(DO_SET_MODE) == []

@@ -118,10 +118,10 @@ async def send_setpoints(autopilot: MavsdkAutopilot, px4: Px4Peer, count: int, e
     await asyncio.to_thread(px4.wait_for, "SET_ATTITUDE_TARGET", count)
 
 
-async def test_qgroundcontrol_sees_the_stub_reads_a_parameter_and_hears_our_words() -> None:
+async def test_qgroundcontrol_sees_the_stub_reads_a_parameter_hears_our_words_and_chooses_a_mode() -> None:
     port = free_udp_port()
     with GroundPeer() as ground:
-        async with standing_stub(port) as stub, link(port, ground.address) as (_, station):
+        async with standing_stub(port) as stub, link(port, ground.address) as (autopilot, station):
             await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1, autopilot=mavlink.MAV_AUTOPILOT_PX4)
             await asyncio.to_thread(ground.wait_for, "ATTITUDE_QUATERNION", 1)
             value = await asyncio.to_thread(ground.read_param, "COM_OF_LOSS_T")
@@ -151,21 +151,24 @@ async def test_qgroundcontrol_sees_the_stub_reads_a_parameter_and_hears_our_word
             assert ground.senders() == {(1, 1), (1, 191)}
             assert station.take_messages() == [f"ground station 127.0.0.1:{ground.port} is connected"]
 
+            custom = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
+            for main, sub, mode in ((1.0, 0.0, FlightMode.MANUAL), (4.0, 3.0, FlightMode.HOLD)):
+                fields = (custom, main, sub, 0.0, 0.0, 0.0, 0.0)
+                ground.say(mavlink.MAVLink_command_long_message(1, 1, 176, 0, *fields))
+                await eventually(partial(is_in_mode, autopilot, mode), mode.name)
+            await asyncio.to_thread(ground.wait_for, "COMMAND_ACK", 1, command=176)
 
-@pytest.mark.parametrize("kind", ["COMMAND_LONG", "COMMAND_INT"])
-async def test_a_forced_disarm_from_the_ground_does_not_reach_an_armed_px4(kind: str) -> None:
+
+async def test_a_forced_disarm_from_the_ground_does_not_reach_an_armed_px4() -> None:
     port = free_udp_port()
     with GroundPeer() as ground, Px4Peer(port) as px4:
         px4.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
         async with link(port, ground.address) as (_, station):
             await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1, autopilot=mavlink.MAV_AUTOPILOT_PX4)
-            if kind == "COMMAND_LONG":
-                ground.say(mavlink.MAVLink_command_long_message(1, 1, 400, 0, 0.0, 21196.0, *[0.0] * 5))
-            else:
-                forced = (0.0, 21196.0, 0.0, 0.0)
-                ground.say(mavlink.MAVLink_command_int_message(1, 1, 0, 400, 0, 0, *forced, 0, 0, 0.0))
+            ground.say(mavlink.MAVLink_command_long_message(1, 1, 400, 0, 0.0, 21196.0, *[0.0] * 5))
+            ground.say(mavlink.MAVLink_command_int_message(1, 1, 0, 400, 0, 0, 0.0, 21196.0, 0.0, 0.0, 0, 0, 0.0))
             ground.say(mavlink.MAVLink_command_long_message(1, 1, 21, 0, *[0.0] * 7))
-            await eventually(lambda: bool(px4.commands(21)), "LAND, which was sent after it")
+            await eventually(lambda: bool(px4.commands(21)), "LAND, which was sent after them")
             assert px4.commands(400) == []
             assert [message for message in px4.of("COMMAND_INT") if message.command == 400] == []
             texts: list[str] = []
@@ -175,21 +178,7 @@ async def test_a_forced_disarm_from_the_ground_does_not_reach_an_armed_px4(kind:
                 return len(texts) > 1
 
             await eventually(refused, "what was refused")
-            assert any("1 command 400 while PX4 is armed" in text for text in texts), texts
-
-
-async def test_a_mode_that_the_ground_chose_reaches_px4_and_the_companion_sees_it() -> None:
-    port = free_udp_port()
-    with GroundPeer() as ground:
-        async with standing_stub(port), link(port, ground.address) as (autopilot, _):
-            await eventually(lambda: autopilot.status() is not None, "a heartbeat")
-            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1, autopilot=mavlink.MAV_AUTOPILOT_PX4)
-            custom = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
-            for main, sub, mode in ((1.0, 0.0, FlightMode.MANUAL), (4.0, 3.0, FlightMode.HOLD)):
-                fields = (custom, main, sub, 0.0, 0.0, 0.0, 0.0)
-                ground.say(mavlink.MAVLink_command_long_message(1, 1, 176, 0, *fields))
-                await eventually(partial(is_in_mode, autopilot, mode), mode.name)
-            await asyncio.to_thread(ground.wait_for, "COMMAND_ACK", 1, command=176)
+            assert any("2 command 400 while PX4 is armed" in text for text in texts), texts
 
 
 def _forgeries() -> list[Any]:
@@ -391,7 +380,7 @@ class NoForwarder:
         b'{"text": "' + b"x" * 4000,
         json.dumps({"text": "\x1b[2J" + "x" * 3000}).encode(),
     ],
-    ids=[f"packet {number}" for number in range(10)],
+    ids=range(10),
 )
 def test_whatever_the_relay_sends_costs_the_flight_a_line_at_most(packet: bytes) -> None:
     """The relay faces the network: who takes it over must reach nothing in the flight process."""
@@ -434,15 +423,12 @@ def test_when_the_flight_process_dies_the_ground_is_informed_and_the_relay_ends(
 @pytest.mark.parametrize(
     "address",
     [
-        *(
-            "",
-            "14550",
-            "udp://127.0.0.1:14550",
-            "udpin://0.0.0.0:14550",
-            "serial:///dev/ttyUSB0:57600",
-            "udpout://:14550",
-        ),
-        *("udpout://127.0.0.1", "udpout://127.0.0.1:0", "udpout://127.0.0.1:65536", "udpout://a b:14550"),
+        "",
+        "14550",
+        "udpin://0.0.0.0:14550",
+        "serial:///dev/ttyUSB0:57600",
+        "udpout://:14550",
+        "udpout://127.0.0.1:65536",
     ],
 )
 def test_an_address_that_is_none_is_one_line(address: str) -> None:
@@ -470,7 +456,6 @@ async def test_a_host_that_cannot_be_spoken_to_is_one_line_and_leaves_nothing_op
         assert found in line and "\n" not in line
 
 
-@pytest.mark.parametrize("address", ["udp://127.0.0.1:14550", "udpout://127.0.0.1", "udpout://127.0.0.1:0"])
-def test_an_address_that_is_none_is_reported_before_any_device_is_opened(address: str) -> None:
+def test_an_address_that_is_none_is_reported_before_any_device_is_opened() -> None:
     with pytest.raises(ConfigError, match=r"vehicle\.ground\.qgroundcontrol: expected udpout://HOST:PORT"):
-        load_flight(CATCH, overrides=[f"vehicle.ground.qgroundcontrol={address}"])
+        load_flight(CATCH, overrides=["vehicle.ground.qgroundcontrol=udpout://127.0.0.1:0"])

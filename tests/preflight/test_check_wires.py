@@ -121,16 +121,24 @@ class StubbornServo(ServoModel):
         super().write(address, data)
 
 
-def test_devices_that_do_not_open_are_rows_and_the_others_are_looked_at(sandbox: Sandbox, tmp_path: Path) -> None:
-    """No force sensor, and a servo that refuses its operating mode."""
+def test_in_a_sound_world_devices_that_do_not_open_are_rows_and_ctrl_c_arms_nothing(
+    sandbox: Sandbox, tmp_path: Path
+) -> None:
+    """No force sensor, and a servo that refuses its operating mode; then a flight that is interrupted in its preflight."""
 
     async def check(world: World) -> Ended:
         async with ServoBus([StubbornServo(1), StubbornServo(2)]) as bus:
             options = world.addresses(arm={"port": bus.path}, force={"port": "/dev/ttyNONE"})
             return await asyncio.to_thread(sandbox.run, "check", CATCH, "--json", *options)
 
+    longer = set_options(**{"vehicle.safety.preflight_s": 60.0})
     with sandbox_in(tmp_path / "world") as around, World(around) as world:
         ended = asyncio.run(check(world))
+        with sandbox.start("fly", CATCH, "--out", "out", *longer, *world.addresses()) as running:
+            running.wait_for("all devices ... ")
+            running.signal(signal.SIGINT)
+            given_up = running.end()
+        assert (world.armings, world.crashes) == (0, 0)
     sandbox.assert_nobody_left()
     assert ended.code == EXIT_REFUSED, ended
     rows = rows_in(ended.out)
@@ -138,18 +146,7 @@ def test_devices_that_do_not_open_are_rows_and_the_others_are_looked_at(sandbox:
     assert "writing operating mode (register 11) was refused" in rows["arm.device"]["read"]
     assert "/dev/ttyNONE: no such port" in rows["force.device"]["read"]
     assert rows["px4.vision"]["ok"] and rows["mocap.rate"]["ok"] and rows["frames.gravity"]["ok"]
-
-
-def test_ctrl_c_during_the_preflight_of_a_flight_ends_it_with_nothing_armed(sandbox: Sandbox, tmp_path: Path) -> None:
-    longer = set_options(**{"vehicle.safety.preflight_s": 60.0})
-    with sandbox_in(tmp_path / "world") as around, World(around, HOVER) as world:
-        with sandbox.start("fly", HOVER, "--out", "out", *longer, *world.addresses()) as running:
-            running.wait_for("all devices ... ")
-            running.signal(signal.SIGINT)
-            ended = running.end()
-        assert (world.armings, world.crashes) == (0, 0)
-    sandbox.assert_nobody_left()
-    assert (ended.code, ended.err) == (EXIT_ABORTED, ""), ended
+    assert (given_up.code, given_up.err) == (EXIT_ABORTED, ""), given_up
     assert read_summary(sandbox.cwd / "out")["outcome"] == "aborted"
     assert not (sandbox.cwd / "out/preflight.json").exists()
 

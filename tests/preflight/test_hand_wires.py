@@ -141,23 +141,6 @@ def test_any_key_ends_it_and_the_terminal_is_as_before(config: SitlConfig, monke
     assert [(row.id, row.read, row.refuses) for row in rows] == [("hand.done", "ended by the operator", True)]
 
 
-def test_ctrl_c_ends_it_and_is_itself_again_afterwards(config: SitlConfig) -> None:
-    console = terminal()
-
-    async def interrupt() -> None:
-        await said(console, "1/4")
-        os.kill(os.getpid(), signal.SIGINT)
-
-    async def both() -> list[Row]:
-        before = signal.getsignal(signal.SIGINT)
-        rows = await over_wires(config, console, interrupt)
-        assert signal.getsignal(signal.SIGINT) == before
-        return rows
-
-    (row,) = asyncio.run(both())
-    assert (row.id, row.read) == ("hand.done", "ended by the operator")
-
-
 def test_it_is_refused_when_px4_is_armed() -> None:
     config = load_sitl(CATCH)
 
@@ -184,18 +167,23 @@ def test_without_motion_capture_or_px4_it_says_which() -> None:
     assert row.read == "motion capture is not connected"
 
 
-def test_scripts_keep_their_standard_output(config: SitlConfig, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_ends_it_and_is_itself_again_and_scripts_keep_their_standard_output(
+    config: SitlConfig, capsys: pytest.CaptureFixture[str]
+) -> None:
     async def interrupt() -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
     async def go() -> list[Row]:
+        before = signal.getsignal(signal.SIGINT)
         async with open_available(config, flight_clock()) as edges, asyncio.TaskGroup() as group:
             # Tasks begin at the first await: the test listens by then.
             group.create_task(interrupt())
-            return await run_hand_test(edges, config, Console(), True)
+            rows = await run_hand_test(edges, config, Console(), True)
+        assert signal.getsignal(signal.SIGINT) == before
+        return rows
 
     (row,) = asyncio.run(go())
-    assert row.read == "ended by the operator"
+    assert (row.id, row.read) == ("hand.done", "ended by the operator")
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "hand test" in captured.err

@@ -63,14 +63,15 @@ def test_everybody_draws_the_same_examples(tmp_path: Path) -> None:
         {"PYTHONHASHSEED": "1"},
         {"PYTHONHASHSEED": "2", "CI": "1", "TZ": "Asia/Kolkata", "LC_ALL": "C", "HOME": "/proc/none"},
     ]
-    drawn = []
+    started = []
     for k, more in enumerate(circumstances):
         path = tmp_path / f"drawn_{k}"
         own = {key: value for key, value in os.environ.items() if key != "CI"}
         environment = {**own, "PYTHONPATH": str(ROOT), "DRAWN": str(path), **more}
         command = (*pytest_of(tmp_path / "test_draws.py"), "-p", "tests.conftest", "-p", "no:cacheprovider")
-        subprocess.run(command, cwd=tmp_path, env=environment, check=True)
-        drawn.append(path.read_text(encoding="utf-8").splitlines())
+        started.append(subprocess.Popen(command, cwd=tmp_path, env=environment))
+    assert [process.wait() for process in started] == [0, 0]
+    drawn = [(tmp_path / f"drawn_{k}").read_text(encoding="utf-8").splitlines() for k in (0, 1)]
     assert len(drawn[0]) == 50
     assert drawn[0] == drawn[1]
 

@@ -35,7 +35,7 @@ def told(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
 async def test_diff_write_diff_on_the_stub(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("companion.io.px4.params.ASKS", 2)  # every read asks for the ports that the stub does not have
+    monkeypatch.setattr("companion.io.px4.params.ASKS", 1)  # every read asks for the ports that the stub does not have
     backup = tmp_path / "old.params"
 
     async def run(*words: str) -> int:

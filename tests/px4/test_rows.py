@@ -162,18 +162,6 @@ def test_parameters_that_nobody_could_read_keep_the_machine_down() -> None:
     assert rows(None, {}, vehicle()) == []
 
 
-def test_types_and_names_are_those_of_px4() -> None:
-    for wanted in WANTED:
-        assert len(wanted.name) <= 16
-        if wanted.value is not None and wanted.name in PX4_DEFAULTS:
-            assert wanted.integer is isinstance(PX4_DEFAULTS[wanted.name], int), wanted.name
-        if wanted.value is not None:
-            assert wanted.accepts(wanted.value, vehicle()), wanted.name
-    assert {wanted.name for wanted in WANTED if wanted.name not in PX4_DEFAULTS} == {
-        wanted.name for wanted in WANTED if wanted.hardware or not has(wanted.name, (1, 17))
-    }
-
-
 def test_a_wrong_parameter_over_real_mavlink_gives_its_row() -> None:
     wrong = {"EKF2_EV_CTRL": 3.0, "COM_OBL_RC_ACT": 6.0, "COM_OF_LOSS_T": 5.0, "CA_ROTOR1_KM": -0.025}
     geometry = geometry_of(vehicle().airframe)

@@ -155,13 +155,17 @@ def test_every_tick_is_in_the_log_with_its_stamp_schema_and_metadata(recorder: R
     assert {"version_python", "version_numpy", "version_mavsdk", "epoch_offset_ns"} <= metadata["companion"].keys()
 
 
-def test_events_reach_the_log_channel_for_people(recorder: RecorderProcess) -> None:
+def test_events_and_answers_reach_the_log_channel_for_people_and_count_as_packets(recorder: RecorderProcess) -> None:
     recorder.client.record(*tick(0, "something odd"))
-    recorder.finish(DEADLINE_S)
+    offer(recorder, range(1, 10))
+    recorder.client.ack("a1", "anna", OperatorCommand.LAND, True, "landing", 0.05, "hold", SafetyAction.LAND)
+    offer(recorder, range(10, 20))
+    report = recorder.finish(DEADLINE_S)
+    assert (report.samples, report.dropped, report.error) == (20, 0, None)
     with recorder.path.open("rb") as file:
-        messages = [m.data for _, _, m in make_reader(file).iter_messages(topics=["/log"])]
-    assert len(messages) == 1
-    assert b"something odd" in messages[0]
+        odd, answer = [m.data for _, _, m in make_reader(file).iter_messages(topics=["/log"])]
+    assert b"something odd" in odd
+    assert b"anna" in answer and b"landing" in answer
 
 
 def test_a_full_channel_drops_and_counts_without_waiting() -> None:
@@ -193,10 +197,12 @@ def test_dropped_ticks_are_counted_by_the_recorder_too(recorder: RecorderProcess
 
 def test_a_dead_recorder_does_not_touch_the_flight(recorder: RecorderProcess) -> None:
     offer(recorder, range(10))
+    assert not recorder.client.gone
     recorder.process.kill()
     recorder.process.wait(DEADLINE_S)
     assert not recorder.client.record(*tick(10))
     recorder.client.text(0.0, Severity.INFO, "x", "y")
+    assert recorder.client.gone and recorder.client.take_commands() == []
     report = recorder.finish(DEADLINE_S)
     assert (report.samples, report.dropped) == (10, 2)
     assert report.error is not None
@@ -424,25 +430,3 @@ def test_an_answer_is_a_packet_in_its_turn(channel: tuple[RecorderClient, socket
         phase="hold",
         action=SafetyAction.HOLD,
     )
-
-
-def test_answers_count_as_packets_and_are_in_the_log_for_people(recorder: RecorderProcess) -> None:
-    offer(recorder, range(10))
-    recorder.client.ack("a1", "anna", OperatorCommand.LAND, True, "landing", 0.05, "hold", SafetyAction.LAND)
-    offer(recorder, range(10, 20))
-    report = recorder.finish(DEADLINE_S)
-    assert (report.samples, report.dropped, report.error) == (20, 0, None)
-    with recorder.path.open("rb") as file:
-        lines = [m.data for _, _, m in make_reader(file).iter_messages(topics=["/log"])]
-    assert [line for line in lines if b"anna" in line and b"landing" in line]
-
-
-def test_without_a_recorder_there_are_no_commands_and_it_is_known(recorder: RecorderProcess) -> None:
-    offer(recorder, range(3))
-    assert not recorder.client.gone
-    recorder.process.kill()
-    recorder.process.wait(DEADLINE_S)
-    recorder.client.record(*tick(3))
-    recorder.client.ack("a1", "anna", OperatorCommand.LAND, True, "landing", 0.0, "", SafetyAction.NOMINAL)
-    assert recorder.client.gone
-    assert recorder.client.take_commands() == []

@@ -102,7 +102,7 @@ def garbage(seed: int, count: int, session: str) -> Iterator[bytes]:
 def test_a_flood_of_rubbish_passes_nothing_costs_no_sample_and_does_not_drown_the_log(
     tmp_path: Path, broker: Broker
 ) -> None:
-    topic, count = Topic.COMMAND.of(VEHICLE), 5000
+    topic, count = Topic.COMMAND.of(VEHICLE), 2000
     with (
         Listener(broker.port, f"companion/{VEHICLE}/state") as states,
         Listener(broker.port, f"companion/{VEHICLE}/stream") as listener,
@@ -219,19 +219,17 @@ def test_no_command_is_heard_over_a_plain_way_to_another_computer(tmp_path: Path
     assert any("commands are not accepted over an unencrypted connection" in line for line in log_lines(flight.path))
 
 
-@pytest.mark.parametrize("fault", ["open to others", "absent"])
 def test_a_login_that_cannot_be_used_is_reported_in_one_line_and_the_log_is_written(
-    tmp_path: Path, broker: Broker, fault: str
+    tmp_path: Path, broker: Broker
 ) -> None:
     login = tmp_path / "login.yaml"
-    if fault != "absent":
-        login.write_text("username: x\npassword: y\n", encoding="utf-8")
-        login.chmod(0o644)
+    login.write_text("username: x\npassword: y\n", encoding="utf-8")
+    login.chmod(0o644)
     with flight_with(tmp_path, broker.url, login_file=str(login)) as flight:
         flight.wait(lambda: flight.recorder.client.telemetry_status is not None, "the flight reports nothing")
         reported = flight.recorder.client.telemetry_status or ""
         assert reported.startswith("no telemetry: ") and str(login) in reported and "\n" not in reported
-        assert ("chmod 600" in reported) == (fault == "open to others")
+        assert "chmod 600" in reported
         flight.fly(600)
         assert flight.finish().samples == 600
     assert any("no telemetry" in line for line in log_lines(flight.path))

@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 from msgspec.structs import fields, replace
 
 from companion.analysis.log import FlightLog
@@ -20,10 +18,9 @@ from companion.control.arm_model import manipulator_of
 from companion.model.codec import Record, differences
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.hanging_line import hanging_line_m
-from companion.model.types import Inputs, Joints, MocapPose, Outputs, Quat, Sent, TetherState, Vec3
+from companion.model.types import Joints, MocapPose, Quat, TetherState, Vec3
 from companion.recorder.log_file import LogFile
 from companion.recorder.log_writer import LogWriter
-from companion.recorder.viewer_scene import path_of
 from tests.machines import overrides_with_joints
 from tests.recorder.flights import EPOCH_NS, Row, config_json, tethered
 from tests.recorder.viewers import Seen, Viewed, view
@@ -258,11 +255,6 @@ def test_the_hanging_line_is_as_long_as_the_tether_and_below_its_chord(end: Vec3
     assert min(p[2] for p in on_floor[1:-1]) >= -0.1
 
 
-def test_a_short_line_is_straight() -> None:
-    points = hanging_line_m((0.0, 0.0, 0.0), (3.0, 0.0, 0.0), 2.9)
-    assert {p[2] for p in points} == {0.0}
-
-
 def test_the_flown_path_stays_short_however_long_the_flight(tmp_path: Path) -> None:
     inputs, outputs, sent = still()[0]
     seen = mocap(0.0)
@@ -339,7 +331,7 @@ def test_no_sick_tick_is_lost_or_stops_the_viewers(tmp_path: Path) -> None:
     chance = random.Random(11)
     healthy = [row for row in tethered(end_s=7.5) if row[0].t_s > 6.0]
     rows: list[Row] = []
-    for k in range(400):
+    for k in range(150):
         inputs, outputs, sent = sick(healthy, chance)
         # What the flight counts itself is always whole.
         rows.append((replace(inputs, tick=k), replace(outputs, tick=k), replace(sent, tick=k)))
@@ -393,34 +385,3 @@ def test_any_configuration_gives_a_log_and_at_least_the_frame(tmp_path: Path, co
     assert viewed.by_topic["/tf"]
     assert not viewed.by_topic["/tf_arm"]
     assert not viewed.by_topic["/scene"]
-
-
-def test_a_path_is_points() -> None:
-    assert path_of([[0, 0, 1], [1, 0]]) == path_of("no") == path_of(None) == ()
-    assert path_of([[0, 0, 1], [1, 0, 1]]) == ((0.0, 0.0, 1.0), (1.0, 0.0, 1.0))
-
-
-def test_a_log_from_before_these_channels_is_read_as_ever(tmp_path: Path) -> None:
-    """The reader returns the same for records without any viewer channel."""
-    new = tmp_path / "new.mcap"
-    written(new, tethered(end_s=1.0))
-    old = tmp_path / "old.mcap"
-    with new.open("rb") as source, old.open("wb") as target:
-        writer = Writer(target)
-        writer.start(profile="companion")
-        channels: dict[int, int] = {}
-        reader = make_reader(source)
-        for record in reader.iter_metadata():
-            writer.add_metadata(record.name, record.metadata)
-        topics = ["/inputs", "/outputs", "/sent"]
-        for schema, channel, message in reader.iter_messages(topics=topics, log_time_order=False):
-            assert schema is not None
-            if channel.id not in channels:
-                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
-        writer.finish()
-    before, after = FlightLog.read(old), FlightLog.read(new)
-    rows: list[tuple[Inputs, Outputs, Sent]] = list(after.rows())
-    assert len(rows) > 300
-    assert list(before.rows()) == rows

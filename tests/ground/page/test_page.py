@@ -58,13 +58,12 @@ def in_flight(**changes: Any) -> Stream:
     return replace(flown().at(8.5), **changes)
 
 
-def test_the_page_sends_its_token_first_and_hides_it(stub: MonitorStub, page: Page) -> None:
+def test_the_page_sends_its_token_first_and_values_are_those_of_the_newest_record(
+    stub: MonitorStub, page: Page
+) -> None:
     wait_until(lambda: bool(stub.received("token")), lambda: "the page sends no token")
     assert stub.received("token") == [{"kind": "token", "token": "secret"}]
     assert page.tab.evaluate("location.hash") == ""
-
-
-def test_values_are_those_of_the_newest_record(page: Page) -> None:
     for mission_t_s in (1.5, 8.5, 14.0):
         stream = flown().at(mission_t_s)
         page.show(relayed(stream))
@@ -76,16 +75,6 @@ def test_values_are_those_of_the_newest_record(page: Page) -> None:
         assert page.text("#light-list li:last-child .text") == stream.lights[-1].text
     page.run(0.1)
     assert page.tab.evaluate("document.getElementById('progress').value") == pytest.approx(stream.progress, abs=1e-3)
-
-
-def test_every_light_of_the_vehicle_is_shown_with_its_state(watched: Page, newest: Callable[[Stream], Message]) -> None:
-    watched.show(newest(in_flight()))
-    rows = watched.tab.locator("#light-list li")
-    shown = [
-        (rows.nth(k).get_attribute("data-light"), rows.nth(k).locator(".text").inner_text())
-        for k in range(rows.count())
-    ]
-    assert shown == [(light.light.value, light.text) for light in in_flight().lights]
 
 
 def test_pictures_change_with_the_flight(page: Page) -> None:
@@ -169,28 +158,27 @@ def test_no_broker_is_stale_at_once(page: Page) -> None:
     assert page.enabled() == SAFE
 
 
-@pytest.mark.parametrize(
-    ("known", "word", "level"),
-    [
+def test_an_end_is_reported_calmly(page: Page) -> None:
+    page.show(relayed(in_flight()))
+    for known, word, level in (
         (state(Presence.ENDED, outcome="completed"), "ENDED completed", "ok"),
         (state(Presence.ENDED, outcome="aborted", text="landed by the guardian"), "ENDED aborted: landed", "warn"),
         (state(Presence.ENDED, outcome="crashed"), "ENDED crashed", "bad"),
-    ],
-)
-def test_an_end_is_reported_calmly(page: Page, known: Any, word: str, level: str) -> None:
-    page.show(relayed(in_flight()), relayed(known))
-    page.run(5.0)
-    assert f"{page.text('#word')} {page.text('#why')}".startswith(word)
-    assert (page.body("level"), page.body("stale"), page.body("old")) == (level, "false", "true")
-    assert (page.enabled(), page.text("#commands-why")) == (set(), "the flight is over")
+    ):
+        page.show(relayed(known))
+        page.run(1.0)
+        assert f"{page.text('#word')} {page.text('#why')}".startswith(word)
+        assert (page.body("level"), page.body("stale"), page.body("old")) == (level, "false", "true")
+        assert (page.enabled(), page.text("#commands-why")) == (set(), "the flight is over")
 
 
-@pytest.mark.parametrize("presence", [Presence.LOST, Presence.SILENT])
-def test_a_vehicle_that_is_gone_is_framed_in_red_and_can_still_be_commanded(page: Page, presence: Presence) -> None:
-    page.show(relayed(in_flight()), relayed(state(presence, text="the guardian may be landing it")))
-    assert page.text("#stale").startswith(presence.value.upper())
-    assert "the guardian may be landing it" in page.text("#stale")
-    assert (page.body("frame"), page.enabled()) == ("bad", SAFE)
+def test_a_vehicle_that_is_gone_is_framed_in_red_and_can_still_be_commanded(page: Page) -> None:
+    page.show(relayed(in_flight()))
+    for presence in (Presence.LOST, Presence.SILENT):
+        page.show(relayed(state(presence, text="the guardian may be landing it")))
+        assert page.text("#stale").startswith(presence.value.upper())
+        assert "the guardian may be landing it" in page.text("#stale")
+        assert (page.body("frame"), page.enabled()) == ("bad", SAFE)
 
 
 def test_the_last_will_of_an_older_session_does_not_hide_a_flight(page: Page) -> None:
@@ -198,9 +186,10 @@ def test_the_last_will_of_an_older_session_does_not_hide_a_flight(page: Page) ->
     assert (page.text("#word"), page.body("stale")) == ("FLYING", "false")
 
 
-@pytest.mark.parametrize(
-    ("changes", "word", "level"),
-    [
+def test_the_word_says_what_it_does_and_a_figure_has_the_colour_of_its_lamp(
+    watched: Page, newest: Callable[[Stream], Message]
+) -> None:
+    words: tuple[tuple[dict[str, Any], str, str], ...] = (
         ({}, "FLYING", "ok"),
         ({"kind": "ground", "armed": False}, "GROUND", "ok"),
         ({"action": "hold"}, "HOLDING", "warn"),
@@ -208,32 +197,27 @@ def test_the_last_will_of_an_older_session_does_not_hide_a_flight(page: Page) ->
         ({"action": "land"}, "LANDING", "warn"),
         ({"kind": "landing"}, "LANDING", "ok"),
         ({"action": "terminate"}, "TERMINATED", "bad"),
-    ],
-)
-def test_the_word_says_what_it_does_and_how_grave_that_is(
-    watched: Page, newest: Callable[[Stream], Message], changes: dict[str, Any], word: str, level: str
-) -> None:
-    watched.show(newest(in_flight(**changes)))
-    assert (watched.text("#word"), watched.body("level")) == (word, level)
-
-
-@pytest.mark.parametrize(
-    ("tile", "lamp", "level"),
-    [
-        ("tether", "tether", HealthLevel.OK),
+    )
+    for changes, word, grave in words:
+        watched.show(newest(in_flight(**changes)))
+        assert (watched.text("#word"), watched.body("level")) == (word, grave)
+    for tile, lamp, level in (
         ("tether", "tether", HealthLevel.BAD),
         ("error", "flight", HealthLevel.WARN),
         ("battery", "battery", HealthLevel.BAD),
         ("latency", "loop", HealthLevel.WARN),
-    ],
-)
-def test_a_figure_has_the_colour_of_its_lamp(
-    watched: Page, newest: Callable[[Stream], Message], tile: str, lamp: str, level: HealthLevel
-) -> None:
-    lights = tuple(replace(light, light=level) if light.name == lamp else light for light in in_flight().lights)
-    watched.show(newest(in_flight(lights=lights)))
-    assert watched.tab.get_attribute(f".tile:has([data-figure={tile}])", "data-level") == level.value
-    assert watched.body("level") == level.value
+        ("tether", "tether", HealthLevel.OK),
+    ):
+        lights = tuple(replace(light, light=level) if light.name == lamp else light for light in in_flight().lights)
+        watched.show(newest(in_flight(lights=lights)))
+        assert watched.tab.get_attribute(f".tile:has([data-figure={tile}])", "data-level") == level.value
+        assert watched.body("level") == level.value
+    rows = watched.tab.locator("#light-list li")
+    shown = [
+        (rows.nth(k).get_attribute("data-light"), rows.nth(k).locator(".text").inner_text())
+        for k in range(rows.count())
+    ]
+    assert shown == [(light.light.value, light.text) for light in lights]
 
 
 def test_a_vehicle_without_tether_and_net_is_drawn_without_them(stub: MonitorStub, shared: Page) -> None:

@@ -66,13 +66,10 @@ def test_hold_then_land_arrive_and_their_answers_show(stub: MonitorStub, page: P
     assert answer(page, "hold")[0] == "done"
 
 
-def test_what_the_vehicle_refuses_is_red(page: Page) -> None:
+def test_refusals_missing_answers_and_others_commands_are_shown(page: Page) -> None:
     page.press("abort")
     page.show(sent("abort"), relayed(ack("abort", NONCE, "nothing to abort: on the ground", accepted=False)))
     assert answer(page, "abort") == ("no", "✗ nothing to abort: on the ground")
-
-
-def test_no_answer_is_red_until_a_late_one_comes(page: Page) -> None:
     page.press("land")
     page.show(sent("land"), refused("land", NO_ANSWER))
     assert answer(page, "land") == ("no", NO_ANSWER)
@@ -80,17 +77,11 @@ def test_no_answer_is_red_until_a_late_one_comes(page: Page) -> None:
     assert answer(page, "land")[0] == "no" and "sent again (2)" in answer(page, "land")[1]
     page.show(relayed(ack("land", NONCE, "landing")))
     assert answer(page, "land") == ("done", "✓ landing")
-
-
-def test_a_silent_monitor_is_shown_as_no_answer(page: Page) -> None:
     page.press("hold")
     page.run(2.4)
     assert answer(page, "hold")[0] == "wait"
     page.run(0.3)
     assert answer(page, "hold")[0] == "no" and "no answer from the monitor" in answer(page, "hold")[1]
-
-
-def test_what_others_command_is_shown_with_their_name(page: Page) -> None:
     page.show(relayed(ack("hold", "d" * 32, "holding", operator="bert")))
     assert answer(page, "hold") == ("done", "✓ bert: holding")
 

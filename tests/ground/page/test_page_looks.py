@@ -110,7 +110,7 @@ def test_buttons_stay_where_they_are_when_things_go_wrong(shared: Page, stub: Mo
         assert shared.tab.is_visible("#commands-why") and boxes() == before
 
 
-@pytest.mark.parametrize(("scheme", "stale"), list(itertools.product(("dark", "light"), (False, True))))
+@pytest.mark.parametrize(("scheme", "stale"), [("dark", False), ("dark", True), ("light", True)])
 def test_text_has_enough_contrast(shared: Page, stub: MonitorStub, scheme: str, stale: bool) -> None:
     shared.open_anew(stub, scheme=scheme)
     lines = [event(1, "a", severity="info"), event(2, "b"), event(3, "c", severity="critical")]
