@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -165,17 +165,27 @@ class FastFlight:
         """PX4's state as the core has last received it."""
         self._dropped = 0
 
-    def run(self, limit_s: float = 90.0, until_mission_s: float = math.inf) -> FastResult:
-        """Fly until the mission ends, the vehicle crashes, world time reaches `limit_s` or the mission's clock `until_mission_s`."""
+    def run(
+        self, limit_s: float = 90.0, until_mission_s: float = math.inf, until: Callable[[Outputs], bool] | None = None
+    ) -> FastResult:
+        """Fly until the mission ends, the vehicle crashes, world time reaches `limit_s`, the mission's clock `until_mission_s`, or
+        `until` returns True for a tick's outputs.
+        """
         machine = self.plant.machine
         result = FastResult(layout=machine.layout)
         with _garbage_collection_paused():
-            self._run(result, limit_s, until_mission_s)
+            self._run(result, limit_s, until_mission_s, until)
         result.crashed = machine.crashed
         result.caught = self.plant.scene.payload.caught_t_s is not None
         return result
 
-    def _run(self, result: FastResult, limit_s: float, until_mission_s: float = math.inf) -> None:
+    def _run(
+        self,
+        result: FastResult,
+        limit_s: float,
+        until_mission_s: float = math.inf,
+        until: Callable[[Outputs], bool] | None = None,
+    ) -> None:
         plant, core, px4 = self.plant, self.core, self.px4
         scene, machine, guardian = plant.scene, plant.machine, self._guardian
         period, tick = round(START_S / TICK_PERIOD_S), 0
@@ -207,6 +217,8 @@ class FastFlight:
             result.snapshots.append(machine.snapshot())
             tick += 1
             if outputs.outcome is not None or machine.crashed or outputs.mission_t_s >= until_mission_s:
+                break
+            if until is not None and until(outputs):
                 break
         if guardian is not None:
             result.guardian_events = guardian.events

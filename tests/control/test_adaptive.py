@@ -82,12 +82,6 @@ def test_a_payload_is_carried_after_a_while() -> None:
     assert max(abs(e) for e in wrench.log.e_tau) < 0.01
 
 
-def test_without_force_sensor_it_flies_on() -> None:
-    config = load_flight("configs/missions/catch.yaml", preset="recommended")
-    wrench = settled(config, state(force=None))
-    assert wrench.log.force_ext_world_n == (0.0, 0.0, 0.0)
-
-
 norms = st.floats(0, 1e4)
 LAW = law(load_flight("configs/missions/catch.yaml"))
 

@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 from companion.config.arm_chain import chain_of
 from companion.config.base import JOINTS_MAX
 from companion.config.loader import load_vehicle
+from companion.control.arm_model import dynamics_of
 from companion.control.arm_model.chain_dynamics import ChainDynamics
 from companion.control.arm_model.chain_manipulator import ChainManipulator
 from companion.control.arm_model.planar_dynamics import PlanarDynamics
 from companion.control.arm_model.planar_manipulator import PlanarManipulator, is_planar_2r
-from companion.control.dynamics import Dynamics
+from companion.control.dynamics import Dynamics, chi_rate_from_body_rate
 from companion.control.manipulator import Manipulator
 from companion.model.arm_chain import ArmChain, ChainLink
 from companion.model.frames import quat_from_euler_zyx, quat_rotate, rotation_matrix
-from companion.model.types import Joints, Mat3, Quat, Vec3
-from tests.control.test_dynamics import to_twist, to_twist_rate
+from companion.model.types import Chi, Joints, Mat3, Quat, Vec3
 from tests.pinocchio_or_skip import pin
 
 Array = NDArray[np.float64]
@@ -88,6 +88,37 @@ def oracle(chain: ArmChain) -> pin.Model:
     model.addFrame(pin.Frame("tip", last, tip, pin.FrameType.OP_FRAME))
     model.armature = np.array([0.0] * 6 + [link.armature_kg_m2 for link in chain.links])
     return model
+
+
+def axis_rotation(axis: int, angle: float) -> Array:
+    unit = np.zeros(3)
+    unit[axis] = angle
+    return np.array(pin.exp3(unit))
+
+
+def rotation_of(rpy: Array) -> Array:
+    return axis_rotation(2, rpy[2]) @ axis_rotation(1, rpy[1]) @ axis_rotation(0, rpy[0])
+
+
+def to_twist(rpy: Vec3, joints: int = 2) -> Array:
+    """chi' to Pinocchio's velocity (origin velocity in body axes, body rate, joints), from the axes that the angles turn about."""
+    yaw_pitch = axis_rotation(2, rpy[2]) @ axis_rotation(1, rpy[1])
+    axes = np.column_stack([yaw_pitch[:, 0], axis_rotation(2, rpy[2])[:, 1], [0.0, 0.0, 1.0]])
+    rotation = rotation_of(np.array(rpy))
+    out = np.eye(6 + joints)
+    out[:3, :3] = rotation.T
+    out[3:6, 3:6] = rotation.T @ axes
+    return out
+
+
+def to_twist_rate(rpy: Vec3, rate: Chi) -> Array:
+    """d/dt of `to_twist`, by a complex-free fourth-order difference."""
+
+    def at(h: float) -> Array:
+        return to_twist((rpy[0] + h * rate[3], rpy[1] + h * rate[4], rpy[2] + h * rate[5]), len(rate) - 6)
+
+    h = 1e-3
+    return (8.0 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12.0 * h)
 
 
 def symmetric(upper: Array) -> Array:
@@ -236,3 +267,19 @@ def test_gravity_levers_times_first_moments_are_the_gravity_torque_of_links_whos
 def test_a_pose_with_too_few_angles_is_refused() -> None:
     with pytest.raises(ValueError):
         ChainManipulator(random_chain(np.random.default_rng(0), 3)).net_body_m((0.1, 0.2))
+
+
+def test_euler_rates_undo_the_body_rate() -> None:
+    rng = np.random.default_rng(9)
+    for _ in range(20):
+        rpy, rate = vec3(rng.uniform(-1.2, 1.2, 3)), rng.uniform(-2, 2, 3)
+        back = chi_rate_from_body_rate(rpy, vec3(to_twist(rpy, 0)[3:6, 3:6] @ rate))
+        np.testing.assert_allclose(back, rate, atol=1e-12)
+
+
+def test_a_scaled_model_is_scaled_throughout() -> None:
+    rpy, angle, rate = (0.3, -0.2, 0.5), (1.0, -0.4), (0.1, 0.2, -0.3, 0.4, -0.5, 0.6, 0.7, -0.8)
+    vehicle, rotation = load_vehicle("tarot650_2r"), rotation_matrix(quat_from_euler_zyx(0.3, -0.2, 0.5))
+    one, scaled = (dynamics_of(vehicle, scale).terms(rotation, rpy, angle, rate) for scale in (1.0, 0.85))
+    for name in ("mass", "coriolis", "gravity"):
+        np.testing.assert_allclose(getattr(scaled, name), 0.85 * np.array(getattr(one, name)), rtol=1e-12, atol=1e-15)

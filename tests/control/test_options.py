@@ -11,7 +11,6 @@ from msgspec.structs import replace
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import FlightConfig, load_flight
 from companion.control.adaptive import AdaptiveController
-from companion.control.arm_model import dynamics_of
 from companion.control.common import Actuation
 from companion.control.disturbance import DisturbanceObserver
 from companion.mission.reference import at_rest
@@ -62,15 +61,6 @@ def test_friction_follows_the_rate_that_is_wanted_not_the_one_that_is_measured(c
     assert added[6:] == pytest.approx([friction_nm, -friction_nm], rel=1e-3)
     resting = at_rest((0.0, 0.0, 1.0), 0.0, POSE)
     assert difference(config, option, resting, rate=(1.0, -1.0))[6:] == pytest.approx([0.0, 0.0], abs=1e-12)
-
-
-def test_the_arms_inertia_takes_the_place_of_m_d(config: FlightConfig) -> None:
-    reference = replace(at_rest((0.0, 0.0, 1.0), 0.0, POSE), arm_acceleration_rad_s2=(2.0, 1.0))
-    added = difference(config, {"arm_inertia_nominal": True}, reference)
-    (m11, m12), (m21, m22) = dynamics_of(config.vehicle).arm_terms(POSE, (0.0, 0.0)).mass
-    assert isinstance(config.controller, AdaptiveConfig)
-    first, second = config.controller.inertia_md[6:8]
-    assert added[6:] == pytest.approx([(m11 - first) * 2.0 + m12, m21 * 2.0 + m22 - second])
 
 
 def test_the_observer_finds_a_steady_force_whatever_is_asked_for() -> None:

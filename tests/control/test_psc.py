@@ -15,12 +15,13 @@ from companion.control.payload_mass import PayloadEstimator
 from companion.control.psc import PscController
 from companion.control.types import PlantState, Wrench
 from companion.mission.reference import at_rest
-from companion.model.types import Outcome, PhaseKind
+from companion.model.types import PhaseKind
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight, FastResult
 from tests.analysis.recorded import record
 from tests.control.states import POSE, at
+from tests.flights.ends import after
 from tests.flights.test_fast_flights import error_after_catch_m, event_ids
 from tests.support import SHORT_CATCH
 
@@ -118,32 +119,30 @@ def test_no_estimate_without_its_switch() -> None:
     assert estimator.step(0.005, 40.0, G, True) == 0.0
 
 
-@pytest.mark.parametrize(("payload_kg", "limit_m"), [(0.1, 0.02), (0.3, 0.03)])
-def test_it_carries_the_payload_and_its_mass_estimate_converges(payload_kg: float, limit_m: float) -> None:
+def test_it_carries_the_payload_and_its_mass_estimate_converges() -> None:
     """Within 20 %, from thrust and IMU alone, with their noise; from 2 s after the catch on."""
-    result = flown(f"world.payload_kg={payload_kg}")
+    result = flown("world.payload_kg=0.3")
     assert event_ids(result) == ["takeoff", "catch"]
-    assert error_after_catch_m(result) <= limit_m
+    assert error_after_catch_m(result) <= 0.03
     catch_s = next(event.t_s for outputs in result.outputs for event in outputs.events if event.id == "catch")
     flight = [o for o in result.outputs if o.phase_kind is PhaseKind.FLIGHT]
     estimates = [(o.t_s, o.control.payload_estimate_kg) for o in flight if o.control is not None]
     assert len(estimates) == len(flight)
     carried = [kg for t_s, kg in estimates if kg is not None and t_s > catch_s + 2.0]
     before = [kg for t_s, kg in estimates if kg is not None and t_s < catch_s]
-    assert np.mean(carried) == pytest.approx(payload_kg, rel=0.2)
+    assert np.mean(carried) == pytest.approx(0.3, rel=0.2)
     assert np.mean(before) < 0.05
 
 
 def test_the_estimate_is_in_the_log_and_comes_out_of_a_replay_bit_for_bit(tmp_path: Path) -> None:
     flight = FastFlight(load_sitl(SHORT_CATCH, controller_law="psc"))
-    log = FlightLog.read(record(log_of(flight.config.flight, flight.run(), None), tmp_path / "flight.mcap"))
+    result = flight.run(until=after("catch", 0.5))
+    log = FlightLog.read(record(log_of(flight.config.flight, result, None), tmp_path / "flight.mcap"))
     estimates = [o.control.payload_estimate_kg for o in log.outputs if o.control is not None]
     assert None not in estimates
-    assert len(set(estimates)) > 700
+    assert len(set(estimates)) > 400
     assert replay(log, flight_core).first_difference is None
 
 
-def test_without_force_sensor_the_mission_goes_on() -> None:
-    lost = "world.faults=[{kind: force_loss, t_s: 3.2}]"
-    result = FastFlight(load_sitl(SHORT_CATCH, controller_law="psc", overrides=[lost])).run()
-    assert result.outputs[-1].outcome is Outcome.COMPLETED
+def test_without_force_sensor_it_flies_as_without_a_force() -> None:
+    assert stepped(configured(), at(force=None)).log == stepped(configured(), at()).log

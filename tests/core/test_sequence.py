@@ -30,8 +30,8 @@ from companion.safety.autopilot_landing import AutopilotLanding
 from companion.safety.rotor_stop import RotorStop
 from companion.safety.touchdown import Sinking
 from tests.core.test_reactions import CONFIG, P, ids, in_plan, tick
+from tests.safety.faults import EXTERNAL
 from tests.safety.healthy import fed_by_another, healthy, put
-from tests.safety.test_monitors import EXTERNAL
 
 replace = msgspec.structs.replace
 NOW_S = healthy().t_s

@@ -16,6 +16,7 @@ from companion.runtime.console import print_result
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight
+from tests.flights.ends import after
 from tests.flights.test_fast_flights import event_ids
 from tests.support import SHORT_CATCH
 
@@ -26,14 +27,14 @@ CONFIRMED_S = 1.0
 @cache
 def usual() -> Event:
     """The catch of a flight without a fault."""
-    outputs = FastFlight(load_sitl(SHORT_CATCH)).run().outputs
+    outputs = FastFlight(load_sitl(SHORT_CATCH)).run(until=after("catch")).outputs
     return next(event for o in outputs for event in o.events if event.id == "catch")
 
 
 def summary_of(fault: str) -> tuple[dict[str, Any], list[str]]:
     """Summary of a flight with a fault, and the ids of its events."""
     config = load_sitl(SHORT_CATCH, overrides=[f"world.faults=[{fault}]"])
-    result = FastFlight(config).run()
+    result = FastFlight(config).run(limit_s=9.5)
     log = log_of(config, result, None)
     return summarise(log, outcome="aborted", controller="adaptive", preset="recommended"), event_ids(result)
 

@@ -164,8 +164,8 @@ def test_a_speed_that_cannot_be_flown_is_refused_in_one_line(words: tuple[str, .
 
 
 def test_slower_than_real_time_px4_is_not_lost(sandbox: Sandbox) -> None:
-    """MAVSDK lives on the computer's clock, and hears a heartbeat every 4 s: nothing is lost until a pilot ends the take-off."""
+    """MAVSDK lives on the computer's clock, and hears a heartbeat every 3.3 s: nothing is lost until a pilot ends the take-off."""
     kill = set_options(**{"world.faults": [{"kind": "kill_switch", "t_s": 2.3}]})
-    ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", "--speed", "0.25", *kill)
+    ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", "--speed", "0.3", *kill)
     assert (ended.code, ended.err) == (EXIT_ABORTED, "")
     assert [event["id"] for event in read_summary(sandbox.cwd / "out")["events"]] == ["takeoff", "killed"]

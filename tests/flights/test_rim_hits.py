@@ -13,6 +13,7 @@ from companion.runtime.console import print_result
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight
+from tests.flights.ends import after
 from tests.flights.test_fast_flights import event_ids
 from tests.support import CATCH
 
@@ -39,6 +40,6 @@ def test_a_ball_that_fell_off_the_rim_is_not_reported_as_caught() -> None:
 def test_the_lightest_and_the_heaviest_payload_are_reported(payload_kg: float) -> None:
     changes = ["world.seed=2001", f"world.payload_kg={payload_kg}"]
     flight = FastFlight(load_sitl(CATCH, overrides=changes, world="lab"))
-    result = flight.run(until_mission_s=UNTIL_S)
+    result = flight.run(until=after("catch"))
     (event,) = [event for o in result.outputs for event in o.events if event.id == "catch"]
     assert event.t_s == pytest.approx(flight.plant.scene.payload.caught_t_s, abs=0.05)

@@ -113,17 +113,6 @@ def test_a_path_is_the_one_that_minsnap_trajectories_finds(points_m: tuple[Vec3,
     assert np.abs(least_snap(points_m, shares) - found).max() < 1e-6 * (1.0 + np.abs(found).max())
 
 
-def test_a_line_is_what_the_library_finds_between_two_points() -> None:
-    rest = np.zeros(1)
-    found = generate_trajectory(
-        [Waypoint(t, np.array([float(t)]), rest, rest, rest) for t in (0, 1)], degree=7, num_continuous_orders=4
-    )
-    polynomial = Polynomial(found.coefficients[0, :, 0])
-    for u in np.linspace(0.0, 1.0, 21):
-        expected = [polynomial(u), *(polynomial.deriv(order)(u) for order in (1, 2, 3))]
-        assert minimum_snap(float(u)) == pytest.approx(expected, abs=1e-9)
-
-
 def test_peaks_of_a_line_are_as_stated() -> None:
     shapes = [minimum_snap(index / 20000) for index in range(20001)]
     peaks = [max(abs(shape[order]) for shape in shapes) for order in (1, 2, 3)]

@@ -7,7 +7,7 @@ from hypothesis import settings
 
 from tests.mission.random_missions import Row, fly
 
-COUNT = min(40, settings().max_examples // 6)
+COUNT = min(40, settings().max_examples // 9)
 PHASES_MAX = 2
 
 

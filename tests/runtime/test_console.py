@@ -12,8 +12,10 @@ from companion.model.launcher_messages import AnyMessage, FlightEvent, Started
 from companion.model.types import Outputs
 from companion.runtime.console import FlightDisplay, print_result
 from companion.runtime.realtime import Realtime
-from tests.flights.test_fast_flights import flown
+from companion.sitl_config.loader import load_sitl
+from sitl.fast.loop import FastFlight
 from tests.ground.monitor_stub import sent_at
+from tests.support import SHORT_CATCH
 
 
 def shown(*messages: AnyMessage) -> list[str]:
@@ -64,11 +66,10 @@ def messages_of(tick: int, outputs: Outputs) -> list[AnyMessage]:
 
 
 def test_every_step_of_a_flight_is_printed_once() -> None:
-    result = flown(0.2, "recommended")
+    result = FastFlight(load_sitl(SHORT_CATCH)).run()
     lines = shown(*(message for k, outputs in enumerate(result.outputs) for message in messages_of(k, outputs)))
     steps = [line[14:] for line in lines]
     assert len(set(steps)) == len(steps), steps
     assert [step for step in steps if "caught" not in step] == [
-        "wait", "offboard", "arm", "spool up", "take-off", "settle", "catch", "stabilise", "return", "above the start", "land",
-        "touchdown", "disarm", "done",
+        "wait", "offboard", "arm", "spool up", "take-off", "catch", "hold", "land", "touchdown", "disarm", "done",
     ]  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable
 
 import msgspec
@@ -48,6 +49,7 @@ SLOW = TetherState(
 Change = Callable[[Inputs], Inputs]
 
 
+@functools.lru_cache(maxsize=8192)
 def healthy(tick: int = 0, t_s: float | None = None) -> Inputs:
     """In the air at (0, 0, 1), yaw 0.4; `t_s` for ticks that do not come every 5 ms."""
     t_s = START_S + tick * TICK_S if t_s is None else t_s

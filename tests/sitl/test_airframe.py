@@ -95,15 +95,6 @@ def test_saturation_shrinks_the_torques_of_any_layout_but_keeps_their_direction(
             assert yaw * sum(spin * k for spin, k in zip(layout.spins, commands, strict=True)) > -1e-6
 
 
-def test_errors_of_rotors_are_used_again_from_the_first_if_there_are_more_rotors() -> None:
-    rotors = {"on": True, "yaw_torque_error": (0.1, -0.1)}
-    one = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-    for index, error in ((0, 0.1), (1, -0.1), (2, 0.1), (5, -0.1)):
-        thrusts_n = [one[i - index] for i in range(6)]
-        *_, yaw_nm = torque_nm(with_airframe(layout="hexa_x"), thrusts_n, rotors=rotors)
-        assert abs(yaw_nm) == pytest.approx(0.025 * (1.0 + error))
-
-
 WEAK = [
     "world.faults=[{kind: motor_weak, t_s: 1.0, size: 0.2}]",
     *(f"{key}={value}" for key, value in LOW_HOVER.items()),

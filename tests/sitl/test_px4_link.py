@@ -188,11 +188,6 @@ def test_what_px4_senses() -> None:
     assert messages[0].zacc == -9.81
 
 
-def test_pressure_falls_with_height() -> None:
-    assert pressure_hpa(0.0) == pytest.approx(1013.25)
-    assert pressure_hpa(0.0) - pressure_hpa(8.4) == pytest.approx(1.0, abs=0.02)
-
-
 @pytest.mark.parametrize(("yaw_enu_deg", "forward", "right"), [(90.0, 0.21, 0.01), (0.0, 0.01, -0.21)])
 def test_the_field_points_north_and_down(yaw_enu_deg: float, forward: float, right: float) -> None:
     """World x is east: a vehicle that looks along y looks north."""

@@ -40,15 +40,6 @@ def test_it_is_found_by_folder_by_binary_and_on_the_path(tmp_path: Path) -> None
     assert find({"PATH": str(tmp_path)}) is None
 
 
-def test_a_link_to_the_binary_leads_to_its_start_scripts(tmp_path: Path) -> None:
-    build = installed(tmp_path / "opt")
-    (tmp_path / "usr" / "bin").mkdir(parents=True)
-    (tmp_path / "usr" / "bin" / "px4").symlink_to(build / "bin" / "px4")
-    found = find({"PATH": str(tmp_path / "usr" / "bin")})
-    assert found is not None
-    assert found.etc == build / "etc"
-
-
 def test_a_name_that_is_no_px4_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(Px4Error, match=r"PX4_SITL=.*nowhere: expected the px4 binary .* found no program at"):
         find({"PX4_SITL": str(tmp_path / "nowhere")})

@@ -84,13 +84,6 @@ def test_arming_rules(state: NavState, health: Health, reason: str | None) -> No
         assert [notice.text for notice in it.notices] == ["Arming denied: Resolve system health failures first"]
 
 
-def test_a_forced_arm_from_outside_still_runs_the_checks() -> None:
-    it = commander()
-    bad = replace(GOOD, attitude_valid=False)
-    assert ask(it, Command.COMPONENT_ARM_DISARM, 1.0, FORCE_MAGIC, health=bad) is Result.TEMPORARILY_REJECTED
-    assert not it.armed
-
-
 @pytest.mark.parametrize(
     ("health", "magic", "result", "armed"),
     [
@@ -253,9 +246,3 @@ def test_when_position_is_lost_offboard_with_attitudes_has_no_failsafe(kind: Off
     it.update(10.0, replace(FLYING, position_valid=False, setpoint_kind=kind))
     assert it.nav_state is state
     assert it.failsafe is (kind is not OffboardKind.ATTITUDE)
-
-
-def test_offboard_loss_may_disarm_at_once() -> None:
-    it = flying(NavState.OFFBOARD, COM_OBL_RC_ACT=7)
-    it.update(1.0, replace(FLYING, setpoint_age_s=1.0))
-    assert not it.armed

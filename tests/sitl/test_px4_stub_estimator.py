@@ -5,94 +5,19 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.config.airframe import Airframe
-from companion.model import frames
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat
-from companion.model.types import IDENTITY_QUAT, Quat, Vec3
+from companion.model.types import IDENTITY_QUAT
 from companion.sitl_config.effects.imu import Imu
 from companion.sitl_config.world import World
 from sitl.autopilot import telemetry
 from sitl.autopilot.backend import stub_of
-from sitl.autopilot.cascade import Cascade, CascadeGains
 from sitl.autopilot.estimator import Estimator
-from sitl.autopilot.types import AttitudeTarget, ImuSample
+from sitl.autopilot.types import ImuSample
 from tests.sitl.px4_rig import Rig
-
-angles = st.floats(-math.pi, math.pi)
-attitudes = st.builds(frames.quat_from_euler_zyx, angles, st.floats(-1.4, 1.4), angles)
-GAINS = CascadeGains()
-MIX_ROLL, MIX_PITCH, MIX_YAW = (-1.0, 1.0, 1.0, -1.0), (1.0, -1.0, 1.0, -1.0), (1.0, 1.0, -1.0, -1.0)
-
-
-def clipped(value: float, limit: float) -> float:
-    return max(-limit, min(limit, value))
-
-
-def plain_rate_setpoint(q: Quat, q_d: Quat, yaw_rate_rad_s: float) -> Vec3:
-    def up(a: Quat) -> Vec3:
-        w, x, y, z = a
-        return (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
-
-    e, f = up(q), up(q_d)
-    dot = e[0] * f[0] + e[1] * f[1] + e[2] * f[2]
-    reduced = q_d
-    if dot >= -0.9999:
-        shortest = (1.0 + dot, e[1] * f[2] - e[2] * f[1], e[2] * f[0] - e[0] * f[2], e[0] * f[1] - e[1] * f[0])
-        reduced = frames.quat_multiply(frames.quat_normalize(shortest), q)
-    left = frames.quat_multiply(frames.quat_conjugate(reduced), q_d)
-    sine = clipped((1.0 if left[0] >= 0 else -1.0) * left[3], 1.0)
-    half = math.asin(sine) * (GAINS.attitude_p[2] / GAINS.attitude_p[0])
-    wanted = frames.quat_multiply(reduced, (math.cos(half), 0.0, 0.0, math.sin(half)))
-    error = frames.quat_multiply(frames.quat_conjugate(q), wanted)
-    sign, p, limit = (2.0 if error[0] >= 0 else -2.0), GAINS.attitude_p, GAINS.rate_max_rad_s
-    down = (2 * (q[1] * q[3] - q[0] * q[2]), 2 * (q[2] * q[3] + q[0] * q[1]), e[2])
-    x, y, z = (
-        clipped(gain * sign * err, most) + yaw_rate_rad_s * axis
-        for gain, err, most, axis in zip((p[0], p[1], p[0]), error[1:], limit, down, strict=True)
-    )
-    return (x, y, z)
-
-
-@given(attitudes, attitudes, st.floats(-2.0, 2.0))
-def test_rate_setpoint(q: Quat, q_d: Quat, yaw_rate_rad_s: float) -> None:
-    assert Cascade()._rate_setpoint(q, AttitudeTarget(q_d, 0.5)) == plain_rate_setpoint(q, q_d, 0.0)
-    got = Cascade()._rate_setpoint(q, AttitudeTarget(q_d, 0.5, yaw_rate_rad_s))
-    for a, b in zip(got, plain_rate_setpoint(q, q_d, yaw_rate_rad_s), strict=True):
-        assert math.isclose(a, b, rel_tol=1e-12, abs_tol=1e-12)
-
-
-small = st.floats(-5.0, 5.0)
-vectors = st.tuples(small, small, small)
-
-
-@given(st.lists(st.tuples(vectors, vectors), min_size=1, max_size=8))
-def test_imu_prediction(samples: list[tuple[Vec3, Vec3]]) -> None:
-    estimator, dt = Estimator(), 0.25  # a step that is a power of two, so that times have no rounding
-    estimator.predict(ImuSample(0.0, (0.0, 0.0, 0.0), (0.5, -0.3, -9.7)))
-    before = estimator.estimate()
-    for k, (gyro, accel) in enumerate(samples, start=1):
-        estimator.predict(ImuSample(k * dt, gyro, accel))
-        now = estimator.estimate()
-        angle = math.sqrt(gyro[0] * gyro[0] + gyro[1] * gyro[1] + gyro[2] * gyro[2]) * dt
-        q = before.attitude_ned_frd
-        if angle > 1e-9:
-            s = math.sin(0.5 * angle) / angle * dt
-            turn = (math.cos(0.5 * angle), gyro[0] * s, gyro[1] * s, gyro[2] * s)
-            q = frames.quat_normalize(frames.quat_multiply(q, turn))
-        push = frames.quat_rotate(q, accel)
-        push = (push[0], push[1], push[2] + GRAVITY_M_S2)
-        assert now.attitude_ned_frd == q
-        for i in range(3):
-            p, v = before.position_ned_m[i], before.velocity_ned_m_s[i]
-            assert now.position_ned_m[i] == p + v * dt + push[i] * (0.5 * dt * dt)
-            assert now.velocity_ned_m_s[i] == v + push[i] * dt
-        before = now
-
 
 AIRFRAME = Airframe(mass_kg=3.0, thrust_max_n=60.0, ground_clearance_m=0.3)
 
@@ -105,19 +30,6 @@ def test_the_stub_knows_the_biases_that_show_at_rest_and_no_others() -> None:
     assert stub.imu is not None
     assert stub.imu.gyro_frd_rad_s == pytest.approx((0.0, 0.0, 0.0))
     assert stub.imu.accel_frd_m_s2 == pytest.approx((0.1, -0.2, -GRAVITY_M_S2))
-
-
-def test_a_bias_above_ekf2s_limit_is_learned_up_to_it() -> None:
-    stub = stub_of(World(imu=Imu(on=True, accel_bias_m_s2=(0.0, 0.0, 1.0), gyro_bias_deg_s=(0.0, 0.0, 0.0))), AIRFRAME)
-    stub.step(ImuSample(1.0, (0.0, 0.0, 0.0), (0.0, 0.0, -GRAVITY_M_S2 - 1.0)))
-    assert stub.imu is not None
-    assert stub.imu.accel_frd_m_s2[2] == pytest.approx(-GRAVITY_M_S2 - 0.6)
-
-
-def test_without_errors_the_stub_takes_samples_as_they_are() -> None:
-    stub, sample = stub_of(World(), AIRFRAME), ImuSample(1.0, (0.1, 0.2, 0.3), (0.4, 0.5, -9.0))
-    stub.step(sample)
-    assert stub.imu is sample
 
 
 def test_a_sideways_bias_stays_a_tilt_whatever_vision_says() -> None:

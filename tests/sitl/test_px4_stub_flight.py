@@ -8,7 +8,7 @@ from functools import cache
 
 import pytest
 
-from companion.model.frames import quat_from_euler_zyx, tilt_rad
+from companion.model.frames import quat_from_euler_zyx
 from sitl.autopilot.commander import Command, Result
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.origin import Origin
@@ -85,18 +85,6 @@ def test_take_off_hold_land_and_automatic_disarm() -> None:
     assert rig.texts() == ["Landing detected", "Disarmed by landing"]
 
 
-def test_nothing_turns_while_disarmed_and_nothing_lifts_during_spool_up() -> None:
-    rig = ready()
-    rig.stub.on_setpoint(rig.t_s, AttitudeTarget(LEVEL, 0.9))
-    rig.run(0.2)
-    assert rig.stub.rotors == (0.0, 0.0, 0.0, 0.0)
-    rig.command(Command.NAV_TAKEOFF)
-    rig.arm()
-    rig.run(0.9)  # COM_SPOOLUP_TIME is 1 s
-    assert rig.stub.target.thrust == 0.0
-    assert rig.stub.landed
-
-
 def test_offboard_needs_a_stream_then_follows_attitude_and_thrust() -> None:
     rig = ready()
     rig.mode(6)
@@ -112,23 +100,6 @@ def test_offboard_needs_a_stream_then_follows_attitude_and_thrust() -> None:
     stream(rig, 2.0, AttitudeTarget(wanted, HOVER * 1.02))
     error = 2 * math.acos(min(1.0, abs(sum(a * b for a, b in zip(wanted, rig.plant.attitude, strict=True)))))
     assert math.degrees(error) < 2.0
-
-
-def test_attitude_offboard_lands_when_thrust_goes_to_zero_on_the_ground() -> None:
-    rig = ready()
-    stream(rig, 0.2, AttitudeTarget(LEVEL, 0.0))
-    rig.mode(6)
-    rig.arm()
-    stream(rig, 1.0, AttitudeTarget(LEVEL, HOVER * 1.05))
-    stream(rig, 2.5, AttitudeTarget(LEVEL, HOVER * 0.93))
-    stream(rig, 2.0, AttitudeTarget(LEVEL, 0.3))
-    assert rig.height_m == pytest.approx(0.0, abs=1e-6)
-    assert not rig.stub.landed, "0.3 is more than PX4 takes for idle"
-    assert rig.disarm() is Result.TEMPORARILY_REJECTED
-    stream(rig, 1.2, AttitudeTarget(LEVEL, 0.0))
-    assert rig.stub.landed
-    assert rig.disarm() is Result.ACCEPTED
-    assert rig.stub.nav_state is NavState.OFFBOARD
 
 
 def test_setpoints_act_after_the_configured_delay() -> None:
@@ -155,16 +126,6 @@ def test_offboard_follows_position_and_velocity_setpoints() -> None:
     assert rig.plant.velocity_ned_m_s == pytest.approx((0.3, 0.0, 0.0), abs=0.08)
 
 
-def test_land_without_mocap_descends_blindly_to_the_ground() -> None:
-    rig = hovering(MPC_LAND_SPEED=0.3)
-    rig.vision = False
-    rig.run(3.0)
-    rig.command(Command.NAV_LAND)
-    run_until(rig, lambda: rig.stub.nav_state is NavState.DESCEND, 5.0)
-    run_until(rig, lambda: rig.height_m <= 0.0, 20.0)
-    assert tilt_rad(rig.plant.attitude) < math.radians(5.0)
-
-
 def test_a_landing_that_ends_before_the_estimate_expires_disarms() -> None:
     """Without position PX4 wants 8 s of idle thrust to believe that it has landed; the rotors stay idle meanwhile."""
     rig = hovering()
@@ -179,11 +140,3 @@ def test_a_landing_that_ends_before_the_estimate_expires_disarms() -> None:
     assert rig.stub.target.thrust == 0.0
     run_until(rig, lambda: not rig.stub.armed, 12.0)
     assert rig.height_m == 0.0
-
-
-def test_termination_stops_the_rotors() -> None:
-    rig = hovering()
-    assert rig.command(Command.DO_FLIGHTTERMINATION, 1.0) is Result.ACCEPTED
-    rig.run(0.02)
-    assert rig.stub.rotors == (0.0, 0.0, 0.0, 0.0)
-    assert rig.stub.nav_state is NavState.TERMINATION

@@ -13,7 +13,6 @@ from sitl.autopilot.modes import NavState
 from sitl.autopilot.receive import Receiver
 from sitl.autopilot.setpoints import PositionTarget, RateTarget, decode_attitude_target, decode_position_target
 from sitl.autopilot.streams import STREAMS, Schedule
-from sitl.autopilot.telemetry import attitude_quaternion
 from sitl.autopilot.types import AttitudeTarget
 from tests.sitl.px4_rig import Rig
 
@@ -183,17 +182,6 @@ def test_commands_to_the_link_are_answered_as_px4_does() -> None:
     assert rig.stub.nav_state is NavState.LOITER
 
 
-@pytest.mark.parametrize(
-    ("system", "component", "heard"),
-    [(245, 190, True), (1, 191, True), (1, 1, False)],
-)
-def test_a_companion_may_share_the_system_id_but_an_echo_is_ignored(system: int, component: int, heard: bool) -> None:
-    wire = Wire(Rig(), system, component)
-    interval = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
-    result = wire.command(interval, mavlink.MAVLINK_MSG_ID_ODOMETRY, 10000)
-    assert (result == mavlink.MAV_RESULT_ACCEPTED) is heard
-
-
 def test_parameters_are_read_by_name_and_index_and_set_by_type() -> None:
     rig = Rig()
     wire = Wire(rig)
@@ -263,19 +251,6 @@ def test_every_stream_can_be_encoded() -> None:
         assert message is not None, message_id
         assert message.get_msgId() == message_id
         assert message.pack(encoder)
-
-
-def test_the_clock_in_its_messages_advances_while_the_world_pauses() -> None:
-    def stamp_ms() -> int:
-        message = attitude_quaternion(rig.stub)
-        assert message is not None
-        return int(message.time_boot_ms)
-
-    rig = Rig()
-    rig.run(1.0)
-    before_ms = stamp_ms()
-    rig.stub.clock_ahead_s += 0.25
-    assert stamp_ms() == before_ms + 250
 
 
 def test_a_stream_that_fell_behind_does_not_burst() -> None:

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl.autopilot.cascade import gains_from_params
 from sitl.autopilot.params import (
     MAV_PARAM_TYPE_INT32,
     Params,
@@ -50,18 +49,3 @@ def test_every_parameter_reads_back_from_its_own_wire_value() -> None:
 def test_bad_values_are_refused(name: str, value: float, error: type[Exception]) -> None:
     with pytest.raises(error):
         Params({name: value})
-
-
-def test_the_hash_and_the_revision_show_of_every_change() -> None:
-    params = Params()
-    hash_before, revision = params.hash_check(), params.revision
-    params.set("MPC_THR_HOVER", 0.6)
-    assert struct.pack("<f", params.hash_check()) != struct.pack("<f", hash_before)
-    assert params.revision > revision
-
-
-def test_the_cascade_takes_its_gains_from_the_parameters() -> None:
-    gains = gains_from_params(Params({"MC_ROLL_P": 4.0, "MC_YAWRATE_I": 0.2, "MC_PITCHRATE_MAX": 180.0}))
-    assert gains.attitude_p[0] == 4.0
-    assert gains.rate_i[2] == pytest.approx(0.2)
-    assert gains.rate_max_rad_s[1] == pytest.approx(math.pi)

@@ -60,12 +60,6 @@ def test_manual_example_is_answered_byte_for_byte(sent: str, answered: str) -> N
     assert line_of(*servos).feed(bytes.fromhex(sent)) == bytes.fromhex(answered.replace(" ", ""))
 
 
-def test_manual_example_of_a_sync_write_takes_effect() -> None:
-    servos = [ServoModel(1), ServoModel(2)]
-    line_of(*servos).feed(bytes.fromhex("fffffd00fe110083740004000196000000 02aa000000 8287"))
-    assert [get(s, 116, 4) for s in servos] == [150, 170]
-
-
 @pytest.mark.parametrize(
     ("silent", "sent", "answered"),
     [
@@ -166,13 +160,6 @@ def test_damaged_traffic_never_raises(flips: list[tuple[int]], cut: int, data: s
         line.feed(bytes(damaged[i : i + step]))
         i += step
     assert recovers(line)
-
-
-def test_packet_behind_a_damaged_length_is_found() -> None:
-    damaged = bytearray(_PING)
-    damaged[5] = 30
-    line = line_of(ServoModel(1))
-    assert line.feed(bytes(damaged) + _PING * 3).count(status(1, 0, bytes((6, 4, 48)))) == 3
 
 
 def test_packet_arrives_byte_by_byte() -> None:

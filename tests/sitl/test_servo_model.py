@@ -12,7 +12,7 @@ from companion.sitl_config.world import World
 from sitl.servo.bus import ServoLine
 from sitl.servo.from_config import servos_of
 from sitl.servo.model import AMP_PER_COUNT as AMP
-from sitl.servo.model import RAD_PER_COUNT, RAD_S_PER_COUNT, ServoModel, ServoRefusal
+from sitl.servo.model import RAD_PER_COUNT, ServoModel, ServoRefusal
 from sitl.servo.protocol import ALERT, StatusError, packet, status
 
 VEHICLE = load_vehicle("tarot650_2r")
@@ -76,18 +76,6 @@ def test_position_starts_within_one_turn_and_then_counts_turns() -> None:
     assert get(servo, 132, 4, signed=True) == start - 2 * 4096
     servo.reboot()
     assert get(servo, 132, 4, signed=True) == start
-
-
-def test_reverse_mode_turns_every_sign() -> None:
-    servo = ServoModel(1)
-    servo.write(10, b"\x01")
-    servo.write(11, b"\x00")
-    servo.write(64, b"\x01")
-    servo.write(102, word(100))
-    servo.update(0.0, 0.0, 0.0)
-    assert servo.update(0.001, -0.5, -1.0) == pytest.approx(-100 * AMP)
-    assert get(servo, 132, 4, signed=True) == round(0.5 / RAD_PER_COUNT)
-    assert get(servo, 128, 4, signed=True) == round(1.0 / RAD_S_PER_COUNT)
 
 
 @pytest.mark.parametrize(
@@ -161,21 +149,3 @@ def test_overload_lets_go_until_reboot() -> None:
     servo.write(64, b"\x01")
     assert get(servo, 11, 1) == 0, "EEPROM outlives a reboot"
     assert get(servo, 102, 2) == 0, "RAM does not"
-
-
-def test_overheating_comes_back_after_reboot_while_it_is_hot() -> None:
-    servo = in_current_mode()
-    servo.set_temperature_c(81)
-    servo.reboot()
-    assert get(servo, 70, 1) == 0x04
-    servo.set_temperature_c(60)
-    servo.reboot()
-    assert get(servo, 70, 1) == 0
-
-
-def test_watchdog_sleeps_while_torque_is_off() -> None:
-    servo = ServoModel(1)
-    servo.write(98, b"\x01")
-    servo.update(0.0, 0.0, 0.0)
-    servo.update(5.0, 0.0, 0.0)
-    assert get(servo, 98, 1) == 1

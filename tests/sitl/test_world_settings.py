@@ -1,54 +1,118 @@
-"""Every setting of `world.*` has an effect: it changes a flight in the fast closed loop.
+"""Every setting of `world.*` is read by the simulated world, every fault changes a flight, and a part that is off changes nothing.
 
-`tests/flights/test_lockstep.py` shows that a flight over the wires is that of the fast loop; what acts on wires alone is tested in
-`test_fault_wires.py` and `test_servo_model.py`.
+What the parts do: `world/`. That a flight over the wires is that of the fast loop: `tests/flights/test_lockstep.py`. What acts on wires
+alone: `test_fault_wires.py` and `test_servo_model.py`.
 """
 
 from __future__ import annotations
 
 import json
-from collections import Counter
+import typing
+from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
 import pytest
 
+from companion.config.base import Model
+from companion.sitl_config.faults import CONTACT_PHASES, KINDS, FaultKind
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from companion.sitl_config.world import World
 from sitl.fast.loop import FastFlight, FastResult
-from tests.sitl.world_settings import Pair, Settings, fault_pairs, pairs
-from tests.support import HOVER, SHORT_CATCH
+from tests.support import HOVER, SHORT_CATCH, set_options
 
-BASE = load_sitl(SHORT_CATCH)
-WITH_ROD = load_sitl(HOVER, vehicle_path="tarot650_2r_rod")
-"""Flown in worlds with surfaces, which a net does not touch."""
-PAIRS = [*pairs(), *fault_pairs()]
-
-_SET_UP = "the companion's set-up of the bus writes this register, or a row of its preflight judges it; the fast loop has neither"
-ON_WIRES_ONLY = {
-    "natnet_version": "the fast loop has no NatNet bytes",
-    "mocap_other_id": "an address: the fast loop has no stream of several rigid bodies",
-    "arm_handling": "it holds a limp arm; in the fast loop the arm gives torque from the start",
-    "servos.firmware": _SET_UP,
-    "servos.return_delay_us": _SET_UP,
-    "servos.operating_mode": _SET_UP,
-    "servos.position_limit_counts": "mode 0 has no position limits",
-    "extends": "a world file's key: the loader has read the other world",
-    "surfaces.name": "it stands in the report alone",
-    "servos.shadow_id": "a second address on the bus",
-}
-"""Settings without a meaning in the fast closed loop, and why."""
-
+Settings = dict[str, Any]
 TARE_S = 0.1
 """In the fast loop, instead of the flight's second: nothing but noise happens meanwhile."""
-UNTIL_S = EARLY_S, _, _ = 0.65, 3.5, 8.3
-"""Flight times in the fast loop: until the servos give torque, until the rotors turn, and including the catch.
+ELSEWHERE = {
+    "World.natnet_version": "the fast loop has no NatNet bytes",
+    "World.mocap_other_id": "the fast loop has no stream of several rigid bodies",
+    "World.arm_handling": "it holds a limp arm; in the fast loop the arm gives torque from the start",
+    "World.extends": "a world file's key: the loader has read the other world",
+    "Surface.name": "it stands in the report alone",
+}
+"""Settings that the fast closed loop does not read, and why."""
 
-A pair flies until its first difference. Shorter flights are tried first, unless other pairs share the usual world.
-"""
-SHARED = {world for world, pairs_of_it in Counter(json.dumps(pair.usual) for pair in PAIRS).items() if pairs_of_it > 3}
-EARLY = {"air", "battery", "compliance", "imu", "machine", "mocap", "push", "rotors"}
-"""Parts of shared worlds that act before the catch."""
+PLATE = {
+    "point_m": (-0.544, -0.03, 0.136),
+    "normal": (0.1, 0.1, 1.0),
+    "size_m": (0.05, 0.05),
+    "stiffness_n_m": 500.0,
+}
+"""A surface whose corner is under the tip of the folded rod."""
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wait before take-off is short, and a flight with faults that is ended in the air is not followed to the floor."""
+    monkeypatch.setattr("companion.model.flight_stage.TARE_S", TARE_S)
+    monkeypatch.setattr("companion.mission.settled.SETTLED_S", TARE_S)
+    monkeypatch.setattr("sitl.fast.loop.SETTLE_S", 0.0)
+
+
+def models(annotation: Any) -> list[type[Model]]:
+    """The models in a field's type."""
+    if isinstance(annotation, type) and issubclass(annotation, Model):
+        return [annotation]
+    return [model for inner in typing.get_args(annotation) for model in models(inner)]
+
+
+PARTS = {name: part for name, field in World.model_fields.items() for part in models(field.annotation)}
+EFFECTS = {name: part for name, part in PARTS.items() if "on" in part.model_fields}
+
+
+def overrides(**world: Any) -> list[str]:
+    return set_options(**{f"world.{key}": value for key, value in world.items()})[1::2]
+
+
+def test_every_setting_is_read_by_the_simulated_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A catch with every effect, a rod on a plate, and a vehicle that is handled."""
+    on = overrides(**{f"{name}.on": True for name in EFFECTS})
+    gust = {"kind": "gust", "phase": "line", "duration_s": 0.1, "size": 0.1}
+    servo = {"kind": "servo_overload", "after": "catch", "t_s": 0.0, "servo": 2}
+    push = {"t_s": 2.0, "duration_s": 0.1, "force_world_n": [0.0, 0.0, 0.1]}
+    # At this place the short catch does not accelerate, and with this seed the net is hit.
+    catch = overrides(
+        push=push, servos=[{}, {}], throws=2, keep_s=0.2, faults=[gust, servo], seed=7, catch_at_m=[0.2, 0.0]
+    )
+    handled = overrides(handling=True, handling_t_s=0.0, handling_taps=1, net_weight_kg=0.5, net_weight_t_s=0.4)
+    flights = [
+        (load_sitl(SHORT_CATCH, overrides=[*on, *catch]), 8.3),
+        (
+            load_sitl(
+                HOVER, vehicle_path="tarot650_2r_rod", overrides=overrides(surfaces=[{**PLATE, "gives_way_n": 8.0}])
+            ),
+            0.6,
+        ),
+        (load_sitl(HOVER, overrides=handled), 0.6),
+    ]
+    read: set[str] = set()
+
+    def reading(model: Model, name: str) -> Any:
+        if name in type(model).model_fields:
+            read.add(f"{type(model).__name__}.{name}")
+        return object.__getattribute__(model, name)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Model, "__getattribute__", reading)
+        results = [FastFlight(config).run(limit_s) for config, limit_s in flights]
+    assert results[0].caught
+    parts: list[type[Model]] = [World, *PARTS.values()]
+    settings = {f"{part.__name__}.{name}" for part in parts for name in part.model_fields}
+    assert settings - read == set(ELSEWHERE)
+
+
+# -- faults ----------------------------------------------------------------------------------------------------------
+
+_NEVER: Settings = {"kind": "gust", "t_s": 1000.0}
+BESIDE: dict[str, Settings] = {"tether_cut": {"kind": "tether_taut", "t_s": 0.0, "size": 0.02}}
+"""Kinds of faults that act only together with another one."""
+IN_THE_AIR = frozenset({"motor_weak", "offboard_refused", "pilot_takeover", "tether_taut", "tether_snag", "tether_cut"})
+"""Kinds of faults that show only once the rotors turn."""
+SIZES: dict[str, float] = {"payload_missed": 0.0, "autopilot_reboot": 0.1}
+"""Sizes of faults for which half of the default size makes no difference."""
+UNTIL_S = 0.65, 3.5, 8.3
+"""Flight times: until the servos give torque, until the rotors turn, and including the catch."""
 
 
 class Unlike(Exception):
@@ -63,84 +127,65 @@ class Watched(list[Any]):
         self._usual = usual
 
     def append(self, item: Any) -> None:
-        """Add an item.
-
-        Raises:
-            Unlike: the earlier record has another one, or none.
-        """
         if len(self) >= len(self._usual) or item != self._usual[len(self)]:
             raise Unlike
         super().append(item)
 
 
-@pytest.fixture(autouse=True)
-def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The wait before take-off is short, and a flight with faults that is ended in the air is not followed to the floor."""
-    monkeypatch.setattr("companion.model.flight_stage.TARE_S", TARE_S)
-    monkeypatch.setattr("companion.mission.settled.SETTLED_S", TARE_S)
-    monkeypatch.setattr("sitl.fast.loop.SETTLE_S", 0.0)
-
-
-def world(settings: Settings) -> SitlConfig:
-    return in_world(World.model_validate(settings))
-
-
-def in_world(world: World) -> SitlConfig:
-    return (WITH_ROD if world.surfaces else BASE).model_copy(update={"world": world})
+def in_world(settings: Settings) -> SitlConfig:
+    mission, vehicle = (HOVER, "tarot650_2r_rod") if "surfaces" in settings else (SHORT_CATCH, None)
+    return load_sitl(mission, vehicle_path=vehicle).model_copy(update={"world": World.model_validate(settings)})
 
 
 @cache
-def usual_flight(world_json: str, limit_s: float) -> FastResult:
-    return FastFlight(in_world(World.model_validate_json(world_json))).run(limit_s)
+def usual_flight(settings: str, limit_s: float) -> FastResult:
+    return FastFlight(in_world(json.loads(settings))).run(limit_s)
 
 
-def flights_differ(pair: Pair, limit_s: float) -> bool:
+def flights_differ(usual: Settings, changed: SitlConfig, limit_s: float) -> bool:
     """Return whether core, world or guardian differ in the fast loop up to this time."""
-    usual = usual_flight(world(pair.usual).world.model_dump_json(), limit_s)
+    flown = usual_flight(json.dumps(usual), limit_s)
     result = FastResult(
-        inputs=Watched(usual.inputs),
-        outputs=Watched(usual.outputs),
-        snapshots=Watched(usual.snapshots),
-        after=Watched(usual.after),
+        inputs=Watched(flown.inputs),
+        outputs=Watched(flown.outputs),
+        snapshots=Watched(flown.snapshots),
+        after=Watched(flown.after),
     )
     try:
-        FastFlight(world(pair.changed))._run(result, limit_s)
+        FastFlight(changed)._run(result, limit_s)
     except Unlike:
         return True
-    return len(result.inputs) < len(usual.inputs)
+    return len(result.inputs) < len(flown.inputs)
 
 
-def tried(pair: Pair) -> tuple[float, ...]:
-    """Return the flight times to try in turn until the pair differs."""
-    if json.dumps(pair.usual) not in SHARED:
-        return UNTIL_S[pair.acts :]
-    return UNTIL_S[1:] if pair.usual.keys() & EARLY else UNTIL_S[-1:]
+def fault_pairs() -> Iterator[tuple[FaultKind, Settings, Settings, float]]:
+    """Two sizes of each kind that has a size, the other kinds with and without the fault, and the time by which it acts."""
+    for kind, about in KINDS.items():
+        after = "catch" if kind.startswith("payload_") else "arming" if kind in IN_THE_AIR else "start"
+        acts = 2 if kind.startswith("tether_") else ("start", "arming", "catch").index(after)
+        fault = {"kind": kind, "t_s": 0.1, "after": after}
+        world: Settings = {"surfaces": [PLATE]} if about.phases == CONTACT_PHASES else {}
+        if about.default is not None and kind != "pilot_takeover":
+            usual, changed = [fault], [{**fault, "size": SIZES.get(kind, 0.5 * about.default)}]
+        else:
+            beside = BESIDE.get(kind, _NEVER)
+            usual, changed = [beside], [beside, fault]
+        yield kind, {**world, "faults": usual}, {**world, "faults": changed}, UNTIL_S[acts]
 
 
-def field(pair: Pair) -> str:
-    """Return the setting without its component or place."""
-    return pair.setting.partition("[")[0].partition(" ")[0]
-
-
-@pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: pair.setting)
-def test_it_changes_a_flight_in_the_fast_loop(pair: Pair) -> None:
-    if field(pair) in ON_WIRES_ONLY:
-        assert not flights_differ(pair, EARLY_S), "it does act in the fast loop: take it off the list"
-    else:
-        differ = any(flights_differ(pair, limit_s) for limit_s in tried(pair))
-        assert differ, f"world.{pair.setting} does nothing in the fast loop"
-
-
-def test_the_list_of_exceptions_names_settings_that_there_are() -> None:
-    assert set(ON_WIRES_ONLY) <= {field(pair) for pair in PAIRS}
-    assert len({field(pair) for pair in PAIRS} - set(ON_WIRES_ONLY)) > 40
+@pytest.mark.parametrize(("kind", "usual", "changed", "limit_s"), [*fault_pairs()], ids=KINDS)
+def test_every_fault_and_its_size_change_a_flight(
+    kind: FaultKind, usual: Settings, changed: Settings, limit_s: float
+) -> None:
+    limits_s = [limit_s, *(later_s for later_s in UNTIL_S if later_s > limit_s)]
+    assert any(flights_differ(usual, in_world(changed), until_s) for until_s in limits_s), f"{kind} does nothing"
 
 
 def test_parts_that_are_off_change_nothing_whatever_their_other_settings_are() -> None:
-    off: dict[str, Settings] = {}
-    for pair in PAIRS:
-        for part, settings in pair.changed.items():
-            if isinstance(settings, dict) and "on" in settings:
-                off.setdefault(part, {}).update({**settings, "on": False})
-    assert {"air", "battery", "downwash", "force_sensor", "imu", "machine", "mocap", "net", "rotors"} <= off.keys()
-    assert not flights_differ(Pair("off", {}, off), UNTIL_S[-1])
+    def off(part: type[Model]) -> Model:
+        values = {name: field.get_default(call_default_factory=True) for name, field in part.model_fields.items()}
+        changed = {name: 1.5 * value + 0.2 for name, value in values.items() if isinstance(value, float)}
+        return part.model_construct(**{**values, **changed, "on": False})
+
+    world = World().model_copy(update={name: off(part) for name, part in EFFECTS.items()})
+    assert not flights_differ({}, in_world({}).model_copy(update={"world": world}), UNTIL_S[-1])

@@ -39,15 +39,6 @@ def air(**settings: float) -> Air:
     return effect
 
 
-def test_the_strength_grows_with_the_thrust_and_towards_the_floor() -> None:
-    effect = air(floor_increase=0.8, floor_range_m=0.5)
-    assert effect.strength(HOVER, 1.0) == 1.0
-    assert effect.strength(0.5 * HOVER, 1.0) == 0.5
-    assert effect.strength(HOVER, 0.25) == pytest.approx(1.4)
-    assert effect.strength(HOVER, 0.0) == pytest.approx(1.8)
-    assert effect.strength(0.0, 0.0) == 0.0
-
-
 def gusts(seed: int, rotor_command: float, steps: int = 2000) -> np.ndarray:
     """Force and torque on the base in a world without drag, in every tenth step."""
     config = WorldConfig(payload_kg=0.0, seed=seed, air=AirConfig(on=True, correlation_time_s=0.02, floor_increase=0.0))
@@ -69,10 +60,6 @@ def test_force_and_torque_on_the_base_have_the_rms_of_the_section() -> None:
     np.testing.assert_allclose(rms[:3], AirConfig().force_rms_n, rtol=0.12)
     np.testing.assert_allclose(rms[3:5], AirConfig().torque_rms_nm, rtol=0.12)
     assert rms[5] == 0.0
-
-
-def test_there_are_no_gusts_while_no_rotor_turns() -> None:
-    assert not gusts(1, 0.0, 300).any()
 
 
 def test_gusts_start_again_at_arming() -> None:

@@ -124,20 +124,6 @@ def test_mass_matrix_coriolis_and_gravity_are_those_of_the_laws_model(vehicle: V
         np.testing.assert_allclose(bias, np.add(terms.coriolis, terms.gravity), atol=1e-9)
 
 
-def test_the_sensor_and_the_net_are_at_the_tip_of_any_chain() -> None:
-    vehicle = with_random_links(3, np.random.default_rng(5))
-    world, chain = free(vehicle), chain_of(vehicle)
-    m, d = world.model, world.data
-    d.qpos[list(world.machine.layout.joint_q)] = (0.5, -1.0, 2.0)
-    mujoco.mj_forward(m, d)
-    link, site = m.body("link3").id, m.site("net").id
-    last = d.xmat[link].reshape(3, 3)
-    np.testing.assert_allclose(d.site_xpos[site], d.xpos[link] + last @ chain.tip_m, atol=1e-12)
-    np.testing.assert_allclose(d.site_xmat[site].reshape(3, 3), last @ rotation_matrix(chain.sensor_wxyz), atol=1e-12)
-    hoop = last @ rotation_matrix(chain.tip_wxyz)
-    np.testing.assert_allclose(d.xmat[m.body("sensor").id].reshape(3, 3), hoop, atol=1e-12)
-
-
 def test_the_tip_of_a_rod_is_beyond_the_sensor_along_the_tips_axis() -> None:
     net = with_random_links(3, np.random.default_rng(5))
     vehicle = with_rod(net)
@@ -214,26 +200,6 @@ def test_each_servo_reads_its_own_joint_and_turns_it_in_its_own_direction(joints
     assert not plant.machine.parked
     torque_nm = plant.scene.data.ctrl[4:].tolist()
     assert torque_nm == pytest.approx(wanted_nm, abs=0.002)
-
-
-def test_a_support_holds_the_arm_until_it_is_armed_and_one_servo_pushes() -> None:
-    plant, bus, _, _ = plant_of(3)
-    bus.write(0.0, (0.5, 0.0, 0.0))
-    for _ in range(3):
-        plant.step(False)
-    assert plant.machine.parked
-    plant.step(True)
-    assert not plant.machine.parked
-
-
-def test_a_lost_servo_lets_go_and_the_others_go_on() -> None:
-    plant, bus, drives, _ = plant_of(4, faults=(Fault(kind="servo_loss", t_s=0.1, after="start", servo=3),))
-    while plant.t_s < 0.3:
-        plant.step(False)
-        state = bus.read(plant.t_s)
-        bus.write(plant.t_s, (0.5,) * 4)
-    assert state is not None and state.read_failures > 0
-    assert [drive.watchdog_tripped for drive in drives] == [False, False, True, False]
 
 
 def sprung(vehicle: Vehicle, config: WorldConfig) -> tuple[Plant, list[ServoDrive]]:

@@ -28,34 +28,12 @@ def pack(start: float = 1.0, life_s: float = 900.0, **changes: Any) -> BatteryPa
     return made
 
 
-def test_open_circuit_voltage_falls_from_full_to_empty() -> None:
-    volts = [open_circuit_v(0.01 * percent, 4) for percent in range(101)]
-    assert volts == sorted(volts)
-    assert volts[100] == pytest.approx(4.0 * 4.1029, abs=1e-3)
-    assert volts[50] == pytest.approx(4.0 * 3.8034, abs=1e-3)
-    assert volts[0] == pytest.approx(4.0 * 2.654, abs=1e-3)
-
-
 @pytest.mark.parametrize("each_n", [0.0, 7.35, 12.0])
 def test_voltage_sags_by_the_resistance_times_the_current(each_n: float) -> None:
     battery = pack(resistance_ohm=0.03)
     battery.step(PHYSICS_DT_S, (each_n,) * 4)
     assert battery.voltage_v * battery.current_a == pytest.approx(15.0 + 4.0 * 3.9 * each_n**1.5)
     assert battery.voltage_v == pytest.approx(open_circuit_v(1.0, 4) - 0.03 * battery.current_a)
-
-
-def test_battery_of_six_cells_has_their_voltage_and_gives_the_vehicle_files_thrust_at_it() -> None:
-    airframe = VEHICLE.airframe.model_copy(update={"battery_cells": 6})
-    battery = BatteryPack(BatteryConfig(on=True, electronics_w=0.0), 1.0, 900.0, WEIGHT_N, airframe)
-    four = pack(electronics_w=0.0)
-    assert battery.voltage_v == pytest.approx(1.5 * four.voltage_v)
-    assert battery.thrust_ratio(battery.voltage_v) == pytest.approx(four.thrust_ratio(four.voltage_v))
-
-
-def test_more_power_than_the_battery_has_does_not_end_the_world() -> None:
-    battery = pack(resistance_ohm=2.0)
-    battery.step(PHYSICS_DT_S, (15.0,) * 4)
-    assert battery.voltage_v == pytest.approx(0.5 * open_circuit_v(1.0, 4))
 
 
 def test_charge_drawn_is_the_integral_of_the_current() -> None:
@@ -101,15 +79,6 @@ def test_thrust_goes_with_the_square_of_the_voltage() -> None:
             )
             wanted = near * VEHICLE.airframe.thrust_max_n * share * (open_circuit_v(start, 4) / 16.0) ** 2
             assert sum(world.data.ctrl[0:4]) == pytest.approx(wanted, rel=2e-3)
-
-
-def test_hover_command_of_linear_rotors_follows_the_voltage() -> None:
-    ideal = OneMachine(VEHICLE, WorldConfig(), (0.0, 0.0), 0.0, (1.0, 1.0))
-    real = OneMachine(VEHICLE, WorldConfig(battery=BatteryConfig(on=True)), (0.0, 0.0), 0.0, (1.0, 1.0))
-    assert real.machine.battery is not None
-    assert real.machine.hover_command == pytest.approx(
-        ideal.machine.hover_command * (16.0 / real.machine.battery.hover_v) ** 2
-    )
 
 
 def test_power_module_reports_the_pack_and_the_sag_of_a_fault() -> None:

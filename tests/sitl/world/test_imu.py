@@ -82,31 +82,6 @@ def test_a_sample_is_the_mean_of_the_vibration_since_the_last_one(hz: float) -> 
         assert (p, q, r) == pytest.approx((-turn * along, -turn * along, turn * left), abs=1e-5)
 
 
-def test_the_rotor_speed_follows_the_root_of_the_thrust_and_the_amplitude_the_thrust() -> None:
-    fast, slow = errors(vibration_m_s2=6.0, vibration_hz=30.0), errors(vibration_m_s2=6.0, vibration_hz=60.0)
-    for _ in range(5):
-        _, quadrupled = fast.measure((4.0, 0.0, 0.0, 0.0), *STILL)
-        _, doubled = slow.measure((1.0, 0.0, 0.0, 0.0), *STILL)
-        assert quadrupled[0] == pytest.approx(4.0 * doubled[0])
-
-
-def test_four_rotors_have_the_rms_of_one_sine_behind_the_filter_of_the_mean() -> None:
-    amplitude, hz, interval_s = 6.0, 80.0, 0.004
-    imu = errors(vibration_m_s2=amplitude, vibration_hz=hz, rotor_spread=0.01)
-    samples = [imu.measure(HOVER, *STILL)[1] for _ in range(10000)]
-    for axis, of in ((0, hz), (1, hz), (2, 2.0 * hz)):
-        passed = math.sin(math.pi * of * interval_s) / (math.pi * of * interval_s)
-        rms = statistics.pstdev(sample[axis] for sample in samples)
-        assert rms == pytest.approx(amplitude / math.sqrt(2.0) * passed, rel=0.05)
-
-
-def test_vibration_shifts_the_mean_with_its_square() -> None:
-    imu = errors(rectification_m_s2=(0.1, -0.2, 0.3))
-    for share in (1.0, 1.5):
-        _, (x, y, z) = imu.measure((share,) * 4, *STILL)
-        assert (x, y, z - G) == pytest.approx((0.1 * share**2, -0.2 * share**2, 0.3 * share**2))
-
-
 def test_the_drift_has_its_spread_and_forgets_with_its_time_constant() -> None:
     imu = errors(interval_s=0.1, accel_drift_m_s2=0.5, gyro_drift_deg_s=2.0, drift_time_s=10.0)
     imu.drift(noise(1, 11))

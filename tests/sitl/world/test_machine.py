@@ -15,8 +15,7 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
-from sitl.world.model import base_mass_kg, mjcf
-from sitl.world.state import PHYSICS_DT_S
+from sitl.world.model import base_mass_kg
 from tests.sitl.plants import OneMachine, run
 from tests.support import CATCH, tool_of
 
@@ -52,13 +51,6 @@ def rotation(rpy_deg: tuple[float, float, float]) -> Array:
     return np.asarray(about_z @ about_y @ about_x)
 
 
-def test_a_section_without_errors_is_the_vehicle_file() -> None:
-    plain = OneMachine(VEHICLE, WorldConfig(payload_kg=0.0), (0.0, 0.0), 0.0, ARM_RAD).model
-    model = built().model
-    for name in ("body_mass", "body_inertia", "body_ipos", "body_pos", "body_quat"):
-        assert np.array_equal(getattr(model, name), getattr(plain, name)), name
-
-
 def test_a_hover_with_a_shifted_centre_of_mass_needs_the_torque_of_that_shift_and_stays_level() -> None:
     shift_m = (0.010, -0.006, 0.008)
     world = built(centre_of_mass_m=shift_m)
@@ -85,12 +77,6 @@ def test_a_hover_with_a_shifted_centre_of_mass_needs_the_torque_of_that_shift_an
     assert min(d.ctrl[:4]) > 0.0
 
 
-def test_no_inertia_exceeds_the_sum_of_the_other_two() -> None:
-    x, y, _ = VEHICLE.airframe.inertia_kg_m2
-    model = built(inertia_error=(-0.2, -0.2, 0.2)).model
-    assert sorted(model.body("base").inertia) == pytest.approx(sorted([0.8 * x, 0.8 * y, 0.8 * (x + y)]))
-
-
 def test_the_shoulder_is_moved_and_turned_with_the_whole_arm() -> None:
     offset_m, rpy_deg = (0.003, -0.002, 0.001), (1.0, -0.8, 0.6)
     nominal = net_body_m(built())
@@ -106,17 +92,6 @@ def test_the_sensor_frame_of_the_vehicle_file_is_turned_by_zyx_angles() -> None:
     world = built(VEHICLE.model_copy(update={"tool": tool}))
     link, sensor = (world.data.xmat[world.model.body(name).id].reshape(3, 3) for name in ("link2", "net"))
     assert link.T @ sensor == pytest.approx(rotation(rpy_deg))
-
-
-def test_mass_errors_and_the_section_act_together() -> None:
-    config = WorldConfig(mass_error=0.03, link_mass_error=(0.1, -0.1), machine=Machine(on=True))
-    arm, tool = VEHICLE.arm, tool_of(VEHICLE)
-    m1, m2 = arm.link_masses_kg
-    base_kg = VEHICLE.airframe.mass_kg - m1 - m2 - tool.sensor_mass_kg - tool.beyond_sensor_kg
-    model = OneMachine(VEHICLE, config, (0.0, 0.0), 0.0, ARM_RAD).model
-    masses = [float(model.body(name).mass[0]) for name in ("base", "link1", "link2", "sensor", "net")]
-    assert masses == pytest.approx([1.03 * base_kg, 1.1 * m1, 0.9 * m2, tool.sensor_mass_kg, tool.beyond_sensor_kg])
-    assert model.body("base").ipos == pytest.approx(Machine().centre_of_mass_m)
 
 
 PHYSICAL = {
@@ -138,14 +113,6 @@ PHYSICAL = {
     "tether": {"anchor_world_m": (0.5, -1.0, 0.1), "length_m": 2.0, "attachment_body_m": (0.0, 0.0, 0.1)},
 }
 """Another machine; every value differs from the Tarot's."""
-
-
-@pytest.mark.parametrize("key", [f"{part}.{name}" for part, values in PHYSICAL.items() for name in values])
-def test_each_physical_value_of_a_vehicle_file_reaches_the_simulated_machine(key: str) -> None:
-    part, _, name = key.partition(".")
-    changed = getattr(VEHICLE, part).model_copy(update={name: PHYSICAL[part][name]})
-    other = VEHICLE.model_copy(update={part: changed})
-    assert mjcf([(other, WorldConfig())], PHYSICS_DT_S) != mjcf([(VEHICLE, WorldConfig())], PHYSICS_DT_S)
 
 
 def test_another_vehicle_file_is_another_machine_in_all_its_parts() -> None:

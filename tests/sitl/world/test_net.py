@@ -18,7 +18,7 @@ from companion.sitl_config.faults import Fault
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.fast.loop import FastFlight
-from sitl.world.effects.net import SETTLED_S, Bag
+from sitl.world.effects.net import Bag
 from sitl.world.model import SECOND, SECOND_CATCH
 from sitl.world.payload import Ball
 from sitl.world.state import PAYLOAD_RADIUS_M, PHYSICS_DT_S
@@ -104,23 +104,6 @@ def test_the_bag_returns_the_restitution_of_the_speed(restitution: float) -> Non
     assert payload.velocity[2] == pytest.approx(2.0 * restitution, abs=0.12)
 
 
-def test_a_settled_payload_swings_with_the_period_of_the_pendulum() -> None:
-    payload = falling(0.0, swing_damping_ratio=0.01)
-    bag = payload.bag
-    payload.position = (0.01, 0.0, -bag._depth_m - 0.006)
-    bag.side, bag._above, bag.entered_s = 1, False, 0.0
-    crossings = []
-    while payload.t_s < 5.0:
-        before = payload.position[0]
-        payload.step()
-        if before < 0.0 <= payload.position[0]:
-            crossings.append(payload.t_s)
-    length_m = -payload.position[2]
-    assert length_m > bag._depth_m
-    period_s = (crossings[-1] - crossings[0]) / (len(crossings) - 1)
-    assert period_s == pytest.approx(math.tau * math.sqrt(length_m / GRAVITY_M_S2), rel=0.01)
-
-
 @pytest.mark.parametrize(("mass_kg", "at"), [(0.02, (0.05, 0.03)), (0.1, (0.0, 0.085)), (1.0, (0.0, 0.0))])
 def test_settling_adds_no_energy(mass_kg: float, at: Vec2) -> None:
     payload = falling(2.0, mass_kg, at)
@@ -134,68 +117,6 @@ def test_settling_adds_no_energy(mass_kg: float, at: Vec2) -> None:
     assert energy < before
     assert math.hypot(*payload.velocity) < 0.02
     assert payload.bag.side == 1
-
-
-def test_a_payload_that_is_too_fast_bounces_out() -> None:
-    payload = falling(7.0, 0.1)
-    while not payload.bag.bounced:
-        payload.step()
-        assert payload.t_s < 0.4
-    payload.run(0.1)
-    assert payload.bag.side == 0
-    assert payload.velocity[2] > 0.0
-    slow = falling(2.7, 0.1)
-    slow.run(0.5)
-    assert slow.bag.side == 1
-    assert slow.bag.touched_s is not None
-    assert slow.bag.caught_s(slow.t_s) == slow.bag.touched_s
-
-
-def test_a_catch_counts_when_the_payload_has_settled() -> None:
-    payload = falling(2.0, z_m=PHYSICS_DT_S)
-    payload.run(SETTLED_S - 0.02)
-    assert payload.bag.side == 1
-    assert payload.bag.caught_s(payload.t_s) is None
-    payload.run(0.04)
-    assert payload.bag.caught_s(payload.t_s) is not None
-
-
-def test_a_caught_payload_that_is_taken_out_by_hand_has_not_bounced() -> None:
-    payload = falling(2.0)
-    payload.run(1.0)
-    payload.velocity, payload.gravity = (0.0, 0.0, 1.0), 0.0
-    while payload.position[2] < 0.1:
-        payload.step()
-        assert not payload.bag.bounced
-        assert payload.t_s < 2.0
-    assert payload.bag.side == 0
-
-
-def test_a_payload_beside_the_hoop_is_not_touched() -> None:
-    payload = falling(2.7, at=(HOOP_M + PAYLOAD_RADIUS_M + 0.002, 0.0))
-    payload.run(0.3)
-    assert payload.bag.touched_s is None
-    assert payload.velocity[0:2] == (0.0, 0.0)
-
-
-@pytest.mark.parametrize(("offset_m", "outwards"), [(0.02, True), (-0.02, False)])
-def test_the_hoop_deflects_a_payload_away_from_its_wire(offset_m: float, outwards: bool) -> None:
-    payload = falling(1.0, at=(HOOP_M + offset_m, 0.0))
-    payload.run(0.12)
-    assert payload.bag.touched_s is not None
-    assert (payload.velocity[0] > 0.05) if outwards else (payload.velocity[0] < -0.05)
-
-
-def test_a_payload_from_below_falls_back() -> None:
-    payload = falling(-2.7, z_m=-0.05)
-    payload.bag._above = False
-    highest_m = 0.0
-    while payload.t_s < 0.6:
-        payload.step()
-        highest_m = max(highest_m, payload.position[2])
-    assert 0.05 < highest_m < 0.2, "the mesh stops it"
-    assert payload.position[2] < -0.1
-    assert payload.bag.side == 0
 
 
 def thrown_at(world: OneMachine, ball: Ball, ball_from_net_m: Vec3, velocity_m_s: Vec3) -> None:
@@ -288,20 +209,6 @@ def test_a_flight_whose_payload_missed_flies_on_and_catches_the_next_one() -> No
     # The impact, 4 N m give or take 1, overloads the sensor (4 N m) or does not; before and after it nothing may.
     ids = [event.id for output in result.outputs for event in output.events]
     assert ids in (["takeoff", *overload, "catch", "touchdown"] for overload in ([], ["force_overload"]))
-
-
-def test_the_swing_decays_with_its_damping_ratio() -> None:
-    payload = falling(0.0, swing_damping_ratio=0.1)
-    payload.bag.side, payload.bag._above = 1, False
-    payload.position = (0.01, 0.0, -payload.bag._depth_m - 0.006)
-    peaks: list[float] = []
-    while payload.t_s < 2.0:
-        before = payload.velocity[0]
-        payload.step()
-        if before > 0.0 >= payload.velocity[0]:
-            peaks.append(payload.position[0])
-    decrement = math.log(peaks[0] / peaks[1])
-    assert decrement == pytest.approx(math.tau * 0.1 / math.sqrt(1 - 0.1**2), rel=0.1)
 
 
 def test_two_payloads_lie_in_the_bag() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from companion.model.rotors import motor_signal, standard_layout
+from companion.model.rotors import motor_signal
 from companion.model.types import Vec4
 from companion.sitl_config.effects.rotors import Rotors as RotorsConfig
 from companion.sitl_config.loader import load_sitl
@@ -15,7 +15,7 @@ from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.backend import stub_of
 from sitl.fast.loop import FastFlight
 from sitl.px4.parameters import parameters
-from sitl.world.effects.rotors import LOWEST_RADII, Rotors
+from sitl.world.effects.rotors import Rotors
 from sitl.world.state import PHYSICS_DT_S
 from tests.sitl.plants import OneMachine
 from tests.support import CATCH
@@ -64,13 +64,6 @@ def test_rotor_speed_rises_and_falls_with_its_own_time_constant() -> None:
     assert [math.sqrt(n) for n in down] == pytest.approx([top * math.exp(-1.0)] * 4)
 
 
-def test_ground_effect_of_rotors_far_apart_is_that_of_cheeseman_and_bennett() -> None:
-    radius_m = 0.165
-    effect = Rotors(RotorsConfig(on=True, radius_m=radius_m), standard_layout("quad_x", 1e4, 0.0), PHYSICS_DT_S)
-    for height_m in (0.1, 0.2, 0.4, 1.0):
-        assert effect.ground_effect(height_m) == pytest.approx(1.0 / (1.0 - (radius_m / (4.0 * height_m)) ** 2))
-
-
 @pytest.mark.parametrize("height_m", [0.1, 0.33, 1.0, 2.0])
 def test_ground_effect_of_four_rotors(height_m: float) -> None:
     r, z, across = 0.165, height_m, 2.0 * ARM_M
@@ -81,22 +74,6 @@ def test_ground_effect_of_four_rotors(height_m: float) -> None:
     body = 2.0 * r**2 * z / (across**2 + 4.0 * z**2) ** 1.5 * 2.0
     found = rotors(radius_m=r, ground_body_lift=2.0).ground_effect(height_m)
     assert found == pytest.approx(1.0 / (1.0 - one - neighbours - opposite - body))
-
-
-def test_ground_effect_of_six_rotors_has_the_images_of_the_five_others() -> None:
-    r, z, arm_m = 0.165, 0.33, 0.34
-    distances_m = [arm_m, arm_m, math.sqrt(3.0) * arm_m, math.sqrt(3.0) * arm_m, 2.0 * arm_m]
-    images = sum(0.5 * r**2 * z / (distance_m**2 + 4.0 * z**2) ** 1.5 for distance_m in distances_m)
-    effect = Rotors(
-        RotorsConfig(on=True, radius_m=r, ground_body_lift=0.0), standard_layout("hexa_plus", arm_m, 0.0), PHYSICS_DT_S
-    )
-    assert effect.ground_effect(z) == pytest.approx(1.0 / (1.0 - (r / (4.0 * z)) ** 2 - images))
-
-
-def test_ground_effect_is_capped_near_the_floor_and_fades_with_height() -> None:
-    effect = rotors(radius_m=0.165)
-    assert effect.ground_effect(0.0) == effect.ground_effect(-1.0) == effect.ground_effect(LOWEST_RADII * 0.165) < 1.5
-    assert effect.ground_effect(20.0) == pytest.approx(1.0, abs=1e-4)
 
 
 def test_drag_opposes_the_airspeed_across_the_rotor_axis() -> None:
@@ -120,15 +97,6 @@ def test_autopilot_assumes_its_own_curve_whether_it_is_the_stub_or_px4() -> None
         assert 0.25 * signal**2 + 0.75 * signal == pytest.approx(command)
         assert motor_signal(command, 0.0) == command
     assert stub_of(WorldConfig(), VEHICLE.airframe).params.real("THR_MDL_FAC") == 0.0
-
-
-def test_hover_command_is_the_setpoint_that_carries_the_weight() -> None:
-    world = standing(rotors={"on": True, "thrust_error": (0.03, 0.03, 0.03, 0.03)})
-    signal = motor_signal(world.machine.hover_command, 0.3)
-    for _ in range(200):
-        near = rotors().ground_effect(world.machine.q[2] + LAYOUT.height_m)
-        world.fly((signal,) * 4, (0.0, 0.0))
-    assert sum(world.data.ctrl[0:4]) == pytest.approx(world.machine.weight_n * near, rel=2e-3)
 
 
 def test_vehicle_hovers_at_the_true_hover_thrust() -> None:

@@ -110,26 +110,6 @@ def test_under_1_n_m_gear_and_mount_yield_and_the_encoder_sees_only_the_gear() -
     assert link.encoder_rad == pytest.approx(-play - GEAR, rel=1e-3)
 
 
-def test_the_link_oscillates_at_the_frequency_of_its_spring_with_the_damping_of_its_relaxation() -> None:
-    mount = math.radians(1.0)
-    link = Link(joint(outer=mount, backlash_deg=0.0, friction_nm=5.0), 0.0, damping_nms=0.0)
-    link.run(0.0, DT_S)
-    link.rad_s = 1.0
-    rates, crossings = [], []
-    for k in range(1000):
-        rates.append(link.rad_s)
-        link.run(0.0, DT_S)
-        if rates[-1] <= 0.0 < link.rad_s:
-            crossings.append(k * DT_S)
-    rad_s = math.sqrt(1.0 / (GEAR + mount) / link.inertia_kg_m2)
-    seen_rad_s = math.tau * (len(crossings) - 1) / (crossings[-1] - crossings[0])
-    assert seen_rad_s == pytest.approx(rad_s, rel=0.02)
-    relaxation_s = (GEAR * ServoMechanics().gear_relaxation_s + mount * Compliance().relaxation_s) / (GEAR + mount)
-    decay = 0.5 * relaxation_s * rad_s**2
-    swings = rates[: round(0.2 / DT_S)]
-    assert max(map(abs, swings[-20:])) / max(map(abs, swings)) == pytest.approx(math.exp(-decay * 0.18), rel=0.2)
-
-
 def test_the_stiffest_gear_on_the_lightest_rotor_and_link_stays_stable() -> None:
     """The least inertia that the elbow feels with the base and the shoulder free, over all poses of the arm, is 0.0013 kg m2."""
     stiff = ServoMechanics(

@@ -1,0 +1,33 @@
+"""When a flight of the fast loop may end: what is judged has happened."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from companion.model.types import Outputs
+
+
+def after(event_id: str, seconds: float = 0.0) -> Callable[[Outputs], bool]:
+    """The flight ends this long after the first event with this id."""
+    end_s = math.inf
+
+    def ended(o: Outputs) -> bool:
+        nonlocal end_s
+        if any(event.id == event_id for event in o.events):
+            end_s = min(end_s, o.t_s + seconds)
+        return o.t_s >= end_s
+
+    return ended
+
+
+def contact_over() -> Callable[[Outputs], bool]:
+    """The flight ends with its contact phases."""
+    begun = False
+
+    def ended(o: Outputs) -> bool:
+        nonlocal begun
+        begun = begun or o.contact is not None
+        return begun and o.contact is None
+
+    return ended
