@@ -22,6 +22,8 @@ from tests.support import HOVER, SHORT_CATCH
 BASE = load_sitl(SHORT_CATCH)
 WITH_ROD = load_sitl(HOVER, vehicle_path="tarot650_2r_rod")
 """Flown in worlds with surfaces, which a net does not touch."""
+WITH_BALL = load_sitl(SHORT_CATCH, overrides=("vehicle.devices.mocap.ball={kind: marker}",))
+"""Flown in worlds with errors of single markers, which are streamed for it alone."""
 PAIRS = [*pairs(), *fault_pairs()]
 
 _SET_UP = "the companion's set-up of the bus writes this register, or a row of its preflight judges it; the fast loop has neither"
@@ -47,7 +49,7 @@ UNTIL_S = EARLY_S, _, _ = 0.65, 3.5, 8.3
 A pair flies until its first difference. Shorter flights are tried first, unless other pairs share the usual world.
 """
 SHARED = {world for world, pairs_of_it in Counter(json.dumps(pair.usual) for pair in PAIRS).items() if pairs_of_it > 3}
-EARLY = {"air", "battery", "compliance", "imu", "machine", "mocap", "push", "rotors"}
+EARLY = {"air", "battery", "compliance", "imu", "machine", "markers", "mocap", "push", "rotors"}
 """Parts of shared worlds that act before the catch."""
 
 
@@ -86,7 +88,7 @@ def world(settings: Settings) -> SitlConfig:
 
 
 def in_world(world: World) -> SitlConfig:
-    return (WITH_ROD if world.surfaces else BASE).model_copy(update={"world": world})
+    return (WITH_ROD if world.surfaces else WITH_BALL if world.markers.on else BASE).model_copy(update={"world": world})
 
 
 @cache

@@ -16,6 +16,7 @@ from pydantic.fields import FieldInfo
 
 from companion.config.base import Model
 from companion.sitl_config.effects.mocap import Mocap
+from companion.sitl_config.effects.thrower import Person
 from companion.sitl_config.faults import CONTACT_PHASES, KINDS, Fault
 from companion.sitl_config.surfaces import Surface
 from companion.sitl_config.world import Push, Servo, World
@@ -36,6 +37,7 @@ class Pair(NamedTuple):
 EXAMPLES: dict[type[Model], Settings] = {
     Push: {"t_s": 0.1, "duration_s": 0.1, "force_world_n": (0.0, 0.0, -2.0)},
     Servo: {},
+    Person: {"from_m": (1.2, 0.5, 0.3)},
     Fault: {"kind": "gust", "t_s": 0.1},
     Mocap: {"on": True, "lost_share": 0.2, "wobble_every_s": 0.5},
     # The corner of a plate under the tip of the rod, which `test_world_settings.WITH_ROD` carries folded.
@@ -54,6 +56,10 @@ VALUES: dict[str, Any] = {
     "px4_params": {"MC_ROLLRATE_P": 0.1},
     "net_weight_kg": 0.5,
     "payload_kg": 0.3,
+    "throw_to": "hovering",
+    "markers.fixed_m": ((1.0, 1.0, 0.03),),
+    "markers.wand_at_m": (1.0, 1.0, 1.0),
+    "markers.range_m": 0.5,
     "handling_taps": 2,
     "servos.id": 9,
     "servos.baud": 57600,
@@ -84,6 +90,8 @@ TOGETHER: dict[str, Settings] = {
     "net_weight_t_s": {"net_weight_kg": 0.5, "net_weight_t_s": 0.4},
     "keep_s": {"throws": 2, "keep_s": 0.2},
     "throws": {"keep_s": 0.2},
+    "throw_after_s": {"throw_to": "hovering", "catch_at_m": (0.4, 0.0), "throw_after_s": 0.5},
+    "payload_radius_m": {"net": {"on": True}, "catch_at_m": (0.2, 0.0)},
 }
 """Further settings of both worlds that make the setting act early in a flight."""
 
@@ -98,7 +106,7 @@ TOGETHER_IN_PART: dict[str, Settings] = {
 }
 """The same for a field of a part: the part's other fields."""
 
-ACTS_LATE = frozenset({"throws", "keep_s", "handling_taps", "handling_tap_n", "faults.phase"})
+ACTS_LATE = frozenset({"throws", "keep_s", "throw_after_s", "handling_taps", "handling_tap_n", "faults.phase"})
 """Settings that act late in a flight."""
 
 _NEVER = {"kind": "gust", "t_s": 1000.0}
