@@ -23,7 +23,7 @@ from tests.support import ROOT
 EXAMPLE = ROOT / "examples/phase"
 MISSION = EXAMPLE / "weigh.yaml"
 FILES = ("pyproject.toml", "lab_weigh.py", "weigh.yaml", "test_lab_weigh.py")
-FLOWN = ("catch", "circuit", "press", "slide", "probe")
+FLOWN = ("catch", "circuit", "intercept", "press", "slide", "probe")
 CODE = (EXAMPLE / "lab_weigh.py").read_text(encoding="utf-8")
 
 

@@ -18,17 +18,21 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.markers import MARKERS_MAX, MarkerFrame
 from companion.model.types import Vec3
 
-NOISE_M: Final = 0.0005
-"""Standard deviation of a marker's position: 0.1 to 0.5 mm in a calibrated volume (Merriaux et al., Sensors 17, 1591, 2017)."""
+NOISE_M: Final = 0.0015
+"""Standard deviation of a marker's position: below 2 mm in motion (Merriaux et al., Sensors 17, 1591, 2017)."""
 SPEED_M_S: Final = 4.0
 """Standard deviation of the velocity of a marker that was seen once."""
 EXTRA_M_S2: Final = 20.0
 """Standard deviation of the acceleration beyond free fall of a marker that was seen once: a hand's."""
 EXTRA_WALK: Final = 30.0
 """Growth of its variance, (m/s^2)^2/s: the filter remembers about 60 ms, so that a ball is found soon after it leaves the hand."""
-FALLS_M_S2: Final = 1.0
+BALL_WALK: Final = 1.0
+"""The same for a ball, which goes on falling: all that was seen of it counts."""
+FALLS_M_S2: Final = 0.3
 """Standard deviation of a ball's acceleration beyond free fall: errors of the drag parameter, spin, and air moved by the rotors."""
-SURE_M_S2: Final = 2.0
+JUDGED_M_S2: Final = 1.0
+"""Acceleration beyond free fall that a ball may have in addition to the filter's uncertainty."""
+SURE_M_S2: Final = 2.5
 """Standard deviation below which that acceleration is judged."""
 FALLS_FRAMES: Final = 3
 """Number of consecutive frames in which a marker must fall to be a ball."""
@@ -146,7 +150,7 @@ def advanced(c: Candidate, t_s: float, drag_per_m: float) -> Candidate:
         c.vv + h * (c.vb + w),
         z,
         w,
-        c.bb + EXTRA_WALK * h,
+        c.bb + (BALL_WALK if c.is_ball else EXTRA_WALK) * h,
         c.falls,
     )
 
@@ -177,7 +181,7 @@ def _judged(c: Candidate) -> Candidate:
     """Return a candidate with the number of frames in which it has fallen freely."""
     sigma = math.sqrt(c.bb)
     x, y, z = c.extra_m_s2
-    most = FALLS_M_S2 + (4.0 if c.is_ball else 2.5) * sigma
+    most = JUDGED_M_S2 + (4.0 if c.is_ball else 2.5) * sigma
     falls = sigma < SURE_M_S2 and x * x + y * y + z * z < most * most
     if not falls and c.falls == 0:
         return c

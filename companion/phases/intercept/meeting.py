@@ -42,12 +42,14 @@ ASIDE: Final = 3.0
 """Effort of a horizontal displacement compared with that of a vertical one, which needs no tilt."""
 SHARES = (1.0, 0.8, 0.6, 0.4, 0.2)
 """Fractions of the net's displacement that are tried one after the other."""
-FACING: Final = 0.5
+FACING: Final = 0.3
 """Smallest cosine between the net's opening and the direction that the ball comes from."""
 ASKEW_M_S2: Final = 2.0
 """Effort of a ball that comes from the side, beyond that of one that comes straight."""
 KEPT_M_S2: Final = 0.3
 """Effort by which another meeting must be better than the planned one."""
+PIECES: Final = 3
+"""Number of pieces of a motion that are compared with the limits: the coefficients of a short piece are close to the curve."""
 TRIED_MAX: Final = 6
 """Number of meetings that are compared with the limits, those of the least effort first."""
 
@@ -220,6 +222,15 @@ class Bounds:
 
     def admit(self, m: Motion) -> bool:
         """Return whether a motion respects every limit at all times, and leaves room to stop at all times."""
+        h = m.duration_s / PIECES
+        for k in range(PIECES):
+            begin, b, c = m.at(m.start_s + k * h), _plus(m.beta, m.alpha, k * h), m.alpha
+            if not self._admits_piece(Motion(m.start_s, h, begin, c, b, begin.jerk_m_s3)):
+                return False
+        return True
+
+    def _admits_piece(self, m: Motion) -> bool:
+        """Return whether the Bernstein coefficients of a motion respect every limit."""
         h = m.duration_s
         jerks = [m.gamma, _plus(m.gamma, m.beta, 0.5 * h), _plus(_plus(m.gamma, m.beta, h), m.alpha, 0.5 * h * h)]
         pushes = _integrated(m.begin.acceleration_m_s2, jerks, h / 3.0)

@@ -30,6 +30,8 @@ MOVED_M: Final = 0.003
 """A plan is made again when its predicted meeting point moves by more than this."""
 ASTRAY_M: Final = 0.3
 """Distance from the planned meeting point beyond which a ball is another one."""
+STALE_S: Final = 0.3
+"""Time without a frame after which no ball is known any more."""
 HORIZON_S: Final = 1.5
 """Longest time for which a ball's path is predicted."""
 BESIDE_S: Final = 0.5
@@ -39,7 +41,7 @@ REST_S: Final = 1.0
 """Time at rest after a meeting, before the way back."""
 BACK_M_S: Final = 0.3
 """Largest speed of the way back."""
-BALL_M: Final = 0.1
+BALL_M: Final = 0.05
 """Distance from the rotor disks at which a ball passes them; it may be this large."""
 
 _NOMINAL: Final = SafetyAction.NOMINAL
@@ -102,6 +104,8 @@ class Interception(Record, frozen=True, kw_only=True):
     replans: int = 0
     passing_m: float | None = None
     """Smallest distance from the waiting net of the ball that is seen; None if none is seen."""
+    seen: bool = False
+    """Whether a ball was seen since the start."""
     at_rotors: bool = False
     """Whether the ball that is seen flies through the rotor disks."""
 
@@ -136,6 +140,8 @@ class Intercept(Phase):
         if not vehicle.has_net:
             yield f"intercepts a ball, but vehicle '{vehicle.name}' has no net; add tool to the vehicle file"
             return
+        if vehicle.devices.mocap.ball is None:
+            yield f"follows a ball, but vehicle '{vehicle.name}' does not see one; add devices.mocap.ball to the vehicle file"
         manipulator, safe = manipulator_of(vehicle), SafeSet(vehicle)
         if (up := opening(manipulator, home)[2]) < 0.5:
             yield f"waits with the net's opening {math.degrees(math.acos(up)):.0f} deg from upwards (limit 60 deg); unfold the arm"
@@ -167,6 +173,8 @@ class Intercept(Phase):
             s = replace(
                 s, candidates=ball.followed(s.candidates, frame, self.drag_per_m), frame_number=frame.frame_number
             )
+        elif s.candidates and air.t_s - s.candidates[0].t_s > STALE_S:
+            s = replace(s, candidates=())
         if s.motion is not None:
             now = s.motion.at(air.t_s)
             s = replace(s, now=now, lag=s.lag.after(air.dt_s, now.acceleration_m_s2))
@@ -207,7 +215,7 @@ class Intercept(Phase):
 
     def _waited(self, air: Air, s: Interception, new: bool) -> Interception | None:
         if air.t_s - s.begun_s >= self.wait_max_s:
-            if s.passing_m is None:
+            if not s.seen:
                 air.report(NO_BALL, f"no ball within {self.wait_max_s:g} s; the plan goes on")
             return None
         s = replace(s, beside_m=_beside(air, s))
@@ -319,8 +327,8 @@ def net_m(manipulator: Manipulator, reference: Reference) -> Vec3:
 
 
 def opening(manipulator: Manipulator, reference: Reference) -> Vec3:
-    """Return the unit vector out of the net's opening of the level vehicle, world frame: across the last link, as far upwards as the
-    arm holds it.
+    """Return the unit vector out of the net's opening of the level vehicle, world frame: across the last link, upwards if that points
+    forwards.
     """
     (x, y, z), (jx, jy, jz) = (
         manipulator.net_body_m(reference.arm_rad),
@@ -329,7 +337,7 @@ def opening(manipulator: Manipulator, reference: Reference) -> Vec3:
     lx, ly, lz = x - jx, y - jy, z - jz
     length = math.sqrt(lx * lx + ly * ly + lz * lz)
     lx, ly, lz = lx / length, ly / length, lz / length
-    up = math.sqrt(max(1e-9, 1.0 - lz * lz))
+    up = math.copysign(math.sqrt(max(1e-9, 1.0 - lz * lz)), lx)
     return quat_rotate(quat_from_euler_zyx(0.0, 0.0, reference.yaw_rad), (-lz * lx / up, -lz * ly / up, up))
 
 
