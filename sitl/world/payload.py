@@ -167,7 +167,8 @@ class Payload:
             self._loads.set(ball.body, "air", (k * x, k * y, k * z))
         if self._before_m is None:
             return
-        (ax, ay, az), x, y, z = self._before_m, *self._in_hoop_m(ball)
+        ax, ay, az = self._before_m
+        x, y, z = self._in_hoop_m(ball)
         self._nearest_m = min(self._nearest_m, math.hypot(x, y, z))
         if az > 0.0 and az > z:
             share = az / (az - z)
