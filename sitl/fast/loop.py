@@ -301,7 +301,9 @@ class FastFlight:
             self._mocap = pose
         if self._sees_ball:
             self._tracked_m = pose.position_world_m if pose.tracking_valid else self._tracked_m
-            self._markers = marker_frame(pose, frame.markers, self._tracked_m)
+            self._markers = marker_frame(
+                pose.stamp_s, pose.latency_s, pose.frame_number, frame.markers, self._tracked_m
+            )
         if pose.tracking_valid if self._external else self.core.forwards(pose, self._vehicle):
             position, attitude = ned_from_enu(pose.position_world_m), attitude_ned_frd_from_enu_flu(pose.attitude_wxyz)
             if self.plant.faults is None or self._external:

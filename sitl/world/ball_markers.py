@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Final
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from sitl.world.views import vec3_of
 
 _STREAM = 23
 """Second part of the seed of this effect's random numbers."""
-_STRAY_BOX_M: Final = (1.5, 1.5, 0.8)
+_STRAY_BOX_M = (1.5, 1.5, 0.8)
 """Half of the size of the box around the vehicle in which reflections appear."""
 _WAND_M, _WAND_RAD_S = 0.4, 2.0 * math.pi
 

@@ -85,6 +85,8 @@ class Payload:
         """Whether the first throw missed the net."""
         self._nearest_m, self._crossed_m = math.inf, math.inf
         """Smallest distances of the first throw from the net's centre: in space, and where it fell through the plane of the opening."""
+        self._ahead_m = math.inf
+        """Distance from the net's centre at which it will fall through that plane if it goes on as it does now."""
         self._before_m: Vec3 | None = None
         """The first throw in the hoop's frame one step ago; None before the throw, and once it has reached net or floor."""
         self._hovers_since: tuple[float, Vec3] | None = None
@@ -124,6 +126,8 @@ class Payload:
             self.catches += 1
             if self.throws == 1:
                 self.caught_t_s = caught_s
+            if self._before_m is not None and self._crossed_m == math.inf:  # caught at the rim, above the plane
+                self._crossed_m = self._ahead_m
             self._flies_since_s, self._kept_since_s, self._before_m = None, caught_s, None
             if self._drag_n_s2_m2 > 0.0:
                 self._loads.set(ball.body, "air", ZERO)
@@ -163,11 +167,14 @@ class Payload:
             self._loads.set(ball.body, "air", (k * x, k * y, k * z))
         if self._before_m is None:
             return
-        (ax, ay, az), x, y, z = self._before_m, *self._in_hoop_m(ball)
+        ax, ay, az = self._before_m
+        x, y, z = self._in_hoop_m(ball)
         self._nearest_m = min(self._nearest_m, math.hypot(x, y, z))
-        if az > 0.0 >= z:
+        if az > 0.0 and az > z:
             share = az / (az - z)
-            self._crossed_m = min(self._crossed_m, math.hypot(ax + share * (x - ax), ay + share * (y - ay)))
+            self._ahead_m = math.hypot(ax + share * (x - ax), ay + share * (y - ay))
+            if z <= 0.0:
+                self._crossed_m = min(self._crossed_m, self._ahead_m)
         on_floor = d.qpos[ball.q + 2] < 2.0 * self._config.payload_radius_m
         self._before_m = None if on_floor else (x, y, z)
 
@@ -219,9 +226,13 @@ class Payload:
         arrival = np.array(self._config.throw_velocity_m_s)
         gravity = np.array([0.0, 0.0, -GRAVITY_M_S2])
         velocity = arrival - gravity * flight_s
-        if self._person is not None:
-            velocity = (target - np.array(self._person.from_m)) / flight_s - 0.5 * gravity * flight_s
         point = target - velocity * flight_s - 0.5 * gravity * flight_s**2
+        if self._person is not None:
+            point = np.array(self._person.from_m)
+            mean = (target - point) / flight_s
+            # A person allows for the drag: for its displacement at the mean velocity.
+            drag_s_1 = self._drag_n_s2_m2 * float(np.linalg.norm(mean)) / self._config.payload_kg
+            velocity = (1.0 + 0.5 * drag_s_1 * flight_s) * mean - 0.5 * gravity * flight_s
         q, v = ball.q, ball.v
         if thrower is None:
             d.qpos[q : q + 3], d.qvel[v : v + 3] = point, velocity

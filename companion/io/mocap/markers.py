@@ -6,14 +6,18 @@ import math
 from collections.abc import Iterable
 
 from companion.model.markers import MARKERS_MAX, Marker, MarkerFrame
-from companion.model.types import MocapPose, Vec3
+from companion.model.types import Vec3
 
 
-def marker_frame(pose: MocapPose, positions_world_m: Iterable[Vec3], vehicle_world_m: Vec3) -> MarkerFrame:
-    """Return the markers of the frame of a pose, at most the `MARKERS_MAX` nearest to the vehicle.
+def marker_frame(
+    stamp_s: float, age_s: float | None, number: int, positions_world_m: Iterable[Vec3], vehicle_world_m: Vec3
+) -> MarkerFrame:
+    """Return the markers of a frame, at most the `MARKERS_MAX` nearest to the vehicle.
 
     Args:
-        pose: the vehicle's body in this frame, tracked or not.
+        stamp_s: arrival of the frame.
+        age_s: time from mid-exposure to arrival; None if the system does not stamp exposures.
+        number: frame number.
         positions_world_m: finite positions of the markers.
         vehicle_world_m: the newest position at which the vehicle was tracked.
     """
@@ -21,8 +25,8 @@ def marker_frame(pose: MocapPose, positions_world_m: Iterable[Vec3], vehicle_wor
     if len(found) > MARKERS_MAX:
         found = sorted(found, key=lambda position: math.dist(position, vehicle_world_m))[:MARKERS_MAX]
     return MarkerFrame(
-        stamp_s=pose.stamp_s,
-        exposed_s=pose.stamp_s - (pose.latency_s or 0.0),
-        frame_number=pose.frame_number,
+        stamp_s=stamp_s,
+        exposed_s=stamp_s - (age_s or 0.0),
+        frame_number=number,
         markers=tuple([Marker(position_world_m=position) for position in found]),
     )
