@@ -39,6 +39,7 @@ from sitl.px4.backend import RealPx4
 from sitl.px4.hil_link import Px4Error
 from sitl.server import Ports, Sitl
 from sitl.world.start import start_of
+from sitl.world.throws import with_throws
 
 _STANDARD = Ports(autopilot_local=14580, autopilot_remote=14540, mocap_command=1510, mocap_data=1511, multicast=True)
 
@@ -165,7 +166,9 @@ def main(argv: list[str] | None = None) -> int:
             page, flight, guardian = map(int, arguments.time.split(","))
             channels = {"flight": socket.socket(fileno=flight), "guardian": socket.socket(fileno=guardian)}
             keeper = TimeKeeper(Page(page), channels, arguments.speed)
-        served = _serve(with_fault_times(config), arguments.for_launcher, truth_file, arguments.px4, keeper)
+        served = _serve(
+            with_fault_times(with_throws(config)), arguments.for_launcher, truth_file, arguments.px4, keeper
+        )
         with asyncio.Runner(loop_factory=fine_loop if keeper is None else LockstepLoop) as runner:
             runner.run(served)
     except (OSError, LinkError, FaultError, Px4Error) as error:

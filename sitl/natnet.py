@@ -157,13 +157,20 @@ class NatNetServer:
         self._number += _NUMBERS - self._number % _NUMBERS
         self._clients = dict.fromkeys(self._clients, self._clock())
 
-    def publish(self, t_s: float, poses: Sequence[BodyPose], exposure_t_s: float | None) -> None:
+    def publish(
+        self,
+        t_s: float,
+        poses: Sequence[BodyPose],
+        exposure_t_s: float | None,
+        markers: Sequence[Vec3] = (_STRAY_MARKER_M,),
+    ) -> None:
         """Send one frame to every client; never blocks.
 
         Args:
             t_s: time of transmission on the world's clock.
             poses: rigid bodies of this frame.
             exposure_t_s: middle of the cameras' exposure on the same clock, or None if the cameras do not report it.
+            markers: markers that belong to no rigid body, in the axes of the stream.
         """
         self._number += 1
         oldest_s = self._clock() - _CLIENT_TIMEOUT_S
@@ -172,7 +179,7 @@ class NatNetServer:
         if self.multicast_group is not None:
             addresses.insert(0, (self.multicast_group, self.data_port))
         if addresses:
-            frame = encode_frame(self.version, self._number, t_s, poses, exposure_t_s, dict(self.bodies))
+            frame = encode_frame(self.version, self._number, t_s, poses, exposure_t_s, dict(self.bodies), markers)
             for address in addresses:
                 self._send(self._data, frame, address)
 
@@ -252,6 +259,7 @@ def encode_frame(
     poses: Sequence[BodyPose],
     exposure_t_s: float | None,
     names: dict[int, str],
+    single: Sequence[Vec3] = (_STRAY_MARKER_M,),
 ) -> bytes:
     """Return one NAT_FRAMEOFDATA datagram with all sections that this NatNet version defines.
 
@@ -262,6 +270,8 @@ def encode_frame(
         poses: as for `NatNetServer.publish`.
         exposure_t_s: as for `NatNetServer.publish`.
         names: name of each rigid body, by its id.
+        single: markers that belong to no rigid body. As Motive does, each is listed twice: among the other markers, and without a
+            label among the labelled ones, with an id that is its place in this frame.
     """
     sizes = _numbers(version) >= _SIZES
     markers = {
@@ -283,8 +293,10 @@ def encode_frame(
         for pose in poses
         for k, point in enumerate(markers[pose.id], start=1)
     )
-    stray_params = _MARKER_UNLABELLED | _MARKER_POINT_CLOUD_SOLVED
-    labelled += struct.pack("<I3ffHf", 900001, *_STRAY_MARKER_M, _MARKER_SIZE_M, stray_params, 0.0004)
+    params = _MARKER_UNLABELLED | _MARKER_POINT_CLOUD_SOLVED
+    labelled += b"".join(
+        struct.pack("<I3ffHf", 900001 + k, *point, _MARKER_SIZE_M, params, 0.0004) for k, point in enumerate(single)
+    )
 
     def section(count: int, content: bytes) -> bytes:
         sized = struct.pack("<I", len(content)) if sizes else b""
@@ -299,11 +311,11 @@ def encode_frame(
         (
             struct.pack("<I", number & 0xFFFFFFFF),
             section(len(sets), marker_sets),
-            section(1, struct.pack("<3f", *_STRAY_MARKER_M)),
+            section(len(single), b"".join(struct.pack("<3f", *point) for point in single)),
             section(len(poses), bodies),
             section(0, b""),  # skeletons
             section(0, b"") if sizes else b"",  # assets
-            section(len(_MARKERS_BODY_M) * len(poses) + 1, labelled),
+            section(len(_MARKERS_BODY_M) * len(poses) + len(single), labelled),
             section(0, b""),  # force plates
             section(0, b""),  # devices
             section(1, b"unknown\0") if _numbers(version) > _NEWEST else b"",

@@ -23,6 +23,7 @@ from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.types import Battery, ImuSample, RotorCommands
 from sitl.faults.injector import Faults
 from sitl.servo.from_config import torque_constants_nm_a
+from sitl.world.ball_markers import BallMarkers
 from sitl.world.effects.force_sensor import ForceSensor
 from sitl.world.effects.imu import ImuErrors
 from sitl.world.effects.mocap import MocapErrors
@@ -84,6 +85,8 @@ class MocapFrame(NamedTuple):
     valid: bool
     network_s: float
     """Time for which the network holds the frame after its transmission."""
+    markers: tuple[Vec3, ...] = ()
+    """Markers that belong to no rigid body, in any order; if the ball is a rigid body, that body alone while it is tracked."""
 
 
 def _zero_rad(joint: Joint, servo: Servo) -> float:
@@ -163,6 +166,9 @@ class Plant:
         hover_n = self.machine.weight_n / self.machine.rotor_count
         self._imu_errors = ImuErrors.of(config.imu, IMU_EVERY * PHYSICS_DT_S, hover_n, vehicle.airframe.rotor_layout)
         self._mocap_errors = MocapErrors.of(config.mocap, config.seed)
+        ball = vehicle.devices.mocap.ball
+        self._ball_is_body = ball is not None and ball.kind == "body"
+        self._markers = None if ball is None else BallMarkers(config, self.scene)
         self._seed_noise()
         self._mocap_noise_rad = math.radians(config.mocap_noise_deg)
         self._misalignment = MocapMisalignment.of(config)
@@ -231,6 +237,8 @@ class Plant:
                 self._imu_errors.drift(noise(config.seed, _IMU_DRIFT))
             if self._mocap_errors is not None:
                 self._mocap_errors.restart(t_s)
+            if self._markers is not None:
+                self._markers.restart(t_s)
             if machine.battery is not None:
                 machine.battery.restart()
         if self.faults is not None:
@@ -321,6 +329,11 @@ class Plant:
                 sent_s + faults.size("mocap_network"), self._mocap_arrives_s
             )  # the network keeps their order
             self._mocap_arrives_s = arrives_s
+        markers: tuple[Vec3, ...] = ()
+        if self._markers is not None:
+            markers = self._markers.frame(t_s, since_s, ball_is_body=self._ball_is_body)
+            if self._misalignment is not None:
+                markers = tuple([self._misalignment.position(marker) for marker in markers])
         self._mocap_queue.append(
             (
                 arrives_s,
@@ -331,6 +344,7 @@ class Plant:
                     attitude_wxyz=attitude,
                     valid=valid,
                     network_s=arrives_s - sent_s,
+                    markers=markers,
                 ),
             )
         )

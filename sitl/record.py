@@ -60,6 +60,7 @@ def final_report(plant: Plant) -> dict[str, Any]:
         "caught": caught is not None,
         "caught_after_arming_s": None if caught is None or armed is None else caught - armed,
         "missed": payload.missed,
+        "miss_m": payload.miss_m,
         "throws": payload.throws,
         "catches": payload.catches,
         "crashed": machine.crashed,

@@ -109,6 +109,8 @@ class Sitl:
         """The emulated force sensor; None if the vehicle has none, or while the links are not open."""
         other = config.mocap_other_id
         self._others = () if other is None else ((other, OTHER_BODY),)
+        self._ball = vehicle.devices.mocap.ball
+        """How motion capture sees the ball; None if the mission does not follow it."""
         self._arm_handling = ArmHandling(vehicle.arm, start.arm_rad) if config.arm_handling and self.servos else None
         self.flight = ProcessFaults()
         self._course = TrueCourse()
@@ -191,10 +193,15 @@ class Sitl:
             command_port=self._ports.mocap_command,
             data_port=self._ports.mocap_data,
             multicast_group=mocap.multicast_group if self._ports.multicast else None,
-            bodies=((mocap.rigid_body_id, self._vehicle.name), *self._others),
+            bodies=((mocap.rigid_body_id, self._vehicle.name), *self._others, *self._ball_body),
             clock=asyncio.get_running_loop().time if self._keeper is None else lambda: self.plant.t_s,
             stamps=self._server_clock_s,
         )
+
+    @property
+    def _ball_body(self) -> tuple[tuple[int, str], ...]:
+        """Id and name of the ball's rigid body; empty if it has none."""
+        return () if self._ball is None or self._ball.id is None else ((self._ball.id, "ball"),)
 
     def _server_clock_s(self) -> float:
         """Return the clock of the motion-capture server, with which `_publish` stamps frames."""
@@ -348,9 +355,14 @@ class Sitl:
         body = self._vehicle.devices.mocap.rigid_body_id
         pose = BodyPose(body, frame.position_world_m, frame.attitude_wxyz, frame.valid)
         others = [BodyPose(number, OTHER_PLACE_M, IDENTITY_QUAT) for number, _ in self._others]
+        others += [
+            BodyPose(number, (*frame.markers, (0.0, 0.0, 0.0))[0], IDENTITY_QUAT, bool(frame.markers))
+            for number, _ in self._ball_body
+        ]
         clock, ahead_s = self.faults.server_clock_s, self._ahead_s
         sent_s = t_s - frame.network_s
-        self.mocap.publish(clock(sent_s) + ahead_s, (*others, pose), clock(frame.exposure_t_s) + ahead_s)
+        single = {"markers": frame.markers} if self._ball is not None and not self._ball_body else {}
+        self.mocap.publish(clock(sent_s) + ahead_s, (*others, pose), clock(frame.exposure_t_s) + ahead_s, **single)
 
     def _apply_faults(self) -> None:
         plant = self.plant

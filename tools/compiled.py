@@ -46,6 +46,8 @@ COMPILED = (
     "companion/phases/contact/sliding.py",
     "companion/phases/contact/surface.py",
     "companion/phases/contact/way.py",
+    "companion/phases/intercept/ball.py",
+    "companion/phases/intercept/meeting.py",
     "companion/model/*.py",
     "companion/io/dynamixel/scale.py",
     "companion/io/px4/delta_velocity.py",

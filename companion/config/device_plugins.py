@@ -44,6 +44,15 @@ def device_class(group: str, name: str) -> Any:
     return found
 
 
+def sees_markers(mocap_type: str) -> bool:
+    """Return whether an installed motion-capture system hands on single markers.
+
+    Raises:
+        PluginError: as `device_class`.
+    """
+    return mocap_type == NATNET or bool(getattr(device_class(plugins.MOCAP_SYSTEMS, mocap_type), "sees_markers", False))
+
+
 def problems(group: str, name: str, options: Mapping[str, Any]) -> list[tuple[Location, str]]:
     """Return the problems of `type` and `options` of a device, each with the key to which it belongs."""
     built_in = BUILT_IN[group]

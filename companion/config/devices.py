@@ -33,6 +33,24 @@ class NatNetOptions(Model):
     """OptiTrack Motive over NatNet; its settings are keys of devices.mocap."""
 
 
+class TrackedBall(Model):
+    """How motion capture sees the ball that is thrown to the vehicle."""
+
+    kind: Literal["marker", "body"]
+    """marker: the ball is covered with reflective tape, and one unlabelled marker of a frame; body: it has three markers or more, and a
+    rigid body of its own."""
+    id: Annotated[int, Field(ge=0)] | None = None
+    """Streaming id of the ball's rigid body; required if and only if `kind` is body."""
+
+    @model_validator(mode="after")
+    def _id_of_a_body(self) -> Self:
+        if self.kind == "body" and self.id is None:
+            refuse("ball", [(("id",), "missing; the streaming id of the ball's rigid body")])
+        if self.kind == "marker" and self.id is not None:
+            refuse("ball", [(("id",), f"a single marker has no id, got {self.id}; remove it, or set kind: body")])
+        return self
+
+
 class MocapDevice(Model):
     """Motion capture: OptiTrack Motive over NatNet, or a system that a plug-in provides (docs/mocap.md)."""
 
@@ -55,6 +73,8 @@ class MocapDevice(Model):
     """Up axis in Motive's streaming settings."""
     rate_hz: Positive = 200.0
     """Expected frame rate."""
+    ball: TrackedBall | None = None
+    """The thrown ball, for missions that follow it; null if none is followed, and no other marker is then read."""
     options: dict[str, JsonValue] = Field(default={})
     """Settings of the system that a plug-in provides; must be empty for natnet and external."""
 
@@ -68,6 +88,12 @@ class MocapDevice(Model):
         missing = [key for key in ("server", "rigid_body_id") if key not in self.model_fields_set]
         if missing and not self.external:
             refuse("motion capture", [((key,), "missing") for key in missing])
+        if self.ball is not None and self.external:
+            text = "another program feeds PX4 (type: external), and the companion sees no ball; remove it"
+            refuse("motion capture", [(("ball",), text)])
+        if self.ball is not None and self.ball.id == self.rigid_body_id:
+            text = f"{self.ball.id} is the vehicle's own body (rigid_body_id); give the ball's"
+            refuse("motion capture", [(("ball", "id"), text)])
         return self
 
 

@@ -274,6 +274,10 @@ def _unusable_devices(vehicle: Vehicle, document: Document) -> list[str]:
         if device is not None:
             problems = device_plugins.problems(group, device.type, device.options)
             found += [(("devices", name, *at), text) for at, text in problems]
+    mocap = vehicle.devices.mocap
+    if mocap.ball is not None and not found and not device_plugins.sees_markers(mocap.type):
+        text = f"the motion-capture system {mocap.type} hands on no markers, so that no ball can be followed; remove it"
+        found.append((("devices", "mocap", "ball"), text))
     if vehicle.devices.arm is not None and vehicle.devices.arm.type == DYNAMIXEL:
         text = f"expected the model of the servo, because devices.arm.type is {DYNAMIXEL}, got null"
         joints = enumerate(vehicle.arm.joints)

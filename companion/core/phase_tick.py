@@ -118,7 +118,9 @@ class _PhaseTick(Air):
 
     def __init__(self, t: Transition, segment: Segment, engaged: Segment) -> None:
         p = t.parameters
-        super().__init__(t.o, p.vehicle, p.manipulator, p.phases, segment, engaged)
+        nominal = t.state.supervisor.action is SafetyAction.NOMINAL
+        limits = p.config.mission.limits
+        super().__init__(t.o, p.vehicle, p.manipulator, p.phases, segment, engaged, limits, p.safe, nominal)
         self._t = t
 
     @property

@@ -22,6 +22,7 @@ from companion.model.flight_stage import Stage
 from companion.model.negative_zero import without_negative_zero
 from companion.model.types import Event, Joints, Outcome, SafetyAction, Severity
 from companion.safety.autopilot_landing import AutopilotLanding
+from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
 from companion.safety.rotor_stop import RotorStop
 from companion.safety.supervisor import EscalationTimeouts
@@ -46,6 +47,7 @@ class Parameters:
     phases: tuple[Phase, ...]
     acts: bool
     """Whether one of the phases has a state of its own in the air."""
+    safe: SafeSet
 
     @classmethod
     def of(cls, config: FlightConfig) -> Parameters:
@@ -62,6 +64,7 @@ class Parameters:
             manipulator=manipulator_of(vehicle),
             phases=phases,
             acts=any(phase.acts for phase in phases),
+            safe=SafeSet(vehicle),
         )
 
     def initial_state(self) -> FlightState:

@@ -187,6 +187,7 @@ class Flight:
             recorder_dropped=self._recorder.client.dropped,
             guardian_ready=self._guardian.ready if self._guardian is not None else None,
             estimator=devices.autopilot.estimator() if self._external else None,
+            markers=devices.mocap.markers() if devices.mocap is not None else None,
         )
         self._vehicle = inputs.vehicle
         outputs = self._core.step(inputs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import socket
 from collections.abc import Sequence
 
@@ -17,7 +18,7 @@ from companion.runtime.clock import Clock, monotonic
 
 
 class GuardianMocap:
-    """Receives poses of the vehicle's rigid body; no call waits or raises.
+    """Receives poses of the vehicle's rigid body, and no markers; no call waits or raises.
 
     Args:
         settings: addresses, rigid body, type and options.
@@ -28,7 +29,7 @@ class GuardianMocap:
     """
 
     def __init__(self, settings: MocapSettings, clock: Clock = monotonic) -> None:
-        self._clock = clock
+        self._clock, settings = clock, dataclasses.replace(settings, ball=None)
         try:
             self._client = ContainedClient(_make(settings), settings, clock)
         except DeviceError:

@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from companion.model.estimator import EstimatorReport
+from companion.model.markers import MarkerFrame
 from companion.model.observations import (
     ArmStatement,
     ForceCounts,
@@ -110,6 +111,9 @@ class Mocap(Device, Protocol):
 
     def latest(self) -> MocapPose | None:
         """Return the newest pose, or None before the first."""
+
+    def markers(self) -> MarkerFrame | None:
+        """Return the single markers of the newest frame, or None without `devices.mocap.ball`."""
 
     def counts(self) -> MocapCounts:
         """Return the numbers of frames since the device was opened."""

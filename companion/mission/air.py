@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from companion.config.mission import Limits
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
 from companion.mission.segments import Segment
+from companion.model.best_pose import best_pose
 from companion.model.codec import Record
+from companion.model.frames import quat_rotate
 from companion.model.types import ContactState, Inputs, MocapPose, Reference, TetherState, Vec3
+from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
 
 
@@ -78,6 +82,9 @@ class Air:
         phases: phases of the mission (`companion.mission.phase.Phase`).
         segment: segment at the plan's time.
         engaged: segment of the phase whose state it is; after a hold, the plan's time may have passed its end.
+        limits: limits of the mission.
+        safe: the governor's safe set.
+        nominal: whether the supervisor has not reacted to anything so far.
     """
 
     def __init__(
@@ -88,6 +95,9 @@ class Air:
         phases: Sequence[Any],
         segment: Segment,
         engaged: Segment,
+        limits: Limits,
+        safe: SafeSet,
+        nominal: bool,
     ) -> None:
         self.o = o
         self.i = o.inputs
@@ -98,8 +108,20 @@ class Air:
         self.phases = phases
         self.segment = segment
         self.engaged = engaged
+        self.limits = limits
+        self.safe = safe
+        self.nominal = nominal
         self.skips_rest = False
         """Whether the phases that follow and need the state of this one are skipped when it ends."""
+
+    def tip_world_m(self) -> Vec3 | None:
+        """Return the measured position of the tip's centre, world frame; None if it is unknown."""
+        pose, arm = best_pose(self.i), self.i.arm
+        if pose is None or not pose.tracking_valid or arm is None:
+            return None
+        x, y, z = quat_rotate(pose.attitude_wxyz, self.manipulator.net_body_m(arm.angle_rad))
+        px, py, pz = pose.position_world_m
+        return (px + x, py + y, pz + z)
 
     def plan_reference(self) -> Reference:
         """Return the plan's reference, without what the phase adds."""

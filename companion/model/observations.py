@@ -10,6 +10,7 @@ import msgspec
 
 from companion.model.codec import Record
 from companion.model.estimator import EstimatorReport
+from companion.model.markers import MarkerFrame
 from companion.model.types import ArmState, AutopilotStatus, ForceSample, MocapPose, VehicleState
 
 
@@ -150,6 +151,8 @@ class Observations(Record, frozen=True, kw_only=True):
     estimator: tuple[EstimatorReport, ...] = ()
     mocap: tuple[MocapPose, ...] = ()
     mocap_stream: MocapStream | None = None
+    markers: tuple[MarkerFrame, ...] = ()
+    """Single markers of some frames; empty without `devices.mocap.ball`."""
     arm: tuple[ArmState, ...] = ()
     servos: tuple[ServoReport, ...] = ()
     """The arm's servos; empty if a plug-in drives the arm."""

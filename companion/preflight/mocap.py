@@ -8,10 +8,13 @@ import itertools
 import statistics
 from collections.abc import Iterator
 
+from companion.config.devices import TrackedBall
+from companion.config.tether import Room
 from companion.config.vehicle import Vehicle
 from companion.model.check_row import Row
+from companion.model.markers import MarkerFrame
 from companion.model.observations import MocapStream, Observations
-from companion.model.types import MocapPose
+from companion.model.types import MocapPose, Vec3
 from companion.preflight.checks import Check, longest_unchanged_s
 
 DEVICE = Check("mocap.device", "motion capture", "the server answers and streams", "PX4 needs it for its position")
@@ -78,7 +81,14 @@ CLOCK = Check(
     "diverging clocks, or a server that stalls and catches up, make every age wrong",
     warns=True,
 )
-CHECKS = (DEVICE, RATE, JITTER, LATENCY, LOST, TRACKED, FROZEN, BODY, ERROR, CLOCK)
+BALL = Check(
+    "mocap.ball",
+    "thrown ball",
+    "with `devices.mocap.ball`: single markers, or the ball's rigid body, in the stream",
+    "nothing is followed: the mission waits, and goes on without a catch",
+    warns=True,
+)
+CHECKS = (DEVICE, RATE, JITTER, LATENCY, LOST, TRACKED, FROZEN, BODY, ERROR, CLOCK, BALL)
 
 RATE_GOOD = 0.9
 GAP_GOOD_S = 0.05
@@ -110,6 +120,8 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     yield _body(stream, vehicle)
     yield _error(o.mocap)
     yield _clock(o.mocap, vehicle)
+    if vehicle.devices.mocap.ball is not None:
+        yield _ball(o.markers, stream, vehicle.devices.mocap.ball, vehicle)
 
 
 def _rate(o: Observations, stream: MocapStream, vehicle: Vehicle) -> Row:
@@ -165,13 +177,40 @@ def _frozen(poses: tuple[MocapPose, ...]) -> Row:
 
 
 def _body(stream: MocapStream, vehicle: Vehicle) -> Row:
-    number = vehicle.devices.mocap.rigid_body_id
+    number, ball = vehicle.devices.mocap.rigid_body_id, vehicle.devices.mocap.ball
+    others = tuple(one for one in stream.other_bodies if ball is None or one != ball.id)
     name = f' "{stream.body_name}"' if stream.body_name else ""
-    if not stream.other_bodies:
+    if not others:
         return BODY.good(f"id {number}{name}, no other", f"id {number}")
-    others = ", ".join(map(str, stream.other_bodies))
     fix = "make sure that this is the vehicle's body; disable the others in Motive, or change their shape"
-    return BODY.bad(f"id {number}{name}, and others: {others}", f"id {number} alone", fix)
+    return BODY.bad(f"id {number}{name}, and others: {', '.join(map(str, others))}", f"id {number} alone", fix)
+
+
+def _ball(frames: tuple[MarkerFrame, ...], stream: MocapStream, ball: TrackedBall, vehicle: Vehicle) -> Row:
+    """Return the row on what could be the ball; markers that are there before the throw are reflections, or the ball in a hand."""
+    if ball.id is not None:
+        share = sum(bool(frame.markers) for frame in frames) / max(1, len(frames))
+        if ball.id not in stream.other_bodies:
+            streamed = ", ".join(map(str, stream.other_bodies)) or "none"
+            fix = "create it in Motive from the ball's markers, or set devices.mocap.ball.id to its streaming id"
+            return BALL.bad(f"no rigid body {ball.id}; other bodies: {streamed}", f"body {ball.id}", fix)
+        return BALL.row(
+            share > 0.0, f"body {ball.id}, in {share:.0%} of the frames", "tracked", "show the ball to the cameras"
+        )
+    counts = [len(frame.markers) for frame in frames]
+    if not any(counts):
+        fix = "stream unlabelled markers in Motive, and show the ball to the cameras"
+        return BALL.bad(f"no single marker in {len(frames)} frames", "the ball, once it is shown", fix)
+    inside = {len([one for one in frame.markers if _in_room(one.position_world_m, vehicle.room)]) for frame in frames}
+    read = f"{min(counts)} to {max(counts)} single markers, {min(inside)} to {max(inside)} of them in the room"
+    return BALL.row(
+        max(inside) <= 1, read, "at most the ball", "cover or mask what reflects in the room, such as other markers"
+    )
+
+
+def _in_room(position_m: Vec3, room: Room) -> bool:
+    sides = zip(position_m, (room.x_m, room.y_m, room.z_m), strict=True)
+    return all(low <= value <= high for value, (low, high) in sides)
 
 
 def _error(poses: tuple[MocapPose, ...]) -> Row:

@@ -20,6 +20,7 @@ from companion.io.devices import AvailableDevices, Devices
 from companion.io.dynamixel.registers import usb_latency_ms
 from companion.io.protocols import Autopilot, DeviceError
 from companion.model.estimator import EstimatorReport
+from companion.model.markers import MarkerFrame
 from companion.model.observations import (
     ForceStream,
     Machine,
@@ -157,6 +158,7 @@ class _Watcher:
         self._device = config.vehicle.devices.mocap
         self._clock = clock
         self._poses: deque[MocapPose] = deque()
+        self._markers: deque[MarkerFrame] = deque()
         self._vehicle: deque[VehicleState] = deque()
         self._status: deque[AutopilotStatus] = deque()
         self._estimator: deque[EstimatorReport] = deque()
@@ -186,6 +188,8 @@ class _Watcher:
             _take(self._vehicle, devices.autopilot.vehicle())
             _take(self._status, devices.autopilot.status())
             _take(self._estimator, devices.autopilot.estimator())
+        if devices.mocap is not None:
+            _take(self._markers, devices.mocap.markers())
         if devices.force is not None:
             _take(self._force, devices.force.latest())
         now_s = self._clock()
@@ -201,6 +205,7 @@ class _Watcher:
         first = self._counts[0]
         devices, start_s = self._devices, first.t_s
         _forget(self._poses, lambda pose: pose.stamp_s < start_s)
+        _forget(self._markers, lambda frame: frame.stamp_s < start_s)
         _forget(self._vehicle, lambda state: state.attitude_stamp_s < start_s)
         _forget(self._estimator, lambda report: report.stamp_s < start_s)
         _forget(self._arm, lambda state: state.stamp_s < start_s)
@@ -214,6 +219,7 @@ class _Watcher:
             estimator=tuple(self._estimator),
             mocap=tuple(self._poses),
             mocap_stream=self._mocap_stream(first, now),
+            markers=tuple(self._markers),
             arm=tuple(self._arm),
             servos=devices.arm.servos if devices.arm is not None else (),
             arm_statement=devices.arm.statement if devices.arm is not None else None,

@@ -20,12 +20,13 @@ from companion.sitl_config.effects.downwash import Downwash
 from companion.sitl_config.effects.force_sensor import ForceSensor
 from companion.sitl_config.effects.imu import Imu
 from companion.sitl_config.effects.machine import Machine
+from companion.sitl_config.effects.markers import Markers
 from companion.sitl_config.effects.mocap import Mocap
 from companion.sitl_config.effects.net import Net
 from companion.sitl_config.effects.rotors import Rotors
 from companion.sitl_config.effects.servo_mechanics import ServoMechanics
 from companion.sitl_config.effects.tether_line import TetherLine
-from companion.sitl_config.effects.thrower import Thrower
+from companion.sitl_config.effects.thrower import Person, Thrower
 from companion.sitl_config.faults import Fault as Fault
 from companion.sitl_config.per_joint import RelativeErrors
 from companion.sitl_config.surfaces import Surface
@@ -100,16 +101,29 @@ class Servo(Model):
 class World(Model):
     """The simulated world."""
 
-    extends: Literal["ideal", "lab", "robustness", "wall"] | None = None
+    extends: Literal["careless", "ideal", "lab", "robustness", "wall"] | None = None
     """Built-in world whose values hold for every key that this file does not give; null for the default of each key."""
     payload_kg: Annotated[float, Field(ge=0, le=2)] = 0.2
     """Mass of the payload; 0 if nothing is thrown."""
+    payload_radius_m: Annotated[float, Field(ge=0.01, le=0.08)] = 0.035
+    payload_drag_coefficient: NonNegative = 0.0
+    """Drag coefficient of the payload in flight, in still air; about 0.47 for a ball. The wakes' drag is in `downwash`."""
     seed: Annotated[int, Field(ge=0)] = 1
     catch_at_m: Vector2 = (0.0, 0.0)
     """x and y of the vehicle when the payload arrives in the net. The payload is thrown on the first pass in the +x direction that is
     at most 0.5 m to the left or right of this point."""
+    throw_to: Literal["passing", "hovering", "either"] = "passing"
+    """Vehicle to which the payload is thrown: passing (see `catch_at_m`); hovering, which is one that has hovered within 0.2 m of
+    `catch_at_m` for `throw_after_s`, its net at rest; or either: hovering if the mission's plan never passes, else passing."""
+    throw_after_s: Positive = 1.0
+    """Time for which a vehicle hovers before the payload is thrown to it."""
     throw_velocity_m_s: Vector3 = (-2.0, 0.15, -1.5)
-    """Velocity of the payload on arrival, world frame."""
+    """Velocity of the payload on arrival, world frame; not used if there are `people`."""
+    throw_flight_s: Annotated[float, Field(ge=0.2, le=2.0)] = 0.45
+    """Time from the throw to the arrival; not used if there are `people`."""
+    people: Annotated[tuple[Person, ...], Field(max_length=8)] = ()
+    """People who throw. Each throw is by one of them, drawn from the seed; without any, the payload is thrown from where it arrives
+    with `throw_velocity_m_s` after `throw_flight_s`."""
     throws: Annotated[int, Field(ge=1, le=1000)] = 1
     """Number of throws. The payload is removed from the net `keep_s` after a catch and thrown again on the next pass."""
     keep_s: Positive = 6.0
@@ -192,6 +206,7 @@ class World(Model):
     force_sensor: ForceSensor = ForceSensor()
     imu: Imu = Imu()
     mocap: Mocap = Mocap()
+    markers: Markers = Markers()
     net: Net = Net()
     thrower: Thrower = Thrower()
     rotors: Rotors = Rotors()

@@ -57,6 +57,8 @@ async def _both_clients(device: MocapDevice, duration_s: float) -> None:
                 guardian.keep_connected()
                 seen += guardian.poses(origin_s)
                 await asyncio.sleep(0.01)
+            if device.ball is not None:
+                assert driver.markers() is not None, f"markers() has no frame of {driver.client.where}"
             counts, server = driver.counts(), driver.server
             assert server is not None and server.name and server.name.isprintable(), f"server_name: {server}"
             assert not counts.malformed, f"{counts.malformed} malformed datagrams: {counts.problem}"

@@ -17,6 +17,7 @@ from companion.mission.segments import Segment
 from companion.model.codec import Record, differences
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.types import ForceSample, Inputs, OperatorCommand, Reference, Vec3
+from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
 
 TICKS = 2000
@@ -117,8 +118,9 @@ class _Still(Air):
     """A tick in which the plan stands at the start of the phase."""
 
     def __init__(self, config: FlightConfig, plan: Plan, segment: Segment, observation: Observation) -> None:
-        vehicle = config.vehicle
-        super().__init__(observation, vehicle, manipulator_of(vehicle), phases_of(config.mission), segment, segment)
+        vehicle, phases = config.vehicle, phases_of(config.mission)
+        limits, safe = config.mission.limits, SafeSet(vehicle)
+        super().__init__(observation, vehicle, manipulator_of(vehicle), phases, segment, segment, limits, safe, True)
         self._reference = plan.reference(segment.start_s)
         self.reports: list[object] = []
 

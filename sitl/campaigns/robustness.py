@@ -26,7 +26,7 @@ from companion.model.types import Outcome, PhaseKind, SafetyAction
 from companion.sitl_config.loader import SitlConfig
 from sitl.campaigns.flights import Flown, fly_to_end, laboratory_of, mission_s, row_of, with_world
 from sitl.campaigns.runner import Data
-from sitl.world.payload import THROW_LEAD_S
+from sitl.world.throws import with_throws
 
 PAYLOAD_KG = (0.05, 0.4)
 THROW_SPEED_M_S = (0.5, 4.0)
@@ -53,8 +53,13 @@ class Throw:
     """Range of the descent speed: the slowest throw starts at `HAND_HEIGHT_M`; the fastest still clears the rotors."""
 
 
-def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
+def throws(mission: Mission, vehicle: Vehicle, flight_s: float = 0.45) -> list[Throw]:
     """Return the catch points along the first pass in the +x direction, in flight order.
+
+    Args:
+        mission: the mission.
+        vehicle: the vehicle.
+        flight_s: time from the throw to the arrival.
 
     Raises:
         CampaignError: the mission has no such pass.
@@ -70,9 +75,9 @@ def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
     line = [t_s for t_s in forwards if begun_s <= t_s < ended_s]
     found: list[Throw] = []
     for t_s in line:
-        now, later = plan.reference(t_s), plan.reference(t_s + THROW_LEAD_S)
+        now, later = plan.reference(t_s), plan.reference(t_s + flight_s)
         # The simulated world extrapolates the vehicle from its speed at the throw.
-        x_m = now.position_world_m[0] + now.velocity_world_m_s[0] * THROW_LEAD_S
+        x_m = now.position_world_m[0] + now.velocity_world_m_s[0] * flight_s
         if x_m > plan.reference(line[-1]).position_world_m[0] - END_MARGIN_M:
             break
         slow = now.velocity_world_m_s[0] < ALONG_MIN_M_S
@@ -80,8 +85,8 @@ def throws(mission: Mission, vehicle: Vehicle) -> list[Throw]:
             continue
         net_below_m = -manipulator.net_body_m(later.arm_rad)[2]
         net_z_m = later.position_world_m[2] - net_below_m
-        rise_m = 0.5 * GRAVITY_M_S2 * THROW_LEAD_S**2
-        slowest = max(0.0, (rise_m + HAND_HEIGHT_M - net_z_m) / THROW_LEAD_S)
+        rise_m = 0.5 * GRAVITY_M_S2 * flight_s**2
+        slowest = max(0.0, (rise_m + HAND_HEIGHT_M - net_z_m) / flight_s)
         fastest = math.sqrt(2.0 * GRAVITY_M_S2 * max(0.0, net_below_m + rotors_m))
         fastest = max(slowest, min(DESCENT_MAX_M_S, fastest))
         found.append(Throw((x_m, later.position_world_m[1]), (slowest, fastest)))
@@ -128,11 +133,19 @@ def prepare(job: Data, configs: Sequence[SitlConfig]) -> list[Data]:
     """
     (config,), flights = configs, job["flights"]
     draws = any(flight["world"] is None for flight in flights)
-    places = throws(config.mission, config.vehicle) if draws else []
+    world, fixed = with_throws(config).world, set(job["fixed"])
+    hovers = world.throw_to == "hovering"
+    places = [Throw(world.catch_at_m, (0.0, 0.0))] if hovers else []
+    if draws and not hovers:
+        places = throws(config.mission, config.vehicle, world.throw_flight_s)
 
     def world_of(flight: Data) -> Data:
-        world = draw(job["seed"], flight["number"], places) if flight["world"] is None else flight["world"]
-        return {key: value for key, value in world.items() if key not in job["fixed"]}
+        if flight["world"] is not None:
+            found = flight["world"]
+        else:
+            found = draw(job["seed"], flight["number"], places)
+            found |= {} if config.world.throw_to != "either" else {"throw_to": world.throw_to}
+        return {key: value for key, value in found.items() if key not in fixed}
 
     return [{**flight, "world": world_of(flight)} for flight in flights]
 
@@ -187,6 +200,7 @@ def _graded(flown: Flown) -> Data:
         "why": f"{ended.id}: {ended.text}" if ended is not None else None,
         "error": graded["error"],
         "caught": graded["caught"],
+        "miss_m": flown.result.miss_m,
         "catch_t_s": graded["catch_t_s"],
         "e_p_m": whole["e_p_m"],
         "pre_e_p_m": before["e_p_m"],

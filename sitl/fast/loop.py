@@ -17,12 +17,14 @@ from msgspec.structs import replace
 from companion.core.flight_core import FlightCore
 from companion.flight.ticker import SIMULATED_START_S
 from companion.io.mocap.client import KEEP_ALIVE_PERIOD_S
+from companion.io.mocap.markers import marker_frame
 from companion.io.mocap.server_clock import ServerClock
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.frames import (
     attitude_ned_frd_from_enu_flu,
     ned_from_enu,
 )
+from companion.model.markers import MarkerFrame
 from companion.model.types import (
     AutopilotRequest,
     Event,
@@ -54,6 +56,7 @@ from sitl.plant import MocapFrame, Plant
 from sitl.servo.from_config import plugged_in, servos_of
 from sitl.world.start import start_of
 from sitl.world.state import Layout, Snapshot, Truth
+from sitl.world.throws import with_throws
 
 START_S: Final = SIMULATED_START_S
 """World time at the first tick, as over the wires."""
@@ -82,6 +85,8 @@ class FastResult:
     outputs: list[Outputs] = field(default_factory=list)
     crashed: bool = False
     caught: bool = False
+    miss_m: float | None = None
+    """Distance of the first throw from the net's centre (`Payload.miss_m`); None if nothing was thrown."""
     snapshots: list[Snapshot] = field(default_factory=list)
     """States of the world, one after each tick."""
     layout: Layout | None = None
@@ -128,7 +133,7 @@ class FastFlight:
     """
 
     def __init__(self, config: SitlConfig, land_at_s: float | None = None) -> None:
-        config = with_fault_times(config)
+        config = with_fault_times(with_throws(config))
         vehicle, world, start = config.vehicle, config.world, config.mission.start
         self._land_at_s = land_at_s
         self.px4 = stub_of(world, vehicle.airframe, LINK_DELAY_S)
@@ -154,6 +159,10 @@ class FastFlight:
         self._external = vehicle.devices.mocap.external
         """Whether another program feeds PX4 with poses: the companion receives none."""
         self._mocap: MocapPose | None = None
+        self._sees_ball = vehicle.devices.mocap.ball is not None
+        self._markers: MarkerFrame | None = None
+        self._tracked_m: Vec3 = (0.0, 0.0, 0.0)
+        """Newest position at which the vehicle's body was tracked."""
         self._server_clock, self._echo_due_s = ServerClock(), 0.0
         force = vehicle.devices.force
         self._force_period_s = None if force is None else 1.0 / force.rate_hz
@@ -177,6 +186,7 @@ class FastFlight:
             self._run(result, limit_s, until_mission_s, until)
         result.crashed = machine.crashed
         result.caught = self.plant.scene.payload.caught_t_s is not None
+        result.miss_m = self.plant.scene.payload.miss_m
         return result
 
     def _run(
@@ -301,6 +311,11 @@ class FastFlight:
         pose = self._pose(frame)
         if not self._external:
             self._mocap = pose
+        if self._sees_ball:
+            self._tracked_m = pose.position_world_m if pose.tracking_valid else self._tracked_m
+            self._markers = marker_frame(
+                pose.stamp_s, pose.latency_s, pose.frame_number, frame.markers, self._tracked_m
+            )
         if pose.tracking_valid if self._external else self.core.forwards(pose, self._vehicle):
             position, attitude = ned_from_enu(pose.position_world_m), attitude_ned_frd_from_enu_flu(pose.attitude_wxyz)
             if self.plant.faults is None or self._external:
@@ -313,7 +328,7 @@ class FastFlight:
 
     def _pose(self, frame: MocapFrame) -> MocapPose:
         t_s = self.plant.scene.t_s
-        number, exposure_s, position, attitude, valid, network_s = frame
+        number, exposure_s, position, attitude, valid, network_s, _ = frame
         latency_s, exposure_server_s = t_s - exposure_s, exposure_s
         if self.plant.faults is not None:
             clock = self.faults.server_clock_s
@@ -363,6 +378,7 @@ class FastFlight:
             recorder_dropped=dropped,
             guardian_ready=guardian_ready,
             estimator=self._telemetry.estimator(t_s) if self._external else None,
+            markers=self._markers,
         )
 
     def _carry_out(self, outputs: Outputs) -> None:

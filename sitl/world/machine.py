@@ -100,7 +100,7 @@ class Machine:
         self._sensordata = data.sensordata[sensor : sensor + self.layout.sensor_count]
         effects: tuple[Effect | None, ...] = (
             Air.of(config.air, config.seed, bodies, self.weight_n),
-            Downwash.of(config.downwash, config.rotors.radius_m, vehicle, bodies, config.seed),
+            Downwash.of(config, vehicle, bodies),
             TetherLine.of(config.tether_line, vehicle.tether, self.tether, bodies),
         )
         self.effects = tuple(effect for effect in effects if effect is not None)

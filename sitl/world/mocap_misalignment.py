@@ -48,11 +48,12 @@ class MocapMisalignment:
     def pose(self, position_world_m: Vec3, attitude_wxyz: Quat) -> tuple[Vec3, Quat]:
         """Return the position (m) and attitude that the server streams for this true pose."""
         w, x, y, z = quat_multiply(attitude_wxyz, self._zero)
-        x, y, z = self._axes((x, y, z))
+        x, y, z = self.position((x, y, z))
         m = self._mirror
-        return self._axes(position_world_m), (w, m * x, m * y, m * z)
+        return self.position(position_world_m), (w, m * x, m * y, m * z)
 
-    def _axes(self, v: Vec3) -> Vec3:
+    def position(self, v: Vec3) -> Vec3:
+        """Return the position (m) that the server streams for this true position."""
         i, j, k = self._index
         a, b, c = self._sign
         return (a * v[i], b * v[j], c * v[k])

@@ -20,8 +20,9 @@ from companion.sitl_config.effects.rotors import of_rotors
 from companion.sitl_config.world import World
 from sitl.world import surfaces
 from sitl.world.effects import machine, transmission
-from sitl.world.state import PAYLOAD_RADIUS_M
 
+PAYLOAD, CATCH = "payload", "catch"
+"""Names of the thrown ball and of the constraint that holds it in the net."""
 SECOND, SECOND_CATCH = "payload2", "catch2"
 """Names of the second ball, which a fault throws after the payload, and of its constraint."""
 _FEET_M = ((0.18, -0.18), (-0.18, 0.18), (0.18, 0.18), (-0.18, -0.18))
@@ -229,15 +230,15 @@ def _balls(world: World) -> tuple[str, str, str]:
     machine.
     """
     bodies = pairs = connect = ""
-    balls = [("payload", "catch", world.payload_kg)]
+    balls = [(PAYLOAD, CATCH, world.payload_kg)]
     balls += [(SECOND, SECOND_CATCH, f.magnitude) for f in world.faults if f.kind == "payload_double"][:1]
     for row, (name, catch, mass_kg) in enumerate(balls):
         if mass_kg <= 0:
             continue
         bodies += f"""
-    <body name="{name}" pos="{row} 50 {PAYLOAD_RADIUS_M}">
+    <body name="{name}" pos="{row} 50 {world.payload_radius_m}">
       <freejoint name="{name}"/>
-      <geom name="{name}" type="sphere" size="{PAYLOAD_RADIUS_M}" mass="{mass_kg}" contype="0" conaffinity="0"/>
+      <geom name="{name}" type="sphere" size="{world.payload_radius_m}" mass="{mass_kg}" contype="0" conaffinity="0"/>
     </body>"""
         pairs += f'<pair geom1="floor" geom2="{name}" friction="1 1 0.005 0.0001 0.0001"/>'
         connect += f"""

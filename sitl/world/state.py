@@ -10,7 +10,6 @@ from companion.model.frames import quat_rotate
 from companion.model.types import Joints, Quat, Vec3
 
 PHYSICS_DT_S: Final = 0.002
-PAYLOAD_RADIUS_M: Final = 0.035
 
 
 @dataclass(frozen=True, slots=True)

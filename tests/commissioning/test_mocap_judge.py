@@ -16,6 +16,7 @@ from companion.config.loader import load_vehicle
 from companion.io.mocap.frames import RigidBody
 from companion.io.mocap.natnet import ServerInfo
 from companion.model.check_row import Level, Row
+from companion.model.markers import Marker, MarkerFrame
 from companion.model.types import IDENTITY_QUAT, Vec3
 from tests.support import ROOT
 
@@ -29,6 +30,7 @@ INFO = ServerInfo(
     multicast=True,
     multicast_group="239.255.42.99",
 )
+BALL, FLOOR = (Marker(position_world_m=place) for place in ((1.0, 0.0, 1.0), (9.0, 0.0, 0.0)))
 CABLE = Route("unicast", "10.0.0.2", "eth0", False)
 NAMES = {1: "quad", 5: "wand"}
 
@@ -166,3 +168,25 @@ def test_wifi_is_reported() -> None:
 def test_too_few_frames_are_not_judged() -> None:
     found = judged(frames(seconds=0.02))
     assert {row.id for row in found[0]} == {"mocap.server", "mocap.network", "mocap.own"}
+
+
+def test_single_markers_are_counted_and_judged_for_a_vehicle_that_follows_a_ball() -> None:
+    seen = [
+        replace(
+            frame,
+            markers=MarkerFrame(
+                stamp_s=frame.arrived_s,
+                exposed_s=frame.arrived_s,
+                frame_number=frame.number,
+                markers=(FLOOR, BALL)[: 1 + frame.number % 2],
+            ),
+        )
+        for frame in frames()
+    ]
+    watched = Watched(seen, NAMES, INFO, CABLE, 4.0, False)
+    assert mocap_judge.as_json(watched)["single_markers"] == (1, 2)
+    assert "single markers per frame: 1 to 2" in mocap_judge.text(watched)
+    with_ball = load_vehicle(ROOT / "configs/vehicles/tarot650_2r.yaml", ["vehicle.devices.mocap.ball={kind: marker}"])
+    for vehicle, expected in ((VEHICLE, []), (with_ball, ["1 to 2 single markers, 0 to 1 of them in the room"])):
+        rows, _ = mocap_judge.judge(watched, vehicle)
+        assert [row.read for row in rows if row.id == "mocap.ball"] == expected

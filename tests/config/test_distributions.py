@@ -161,7 +161,8 @@ def test_an_override_that_cannot_be_drawn_names_the_option() -> None:
 
 def test_a_world_that_does_not_exist_is_refused_with_those_that_do() -> None:
     with pytest.raises(
-        ConfigError, match=r"--world labb: expected ideal, lab.* or a file, found neither \(did you mean lab\?\)"
+        ConfigError,
+        match=r"--world labb: expected careless, ideal, lab.* or a file, found neither \(did you mean lab\?\)",
     ):
         load_world([], "labb")
     with pytest.raises(ConfigError, match=r"mine\.yaml: no such file"):

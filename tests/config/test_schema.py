@@ -72,5 +72,5 @@ def test_every_preset_is_shipped() -> None:
 
 
 def test_every_world_is_shipped() -> None:
-    assert WORLDS == ("ideal", "lab", "robustness", "wall")
+    assert WORLDS == ("careless", "ideal", "lab", "robustness", "wall")
     assert set(get_args(get_args(World.model_fields["extends"].annotation)[0])) == set(WORLDS)

@@ -17,6 +17,7 @@ from companion.flight.main import Flight
 from companion.io.devices import Devices, PoseForwarder
 from companion.model.estimator import EstimatorReport
 from companion.model.launcher_messages import Land
+from companion.model.markers import MarkerFrame
 from companion.model.observations import (
     ArmStatement,
     ForceCounts,
@@ -150,6 +151,9 @@ class OtherMocap(Standing):
 
     def counts(self) -> MocapCounts:
         return RECORDED
+
+    def markers(self) -> MarkerFrame | None:
+        return None
 
     def latest(self) -> MocapPose | None:
         self.frame += 1

@@ -39,7 +39,8 @@ def busy_programs(count: int) -> Iterator[None]:
             program.wait()
 
 
-IN_LAB = ("fly", SHORT_CATCH, "--sitl", "--world", "lab", "--seed", "1", "--out", "out")
+WITH_BALL = ("--set", "vehicle.devices.mocap.ball={kind: marker}")
+IN_LAB = ("fly", SHORT_CATCH, "--sitl", "--world", "lab", "--seed", "1", "--out", "out", *WITH_BALL)
 
 
 @dataclass(frozen=True)
@@ -115,12 +116,16 @@ def test_it_is_the_flight_of_the_fast_loop(flown: Flown) -> None:
     config = SitlConfig.model_validate_json((flown.out / "sitl_config.json").read_text(encoding="utf-8"))
     fast = FastFlight(config).run()
     assert [o.phase for o in fast.outputs][:2000] == [o.phase for o in log.outputs][:2000]
-    equal = True
+    equal, balls = True, 0
     for ours, theirs in zip(fast.inputs, log.inputs, strict=False):
         assert ours.t_s == theirs.t_s
         assert ours.mocap is not None and theirs.mocap is not None
         assert ours.vehicle is not None and theirs.vehicle is not None
         assert ours.mocap.stamp_s == theirs.mocap.stamp_s
+        assert ours.markers is not None and theirs.markers is not None
+        assert ours.markers.frame_number - ours.mocap.frame_number == 0 == theirs.markers.stamp_s - theirs.mocap.stamp_s
+        assert theirs.markers.exposed_s == pytest.approx(ours.markers.exposed_s, abs=1e-6)
+        balls = max(balls, len(ours.markers.markers))
         equal = equal and counts(ours) == counts(theirs)
         allowed_m = FLOAT32 if equal else APART_M
         assert difference(ours.mocap.position_world_m, theirs.mocap.position_world_m) < allowed_m, ours.t_s
@@ -128,6 +133,9 @@ def test_it_is_the_flight_of_the_fast_loop(flown: Flown) -> None:
         if equal:
             assert difference(ours.vehicle.attitude_wxyz, theirs.vehicle.attitude_wxyz) < FLOAT32, ours.t_s
             assert ours.vehicle.imu_stamp_s == theirs.vehicle.imu_stamp_s
+            for one, other in zip(ours.markers.markers, theirs.markers.markers, strict=True):
+                assert difference(one.position_world_m, other.position_world_m) < APART_M, "a ball that rolls"
+    assert balls >= 2, "the ball, and a reflection"
     in_flight = [k for k, output in enumerate(log.outputs) if output.mission_t_s > 1.0]
     assert counts(fast.inputs[in_flight[0]]) == counts(log.inputs[in_flight[0]])
     assert abs(len(fast.outputs) - len(log.outputs)) <= 3

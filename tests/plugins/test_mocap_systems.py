@@ -46,6 +46,8 @@ VEHICLE = (ROOT / "configs/vehicles/tarot650_2r.yaml").read_text(encoding="utf-8
 FAILING = '''
 import socket
 from companion.config.base import Model
+from companion.io.mocap.system import ExtendedClient
+from companion.model.markers import Marker, MarkerFrame
 from companion.model.types import MocapPose
 class Options(Model):
     """Fails."""
@@ -86,6 +88,15 @@ class Scripted(Failing):
             stamp_s=now_s + self.given["stamped_after_now_s"], frame_number=self.number,
             position_world_m=(self.given["x_m"], 0.0, 1.0), attitude_wxyz=(self.given["w"], 0.0, 0.0, 0.0),
             tracking_valid=self.given["tracking_valid"], marker_error_m=0.0)]
+class WithMarkers(Scripted, ExtendedClient):
+    """Sees the markers that its options give."""
+    sees_markers = True
+    def markers(self):
+        at = tuple(float(value) for value in self.given["at"])
+        count, late_s = int(self.given.get("count", 1)), self.given.get("late_s", 0.0)
+        stamp_s = self.clock() + late_s
+        markers = (Marker(position_world_m=at),) * count if count else "none"
+        return MarkerFrame(stamp_s=stamp_s, exposed_s=stamp_s, frame_number=self.number, markers=markers)
 class Stuck(Scripted):
     """Repeats its frame number."""
     def poses(self, now_s):
@@ -128,7 +139,18 @@ def installed(tmp_path: Path) -> Iterator[None]:
     (tmp_path / "lab_mocap.py").write_text(FAILING)
     announced = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]["entry-points"][MOCAP_SYSTEMS]
     write_distribution(tmp_path, "companion-vicon", "0.1.0", announced, MOCAP_SYSTEMS)
-    names = ("Failing", "Absent", "NoOptions", "Nonsense", "Nameless", "NoProblem", "Scripted", "Stuck", "Reconnecting")
+    names = (
+        "Failing",
+        "Absent",
+        "NoOptions",
+        "Nonsense",
+        "Nameless",
+        "NoProblem",
+        "Scripted",
+        "Stuck",
+        "Reconnecting",
+        "WithMarkers",
+    )
     failing = {name.lower(): f"lab_mocap:{name}" for name in names}
     write_distribution(tmp_path, "lab-mocap", "1.0", failing, MOCAP_SYSTEMS)
     with on_path(tmp_path):
@@ -312,6 +334,56 @@ def test_a_vicon_object_that_is_not_finite_does_not_stop_the_others(value: float
 
 def scripted(**options: JsonValue) -> MocapDevice:
     return MocapDevice(type="scripted", server="server", rigid_body_id=1, options=options)
+
+
+def seen_by_a_plug_in(**options: JsonValue) -> ContainedClient:
+    """The client of a plug-in that sees markers, after two frames."""
+    ball = {"kind": "marker"}
+    device = MocapDevice(type="withmarkers", server="server", rigid_body_id=1, ball=ball, options=options)  # type: ignore[arg-type]
+    settings = settings_of(device)
+    client = ContainedClient(device_class(MOCAP_SYSTEMS, "withmarkers")(settings), settings, monotonic)
+    for _ in range(2):
+        assert len(client.poses()) == 1
+        client.markers()
+    return client
+
+
+def test_a_plug_in_hands_on_markers() -> None:
+    client = seen_by_a_plug_in(at=["1", "2", "0.5"])
+    frame = client.markers()
+    assert frame is not None and [marker.position_world_m for marker in frame.markers] == [(1.0, 2.0, 0.5)]
+    assert (client.malformed, client.problem) == (0, None)
+
+
+BAD_MARKERS: list[tuple[dict[str, JsonValue], str]] = [
+    ({"at": ["nan", "0", "1"]}, "without a finite position"),
+    ({"at": ["0", "1001", "1"]}, "without a finite position within 1000 m"),
+    ({"at": ["0", "0", "1"], "count": 9}, "9 markers, expected at most 8"),
+    ({"at": ["0", "0", "1"], "late_s": -1.5}, "markers stamped"),
+    ({"at": ["0", "0", "1"], "late_s": 0.5}, "markers stamped"),
+    ({"at": ["0", "1"]}, "ValidationError"),
+    ({"at": ["0", "0", "1"], "count": 0}, "ValidationError"),
+]
+
+
+@pytest.mark.parametrize(("options", "why"), BAD_MARKERS)
+def test_bad_markers_of_a_plug_in_are_counted_and_go_no_further(options: dict[str, JsonValue], why: str) -> None:
+    client = seen_by_a_plug_in(**options)
+    assert client.markers() is None
+    assert client.malformed == 3 and client.problem is not None and why in client.problem
+
+
+def test_a_system_without_markers_is_refused_for_a_vehicle_that_follows_a_ball(tmp_path: Path) -> None:
+    vehicle, ball = tmp_path / "vehicle.yaml", "    ball: {kind: marker}"
+    vehicle.write_text(
+        VEHICLE.replace("  mocap:\n", f"  mocap:\n    type: vicon\n    options: {{object_name: quad}}\n{ball}\n", 1)
+    )
+    with pytest.raises(ConfigError) as caught:
+        load_vehicle(vehicle)
+    (line,) = caught.value.lines
+    assert re.search(
+        r"vehicle\.yaml:\d+:\d+: devices\.mocap\.ball: the motion-capture system vicon hands on no markers", line
+    )
 
 
 INVALID: list[tuple[dict[str, JsonValue], str]] = [

@@ -29,7 +29,7 @@ from tests.support import ROOT
 EXAMPLE = ROOT / "examples/phase"
 MISSION = EXAMPLE / "weigh.yaml"
 FILES = ("pyproject.toml", "lab_weigh.py", "weigh.yaml", "test_lab_weigh.py")
-FLOWN = ("circuit", "press", "slide", "probe")
+FLOWN = ("circuit", "intercept", "press", "slide", "probe")
 CODE = (EXAMPLE / "lab_weigh.py").read_text(encoding="utf-8")
 
 

@@ -14,9 +14,10 @@ from msgspec.structs import replace
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.model.check_row import Level, Row
+from companion.model.markers import Marker, MarkerFrame
 from companion.model.observations import ForceStream, Observations, StateCounts
-from companion.model.types import ArmState, VehicleState
-from companion.preflight import evaluation, frames, px4
+from companion.model.types import ArmState, Vec3, VehicleState
+from companion.preflight import evaluation, frames, mocap, px4
 from tests.machines import overrides_with_joints
 from tests.preflight import records as r
 from tests.support import HOVER, ROOT
@@ -43,6 +44,8 @@ class Case:
 
 FED: dict[str, Any] = {"mocap": (), "mocap_stream": None}
 EXTERNAL = {"devices.mocap.type": "external"}
+WITH_MARKER: dict[str, Any] = {"devices.mocap.ball": {"kind": "marker"}}
+WITH_BODY: dict[str, Any] = {"devices.mocap.ball": {"kind": "body", "id": 9}}
 
 
 def force_stream(samples: int = 1000, bad_sums: int = 0, lost: str | None = None) -> dict[str, Any]:
@@ -73,6 +76,13 @@ def late(share: float, late_s: float) -> tuple[VehicleState, ...]:
 def unsteady_clock() -> Any:
     """A server that stops for 60 ms a second and then catches up."""
     return tuple(replace(p, stamp_s=p.stamp_s + 0.06 * (i // 500)) for i, p in enumerate(r.mocap()))
+
+
+def markers(*places: Vec3) -> Mapping[str, Any]:
+    """100 frames with the same single markers."""
+    single = tuple(Marker(position_world_m=place) for place in places)
+    frames_ = [MarkerFrame(stamp_s=k / 20, exposed_s=k / 20, frame_number=k, markers=single) for k in range(100)]
+    return {"markers": tuple(frames_)}
 
 
 def failure(device: str) -> Mapping[str, Any]:
@@ -181,6 +191,19 @@ CASES = {
         {"mocap": r.mocap(position_world_m=(-1.0, 0.0, 0.3), attitude_wxyz=(1.0, 0.0, 0.0, 0.0))},
     ),
     "another body": Case("mocap.body", "others: 2, 7", "disable the others", {"mocap_stream": r.stream(other_bodies=(2, 7))}, WARN),
+    "markers off": Case("mocap.ball", "no single marker in 100 frames", "unlabelled", markers(), WARN, WITH_MARKER),
+    "reflections": Case(
+        "mocap.ball", "3 to 3 single markers, 2 to 2 of them", "mask",
+        markers((1.0, 0.0, 1.0), (0.0, 1.0, 1.0), (9.0, 0.0, 1.0)), WARN, WITH_MARKER,
+    ),
+    "ball that is not there": Case(
+        "mocap.ball", "no rigid body 9; other bodies: 2", "devices.mocap.ball.id",
+        {"mocap_stream": r.stream(other_bodies=(2,))}, WARN, WITH_BODY, (),
+    ),
+    "ball out of sight": Case(
+        "mocap.ball", "in 0% of the frames", "show the ball",
+        {"mocap_stream": r.stream(other_bodies=(9,)), **markers()}, WARN, WITH_BODY,
+    ),
     "bent markers": Case("mocap.error", "4.0 mm", "calibrate", {"mocap": r.mocap(marker_error_m=0.004)}, WARN),
     "stalling server": Case("mocap.clock", "jitter", "stalls", {"mocap": unsteady_clock()}, WARN),
     "another frame rate": Case(
@@ -294,7 +317,7 @@ def failed(rows: Mapping[str, Row]) -> set[str]:
 def test_a_sound_machine_passes_every_row() -> None:
     rows = {row.id: row for row in evaluation.rows(r.sound(), r.config())}
     assert not failed(rows), [row.line() for row in rows.values() if not row.ok]
-    assert set(rows) >= {check.id for check in evaluation.CHECKS} - {frames.HAND_TEST.id}
+    assert set(rows) >= {check.id for check in evaluation.CHECKS} - {frames.HAND_TEST.id, mocap.BALL.id}
     assert all(row.read and row.why and not row.fix for row in rows.values())
     assert evaluation.unsettled(r.sound(), r.config()) is None
 
@@ -381,6 +404,20 @@ def test_what_the_vehicle_file_does_not_ask_for_is_no_warning() -> None:
 def test_a_row_is_one_line_with_read_wanted_and_fix() -> None:
     row = judged(CASES["flat battery"])["px4.battery"]
     assert row.line() == "battery: 25%, 16.2 V, wanted 30%, 13.2 V; charge the battery"
+
+
+@pytest.mark.parametrize(
+    ("ball", "seen"),
+    [(WITH_MARKER, markers((1.0, 0.0, 1.0), (9.0, 0.0, 1.0))), (WITH_BODY, markers((1.0, 0.0, 1.0)))],
+    ids=["marker", "body"],
+)
+def test_a_ball_that_is_shown_to_the_cameras_passes(ball: Mapping[str, Any], seen: Mapping[str, Any]) -> None:
+    rows = judged(
+        Case(
+            "", "", "", {"mocap_stream": r.stream(other_bodies=(9,) if ball is WITH_BODY else ()), **seen}, vehicle=ball
+        )
+    )
+    assert rows["mocap.ball"].ok and rows["mocap.body"].ok
 
 
 def test_observations_of_nothing_refuse_and_do_not_fall_over() -> None:

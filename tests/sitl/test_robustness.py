@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from companion.campaigns.process import CampaignError
+from companion.campaigns.robustness import draws
 from companion.control.arm_model import manipulator_of
 from companion.mission.plan import Plan
 from companion.sitl_config.loader import SitlConfig, load_sitl
@@ -134,3 +135,33 @@ def test_what_ended_a_mission_early_is_reported() -> None:
     assert found["why"].startswith("battery_voltage: ")
     assert "touchdown" in found["events"]
     assert found["pre_e_p_m"] is None and found["peak_e_p_m"] is None, "what was not flown to its end is not graded"
+
+
+PASSES = load_sitl(CATCH, world="careless")
+WAITS = load_sitl(
+    SHORT_CATCH,
+    world="careless",
+    overrides=[
+        'mission.phases=[{"type": "takeoff", "height_m": 1.0, "duration_s": 2.0}, {"type": "hold", "duration_s": 2.5},'
+        ' {"type": "land", "speed_m_s": 0.35}]',
+        'mission.start.arm_deg="unfolded"',
+        "world.catch_at_m=[-0.2, 0]",
+    ],
+)
+
+
+def test_careless_people_throw_the_same_to_a_vehicle_that_waits_and_to_one_that_passes() -> None:
+    pairs = zip(worlds(WAITS, range(8)), worlds(PASSES, range(8)), strict=True)
+    for hovers, passes in pairs:
+        assert (hovers["throw_to"], passes["throw_to"]) == ("hovering", "passing")
+        assert hovers["catch_at_m"] == [-0.2, 0.0] != passes["catch_at_m"]
+        assert all(hovers[key] == passes[key] for key in ("payload_kg", "seed"))
+        there, here = (flights.with_world(config, world).world for config, world in ((WAITS, hovers), (PASSES, passes)))
+        assert (there.people, there.thrower) == (here.people, here.thrower)
+        assert (len(there.people), there.thrower.scatter) == (4, 3.0)
+
+
+def test_a_row_of_a_careless_throw_has_its_miss() -> None:
+    row = robustness.fly(WAITS, {"name": "", "number": 0, "world": worlds(WAITS, [0])[0]})["row"]
+    assert row["thrown"] and 0.0 < row["miss_m"] < 2.0
+    assert draws.drivers(row["world"])["throw_speed_m_s"] is None

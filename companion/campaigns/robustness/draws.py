@@ -47,7 +47,8 @@ DRAWN = ("payload_kg", "throw_velocity_m_s", "catch_at_m", "seed")
 
 def drivers(world: Mapping[str, Any]) -> dict[str, float | None]:
     """Return the drawn values by the keys of `DRIVERS`; None where a quantity does not apply."""
-    vx, vy, vz = world.get("throw_velocity_m_s", (math.nan,) * 3)
+    unknown = (math.nan,) * 3  # people throw with a velocity of their own
+    vx, vy, vz = unknown if world.get("people") else world.get("throw_velocity_m_s", unknown)
     wx, wy, _ = world.get("wind_m_s", (math.nan,) * 3)
     link1, link2 = of_joints(world.get("link_mass_error", (math.nan,)), 2)
     values: dict[str, float | None] = {

@@ -18,6 +18,7 @@ from companion.config.vehicle import Vehicle
 from companion.io.mocap.frames import RigidBody
 from companion.io.mocap.natnet import NEWEST_DESCRIBED_VERSION, ServerInfo, z_up_from_y_up
 from companion.model.check_row import Row
+from companion.model.markers import MarkerFrame
 from companion.model.observations import MocapStream, Observations
 from companion.model.types import MocapPose
 from companion.preflight import mocap as preflight
@@ -58,6 +59,8 @@ class FrameSeen:
     latency_s: float | None
     """Time from mid-exposure to transmission."""
     bodies: tuple[RigidBody, ...]
+    markers: MarkerFrame | None = None
+    """Its single markers, or those of the ball's rigid body, in the world frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +213,10 @@ def judge(watched: Watched, vehicle: Vehicle) -> tuple[list[Row], dict[Location,
         other_bodies=others,
         body_name=watched.names.get(device.rigid_body_id, ""),
     )
-    observed = Observations(start_s=0.0, duration_s=watched.duration_s, mocap=tuple(poses), mocap_stream=stream)
+    markers = tuple(frame.markers for frame in frames if frame.markers is not None)
+    observed = Observations(
+        start_s=0.0, duration_s=watched.duration_s, mocap=tuple(poses), mocap_stream=stream, markers=markers
+    )
     rate = _rate(t, device.rate_hz, changes)
     # The preflight's device row is replaced by the server's row, and its rate by a row with the cause.
     rows += [
@@ -332,10 +338,17 @@ def text(watched: Watched) -> list[str]:
             f"  id {body.id:<5} {body.name or '-':<20} {share}, moved {100.0 * body.moved_m:.1f} cm, "
             f"marker error {1e3 * body.error_m:.1f} mm"
         )
+    lines.append("single markers per frame: {} to {}".format(*_marker_counts(watched.frames)))
     t = timing(watched.frames)
     if t is not None:
         lines += ["delay of the frames relative to a regular stream:", *histogram(t)]
     return [*lines, ""]
+
+
+def _marker_counts(frames: Sequence[FrameSeen]) -> tuple[int, int]:
+    """Return the smallest and largest number of single markers in a frame."""
+    counts = [len(frame.markers.markers) for frame in frames if frame.markers is not None] or [0]
+    return min(counts), max(counts)
 
 
 def as_json(watched: Watched) -> dict[str, Any]:
@@ -346,6 +359,7 @@ def as_json(watched: Watched) -> dict[str, Any]:
     return {
         "server": {"application": info.application, "version": version, "natnet": info.version, **route},
         "bodies": [asdict(body) for body in bodies(watched.frames, watched.names)],
+        "single_markers": _marker_counts(watched.frames),
         "timing": t
         and {
             "rate_hz": t.rate_hz,

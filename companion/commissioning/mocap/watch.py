@@ -7,6 +7,7 @@ from __future__ import annotations
 import array
 import asyncio
 import contextlib
+import dataclasses
 import fcntl
 import socket
 import struct
@@ -30,10 +31,10 @@ _ANSWERS_S: Final = 1.0
 
 
 class WatchedTrack(OptiTrack):
-    """The flight's client, which also reports every rigid body of every frame and requires none."""
+    """The flight's client, which also reports every rigid body and single marker of every frame and requires none."""
 
     def __init__(self, settings: MocapSettings, on_frame: Callable[[FrameSeen], None]) -> None:
-        super().__init__(settings)
+        super().__init__(dataclasses.replace(settings, ball=settings.ball or {"kind": "marker", "id": None}))
         self._on_frame = on_frame
 
     def refusal(self) -> str | None:
@@ -42,6 +43,7 @@ class WatchedTrack(OptiTrack):
 
     def take(self, frame: Frame, datagram: bytes, stamp_s: float) -> None:
         """Report a frame."""
+        marker_frame = self.protocol.markers(frame, datagram, stamp_s)
         bodies = (self.protocol.other_body(datagram, number) for number in frame.body_ids)
         self._on_frame(
             FrameSeen(
@@ -50,6 +52,7 @@ class WatchedTrack(OptiTrack):
                 timestamp_s=frame.timestamp_s,
                 latency_s=frame.latency_s,
                 bodies=tuple(body for body in bodies if body is not None),
+                markers=marker_frame,
             )
         )
 

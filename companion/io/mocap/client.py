@@ -6,14 +6,17 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 from companion.io.mocap import natnet
 from companion.io.mocap.definitions import parse_model_definitions
 from companion.io.mocap.frames import Frame, RigidBody, parse_frame
+from companion.io.mocap.markers import marker_frame
 from companion.io.mocap.natnet import OLDEST_VERSION, Malformed, Message, ServerInfo, Version
 from companion.io.mocap.server_clock import ServerClock
-from companion.model.types import MocapPose
+from companion.model.markers import MarkerFrame
+from companion.model.types import IDENTITY_QUAT, MocapPose, Vec3
 from companion.safety.stream_watch import StreamWatch
 
 SUPPORTED_VERSIONS: Final = "{}.{} or later".format(*OLDEST_VERSION)
@@ -33,13 +36,25 @@ class NatNetClient:
         up_axis: "y" or "z": Motive's streaming setting.
         transport: "unicast" or "multicast"; a unicast server forgets a client that sends no keep-alives.
         application: name of this client in connect requests.
+        ball: `devices.mocap.ball`; None if no marker is read.
     """
 
-    def __init__(self, body_id: int, up_axis: str, transport: str, application: str = "companion") -> None:
+    def __init__(
+        self,
+        body_id: int,
+        up_axis: str,
+        transport: str,
+        application: str = "companion",
+        ball: Mapping[str, Any] | None = None,
+    ) -> None:
         self._body_id = body_id
         self._up_axis = up_axis
         self._unicast = transport == "unicast"
         self._application = application
+        self._ball = ball
+        self._with_markers = ball is not None and ball["kind"] == "marker"
+        self._tracked_m: Vec3 = (0.0, 0.0, 0.0)
+        """Newest position at which the vehicle's body was tracked, in the axes of the stream."""
         self._streams = StreamWatch()
         self._clock = ServerClock()
         self._token = 0
@@ -142,6 +157,28 @@ class NatNetClient:
             exposure_server_s=frame.exposure_s,
         )
 
+    def markers(self, frame: Frame, datagram: bytes, stamp_s: float) -> MarkerFrame | None:
+        """Return the single markers of a frame in the world frame, or None if no ball is followed. If the ball is a rigid body, it is
+        the only marker, as long as it is tracked.
+
+        Args:
+            frame: as returned by `receive`.
+            datagram: the datagram from which the frame was read.
+            stamp_s: arrival of the datagram on the flight clock, s.
+        """
+        if self._ball is None:
+            return None
+        if frame.body is not None and frame.body.tracking_valid:
+            self._tracked_m = frame.body.position_m
+        positions = frame.markers
+        if not self._with_markers:
+            ball = self.other_body(datagram, self._ball["id"])
+            positions = (ball.position_m,) if ball is not None and ball.tracking_valid else ()
+        if self._up_axis == "y":
+            positions = tuple([natnet.z_up_from_y_up(position, IDENTITY_QUAT)[0] for position in positions])
+        near_m = self._tracked_m if self._up_axis == "z" else natnet.z_up_from_y_up(self._tracked_m, IDENTITY_QUAT)[0]
+        return marker_frame(stamp_s, frame.age_s, frame.number, positions, near_m)
+
     def _receive_info(self, datagram: bytes, arrived_s: float) -> None:
         info = natnet.parse_server_info(datagram)
         if isinstance(info, Malformed):
@@ -171,7 +208,8 @@ class NatNetClient:
     def _receive_frame(self, datagram: bytes, arrived_s: float) -> Frame | None:
         if self.version is None or self.info is None:
             return None
-        frame = parse_frame(datagram, self.version, self._body_id, self.info.clock_frequency_hz)
+        ticks_hz, markers = self.info.clock_frequency_hz, self._with_markers
+        frame = parse_frame(datagram, self.version, self._body_id, ticks_hz, markers=markers)
         if isinstance(frame, Malformed):
             self._reject(frame)
             return None
@@ -186,6 +224,9 @@ class NatNetClient:
         self.body_ids = frame.body_ids
         if self.is_ambiguous:
             self.problem = f"two rigid bodies have the streaming id {self._body_id}; the first one is used"
+        if frame.bad_markers:
+            self.malformed += frame.bad_markers
+            self.problem = f"frame {frame.number}: {frame.bad_markers} markers without a finite position are dropped"
         if frame.latency_s is None or frame.exposure_s is None:
             return frame
         return frame._replace(age_s=self._clock.age_s(frame.exposure_s, frame.latency_s, arrived_s))

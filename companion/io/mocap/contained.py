@@ -7,7 +7,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Final, TypeVar
 
-from companion.io.mocap.system import ExtendedClient, MocapSettings, PoseClient, valid_poses
+from companion.io.mocap.system import ExtendedClient, MocapSettings, PoseClient, markers_problem, valid_poses
+from companion.model.markers import MarkerFrame
 from companion.model.types import MocapPose
 from companion.plugins import one_line
 from companion.runtime.clock import Clock
@@ -37,6 +38,7 @@ class ContainedClient:
         self.where = self.extended.where or f"mocap {settings.type} {settings.server}"
         """Beginning of a text on this client."""
         self.extended.clock = clock
+        self._markers: MarkerFrame | None = None
         self._rejected = 0
         self.problem: str | None = None
         """The newest problem: an exception, or why a pose or datagram was rejected; None if there was none."""
@@ -59,6 +61,22 @@ class ContainedClient:
     def poses(self) -> list[MocapPose]:
         """Return the valid poses that have arrived, in order."""
         return self._call("poses()", self._receive, [])
+
+    def markers(self) -> MarkerFrame | None:
+        """Return the valid single markers of the newest frame, or None; call it after `poses`."""
+        return self._call("markers()", self._valid_markers, None)
+
+    def _valid_markers(self, now_s: float) -> MarkerFrame | None:
+        frame = self.extended.markers()
+        if frame is None or frame is self._markers:
+            return self._markers
+        problem = markers_problem(frame, self._clock())
+        if problem is None:
+            self._markers = frame
+        else:
+            self._rejected += 1
+            self.problem = problem
+        return self._markers
 
     def close(self) -> None:
         """Close the client."""

@@ -15,6 +15,7 @@ from companion.config.devices import MocapDevice
 from companion.io.mocap.contained import ContainedClient
 from companion.io.mocap.system import ExtendedClient, MocapSettings, PoseClient
 from companion.io.protocols import DeviceError
+from companion.model.markers import MarkerFrame
 from companion.model.observations import MocapCounts, MocapServer
 from companion.model.types import MocapPose
 from companion.plugins import MOCAP_SYSTEMS, PluginError, one_line
@@ -34,7 +35,8 @@ MakeClient = Callable[[MocapSettings], PoseClient]
 
 def settings_of(device: MocapDevice) -> MocapSettings:
     """Return `devices.mocap` as a client receives it."""
-    return MocapSettings(**{each.name: getattr(device, each.name) for each in fields(MocapSettings)})
+    values = {each.name: getattr(device, each.name) for each in fields(MocapSettings)}
+    return MocapSettings(**values | {"ball": None if device.ball is None else device.ball.model_dump()})
 
 
 class MocapDriver:
@@ -81,6 +83,7 @@ class MocapDriver:
         """Earliest flight clock of the next `keep_connected`, and of the next problem in the log."""
         self._answered, self._received = asyncio.Event(), asyncio.Event()
         self._latest: MocapPose | None = None
+        self._markers: MarkerFrame | None = None
         self._frames = self._superseded = 0
         self._logged: str | None = None
         self._callback_error: str | None = None
@@ -88,6 +91,10 @@ class MocapDriver:
     def latest(self) -> MocapPose | None:
         """Return the newest pose, or None before the first; never blocks."""
         return self._latest
+
+    def markers(self) -> MarkerFrame | None:
+        """Return the single markers of the newest frame, or None without `devices.mocap.ball`; never blocks."""
+        return self._markers
 
     @property
     def client(self) -> ContainedClient:
@@ -211,6 +218,8 @@ class MocapDriver:
         """Read all that has arrived and deliver the newest pose."""
         client = self.client
         poses = client.poses()
+        if self._device.ball is not None:
+            self._markers = client.markers()
         if not self._received.is_set():
             self._note_opening(client, poses)
         if not poses:

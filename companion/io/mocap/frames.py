@@ -34,7 +34,11 @@ LATER_LATENCY_MAX_S: Final = 1.0
 """If a version later than the newest described one yields a longer latency than this, its suffix has a different layout."""
 _RIGID_BODY = struct.Struct("<I7ffH")
 _SUFFIX = struct.Struct("<IIdQQQ")
+_LABELLED_MARKER = struct.Struct("<I3ffHf")
+_VEC3 = struct.Struct("<3f")
 _PARAM_TRACKING_VALID = 0x01
+_MARKER_OCCLUDED, _MARKER_HAS_BODY, _MARKER_UNLABELLED = 0x01, 0x08, 0x10
+_MARKER_MAX_M = 1000.0
 _QUAT_NORM_TOLERANCE = 0.02
 
 
@@ -64,9 +68,15 @@ class Frame(NamedTuple):
     body_ids: tuple[int, ...]
     age_s: float | None = None
     """Time from mid-exposure to arrival, which the client adds."""
+    markers: tuple[Vec3, ...] = ()
+    """Markers that belong to no rigid body, in the axes that the server streams; empty if they were not requested."""
+    bad_markers: int = 0
+    """Number of such markers that are not finite or more than 1000 m from the origin, and therefore dropped."""
 
 
-def parse_frame(datagram: Buffer, version: Version, body_id: int, clock_frequency_hz: int | None) -> Frame | Malformed:
+def parse_frame(
+    datagram: Buffer, version: Version, body_id: int, clock_frequency_hz: int | None, *, markers: bool = False
+) -> Frame | Malformed:
     """Parse the requested rigid body and the suffix of a NAT_FRAMEOFDATA datagram; all other sections are skipped.
 
     Args:
@@ -74,22 +84,25 @@ def parse_frame(datagram: Buffer, version: Version, body_id: int, clock_frequenc
         version: the server's NatNet version.
         body_id: streaming id of the requested rigid body.
         clock_frequency_hz: from `ServerInfo`, for the latency.
+        markers: whether markers that belong to no rigid body are requested, too.
     """
     payload = payload_of(datagram, Message.FRAME)
     if isinstance(payload, Malformed):
         return payload
     try:
-        return _frame(payload, version, body_id, clock_frequency_hz)
+        return _frame(payload, version, body_id, clock_frequency_hz, markers)
     except (struct.error, ValueError) as error:
         # Every read past the end and every missing terminator ends up here, so no field needs a check of its own.
         return Malformed(f"frame of {len(payload)} bytes ends early or has wrong section sizes ({error})")
 
 
-def _frame(data: bytes, version: Version, body_id: int, clock_frequency_hz: int | None) -> Frame | Malformed:
+def _frame(
+    data: bytes, version: Version, body_id: int, clock_frequency_hz: int | None, with_markers: bool
+) -> Frame | Malformed:
     sized = version >= SECTION_SIZES_SINCE
     number: int = U32.unpack_from(data)[0]
-    offset = _skip_marker_sets(data, 4, sized)
-    offset = _skip_fixed(data, offset, sized, VEC3_BYTES)  # other (unlabelled) markers
+    others = _skip_marker_sets(data, 4, sized)
+    offset = _skip_fixed(data, others, sized, VEC3_BYTES)  # other (unlabelled) markers
 
     count, start = _section(data, offset, sized)
     offset = start + RIGID_BODY_BYTES * count
@@ -106,12 +119,13 @@ def _frame(data: bytes, version: Version, body_id: int, clock_frequency_hz: int 
         body = found
 
     if sized:
-        for _ in range(5):  # skeletons, assets, labelled markers, force plates, devices
+        labelled = offset = _skip_sized(data, _skip_sized(data, offset))  # skeletons, assets
+        for _ in range(3):  # labelled markers, force plates, devices
             offset = _skip_sized(data, offset)
         if version > NEWEST_DESCRIBED_VERSION:
             offset = _skip_unknown(data, offset)
     else:
-        offset = _skip_skeletons(data, offset)
+        labelled = offset = _skip_skeletons(data, offset)
         offset = _skip_fixed(data, offset, sized, LABELLED_MARKER_BYTES)
         offset = _skip_channels(data, offset)  # force plates
         offset = _skip_channels(data, offset)  # devices
@@ -123,9 +137,41 @@ def _frame(data: bytes, version: Version, body_id: int, clock_frequency_hz: int 
         exposure_s = exposure / clock_frequency_hz
         if version > NEWEST_DESCRIBED_VERSION and latency_s > LATER_LATENCY_MAX_S:
             latency_s = exposure_s = None
+    markers, bad = _single_markers(data, others, labelled, sized) if with_markers else ((), 0)
     return Frame(
-        number=number, timestamp_s=timestamp_s, latency_s=latency_s, exposure_s=exposure_s, body=body, body_ids=ids
+        number=number,
+        timestamp_s=timestamp_s,
+        latency_s=latency_s,
+        exposure_s=exposure_s,
+        body=body,
+        body_ids=ids,
+        markers=markers,
+        bad_markers=bad,
     )
+
+
+def _single_markers(data: bytes, others: int, labelled: int, sized: bool) -> tuple[tuple[Vec3, ...], int]:
+    """Return the markers that belong to no rigid body, and the number of those that are dropped. Depending on its settings Motive lists
+    them as other markers, as labelled markers without a label, or as both; they are the same to the last bit then.
+
+    Args:
+        data: the payload of a frame that has been read to its end.
+        others: offset of the section of other markers.
+        labelled: offset of the section of labelled markers.
+        sized: whether sections state their sizes.
+    """
+    count, start = _section(data, others, sized)
+    found: list[Vec3] = list(_VEC3.iter_unpack(data[start : start + VEC3_BYTES * count]))
+    count, start = _section(data, labelled, sized)
+    if not sized or U32.unpack_from(data, start - 4)[0] == LABELLED_MARKER_BYTES * count:  # else of a later version
+        for _, x, y, z, _, params, _ in _LABELLED_MARKER.iter_unpack(
+            data[start : start + LABELLED_MARKER_BYTES * count]
+        ):
+            single = params & _MARKER_UNLABELLED or not params & _MARKER_HAS_BODY
+            if single and not params & _MARKER_OCCLUDED:
+                found.append((x, y, z))
+    good = dict.fromkeys(point for point in found if all(abs(value) <= _MARKER_MAX_M for value in point))
+    return tuple(good), sum(not all(abs(value) <= _MARKER_MAX_M for value in point) for point in found)
 
 
 def _rigid_body(data: bytes, offset: int) -> RigidBody | Malformed:

@@ -16,6 +16,7 @@ from companion.io.mocap.frames import Frame
 from companion.io.mocap.natnet import Message
 from companion.io.mocap.system import Counts, ExtendedClient, MocapSettings
 from companion.io.protocols import DeviceError
+from companion.model.markers import MarkerFrame
 from companion.model.types import MocapPose
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ class OptiTrack(ExtendedClient):
     """
 
     options: ClassVar[Any] = _Options()
+    sees_markers: ClassVar[bool] = True
 
     def __init__(self, settings: MocapSettings) -> None:
         self._settings = settings
@@ -57,8 +59,9 @@ class OptiTrack(ExtendedClient):
                 f"{self.where}: the name cannot be resolved; put the Motive computer's IPv4 address into devices.mocap.server"
             ) from None
         self.sockets: list[socket.socket] = []
-        self.protocol = NatNetClient(settings.rigid_body_id, settings.up_axis, settings.transport)
+        self.protocol = NatNetClient(settings.rigid_body_id, settings.up_axis, settings.transport, ball=settings.ball)
         """State of the protocol, for tools."""
+        self._markers: MarkerFrame | None = None
         self._foreign = 0
         self._foreign_ip: str | None = None
         self._unsent = ""
@@ -92,6 +95,10 @@ class OptiTrack(ExtendedClient):
         """Return the rigid bodies of the newest frame by streaming id; the name is empty if the server has not sent it."""
         ids, names = self.protocol.body_ids, self.protocol.names
         return None if ids is None else {number: names.get(number, "") for number in ids}
+
+    def markers(self) -> MarkerFrame | None:
+        """Return the single markers of the newest frame, or None if the mission follows no ball."""
+        return self._markers
 
     def counts(self) -> Counts:
         """Return the numbers of dropped datagrams."""
@@ -127,6 +134,7 @@ class OptiTrack(ExtendedClient):
                 frame = self.protocol.receive(data, stamp_s)
                 if frame is not None:
                     self.take(frame, data, stamp_s)
+                    self._markers = self.protocol.markers(frame, data, stamp_s)
                     if frame.body is not None and (pose := self.protocol.pose(frame, stamp_s)) is not None:
                         found.append(pose)
         return found

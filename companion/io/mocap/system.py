@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Final, NamedTuple, Protocol
 
 import msgspec
 
+from companion.model.markers import MARKERS_MAX, MarkerFrame
 from companion.model.types import IDENTITY_QUAT, MocapPose
 from companion.runtime.clock import Clock
 
@@ -39,6 +40,8 @@ class MocapSettings:
     up_axis: str
     natnet_version: str | None = None
     type: str = "natnet"
+    ball: Mapping[str, Any] | None = None
+    """`kind` and `id` of the ball that the mission follows; None if no marker is read, as in the guardian."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """`devices.mocap.options`, already checked by the system's model."""
 
@@ -99,6 +102,8 @@ class ExtendedClient:
     """Clock of `now_s`, set before the first call of `poses`. What arrives during a call is stamped by it: `now_s` is older by the time
     that the process has waited for a core since.
     """
+    sees_markers: ClassVar[bool] = False
+    """Whether the system hands on single markers; a class without it is refused for a vehicle with `devices.mocap.ball`."""
     where = ""
     """Beginning of a text on this client, such as "mocap 10.0.0.5:1510"; empty for the type and `MocapSettings.server`."""
 
@@ -109,6 +114,12 @@ class ExtendedClient:
     def bodies(self) -> Mapping[int, str] | None:
         """Return the rigid bodies of the newest frame by streaming id, with their names, which are empty if not known; None before the
         first frame, and if the client does not know them.
+        """
+        return None
+
+    def markers(self) -> MarkerFrame | None:
+        """Return the single markers of the newest frame that `poses` has read, in the world frame, as
+        `companion.io.mocap.markers.marker_frame` builds them; None before the first frame, and without `MocapSettings.ball`.
         """
         return None
 
@@ -185,6 +196,28 @@ def valid_poses(poses: list[MocapPose], now_s: float) -> tuple[list[MocapPose], 
                 f"values, at most {_POSITION_MAX_M:g} m and norm 1; the pose is rejected"
             )
     return valid, rejected
+
+
+def markers_problem(frame: MarkerFrame, now_s: float) -> str | None:
+    """Return why a client's return value of `ExtendedClient.markers` is invalid, as one line, or None.
+
+    Raises:
+        TypeError: `frame` is no `MarkerFrame`.
+        msgspec.ValidationError: it has a value of the wrong type.
+    """
+    if not isinstance(frame, MarkerFrame):
+        raise TypeError(f"markers() returned {frame!r:.80}, expected a MarkerFrame or None")
+    checked = msgspec.convert(msgspec.to_builtins(frame), MarkerFrame, strict=True)
+    values = [value for marker in checked.markers for value in marker.position_world_m]
+    if len(checked.markers) > MARKERS_MAX:
+        return f"frame {checked.frame_number}: {len(checked.markers)} markers, expected at most {MARKERS_MAX}; they are dropped"
+    if not all(abs(value) <= _POSITION_MAX_M for value in values):
+        return f"frame {checked.frame_number}: a marker without a finite position within {_POSITION_MAX_M:g} m; its frame is dropped"
+    if not now_s - _AGE_MAX_S < checked.exposed_s <= checked.stamp_s <= now_s + _AHEAD_MAX_S:
+        return (
+            f"frame {checked.frame_number}: markers stamped {checked.stamp_s:.3f} s at {now_s:.3f} s; they are dropped"
+        )
+    return None
 
 
 def _has_types(pose: MocapPose) -> bool:

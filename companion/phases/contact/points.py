@@ -12,9 +12,7 @@ from msgspec.structs import replace
 
 from companion.mission.air import Air
 from companion.model.algebra import dot
-from companion.model.best_pose import best_pose
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.frames import quat_rotate
 from companion.model.types import ContactMode, ContactState, FoundSurface, TouchedPoint, Vec3
 from companion.phases.contact import force as c
 from companion.phases.contact.surface import TILT_MAX_RAD, axes, plane, tool_turn_rad, turn_to
@@ -46,7 +44,7 @@ def touching(air: Air, contact: ContactState, way: Way) -> ContactState:
     contact = c.timed(contact, dt_s, not felt)
     if contact.beyond_s >= c.LOST_S:  # gusts have feigned a touch
         return c.entered(replace(contact, samples=0), t_s, ContactMode.LOST)
-    tip = tip_world_m(air)
+    tip = air.tip_world_m()
     if t_s - contact.since_s < c.TOUCH_SETTLE_S or not felt or tip is None:
         return contact
     contact = c.averaged(contact, tip)
@@ -94,7 +92,7 @@ def shifting(air: Air, contact: ContactState, way: Way) -> ContactState:
 
 def beside_m(air: Air, contact: ContactState) -> float:
     """Return the distance of the tip from its reference, across the direction of the press, m; 0 if it is unknown."""
-    tip = tip_world_m(air)
+    tip = air.tip_world_m()
     if tip is None:
         return 0.0
     reference = c.along(air.plan_reference(), contact)
@@ -160,13 +158,3 @@ def ahead_m(air: Air, turn_rad: float = 0.0, tool_rad: float = 0.0) -> Vec3:
     x, y, z = air.manipulator.net_body_m((*reference.arm_rad[:-1], reference.arm_rad[-1] + tool_rad))
     cos, sin = math.cos(reference.yaw_rad + turn_rad), math.sin(reference.yaw_rad + turn_rad)
     return (cos * x - sin * y, sin * x + cos * y, z)
-
-
-def tip_world_m(air: Air) -> Vec3 | None:
-    """Return the measured position of the tip's centre, world frame; None if it is unknown."""
-    pose, arm = best_pose(air.i), air.i.arm
-    if pose is None or not pose.tracking_valid or arm is None:
-        return None
-    x, y, z = quat_rotate(pose.attitude_wxyz, air.manipulator.net_body_m(arm.angle_rad))
-    px, py, pz = pose.position_world_m
-    return (px + x, py + y, pz + z)

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from companion.mission.air import Air
 from companion.model.types import ContactMode, ContactState, Vec2, Vec3
 from companion.phases.contact import force as c
-from companion.phases.contact.points import ahead_m, tip_world_m
+from companion.phases.contact.points import ahead_m
 from companion.phases.contact.surface import axes
 
 LAG_N_M, LAG_N_MS = 30.0, 40.0
@@ -129,7 +129,7 @@ def way(contact: ContactState) -> Vec3:
 
 def _beside_m(air: Air, contact: ContactState) -> Vec3 | None:
     """Return the place of the tip minus that of its reference; None if it is unknown."""
-    tip, shift = tip_world_m(air), contact.shift
+    tip, shift = air.tip_world_m(), contact.shift
     if tip is None:
         return None
     (px, py, pz), (ax, ay, az) = (

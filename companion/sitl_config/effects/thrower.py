@@ -1,8 +1,17 @@
-"""Section `thrower` of the simulated world: scatter of a person's throws."""
+"""Section `thrower` of the simulated world: scatter of a person's throws; and the people who throw."""
 
 from __future__ import annotations
 
-from companion.config.base import Model, NonNegative
+from companion.config.base import Model, NonNegative, Positive, Vector3
+
+
+class Person(Model):
+    """A person who throws the payload from a fixed place."""
+
+    from_m: Vector3
+    """Point at which the payload leaves the hand, world frame."""
+    flight_s: Positive = 0.45
+    """Time from the throw to the arrival at the net: a long flight is a lob."""
 
 
 class Thrower(Model):
@@ -12,6 +21,8 @@ class Thrower(Model):
 
     on: bool = False
     """Whether this effect acts."""
+    scatter: NonNegative = 1.0
+    """Factor on every error below: 1 for a skilled person, 3 for a person without practice, 6 for a careless one (e)."""
     speed_error: NonNegative = 0.02
     """Relative error of the release speed. Skilled basketball players: 0.05 to 0.13 m/s of about 7 m/s (p: Slegers et al. 2021)."""
     direction_error_deg: NonNegative = 1.3

@@ -20,10 +20,10 @@ from companion.model.algebra import mat_vec, vec_mat
 from companion.model.rotors import RotorLayout
 from companion.model.types import Mat3, Vec3
 from companion.sitl_config.effects.downwash import Downwash as DownwashConfig
+from companion.sitl_config.world import World
 from sitl.world.effects.rotors import Thrusts
 from sitl.world.loads import EFFECT_PERIOD_S, Bodies
 from sitl.world.ornstein_uhlenbeck import OrnsteinUhlenbeck
-from sitl.world.state import PAYLOAD_RADIUS_M
 from sitl.world.views import mat3_of, vec3_of
 
 _NOISE = 14
@@ -100,13 +100,20 @@ class Downwash:
     Args:
         config: section `downwash`.
         rotor_radius_m: radius of a rotor.
+        payload_radius_m: radius of the payload.
         vehicle: vehicle file.
         bodies: the model of the scene; the wakes load the arm and the net of the machine, and the payload.
         seed: seed of the world.
     """
 
     def __init__(
-        self, config: DownwashConfig, rotor_radius_m: float, vehicle: Vehicle, bodies: Bodies, seed: int
+        self,
+        config: DownwashConfig,
+        rotor_radius_m: float,
+        payload_radius_m: float,
+        vehicle: Vehicle,
+        bodies: Bodies,
+        seed: int,
     ) -> None:
         model, data, self._loads, prefix = bodies
         self._cause = f"{prefix}downwash"
@@ -124,9 +131,9 @@ class Downwash:
             for body, (_, direction, length_m) in zip(indices, links, strict=True)
         )
         names = {model.body(k).name: k for k in range(model.nbody)}
-        payload_m2 = config.payload_drag_coefficient * math.pi * PAYLOAD_RADIUS_M**2
+        payload_m2 = config.payload_drag_coefficient * math.pi * payload_radius_m**2
         compact = [(f"{prefix}net", config.net_drag_area_m2, vehicle.tip_radius_m)] if vehicle.has_net else []
-        compact.append(("payload", payload_m2, PAYLOAD_RADIUS_M))
+        compact.append(("payload", payload_m2, payload_radius_m))
         self._compact = tuple(
             (names[name], data.xipos[names[name]], area_m2, radius_m / 2.0)
             for name, area_m2, radius_m in compact
@@ -135,11 +142,11 @@ class Downwash:
         self.restart_noise()
 
     @classmethod
-    def of(
-        cls, config: DownwashConfig, rotor_radius_m: float, vehicle: Vehicle, bodies: Bodies, seed: int
-    ) -> Downwash | None:
-        """Return the effect, or None if it is off."""
-        return cls(config, rotor_radius_m, vehicle, bodies, seed) if config.on else None
+    def of(cls, config: World, vehicle: Vehicle, bodies: Bodies) -> Downwash | None:
+        """Return the effect of a world's configuration, or None if it is off."""
+        if not config.downwash.on:
+            return None
+        return cls(config.downwash, config.rotors.radius_m, config.payload_radius_m, vehicle, bodies, config.seed)
 
     def restart_noise(self) -> None:
         """Restart the noise sequence."""

@@ -35,7 +35,7 @@ class Thrower:
 
     def prediction_error_s(self) -> float:
         """Draw the error in s of the lead time for which the thrower extrapolates the vehicle's motion in this throw."""
-        return self._config.prediction_error_s * float(self._rng.standard_normal())
+        return self._config.scatter * self._config.prediction_error_s * float(self._rng.standard_normal())
 
     def release(self, point_m: Vec3, velocity_m_s: Vec3, flight_s: float) -> tuple[Vec3, Vec3]:
         """Draw the release of a throw and return its point (m) and velocity (m/s), world frame.
@@ -45,14 +45,14 @@ class Thrower:
             velocity_m_s: intended release velocity.
             flight_s: time from the release to the arrival.
         """
-        config = self._config
-        scatter = [config.release_error_m * value for value in self._rng.standard_normal(3).tolist()]
+        config, factor = self._config, self._config.scatter
+        scatter = [factor * config.release_error_m * value for value in self._rng.standard_normal(3).tolist()]
         # From another point, with the same time of flight, to the same point of arrival.
         vx, vy, vz = (v - s / flight_s for v, s in zip(velocity_m_s, scatter, strict=True))
         faster, aside, up = self._rng.standard_normal(3).tolist()
         level = math.hypot(vx, vy)
-        speed = math.hypot(level, vz) * (1.0 + config.speed_error * faster)
-        error_rad = math.radians(config.direction_error_deg)
+        speed = math.hypot(level, vz) * (1.0 + factor * config.speed_error * faster)
+        error_rad = math.radians(factor * config.direction_error_deg)
         azimuth = math.atan2(vy, vx) + error_rad * aside * math.hypot(level, vz) / max(level, 0.1)
         elevation = math.atan2(vz, level) + error_rad * up
         level = speed * math.cos(elevation)

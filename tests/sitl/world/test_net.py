@@ -21,13 +21,13 @@ from sitl.fast.loop import FastFlight
 from sitl.world.effects.net import Bag
 from sitl.world.model import SECOND, SECOND_CATCH
 from sitl.world.payload import Ball
-from sitl.world.state import PAYLOAD_RADIUS_M, PHYSICS_DT_S
+from sitl.world.state import PHYSICS_DT_S
 from tests.sitl.plants import OneMachine, run
 from tests.sitl.test_throws import FIRST_MISSED, TO_AND_FRO
 from tests.support import SHORT_CATCH, tool_of
 
 Array = NDArray[np.float64]
-HOOP_M = 0.09
+HOOP_M, PAYLOAD_RADIUS_M = 0.09, 0.035
 CATCH_POSE = (math.radians(100), math.radians(60))
 
 

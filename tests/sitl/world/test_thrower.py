@@ -45,3 +45,11 @@ def test_the_arrival_scatters_as_speed_and_direction_do() -> None:
     assert np.std(error @ np.cross(along, aside)) == pytest.approx(math.radians(1.3) * path_m, rel=0.1)
     assert np.linalg.norm(error.mean(axis=0)) < 0.005
     assert np.std(points, axis=0) == pytest.approx([0.05] * 3, rel=0.1)
+
+
+def test_the_scatter_multiplies_every_error() -> None:
+    skilled, careless = (Thrower(ThrowerConfig(on=True, scatter=scatter), 1) for scatter in (1.0, 1e-3))
+    assert careless.prediction_error_s() == pytest.approx(1e-3 * skilled.prediction_error_s())
+    release, small = (np.array(thrower.release(POINT, VELOCITY, FLIGHT_S)) for thrower in (skilled, careless))
+    exact = np.array((POINT, VELOCITY))
+    assert np.abs(small - exact).max() < 2e-3 * np.abs(release - exact).max()

@@ -1,0 +1,359 @@
+"""Phase `intercept`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from enum import Enum
+from itertools import product
+from typing import Annotated, Any, ClassVar, Final, Literal
+
+from msgspec.structs import replace
+from pydantic import Field
+
+from companion.config.base import NonNegative, Positive3
+from companion.config.phase import Duration
+from companion.control.arm_model import manipulator_of
+from companion.control.manipulator import Manipulator
+from companion.mission.air import Air
+from companion.mission.phase import Checking, Phase, Planning
+from companion.model.codec import Record
+from companion.model.frames import quat_from_euler_zyx, quat_rotate
+from companion.model.types import Reference, SafetyAction, Severity, Vec3
+from companion.phases.intercept import ball
+from companion.phases.intercept.ball import Candidate, Point
+from companion.phases.intercept.meeting import LEAST_S, Bounds, Lag, Meeting, Motion, State, meeting, motion_to
+from companion.safety.governor import SafeSet
+from companion.safety.notices import EventDefinition
+
+MOVED_M: Final = 0.003
+"""A plan is made again when its predicted meeting point moves by more than this."""
+ASTRAY_M: Final = 0.3
+"""Distance from the planned meeting point beyond which a ball is another one."""
+STALE_S: Final = 0.3
+"""Time without a frame after which no ball is known any more."""
+HORIZON_S: Final = 1.5
+"""Longest time for which a ball's path is predicted."""
+BESIDE_S: Final = 0.5
+"""Time constant of the mean distance of the net from its reference, which is what the plan of a meeting adds to it."""
+BESIDE_MAX_M: Final = 0.1
+REST_S: Final = 1.0
+"""Time at rest after a meeting, before the way back."""
+BACK_M_S: Final = 0.3
+"""Largest speed of the way back."""
+BALL_M: Final = 0.05
+"""Distance from the rotor disks at which a ball passes them; it may be this large."""
+
+_NOMINAL: Final = SafetyAction.NOMINAL
+BALL_SEEN = EventDefinition("ball_seen", Severity.INFO, _NOMINAL, "a marker falls freely: it is a ball in flight")
+MEETING_PLANNED = EventDefinition(
+    "meeting_planned",
+    Severity.INFO,
+    _NOMINAL,
+    "the vehicle moves to meet a ball; the text gives the time and the distance",
+)
+BALL_OUT_OF_REACH = EventDefinition(
+    "ball_out_of_reach", Severity.INFO, _NOMINAL,
+    "a ball has passed that could not be met within the box and the limits; the text gives its distance from the net",
+)  # fmt: skip
+BALL_AT_ROTORS = EventDefinition(
+    "ball_at_rotors", Severity.WARNING, _NOMINAL, "a ball flies through the rotor disks: the vehicle stays where it is"
+)
+BALL_LOST = EventDefinition(
+    "ball_lost",
+    Severity.INFO,
+    _NOMINAL,
+    "a ball that was to be met is not seen any more, or does not fall: the vehicle stops",
+)
+NO_BALL = EventDefinition("no_ball", Severity.INFO, _NOMINAL, "no ball came within `wait_max_s`: the plan goes on")
+
+
+class Mode(Enum):
+    """What the vehicle does."""
+
+    WAIT = "wait"
+    CHASE = "chase"  # move to the meeting point
+    STOP = "stop"  # come to rest after the meeting, and stay
+    RETURN = "return"  # move back to where it waited
+
+    # An enum's own hash is a Python function.
+    __hash__ = object.__hash__
+
+
+class Interception(Record, frozen=True, kw_only=True):
+    """The state in the air."""
+
+    mode: Mode
+    begun_s: float
+    home: Reference
+    """The plan's reference, at rest."""
+    now: State
+    """Motion of the reference in this tick."""
+    lag: Lag = Lag()
+    """The reference's lagging acceleration."""
+    motion: Motion | None = None
+    """Motion that is flown; None while waiting, and before a stop is planned."""
+    candidates: tuple[Candidate, ...] = ()
+    frame_number: int = -1
+    beside_m: Vec3 = (0.0, 0.0, 0.0)
+    """Mean position of the net minus that of its reference."""
+    point: Point | None = None
+    """The ball at the meeting that was planned last."""
+    planned_s: float | None = None
+    """Flight clock when a meeting was planned for the first time."""
+    replans: int = 0
+    passing_m: float | None = None
+    """Smallest distance from the waiting net of the ball that is seen; None if none is seen."""
+    seen: bool = False
+    """Whether a ball was seen since the start."""
+    at_rotors: bool = False
+    """Whether the ball that is seen flies through the rotor disks."""
+
+
+class Intercept(Phase):
+    """Wait at rest for a ball, fly to where the net meets it, stop, and come back."""
+
+    acts: ClassVar[bool] = True
+
+    type: Literal["intercept"]
+    wait_max_s: Duration
+    """Longest time at rest before a ball is met. After it, the mission goes on."""
+    box_m: Positive3
+    """Half sizes of the box, about the position of the body's origin at the start, that the reference does not leave."""
+    drag_per_m: Annotated[NonNegative, Field(le=0.2)] = 0.01
+    """Drag of the ball: deceleration divided by the square of the speed, air density times drag coefficient times cross-section over
+    twice the mass. With a drag coefficient of 0.5 (a sphere, Achenbach 1972) it is 0.006 for 0.2 kg and 7 cm, and 0.018 for a tennis
+    ball."""
+
+    @property
+    def description(self) -> str:
+        """What the phase does, for a phase without a name."""
+        return "intercept a ball"
+
+    def plan(self, p: Planning) -> None:
+        """Append the longest time of waiting."""
+        p.builder.t_s += self.wait_max_s
+
+    def problems(self, c: Checking) -> Iterator[str]:
+        """Check the net and the room for the box."""
+        vehicle, home = c.vehicle, c.begin
+        if not vehicle.has_net:
+            yield f"intercepts a ball, but vehicle '{vehicle.name}' has no net; add tool to the vehicle file"
+            return
+        if vehicle.devices.mocap.ball is None:
+            yield f"follows a ball, but vehicle '{vehicle.name}' does not see one; add devices.mocap.ball to the vehicle file"
+        manipulator, safe = manipulator_of(vehicle), SafeSet(vehicle)
+        if (up := opening(manipulator, home)[2]) < 0.5:
+            yield f"waits with the net's opening {math.degrees(math.acos(up)):.0f} deg from upwards (limit 60 deg); unfold the arm"
+        low_m = home.position_world_m[2] - self.box_m[2] + net_m(manipulator, home)[2] - vehicle.tip_radius_m
+        if low_m < FLOOR_M:
+            yield f"may bring the net {low_m:.2f} m above the floor (minimum {FLOOR_M:g} m); lower box_m[2] or wait higher"
+        for corner in product((-1.0, 1.0), repeat=3):
+            px, py, pz = (p + s * b for p, s, b in zip(home.position_world_m, corner, self.box_m, strict=True))
+            beyond_m = max(safe.breach_walls_m((px, py, pz)), safe.breach_tether_m((px, py, pz))) + TRACKING_M
+            if beyond_m > 0.0:
+                yield (
+                    f"may move to ({px:.2f}, {py:.2f}, {pz:.2f}) m, {beyond_m:.2f} m beyond what room and tether allow with a margin "
+                    f"of {TRACKING_M:g} m; lower box_m or wait elsewhere"
+                )
+                return
+
+    def begin(self, air: Air) -> Interception:
+        """Return the state at the start."""
+        home = air.plan_reference()
+        return Interception(mode=Mode.WAIT, begun_s=air.t_s, home=home, now=State(*_motion(home)))
+
+    def step(self, air: Air, own: Any) -> Interception | None:
+        """Return the state after one tick; None when the vehicle is back, or no ball has come."""
+        air.stay(air.engaged)
+        s: Interception = own
+        frame = air.i.markers
+        new = frame is not None and frame.frame_number != s.frame_number
+        if frame is not None and new:
+            s = replace(
+                s, candidates=ball.followed(s.candidates, frame, self.drag_per_m), frame_number=frame.frame_number
+            )
+        elif s.candidates and air.t_s - s.candidates[0].t_s > STALE_S:
+            s = replace(s, candidates=())
+        if s.motion is not None:
+            now = s.motion.at(air.t_s)
+            s = replace(s, now=now, lag=s.lag.after(air.dt_s, now.acceleration_m_s2))
+        if s.mode is Mode.WAIT:
+            return self._waited(air, s, new)
+        if s.mode is Mode.CHASE:
+            return self._chased(air, s, new)
+        if s.motion is None:
+            return replace(s, motion=self._bounds(air, s).stop(air.t_s, s.now))
+        if s.mode is Mode.STOP and air.t_s >= s.motion.end_s + REST_S:
+            away_m = math.dist(s.now.position_m, s.home.position_world_m)
+            back_s = max(1.0, 1.875 * away_m / BACK_M_S)
+            back = motion_to(air.t_s, s.now, back_s, s.home.position_world_m)
+            return replace(s, mode=Mode.RETURN, motion=back)
+        if s.mode is Mode.RETURN and air.t_s >= s.motion.end_s:
+            return None
+        return s
+
+    def leave(self, own: Any, t_s: float) -> Interception | None:
+        """Return the state that stops a chase; None while waiting."""
+        s: Interception = own
+        if s.mode is Mode.WAIT:
+            return None
+        return replace(s, mode=Mode.STOP, motion=None) if s.mode is Mode.CHASE else s
+
+    def reference(self, reference: Reference, own: Any) -> Reference:
+        """Return the reference of the state."""
+        s: Interception = own
+        if s.mode is Mode.WAIT:
+            return reference
+        return replace(
+            reference,
+            position_world_m=s.now.position_m,
+            velocity_world_m_s=s.now.velocity_m_s,
+            acceleration_world_m_s2=s.now.acceleration_m_s2,
+            jerk_world_m_s3=s.now.jerk_m_s3,
+        )
+
+    def _waited(self, air: Air, s: Interception, new: bool) -> Interception | None:
+        if air.t_s - s.begun_s >= self.wait_max_s:
+            if not s.seen:
+                air.report(NO_BALL, f"no ball within {self.wait_max_s:g} s; the plan goes on")
+            return None
+        s = replace(s, beside_m=_beside(air, s))
+        balls = [candidate for candidate in s.candidates if candidate.is_ball]
+        if not balls:
+            if s.passing_m is not None and not s.at_rotors:
+                air.report(
+                    BALL_OUT_OF_REACH, f"a ball passes {s.passing_m:.2f} m from the waiting net; it cannot be met"
+                )
+            return s if s.passing_m is None else replace(s, passing_m=None, at_rotors=False)
+        if not new or not air.nominal or not air.o.airborne:
+            return s
+        for candidate in balls:
+            path = self._path(air, s, candidate)
+            if s.passing_m is None:
+                x, y, z = candidate.position_m
+                air.report(BALL_SEEN, f"a ball flies at ({x:.2f}, {y:.2f}, {z:.2f}) m")
+            s = replace(
+                s, passing_m=min([s.passing_m or math.inf, *[math.dist(p.position_m, self._net(air, s)) for p in path]])
+            )
+            if self._clears(air, path, None):
+                if (met := self._meeting(air, s, path, None)) is not None:
+                    left_s, to = met.point.t_s - air.t_s, met.motion.at(met.point.t_s).position_m
+                    away_m = math.dist(to, s.home.position_world_m)
+                    air.report(
+                        MEETING_PLANNED,
+                        f"meets the ball in {left_s:.2f} s, {away_m:.2f} m from where the vehicle waits",
+                    )
+                    return replace(s, mode=Mode.CHASE, motion=met.motion, point=met.point, planned_s=air.t_s)
+            elif not s.at_rotors:
+                air.report(BALL_AT_ROTORS, "a ball flies through the rotor disks; the vehicle stays where it is")
+                s = replace(s, at_rotors=True)
+        return s
+
+    def _chased(self, air: Air, s: Interception, new: bool) -> Interception:
+        assert s.point is not None and s.motion is not None
+        if air.t_s >= s.point.t_s:
+            return replace(s, mode=Mode.STOP, motion=self._bounds(air, s).stop(air.t_s, s.now))
+        if not new or s.point.t_s - air.t_s < LEAST_S:
+            return s
+        at, point = ASTRAY_M, None
+        for candidate in s.candidates:
+            if candidate.is_ball:
+                p = ball.predicted(candidate, s.point.t_s, self.drag_per_m)
+                if math.dist(p.position_m, s.point.position_m) < at:
+                    at, point, chased = math.dist(p.position_m, s.point.position_m), p, candidate
+        if point is None or not air.nominal:
+            air.report(BALL_LOST, "the ball that was to be met is lost; stopping")
+            return replace(s, mode=Mode.STOP, motion=None)
+        if at <= MOVED_M:
+            return s
+        met = self._meeting(air, s, self._path(air, s, chased), s.point.t_s)
+        if met is None:
+            return s
+        return replace(s, motion=met.motion, point=met.point, replans=s.replans + 1)
+
+    def _path(self, air: Air, s: Interception, candidate: Candidate) -> list[Point]:
+        floor_m = self._net(air, s)[2] - self.box_m[2]
+        return ball.path(candidate, air.t_s + HORIZON_S, floor_m, self.drag_per_m)
+
+    def _net(self, air: Air, s: Interception) -> Vec3:
+        """Return the waiting net's centre, world frame."""
+        (x, y, z), (bx, by, bz), (px, py, pz) = net_m(air.manipulator, s.home), s.beside_m, s.home.position_world_m
+        return (px + x + bx, py + y + by, pz + z + bz)
+
+    def _bounds(self, air: Air, s: Interception) -> Bounds:
+        return Bounds(air.vehicle, air.limits, air.safe, s.home.position_world_m, self.box_m)
+
+    def _meeting(self, air: Air, s: Interception, path: list[Point], kept_s: float | None) -> Meeting | None:
+        (x, y, z), (bx, by, bz) = net_m(air.manipulator, s.home), s.beside_m
+        return meeting(
+            air.t_s,
+            s.now,
+            s.lag,
+            path,
+            (x + bx, y + by, z + bz),
+            opening(air.manipulator, s.home),
+            self._bounds(air, s),
+            lambda motion: self._clears(air, path, motion),
+            kept_s,
+        )
+
+    def _clears(self, air: Air, path: list[Point], motion: Motion | None) -> bool:
+        """Return whether a ball flies clear of the rotor disks before it is met; without a motion, those of the waiting vehicle."""
+        airframe, home = air.vehicle.airframe, air.plan_reference().position_world_m
+        for point in path:
+            if motion is not None and point.t_s >= motion.end_s:
+                return True
+            x, y, z = home if motion is None else motion.at(point.t_s).position_m
+            px, py, pz = point.position_m
+            near_m = BALL_M + 0.5 * ball.STEP_S * abs(point.velocity_m_s[2])
+            if (
+                abs(pz - z - airframe.rotor_height_m) < near_m
+                and math.hypot(px - x, py - y) < airframe.radius_m + BALL_M
+            ):
+                return False
+        return True
+
+
+FLOOR_M: Final = 0.1
+"""Smallest height of the net above the floor in the box."""
+TRACKING_M: Final = 0.1
+"""Distance from the limits of room and tether in the box."""
+
+
+def net_m(manipulator: Manipulator, reference: Reference) -> Vec3:
+    """Return the net's centre relative to the body's origin of the level vehicle, world frame."""
+    return quat_rotate(quat_from_euler_zyx(0.0, 0.0, reference.yaw_rad), manipulator.net_body_m(reference.arm_rad))
+
+
+def opening(manipulator: Manipulator, reference: Reference) -> Vec3:
+    """Return the unit vector out of the net's opening of the level vehicle, world frame: across the last link, upwards if that points
+    forwards.
+    """
+    (x, y, z), (jx, jy, jz) = (
+        manipulator.net_body_m(reference.arm_rad),
+        manipulator.joints_body_m(reference.arm_rad)[-1],
+    )
+    lx, ly, lz = x - jx, y - jy, z - jz
+    length = math.sqrt(lx * lx + ly * ly + lz * lz)
+    lx, ly, lz = lx / length, ly / length, lz / length
+    up = math.copysign(math.sqrt(max(1e-9, 1.0 - lz * lz)), lx)
+    return quat_rotate(quat_from_euler_zyx(0.0, 0.0, reference.yaw_rad), (-lz * lx / up, -lz * ly / up, up))
+
+
+def _beside(air: Air, s: Interception) -> Vec3:
+    """Return the mean position of the net minus that of its reference, after one more tick at rest."""
+    tip = air.tip_world_m()
+    if tip is None:
+        return s.beside_m
+    (px, py, pz), (x, y, z), share = s.home.position_world_m, net_m(air.manipulator, s.home), air.dt_s / BESIDE_S
+    found = [
+        before + share * (at - p - n - before)
+        for before, at, p, n in zip(s.beside_m, tip, (px, py, pz), (x, y, z), strict=True)
+    ]
+    bx, by, bz = (max(-BESIDE_MAX_M, min(BESIDE_MAX_M, value)) for value in found)
+    return (bx, by, bz)
+
+
+def _motion(r: Reference) -> tuple[Vec3, Vec3, Vec3]:
+    return r.position_world_m, r.velocity_world_m_s, r.acceleration_world_m_s2

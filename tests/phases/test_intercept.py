@@ -1,0 +1,384 @@
+"""Interception of a ball: which marker is one, where it goes, and that no plan to meet it leaves a limit."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from companion.config.loader import load_flight
+from companion.control.arm_model import manipulator_of
+from companion.mission.air import Air, Observation
+from companion.mission.check import check_mission
+from companion.mission.phase import phases_of
+from companion.mission.plan import Plan
+from companion.mission.segments import Segment
+from companion.model.constants import GRAVITY_M_S2, TICK_PERIOD_S
+from companion.model.markers import Marker, MarkerFrame
+from companion.model.types import Inputs, OperatorCommand, Reference, Vec3
+from companion.phases.intercept import ball
+from companion.phases.intercept.ball import Candidate
+from companion.phases.intercept.meeting import (
+    FOLLOWS_S,
+    RISES_S,
+    SWING_S2_M,
+    Bounds,
+    Lag,
+    State,
+    meeting,
+    shift_of_net,
+)
+from companion.phases.intercept.phase import Intercept, Interception, Mode, net_m, opening
+from companion.safety.governor import SafeSet
+from companion.safety.notices import EventDefinition
+from companion.safety.stop import StopModel
+
+CONFIG = load_flight("configs/missions/intercept.yaml")
+PLAN = Plan.build(CONFIG.mission, CONFIG.vehicle)
+PHASES = phases_of(CONFIG.mission)
+PHASE = next(phase for phase in PHASES if isinstance(phase, Intercept))
+SEGMENT = next(segment for segment in PLAN.segments if PHASES[segment.index] is PHASE)
+HOME = PLAN.reference(SEGMENT.start_s)
+MANIPULATOR, SAFE, LIMITS = manipulator_of(CONFIG.vehicle), SafeSet(CONFIG.vehicle), CONFIG.mission.limits
+NET_M = net_m(MANIPULATOR, HOME)
+NET_WORLD_M: Vec3 = tuple(a + b for a, b in zip(HOME.position_world_m, NET_M, strict=True))  # type: ignore[assignment]
+OPENING = opening(MANIPULATOR, HOME)
+BOUNDS = Bounds(CONFIG.vehicle, LIMITS, SAFE, HOME.position_world_m, PHASE.box_m)
+DRAG_PER_M = PHASE.drag_per_m
+NOISE_M = 0.001
+Where = Callable[[float], Vec3 | None]
+
+
+def flight(to_m: Vec3, arrival_m_s: Vec3, arrival_s: float, drag_per_m: float = DRAG_PER_M) -> Where:
+    """The path of a ball that arrives at a point with a velocity, integrated backwards in steps of 0.5 ms."""
+    h, path = -0.0005, [to_m]
+    p, v = list(to_m), list(arrival_m_s)
+    while arrival_s + h * (len(path) - 1) > 0.0:
+        speed = math.hypot(*v)
+        a = [-drag_per_m * speed * x for x in v]
+        a[2] -= GRAVITY_M_S2
+        p = [x + h * (u + 0.5 * h * w) for x, u, w in zip(p, v, a, strict=True)]
+        v = [u + h * w for u, w in zip(v, a, strict=True)]
+        path.append((p[0], p[1], p[2]))
+
+    def where(t_s: float) -> Vec3 | None:
+        number = round((arrival_s - t_s) / -h)
+        return path[number] if 0 <= number < len(path) else None
+
+    return where
+
+
+def frames(
+    places: Sequence[Where], until_s: float, seed: int = 1, lost: Callable[[float], bool] = lambda t_s: False
+) -> Iterator[MarkerFrame]:
+    """Frames at 200 Hz in which the markers come in any order, with noise, and 3 % of them are not seen."""
+    draw = random.Random(seed)
+    for number in range(round(until_s * 200.0)):
+        t_s = number * TICK_PERIOD_S
+        seen = [where(t_s) for where in places]
+        markers = [
+            Marker((x + draw.gauss(0.0, NOISE_M), y + draw.gauss(0.0, NOISE_M), z + draw.gauss(0.0, NOISE_M)))
+            for x, y, z in (at for at in seen if at is not None)
+            if draw.random() > 0.03 and not lost(t_s)
+        ]
+        draw.shuffle(markers)
+        yield MarkerFrame(stamp_s=t_s + 0.004, exposed_s=t_s, frame_number=number, markers=tuple(markers))
+
+
+def followed(seen: Iterator[MarkerFrame]) -> Iterator[tuple[float, tuple[Candidate, ...]]]:
+    candidates: tuple[Candidate, ...] = ()
+    for frame in seen:
+        candidates = ball.followed(candidates, frame, DRAG_PER_M)
+        yield frame.exposed_s, candidates
+
+
+def still(at_m: Vec3) -> Where:
+    return lambda t_s: at_m
+
+
+def flickering(draw: random.Random) -> Where:
+    """A reflection that is seen at another place in every 40 ms."""
+    places = [(draw.uniform(-2.0, 2.0), draw.uniform(-2.0, 2.0), draw.uniform(0.0, 2.0)) for _ in range(100)]
+    return lambda t_s: places[int(t_s / 0.04)] if int(t_s / 0.02) % 2 else None
+
+
+def swung(t_s: float) -> Vec3:
+    """A marker wand on a vertical circle of 0.4 m, one turn per second."""
+    angle = 2.0 * math.pi * t_s
+    return (1.0 + 0.4 * math.cos(angle), 0.3, 1.0 + 0.4 * math.sin(angle))
+
+
+THROWN = flight(NET_WORLD_M, (-3.0, 0.3, -2.0), 0.6)
+
+
+def test_a_ball_is_found_among_reflections_within_0_12_s_and_nothing_else_is_one() -> None:
+    others = [still((1.8, -1.5, 0.05)), flickering(random.Random(3)), flickering(random.Random(4))]
+    found: dict[str, float] = {}
+    for t_s, candidates in followed(frames([THROWN, *others], 0.55)):
+        for candidate in candidates:
+            if candidate.is_ball:
+                at = THROWN(t_s)
+                assert at is not None
+                assert math.dist(candidate.position_m, at) < 0.02, "a reflection is taken for a ball"
+                found.setdefault("first_s", t_s)
+    assert found["first_s"] < 0.12
+
+
+def test_a_marker_that_does_not_fall_is_no_ball() -> None:
+    for where in (still((0.5, 0.2, 0.7)), swung, lambda t_s: (2.0 - 2.0 * t_s, 0.1, 0.8)):
+        frames_of_a_ball = [
+            t_s for t_s, cs in followed(frames([where], 4.0 if where is swung else 0.9)) if any(c.is_ball for c in cs)
+        ]
+        assert frames_of_a_ball == []
+
+
+@pytest.mark.parametrize(("before_s", "limit_m"), [(0.1, 0.01), (0.2, 0.02), (0.3, 0.04)])
+@pytest.mark.parametrize("drag_per_m", [0.0, 0.006, 0.018])
+def test_the_arrival_is_predicted_although_the_drag_is_not_known(
+    before_s: float, limit_m: float, drag_per_m: float
+) -> None:
+    errors_m = []
+    for seed in range(10):
+        where = flight(NET_WORLD_M, (-3.0, 0.3, -2.0), 0.6, drag_per_m)
+        for t_s, candidates in followed(frames([where], 0.6 - before_s, seed)):
+            last = (t_s, candidates)
+        (thrown,) = [candidate for candidate in last[1] if candidate.is_ball]
+        point = ball.predicted(thrown, 0.6, DRAG_PER_M)
+        errors_m.append(math.dist(point.position_m, NET_WORLD_M))
+        assert errors_m[-1] < 6.0 * point.sigma_m, "the covariance promises more"
+    assert sorted(errors_m)[8] < limit_m
+
+
+def test_a_ball_is_found_again_after_50_ms_without_frames() -> None:
+    is_lost = lambda t_s: 0.2 <= t_s < 0.25  # noqa: E731
+    seen = {t_s: any(c.is_ball for c in cs) for t_s, cs in followed(frames([THROWN], 0.5, lost=is_lost))}
+    assert all(ball_is_seen for t_s, ball_is_seen in seen.items() if t_s > 0.12)
+
+
+def test_the_net_is_where_the_plan_wants_it_if_body_and_tilt_follow_as_assumed() -> None:
+    shift, duration_s, drop_m, steps = (0.05, -0.12, 0.1), 0.4, 0.35, 4000
+    motion = shift_of_net(
+        0.0, State((0.0, 0.0, 1.0), (0.1, 0.0, -0.1), (0.3, 0.2, 0.0)), Lag(), duration_s, drop_m, shift
+    )
+    lag = Lag()
+    for k in range(steps):
+        lag = lag.after(duration_s / steps, motion.at((k + 0.5) * duration_s / steps).acceleration_m_s2)
+    end = motion.at(duration_s)
+    for k in range(2):
+        swing_m = SWING_S2_M * drop_m * lag.second_m_s2[k]
+        assert end.position_m[k] - FOLLOWS_S * end.velocity_m_s[k] - swing_m == pytest.approx(shift[k], abs=1e-3)
+    assert end.position_m[2] - 1.0 - RISES_S * end.velocity_m_s[2] == pytest.approx(shift[2], abs=1e-9)
+
+
+def throws(count: int, seed: int) -> Iterator[tuple[list[ball.Point], Where, float]]:
+    """Predicted paths of random throws: around the net, from all sides, 0.2 to 0.7 s before their arrival."""
+    draw = random.Random(seed)
+    for _ in range(count):
+        azimuth, speed = draw.uniform(-math.pi, math.pi), draw.uniform(0.5, 4.5)
+        arrival: Vec3 = (-speed * math.cos(azimuth), -speed * math.sin(azimuth), -draw.uniform(0.3, 3.0))
+        x, y, z = NET_WORLD_M
+        to_m = (x + draw.gauss(0.0, 0.12), y + draw.gauss(0.0, 0.12), z + draw.gauss(0.0, 0.12))
+        left_s = draw.uniform(0.2, 0.7)
+        where = flight(to_m, arrival, left_s)
+        start, after = where(0.0), where(0.001)
+        assert start is not None and after is not None
+        velocity = tuple((b - a) / 0.001 for a, b in zip(start, after, strict=True))
+        begun = replace(ball.begun(0.0, start), velocity_m_s=velocity, vv=1e-6, bb=1.0, falls=ball.FALLS_FRAMES)
+        yield ball.path(begun, 1.5, 0.1, DRAG_PER_M), where, left_s
+
+
+def test_no_plan_to_meet_one_of_400_balls_leaves_a_limit() -> None:
+    stops, draw, found = StopModel(CONFIG.vehicle.safety), random.Random(5), 0
+    airframe = CONFIG.vehicle.airframe
+    most_m_s2 = LIMITS.thrust_share_max * airframe.thrust_max_n / (airframe.mass_kg + airframe.payload_max_kg)
+    now: State = State(HOME.position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    for path, _, _ in throws(400, 6):
+        met = meeting(0.0, now, Lag(), path, NET_M, OPENING, BOUNDS, lambda _: True, None)
+        now = State(HOME.position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        if met is None:
+            continue
+        found += 1
+        end_s = met.motion.end_s
+        stop = BOUNDS.stop(end_s, met.motion.at(end_s))
+        for motion in (met.motion, stop):
+            for k in range(51):
+                s = motion.at(motion.start_s + motion.duration_s * k / 50)
+                (ax, ay, az), speed = s.acceleration_m_s2, math.hypot(*s.velocity_m_s)
+                assert speed <= LIMITS.speed_max_m_s and math.hypot(ax, ay, az) <= LIMITS.acceleration_max_m_s2
+                assert math.hypot(*s.jerk_m_s3) <= LIMITS.jerk_max_m_s3
+                assert math.degrees(math.atan2(math.hypot(ax, ay), az + GRAVITY_M_S2)) <= airframe.tilt_max_deg
+                assert math.hypot(ax, ay, az + GRAVITY_M_S2) <= most_m_s2
+                assert all(
+                    abs(p - h) <= b for p, h, b in zip(s.position_m, HOME.position_world_m, PHASE.box_m, strict=True)
+                )
+                place = tuple(p + stops.time_s(speed) * v for p, v in zip(s.position_m, s.velocity_m_s, strict=True))
+                assert SAFE.holds(s.position_m) and SAFE.holds((place[0], place[1], place[2]))
+        assert math.hypot(*stop.at(stop.end_s).velocity_m_s) < 1e-9, "at rest after the stop"
+        now = met.motion.at(draw.uniform(0.1, 0.9) * end_s)  # the next ball comes while the vehicle moves
+    assert found > 100, "too few balls are met to judge"
+
+
+class Tick(Air):
+    """A tick of the phase that records what it reports."""
+
+    def __init__(self, t_s: float, frame: MarkerFrame | None, nominal: bool, reports: list[tuple[str, str]]) -> None:
+        i = Inputs(tick=round(t_s * 200), t_s=t_s, command=OperatorCommand.NONE, recorder_dropped=0, markers=frame)
+        o = Observation(
+            inputs=i, airborne=True, armed_by_others=False, standing=None, reference=HOME, tether=None, thrust_share=1.0,
+            pose_s=t_s, dt_s=TICK_PERIOD_S, force_world_n=None, disturbance_world_n=None, position_error_m=(0.0, 0.0, 0.0),
+            yaw_error_rad=0.0,
+        )  # fmt: skip
+        super().__init__(o, CONFIG.vehicle, MANIPULATOR, PHASES, SEGMENT, SEGMENT, LIMITS, SAFE, nominal)
+        self._reports = reports
+
+    def plan_reference(self) -> Reference:
+        return HOME
+
+    def report(self, notice: EventDefinition, text: str) -> None:
+        self._reports.append((notice.id, text))
+
+    def stay(self, segment: Segment) -> None:
+        pass
+
+
+class Flown:
+    """What the phase did with some frames."""
+
+    def __init__(
+        self, seen: Iterator[MarkerFrame], until_s: float, *, nominal: bool = True, hold_s: float = math.inf
+    ) -> None:
+        self.reports: list[tuple[str, str]] = []
+        self.states: list[Interception] = []
+        self.references: list[Reference] = []
+        waiting = {frame.frame_number + 1: frame for frame in seen}
+        frame: MarkerFrame | None = None
+        state: Any = PHASE.begin(Tick(0.0, None, nominal, self.reports))
+        for number in range(1, round(until_s * 200.0)):
+            frame = waiting.get(number, frame)
+            t_s = number * TICK_PERIOD_S
+            if t_s >= hold_s:
+                state, hold_s = PHASE.leave(state, t_s), math.inf
+            state = None if state is None else PHASE.step(Tick(t_s, frame, nominal, self.reports), state)
+            if state is None:
+                break
+            self.states.append(state)
+            self.references.append(PHASE.reference(HOME, state))
+        self.over = state is None
+        self.ids = [name for name, _ in self.reports]
+        self.farthest_m = max(math.dist(r.position_world_m, HOME.position_world_m) for r in self.references)
+
+
+def beside(right_m: float, up_m: float) -> Vec3:
+    x, y, z = NET_WORLD_M
+    return (x, y + right_m, z + up_m)
+
+
+MEETABLE = flight(beside(0.0, 0.08), (-3.0, 0.0, -1.5), 0.6)
+
+
+def test_the_vehicle_meets_a_ball_comes_to_rest_and_returns() -> None:
+    flown = Flown(frames([MEETABLE], 0.6), 12.0)
+    assert flown.ids == ["ball_seen", "meeting_planned"] and flown.over
+    assert {state.mode for state in flown.states} == set(Mode)
+    at_meeting = next(s for s in flown.states if s.mode is Mode.STOP)
+    assert at_meeting.now.position_m[2] > HOME.position_world_m[2] + 0.05 and at_meeting.replans > 0
+    assert math.dist(flown.references[-1].position_world_m, HOME.position_world_m) < 1e-3
+    steps_m = [
+        math.dist(a.position_world_m, b.position_world_m)
+        for a, b in zip(flown.references, flown.references[1:], strict=False)
+    ]
+    assert max(steps_m) <= LIMITS.speed_max_m_s * TICK_PERIOD_S * 1.01, "the reference jumps"
+    turns = [
+        math.dist(a.velocity_world_m_s, b.velocity_world_m_s) / TICK_PERIOD_S
+        for a, b in zip(flown.references, flown.references[1:], strict=False)
+    ]
+    assert max(turns) <= LIMITS.acceleration_max_m_s2 * 1.01, "the reference's velocity jumps"
+
+
+@pytest.mark.parametrize(
+    "places",
+    [
+        [still((0.6, 0.1, 0.8)), flickering(random.Random(3)), flickering(random.Random(8))],
+        [swung, lambda t_s: (swung(t_s)[0], 0.35, swung(t_s)[2] + 0.3)],
+        [],
+    ],
+    ids=["reflections", "wand", "nothing"],
+)
+def test_without_a_ball_the_vehicle_stays_and_goes_on_with_one_event(places: list[Where]) -> None:
+    flown = Flown(frames(places, 4.0), PHASE.wait_max_s + 1.0)
+    assert flown.ids == ["no_ball"] and flown.over and flown.farthest_m == 0.0
+
+
+def test_a_ball_out_of_reach_is_not_chased_and_one_event_tells_how_far() -> None:
+    flown = Flown(frames([flight(beside(0.9, 0.0), (-3.0, 0.0, -2.0), 0.6)], 0.7), 2.0)
+    assert flown.ids == ["ball_seen", "ball_out_of_reach"] and flown.farthest_m == 0.0
+    assert 0.7 < float(flown.reports[1][1].split()[3]) < 1.0
+
+
+def test_a_second_ball_is_never_chased() -> None:
+    other = flight(beside(-0.12, 0.08), (-3.0, 0.0, -1.5), 0.6)
+    both = Flown(frames([MEETABLE, other], 0.6), 6.0)
+    assert both.ids.count("meeting_planned") == 1
+    points = [state.point.position_m for state in both.states if state.mode is Mode.CHASE and state.point is not None]
+    assert max(math.dist(points[0], point) for point in points) < 0.08, "the vehicle turns to the other ball"
+
+
+def test_a_ball_at_the_rotors_makes_the_vehicle_stay() -> None:
+    x, y, z = HOME.position_world_m
+    flown = Flown(frames([flight((x + 0.2, y, z + 0.05), (-1.0, 0.0, -3.0), 0.6)], 0.6), 2.0)
+    assert "ball_at_rotors" in flown.ids and flown.farthest_m == 0.0
+
+
+def test_frames_lost_for_50_ms_do_not_end_a_chase() -> None:
+    flown = Flown(frames([MEETABLE], 0.6, lost=lambda t_s: 0.3 <= t_s < 0.35), 12.0)
+    assert flown.ids == ["ball_seen", "meeting_planned"] and flown.over
+
+
+def test_a_ball_that_leaves_its_path_is_not_chased_any_further() -> None:
+    def stopped(t_s: float) -> Vec3 | None:  # somebody else catches it
+        return slow(min(t_s, 0.3))
+
+    slow = flight(beside(0.0, 0.08), (-3.0, 0.0, -1.5), 0.9)
+
+    flown = Flown(frames([stopped], 2.0), 12.0)
+    assert flown.ids[:2] == ["ball_seen", "meeting_planned"] and "ball_lost" in flown.ids and flown.over
+    assert flown.farthest_m < 0.15
+
+
+def test_above_nominal_nothing_is_chased() -> None:
+    assert Flown(frames([MEETABLE], 0.6), 2.0, nominal=False).farthest_m == 0.0
+
+
+def test_a_hold_during_a_chase_brings_the_vehicle_to_rest_and_back() -> None:
+    flown = Flown(frames([MEETABLE], 0.6), 12.0, hold_s=0.35)
+    assert flown.over and 0.0 < flown.farthest_m < 0.2
+    assert math.dist(flown.references[-1].position_world_m, HOME.position_world_m) < 1e-3
+
+
+def test_the_same_inputs_give_the_same_states() -> None:
+    places = [MEETABLE, flickering(random.Random(3)), swung]
+    first, second = (Flown(frames(places, 0.8), 6.0) for _ in range(2))
+    assert first.states == second.states and first.reports == second.reports
+
+
+def test_without_sight_of_the_ball_with_a_box_beyond_the_tether_or_a_closed_net_the_mission_is_refused() -> None:
+    def found(*overrides: str) -> str:
+        config = load_flight("configs/missions/intercept.yaml", overrides=overrides)
+        return " ".join(check_mission(config.mission, config.vehicle))
+
+    assert found() == ""
+    assert "does not see one; add devices.mocap.ball" in found("vehicle.devices.mocap.ball=null")
+    assert "beyond what room and tether allow" in found("mission.phases[3].box_m=[0.5, 1.2, 0.35]")
+    assert "above the floor" in found("mission.phases[3].box_m=[0.5, 0.5, 0.7]")
+    assert "from upwards (limit 60 deg)" in found("mission.phases[2].arm_deg=[160.0, 20.0]")
+
+
+def test_the_vehicle_of_the_mission_differs_only_by_the_sight_of_the_ball() -> None:
+    config = load_flight("configs/missions/catch.yaml")
+    mocap = config.vehicle.devices.mocap.model_copy(update={"ball": CONFIG.vehicle.devices.mocap.ball})
+    devices = config.vehicle.devices.model_copy(update={"mocap": mocap})
+    assert config.vehicle.model_copy(update={"devices": devices, "name": CONFIG.vehicle.name}) == CONFIG.vehicle
