@@ -48,11 +48,14 @@ def refusing(rows: dict[str, dict[str, Any]]) -> set[str]:
 
 
 def test_a_sound_world_may_fly_and_every_row_is_reported(sandbox: Sandbox) -> None:
-    ended = sandbox.run("check", CATCH, "--sitl", "--json")
+    reflection = "world.markers={on: true, stray_per_s: 0, fixed_m: [[2.0, 1.0, 0.03], [1.0, 1.0, 9.0]]}"
+    ball = ("--set", "vehicle.devices.mocap.ball={kind: marker}", reflection)
+    ended = sandbox.run("check", CATCH, "--sitl", "--json", *ball)
     sandbox.assert_nobody_left()
     assert (ended.code, ended.err) == (EXIT_OK, ""), ended
     rows = rows_in(ended.out)
     assert not refusing(rows)
+    assert rows["mocap.ball"]["read"] == "2 to 2 single markers, 1 to 1 of them in the room"
     # The simulated world has no port TELEM2, and nobody moves it by hand.
     params = {f"px4.param.{one.name}" for one in required.WANTED if not one.hardware and has(one.name, (1, 16))}
     assert set(rows) == {check.id for check in evaluation.CHECKS} - {frames.HAND_TEST.id} | {"px4.firmware"} | params
