@@ -75,9 +75,11 @@ def test_every_setting_is_read_by_the_simulated_world(monkeypatch: pytest.Monkey
     catch = overrides(
         push=push, servos=[{}, {}], throws=2, keep_s=0.2, faults=[gust, servo], seed=7, catch_at_m=[0.2, 0.0]
     )
+    people = [{"from_m": [0.2, 1.0, 0.5], "flight_s": 0.5}]
+    waiting = overrides(throw_to="hovering", people=people, catch_at_m=[-1.0, 0.0], payload_kg=0.2)
     handled = overrides(handling=True, handling_t_s=0.0, handling_taps=1, net_weight_kg=0.5, net_weight_t_s=0.4)
     flights = [
-        (load_sitl(SHORT_CATCH, overrides=[*on, *catch]), 8.3),
+        (load_sitl(SHORT_CATCH, overrides=[*on, *catch, "vehicle.devices.mocap.ball={kind: marker}"]), 8.3),
         (
             load_sitl(
                 HOVER, vehicle_path="tarot650_2r_rod", overrides=overrides(surfaces=[{**PLATE, "gives_way_n": 8.0}])
@@ -85,6 +87,7 @@ def test_every_setting_is_read_by_the_simulated_world(monkeypatch: pytest.Monkey
             0.6,
         ),
         (load_sitl(HOVER, overrides=handled), 0.6),
+        (load_sitl(HOVER, overrides=waiting), 9.5),
     ]
     read: set[str] = set()
 
