@@ -33,7 +33,7 @@ EFFECTS = {
     "downwash": ("downwash",),
     "slack tether": ("tether_line",),
     "IMU": ("imu",),
-    "motion capture": ("mocap",),
+    "motion capture": ("mocap", "markers"),
     "net": ("net",),
     "thrower": ("thrower",),
     "rotors": ("rotors",),

@@ -37,7 +37,7 @@ class TunedGain:
 
     @property
     def place(self) -> slice:
-        """Return the place of the values in a list."""
+        """Return the slice of the list that holds the values."""
         return slice(*self.rows)
 
 

@@ -226,7 +226,7 @@ class ArmState(Record, frozen=True, kw_only=True):
 
     @property
     def measured_s(self) -> float:
-        """Flight clock at which the joints were where this state says: the servos measure when they are asked."""
+        """Flight clock at which the joint state was measured: the servos measure when the read begins."""
         return self.stamp_s if self.asked_s is None else self.asked_s
 
 

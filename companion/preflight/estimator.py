@@ -75,7 +75,7 @@ KILL_SWITCH = Check(
     "px4.kill_switch",
     "kill switch",
     "released; mapped to a channel (`RC_MAP_KILL_SW`) of a radio that PX4 receives, unless `COM_RC_IN_MODE` is 4",
-    "nobody could stop the rotors at once",
+    "the pilot could not stop the rotors at once",
 )
 HOVER = Check(
     "px4.hover_thrust",

@@ -101,5 +101,5 @@ def _room(position: Vec3, room: Room, radius_m: float) -> Row:
     if inside:
         return ROOM.good(read, wanted)
     return ROOM.bad(
-        read, f"{wanted}, rotors ({radius_m:g} m) included", "move the vehicle further inside, or correct room"
+        read, f"{wanted}, with rotors ({radius_m:g} m) inside", "move the vehicle further inside, or correct room"
     )

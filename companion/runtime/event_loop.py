@@ -136,7 +136,7 @@ def real_time() -> Iterator[None]:
 
 
 def process_loop() -> asyncio.AbstractEventLoop:
-    """Return an event loop for the time that this process lives in."""
+    """Return an event loop in simulated time if this process has it, else in real time."""
     simulated = simulated_time.current()
     return fine_loop() if simulated is None else SimulatedLoop(simulated)
 

@@ -71,7 +71,7 @@ TAKEOFF = EventDefinition("takeoff", _INFO, _NOMINAL, "the plan begins")
 CATCH = EventDefinition("catch", _INFO, _NOMINAL, "a payload was caught")
 PAYLOAD_LEFT = EventDefinition(
     "payload_left", _INFO, _NOMINAL,
-    "no pull on the net for 0.5 s without free fall: the net is empty and ready for the next catch",
+    "no weight in the net for 0.5 s, not in free fall: the net is empty, ready for the next catch",
 )  # fmt: skip
 IMPEDANCE_SCALED = EventDefinition(
     "impedance_scaled", _INFO, _NOMINAL,
@@ -89,36 +89,37 @@ CONTACT_LOST = EventDefinition(
     "contact_lost", _WARNING, _WARN,
     "the surface was not found again within 0.1 m of where it was touched, the force is not measured any more, "
     "`contact_disagreement_n` of the push act against nothing for 0.1 s, or the vehicle is 0.08 m ahead of its reference: the vehicle "
-    "moves back, and the mission goes on as aborted",
+    "moves back, and the mission continues as aborted",
 )  # fmt: skip
 CONTACT_DISAGREES = EventDefinition(
     "contact_disagrees", _WARNING, _WARN,
     "for 0.1 s the contact force that thrust, tilt and acceleration show exceeds the measured one by `contact_disagreement_n`, or the "
-    "vehicle is 0.08 m behind its reference although no touch was measured: the vehicle moves back, and the mission goes on as aborted",
+    "vehicle is 0.08 m behind its reference although no touch was measured: the vehicle moves back, and the mission continues as "
+    "aborted",
 )  # fmt: skip
 CONTACT_BOUNCE = EventDefinition(
     "contact_bounce", _WARNING, _WARN,
-    "the surface was touched three times in one contact: the vehicle moves back, and the mission goes on as aborted",
+    "the surface was touched three times in one contact: the vehicle moves back, and the mission continues as aborted",
 )  # fmt: skip
 CONTACT_BESIDE = EventDefinition(
     "contact_beside", _WARNING, _WARN,
     "the tool touched more than 5 cm beside the point of the mission, or slipped there: judged when the force is reached and when it "
-    "ends; the mission goes on",
+    "ends; the mission continues",
 )  # fmt: skip
 CONTACT_SLIPPED = EventDefinition(
     "contact_slipped", _WARNING, _WARN,
     "the yaw error exceeded 5 deg while approaching or pressing (15 deg while light touches find the surface's normal), because the "
-    "tool slips along the surface: the vehicle moves back, and the mission goes on as aborted",
+    "tool slips along the surface: the vehicle moves back, and the mission continues as aborted",
 )  # fmt: skip
 CONTACT_STUCK = EventDefinition(
     "contact_stuck", _WARNING, _WARN,
     "for 0.5 s the tip of a slide is 0.05 m behind its reference or ahead of it, because the tool is caught on the surface or friction "
-    "exceeds `friction_max`: the vehicle moves back, and the mission goes on as aborted",
+    "exceeds `friction_max`: the vehicle moves back, and the mission continues as aborted",
 )  # fmt: skip
 SURFACE_MISSING = EventDefinition(
     "surface_missing", _WARNING, _WARN,
     "nothing was touched within `distance_max_m`, or the touched points lie on a plane tilted by more than 30 deg: the vehicle moves "
-    "back, and the mission goes on as aborted",
+    "back, and the mission continues as aborted",
 )  # fmt: skip
 TOUCHDOWN = EventDefinition("touchdown", _INFO, _NOMINAL, "the vehicle is on the ground")
 NO_TOUCHDOWN = EventDefinition(

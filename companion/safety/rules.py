@@ -266,8 +266,8 @@ RULES: tuple[Rule, ...] = (
         message="joint {} swings at {:.0f} Hz with {:.0f} deg/s; no catch is detected meanwhile",
     ),
     Rule(
-        id="joint_swings_on", subject=Subject.ARM, what="a joint goes on swinging", predicate=arm.joint_swings, hold_time=1.5,
-        ground=_LAND, air=_LAND, message="joint {} goes on swinging at {:.0f} Hz with {:.0f} deg/s",
+        id="joint_swings_on", subject=Subject.ARM, what="a joint still swings", predicate=arm.joint_swings, hold_time=1.5,
+        ground=_LAND, air=_LAND, message="joint {} still swings at {:.0f} Hz with {:.0f} deg/s",
     ),
     Rule(
         id="torque_refused", subject=Subject.ARM,

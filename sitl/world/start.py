@@ -1,4 +1,4 @@
-"""What a scene is made of: its machines, and where they stand at the start."""
+"""The contents of a scene: its machines and their start poses."""
 
 from __future__ import annotations
 

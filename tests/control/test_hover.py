@@ -99,7 +99,7 @@ def test_it_stands_still_while_jerked() -> None:
 
 
 @pytest.mark.parametrize(("thrust", "bound"), [(0.99, 1.0 + SHARE_MAX), (0.05, 1.0 - SHARE_MAX)])
-def test_it_is_bounded(thrust: float, bound: float) -> None:
+def test_the_hover_thrust_is_bounded(thrust: float, bound: float) -> None:
     assert learnt(thrust, state(), seconds=60.0) == pytest.approx(START * bound)
 
 

@@ -164,7 +164,7 @@ def test_a_flight_reports_the_changes_undoes_them_proposes_them_and_replays(
 
 
 @pytest.mark.parametrize("cause", ["hold", "stale pose"])
-def test_a_hold_and_a_stale_pose_freeze_it_in_the_core(soft: tuple[SitlConfig, FastResult], cause: str) -> None:
+def test_a_hold_or_a_stale_pose_freezes_the_scale(soft: tuple[SitlConfig, FastResult], cause: str) -> None:
     config, result = soft
     begin = next(k for k, o in enumerate(result.outputs) if o.control and (o.control.impedance_scale or 1.0) > 1.1)
 

@@ -342,7 +342,7 @@ def test_memory_is_bounded_and_forgets() -> None:
     assert sum(heard.size for heard in judge._histories.values()) == 1
 
 
-def test_well_signed_and_refused_is_answered_but_no_flood_of_it() -> None:
+def test_answers_to_refused_signed_commands_are_rate_limited() -> None:
     judge = verifier()
     stale = made(t_s=0.0)
     answers = [judge.check(encode(stale), False, NOW_T_S) for _ in range(1000)]

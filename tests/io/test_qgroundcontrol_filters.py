@@ -276,7 +276,7 @@ def test_a_flood_is_cut_to_the_rate_and_counted() -> None:
     assert uplink.refused == {"more than 100 messages a second": 10_000 - passed}
 
 
-def test_many_system_ids_make_no_end_of_systems() -> None:
+def test_the_number_of_system_ids_is_limited() -> None:
     uplink = uplink_of(armed=False)
     passed = [system for system in range(2, 256) if uplink.admit(packed(_HEARTBEAT, system), float(system))]
     assert passed == list(range(2, 2 + GROUND_SYSTEMS_MAX))

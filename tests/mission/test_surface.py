@@ -67,6 +67,6 @@ def test_three_points_all_count() -> None:
     assert found.point_world_m[0] == pytest.approx((1.5 + 1.48 + 1.5) / 3.0)
 
 
-def test_a_plane_that_is_too_steep_is_none() -> None:
+def test_a_plane_that_is_too_steep_is_rejected() -> None:
     assert plane(touched(0.7, 0.0), AHEAD, 0.0) is None
     assert plane([(1.5, 0.0, 1.0), (1.5, 0.1, 1.0), (1.5, 0.2, 1.0)], AHEAD, 0.0) is None

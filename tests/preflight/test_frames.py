@@ -98,7 +98,7 @@ def test_a_body_whose_zero_is_turned_is_named_wherever_it_stands(axes: AxisMap) 
     assert explanation(at, force, wanted, "z").startswith("the rigid body's zero was set while it was turned")
 
 
-def test_a_machine_that_only_stands_elsewhere_is_not_explained_away() -> None:
+def test_a_wrong_start_position_is_not_taken_for_wrong_axes() -> None:
     wanted = Wanted((-1.0, 0.3, 0.3), 0.0, 0.15, 15.0)
     rows = list(standing(Pose((-0.6, 0.5, 0.31), (1.0, 0.0, 0.0, 0.0)), G, wanted, "z"))
     assert failed(rows) == {"frames.place": "carry the vehicle there or change the mission's start.position_m"}

@@ -54,7 +54,7 @@ def test_write():
 """
 
 
-def test_everybody_draws_the_same_examples(tmp_path: Path) -> None:
+def test_examples_do_not_depend_on_the_environment(tmp_path: Path) -> None:
     """Whatever the environment, the time zone, the hash seed, and the modules imported before."""
     (tmp_path / "test_draws.py").write_text(DRAWS, encoding="utf-8")
     constants = "\n".join(f"A{k} = {k * 7919}; B{k} = 'word {k}'; C{k} = {k}.125" for k in range(100, 400))

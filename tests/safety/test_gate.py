@@ -131,7 +131,7 @@ number = st.floats(allow_nan=True, allow_infinity=True, width=32)
         max_size=6,
     )
 )
-def test_whatever_is_asked_for_only_what_is_allowed_leaves(rows: list[tuple[float, ...]]) -> None:
+def test_the_gate_passes_only_commands_within_limits(rows: list[tuple[float, ...]]) -> None:
     gate, t_s, last = Gate(VEHICLE), 1.0, None
     for w, x, y, z, thrust, first, second, angle, rate, pause_s in rows:
         t_s += pause_s

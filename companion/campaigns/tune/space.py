@@ -60,7 +60,7 @@ class Space:
 
     @property
     def start_point(self) -> Point:
-        """Return the point of the start."""
+        """Return the start as a point of the space."""
         return tuple([axis.at_start for axis in self.axes])
 
     def settings(self, point: Point) -> ControllerConfig:

@@ -30,7 +30,7 @@ WELL_MM: Final = 3.0
 SPREAD_MIN: Final = 0.1
 """Least singular value of the normals: below it errors of the probes would grow more than tenfold."""
 
-PIVOT = Check("mocap.pivot", "pivot of the rigid body", why="the tip is not where it is believed to be")
+PIVOT = Check("mocap.pivot", "pivot of the rigid body", why="the computed position of the tip is wrong")
 
 
 @dataclass(frozen=True, slots=True)

@@ -220,7 +220,7 @@ def new_key() -> bytes:
 def operators_text(operators: Sequence[Operator]) -> str:
     """Return the text of an operators file."""
     lines = [
-        "# Keys of operators: anyone who has a key can command the vehicle. Keep this file private: chmod 600.",
+        "# Keys of operators: every holder of a key can command the vehicle. Keep this file private: chmod 600.",
         "version: 1",
         "operators:",
     ]

@@ -95,7 +95,7 @@ class GroundStation:
         """Return one line about the open link for the operator."""
         when = " even in flight," if self._while_armed else " while it is disarmed,"
         return (
-            f"MAVLink is forwarded to and from {self.address}. Anyone who can send from there can change PX4's mode and,"
+            f"MAVLink is forwarded to and from {self.address}. Any program that can send from there can change PX4's mode and,"
             f"{when} its parameters, but nothing in the companion"
         )
 

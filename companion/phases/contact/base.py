@@ -117,12 +117,12 @@ class Pressing(ContactPhase):
     """Force along the direction of the approach."""
 
     def order_problem(self, before: PhaseSettings | None) -> str | None:
-        """Return that a surface must have been touched before."""
+        """Return the problem if no surface was touched before, else None."""
         touched = isinstance(before, Pressing) or (isinstance(before, Opening) and before.goes_on)
         return None if touched else f"a {self.type} must follow an approach, a press or a slide"
 
     def unfinished(self, after: PhaseSettings) -> str | None:
-        """Return that the tool must be detached first."""
+        """Return the problem: the tool must be detached first."""
         return f"a detach must come before this {after.type}: the tool still touches the surface"
 
 

@@ -30,7 +30,7 @@ LIFT = Check("hand.lift", "hand test: up", "IMU and motion capture agree on the 
 FORWARD = Check(
     "hand.forward",
     "hand test: forward",
-    "the same for this direction, and within 12 deg about the vertical",
+    "IMU and motion capture agree within 20 deg, and within 12 deg about the vertical",
     "PX4 fuses this yaw and cannot detect that it is wrong: the vehicle would circle or fly away",
 )
 TURN = Check(
