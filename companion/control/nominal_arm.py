@@ -12,7 +12,7 @@ from companion.model.types import Joints, Mat3, Matrix, Vec3
 
 
 class NominalArm:
-    """Jacobian, gravity and inertia in the pose of a tick; gravity and inertia are 0 if the law is not told them."""
+    """Jacobian, gravity and inertia in the pose of a tick; gravity and inertia are 0 if the law does not know them."""
 
     def __init__(self, config: AdaptiveConfig, vehicle: Vehicle) -> None:
         self.manipulator = manipulator_of(vehicle)

@@ -101,13 +101,17 @@ def test_json_is_printed_alone_and_nothing_is_written(flights: Path, capsys: pyt
     before = contents(flights)
     capsys.readouterr()
     assert main(["report", WHOLE, GAINS, WHOLE, "--json"]) == EXIT_OK
-    told = json.loads(capsys.readouterr().out)
-    assert [flight["letter"] for flight in told["flights"]] == ["A", "B", "C"]
-    assert told["flights"][0]["sha256"] == told["flights"][2]["sha256"] != told["flights"][1]["sha256"]
-    assert [row["key"] for row in told["configuration"]] == ["controller.preset"]
-    assert told["align"] == "catch"
-    assert {row["key"] for row in told["figures"]} >= {"rms.pre.e_p_m", "loop.lateness_ms.p99", "tether.min_slack_m"}
-    assert all(row["differences"][2] == 0 for row in told["figures"])
+    document = json.loads(capsys.readouterr().out)
+    assert [flight["letter"] for flight in document["flights"]] == ["A", "B", "C"]
+    assert document["flights"][0]["sha256"] == document["flights"][2]["sha256"] != document["flights"][1]["sha256"]
+    assert [row["key"] for row in document["configuration"]] == ["controller.preset"]
+    assert document["align"] == "catch"
+    assert {row["key"] for row in document["figures"]} >= {
+        "rms.pre.e_p_m",
+        "loop.lateness_ms.p99",
+        "tether.min_slack_m",
+    }
+    assert all(row["differences"][2] == 0 for row in document["figures"])
     assert main(["report", WHOLE, "--json"]) == EXIT_OK
     assert json.loads(capsys.readouterr().out) == json.loads((flights / "flights/whole/summary.json").read_text())
     assert contents(flights) == before
@@ -181,10 +185,10 @@ def test_a_long_log_is_thinned_with_a_note(
     monkeypatch.setattr(flight_module, "TICKS_MAX", 500)
     capsys.readouterr()
     assert main(["report", WHOLE, WHOLE, "--json"]) == EXIT_OK
-    told = json.loads(capsys.readouterr().out)
-    stride = told["flights"][0]["summary"]["graded_every"]
+    document = json.loads(capsys.readouterr().out)
+    stride = document["flights"][0]["summary"]["graded_every"]
     assert stride > 1
-    assert any(f"A one tick in {stride}" in note for note in told["notes"])
+    assert any(f"A one tick in {stride}" in note for note in document["notes"])
 
 
 def test_flights_have_names_of_their_own() -> None:

@@ -333,13 +333,28 @@ def test_a_ball_at_the_rotors_makes_the_vehicle_stay() -> None:
     assert "ball_at_rotors" in flown.ids and flown.farthest_m == 0.0
 
 
+def test_no_ball_crosses_the_rotor_disks_of_a_vehicle_that_moves_to_meet_it() -> None:
+    air, airframe = Tick(0.0, None, True, []), CONFIG.vehicle.airframe
+    state, changed = PHASE.begin(air), 0
+    for path, _, _ in throws(400, 6):
+        free = meeting(0.0, state.now, state.lag, path, NET_M, OPENING, BOUNDS, lambda _: True, None)
+        met = PHASE._meeting(air, state, path, None)
+        changed += free is not None and met != free
+        for point in path if met is not None else ():
+            if met is not None and point.t_s < met.motion.end_s:
+                x, y, z = met.motion.at(point.t_s).position_m
+                px, py, pz = point.position_m
+                assert abs(pz - z - airframe.rotor_height_m) >= 0.05 or math.hypot(px - x, py - y) >= airframe.radius_m
+    assert changed > 0, "the rotors forbid no meeting"
+
+
 def test_frames_lost_for_50_ms_do_not_end_a_chase() -> None:
     flown = Flown(frames([MEETABLE], 0.6, lost=lambda t_s: 0.3 <= t_s < 0.35), 12.0)
     assert flown.ids == ["ball_seen", "meeting_planned"] and flown.over
 
 
 def test_a_ball_that_leaves_its_path_is_not_chased_any_further() -> None:
-    def stopped(t_s: float) -> Vec3 | None:  # somebody else catches it
+    def stopped(t_s: float) -> Vec3 | None:  # caught by another net
         return slow(min(t_s, 0.3))
 
     slow = flight(beside(0.0, 0.08), (-3.0, 0.0, -1.5), 0.9)
