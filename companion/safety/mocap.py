@@ -60,6 +60,10 @@ def limits_of(safety: Safety) -> PoseLimits:
     )
 
 
+LATE_MAX_S: Final = 0.5
+"""Age above which a late pose shows nothing: in a queue, poses still show the floor after lift-off."""
+
+
 class MocapTracker:
     """Evaluates each frame once: whether it is trusted, repeats the previous one, and agrees with the IMU.
 
@@ -160,9 +164,11 @@ class MocapTracker:
 
     @property
     def late(self) -> MocapPose | None:
-        """Return the newest pose if it is trusted but too late, else None."""
-        frame, shown = self.frame, self.too_late and self.trusted and not self.repeats
-        return frame if shown and frame is not None and frame.tracking_valid else None
+        """Return the newest pose if it is trusted but too late, by at most `LATE_MAX_S`; else None."""
+        frame, age_s = self.frame, self.latency_s
+        if frame is None or age_s is None or age_s > LATE_MAX_S or not frame.tracking_valid:
+            return None
+        return frame if self.too_late and self.trusted and not self.repeats else None
 
     def pose_filter(self) -> PoseFilter | None:
         """Return a filter for a landing without the core; None if the stream is rejected, so that no pose may be passed on."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
+from companion.config.loader import load_vehicle
 from companion.model.types import AutopilotRequest, FlightMode, LandedState, MocapPose
 from companion.safety.autopilot_landing import AutopilotLanding
+from companion.safety.monitors import Monitors
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import fly_to_end, with_world
 from sitl.campaigns.robustness import prepare
-from tests.safety.healthy import START_S, TICK_S, healthy, put
+from tests.safety.healthy import START_S, TICK_S, flying, healthy, put
 
 CLEARANCE_M = 0.30
 SINKS = put("vehicle", position_world_m=(0.0, 0.0, -1.0), velocity_world_m_s=(0.0, 0.0, -0.6))
@@ -48,6 +50,17 @@ def test_late_poses_near_the_floor_show_a_touchdown(
     height_m: float, sink_m_s: float, late: bool, found_s: float | None
 ) -> None:
     assert touchdown_s(height_m, sink_m_s, late) == pytest.approx(found_s, abs=0.02)
+
+
+@pytest.mark.parametrize(("age_s", "shows"), [(0.05, False), (0.2, True), (0.6, False), (3.0, False)])
+def test_a_pose_of_seconds_ago_shows_no_touchdown(age_s: float, shows: bool) -> None:
+    """A vehicle that has lifted off still stands in such a stream, and its rotors would be stopped in the air."""
+    monitors = Monitors(load_vehicle("configs/vehicles/tarot650_2r.yaml"))
+    for tick in range(100):
+        inputs = healthy(tick)
+        late = put("mocap", latency_s=age_s, exposure_server_s=inputs.t_s - age_s)
+        monitors.check(late(inputs), flying())
+    assert (monitors.late_pose is not None) == shows
 
 
 def test_a_vehicle_whose_estimate_drifts_along_the_floor_is_stopped_where_late_poses_show_it() -> None:
