@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from msgspec import Struct
 
 from companion.analysis.log import FlightLog
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
@@ -93,10 +94,19 @@ def test_beside_busy_programs_it_repeats_itself_bit_for_bit(flown: Flown, tmp_pa
         again = FlightLog.read(sandbox.cwd / "out/flight.mcap")
     assert len(again.inputs) == len(log.inputs)
     for name in ("inputs", "outputs", "sent"):
-        pairs = zip(getattr(again, name), getattr(log, name), strict=True)
-        differ = next(((one, other) for one, other in pairs if one != other), None)
-        assert differ is None, (name, differ)
+        for one, other in zip(getattr(again, name), getattr(log, name), strict=True):
+            assert one == other, (name, differing(one, other))
     assert again.metadata["flight"]["clock"] == "simulated"
+
+
+def differing(one: Struct, other: Struct) -> dict[str, object]:
+    """Return the fields that differ, by name."""
+    pairs = ((name, getattr(one, name), getattr(other, name)) for name in one.__struct_fields__)
+    return {
+        name: differing(a, b) if isinstance(a, Struct) and isinstance(b, Struct) else (a, b)
+        for name, a, b in pairs
+        if a != b
+    }
 
 
 def counts(inputs: Inputs) -> object:

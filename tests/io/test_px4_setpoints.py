@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal, get_args
 
 import pytest
+from mavsdk.plugins.offboard.offboard import Attitude
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.config.devices import AutopilotDevice
@@ -131,6 +133,38 @@ def test_a_repetition_of_the_setpoint_before_does_not_leave_in_place_of_the_new_
     for k in range(5):
         assert path.send(AttitudeSetpoint(tilted, 0.25 + 0.125 * k), 0.0)
     assert sent == [0.25 + 0.125 * k for k in range(5)]
+
+
+def test_in_simulated_time_not_even_a_repetition_that_is_nearly_the_new_one_leaves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The plugin repeats what it holds by the computer's clock: a flight would depend on how busy the computer is."""
+    monkeypatch.setattr("companion.io.px4.setpoints.simulated_time.current", lambda: object())
+    sent: list[float] = []
+
+    def write(frame: bytes) -> bool:
+        sent.append(parsed(frame).thrust)
+        return True
+
+    path = OffboardSetpoints(None, write, DirectSetpoints(lambda number, payload: False, 1))
+
+    class Plugin:
+        """Its thread repeats before each new attitude."""
+
+        held = Attitude(0.0, 0.0, 0.0, 0.0)
+
+        def set_attitude(self, attitude: Attitude) -> None:
+            for one in (self.held, attitude):
+                q = quat_from_euler_zyx(*(math.radians(deg) for deg in (one.roll_deg, one.pitch_deg, one.yaw_deg)))
+                message = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0.0, 0.0, 0.0, one.thrust_value)
+                path.pass_on(bytes(message.pack(mavlink.MAVLink(None))))
+            self.held = attitude
+
+    path._plugin = Plugin()
+    thrusts = [0.5 + 2**-15 * k for k in range(5)]
+    for thrust in thrusts:
+        assert path.send(AttitudeSetpoint(LEVEL.attitude_wxyz, thrust), 0.0)
+    assert sent == thrusts
 
 
 def parsed(frame: bytes) -> Any:

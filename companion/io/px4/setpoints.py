@@ -29,6 +29,8 @@ _TARGET = struct.Struct("<4f12xf")
 """Quaternion and thrust; between them are the body rates."""
 _SAME = 1e-4
 """Largest difference of a value of one setpoint: the plugin computes the quaternion from Euler angles in single precision."""
+_NEVER_LEAVES = Attitude(math.nan, math.nan, math.nan, math.nan)
+"""An attitude that equals no setpoint."""
 _log = logging.getLogger(__name__)
 
 
@@ -96,6 +98,9 @@ class OffboardSetpoints:
     earlier one that comes in between. So nothing is repeated, and PX4's offboard-loss failsafe triggers if the companion hangs. The
     plugin's own `start` and `stop` are never used: the request queue changes modes, and `stop` would command HOLD.
 
+    A repetition that differs by less than `_SAME` may leave in place of the new setpoint. That is harmless, but in simulated time a
+    flight would then depend on the computer's clock; there the plugin has nothing to repeat, at the cost of a second call.
+
     Args:
         system: the MAVSDK system.
         write: sends a frame of MAVSDK's; returns whether it was sent.
@@ -112,7 +117,8 @@ class OffboardSetpoints:
         self._target: tuple[float, ...] = ()
         """Quaternion FRD -> NED and thrust of the newest call."""
         self._left = threading.Event()
-        self._max_s = PLUGIN_MAX_S if simulated_time.current() is None else _PLUGIN_MAX_SIMULATED_S
+        self._simulated = simulated_time.current() is not None
+        self._max_s = _PLUGIN_MAX_SIMULATED_S if self._simulated else PLUGIN_MAX_S
 
     def send(self, setpoint: AttitudeSetpoint, t_s: float) -> bool:
         """Send roll, pitch, yaw and thrust, stamped by MAVSDK, and wait until they have left."""
@@ -124,6 +130,8 @@ class OffboardSetpoints:
         self._wanted = True
         try:
             self._plugin.set_attitude(attitude)
+            if self._simulated:
+                self._plugin.set_attitude(_NEVER_LEAVES)
         except MavsdkError as error:
             _log.debug("SET_ATTITUDE_TARGET not sent by MAVSDK: %s", error)
         else:
