@@ -15,7 +15,7 @@ from companion.config.vehicle import OBSERVER
 from companion.control.types import Tuning
 from companion.control.vehicle_control import Command, VehicleControl
 from companion.core.flight_state import Request, Tare
-from companion.core.phase_tick import failed
+from companion.core.phase_tick import checked, failed
 from companion.core.sequence import missing_inputs
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters, event_of
@@ -279,7 +279,7 @@ class FlightCore:
         if state.own is not None and engaged is not None:
             phase = self._parameters.phases[engaged.index]
             try:
-                reference = phase.reference(reference, state.own)
+                reference = checked(Reference, phase.reference(reference, state.own))
             except Exception as error:  # the next tick lands
                 self._phase_error = str(failed(phase, error))
                 reference = self._reference or reference

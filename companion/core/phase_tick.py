@@ -6,10 +6,10 @@ from pathlib import Path
 
 from companion.core.transition import Transition
 from companion.mission.active_plan import ActiveTrajectory
-from companion.mission.air import NOTHING, Air
+from companion.mission.air import NOTHING, Air, Expectation
 from companion.mission.phase import Phase
 from companion.mission.segments import Segment
-from companion.model.codec import Record
+from companion.model.codec import R, Record, RecordError, from_packet, to_packet
 from companion.model.types import Outcome, Reference, SafetyAction
 from companion.plugins import one_line
 from companion.safety.notices import EventDefinition
@@ -26,8 +26,21 @@ def failed(phase: Phase, error: Exception) -> PhaseFailed:
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
-    place = "" if trace is None else f" ({Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno})"
+    in_phase = trace is not None and not isinstance(error, RecordError)
+    place = (
+        f" ({Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno})" if in_phase and trace is not None else ""
+    )
     return PhaseFailed(f"phase '{phase.title}' failed: {one_line(error)}{place}")
+
+
+def checked(cls: type[R], returned: object) -> R:
+    """Return what a phase has returned, as a record of this class.
+
+    Raises:
+        RecordError, TypeError, ValueError, OverflowError: it is none.
+    """
+    record: R = from_packet(cls, to_packet(returned))
+    return record
 
 
 def advance_phase(t: Transition) -> None:
@@ -99,7 +112,7 @@ def _phase_of(t: Transition, segment: Segment) -> Phase:
 
 
 def _fly(t: Transition, phase: Phase, own: Record, engaged: Segment) -> None:
-    t.change(own=own, engaged=engaged, expected=phase.expects(own))
+    t.change(own=own, engaged=engaged, expected=checked(Expectation, phase.expects(own)))
 
 
 def _end(t: Transition, engaged: Segment, skips: bool) -> None:
