@@ -9,7 +9,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # All targets run the source, also after make compile.
 export PYTHONPATH := $(CURDIR)
 
-.PHONY: install lock audit fly press compile test lint explore mutants debian bench docs clean
+.PHONY: install lock audit fly press intercept compile test lint explore mutants debian bench docs clean
 
 install: $(STAMP)
 
@@ -45,6 +45,9 @@ fly: install
 
 press: install
 	@$(BIN)/companion fly configs/missions/press.yaml --sitl --world wall
+
+intercept: install
+	@$(BIN)/companion fly configs/missions/intercept.yaml --sitl --world careless
 
 # Builds a wheel with compiled modules in build/compiled and installs it: .venv/bin/companion computes the same faster.
 compile: install

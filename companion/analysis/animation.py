@@ -1,7 +1,7 @@
 """Animation of a flight: the vehicle in 3D with plots of position and arm error, as a GIF or as a player in an HTML page.
 
-No sensor measures the payload before the catch: its path is computed from the throw configured in the simulated world. For a real
-flight it is not drawn.
+Where motion capture does not see the payload before the catch, its path is computed from the throw configured in the simulated world;
+for a real flight it is not drawn then.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ _FLYING = (PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING)
 _GRAVITY_WORLD_M_S2 = np.array([0.0, 0.0, -GRAVITY_M_S2])
 _TARGET_M = np.array([0.1, 0.0, -0.16])
 """Point that the camera looks at, relative to the vehicle, world axes."""
+_SEEN_TICKS = 6
+"""Ticks between the places of a ball that was seen."""
 _THROWN_S = 0.45
 """Time before the catch during which the payload is drawn."""
 
@@ -57,7 +59,7 @@ class Movie:
     curves: list[Shape]
     frames: list[Frame]
     still: int
-    """Index of the frame to show while paused: shortly before the catch."""
+    """Index of the frame to show while paused: shortly before the catch, or a miss."""
 
 
 def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
@@ -88,7 +90,9 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
     still, target = 0, None
     payload_kg = summary["payload_kg"]
     name = "payload" if payload_kg is None else f"{payload_kg:g} kg payload"
-    for now_s, speed in _times(t_s[first], t_s[last], None if caught is None else t_s[caught]):
+    chased = [k for k in range(first, last) if (ball := log.outputs[k].ball) is not None and ball.meeting_s is not None]
+    moment = caught if caught is not None or not chased else chased[-1]
+    for now_s, speed in _times(t_s[first], t_s[last], None if moment is None else t_s[moment]):
         k = min(int(np.searchsorted(t_s, now_s)), last)
         pose = track.pose(k)
         centre = np.array(pose.position_world_m) + _TARGET_M
@@ -102,7 +106,7 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
         elif caught is not None and 0.0 <= t_s[k] - t_s[caught] < 1.2:
             net = camera.pixels(scene.net_world_m(pose)[None])
             shapes.append(Shape(net + np.array([0.0, 56.0]), CATCH, 17.0, text=f"{name}, caught"))
-        if caught is not None and k <= caught:
+        if moment is not None and k <= moment:
             still = len(frames)
         x = _PLOT_X[0] + (t_s[k] - t_s[first]) / (t_s[last] - t_s[first]) * (_PLOT_X[1] - _PLOT_X[0])
         frames.append(Frame(shapes, float(x)))
@@ -118,14 +122,14 @@ def _end(log: FlightLog, flying: npt.NDArray[np.intp], scene: Scene) -> int:
     return int(flying[np.argmax(landing & low)] if (landing & low).any() else flying[-1])
 
 
-def _times(first_s: float, last_s: float, catch_s: float | None) -> Iterator[tuple[float, float]]:
-    """Yield the time of each frame and its playback speed: 1 is real time, the catch is slower, a long flight is faster."""
+def _times(first_s: float, last_s: float, moment_s: float | None) -> Iterator[tuple[float, float]]:
+    """Yield the time of each frame and its playback speed: 1 is real time, the catch or a miss is slower, a long flight is faster."""
     spans: list[tuple[float, float, float]] = []
-    if catch_s is None:
+    if moment_s is None:
         spans = [(last_s, 0.0, 10.0)]
     else:
-        spans = [(catch_s - 1.2, 0.0, 1.8), (catch_s - 0.5, 1.0, 0.0), (catch_s + 0.4, 0.25, 0.0)]
-        spans += [(catch_s + 1.6, 1.0, 0.0), (last_s, 0.0, 2.6)]
+        spans = [(moment_s - 1.2, 0.0, 1.8), (moment_s - 0.5, 1.0, 0.0), (moment_s + 0.4, 0.25, 0.0)]
+        spans += [(moment_s + 1.6, 1.0, 0.0), (last_s, 0.0, 2.6)]
     now_s = first_s
     for end_s, speed, duration_s in spans:
         end_s = min(end_s, last_s)
@@ -154,15 +158,23 @@ class _Track:
         arm = self._log.inputs[int(self._arm[k])].arm
         assert mocap is not None
         caught = self._caught is not None and k >= self._caught
+        ball = None if caught else self._log.outputs[k].ball
         return Pose(
             position_world_m=mocap.position_world_m,
             attitude_wxyz=mocap.attitude_wxyz,
             arm_rad=arm.angle_rad if arm is not None else (),
-            ball_world_m=self._ball(k),
+            ball_world_m=self._thrown(k) if ball is None else self._seen(k),
             caught=caught,
+            meeting_world_m=None if ball is None else ball.meeting_world_m,
         )
 
-    def _ball(self, k: int) -> tuple[Vec3, ...]:
+    def _seen(self, k: int) -> tuple[Vec3, ...]:
+        """Return the places of the ball that motion capture has seen."""
+        balls = (self._log.outputs[before].ball for before in range(k, max(k - 8 * _SEEN_TICKS, 0), -_SEEN_TICKS))
+        return tuple(ball.position_world_m for ball in balls if ball is not None)
+
+    def _thrown(self, k: int) -> tuple[Vec3, ...]:
+        """Return the path of the configured throw."""
         if self._caught is None or self._throw is None:
             return ()
         before_s = self._t_s[k] - self._t_s[self._caught]

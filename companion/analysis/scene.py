@@ -55,6 +55,8 @@ class Pose:
     ball_world_m: tuple[Vec3, ...]
     """Centre of the flying payload and its earlier positions, newest first; empty before the throw and after the catch."""
     caught: bool
+    meeting_world_m: Vec3 | None = None
+    """Where the net is to meet it; None if no meeting is planned."""
 
 
 class Camera:
@@ -136,6 +138,10 @@ class Scene:
         parts = self._machine(camera, pose)
         if self._tether_line is not None:
             parts.append(self._tether(camera, pose, self._tether_line))
+        if pose.meeting_world_m is not None:
+            at, net_m = np.array(pose.meeting_world_m), self._net_radius_m or BALL_RADIUS_M
+            for u, v in ((_X, _Y), (_X, _Z), (_Y, _Z)):
+                shapes.append(Shape(camera.pixels(_circle(at, u, v, net_m), closed=True), BALL, 0.0, 0.12))
         for k, ball in enumerate(pose.ball_world_m):
             if k == 0:
                 shapes.append(self._shadow(camera, np.array(ball), BALL_RADIUS_M, 0.3))

@@ -151,6 +151,7 @@ class FlightCore:
             limited_by=self._limited_by,
             mocap_innovation_m=self._monitors.mocap_innovation_m,
             contact=state.expected.contact,
+            ball=state.expected.ball,
         )
 
     def forwards(self, pose: MocapPose, vehicle: VehicleState | None) -> bool:

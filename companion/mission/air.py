@@ -12,6 +12,7 @@ from companion.mission.segments import Segment
 from companion.model.best_pose import best_pose
 from companion.model.codec import Record
 from companion.model.frames import quat_rotate
+from companion.model.markers import BallState
 from companion.model.types import ContactState, Inputs, MocapPose, Reference, TetherState, Vec3
 from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
@@ -34,6 +35,8 @@ class Expectation(Record, frozen=True):
     """Way from the reference to a place in front of the surface, world frame; None if there is no surface."""
     contact: ContactState | None = None
     """State of the contact for the log and for the displays."""
+    ball: BallState | None = None
+    """The ball that the phase follows, for the log and for the displays."""
 
 
 NOTHING = Expectation()

@@ -1,4 +1,4 @@
-"""Single markers of a motion-capture frame."""
+"""Single markers of a motion-capture frame, and the ball among them."""
 
 from __future__ import annotations
 
@@ -27,3 +27,16 @@ class MarkerFrame(Record, frozen=True, kw_only=True):
     frame_number: int
     markers: tuple[Marker, ...]
     """At most `MARKERS_MAX`."""
+
+
+class BallState(Record, frozen=True, kw_only=True):
+    """The ball that is seen, and where the net is to meet it, for the log and the displays."""
+
+    position_world_m: tuple[float, float, float]
+    """Estimate at the mid-exposure of the newest frame."""
+    meeting_world_m: tuple[float, float, float] | None = None
+    """Predicted place of the ball when the net meets it; None if no meeting is planned."""
+    meeting_s: float | None = None
+    """Flight clock at that meeting."""
+    sigma_m: float | None = None
+    """Standard deviation of that place on each axis."""

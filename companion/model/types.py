@@ -16,7 +16,7 @@ from enum import Enum
 
 from companion.model.codec import Record
 from companion.model.estimator import EstimatorReport
-from companion.model.markers import MarkerFrame
+from companion.model.markers import BallState, MarkerFrame
 from companion.model.verdict import Verdict
 
 Vec2 = tuple[float, float]
@@ -539,6 +539,8 @@ class Outputs(Record, frozen=True, kw_only=True):
     """Distance between the newest pose and the position predicted from the IMU; 0 if it is not evaluated, None in older logs."""
     contact: ContactState | None = None
     """Contact with a surface; None outside contact phases."""
+    ball: BallState | None = None
+    """The ball that the phase follows; None without one, and in older logs."""
 
 
 class Sent(Record, frozen=True, kw_only=True):

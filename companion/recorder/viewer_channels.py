@@ -5,7 +5,7 @@
 ``/tf_arm``       foxglove.FrameTransforms    body -> link1 -> ... -> net, 50 Hz
 ``/pose``         foxglove.PoseInFrame        motion capture as received, 50 Hz
 ``/reference``    foxglove.PoseInFrame        reference pose, 50 Hz
-``/scene``        foxglove.SceneUpdate        the tether, 20 Hz
+``/scene``        foxglove.SceneUpdate        the tether, and the ball that is seen with where it meets the net, 20 Hz
 ``/scene_path``   foxglove.SceneUpdate        flown and reference path so far, every 2 s
 ``/scene_static`` foxglove.SceneUpdate        room, anchor, planned path, vehicle, arm, net: once, and for a new plan or live viewer
 ================  ==========================  =========================================================================
@@ -42,8 +42,19 @@ from companion.model.arm_skeleton import NO_ARM, ArmSkeleton
 from companion.model.frames import quat_rotate
 from companion.model.hanging_line import hanging_line_m
 from companion.model.logged_geometry import Geometry, logged_geometry
+from companion.model.markers import BallState
 from companion.model.types import Inputs, Outputs, Quat, Reference, TetherState, Vec3
-from companion.recorder.viewer_scene import path_of, point3, static_entities, tether_colour, trail
+from companion.recorder.viewer_scene import (
+    BALL,
+    BALL_M,
+    MEETING,
+    path_of,
+    point3,
+    sphere,
+    static_entities,
+    tether_colour,
+    trail,
+)
 
 PERIOD_S = 0.02
 SCENE_PERIOD_S = 0.05
@@ -121,6 +132,8 @@ class ViewerChannels:
             self._scene_due_s = t_s
             if pose is not None:
                 self._tether(stamp, stamp_ns, pose, outputs.tether)
+            if outputs.ball is not None:
+                self._ball(stamp, stamp_ns, outputs.ball)
             self._paths(t_s, stamp, stamp_ns, pose, outputs.reference)
 
     def _frames(
@@ -158,6 +171,16 @@ class ViewerChannels:
         points = hanging_line_m(tether.anchor_world_m, end, tether.length_m, geometry.room_min_world_m[2])
         line = trail([point3(p) for p in points], tether_colour(tether, slack_m, held=held), 4.0)
         entity = SceneEntity(timestamp=stamp, frame_id="world", id="tether", lifetime=_LIFETIME, lines=[line])
+        self._scene.log(SceneUpdate(entities=[entity]), log_time=stamp_ns)
+
+    def _ball(self, stamp: Timestamp, stamp_ns: int, ball: BallState) -> None:
+        balls = [sphere(ball.position_world_m, BALL_M, BALL)]
+        if ball.meeting_world_m is not None:
+            net_m = self._geometry.net_radius_m if self._geometry is not None else 0.0
+            balls.append(sphere(ball.meeting_world_m, net_m or BALL_M, MEETING))
+        if not math.isfinite(sum(ball.position_world_m) + sum(ball.meeting_world_m or ())):
+            return
+        entity = SceneEntity(timestamp=stamp, frame_id="world", id="ball", lifetime=_LIFETIME, spheres=balls)
         self._scene.log(SceneUpdate(entities=[entity]), log_time=stamp_ns)
 
     def _paths(

@@ -37,6 +37,9 @@ _PLANNED = Color(r=0.45, g=0.45, b=0.75, a=0.9)
 SLACK = Color(r=0.18, g=0.62, b=0.42, a=1.0)
 NEARLY_TAUT = Color(r=0.93, g=0.62, b=0.10, a=1.0)
 TAUT = Color(r=0.85, g=0.15, b=0.15, a=1.0)
+BALL = Color(r=0.76, g=0.15, b=0.36, a=1.0)
+MEETING = Color(r=0.76, g=0.15, b=0.36, a=0.25)
+BALL_M = 0.035
 
 _DOWN = Quaternion(w=0.0, x=1.0, y=0.0, z=0.0)
 _UPRIGHT = Quaternion(w=1.0, x=0.0, y=0.0, z=0.0)
@@ -65,12 +68,12 @@ def static_entities(
         return entities
     add("room", "world", lines=[_box(geometry.room_min_world_m, geometry.room_max_world_m)])
     if geometry.tether is not None:
-        add("anchor", "world", spheres=[_ball(geometry.tether.anchor_world_m, 0.05, _DARK)])
+        add("anchor", "world", spheres=[sphere(geometry.tether.anchor_world_m, 0.05, _DARK)])
     add("vehicle", "body", **_airframe(geometry))
     for number, link in enumerate(geometry.arm.links_body_m, start=1):
         add(f"link{number}", f"link{number}", cylinders=[_rod(link)])
     if geometry.arm.links_body_m and (radius_m := geometry.net_radius_m or geometry.tip_radius_m):
-        add("net", "net", spheres=[_ball((0.0, 0.0, 0.0), radius_m, _NET)])
+        add("net", "net", spheres=[sphere((0.0, 0.0, 0.0), radius_m, _NET)])
     return entities
 
 
@@ -156,7 +159,8 @@ def _rod(end: Vec3) -> CylinderPrimitive:
     )
 
 
-def _ball(centre: Vec3, radius_m: float, colour: Color) -> SpherePrimitive:
+def sphere(centre: Vec3, radius_m: float, colour: Color) -> SpherePrimitive:
+    """Return a sphere."""
     wide = 2.0 * radius_m
     return SpherePrimitive(
         pose=Pose(position=Vector3(x=centre[0], y=centre[1], z=centre[2]), orientation=_UPRIGHT),

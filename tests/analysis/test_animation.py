@@ -15,10 +15,11 @@ from PIL import Image, ImageSequence
 
 from companion.analysis.animation import FRAMES_PER_S, Movie, movie_of, player_html, write_gif
 from companion.analysis.log import FlightLog
-from companion.analysis.scene import FRONT, NET, ROTOR, TETHER, Camera, Pose, Scene
+from companion.analysis.scene import BALL, FRONT, NET, ROTOR, TETHER, Camera, Pose, Scene
 from companion.config.loader import load_vehicle
 from companion.control.arm_model import manipulator_of
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
+from companion.model.markers import BallState
 from companion.model.types import Joints
 from tests.analysis.synthetic_flight import CATCH_S, CONFIG, log_of_rows, synthetic_flight
 from tests.ground.page_browser import chromium
@@ -61,6 +62,22 @@ def test_the_payload_is_thrown_and_then_caught(movie: Movie) -> None:
     assert shown[movie.still] == "thrown"
     assert times == sorted(times)
     assert 8.0 < len(times) / FRAMES_PER_S < 13.0
+
+
+def test_a_ball_that_was_seen_is_drawn_where_it_was_and_the_net_where_they_meet() -> None:
+    """Slowly, although it was missed."""
+    ball = BallState(position_world_m=(1.0, 0.0, 1.0), meeting_world_m=(0.3, 0.0, 0.8), meeting_s=7.0)
+    rows = (
+        (i, replace(o, ball=ball if 6.0 < o.mission_t_s < 6.4 else None, events=()), s)
+        for i, o, s in synthetic_flight(rate_hz=50.0)
+    )
+    made = movie_of(log_of_rows(rows, {**CONFIG, "vehicle": json.loads(VEHICLE.model_dump_json())}), SIMULATED)
+    assert made is not None
+    drawn = [[shape for shape in frame.shapes if shape.colour == BALL and not shape.text] for frame in made.frames]
+    shown = [k for k, shapes in enumerate(drawn) if shapes]
+    assert shown == list(range(shown[0], shown[-1] + 1)) and made.still in shown
+    assert sum(shape.alpha == 0.12 for shape in drawn[shown[1]]) == 3, "the net, by three circles"
+    assert all("¼ speed" in texts(made)[k] for k in shown)
 
 
 def test_without_a_simulated_throw_the_payload_appears_in_the_net() -> None:

@@ -15,6 +15,7 @@ from companion.config.loader import load_flight
 from companion.ground.protocol.messages import (
     EVENTS_KEPT,
     MESSAGE_MAX_BYTES,
+    BallView,
     Events,
     HealthLevel,
     Stream,
@@ -25,6 +26,7 @@ from companion.ground.protocol.messages import (
 from companion.ground.telemetry.stream import TEXT_MAX, StreamBuilder, replay
 from companion.model.codec import Record
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
+from companion.model.markers import BallState
 from companion.model.types import (
     ActiveRule,
     AttitudeSetpoint,
@@ -93,9 +95,19 @@ def test_a_message_is_the_tick_that_it_is_made_of() -> None:
     assert stream.control is not None and outputs.control is not None
     assert stream.control.tau == pytest.approx(outputs.control.tau[0:3], abs=6e-5)
     assert stream.control.arm_torque_nm == pytest.approx(outputs.control.tau[6:8], abs=6e-5)
-    assert not stream.waits_for_start
+    assert not stream.waits_for_start and stream.ball is None
     assert decode(Stream, encode(stream)) == stream
     jsonschema.Draft202012Validator(schema_of(Topic.STREAM)).validate(json.loads(encode(stream)))
+
+
+def test_a_ball_is_shown_with_the_time_until_the_net_meets_it() -> None:
+    t_s = IN_FLIGHT[0].t_s
+    ball = BallState(position_world_m=(1.0, 2.0, 3.0), meeting_world_m=(0.5, 0.25, 1.0), meeting_s=t_s + 0.25)
+    stream = stream_of(changed(IN_FLIGHT, outputs__ball=ball))
+    assert stream.ball == BallView(position_world_m=(1.0, 2.0, 3.0), meeting_world_m=(0.5, 0.25, 1.0), meets_in_s=0.25)
+    assert decode(Stream, encode(stream)) == stream
+    late = stream_of(changed(IN_FLIGHT, outputs__ball=msgspec.structs.replace(ball, meeting_s=t_s - 0.1))).ball
+    assert late is not None and late.meets_in_s == 0.0
 
 
 def test_the_position_error_is_that_of_the_metrics_also_of_an_old_frame_in_motion() -> None:

@@ -380,6 +380,17 @@ def test_the_same_inputs_give_the_same_states() -> None:
     assert first.states == second.states and first.reports == second.reports
 
 
+def test_the_displays_are_told_the_ball_and_where_it_meets_the_net() -> None:
+    flown = Flown(frames([MEETABLE], 0.6), 12.0)
+    seen = [(state, PHASE.expects(state).ball) for state in flown.states]
+    chases = [(state, ball) for state, ball in seen if ball is not None and ball.meeting_world_m is not None]
+    assert chases and {state.mode for state, _ in chases} == {Mode.CHASE}
+    last, at_end = chases[-1]
+    assert last.point is not None and at_end.meeting_s == last.point.t_s
+    assert math.dist(at_end.position_world_m, last.point.position_m) < 0.1, "it is nearly there"
+    assert seen[0][1] is None and seen[-1][1] is None
+
+
 def test_without_sight_of_the_ball_with_a_box_beyond_the_tether_or_a_closed_net_the_mission_is_refused() -> None:
     def found(*overrides: str) -> str:
         config = load_flight("configs/missions/intercept.yaml", overrides=overrides)

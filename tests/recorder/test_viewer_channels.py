@@ -18,6 +18,7 @@ from companion.control.arm_model import manipulator_of
 from companion.model.codec import Record, differences
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.hanging_line import hanging_line_m
+from companion.model.markers import BallState
 from companion.model.types import Joints, MocapPose, Quat, TetherState, Vec3
 from companion.recorder.log_file import LogFile
 from companion.recorder.log_writer import LogWriter
@@ -239,6 +240,17 @@ def test_the_tether_is_coloured_by_its_slack(tmp_path: Path, away_m: float, held
     assert colour_of(line["color"]) == colour
     assert vec(line["points"][0]) == pytest.approx(tether.anchor_world_m)
     assert vec(line["points"][-1]) == pytest.approx((x, y, z + away_m))
+
+
+def test_a_ball_is_drawn_with_the_net_where_they_meet(tmp_path: Path) -> None:
+    inputs, outputs, sent = still()[0]
+    ball = BallState(position_world_m=(1.0, 2.0, 3.0), meeting_world_m=(0.5, 0.25, 1.0), meeting_s=1.0)
+    viewed = written(tmp_path / "flight.mcap", [(inputs, replace(outputs, ball=ball), sent)])
+    spheres = only(viewed.by_topic["/scene"], "ball")["spheres"]
+    assert [vec(sphere["pose"]["position"]) for sphere in spheres] == [(1.0, 2.0, 3.0), (0.5, 0.25, 1.0)]
+    tool = load_flight("configs/missions/catch.yaml").vehicle.tool
+    assert tool is not None and tool.net_radius_m is not None
+    assert spheres[1]["size"]["x"] == pytest.approx(2.0 * tool.net_radius_m)
 
 
 @pytest.mark.parametrize("end", [(2.0, 0.0, 0.0), (1.5, 1.0, 1.0), (0.5, 0.0, 2.5), (0.3, 0.0, -2.0), (0.05, 0.0, 1.0)])

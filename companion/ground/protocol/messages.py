@@ -232,6 +232,15 @@ class ContactView(Record, frozen=True, kw_only=True):
     wanted_n: float
 
 
+class BallView(Record, frozen=True, kw_only=True):
+    """The ball that the vehicle sees; see `companion.model.markers.BallState`."""
+
+    position_world_m: Vec3
+    meeting_world_m: Vec3 | None = None
+    meets_in_s: float | None = None
+    """Time until the net is to meet it."""
+
+
 class Timing(Record, frozen=True, kw_only=True):
     """Durations of the loop and the links: the largest of all ticks since the previous message."""
 
@@ -293,6 +302,7 @@ class Stream(Record, frozen=True, kw_only=True):
     control: ControlView | None = None
     contact: ContactView | None = None
     """None outside contact phases."""
+    ball: BallView | None = None
     timing: Timing
     lights: tuple[DeviceHealth, ...]
     limited_by: tuple[str, ...]

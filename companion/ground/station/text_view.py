@@ -225,6 +225,9 @@ def _figures(stream: Stream) -> list[str]:
         parts.append(
             f"{printable(stream.contact.mode)} {stream.contact.force_n:.1f} of {stream.contact.wanted_n:.1f} N"
         )
+    if stream.ball is not None:
+        in_s = stream.ball.meets_in_s
+        parts.append("ball seen" if in_s is None else f"ball met in {in_s:.2f} s")
     if stream.battery_v is not None:
         left = "" if stream.battery_remaining is None else f" {100 * stream.battery_remaining:.0f} %"
         parts.append(f"battery {stream.battery_v:.1f} V{left}")

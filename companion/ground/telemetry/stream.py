@@ -18,6 +18,7 @@ from companion.config.vehicle import OBSERVER
 from companion.ground.protocol.messages import (
     EVENTS_KEPT,
     VERSION,
+    BallView,
     ContactView,
     ControlView,
     EventLine,
@@ -31,6 +32,7 @@ from companion.ground.telemetry.health import HealthEvaluator, Snapshot, WorstAg
 from companion.ground.telemetry.timings import WorstTimings, merge_timings
 from companion.model.constants import GRADED_POSE_MAX_AGE_S, TICK_PERIOD_S
 from companion.model.flight_stage import Stage
+from companion.model.markers import BallState
 from companion.model.types import (
     ContactState,
     ControlLog,
@@ -189,6 +191,7 @@ class StreamBuilder:
             tether=_tether(o.tether),
             control=_control(o.control, self._has_force),
             contact=_contact(o.contact),
+            ball=_ball(o.ball, i.t_s),
             timing=timing,
             lights=self._health.evaluate(snapshot),
             limited_by=o.limited_by,
@@ -341,6 +344,15 @@ def _contact(contact: ContactState | None) -> ContactView | None:
     if contact is None or numbers is None:
         return None
     return ContactView(mode=contact.mode.value, force_n=numbers[0], wanted_n=numbers[1])
+
+
+def _ball(ball: BallState | None, t_s: float) -> BallView | None:
+    position = None if ball is None else _rounded(ball.position_world_m, 3)
+    if ball is None or position is None:
+        return None
+    meeting = None if ball.meeting_world_m is None else _rounded(ball.meeting_world_m, 3)
+    meets_in_s = None if ball.meeting_s is None else _number(max(0.0, ball.meeting_s - t_s), 3)
+    return BallView(position_world_m=position, meeting_world_m=meeting, meets_in_s=meets_in_s)
 
 
 def truncated(text: str) -> str:

@@ -15,10 +15,11 @@ from companion.config.base import NonNegative, Positive3
 from companion.config.phase import Duration
 from companion.control.arm_model import manipulator_of
 from companion.control.manipulator import Manipulator
-from companion.mission.air import Air
+from companion.mission.air import NOTHING, Air, Expectation
 from companion.mission.phase import Checking, Phase, Planning
 from companion.model.codec import Record
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
+from companion.model.markers import BallState
 from companion.model.types import Reference, SafetyAction, Severity, Vec3
 from companion.phases.intercept import ball
 from companion.phases.intercept.ball import Candidate, Point
@@ -199,6 +200,23 @@ class Intercept(Phase):
         if s.mode is Mode.WAIT:
             return None
         return replace(s, mode=Mode.STOP, motion=None) if s.mode is Mode.CHASE else s
+
+    def expects(self, own: Any) -> Expectation:
+        """Return the ball that is seen: while one is chased, the one that comes nearest to the meeting."""
+        s: Interception = own
+        balls = [candidate for candidate in s.candidates if candidate.is_ball]
+        if not balls:
+            return NOTHING
+        met = s.point if s.mode is Mode.CHASE else None
+        if met is None:
+            return Expectation(ball=BallState(position_world_m=balls[0].position_m))
+        at_m, end_s = met.position_m, met.t_s
+        chased = min(balls, key=lambda c: math.dist(ball.predicted(c, end_s, self.drag_per_m).position_m, at_m))
+        return Expectation(
+            ball=BallState(
+                position_world_m=chased.position_m, meeting_world_m=at_m, meeting_s=end_s, sigma_m=met.sigma_m
+            )
+        )
 
     def reference(self, reference: Reference, own: Any) -> Reference:
         """Return the reference of the state."""

@@ -1,7 +1,7 @@
 // Draws the vehicle: frame, rotors, heading, arm, net, caught payload, and the reference pose as a ghost.
 
 import { colours } from "./colours.js";
-import { add, armBody, circle, rotate, scale, yawOnly } from "./geometry.js";
+import { add, armBody, circle, mix, rotate, scale, yawOnly } from "./geometry.js";
 
 const X = [1, 0, 0];
 const Y = [0, 1, 0];
@@ -23,6 +23,18 @@ export function drawMachine(renderer, scene, position, attitude, { arm = null, c
   if (arm?.length) parts.push([world(armBody(scene, arm).joints.at(-1)), () => drawArm(renderer, scene, world, turn, arm, caught)]);
   parts.map(([at, draw]) => [renderer.depth(at), draw]).sort((a, b) => b[0] - a[0]).forEach(([, draw]) => draw());
   renderer.arrow(world([0.1 * radius, 0, high]), world([1.25 * radius, 0, high]), colours.accent, 3);
+}
+
+/** Draw a flying ball, its path to the net and the net's place there. */
+export function drawBall(renderer, scene, { position_world_m: from, meeting_world_m: to, meets_in_s: time }) {
+  if (to) {
+    const ring = [[X, Y], [X, Z], [Y, Z]].map(([u, v]) => circle(to, u, v, scene.net_radius_m ?? 0.1));
+    for (const line of ring) renderer.line(line, colours.force, { width: 1.2, alpha: 0.7 });
+    const sag = (k) => 4.903 * time * time * k * (1 - k); // free fall between two places
+    const path = Array.from({ length: 13 }, (_, k) => add(mix(from, to, k / 12), [0, 0, sag(k / 12)]));
+    renderer.line(path, colours.force, { width: 2, dash: [4, 5] });
+  }
+  renderer.ball(from, 0.035, colours.force, { least: 4 });
 }
 
 // Radius of the rotor disks, which end at the horizontal reach.

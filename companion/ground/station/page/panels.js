@@ -130,6 +130,7 @@ const DETAILS = [
   ["commanded force", ({ stream: s }) => vector(s.control?.tau, 1, "N")],
   ["external force", ({ stream: s }) => vector(s.control?.force_ext_world_n, 1, "N")],
   ["contact", ({ stream: s }) => (s.contact ? `${readable(s.contact.mode)}, ${fixed(s.contact.force_n, 1)} of ${quantity(s.contact.wanted_n, 1, "N")}` : "none")],
+  ["ball", ({ stream: s }) => (s.ball ? (s.ball.meeting_world_m ? `meets the net in ${quantity(s.ball.meets_in_s, 2, "s")}` : "seen") : "none")],
   ["arm torque", ({ stream: s }) => vector(s.control?.arm_torque_nm, 2, "N m")],
   ["ρ", ({ stream: s }) => fixed(s.control?.rho, 5)],
   ["H", ({ stream: s }) => (s.control ? s.control.h_hat.map((part) => part.toExponential(1)).join("  ") : NOTHING)],

@@ -6,7 +6,7 @@ import { fitCanvas } from "./dom.js";
 import { fixed, quantity } from "./format.js";
 import { add, circle, hanging, LEVEL, mix, rotate } from "./geometry.js";
 import { lampLevel } from "./verdict.js";
-import { drawForce, drawGhost, drawMachine, drawShadow } from "./machine.js";
+import { drawBall, drawForce, drawGhost, drawMachine, drawShadow } from "./machine.js";
 import { Renderer } from "./renderer.js";
 
 export class SceneView {
@@ -58,6 +58,7 @@ export class SceneView {
     if (position === null || stream === null) return;
     drawShadow(renderer, scene, position, room.min[2]);
     if (stream.reference_world_m) drawGhost(renderer, scene, stream.reference_world_m, stream.reference_yaw_rad, stream.reference_arm_rad);
+    if (stream.ball) drawBall(renderer, scene, stream.ball);
     const tied = Boolean(scene.anchor_world_m);
     const behind = tied && renderer.depth(scene.anchor_world_m) > renderer.depth(position);
     if (behind) drawTether(renderer, scene, stream, position, attitude);
