@@ -12,8 +12,8 @@ from typing import Self
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.flight.command_queue import Operator
+from companion.flight.control_loop import Flight
 from companion.flight.fallback_landing import unflown
-from companion.flight.main import Flight
 from companion.io.devices import Devices, PoseForwarder
 from companion.model.estimator import EstimatorReport
 from companion.model.launcher_messages import Land

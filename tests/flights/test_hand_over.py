@@ -11,6 +11,7 @@ from pathlib import Path
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.core.flight_core import FlightCore
+from companion.flight import control_loop
 from companion.flight import main as app
 from companion.launcher.launcher import replace_device_settings
 from companion.model.types import Inputs, Outcome, Outputs
@@ -31,7 +32,7 @@ class BreakingCore(FlightCore):
 
 def fly_with_a_bug() -> None:
     """The flight process: configuration from stdin, folder and socket as arguments, the outcome to stdout."""
-    app.FlightCore = BreakingCore  # type: ignore[attr-defined]
+    control_loop.FlightCore = BreakingCore  # type: ignore[attr-defined]
     config = FlightConfig.model_validate_json(sys.stdin.read())
     with socket.socket(fileno=int(sys.argv[2])) as channel:
         print(asyncio.run(app.fly(config, Path(sys.argv[1]), channel)).value)

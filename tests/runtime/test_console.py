@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from companion.flight.main import status_of
+from companion.flight.control_loop import status_of
 from companion.model.launcher_messages import AnyMessage, FlightEvent, Started
 from companion.model.types import Outputs
 from companion.runtime.console import FlightDisplay, print_result
