@@ -152,6 +152,8 @@ class FlightDisplay:
                 self._show_status(message)
             case WorldEvent(kind="rotor_touched"):
                 self._line("", "a rotor touched a surface", "red")
+            case WorldEvent(kind="rotor_hit"):
+                self._line("", "the ball hit a rotor", "red")
             case WorldEvent(kind="missed"):
                 self._line("", "the payload was missed", "red")
             case WorldEvent(kind="crashed"):

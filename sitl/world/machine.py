@@ -8,6 +8,7 @@ from typing import Final, Protocol
 
 from companion.model.algebra import cross
 from companion.model.constants import GRAVITY_M_S2
+from companion.model.frames import quat_rotate
 from companion.model.types import Joints, Vec3
 from companion.sitl_config.effects.rotors import BODY_DRAG_N_PER_M_S
 from sitl.world.effects.air import Air
@@ -28,6 +29,8 @@ from sitl.world.views import Writer
 
 FALL_M_S: Final = 2.5
 """Speed of impact on the floor at which the legs break: the speed after a fall from 0.3 m. PX4 descends at 0.7 m/s at most."""
+TURNING_N: Final = 0.1
+"""Thrust of all rotors above which they turn."""
 _EFFECT_STEPS: Final = round(EFFECT_PERIOD_S / PHYSICS_DT_S)
 
 
@@ -74,6 +77,8 @@ class Machine:
         """Contact with the surfaces; None if there are none."""
         self.rotor_count, self.battery_cells = layout.count, airframe.battery_cells
         self._rotor_max_n, self._rotor_height_m = airframe.thrust_max_n / layout.count, layout.height_m
+        self._rotors_at_m = tuple((x, y) for x, y, _ in layout.positions_body_m)
+        self._disk_m, self._reach_m = airframe.disk_radius_m, airframe.radius_m + layout.height_m
         self._rotors: Rotors | LinearRotors = Rotors.of(config.rotors, layout, PHYSICS_DT_S) or LinearRotors(
             layout.count, config.rotor_lag_s, PHYSICS_DT_S
         )
@@ -246,6 +251,19 @@ class Machine:
             contact.step(t_s, self.q, *self.layout.contact(self.sensors()))
             if contact.rotor_distance_m <= 0.0:
                 self._crash(t_s, "rotor_touched")
+
+    def watch_ball(self, t_s: float, at_world_m: Vec3, radius_m: float) -> None:
+        """Detect a ball in the disk of a turning rotor, which breaks it: the end of the flight."""
+        q, (x, y, z) = self.q, at_world_m
+        x, y, z = x - q[0], y - q[1], z - q[2]
+        reach_m = self._reach_m + radius_m
+        if self.crashed or x * x + y * y + z * z > reach_m * reach_m or sum(self._thrust) < TURNING_N:
+            return
+        x, y, z = quat_rotate((q[3], -q[4], -q[5], -q[6]), (x, y, z))
+        if abs(z - self._rotor_height_m) < radius_m and any(
+            math.hypot(x - rotor_x, y - rotor_y) < self._disk_m + radius_m for rotor_x, rotor_y in self._rotors_at_m
+        ):
+            self._crash(t_s, "rotor_hit")
 
     def watch_crash(self, t_s: float) -> None:
         """Detect a crash: the vehicle is far below its standing height, tilted by more than 72 deg, or has hit the floor too fast."""

@@ -183,6 +183,13 @@ class Payload:
         return vec_mat((bx - nx, by - ny, bz - nz), mat3_of(self._hoop_axes))
 
     @property
+    def flying(self) -> tuple[Vec3, float] | None:
+        """Centre (world frame) and radius of the payload while it is neither in a hand nor caught, m; None otherwise."""
+        if self.ball is None or self._flies_since_s is None:
+            return None
+        return vec3_of(self._data.xpos[self.ball.body]), self._config.payload_radius_m
+
+    @property
     def miss_m(self) -> float | None:
         """Distance of the first throw from the net's centre where it fell through the plane of the opening before it reached the floor;
         if it never did, its smallest distance from the centre. None before the throw.

@@ -59,6 +59,9 @@ class Scene:
             machine.read()
             machine.watch_contact(t_s)
         self.payload.step(t_s, airborne)
+        if (ball := self.payload.flying) is not None:
+            for machine in self.machines:
+                machine.watch_ball(t_s, *ball)
         for machine in self.machines:
             machine.watch_crash(t_s)
 

@@ -96,7 +96,7 @@ class WorldEvent:
     t_s: float
     kind: str
     """Kind: thrown, caught, taken (out of the net), missed, bounced_out (of the bag), touched or gave_way (a surface), rotor_touched
-    (a surface) or crashed."""
+    (a surface), rotor_hit (by a ball) or crashed."""
 
 
 class Events:

@@ -139,3 +139,32 @@ def test_another_vehicle_file_is_another_machine_in_all_its_parts() -> None:
     for _ in range(500):
         world.fly((1.0, 1.0, 1.0, 1.0), (0.0, 0.0), False, drag=False)
     assert float(data.ctrl[:4].sum()) == pytest.approx(40.0)
+
+
+@pytest.mark.parametrize(
+    ("beside_m", "turning", "hit"), [(0.0, True, True), (-0.01, True, True), (0.01, True, False), (0.0, False, False)]
+)
+def test_a_ball_in_the_disk_of_a_turning_rotor_is_a_crash(beside_m: float, turning: bool, hit: bool) -> None:
+    """It falls through the middle of a rotor, or past the outermost edge of its disk, of a vehicle that is yawed and in the air."""
+    config = WorldConfig(payload_kg=0.2)
+    world, layout = OneMachine(VEHICLE, config, (1.0, 0.0), 0.7, ARM_RAD), VEHICLE.airframe.rotor_layout
+    payload, d = world.payload, world.data
+    assert payload.ball is not None
+    rotor = np.array(layout.positions_body_m[0][:2])
+    out = rotor / np.linalg.norm(rotor)
+    edge_m = VEHICLE.airframe.disk_radius_m + config.payload_radius_m + beside_m
+    x, y = rotor if beside_m == 0.0 else rotor + edge_m * out
+    d.qpos[2] = 2.0
+    at, yaw_rad = payload.ball.q, 0.7
+    d.qpos[at : at + 3] = (
+        1.0 + math.cos(yaw_rad) * x - math.sin(yaw_rad) * y,
+        math.sin(yaw_rad) * x + math.cos(yaw_rad) * y,
+        2.3,
+    )
+    d.qvel[payload.ball.v + 2] = -3.0
+    payload.throws, payload._flies_since_s = 1, world.t_s
+    mujoco.mj_forward(world.model, d)
+    world.model.opt.gravity[:] = 0.0
+    for _ in range(100):  # 0.2 s: past the rotors
+        world.fly((0.05 if turning else 0.0,) * layout.count, (0.0, 0.0), False, drag=False)
+    assert [event.kind for event in world.take_events()] == (["rotor_hit", "crashed"] if hit else [])
