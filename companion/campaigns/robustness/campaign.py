@@ -97,11 +97,11 @@ class Robustness(Campaign):
             good=not unsafe,
         )
 
-    def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:
+    def draw(self, rows: Sequence[Row], out: Path) -> list[Picture]:
         """Write the plot of the distribution."""
         from companion.campaigns.robustness.plots import write_distribution
 
-        rows, path, (law, preset) = [message["row"] for message in messages], out / "distribution.png", self.law
+        path, (law, preset) = out / "distribution.png", self.law
         title = f"{self.configs[0].mission.name}, {law}/{preset}: {len(rows)} worlds"
         caption = "RMS of ‖e_p‖ after the catch, over completed flights that caught the payload."
         return [Picture(path, title, caption)] if write_distribution(rows, title, path) else []
