@@ -114,7 +114,7 @@ class Campaign(ABC):
     def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
         """Return the content of the HTML page."""
 
-    def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:
+    def draw(self, rows: Sequence[Row], out: Path) -> list[Picture]:
         """Write the plots, if there are any, and return them.
 
         Raises:
@@ -233,7 +233,7 @@ def _write(campaign: Campaign, flown: CampaignResult, table: dict[str, Any], out
     rows, settings, used = flown.rows, campaign.settings(), versions()
     write_csv((campaign.csv_row(row) for row in rows), out / campaign.csv_name)
     try:
-        pictures = campaign.draw(flown.messages, out)
+        pictures = campaign.draw(rows, out)
     except ImportError:
         print_error(no_plots(campaign.name))
         pictures = []

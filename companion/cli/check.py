@@ -10,7 +10,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
 
@@ -30,6 +30,7 @@ from companion.io.devices import open_available
 from companion.io.protocols import DeviceError
 from companion.launcher.launcher import replace_device_settings
 from companion.launcher.sitl_process import SitlProcess
+from companion.mission.check import check_mission
 from companion.mission.plan import Plan
 from companion.model.check_row import Level, Row, refusals
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
@@ -63,12 +64,10 @@ GROUPS = {
 _MARK_WIDTH, _TITLE_WIDTH, _WIDTH_MAX, _GAP = 4, 34, 160, 2
 _STYLES = {"ok": "green", "WARN": "yellow", "FAIL": "bold red"}
 
-Plans = Callable[[FlightConfig], list[str]]
 
-
-def run(arguments: argparse.Namespace, config: SitlConfig, problems: Plans) -> int:
+def run(arguments: argparse.Namespace, config: SitlConfig) -> int:
     """Run the command and return the exit code."""
-    found = problems(config)
+    found = check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases)
     if arguments.plan_only:
         return _plan_only(arguments, config, found)
     people = console_on(sys.stderr)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from companion.cli.options import MISSION_HELP, MISSION_OR_DEFAULT_HELP, add_law, add_seed, add_world, time_stamp
-from companion.cli.planning_progress import PlanningProgress
 from companion.cli.schema import schema_json
 from companion.config.document import ConfigError
 from companion.config.ground import FOXGLOVE_DEFAULT, listen_address
@@ -124,11 +123,6 @@ def _load(arguments: argparse.Namespace, *, hardware: bool, real_px4: bool = Fal
     )
 
 
-def _problems(config: FlightConfig) -> list[str]:
-    with PlanningProgress() as progress:
-        return check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases, progress=progress)
-
-
 def _check(arguments: argparse.Namespace) -> int:
     from companion.cli import check as check_command  # imports MAVSDK
 
@@ -136,9 +130,7 @@ def _check(arguments: argparse.Namespace) -> int:
         print_error(f"companion check: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
         return EXIT_BAD_INPUT
     hardware = arguments.sitl is None and not arguments.plan_only
-    return check_command.run(
-        arguments, _load(arguments, hardware=hardware, real_px4=arguments.sitl == "px4"), _problems
-    )
+    return check_command.run(arguments, _load(arguments, hardware=hardware, real_px4=arguments.sitl == "px4"))
 
 
 def _fly(arguments: argparse.Namespace) -> int:
@@ -164,7 +156,11 @@ def _fly(arguments: argparse.Namespace) -> int:
     if arguments.wait_for_start:
         arguments.overrides += ["mission.start.takeoff=by_operator"]
     config = _load(arguments, hardware=arguments.sitl is None, real_px4=arguments.sitl == "px4")
-    problems = _no_server(config) or [*_problems(config), *_start_impossible(config), *_no_bus_time(config, speed)]
+    problems = _no_server(config) or [
+        *check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases),
+        *_start_impossible(config),
+        *_no_bus_time(config, speed),
+    ]
     if problems:
         for line in problems:
             print_error(line)

@@ -69,9 +69,7 @@ class Manipulator(ABC):
         fx, fy, fz = force_body_n
         return tuple([x * fx + y * fy + z * fz for x, y, z in zip(jx, jy, jz, strict=True)])
 
-    def gravity_torque_nm(
-        self, angle_rad: Joints, attitude_wxyz: Quat, specific_force_m_s2: float = GRAVITY_M_S2
-    ) -> Joints:
+    def gravity_torque_nm(self, angle_rad: Joints, attitude_wxyz: Quat) -> Joints:
         """Return the motor torques that hold the arm against gravity at the given attitude, N m, payload excluded."""
         w, x, y, z = attitude_wxyz
-        return self.joint_terms(angle_rad, quat_rotate((w, -x, -y, -z), (0.0, 0.0, specific_force_m_s2)))[1]
+        return self.joint_terms(angle_rad, quat_rotate((w, -x, -y, -z), (0.0, 0.0, GRAVITY_M_S2)))[1]

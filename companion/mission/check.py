@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
-from companion.mission.minsnap import Progress
 from companion.mission.phase import Checking, phases_of
 from companion.mission.plan import Plan
 from companion.mission.sample_check import CATCH_NEAR_M, STOP, SampleCheck
@@ -38,7 +37,6 @@ def check_mission(
     start_yaw_rad: float | None = None,
     start_arm_rad: Joints | None = None,
     phase_origins: Sequence[str] = (),
-    progress: Progress | None = None,
 ) -> list[str]:
     """Return every reason not to fly this mission, one line each: what, where, when, and how to fix it. The list is empty if there
     is none.
@@ -54,7 +52,6 @@ def check_mission(
         start_yaw_rad: measured yaw; None for the mission's value.
         start_arm_rad: measured joint angles as in the paper; None for the mission's values.
         phase_origins: file:line:col of each phase (`FlightConfig.sources.phases`).
-        progress: called with the completed fraction of the planning, 0 to 1, while paths are solved.
     """
     start = mission.start
     position = start_position_world_m or (*start.position_m, vehicle.airframe.ground_clearance_m)
@@ -62,7 +59,7 @@ def check_mission(
     problems = check_vehicle(vehicle)
     if problems:
         return problems
-    plan = Plan.build(mission, vehicle, position, yaw_rad, start_arm_rad, progress)
+    plan = Plan.build(mission, vehicle, position, yaw_rad, start_arm_rad)
     problems = check_start(mission, vehicle, position, yaw_rad, start_arm_rad)
     problems += [
         *_speed(mission, vehicle),

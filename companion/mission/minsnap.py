@@ -7,10 +7,10 @@ linear system for given times of the waypoints; this module also finds those tim
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 from companion.mission.reference import Septic
 from companion.model.types import Vec3
@@ -18,9 +18,6 @@ from companion.model.types import Vec3
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-Progress: TypeAlias = Callable[[float], None]
-"""Callback with the completed fraction of the work, 0 to 1."""
 
 PEAK_SPEED = 2.1875
 """Largest f' of `minimum_snap`: 35 / 16, at half time."""
@@ -81,7 +78,7 @@ def least_line_s(distance_m: float, limits: VehicleLimits) -> float:
 _known: dict[tuple[tuple[Vec3, ...], VehicleLimits], Route] = {}
 
 
-def route(points_m: tuple[Vec3, ...], limits: VehicleLimits, progress: Progress | None = None) -> Route:
+def route(points_m: tuple[Vec3, ...], limits: VehicleLimits) -> Route:
     """Return the minimum-snap path through three or more points, at rest at the first and the last, without a stop at the others.
 
     The times of the pieces are varied one by one to find the shortest flight within the limits; the result is good, but not provably
@@ -91,26 +88,22 @@ def route(points_m: tuple[Vec3, ...], limits: VehicleLimits, progress: Progress 
     Args:
         points_m: world frame; no two consecutive points are equal.
         limits: speed, acceleration and jerk, each as the length of the vector.
-        progress: called several times during the search.
     """
     key = (points_m, limits)
     found = _known.get(key)
     if found is None:
-        found = _solve(points_m, limits, progress)
+        found = _solve(points_m, limits)
         while len(_known) >= _KNOWN_MAX:
             _known.pop(next(iter(_known)))
         _known[key] = found
-    if progress is not None:
-        progress(1.0)
     return found
 
 
-def _solve(points_m: tuple[Vec3, ...], limits: VehicleLimits, progress: Progress | None) -> Route:
+def _solve(points_m: tuple[Vec3, ...], limits: VehicleLimits) -> Route:
     distances_m = [math.dist(a, b) for a, b in pairwise(points_m)]
     shares = _normalised([math.sqrt(distance) for distance in distances_m])
     best_s = _total_s(points_m, shares, limits)
     passes = 2 if len(shares) <= _PIECES_FOR_TWO_PASSES else 1
-    tries, done = len(_STEPS) * passes * len(shares), 0
     for step in _STEPS:
         for _ in range(passes):
             for index in range(len(shares)):
@@ -120,9 +113,6 @@ def _solve(points_m: tuple[Vec3, ...], limits: VehicleLimits, progress: Progress
                     if total_s < best_s * (1.0 - _WORTH):
                         best_s, shares = total_s, tried
                         break
-                done += 1
-                if progress is not None:
-                    progress(done / (tries + 1))
     coefficients = least_snap(points_m, shares)
     return _rebuilt(points_m, shares, coefficients, _up(_needed_s(shares, coefficients, limits) * _MARGIN))
 

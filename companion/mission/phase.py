@@ -16,7 +16,7 @@ from companion.config.phase import PhaseSettings
 from companion.config.vehicle import Vehicle
 from companion.mission.air import NOTHING, Air, Expectation
 from companion.mission.arm_motion import ArmLimits
-from companion.mission.minsnap import Progress, VehicleLimits
+from companion.mission.minsnap import VehicleLimits
 from companion.mission.plan_builder import PlanBuilder
 from companion.model.codec import Record
 from companion.model.types import PhaseKind, Reference
@@ -34,8 +34,6 @@ class Planning:
     arm_limits: ArmLimits
     earlier: Sequence[Phase]
     """Phases before this one in the mission, the newest last."""
-    progress: Progress | None
-    """Called with the completed fraction of this phase's planning, if it is `slow_to_plan`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +53,6 @@ class Phase(PhaseSettings):
     """One phase of a mission. A type narrows `type` to `Literal[NAME]`, adds its keys, and overrides what it needs."""
 
     kind: ClassVar[PhaseKind] = PhaseKind.FLIGHT
-    slow_to_plan: ClassVar[bool] = False
-    """Whether planning may take seconds."""
     touches: ClassVar[bool] = False
     """Whether the tool begins to touch a surface."""
     presses: ClassVar[bool] = False

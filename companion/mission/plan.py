@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from companion.config.mission import Mission
 from companion.config.vehicle import Vehicle
 from companion.mission.arm_motion import ArmLimits
-from companion.mission.minsnap import Progress, VehicleLimits
+from companion.mission.minsnap import VehicleLimits
 from companion.mission.phase import Planning, phases_of
 from companion.mission.plan_builder import PlanBuilder
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED, Track, reference_at
@@ -53,7 +53,6 @@ class Plan:
         start_position_world_m: Vec3 | None = None,
         start_yaw_rad: float | None = None,
         start_arm_rad: Joints | None = None,
-        progress: Progress | None = None,
     ) -> Plan:
         """Plan a mission from the measured start.
 
@@ -70,7 +69,6 @@ class Plan:
             start_position_world_m: measured position of the body's origin; None for the mission's start, on the floor.
             start_yaw_rad: measured yaw; None for the mission's value.
             start_arm_rad: measured joint angles as in the paper; None for the mission's values.
-            progress: called with the completed fraction of the planning, 0 to 1, while paths are solved.
         """
         start = mission.start
         builder = PlanBuilder(
@@ -80,12 +78,9 @@ class Plan:
         )
         limits, arm_limits = _vehicle_limits(mission), _arm_limits(mission, vehicle)
         phases, flown = phases_of(mission), flown_phases(mission)
-        slow, solved = sum(phases[index].slow_to_plan for index, _ in flown), 0
         for index, repetition in flown:
             phase, start_s = phases[index], builder.t_s
-            part = _part(progress, solved, slow) if phase.slow_to_plan else None
-            phase.plan(Planning(builder, mission, vehicle, limits, arm_limits, phases[:index], part))
-            solved += phase.slow_to_plan
+            phase.plan(Planning(builder, mission, vehicle, limits, arm_limits, phases[:index]))
             name = counted(phase.title, repetition, mission.repeat)
             builder.segments.append(
                 Segment(
@@ -238,8 +233,3 @@ def _arm_limits(mission: Mission, vehicle: Vehicle) -> ArmLimits:
         acceleration_max_rad_s2=math.radians(limits.arm_acceleration_max_deg_s2),
         jerk_max_rad_s3=math.radians(limits.arm_jerk_max_deg_s3),
     )
-
-
-def _part(progress: Progress | None, done: int, count: int) -> Progress | None:
-    """Return a progress callback that converts the progress of one slow phase into the progress of all of them."""
-    return None if progress is None else lambda share: progress((done + share) / count)

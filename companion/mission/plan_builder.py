@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 from companion.mission.arm_motion import ArmLimits, plan_arm
-from companion.mission.minsnap import Progress, VehicleLimits, least_line_s, route
+from companion.mission.minsnap import VehicleLimits, least_line_s, route
 from companion.mission.reference import (
     REST_TO_REST_PEAK_SPEED,
     Curve,
@@ -78,16 +78,14 @@ class PlanBuilder:
         """Append a straight move from rest to rest with a lower peak speed than minimum snap."""
         self._go(0, to_world_m, self.t_s, duration_s, rest_to_rest)
 
-    def follow(
-        self, points_m: tuple[Vec3, ...], duration_s: float | None, limits: VehicleLimits, progress: Progress | None
-    ) -> float:
+    def follow(self, points_m: tuple[Vec3, ...], duration_s: float | None, limits: VehicleLimits) -> float:
         """Append a path through points without a stop; return its duration, s."""
         if len(points_m) == 1:
             duration_s = duration_s or least_line_s(self.line_m(points_m[0]), limits)
             self.move_vehicle(points_m[0], duration_s)
             return duration_s
         x_m, y_m, z_m = self._at[0]
-        way = route(((x_m, y_m, z_m), *points_m), limits, progress)
+        way = route(((x_m, y_m, z_m), *points_m), limits)
         scale_s = way.least_scale_s if duration_s is None else duration_s / way.knots[-1]
         duration_s = duration_s or scale_s * way.knots[-1]
         self._append(

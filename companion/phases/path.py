@@ -19,7 +19,6 @@ POINTS_APART_M = 0.01
 class Path(Phase):
     """Fly through points without stopping, from rest to rest with minimum snap; the arm keeps its pose."""
 
-    slow_to_plan: ClassVar[bool] = True
     renamed: ClassVar[dict[str, str]] = {"through_m": "waypoints_m"}
 
     type: Literal["path"]
@@ -45,4 +44,4 @@ class Path(Phase):
 
     def plan(self, p: Planning) -> None:
         """Append the path."""
-        p.builder.t_s += p.builder.follow(self.waypoints_m, self.duration_s, p.limits, p.progress)
+        p.builder.t_s += p.builder.follow(self.waypoints_m, self.duration_s, p.limits)

@@ -24,6 +24,8 @@ from companion.recorder.viewer_channels import ViewerChannels, timestamp
 _LEVELS = {"info": LogLevel.Info, "warning": LogLevel.Warning, "critical": LogLevel.Error}
 _STAMP_MAX_NS = 2**32 * 1_000_000_000 - 1
 """Largest time stamp of a header, whose seconds have 32 bits."""
+_CHUNK_BYTES = 2**19
+"""Size at which a chunk is flushed."""
 
 
 class LogWriter:
@@ -33,12 +35,11 @@ class LogWriter:
         viewer_error: why the viewer messages of a tick were left out, for the first such tick; None if none were left out.
     """
 
-    def __init__(self, log_file: LogFile, epoch_offset_ns: int, *, chunk_bytes: int) -> None:
+    def __init__(self, log_file: LogFile, epoch_offset_ns: int) -> None:
         self._epoch_offset_ns = epoch_offset_ns
         self._context = foxglove.Context()
         # Chunks are closed by `flush`, between ticks and not within one.
         options = MCAPWriteOptions(profile="companion", chunk_size=None, disable_seeking=True, compression_threads=0)
-        self._chunk_bytes = chunk_bytes
         self._mcap = foxglove.open_mcap(log_file, context=self._context, channel_filter=in_log, writer_options=options)
         self._records = (
             self._json_channel("/inputs", Inputs),
@@ -66,7 +67,7 @@ class LogWriter:
     @property
     def chunk_is_full(self) -> bool:
         """Whether the open chunk should be flushed."""
-        return self._unflushed_bytes >= self._chunk_bytes
+        return self._unflushed_bytes >= _CHUNK_BYTES
 
     def tick(self, inputs: Inputs, outputs: Outputs, sent: Sent) -> None:
         """Write one tick: three full-rate messages, its events, and the viewer messages that are due."""

@@ -185,7 +185,6 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
         "--metadata", type=json.loads, default={}, help="metadata record `flight`: a JSON object of strings"
     )
     parser.add_argument("--simulated", action="store_true", help="the devices are simulated")
-    parser.add_argument("--chunk-bytes", type=int, default=2**19, help="largest size of an MCAP chunk")
     return parser.parse_args(argv)
 
 
@@ -208,7 +207,7 @@ def main(argv: list[str] | None = None) -> int:
             {"samples": 0, "dropped": 0, "error": f"recorder: {name}: {error.strerror}; choose a writable --out"}
         )
         return 1
-    writer = LogWriter(log_file, arguments.epoch_offset_ns, chunk_bytes=arguments.chunk_bytes)
+    writer = LogWriter(log_file, arguments.epoch_offset_ns)
     about = {
         "log_format": LOG_FORMAT,
         "records": fingerprint(Inputs, Outputs, Sent),

@@ -10,7 +10,7 @@ Standard input contains the job, one line of JSON, and stays open; when it close
 * `scheduler`: address of a Dask scheduler on whose workers the flights run; null for this computer.
 * `batches`: whether further lines follow, each with the `flights` of one batch, which is flown before the next line is read.
 
-Standard output has a line of JSON for each flight that ends, {"type": "flight", "index", "row", "series", "wall_s"}, or
+Standard output has a line of JSON for each flight that ends, {"type": "flight", "index", "row", "wall_s"}, or
 {"type": "error", "text", "bad_input"} and exit code 1 if the campaign cannot continue.
 
 The row of a flight depends only on its configuration, not on the computer or on other flights.

@@ -17,9 +17,7 @@ WORKERS_TIMEOUT_S = 30.0
 
 Data = dict[str, Any]
 Fly = Callable[[SitlConfig, Data], Data]
-"""Flies one flight of a job and returns its `row`, and its `series` if it has one; must be a module-level function, so that workers can
-import it.
-"""
+"""Flies one flight of a job and returns its `row`; must be a module-level function, so that workers can import it."""
 
 
 def fly_all(

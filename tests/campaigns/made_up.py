@@ -31,14 +31,13 @@ def fly_made_up(
     monkeypatch: pytest.MonkeyPatch,
     row_of: Callable[[dict[str, Any]], Row | None],
     error: CampaignError | None = None,
-    series: dict[str, Any] | None = None,
 ) -> None:
     """Let `row_of` make the row of each flight of a job, or None for one that is not flown."""
 
     def start(campaign: Campaign, out: Path) -> contextlib.AbstractContextManager[Flights]:
         made = [(index, row_of(flight)) for index, flight in enumerate(campaign.job()["flights"])]
         messages = [
-            {"index": index, "row": row, "series": series, "wall_s": 0.1, "cpu_s": 0.5 + index % 2, "at_once": 4}
+            {"index": index, "row": row, "wall_s": 0.1, "cpu_s": 0.5 + index % 2, "at_once": 4}
             for index, row in made
             if row is not None
         ]

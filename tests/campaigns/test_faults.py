@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 
@@ -30,7 +30,7 @@ from companion.model.types import (
 )
 from companion.safety.notices import NOTICES
 from companion.safety.rules import RULES
-from companion.sitl_config.faults import CONTACT_PHASES, KINDS, PHASES, FaultKind
+from companion.sitl_config.faults import CONTACT_PHASES, KINDS, PHASES
 from companion.sitl_config.loader import load_sitl
 from tests.campaigns.made_up import fault_row
 from tests.support import CATCH
@@ -147,8 +147,7 @@ def test_what_is_reported_after_the_landing_is_no_answer() -> None:
     assert (row["action"], row["event"], row["reacted_s"]) == ("nominal", None, None)
 
 
-def test_the_table_of_kinds_is_the_literal_and_names_events_that_exist() -> None:
-    assert tuple(KINDS) == get_args(FaultKind)
+def test_the_table_of_kinds_names_events_that_exist() -> None:
     known = {rule.id for rule in RULES} | {"guardian_took_over", "offboard_refused", "arming_refused"}
     known |= {notice.id for notice in NOTICES}
     assert {name for kind in KINDS.values() for name in kind.named_by} - known == set()

@@ -12,7 +12,6 @@ from companion.campaigns.robustness.cases import (
     Kept,
     as_cases,
     fly_command,
-    name_of,
     read_cases,
     worse_than,
     write_cases,
@@ -26,14 +25,6 @@ from companion.sitl_config.loader import load_sitl
 from tests.campaigns.made_up import WORLD
 from tests.campaigns.made_up import draw_row as row
 from tests.support import CATCH
-
-
-def test_the_name_of_a_draw_lists_what_is_hard() -> None:
-    assert name_of(WORLD) == "heavy_fast_from_behind_force_lost_slow_setpoints"
-    gentle = {**WORLD, "payload_kg": 0.06, "throw_velocity_m_s": [0.1, -0.6, -1.0], "wind_m_s": [2.9, 0.0, 0.0]}
-    gentle = {**gentle, "faults": [{"kind": "force_loss", "t_s": 0.0}], "setpoint_delay_s": 0.01}
-    assert name_of(gentle) == "light_gentle_from_left_no_force_windy"
-    assert name_of({"payload_kg": 0.2}) == "plain"
 
 
 def test_the_worst_are_those_that_crashed_then_gave_up_then_were_off() -> None:
@@ -60,11 +51,11 @@ def test_cases_come_back_from_their_file_as_they_were(tmp_path: Path) -> None:
     assert read_cases(path) == cases
     assert [case.knobs() for case in read_cases(path).cases] == [one["world"] for one in rows]
     names = [case.name for case in cases.cases]
-    assert names[1] == f"{names[0]}_2", "two of one name"
+    assert names == ["draw_0", "draw_1", "draw_2"]
     assert cases.cases[0].kept == Kept(outcome=Outcome.COMPLETED, caught=True, e_p_m=0.0423)
     assert cases.cases[1].kept.e_p_m is None
     assert [case.name for case in cases.named([names[1]])] == [names[1]]
-    with pytest.raises(ConfigError, match="--case nobody: no such case; available: heavy"):
+    with pytest.raises(ConfigError, match="--case nobody: no such case; available: draw_0, draw_1"):
         cases.named(["nobody"])
 
 

@@ -20,10 +20,6 @@ from tests.campaigns.made_up import compare_row, draw_row, fault_row, fly_made_u
 from tests.support import CATCH, HOVER, run_here
 
 EVIL = "<script>alert('$x$')</script>"
-T_S = [0.02 * k for k in range(50)]
-SERIES: dict[str, Any] = {
-    "t_s": T_S, "e_p_m": T_S, "e_q_deg": T_S, "alpha_deg": [T_S, T_S], "alpha_reference_deg": [T_S, [None] * 50], "catch_t_s": 0.4,
-}  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -72,7 +68,7 @@ def test_files_of_a_comparison_hold_what_is_printed(monkeypatch: pytest.MonkeyPa
     def row(flight: dict[str, Any]) -> dict[str, Any]:
         return compare_row(flight, None if flight["preset"] == "paper" else 0.05, error=EVIL)
 
-    fly_made_up(monkeypatch, row, series=SERIES)
+    fly_made_up(monkeypatch, row)
     ended = run_here(*COMPARE, "--presets", "paper,recommended", "--seeds", "2", "--first-seed", "7", "--json")
     assert (ended.code, ended.err) == (EXIT_OK, ""), "a crash is a result"
     table = json.loads(ended.out)
@@ -87,7 +83,7 @@ def test_files_of_a_comparison_hold_what_is_printed(monkeypatch: pytest.MonkeyPa
     with open("out/compare.csv", newline="", encoding="utf-8") as file:
         lines = list(csv.DictReader(file))
     assert lines == [{key: "" if v is None else str(v) for key, v in flat(row)} for row in table["rows"]]
-    pictures = {"errors.png", "tracking_0.2kg.png"}
+    pictures = {"errors.png"}
     assert {path.name for path in Path("out").iterdir()} == {"compare.json", "compare.csv", "compare.html"} | pictures
     page = Page(Path("out/compare.html"))
     assert sorted(page.pictures) == sorted(Path("out", name).read_bytes() for name in pictures)
@@ -98,7 +94,7 @@ def test_files_of_a_comparison_hold_what_is_printed(monkeypatch: pytest.MonkeyPa
 
 
 def test_the_terminal_shows_tables_and_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.campaigns.compare.plots.write_png", lambda figure, path: path.write_bytes(b"drawn"))
+    monkeypatch.setattr("companion.analysis.plot_style.write_png", lambda figure, path: path.write_bytes(b"drawn"))
     fly_made_up(monkeypatch, lambda flight: compare_row(flight, None))
     ended = run_here(*COMPARE, "--seeds", "1")
     line = next(line for line in ended.out.splitlines() if "adaptive/paper" in line)

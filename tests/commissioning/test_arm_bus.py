@@ -40,7 +40,7 @@ def damaging() -> ServoBus:
 def test_two_lost_or_damaged_packets_are_repeated(bus: ServoBus) -> None:
     with served(bus) as port, ServoTalk(port) as talk:
         talk.open(BAUD)
-        assert talk.answers(1)
+        assert talk.ping(1) is not None
         talk.write(1, dxl.RETURN_DELAY, 7)
         assert talk.read(1, dxl.RETURN_DELAY) == 7
 

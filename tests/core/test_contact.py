@@ -182,7 +182,7 @@ def test_report_and_ground_station_show_the_force_and_the_report_the_true_one(
     assert 0.1 < float(rotors[1].split()[0]) < 0.6
     true_n = float(true[1].split()[0])
     assert true_n == pytest.approx(5.0, abs=0.25)
-    streams, _ = replay(log.rows(), flight.config.flight, "s", 0.0, rate_hz=2.0)
+    streams, _ = replay(log.rows(), flight.config.flight, "s", 0.0)
     shown = [stream.contact for stream in streams if stream.contact is not None and stream.contact.mode == "press"]
     assert any(4.0 < view.force_n < 6.0 and view.wanted_n == 5.0 for view in shown)
     assert scene_of(flight.config.flight, "s").has_contact

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from companion.analysis import plot_style
-from companion.campaigns.compare import plots as compare_plots
 from companion.campaigns.robustness import plots as robustness_plots
 from companion.campaigns.runner import Row
 from companion.cli.main import main
@@ -48,7 +47,7 @@ PAGES = {
 def test_a_campaign_notes_its_command_and_the_page_prints_it(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (compare_plots, plot_style, robustness_plots):  # nobody looks at the plots
+    for module in (plot_style, robustness_plots):  # nobody looks at the plots
         monkeypatch.setattr(module, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
     fly_made_up(monkeypatch, ROWS[name])
     words = [name, *RUNS[name], "--out", str(tmp_path)]

@@ -238,7 +238,7 @@ class DynamixelTarget(Target):
     def _new(self) -> tuple[DynamixelArm, ArmBus]:
         device = ArmDevice(port="memory", watchdog_ms=_WATCHDOG_MS)
         arm = DynamixelArm(device, arm_config(), lambda: self._line.now_s)
-        arm._bus._port = MemoryPort(self._line)
+        arm._bus._port = arm._bus._servos.port = MemoryPort(self._line)
         self._line.reset_input_buffer()
         return arm, arm._bus
 

@@ -51,7 +51,7 @@ def opened(late_exchange: int) -> tuple[ArmBus, LateSerial]:
     line = LateSerial(late_exchange)
     line.answer = servos().feed
     bus = ArmBus(ArmDevice(port="memory"), arm_config(), aborted=lambda: False)
-    bus._port = MemoryPort(line)
+    bus._port = bus._servos.port = MemoryPort(line)
     bus.open(30.0)
     return bus, line
 

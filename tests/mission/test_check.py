@@ -232,14 +232,6 @@ def test_a_path_that_overshoots_the_room_is_refused() -> None:
     assert problems(swing, "mission.catch.expected_at_m=[1.2, 0]") == []
 
 
-def test_progress_of_the_planning_is_reported() -> None:
-    told: list[float] = []
-    config = load(mission="circuit")
-    assert check_mission(config.mission, config.vehicle, progress=told.append) == []
-    assert told == sorted(told)
-    assert told[-1] == 1.0
-
-
 def test_a_yawed_vehicle_reaches_elsewhere_with_its_net() -> None:
     wide = "vehicle.arm.link_lengths_m=[0.4, 0.4]"
     overrides = [wide, "mission.phases[2].arm_deg=[60, 60]", "mission.limits.arm_speed_max_deg_s=200"]

@@ -33,7 +33,7 @@ NAN = math.nan
 def written(path: Path, rows: Iterable[Row], *, config: str | None = None, plan: str | None = None) -> Viewed:
     """Write rows with the log writer alone."""
     log_file = LogFile(path)
-    writer = LogWriter(log_file, EPOCH_NS, chunk_bytes=2**19)
+    writer = LogWriter(log_file, EPOCH_NS)
     writer.metadata("companion", {"log_format": "1"})
     writer.metadata("config", {"json": config_json() if config is None else config})
     if plan is not None:
@@ -182,7 +182,7 @@ def test_what_stands_is_drawn_once_for_good_in_its_own_frame(tmp_path: Path) -> 
 
 def test_a_plan_that_comes_later_is_drawn_with_everything_else_again(tmp_path: Path) -> None:
     log_file = LogFile(tmp_path / "flight.mcap")
-    writer = LogWriter(log_file, EPOCH_NS, chunk_bytes=2**19)
+    writer = LogWriter(log_file, EPOCH_NS)
     writer.metadata("config", {"json": config_json()})
     rows = still(40)
     for row in rows[:20]:
@@ -363,7 +363,7 @@ def test_no_sick_tick_is_lost_or_stops_the_viewers(tmp_path: Path) -> None:
 
 def test_a_tick_that_cannot_be_drawn_is_recorded_and_reported_once(tmp_path: Path) -> None:
     log_file = LogFile(tmp_path / "flight.mcap")
-    writer = LogWriter(log_file, EPOCH_NS, chunk_bytes=2**19)
+    writer = LogWriter(log_file, EPOCH_NS)
     rows = still(12)
     for inputs, outputs, sent in rows:
         torn: Any = (0.0, 1.0)

@@ -44,7 +44,6 @@ FLIGHT: dict[str, Any] = {
     "payload_kg": 0.2,
     "seed": 3,
     "model_error": 0.0,
-    "series": True,
 }
 
 
@@ -103,23 +102,6 @@ def test_a_row_is_what_the_flight_was(seen: Seen) -> None:
     assert row["torque_activity_nm"] == pytest.approx(
         math.sqrt(math.fsum(c * c for c in changes) / len(changes)), rel=1e-9
     )
-
-
-def test_a_series_is_the_course_of_the_flight(seen: Seen) -> None:
-    series, flown = seen.made["series"], seen.result
-    t_s = series["t_s"]
-    assert t_s == sorted(t_s)
-    assert t_s[1] - t_s[0] == pytest.approx(0.02)
-    for key in ("e_p_m", "e_q_deg"):
-        assert len(series[key]) == len(t_s)
-    k = len(t_s) // 2
-    at = min(range(len(flown.outputs)), key=lambda n: abs(flown.outputs[n].mission_t_s - t_s[k]))
-    arm = flown.inputs[at].arm
-    assert arm is not None
-    assert [series["alpha_deg"][j][k] for j in range(2)] == pytest.approx(
-        [math.degrees(a) for a in arm.angle_rad], abs=1e-5
-    )
-    assert series["catch_t_s"] == pytest.approx(seen.made["row"]["catch_t_s"], abs=0.05)
 
 
 def test_a_catch_that_was_not_noticed_still_divides_the_flight(seen: Seen) -> None:
@@ -204,7 +186,7 @@ def job_of(jobs: int | None, scheduler: str | None, more: int = 0) -> dict[str, 
     return {
         "campaign": "compare",
         "configs": [CONFIG.model_dump(mode="json")],
-        "flights": [FLIGHT, *({**FLIGHT, "seed": seed, "series": False} for seed in range(more))],
+        "flights": [FLIGHT, *({**FLIGHT, "seed": seed} for seed in range(more))],
         "jobs": jobs,
         "scheduler": scheduler,
     }
@@ -212,7 +194,7 @@ def job_of(jobs: int | None, scheduler: str | None, more: int = 0) -> dict[str, 
 
 def assert_same_flight(flown: list[dict[str, Any]], seen: Seen) -> None:
     (found,) = (message for message in flown if message["index"] == 0)
-    assert {key: found[key] for key in ("row", "series")} == {key: seen.made[key] for key in ("row", "series")}
+    assert found["row"] == seen.made["row"]
 
 
 def test_two_processes_fly_the_same_row_and_end_with_the_program_that_started_them(seen: Seen, place: Sandbox) -> None:

@@ -14,7 +14,6 @@ from companion.campaigns.compare.aggregate import aggregate
 from companion.campaigns.compare.grid import Variant
 from companion.campaigns.compare.paper_results import SOURCE
 from companion.campaigns.compare.tables import by_payload, compliance_table, print_tables, tracking_table
-from companion.campaigns.process import Message
 from companion.campaigns.runner import Campaign, Row
 from companion.plugins import CONTROL_LAWS, find
 
@@ -86,11 +85,11 @@ class Compare(Campaign):
             sections,
         )
 
-    def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:
-        """Plot the distributions, and the time series of the flights that recorded one."""
+    def draw(self, rows: Sequence[Row], out: Path) -> list[Picture]:
+        """Plot the distributions."""
         from companion.campaigns.compare.plots import write_pictures
 
-        return write_pictures(messages, aggregate(message["row"] for message in messages), out)
+        return write_pictures(aggregate(rows), out)
 
     def show(self, rows: Sequence[Row], console: Console) -> None:
         """Print both tables."""

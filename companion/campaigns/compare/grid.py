@@ -116,9 +116,7 @@ def flights_of(
     seeds: Sequence[int],
     model_errors: Sequence[float] = (0.0,),
 ) -> list[Message]:
-    """Return the flights in the order of the table: payload, model error, variant, seed. The first seed's flights with the first model
-    error record a time series.
-    """
+    """Return the flights in the order of the table: payload, model error, variant, seed."""
     return [
         {
             "variant": position,
@@ -127,7 +125,6 @@ def flights_of(
             "payload_kg": payload_kg,
             "model_error": model_error,
             "seed": seed,
-            "series": (seed, model_error) == (seeds[0], model_errors[0]),
         }
         for payload_kg in payloads_kg
         for model_error in model_errors

@@ -1,5 +1,5 @@
 """The plots of a comparison: the distributions of the position error, the error over the model error, the error with and without
-adaptation; and, as in the paper's figures, ||e_p||, ||e_q|| and the joint angles over time, one figure per payload.
+adaptation.
 
 Needs matplotlib (extra `analysis`).
 """
@@ -28,94 +28,18 @@ from companion.analysis.plot_style import (
     dress,
     figure_legend,
     label_lowest,
-    mark_catch,
-    mark_end,
     new_figure,
     panels,
-    write_png,
 )
-from companion.campaigns.compare.aggregate import COMPLETED, Group, Pairs, adaptation_pairs
+from companion.campaigns.compare.aggregate import Group, Pairs, adaptation_pairs
 from companion.campaigns.compare.grid import ABLATED, is_ablation, short_label
-from companion.campaigns.process import Message
 
 PARTS = {"pre": "before", "post": "after"}
-_ERRORS = (("e_p_m", r"$\|e_p\|$ [m]"), ("e_q_deg", r"$\|e_q\|$ [deg]"))
 
 
-def write_pictures(messages: Sequence[Message], groups: Sequence[Group], out: Path) -> list[Picture]:
-    """Draw every plot for which there is data.
-
-    Args:
-        messages: results of the flights; a `series` {t_s, e_p_m, e_q_deg, alpha_deg, alpha_reference_deg, catch_t_s} is drawn
-            over time; the angles have one series per joint.
-        groups: aggregated rows of the flights.
-        out: folder for the PNG files.
-    """
-    written = plot_style.write_pictures(distributions(groups), out)
-    colours = _colours(group.label for group in sorted(groups, key=lambda group: is_ablation(group.preset)))
-    drawn = [message for message in messages if message["series"] is not None]
-    for payload_kg in sorted({message["row"]["payload_kg"] for message in drawn}):
-        these = [message for message in drawn if message["row"]["payload_kg"] == payload_kg]
-        whole = [message for message in these if not is_ablation(message["row"]["preset"])]
-        kinds = [("tracking", "Tracking errors and arm", whole)]
-        if len(whole) < len(these):
-            below = [m for m in these if m not in whole or (m["row"]["controller"], m["row"]["preset"]) == ABLATED]
-            kinds.append(("ablation", f"{'/'.join(ABLATED)} and its ablations", below))
-        for name, title, chosen in kinds:
-            if not chosen:
-                continue
-            path, title = out / f"{name}_{payload_kg:g}kg.png", f"{title}, {payload_kg:g} kg"
-            write_png(_courses(title, chosen, colours), path)
-            seed = chosen[0]["row"]["seed"]
-            caption = (
-                f"Seed {seed}; dashed vertical line: the catch; cross: the end of a flight that was not completed."
-            )
-            written.append(Picture(path, title, caption))
-    return written
-
-
-def _courses(title: str, messages: Sequence[Message], colours: dict[str, str]) -> Figure:
-    joints = len(messages[0]["series"]["alpha_deg"])
-    panes: list[tuple[str, int | None, str]] = [(key, None, label) for key, label in _ERRORS]
-    panes += [("alpha_deg", joint, rf"$\alpha_{joint + 1}$ [deg]") for joint in range(joints)]
-    figure = new_figure(0.2 + 2.0 * len(panes))
-    axes = figure.subplots(len(panes), 1, sharex=True, height_ratios=(1.15, *(1.0 for _ in panes[1:])))
-    for ax, (key, joint, label) in zip(axes, panes, strict=True):
-        dress(ax)
-        ax.set_ylabel(label)
-        for message in messages:
-            row, series = message["row"], message["series"]
-            colour = colours[_label(row)]
-            t_s, values = _array(series["t_s"]), _values(series[key], joint)
-            name = short_label(row["controller"], row["preset"]).strip()
-            ax.plot(t_s, values, color=colour, lw=1.2, label=name, zorder=3)
-            if row["outcome"] != COMPLETED:
-                mark_end(ax, t_s, values, colour)
-        if joint is None:
-            ax.set_ylim(bottom=0.0, top=_top(messages, key))
-        else:
-            longest = max((message["series"] for message in messages), key=lambda series: len(series["t_s"]))
-            reference = _values(longest["alpha_reference_deg"], joint)
-            ax.plot(_array(longest["t_s"]), reference, color=INK, lw=1.1, ls=DASHED, label="reference", zorder=4)
-        ax.margins(x=0.0)
-    caught = [m["series"]["catch_t_s"] for m in messages if m["series"]["catch_t_s"] is not None]
-    if caught:
-        mark_catch(axes, float(np.median(caught)))
-    axes[-1].set_xlabel("mission time [s]")
-    handles, names = axes[min(2, len(panes) - 1)].get_legend_handles_labels()
-    figure_legend(figure, title, handles, names, columns=4)
-    return figure
-
-
-def _top(messages: Sequence[Message], key: str) -> float:
-    """Return the upper limit of an error axis; it cuts off an incomplete flight whose errors would hide the others."""
-    courses = [(_array(m["series"][key]), m["row"]["outcome"] == COMPLETED) for m in messages]
-    peaks = [(float(np.nanmax(values)), completed) for values, completed in courses if np.isfinite(values).any()]
-    if not peaks:
-        return 1.0
-    every, completed = [peak for peak, _ in peaks], [peak for peak, whole in peaks if whole]
-    limit = 2.0 * max(completed) if completed else 3.0 * float(np.median(every))
-    return 1.1 * max(1e-3, min(max(every), limit))
+def write_pictures(groups: Sequence[Group], out: Path) -> list[Picture]:
+    """Write every plot for which there is data as PNG into a folder."""
+    return plot_style.write_pictures(distributions(groups), out)
 
 
 def distributions(groups: Sequence[Group]) -> list[tuple[str, str, str, Figure]]:
@@ -293,10 +217,6 @@ def _log_metres(ax: Any, *names: str) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def _label(row: dict[str, Any]) -> str:
-    return f"{row['controller']}/{row['preset']}"
-
-
 def _colours(labels: Iterable[str]) -> dict[str, str]:
     """Return a colour for each label, the same in every picture."""
     return {label: COLOURS[k % len(COLOURS)] for k, label in enumerate(dict.fromkeys(labels))}
@@ -304,7 +224,3 @@ def _colours(labels: Iterable[str]) -> dict[str, str]:
 
 def _array(values: Sequence[float | None]) -> Array:
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
-
-
-def _values(series: Any, joint: int | None) -> Array:
-    return _array(series if joint is None else series[joint])

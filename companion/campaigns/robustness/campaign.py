@@ -12,7 +12,7 @@ from rich.console import Console
 from companion.analysis.page import Page, Picture, Section
 from companion.analysis.table import Cell, Column, Table, for_terminal, number, table
 from companion.campaigns.process import Message
-from companion.campaigns.robustness.cases import Case, Cases, as_cases, fly_command, worse_than, write_cases
+from companion.campaigns.robustness.cases import Case, Cases, as_cases, case_name, fly_command, worse_than, write_cases
 from companion.campaigns.robustness.draws import DRAWN, DRIVERS, SAFE, drivers, influence, thirds, worst
 from companion.campaigns.runner import Campaign, Row, catches, counted, outcomes, print_lines
 from companion.model.types import Outcome
@@ -97,11 +97,11 @@ class Robustness(Campaign):
             good=not unsafe,
         )
 
-    def draw(self, messages: Sequence[Message], out: Path) -> list[Picture]:
+    def draw(self, rows: Sequence[Row], out: Path) -> list[Picture]:
         """Write the plot of the distribution."""
         from companion.campaigns.robustness.plots import write_distribution
 
-        rows, path, (law, preset) = [message["row"] for message in messages], out / "distribution.png", self.law
+        path, (law, preset) = out / "distribution.png", self.law
         title = f"{self.configs[0].mission.name}, {law}/{preset}: {len(rows)} worlds"
         caption = "RMS of ‖e_p‖ after the catch, over completed flights that caught the payload."
         return [Picture(path, title, caption)] if write_distribution(rows, title, path) else []
@@ -147,10 +147,7 @@ class Robustness(Campaign):
     def _flights_table(self, rows: Sequence[Row]) -> Table:
         if self.cases:
             return flights_table(rows, self.cases)
-        hardest = worst(rows)
-        # Names of the worst flights in worst.yaml.
-        names = [case.name for case in as_cases(hardest)]
-        return flights_table([{**row, "name": name} for row, name in zip(hardest, names, strict=True)])
+        return flights_table([{**row, "name": case_name(row)} for row in worst(rows)])
 
     def _write_cases(self, rows: Sequence[Row], path: Path) -> None:
         law, preset = self.law

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from companion.campaigns.robustness.draws import SAFE, drivers
+from companion.campaigns.robustness.draws import SAFE
 from companion.campaigns.runner import Row
 from companion.config.base import Model, NonNegative
 from companion.config.document import ConfigError, problem_lines
@@ -19,20 +19,6 @@ from companion.sitl_config.world import World
 
 WORSE_THAN_KEPT = 1.25
 """Largest allowed ratio of a case's error to its recorded error."""
-_HARD_FROM = 0.4
-"""A case's name mentions a quantity whose value lies beyond this fraction of the way from the middle of its range to the hard end."""
-_WORDS = (
-    # key, middle and hard end of its range, word
-    ("setpoint_delay_s", 0.03, 0.06, "slow_setpoints"),
-    ("arm_delay_s", 0.006, 0.01, "slow_arm"),
-    ("rotor_lag_s", 0.04, 0.06, "slow_rotors"),
-    ("wind_speed_m_s", 1.5, 3.0, "windy"),
-    ("hover_thrust_error", 0.0, 0.1, "hover_too_high"),
-    ("hover_thrust_error", 0.0, -0.1, "hover_too_low"),
-    ("catch_x_m", 0.0, 1.0, "caught_late"),
-    ("catch_x_m", 0.0, -1.0, "caught_early"),
-    ("force_bias_n", 6.0, 12.0, "biased"),
-)
 
 
 class Kept(Model):
@@ -133,44 +119,20 @@ def fly_command(
     return shlex.join(words)
 
 
-def name_of(world: Mapping[str, Any]) -> str:
-    """Return a name that lists the difficulties of a world, such as `heavy_fast_from_behind_slow_setpoints`."""
-    drawn = drivers(world)
-
-    def hardness(key: str, middle: float, end: float) -> float:
-        """Return the difficulty: 0 at the middle of the range, 1 at its hard end."""
-        value = drawn[key]
-        return 0.0 if value is None else (value - middle) / (end - middle)
-
-    def either(share: float, high: str, low: str) -> list[str]:
-        return [high] if share > _HARD_FROM else [low] if share < -_HARD_FROM else []
-
-    words = either(hardness("payload_kg", 0.225, 0.4), "heavy", "light")
-    words += either(hardness("throw_speed_m_s", 2.25, 4.0), "fast", "gentle")
-    from_deg = drawn["throw_from_deg"]
-    if from_deg is not None:
-        side = "left" if world["throw_velocity_m_s"][1] < 0 else "right"
-        words.append(f"from_{'ahead' if from_deg < 45 else 'behind' if from_deg > 135 else side}")
-    if drawn["force_lost_s"] is not None:
-        words.append("no_force" if drawn["force_lost_s"] == 0.0 else "force_lost")
-    hard = [(hardness(key, middle, end), word) for key, middle, end, word in _WORDS]
-    words += [word for share, word in sorted(hard, reverse=True)[:2] if share > _HARD_FROM]
-    return "_".join(words) or "plain"
+def case_name(row: Row) -> str:
+    """Return the name under which a row is kept: that of its case, or the number of its draw."""
+    return str(row["name"]) if row["number"] is None else f"draw_{row['number']}"
 
 
 def as_cases(rows: Sequence[Row]) -> tuple[Case, ...]:
-    """Return rows as cases to keep. The name of a draw lists its difficulties."""
-    taken: dict[str, int] = {}
+    """Return rows as cases to keep."""
     cases = []
     for row in rows:
-        name = row["name"] if row["number"] is None else name_of(row["world"])
-        taken[name] = taken.get(name, 0) + 1
-        unique = name if taken[name] == 1 else f"{name}_{taken[name]}"
         error_m = row["e_p_m"] if row["outcome"] == Outcome.COMPLETED.value else None
         kept = Kept(
             outcome=Outcome(row["outcome"]), caught=row["caught"], e_p_m=None if error_m is None else round(error_m, 4)
         )
-        cases.append(Case(name=unique, world=World.model_validate(row["world"]), kept=kept))
+        cases.append(Case(name=case_name(row), world=World.model_validate(row["world"]), kept=kept))
     return tuple(cases)
 
 

@@ -95,7 +95,7 @@ def scan(
                 break  # 5 s for a rate that is rarely used
             progress(f"{baud} baud")
             talk.open(baud)
-            answers = talk.ping_all()
+            answers = talk.answers_to_ping()
             tried.append(baud)
             found = [_read(talk, *answer) for answer in answers.servos]
             servos += found

@@ -160,11 +160,11 @@ def _carry_out(talk: ServoTalk, one: ServoPlan, report: Callable[[str], None]) -
         register = setting.register
         report(f"servo {servo_id}: {register} {setting.shown(setting.found)} -> {setting.shown(setting.wanted)}")
         if register == bus.ID:
-            talk.write(servo_id, register, setting.wanted, read_back=False)
+            talk.try_write(servo_id, register, setting.wanted)
             _expect(talk, setting.wanted, f"id {setting.wanted}", f"id {servo_id}")
             servo_id = setting.wanted
         elif register == bus.BAUD:
-            talk.write(servo_id, register, setting.wanted, read_back=False)
+            talk.try_write(servo_id, register, setting.wanted)
             talk.open(bus.BAUDS[setting.wanted])
             _expect(talk, servo_id, f"{baud_text(setting.wanted)} baud", f"{one.servo.baud} baud")
         else:
@@ -172,7 +172,7 @@ def _carry_out(talk: ServoTalk, one: ServoPlan, report: Callable[[str], None]) -
 
 
 def _expect(talk: ServoTalk, servo_id: int, now: str, before: str) -> None:
-    if not talk.answers(servo_id):
+    if talk.ping(servo_id) is None:
         raise DeviceError(
             f"servo {servo_id}: does not answer with its new {now} (it had {before}); run companion arm scan, which finds it "
             "with either value, then companion arm setup again"

@@ -44,7 +44,7 @@ def hold(vehicle: Vehicle, guide: ZeroGuide, console: Console) -> ZeroResult:
 
 def _ready(talk: ServoTalk, servo_id: int) -> None:
     name = f"arm bus: servo {servo_id}"
-    if not talk.answers(servo_id):
+    if talk.ping(servo_id) is None:
         fix = "find it with companion arm scan, and correct it with companion arm setup"
         raise DeviceError(f"{name} does not answer at {talk.baud} baud; {fix}")
     talk.write(servo_id, dxl.TORQUE_ENABLE, 0)

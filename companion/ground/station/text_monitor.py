@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
-import sys
-import termios
 import time
-import tty
 from collections import deque
 from collections.abc import Iterator
 
@@ -26,6 +22,7 @@ from companion.model.commands import SAFER_COMMANDS, TABLE
 from companion.model.types import OperatorCommand
 from companion.runtime.console import terminal_console
 from companion.runtime.tasks import until_first
+from companion.runtime.terminal import pressed, raw_keys
 
 PERIOD_S = 0.125
 LINE_PERIOD_S = 1.0
@@ -165,29 +162,26 @@ class _Screen:
     @contextlib.contextmanager
     def _key_presses(self) -> Iterator[None]:
         """Context in which keys are read one by one; restores the terminal afterwards."""
-        if not sys.stdin.isatty():
-            yield
-            return
-        loop, file = asyncio.get_running_loop(), sys.stdin.fileno()
-        before = termios.tcgetattr(file)
+        with raw_keys() as terminal:
+            if terminal is None:
+                yield
+                return
+            loop = asyncio.get_running_loop()
 
-        def read() -> None:
+            def read() -> None:
+                keys = ""
+                with contextlib.suppress(OSError):
+                    keys = pressed(terminal)
+                if not keys:
+                    loop.remove_reader(terminal)
+                self._keys.extend(keys.lower())
+                self._pressed.set()
+
+            loop.add_reader(terminal, read)
             try:
-                data = os.read(file, 64)
-            except OSError:
-                data = b""
-            if not data:
-                loop.remove_reader(file)
-            self._keys.extend(data.decode("ascii", "ignore").lower())
-            self._pressed.set()
-
-        tty.setcbreak(file)
-        loop.add_reader(file, read)
-        try:
-            yield
-        finally:
-            loop.remove_reader(file)
-            termios.tcsetattr(file, termios.TCSADRAIN, before)
+                yield
+            finally:
+                loop.remove_reader(terminal)
 
 
 def _target(vehicle: Vehicle | None) -> tuple[object, ...]:

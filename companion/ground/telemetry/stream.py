@@ -47,7 +47,9 @@ from companion.model.types import (
 )
 
 STREAM_PERIOD_S = 0.05
-"""Period of the stream messages over MQTT."""
+"""Period of the stream messages over MQTT, and of those of a replayed flight."""
+_REPLAYED_EVENTS = 2000
+"""Number of newest events of a replayed flight to keep."""
 _TOUCHDOWN = Stage.TOUCHDOWN.value
 """Phase after touchdown, in which a reference below the floor is not a tracking error."""
 WAITS_FOR_START = Stage.READY.value
@@ -225,9 +227,7 @@ def replay(
     config: FlightConfig,
     session: str,
     epoch_offset_s: float,
-    rate_hz: float = 20.0,
     max_records: int = 12000,
-    max_events: int = 2000,
 ) -> tuple[list[Stream], Events]:
     """Return a logged flight as the messages that the vehicle would have published.
 
@@ -236,14 +236,13 @@ def replay(
         session: any session id.
         epoch_offset_s: wall clock when the flight clock was zero.
         max_records: maximum number of messages, at least 2.
-        max_events: number of newest events to keep.
 
     Returns:
         Messages in order, including the first and the last tick, and the events of the flight.
     """
     maker = StreamBuilder(config, session)
-    maker.events = deque(maxlen=max_events)
-    period_s = 1.0 / rate_hz
+    maker.events = deque(maxlen=_REPLAYED_EVENTS)
+    period_s = STREAM_PERIOD_S
     records: list[Stream] = []
     due_s = -math.inf
     pending_s: float | None = None

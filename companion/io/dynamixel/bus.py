@@ -11,12 +11,13 @@ import termios
 from collections.abc import Callable
 
 import serial
-from dynamixel_sdk import COMM_SUCCESS, PacketHandler
+from dynamixel_sdk import COMM_SUCCESS
 
 from companion.config.arm import Arm, Joint
 from companion.config.devices import ArmDevice
 from companion.io.dynamixel import packets
 from companion.io.dynamixel import registers as dxl
+from companion.io.dynamixel.access import ATTEMPTS, ERROR_NUMBER, ServoAccess
 from companion.io.dynamixel.registers import Block, Register
 from companion.io.dynamixel.scale import RAD_PER_COUNT, JointScale
 from companion.io.protocols import DeviceError
@@ -29,12 +30,6 @@ _FLIGHT_REPLY_TIMEOUT_MS = 8.0
 """Reply timeout in flight, the longest delay caused by an absent servo."""
 _USB_LATENCY_MAX_MS = 4
 _ANSWER_BYTES = packets.STATUS_BYTES + dxl.BLOCK_SIZE
-_ERROR_NUMBER = 0x7F
-_CRC_ERROR = 3
-SETUP_ATTEMPTS = 10
-"""Number of attempts at each ping, read or write during set-up: interference corrupts single packets, and a busy computer delays
-answers.
-"""
 
 Counts = tuple[int, ...]
 """One value in register units for each servo, from the shoulder outwards."""
@@ -56,8 +51,9 @@ class ArmBus:
         self._limp = (0,) * len(arm.joints)
         self._aborted = aborted
         self._ids = [joint.servo_id for joint in arm.joints]
-        self._protocol = PacketHandler(2.0)
         self._port = dxl.servo_port(device.port)
+        names = {joint.servo_id: f"servo {joint.servo_id} (joint {n})" for n, joint in enumerate(arm.joints, 1)}
+        self._servos = ServoAccess(self._port, f"arm bus {device.port}", names, self._check_time)
         self._request = packets.sync_read(dxl.INDIRECT_DATA_1, dxl.BLOCK_SIZE, self._ids)
         self._deadline_s = 0.0
         self._watchdog = device.watchdog_ms // dxl.WATCHDOG_UNIT_MS
@@ -81,10 +77,11 @@ class ArmBus:
         scales = tuple(
             self._set_up(joint, nm_a) for joint, nm_a in zip(self._joints, self._torque_constants_nm_a, strict=True)
         )
-        blocks = next((found for found in (self.read() for _ in range(SETUP_ATTEMPTS)) if found is not None), None)
+        blocks = next((found for found in (self.read() for _ in range(ATTEMPTS)) if found is not None), None)
         if blocks is None:
             raise self._error(
-                "servos", self._ids, "answered individually but not to a sync read; check for a loose cable"
+                f"servos {' and '.join(map(str, self._ids))}",
+                "answered individually but not to a sync read; check for a loose cable",
             )
         scales = tuple(
             self._within_limits(joint, scale, block)
@@ -94,7 +91,7 @@ class ArmBus:
             self._verify_ready(joint)
         self.reports = tuple(self._report(joint) for joint in self._joints)
         for joint in self._joints:
-            self._write(joint, dxl.TORQUE_ENABLE, 1)
+            self._servos.write(joint.servo_id, dxl.TORQUE_ENABLE, 1)
         self._port.reply_timeout_ms = _FLIGHT_REPLY_TIMEOUT_MS
         self._port.late_reply_ms = 0.0
         return scales
@@ -131,7 +128,7 @@ class ArmBus:
 
     def _read_all(self) -> tuple[Block, ...] | None:
         port = self._port
-        self._begin()
+        port.is_using = False  # an exception in an earlier transaction leaves it set
         port.clearPort()
         if port.writePort(self._request) != len(self._request):
             return None
@@ -143,11 +140,11 @@ class ArmBus:
                 data, error = answer
                 port.skip(_ANSWER_BYTES)
             else:  # late, in parts, damaged or mixed with noise
-                received, result, error = self._protocol.readRx(port, servo_id, dxl.BLOCK_SIZE)
+                received, result, error = self._servos.protocol.readRx(port, servo_id, dxl.BLOCK_SIZE)
                 if result != COMM_SUCCESS or len(received) != dxl.BLOCK_SIZE:
                     return None
                 data = bytes(received)
-            if error & _ERROR_NUMBER:
+            if error & ERROR_NUMBER:
                 return None
             block = Block.from_bytes(data)
             if block.bus_watchdog not in (self._watchdog, dxl.WATCHDOG_TRIPPED):
@@ -173,10 +170,10 @@ class ArmBus:
             OSError: the port is gone.
         """
         for servo_id in self._ids:
-            self._try_write(servo_id, dxl.BUS_WATCHDOG, 0)
+            self._servos.try_write(servo_id, dxl.BUS_WATCHDOG, 0)
         self.write_currents(self._limp)
         for servo_id in self._ids:
-            self._try_write(servo_id, dxl.BUS_WATCHDOG, self._watchdog)
+            self._servos.try_write(servo_id, dxl.BUS_WATCHDOG, self._watchdog)
 
     def close(self) -> None:
         """Set goal current 0, switch off torque and watchdog as far as the bus still works, and close the port. Never raises."""
@@ -187,7 +184,7 @@ class ArmBus:
                 self.write_currents(self._limp)
                 for register in (dxl.TORQUE_ENABLE, dxl.BUS_WATCHDOG):
                     for servo_id in self._ids:
-                        self._try_write(servo_id, register, 0)
+                        self._servos.try_write(servo_id, register, 0)
         except Exception:  # a lost port raises any exception of its driver; it must be closed all the same
             pass
         finally:
@@ -201,76 +198,68 @@ class ArmBus:
     def _open_port(self) -> None:
         self._port.baudrate = self._device.baud
         if not self._port.openPort():
-            raise self._error("port", None, f"dynamixel-sdk does not know baud rate {self._device.baud}")
+            raise self._error("port", f"dynamixel-sdk does not know baud rate {self._device.baud}")
         latency_ms = dxl.usb_latency_ms(self._device.port)
         if latency_ms is not None and latency_ms > _USB_LATENCY_MAX_MS:
             raise self._error(
                 "USB adapter",
-                None,
                 f"latency timer is {latency_ms} ms, expected at most {_USB_LATENCY_MAX_MS}; write 1 to "
                 f"/sys/bus/usb-serial/devices/{self._device.servo_port.rsplit('/', 1)[-1]}/latency_timer (a udev rule keeps it)",
             )
 
     def _check_identity(self, joint: Joint) -> None:
-        for _ in range(SETUP_ATTEMPTS):
-            self._check_time()
-            self._begin()
-            model, result, error = self._protocol.ping(self._port, joint.servo_id)
-            if _arrived(result, error):
-                break
-        if result != COMM_SUCCESS:
-            answered, _ = self._protocol.broadcastPing(self._port)
+        model = self._servos.ping(joint.servo_id)
+        if model is None:
+            answered = self._servos.ping_all()
             others = (
                 f"ids that answer: {', '.join(map(str, sorted(answered)))}" if answered else "no servo answers at all"
             )
-            raise self._error(
-                "servo",
+            raise self._servos.error(
                 joint.servo_id,
                 f"does not answer at {self._device.baud} baud; {others}; check its power, cable, id and baud rate",
             )
         if model != joint.kind.number:
-            raise self._error("servo", joint.servo_id, f"is {model_text(model)}; the vehicle file says {joint.servo}")
+            raise self._servos.error(joint.servo_id, f"is {model_text(model)}; the vehicle file says {joint.servo}")
         # A servo set to answer pings only would look dead; the answer to this write does not matter.
-        self._try_write(joint.servo_id, dxl.STATUS_RETURN_LEVEL, 2)
-        firmware = self._read(joint, dxl.FIRMWARE)
+        self._servos.try_write(joint.servo_id, dxl.STATUS_RETURN_LEVEL, 2)
+        firmware = self._servos.read(joint.servo_id, dxl.FIRMWARE)
         if firmware < joint.kind.firmware_min:
-            raise self._error(
-                "servo",
+            raise self._servos.error(
                 joint.servo_id,
                 f"has firmware {firmware}; the {joint.servo} needs {joint.kind.firmware_min} or newer; update it with DYNAMIXEL "
                 "Wizard",
             )
-        errors = self._read(joint, dxl.HARDWARE_ERROR)
+        errors = self._servos.read(joint.servo_id, dxl.HARDWARE_ERROR)
         if errors:
-            raise self._error(
-                "servo",
+            raise self._servos.error(
                 joint.servo_id,
                 f"reports a hardware error: {hardware_error_text(errors)} ({dxl.HARDWARE_ERROR} = {errors}); "
                 "remove the cause, then run companion arm reboot",
             )
         for register, wanted, why in dxl.REQUIRED:
-            found = self._read(joint, register)
+            found = self._servos.read(joint.servo_id, register)
             more = (
                 register == dxl.SHUTDOWN and found & wanted == wanted
             )  # the 330 models leave the factory with one more
             if found != wanted and not more:
                 text = f"{register} is {found}, expected {wanted}, because {why}; run companion arm setup"
-                raise self._error("servo", joint.servo_id, text)
+                raise self._servos.error(joint.servo_id, text)
 
     def _set_up(self, joint: Joint, torque_per_amp_nm_a: float) -> JointScale:
-        self._write(joint, dxl.TORQUE_ENABLE, 0)
-        self._write(joint, dxl.BUS_WATCHDOG, 0)
+        self._servos.write(joint.servo_id, dxl.TORQUE_ENABLE, 0)
+        self._servos.write(joint.servo_id, dxl.BUS_WATCHDOG, 0)
         for register, value in ((dxl.RETURN_DELAY, 0), (dxl.OPERATING_MODE, dxl.MODE_CURRENT)):
-            if self._read(joint, register) != value:  # EEPROM wears
-                self._write(joint, register, value)
+            if self._servos.read(joint.servo_id, register) != value:  # EEPROM wears
+                self._servos.write(joint.servo_id, register, value)
         try:
-            scale = dxl.joint_scale(joint, torque_per_amp_nm_a, self._read(joint, dxl.CURRENT_LIMIT))
+            scale = dxl.joint_scale(joint, torque_per_amp_nm_a, self._servos.read(joint.servo_id, dxl.CURRENT_LIMIT))
         except ValueError as error:
-            raise self._error("servo", joint.servo_id, str(error)) from error
-        pointers = [byte for address in dxl.BLOCK_ADDRESSES for byte in (address & 0xFF, address >> 8)]
-        self._write_bytes(joint, Register(dxl.INDIRECT_ADDRESS_1, len(pointers), "indirect addresses"), pointers)
-        self._write(joint, dxl.GOAL_CURRENT, 0)
-        self._write(joint, dxl.BUS_WATCHDOG, self._watchdog)
+            raise self._servos.error(joint.servo_id, str(error)) from error
+        pointers = b"".join(address.to_bytes(2, "little") for address in dxl.BLOCK_ADDRESSES)
+        indirect = Register(dxl.INDIRECT_ADDRESS_1, len(pointers), "indirect addresses")
+        self._servos.write_bytes(joint.servo_id, indirect, pointers)
+        self._servos.write(joint.servo_id, dxl.GOAL_CURRENT, 0)
+        self._servos.write(joint.servo_id, dxl.BUS_WATCHDOG, self._watchdog)
         return scale
 
     def _within_limits(self, joint: Joint, scale: JointScale, block: Block) -> JointScale:
@@ -279,8 +268,7 @@ class ArmBus:
         angle_deg = scale.angle_rad(block.position_count) * 360.0 / (COUNTS_PER_TURN * RAD_PER_COUNT)
         low_deg, high_deg = joint.angle_deg
         if not low_deg <= angle_deg <= high_deg:
-            raise self._error(
-                "servo",
+            raise self._servos.error(
                 joint.servo_id,
                 f"is at {angle_deg:.1f} deg ({dxl.PRESENT_POSITION} = {block.position_count}), outside its limits "
                 f"{low_deg:g} to {high_deg:g} deg; move the arm by hand or correct zero_count and sign",
@@ -297,88 +285,27 @@ class ArmBus:
             (dxl.HARDWARE_ERROR, 0),
         )
         for register, value in expected:
-            found = self._read(joint, register)
+            found = self._servos.read(joint.servo_id, register)
             if found != value:
-                raise self._error("servo", joint.servo_id, f"{register} reads {found} after set-up, expected {value}")
+                raise self._servos.error(joint.servo_id, f"{register} reads {found} after set-up, expected {value}")
 
     def _report(self, joint: Joint) -> ServoReport:
         return ServoReport(
             servo_id=joint.servo_id,
-            model=self._read(joint, dxl.MODEL),
-            firmware=self._read(joint, dxl.FIRMWARE),
-            operating_mode=self._read(joint, dxl.OPERATING_MODE),
-            return_delay_us=self._read(joint, dxl.RETURN_DELAY) * dxl.RETURN_DELAY_UNIT_US,
-            current_limit_counts=self._read(joint, dxl.CURRENT_LIMIT),
-            watchdog_ms=self._read(joint, dxl.BUS_WATCHDOG) * dxl.WATCHDOG_UNIT_MS,
-            voltage_v=round(self._read(joint, dxl.PRESENT_VOLTAGE) * dxl.VOLTAGE_UNIT_V, 1),
+            model=self._servos.read(joint.servo_id, dxl.MODEL),
+            firmware=self._servos.read(joint.servo_id, dxl.FIRMWARE),
+            operating_mode=self._servos.read(joint.servo_id, dxl.OPERATING_MODE),
+            return_delay_us=self._servos.read(joint.servo_id, dxl.RETURN_DELAY) * dxl.RETURN_DELAY_UNIT_US,
+            current_limit_counts=self._servos.read(joint.servo_id, dxl.CURRENT_LIMIT),
+            watchdog_ms=self._servos.read(joint.servo_id, dxl.BUS_WATCHDOG) * dxl.WATCHDOG_UNIT_MS,
+            voltage_v=round(self._servos.read(joint.servo_id, dxl.PRESENT_VOLTAGE) * dxl.VOLTAGE_UNIT_V, 1),
         )
-
-    def _begin(self) -> None:
-        """Prepare the port for a transaction of the SDK."""
-        self._port.is_using = False  # an exception in an earlier transaction leaves it set
-
-    # --- registers ---------------------------------------------------------------------------------------------------
-
-    def _read(self, joint: Joint, register: Register) -> int:
-        data = self._read_bytes(joint, register)
-        return int.from_bytes(data, "little", signed=register.signed)
-
-    def _read_bytes(self, joint: Joint, register: Register) -> bytes:
-        for _ in range(SETUP_ATTEMPTS):
-            self._check_time()
-            self._begin()
-            data, result, error = self._protocol.readTxRx(self._port, joint.servo_id, register.address, register.size)
-            if _arrived(result, error):
-                break
-        self._check_answer(joint, f"reading {register}", result, error)
-        return bytes(data)
-
-    def _write(self, joint: Joint, register: Register, value: int) -> None:
-        self._write_bytes(joint, register, list(value.to_bytes(register.size, "little", signed=register.signed)))
-
-    def _write_bytes(self, joint: Joint, register: Register, data: list[int]) -> None:
-        """Write and read back; a lost or corrupt packet is repeated, as in `_read_bytes`, and so is a write without effect."""
-        found = b""
-        for _ in range(SETUP_ATTEMPTS):
-            self._check_time()
-            self._begin()
-            result, error = self._protocol.writeTxRx(self._port, joint.servo_id, register.address, len(data), data)
-            if _arrived(result, error):
-                self._check_answer(joint, f"writing {register}", result, error)
-                found = self._read_bytes(joint, register)
-                if found == bytes(data):
-                    return
-        self._check_answer(joint, f"writing {register}", result, error)
-        text = f"{register} reads {found.hex()} after {bytes(data).hex()} was written"
-        raise self._error("servo", joint.servo_id, text)
-
-    def _try_write(self, servo_id: int, register: Register, value: int) -> None:
-        self._begin()
-        data = list(value.to_bytes(register.size, "little"))
-        self._protocol.writeTxRx(self._port, servo_id, register.address, register.size, data)
-
-    def _check_answer(self, joint: Joint, doing: str, result: int, error: int) -> None:
-        if result != COMM_SUCCESS:
-            text = self._protocol.getTxRxResult(result).removeprefix("[TxRxResult] ")
-            raise self._error("servo", joint.servo_id, f"{doing} failed: {text} Check for a loose cable.")
-        if error & _ERROR_NUMBER:
-            text = self._protocol.getRxPacketError(error & _ERROR_NUMBER).removeprefix("[RxPacketError] ")
-            raise self._error("servo", joint.servo_id, f"{doing} was refused: {text}")
 
     def _check_time(self) -> None:
         if self._aborted():
-            raise self._error("set-up", None, "given up")
+            raise self._error("set-up", "given up")
         if monotonic() > self._deadline_s:
-            raise self._error("set-up", None, "not finished in time: the servos answer too slowly; check the cables")
+            raise self._error("set-up", "not finished in time: the servos answer too slowly; check the cables")
 
-    def _error(self, what: str, ids: int | list[int] | None, text: str) -> DeviceError:
-        if isinstance(ids, list):
-            what = f"{what} {' and '.join(map(str, ids))}"
-        elif ids is not None:
-            what = f"{what} {ids} (joint {self._ids.index(ids) + 1})"
+    def _error(self, what: str, text: str) -> DeviceError:
         return DeviceError(f"arm bus {self._device.port}: {what}: {text}")
-
-
-def _arrived(result: int, error: int) -> bool:
-    """Return whether request and answer arrived intact."""
-    return bool(result == COMM_SUCCESS and error & _ERROR_NUMBER != _CRC_ERROR)
