@@ -202,6 +202,7 @@ class Receiver:
             (m.afx, m.afy, m.afz),
             m.yaw,
             m.yaw_rate,
+            self._stub.heading_rad,
         )
         if target is not None:
             self._stub.on_setpoint(self._stub.arrival_s, target)

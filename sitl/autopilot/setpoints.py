@@ -14,6 +14,15 @@ NOTHING: Axis3 = (None, None, None)
 
 
 @dataclass(frozen=True, slots=True)
+class RateTarget:
+    """Body rate setpoint."""
+
+    rates_frd_rad_s: Vec3
+    thrust: float
+    """Collective thrust, 0 to 1."""
+
+
+@dataclass(frozen=True, slots=True)
 class PositionTarget:
     """Position setpoint (trajectory_setpoint); None means that the quantity is not commanded on that axis."""
 
@@ -39,27 +48,39 @@ class PositionTarget:
         return all(value is None for value in axes)
 
 
-OffboardTarget = AttitudeTarget | PositionTarget
+OffboardTarget = AttitudeTarget | RateTarget | PositionTarget
 
-_YAW_RATE_IGNORE, _THROTTLE_IGNORE, _ATTITUDE_IGNORE = 4, 64, 128
+_ROLL_RATE_IGNORE, _PITCH_RATE_IGNORE, _YAW_RATE_IGNORE = 1, 2, 4
+_THROTTLE_IGNORE, _ATTITUDE_IGNORE = 64, 128
 
 
-def decode_attitude_target(type_mask: int, q_wxyz: Quat, rates_frd_rad_s: Vec3, thrust: float) -> AttitudeTarget | None:
+def decode_attitude_target(
+    type_mask: int, q_wxyz: Quat, rates_frd_rad_s: Vec3, thrust: float
+) -> AttitudeTarget | RateTarget | None:
     """Decode SET_ATTITUDE_TARGET as PX4 does, with thrust limited to 0 to 1.
 
     Returns:
-        The setpoint, or None if PX4 ignores the message, because its thrust is non-finite or masked out, or its quaternion is zero or
-        non-finite; and for body rates without an attitude, which the stub does not fly.
+        The setpoint, or None if PX4 ignores the message: its thrust is non-finite or masked out, its quaternion is zero or
+        non-finite, or, without an attitude, a body rate is non-finite or the roll or pitch rate is masked out.
     """
-    norm = math.sqrt(sum(value * value for value in q_wxyz))
-    if type_mask & (_THROTTLE_IGNORE | _ATTITUDE_IGNORE) or not math.isfinite(thrust + norm) or not norm > 1e-6:
+    if type_mask & _THROTTLE_IGNORE or not math.isfinite(thrust):
         return None
-    yaw_rate = 0.0 if type_mask & _YAW_RATE_IGNORE or not math.isfinite(rates_frd_rad_s[2]) else rates_frd_rad_s[2]
-    w, x, y, z = q_wxyz
-    return AttitudeTarget((w / norm, x / norm, y / norm, z / norm), min(1.0, max(0.0, thrust)), yaw_rate)
+    thrust = min(1.0, max(0.0, thrust))
+    if not type_mask & _ATTITUDE_IGNORE:
+        norm = math.sqrt(sum(value * value for value in q_wxyz))
+        if not norm > 1e-6 or not math.isfinite(norm):
+            return None
+        yaw_rate = 0.0 if type_mask & _YAW_RATE_IGNORE or not math.isfinite(rates_frd_rad_s[2]) else rates_frd_rad_s[2]
+        w, x, y, z = q_wxyz
+        return AttitudeTarget((w / norm, x / norm, y / norm, z / norm), thrust, yaw_rate)
+    if type_mask & (_ROLL_RATE_IGNORE | _PITCH_RATE_IGNORE) or not all(math.isfinite(rate) for rate in rates_frd_rad_s):
+        return None
+    roll, pitch, yaw = rates_frd_rad_s
+    return RateTarget((roll, pitch, 0.0 if type_mask & _YAW_RATE_IGNORE else yaw), thrust)
 
 
 MAV_FRAME_LOCAL_NED = 1
+MAV_FRAME_BODY_NED = 8
 _YAW_IGNORE, _YAW_RATE_IGNORE_POSITION, _FORCE_SET = 1024, 2048, 512
 
 
@@ -71,13 +92,19 @@ def decode_position_target(
     acceleration: Vec3,
     yaw_rad: float,
     yaw_rate_rad_s: float,
+    heading_rad: float,
 ) -> PositionTarget | None:
-    """Decode SET_POSITION_TARGET_LOCAL_NED as PX4 does; return None if it commands nothing or is not in MAV_FRAME_LOCAL_NED."""
-    if frame != MAV_FRAME_LOCAL_NED or type_mask & _FORCE_SET:
+    """Decode SET_POSITION_TARGET_LOCAL_NED as PX4 does; return None if it commands nothing.
+
+    In MAV_FRAME_LOCAL_NED PX4 uses every field; in MAV_FRAME_BODY_NED it uses only velocity and acceleration, rotated by the heading.
+    """
+    if frame not in (MAV_FRAME_LOCAL_NED, MAV_FRAME_BODY_NED) or type_mask & _FORCE_SET:
         return None
     where, speed, push = (
         _axes(type_mask >> 3 * i, values) for i, values in enumerate((position, velocity, acceleration))
     )
+    if frame == MAV_FRAME_BODY_NED:
+        where, speed, push = NOTHING, _turned(speed, heading_rad), _turned(push, heading_rad)
     target = PositionTarget(
         position_ned_m=where,
         velocity_ned_m_s=speed,
@@ -93,3 +120,12 @@ def decode_position_target(
 def _axes(ignore_bits: int, values: Vec3) -> Axis3:
     x, y, z = (None if ignore_bits >> i & 1 or not math.isfinite(value) else value for i, value in enumerate(values))
     return (x, y, z)
+
+
+def _turned(axes: Axis3, heading_rad: float) -> Axis3:
+    x, y, z = axes
+    if x is None and y is None:
+        return axes
+    x, y = x or 0.0, y or 0.0
+    c, s = math.cos(heading_rad), math.sin(heading_rad)
+    return (c * x - s * y, s * x + c * y, z)

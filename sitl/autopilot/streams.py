@@ -72,6 +72,12 @@ STREAMS: dict[int, Stream] = {
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: Stream(build=telemetry.system_time, onboard_hz=1.0, ground_hz=0.0),
     mavlink.MAVLINK_MSG_ID_VFR_HUD: Stream(build=telemetry.vfr_hud, onboard_hz=10.0, ground_hz=4.0),
     mavlink.MAVLINK_MSG_ID_VIBRATION: Stream(build=telemetry.vibration, onboard_hz=0.5, ground_hz=0.1),
+    mavlink.MAVLINK_MSG_ID_ACTUATOR_OUTPUT_STATUS: Stream(
+        build=telemetry.actuator_output_status, onboard_hz=0.0, ground_hz=0.0, ceiling_hz=212.0
+    ),
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: Stream(
+        build=telemetry.scaled_imu, onboard_hz=0.0, ground_hz=0.0, ceiling_hz=124.0
+    ),
     mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: Stream(
         build=telemetry.autopilot_version, onboard_hz=0.0, ground_hz=0.0, ceiling_hz=1.0
     ),

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.model.frames import quat_from_euler_zyx
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.receive import Receiver
-from sitl.autopilot.setpoints import PositionTarget, decode_attitude_target, decode_position_target
+from sitl.autopilot.setpoints import PositionTarget, RateTarget, decode_attitude_target, decode_position_target
 from sitl.autopilot.streams import STREAMS, Schedule
 from sitl.autopilot.types import AttitudeTarget
 from tests.sitl.px4_rig import Rig
@@ -115,7 +115,10 @@ RATES_IGNORED = 7
         (RATES_IGNORED, (NAN, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.4, None),
         (RATES_IGNORED, (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.4, None),
         (RATES_IGNORED | 64, QUAT, (0.0, 0.0, 0.0), 0.4, None),
-        (128, QUAT, (0.1, 0.2, 0.3), 0.4, None),  # body rates alone
+        (128, QUAT, (0.1, 0.2, 0.3), 0.4, RateTarget((0.1, 0.2, 0.3), 0.4)),
+        (128 | 4, QUAT, (0.1, 0.2, 0.3), 0.4, RateTarget((0.1, 0.2, 0.0), 0.4)),
+        (128 | RATES_IGNORED, QUAT, (0.1, 0.2, 0.3), 0.4, None),
+        (128, QUAT, (0.1, NAN, 0.3), 0.4, None),
     ],
 )
 def test_attitude_target_masks(mask: int, q: Any, rates: Any, thrust: float, expected: Any) -> None:
@@ -138,13 +141,19 @@ POS, VEL, ACC = (1.0, 2.0, -3.0), (0.1, 0.2, 0.3), (0.0, 0.0, -1.0)
         (0b0001_1100_0111 | 1024 | 2048, 1, PositionTarget(velocity_ned_m_s=VEL)),
         (0b0001_1100_0000 | 2048, 1, PositionTarget(POS, VEL, yaw_rad=0.7)),
         (0b0000_0011_1111 | 1024, 1, PositionTarget(acceleration_ned_m_s2=ACC, yaw_rate_rad_s=0.2)),
-        (0b0001_1100_0111 | 1024 | 2048, 8, None),  # MAV_FRAME_BODY_NED
+        (0b0001_1100_0111 | 1024 | 2048, 8, PositionTarget(velocity_ned_m_s=(-0.2, 0.1, 0.3))),
+        (0b0001_1111_1000, 8, None),  # a position in the body frame
         (0b0001_1111_1111 | 1024, 1, None),
         (0, 7, None),  # MAV_FRAME_LOCAL_OFFSET_NED
     ],
 )
 def test_position_target_masks(mask: int, frame: int, expected: PositionTarget | None) -> None:
-    assert decode_position_target(mask, frame, POS, VEL, ACC, 0.7, 0.2) == expected
+    got = decode_position_target(mask, frame, POS, VEL, ACC, 0.7, 0.2, math.pi / 2)
+    if expected is None or frame == 1:
+        assert got == expected
+    else:
+        assert got is not None
+        assert got.velocity_ned_m_s == pytest.approx(expected.velocity_ned_m_s)
 
 
 def test_commands_to_the_link_are_answered_as_px4_does() -> None:
