@@ -40,6 +40,15 @@ from companion.plugins import ARMS, FORCE_SENSORS, MOCAP_SYSTEMS
 M = TypeVar("M", bound=Model)
 
 
+MOVED = {
+    ("tether", "react_time_s"): ("safety", "react_time_s"),
+    ("tether", "stop_deceleration_m_s2"): ("safety", "stop_deceleration_m_s2"),
+    ("safety", "joint_wall_warn_deg"): ("safety", "joint_limit_warn_deg"),
+    ("safety", "joint_wall_max_deg"): ("safety", "joint_limit_max_deg"),
+}
+"""Keys of vehicle files and logs of version 0.1.0, and their present place."""
+
+
 class Sources(Model):
     """Origins of the parts of a `FlightConfig`, for messages and for the log."""
 
@@ -160,6 +169,8 @@ def logged_flight(config_json: str) -> FlightConfig:
     data = json.loads(config_json)
     if isinstance(data, dict):
         data.pop("world", None)
+        if isinstance(data.get("vehicle"), dict):
+            _move_keys(Document("log", data["vehicle"]))
         if isinstance(data.get("mission"), dict):
             _rename_phase_keys(Document("log", data["mission"]))
     return FlightConfig.model_validate_json(json.dumps(data))
@@ -168,6 +179,7 @@ def logged_flight(config_json: str) -> FlightConfig:
 def _check_vehicle(document: Document, overrides: list[Override], lines: list[str]) -> Vehicle | None:
     """Apply the overrides to a vehicle file and validate it; return None if it has problems."""
     _override(document, "vehicle", overrides, lines)
+    _move_keys(document)
     if document.data.get("arm", NO_ARM) is None:
         document.replace(("arm",), copy.deepcopy(NO_ARM), document.origin(("arm",)))
     _read_urdf(document)
@@ -193,6 +205,15 @@ def _read_urdf(document: Document) -> None:
         return
     for key, value in arm.items():
         document.replace(("arm", key), value, origin)
+
+
+def _move_keys(document: Document) -> None:
+    """Move the keys of older vehicle files and logs to their present place, unless that has a value too."""
+    for (old_part, old_key), (part, key) in MOVED.items():
+        old, new = document.data.get(old_part), document.data.setdefault(part, {})
+        if isinstance(old, dict) and isinstance(new, dict) and old_key in old and key not in new:
+            document.replace((part, key), old[old_key], document.origin((old_part, old_key)))
+            del old[old_key]
 
 
 def _rename_phase_keys(document: Document) -> None:

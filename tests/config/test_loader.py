@@ -428,6 +428,11 @@ def test_a_part_that_may_be_absent_is_not_left_out_by_mistake(project: Path, key
     assert line.endswith(", or null if there is none")
 
 
+def test_the_configuration_in_a_log_of_version_0_1_opens() -> None:
+    config = logged_flight((Path(__file__).parent / "data" / "logged_0.1.0.json").read_text(encoding="utf-8"))
+    assert (config.vehicle.safety.joint_limit_max_deg, config.vehicle.safety.react_time_s) == (10.0, 0.18)
+
+
 @pytest.mark.parametrize(
     ("mission", "index", "old", "new"),
     [("slide", 4, "by_m", "displacement_m"), ("circuit", 2, "through_m", "waypoints_m")],

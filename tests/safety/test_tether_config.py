@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -9,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from companion.config.document import ConfigError
-from companion.config.loader import load_flight
+from companion.config.loader import MOVED, load_flight, logged_flight
+from tests.support import CATCH
 
 ROOT = Path(__file__).parents[2]
 ANCHOR = "  anchor_world_m: [0.0, -1.2, 0.0]\n"
@@ -51,3 +53,16 @@ def test_a_file_states_that_a_vehicle_has_no_tether(mission: Path) -> None:
     before, _, rest = path.read_text(encoding="utf-8").partition("tether:\n")
     path.write_text(before + "tether: null\n" + rest.partition("\n\n")[2], encoding="utf-8")
     assert load_flight(mission).vehicle.tether is None
+
+
+def test_keys_of_version_0_1_are_still_read() -> None:
+    below = "vehicle.tether.react_time_s=0.4", "vehicle.tether.stop_deceleration_m_s2=1.5"
+    config = load_flight(CATCH, overrides=below)
+    assert (config.vehicle.safety.react_time_s, config.vehicle.safety.stop_deceleration_m_s2) == (0.4, 1.5)
+    logged = json.loads(config.model_dump_json())
+    for (old_part, old_key), (part, key) in MOVED.items():
+        logged["vehicle"][old_part][old_key] = logged["vehicle"][part].pop(key)
+    assert logged_flight(json.dumps(logged)) == config
+    with pytest.raises(ConfigError) as twice:
+        load_flight(CATCH, overrides=["vehicle.safety.react_time_s=0.3", below[0]])
+    assert "--set vehicle.tether.react_time_s: unknown key" in str(twice.value)
