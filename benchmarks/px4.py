@@ -179,6 +179,8 @@ def row_of(case: Case, autopilot: str, path: str | None, run: int, folder: Path)
         "cpu_percent": _cpu_percent(folder),
     }  # fmt: skip
     witness = json.loads((folder / WITNESS).read_text(encoding="utf-8")) if (folder / WITNESS).exists() else None
+    if case.fault and (witness is None or witness["fault_begun_s"] is None):
+        known["as_it_must"] = False  # it ended before the fault
     if case.fault and witness is not None and witness["course"]:
         known |= _course_of(witness["course"])
     if autopilot == "px4":
