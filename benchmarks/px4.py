@@ -1,6 +1,7 @@
 """Flies the same flights on the stub and on a real PX4 (SITL) and tabulates the differences.
 
-    PX4_SITL=.../build/px4_sitl_default python -m benchmarks.px4 --keep flights/px4           # 36 flights, half an hour
+    PX4_SITL=.../build/px4_sitl_default python -m benchmarks.px4 --keep flights/px4           # 48 flights, 40 minutes
+    PX4_SITL=.../build/px4_sitl_default python -m benchmarks.px4 --keep flights/paths --path offboard --path direct --case catch-0.2kg
     python -m benchmarks.px4 --keep flights/px4 --table                                       # only flights in the folder
     python -m benchmarks.px4 --keep flights/lab --world lab --case catch-0.1kg --case catch-0.2kg --case catch-0.3kg
 
@@ -11,27 +12,39 @@ pyulog), from the world for the stub. Exit code 0: every flight ended as expecte
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import statistics
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from itertools import groupby
+from itertools import groupby, pairwise, product
 from pathlib import Path
 from typing import Any
 
+from benchmarks.measuring.hovering import LIMITS
 from benchmarks.px4_log import Px4Log, newest
 from benchmarks.report import write_json
+from benchmarks.soaking.processes import family, usage
 from companion.analysis.log import FlightLog, LogError
 from companion.campaigns.faults.sitl_flights import WITNESS
 from sitl.px4.hil_link import Px4Error
+from tests.support import set_options
 
 ROOT = Path(__file__).parents[1]
 MISSION = ROOT / "configs/missions/catch.yaml"
 AUTOPILOTS = ("stub", "px4")
+PATHS = ("offboard", "direct")
+"""Values of `devices.autopilot.setpoint_path`."""
 TIMEOUT_S = 300.0
+CPU_PERIOD_S = 1.0
+CPU = "flight_cpu.json"
+"""File in the flight's folder: CPU time of the flight process in each second, % of a core."""
+IN_THE_AIR = slice(-20, -2)
+"""Seconds before the end of a flight, of which none is spent on the ground in a completed catch."""
 LIKE_THE_STUB = 0.25
 """Largest relative difference of the position error after the catch."""
 
@@ -52,7 +65,11 @@ def _fault(name: str, fault: dict[str, Any]) -> Case:
 
 CASES = (
     *(Case(f"catch-{kg:g}kg", (f"world.payload_kg={kg:g}",), "completed", fault=False) for kg in (0.1, 0.2, 0.3)),
-    *(_fault(kind, {"kind": kind, "after": "catch", "t_s": 0.1}) for kind in ("kill_flight", "stop_flight")),
+    *(
+        _fault(kind, {"kind": kind, "after": "catch", "t_s": 0.1})
+        for kind in ("kill_flight", "stop_flight", "hold_gil")
+    ),
+    _fault("stall_loop", {"kind": "stall_loop", "after": "catch", "t_s": 0.1, "duration_s": 5.0}),
     _fault("mocap_loss", {"kind": "mocap_loss", "after": "catch", "t_s": 0.1, "duration_s": 2.0}),
 )
 
@@ -63,6 +80,8 @@ class Row:
 
     case: str
     autopilot: str
+    path: str | None
+    """Setpoint path; None for the vehicle file's."""
     version: str | None
     run: int
     outcome: str
@@ -76,6 +95,8 @@ class Row:
     latency_p50_ms: float | None
     """Latency from motion capture to setpoint, median."""
     latency_p99_ms: float | None
+    cpu_percent: float | None
+    """CPU of the flight process, % of a core, median of the seconds in the air."""
     modes: str
     last_setpoint_s: float | None = None
     vision_gap_s: float | None = None
@@ -89,7 +110,7 @@ class Row:
     worst_tilt_deg: float | None = None
 
 
-def fly(case: Case, world: str, autopilot: str, run: int, folder: Path) -> None:
+def fly(case: Case, world: str, autopilot: str, path: str | None, run: int, folder: Path) -> None:
     """Fly once, unless the folder holds the flight already."""
     if (folder / "summary.json").exists():
         return
@@ -105,12 +126,45 @@ def fly(case: Case, world: str, autopilot: str, run: int, folder: Path) -> None:
         str(folder),
     ]
     command += ["--world", world, "--seed", str(run), "--set", *case.overrides]
+    if path is not None:
+        command.append(f"vehicle.devices.autopilot.setpoint_path={path}")
+    if not case.fault:
+        command += set_options(**LIMITS)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with open(folder.with_name(f"{folder.name}.txt"), "wb") as output:
-        subprocess.run(command, stdout=output, stderr=subprocess.STDOUT, timeout=TIMEOUT_S, check=False)
+    with (
+        open(folder.with_name(f"{folder.name}.txt"), "wb") as output,
+        subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT) as process,
+    ):
+        try:
+            percents = _watch(process)
+        except BaseException:
+            process.terminate()
+            raise
+    if folder.is_dir():
+        (folder / CPU).write_text(json.dumps(percents), encoding="utf-8")
 
 
-def row_of(case: Case, autopilot: str, run: int, folder: Path) -> Row | None:
+def _watch(process: subprocess.Popen[bytes]) -> list[float]:
+    """Wait for the end of the flight and return the CPU of its flight process in each second, % of a core.
+
+    Raises:
+        TimeoutExpired: the flight takes too long.
+    """
+    begun_s = time.monotonic()
+    used: list[tuple[float, float]] = []
+    while process.poll() is None:
+        now_s = time.monotonic()
+        if now_s - begun_s > TIMEOUT_S:
+            raise subprocess.TimeoutExpired(process.args, TIMEOUT_S)
+        pid = family(process.pid).get("flight")
+        if pid is not None and (present := usage(pid)) is not None:
+            used.append((now_s, present.cpu_s))
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(CPU_PERIOD_S)
+    return [100.0 * (after - before) / (t - s) for (s, before), (t, after) in pairwise(used)]
+
+
+def row_of(case: Case, autopilot: str, path: str | None, run: int, folder: Path) -> Row | None:
     """Read a flight's folder; return None if it was not flown."""
     if not (folder / "summary.json").exists():
         return None
@@ -118,12 +172,15 @@ def row_of(case: Case, autopilot: str, run: int, folder: Path) -> Row | None:
     before, post = summary["rms"]["pre"], summary["rms"]["post"]
     latency = summary["latency_ms"]["mocap_to_setpoint"]
     known: dict[str, Any] = {
-        "case": case.name, "autopilot": autopilot, "version": summary["autopilot"]["version"], "run": run,
+        "case": case.name, "autopilot": autopilot, "path": path, "version": summary["autopilot"]["version"], "run": run,
         "outcome": summary["outcome"], "as_it_must": summary["outcome"] == case.outcome,
         "e_p_before_m": before["e_p_m"], "e_p_m": post["e_p_m"], "e_q_deg": post["e_q_deg"], "e_alpha_deg": post["e_alpha_deg"],
         "latency_p50_ms": latency["p50"], "latency_p99_ms": latency["p99"], "modes": "",
+        "cpu_percent": _cpu_percent(folder),
     }  # fmt: skip
     witness = json.loads((folder / WITNESS).read_text(encoding="utf-8")) if (folder / WITNESS).exists() else None
+    if case.fault and (witness is None or witness["fault_begun_s"] is None):
+        known["as_it_must"] = False  # it ended before the fault
     if case.fault and witness is not None and witness["course"]:
         known |= _course_of(witness["course"])
     if autopilot == "px4":
@@ -136,6 +193,13 @@ def row_of(case: Case, autopilot: str, run: int, folder: Path) -> Row | None:
         if case.fault and witness is not None and witness["fault_begun_s"] is not None:
             known |= _after_fault_of_the_stub(witness)
     return Row(**known)
+
+
+def _cpu_percent(folder: Path) -> float | None:
+    if not (folder / CPU).exists():
+        return None
+    percents = json.loads((folder / CPU).read_text(encoding="utf-8"))[IN_THE_AIR]
+    return statistics.median(percents) if percents else None
 
 
 def _course_of(course: list[Any]) -> dict[str, Any]:
@@ -187,6 +251,7 @@ FLIGHT_COLUMNS: dict[str, Cell] = {
     "arm error, deg": _spread_of("e_alpha_deg", 2),
     "mocap to setpoint, ms: p50": _spread_of("latency_p50_ms", 1),
     "p99": _spread_of("latency_p99_ms", 1),
+    "CPU, %": _spread_of("cpu_percent", 0),
     "modes": lambda rows: " / ".join(sorted({row.modes for row in rows})),
 }
 FAULT_COLUMNS: dict[str, Cell] = {
@@ -207,15 +272,37 @@ def markdown(rows: Sequence[Row]) -> str:
     versions = sorted({row.version or "?" for row in rows if row.autopilot == "px4"})
     lines = [f"PX4 {' and '.join(versions)}; each cell: smallest to largest of the runs."]
     for fault, columns in ((False, FLIGHT_COLUMNS), (True, FAULT_COLUMNS)):
-        lines += ["", f"| {' | '.join(('fault' if fault else 'flight', 'autopilot', *columns))} |"]
-        lines.append("|---" * (len(columns) + 2) + "|")
-        for case in CASES:
-            for autopilot in AUTOPILOTS:
-                some = [row for row in rows if (row.case, row.autopilot) == (case.name, autopilot)]
-                if some and case.fault is fault:
-                    cells = (case.name, autopilot, *(cell(some) for cell in columns.values()))
-                    lines.append(f"| {' | '.join(cells)} |")
+        lines += ["", f"| {' | '.join(('fault' if fault else 'flight', 'autopilot', 'path', *columns))} |"]
+        lines.append("|---" * (len(columns) + 3) + "|")
+        for case, autopilot, path in product(CASES, AUTOPILOTS, (None, *PATHS)):
+            some = [row for row in rows if (row.case, row.autopilot, row.path) == (case.name, autopilot, path)]
+            if some and case.fault is fault:
+                cells = (case.name, autopilot, path or "-", *(cell(some) for cell in columns.values()))
+                lines.append(f"| {' | '.join(cells)} |")
+    lines += _offboard_to_direct(rows)
     return "\n".join(lines) + "\n"
+
+
+def _offboard_to_direct(rows: Sequence[Row]) -> list[str]:
+    """Return a table of the ratios of pairs of completed flights that differ in the setpoint path only; nothing without a pair."""
+    keys = {"mocap to setpoint: p50": "latency_p50_ms", "p99": "latency_p99_ms", "CPU": "cpu_percent"}
+    flown = [row for row in rows if row.outcome == "completed" and row.cpu_percent is not None]
+    lines = []
+    for autopilot in AUTOPILOTS:
+        pairs = [
+            (row, other)
+            for row, other in product(flown, flown)
+            if (row.path, row.autopilot, other.path, other.autopilot) == (PATHS[0], autopilot, PATHS[1], autopilot)
+            and (row.case, row.run) == (other.case, other.run)
+        ]
+        if pairs:
+            found = [[getattr(row, key) / getattr(other, key) for row, other in pairs] for key in keys.values()]
+            cells = [f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})" for ratios in found]
+            lines.append(f"| {' | '.join((autopilot, str(len(pairs)), *cells))} |")
+    if not lines:
+        return []
+    head = f"| {' | '.join(('offboard / direct', 'pairs', *keys))} |"
+    return ["", head, "|---" * (len(keys) + 2) + "|", *lines]
 
 
 def _spread(values: Sequence[float | None], scale: float, digits: int) -> str:
@@ -246,6 +333,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--keep", type=Path, required=True, metavar="DIR", help="folder of the flights")
     parser.add_argument("--case", choices=[case.name for case in CASES], action="append", help="default: all")
     parser.add_argument("--autopilot", choices=AUTOPILOTS, action="append", help="default: both")
+    parser.add_argument("--path", choices=PATHS, action="append", help="setpoint path (default: the vehicle file's)")
     parser.add_argument("--repeat", type=int, default=3, help="flights of each case, seeds 1 to N")
     parser.add_argument("--world", default="ideal", metavar="lab|ideal|FILE", help="default: %(default)s")
     parser.add_argument("--table", action="store_true", help="fly nothing")
@@ -253,24 +341,24 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     rows: list[Row] = []
     failed = False
+    cases = [case for case in CASES if arguments.case is None or case.name in arguments.case]
+    paths = arguments.path or (None,)
     for run in range(1, arguments.repeat + 1):
-        for case in CASES:
-            for autopilot in arguments.autopilot or AUTOPILOTS:
-                if arguments.case is not None and case.name not in arguments.case:
-                    continue
-                folder = arguments.keep / f"{case.name}-{autopilot}-{run}"
-                try:
-                    if not arguments.table:
-                        fly(case, arguments.world, autopilot, run, folder)
-                    row = row_of(case, autopilot, run, folder)
-                except (Px4Error, subprocess.TimeoutExpired) as error:
-                    print(f"{folder}: {error}", file=sys.stderr)
-                    failed = True
-                    continue
-                if row is not None:
-                    rows.append(row)
-                    if not arguments.table:
-                        print(f"{folder.name}: {row.outcome}", file=sys.stderr, flush=True)
+        turn = paths if run % 2 else paths[::-1]
+        for case, autopilot, path in product(cases, arguments.autopilot or AUTOPILOTS, turn):
+            folder = arguments.keep / "-".join((case.name, autopilot, *([path] if path else []), str(run)))
+            try:
+                if not arguments.table:
+                    fly(case, arguments.world, autopilot, path, run, folder)
+                row = row_of(case, autopilot, path, run, folder)
+            except (Px4Error, subprocess.TimeoutExpired) as error:
+                print(f"{folder}: {error}", file=sys.stderr)
+                failed = True
+                continue
+            if row is not None:
+                rows.append(row)
+                if not arguments.table:
+                    print(f"{folder.name}: {row.outcome}", file=sys.stderr, flush=True)
     print(markdown(rows))
     problems = verdicts(rows)
     for problem in problems:

@@ -25,11 +25,6 @@ ROLL_PITCH_SHARE = 1.0 / math.sqrt(2.0)
 (ControlAllocationPseudoInverse::updateControlAllocationMatrixScale).
 """
 
-SIMULATED_MOCAP: Mapping[str, Value] = {"EKF2_EV_DELAY": 10.0}
-"""Delay from exposure to fusion in ms, measured on PX4 1.16.1: 5 ms of latency, the delay of the links, and half a period each of
-lockstep and EKF2. The stub has only the latency, for which the 5 ms in configs/px4/indoor_mocap.params are correct.
-"""
-
 _GAINS = (
     "MC_ROLL_P", "MC_PITCH_P", "MC_YAW_P", "MC_YAW_WEIGHT", "MC_ROLLRATE_MAX", "MC_PITCHRATE_MAX", "MC_YAWRATE_MAX", "MC_YAWRATE_P",
     "MC_YAWRATE_I", "MC_YAWRATE_D", "MC_RR_INT_LIM", "MC_PR_INT_LIM", "MC_YR_INT_LIM", "MC_AIRMODE",
@@ -65,7 +60,6 @@ def parameters(airframe: Airframe, config: WorldConfig, hover_command: float) ->
     return {
         **simulated_values(),
         **VEHICLE_DEFAULTS,
-        **SIMULATED_MOCAP,
         **BEFORE_BOOT,
         **gains,
         **mixed,

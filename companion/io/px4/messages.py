@@ -246,7 +246,7 @@ def vision_ned(pose: MocapPose) -> tuple[Vec3, Vec3]:
 def vision_position_estimate(pose: MocapPose) -> bytes:
     """Return the payload of VISION_POSITION_ESTIMATE; raises the errors of `vision_ned`.
 
-    Without TIMESYNC, which PX4 1.16 does not accept from MAVSDK, PX4 stamps on arrival (and subtracts EKF2_EV_DELAY); the companion's
+    PX4 stamps on arrival (and subtracts EKF2_EV_DELAY), because nobody answers its TIMESYNC (docs/internals/px4.md); the companion's
     own clock is what a log reader can use. The first covariance is NaN, which makes PX4 use EKF2_EVP_NOISE and EKF2_EVA_NOISE.
     """
     position_ned_m, euler_rad = vision_ned(pose)
