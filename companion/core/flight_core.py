@@ -151,6 +151,7 @@ class FlightCore:
             limited_by=self._limited_by,
             mocap_innovation_m=self._monitors.mocap_innovation_m,
             contact=state.expected.contact,
+            chase=state.expected.chase,
         )
 
     def forwards(self, pose: MocapPose, vehicle: VehicleState | None) -> bool:

@@ -12,7 +12,7 @@ from companion.mission.segments import Segment
 from companion.model.best_pose import best_pose
 from companion.model.codec import Record
 from companion.model.frames import quat_rotate
-from companion.model.types import ContactState, Inputs, MocapPose, Reference, TetherState, Vec3
+from companion.model.types import ChaseState, ContactState, Inputs, MocapPose, Reference, TetherState, Vec3
 from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
 
@@ -34,6 +34,8 @@ class Expectation(Record, frozen=True):
     """Way from the reference to a place in front of the surface, world frame; None if there is no surface."""
     contact: ContactState | None = None
     """State of the contact for the log and for the displays."""
+    chase: ChaseState | None = None
+    """The same of the way to a thrown ball."""
 
 
 NOTHING = Expectation()

@@ -383,6 +383,21 @@ class ContactState(Record, frozen=True, kw_only=True):
     """Time for which the tip has been too far behind its reference."""
 
 
+class ChaseState(Record, frozen=True, kw_only=True):
+    """How the net is to meet a ball in flight."""
+
+    meeting_s: float
+    """Time of the meeting, flight clock."""
+    meeting_world_m: Vec3
+    """The ball at the meeting."""
+    predicted_s: float
+    """Time from the first plan to its meeting."""
+    replans: int
+    """Number of plans after the first."""
+    relative_speed_m_s: float
+    """Speed of the ball relative to the net at the meeting, if the vehicle keeps its velocity."""
+
+
 class Reference(Record, frozen=True, kw_only=True):
     """Reference motion of vehicle and arm at one instant."""
 
@@ -539,6 +554,8 @@ class Outputs(Record, frozen=True, kw_only=True):
     """Distance between the newest pose and the position predicted from the IMU; 0 if it is not evaluated, None in older logs."""
     contact: ContactState | None = None
     """Contact with a surface; None outside contact phases."""
+    chase: ChaseState | None = None
+    """Way to a thrown ball; None before one is met."""
 
 
 class Sent(Record, frozen=True, kw_only=True):

@@ -306,7 +306,11 @@ def test_the_vehicle_meets_a_ball_comes_to_rest_and_returns() -> None:
     assert flown.ids == ["ball_seen", "meeting_planned"] and flown.over
     assert {state.mode for state in flown.states} == set(Mode)
     at_meeting = next(s for s in flown.states if s.mode is Mode.STOP)
-    assert at_meeting.now.position_m[2] > HOME.position_world_m[2] + 0.05 and at_meeting.replans > 0
+    assert (
+        at_meeting.now.position_m[2] > HOME.position_world_m[2] + 0.05
+        and at_meeting.chase is not None
+        and at_meeting.chase.replans > 0
+    )
     assert math.dist(flown.references[-1].position_world_m, HOME.position_world_m) < 1e-3
     steps_m = [
         math.dist(a.position_world_m, b.position_world_m)

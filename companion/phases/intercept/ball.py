@@ -35,7 +35,7 @@ JUDGED_M_S2: Final = 1.0
 SURE_M_S2: Final = 2.5
 """Standard deviation below which that acceleration is judged."""
 FAST_M_S: Final = 3.5
-FAST_SURE_M_S2: Final = 9.0
+FAST_SURE_M_S2: Final = 15.0
 """The same for a marker that is faster than this: a hand that swings it so fast accelerates it by more than the test allows."""
 FALLS_FRAMES: Final = 3
 """Number of consecutive frames in which a marker must fall to be a ball."""

@@ -16,6 +16,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import operator
 from collections.abc import Iterator, Sequence
 from typing import Final
 
@@ -34,11 +35,11 @@ TILT_RESERVE_RAD: Final = math.radians(2.0)
 """Tilt that is left to the control law."""
 STOP_LEAST_S: Final = 0.5
 """Shortest duration of a stop."""
-LAG_S: Final = 0.15
+LAG_S: Final = 0.12
 """Time constant of each of the lags through which body and tilt follow the reference's acceleration."""
-BODY_S2 = (0.0, 0.018, -0.162, 0.125)
-"""Displacement of the body from its reference per acceleration after one to four lags, horizontally."""
-TILT_S2_M = (0.0, 0.092, 0.427, -0.478)
+BODY_S2 = (0.0, -0.051, 0.182, -0.421, 0.274)
+"""Displacement of the body from its reference per acceleration after one to five lags, horizontally."""
+TILT_S2_M = (0.0, 0.050, 0.174, 0.186, -0.337)
 """Slope of the body's tilt, the same. These were identified in the fast loop, in other laboratories than those of the figures."""
 SWINGS: Final = 0.85
 """Share of the net's distance below the body's origin by which it swings against the tilt: the arm gives way."""
@@ -151,7 +152,7 @@ def _motion(t_s: float, begin: State, duration_s: float, found: list[tuple[float
 
 
 class Lag(Record, frozen=True):
-    """The reference's horizontal acceleration after one to four lags of `LAG_S`: how body and tilt follow it."""
+    """The reference's horizontal acceleration after one to five lags of `LAG_S`: how body and tilt follow it."""
 
     x_m_s2: tuple[float, ...] = (0.0,) * len(BODY_S2)
     y_m_s2: tuple[float, ...] = (0.0,) * len(BODY_S2)
@@ -160,6 +161,17 @@ class Lag(Record, frozen=True):
         """Return the lags after a tick with this acceleration."""
         x, y, _ = acceleration_m_s2
         return Lag(_lagging(self.x_m_s2, x, dt_s), _lagging(self.y_m_s2, y, dt_s))
+
+    def net_m(self, drop_m: float, ahead_m: tuple[float, float]) -> Vec3:
+        """Return the displacement of the net from where it hangs at the reference.
+
+        Args:
+            drop_m: distance of the net below the body's origin by which it swings.
+            ahead_m: horizontal position of the net relative to the body, world frame.
+        """
+        x, y = (sum(map(operator.mul, TILT_S2_M, lags)) for lags in (self.x_m_s2, self.y_m_s2))
+        u, v = (sum(map(operator.mul, BODY_S2, lags)) for lags in (self.x_m_s2, self.y_m_s2))
+        return (u - drop_m * x, v - drop_m * y, -ahead_m[0] * x - ahead_m[1] * y)
 
 
 def _lagging(values: tuple[float, ...], followed: float, dt_s: float) -> tuple[float, ...]:

@@ -15,11 +15,11 @@ from companion.config.base import NonNegative, Positive3
 from companion.config.phase import Duration
 from companion.control.arm_model import manipulator_of
 from companion.control.manipulator import Manipulator
-from companion.mission.air import Air
+from companion.mission.air import Air, Expectation
 from companion.mission.phase import Checking, Phase, Planning
 from companion.model.codec import Record
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
-from companion.model.types import Reference, SafetyAction, Severity, Vec3
+from companion.model.types import ChaseState, Reference, SafetyAction, Severity, Vec3
 from companion.phases.intercept import ball
 from companion.phases.intercept.ball import Candidate, Point
 from companion.phases.intercept.meeting import (
@@ -46,6 +46,8 @@ HORIZON_S: Final = 1.5
 BESIDE_S: Final = 0.5
 """Time constant of the mean distance of the net from its reference, which is what the plan of a meeting adds to it."""
 BESIDE_MAX_M: Final = 0.1
+AMISS: Final = 0.5
+"""Share of the net's deviation from the assumed response that is expected to be left at the meeting."""
 REST_S: Final = 1.0
 """Time at rest after a meeting, before the way back."""
 BACK_M_S: Final = 0.3
@@ -109,9 +111,8 @@ class Interception(Record, frozen=True, kw_only=True):
     frame_number: int = -1
     beside_m: Vec3 = (0.0, 0.0, 0.0)
     """Mean position of the net minus that of its reference."""
-    planned_s: float | None = None
-    """Flight clock when a meeting was planned for the first time."""
-    replans: int = 0
+    chase: ChaseState | None = None
+    """The same for the log and for the displays."""
     passing_m: float | None = None
     """Smallest distance from the waiting net of the ball that is seen; None if none is seen."""
     seen: bool = False
@@ -223,6 +224,11 @@ class Intercept(Phase):
             jerk_world_m_s3=s.now.jerk_m_s3,
         )
 
+    def expects(self, own: Any) -> Expectation:
+        """Return the way to the ball that is met, or was met last."""
+        s: Interception = own
+        return Expectation(chase=s.chase)
+
     def _waited(self, air: Air, s: Interception, new: bool) -> Interception | None:
         if air.t_s - s.begun_s >= self.wait_max_s:
             if not s.seen:
@@ -251,7 +257,7 @@ class Intercept(Phase):
             if (plan := self._meeting(air, s, path, None)) is not None:
                 left_s, away_m = plan.point.t_s - air.t_s, math.dist(plan.point.position_m, self._net(air, s))
                 air.report(MEETING_PLANNED, f"meets the ball in {left_s:.2f} s, {away_m:.2f} m from the waiting net")
-                return self._pushed(air, replace(s, mode=Mode.CHASE, plan=plan, planned_s=air.t_s))
+                return self._pushed(air, _planned(replace(s, mode=Mode.CHASE), plan, left_s))
             if not s.at_rotors and not self._clears(air, s, path, None):
                 air.report(BALL_AT_ROTORS, "a ball flies through the rotor disks; the vehicle stays where it is")
                 s = replace(s, at_rotors=True)
@@ -277,7 +283,7 @@ class Intercept(Phase):
         path = self._path(air, s, s.candidates[number])
         plan = self._meeting(air, s, path, point.t_s)
         if plan is not None:
-            return replace(s, plan=plan, replans=s.replans + 1)
+            return _planned(s, plan, plan.point.t_s - air.t_s)
         if not self._clears(air, s, path, s.plan):
             air.report(BALL_AT_ROTORS, "a ball flies through the rotor disks; the vehicle stops")
             return replace(s, mode=Mode.STOP)
@@ -311,6 +317,15 @@ class Intercept(Phase):
 
     def _meeting(self, air: Air, s: Interception, path: list[Point], kept_s: float | None) -> Plan | None:
         (x, y, z), (bx, by, bz) = net_m(air.manipulator, s.home), s.beside_m
+        tip, (px, py, pz), (u, v, w) = (
+            air.tip_world_m(),
+            s.now.position_m,
+            s.lag.net_m(self._reach(air, s).drop_m, (x, y)),
+        )
+        if tip is not None and s.mode is Mode.CHASE:
+            bx += AMISS * (tip[0] - px - x - bx - u)
+            by += AMISS * (tip[1] - py - y - by - v)
+            bz += AMISS * (tip[2] - pz - z - bz - w)
         net, bounds = (x + bx, y + by, z + bz), self._bounds(air, s)
         plans = meetings(
             air.t_s, s.now, s.lag, path, net, opening(air.manipulator, s.home), bounds, self._reach(air, s), kept_s
@@ -339,6 +354,19 @@ class Intercept(Phase):
                 if abs(pz - z) < near_m and math.hypot(px - x, py - y) < airframe.disk_radius_m + ball_m:
                     return False
         return True
+
+
+def _planned(s: Interception, plan: Plan, left_s: float) -> Interception:
+    """Return the state with a plan that is new or replaces the one before."""
+    before, point = s.chase, plan.point
+    chase = ChaseState(
+        meeting_s=point.t_s,
+        meeting_world_m=point.position_m,
+        predicted_s=left_s if before is None else before.predicted_s,
+        replans=0 if before is None else before.replans + 1,
+        relative_speed_m_s=math.dist(point.velocity_m_s, s.now.velocity_m_s),
+    )
+    return replace(s, plan=plan, chase=chase)
 
 
 FLOOR_M: Final = 0.1
