@@ -386,10 +386,6 @@ class ContactState(Record, frozen=True, kw_only=True):
 class ChaseState(Record, frozen=True, kw_only=True):
     """How the net is to meet a ball in flight."""
 
-    meeting_s: float
-    """Time of the meeting, flight clock."""
-    meeting_world_m: Vec3
-    """The ball at the meeting."""
     predicted_s: float
     """Time from the first plan to its meeting."""
     replans: int

@@ -95,15 +95,9 @@ class Motion(Record, frozen=True):
 
     def at(self, t_s: float) -> State:
         """Return the state at a time; after the end, that of the end."""
-        h, p, v, a = (
-            min(t_s, self.end_s) - self.start_s,
-            self.begin.position_m,
-            self.begin.velocity_m_s,
-            self.begin.acceleration_m_s2,
-        )
-        (x, vx, ax, jx), (y, vy, ay, jy), (z, vz, az, jz) = [
-            _axis(h, p[k], v[k], a[k], self.gamma[k], self.beta[k], self.alpha[k]) for k in range(3)
-        ]
+        h, s = min(t_s, self.end_s) - self.start_s, self.begin
+        axes = zip(s.position_m, s.velocity_m_s, s.acceleration_m_s2, self.gamma, self.beta, self.alpha, strict=True)
+        (x, vx, ax, jx), (y, vy, ay, jy), (z, vz, az, jz) = [_axis(h, *axis) for axis in axes]
         return State((x, y, z), (vx, vy, vz), (ax, ay, az), (jx, jy, jz))
 
 
@@ -143,12 +137,8 @@ def motion_to(t_s: float, begin: State, duration_s: float, position_m: Vec3 | No
                 (60.0 * beyond - 24.0 * h * faster - 3.0 * h * h * a0) / h**3,
             )
         )
-    return _motion(t_s, begin, h, found)
-
-
-def _motion(t_s: float, begin: State, duration_s: float, found: list[tuple[float, float, float]]) -> Motion:
     (ax, bx, gx), (ay, by, gy), (az, bz, gz) = found
-    return Motion(t_s, duration_s, begin, (ax, ay, az), (bx, by, bz), (gx, gy, gz))
+    return Motion(t_s, h, begin, (ax, ay, az), (bx, by, bz), (gx, gy, gz))
 
 
 class Lag(Record, frozen=True):
@@ -218,7 +208,7 @@ class Plan(Record, frozen=True):
         if left_s <= 0.0:
             return (0.0, 0.0, 0.0)
         aside = max(-1.0, min(1.0, self.aside_gain * aside_s(left_s, drop_m)))
-        up = max(-1.0, min(1.0, self.up_gain * up_s(left_s)))
+        up = max(-1.0, min(1.0, self.up_gain * (left_s - RISES_S)))
         return (self.aside_m_s2[0] * aside, self.aside_m_s2[1] * aside, self.up_m_s2 * up)
 
 
@@ -232,11 +222,6 @@ def aside_s(left_s: float, drop_m: float) -> float:
     return left_s + _impulse_1_s(BODY_S2, left_s) - drop_m * _impulse_1_s(TILT_S2_M, left_s)
 
 
-def up_s(left_s: float) -> float:
-    """Return the same for the vertical displacement."""
-    return left_s - RISES_S
-
-
 class Reach:
     """How far an acceleration of 1 m/s^2 brings the net in a time.
 
@@ -246,16 +231,20 @@ class Reach:
     """
 
     def __init__(self, drop_m: float, horizon_s: float) -> None:
-        self.drop_m = drop_m
+        self.drop_m = drop_m = SWINGS * drop_m
+        """Distance by which it swings."""
         times = [(k + 0.5) * STEP_S for k in range(math.ceil(horizon_s / STEP_S))]
-        self._aside, self._up = [aside_s(t, drop_m) for t in times], [up_s(t) for t in times]
+        self._aside, self._up = [aside_s(t, drop_m) for t in times], [t - RISES_S for t in times]
         self._tilt = [_impulse_1_s(TILT_S2_M, t) for t in times]
-        self._asides_s2, self._ups_s2 = _sums(self._aside), _sums(self._up)
+        self._asides_s2, self._ups_s2 = (
+            list(itertools.accumulate(STEP_S * abs(response) for response in responses))
+            for responses in (self._aside, self._up)
+        )
 
-    def of(self, left_s: float) -> tuple[float, float]:
-        """Return the horizontal and the vertical reach."""
+    def of(self, left_s: float) -> tuple[int, float, float]:
+        """Return the number of steps, the horizontal and the vertical reach."""
         number = min(len(self._aside), max(1, round(left_s / STEP_S)))
-        return self._asides_s2[number - 1], self._ups_s2[number - 1]
+        return number, self._asides_s2[number - 1], self._ups_s2[number - 1]
 
     def plan(self, point: Point, left_s: float, away_m: Vec3, most_m_s2: float, ahead_m: tuple[float, float]) -> Plan:
         """Return the plan with which the net moves by `away_m`.
@@ -267,9 +256,9 @@ class Reach:
             most_m_s2: largest acceleration.
             ahead_m: horizontal position of the net relative to the body, world frame: if that is tilted, the net rises or falls.
         """
-        number = min(len(self._aside), max(1, round(left_s / STEP_S)))
+        number, aside_s2, up_s2 = self.of(left_s)
         (x, y, z), aside, up, tilt = away_m, self._aside[:number], self._up[:number], self._tilt[:number]
-        aside_m, aside_s2, up_s2 = math.hypot(x, y), self._asides_s2[number - 1], self._ups_s2[number - 1]
+        aside_m = math.hypot(x, y)
         effort = math.hypot(aside_m / aside_s2, z / up_s2) or 1.0
         most = most_m_s2 * aside_m / aside_s2 / effort
         gain = _gain(aside, aside_m / most) if most > 0.0 else 0.0
@@ -280,14 +269,7 @@ class Reach:
         return Plan(point, push, rise, gain, _gain(up, z / rise))
 
 
-@functools.lru_cache(maxsize=4)
-def reach_of(drop_m: float, horizon_s: float) -> Reach:
-    """Return the `Reach` of a net that hangs this far below the body's origin."""
-    return Reach(SWINGS * drop_m, horizon_s)
-
-
-def _sums(responses: list[float]) -> list[float]:
-    return list(itertools.accumulate(STEP_S * abs(response) for response in responses))
+reach_of = functools.lru_cache(maxsize=4)(Reach)
 
 
 def _gain(responses: list[float], wanted_s2: float) -> float:
@@ -438,29 +420,22 @@ def meetings(
     for point in path:
         h, (bx, by, bz), (ux, uy, uz) = point.t_s - t_s, point.position_m, point.velocity_m_s
         facing = -(ox * ux + oy * uy + oz * uz) / math.hypot(ux, uy, uz)
-        if h < (LEAST_S if kept_s is None else FROZEN_S) or facing < FACING:
-            continue
-        if not bounds.in_box((bx - nx, by - ny, bz - nz)):
+        early = h >= (LEAST_S if kept_s is None else FROZEN_S)
+        if not early or facing < FACING or not bounds.in_box((bx - nx, by - ny, bz - nz)):
             continue
         dx = bx - nx - x - h * vx - _faded(left_x, h)
         dy = by - ny - y - h * vy - _faded(left_y, h)
         dz = bz - nz - z - (h - RISES_S) * vz + _faded(left_z, h)
-        aside_s2, up_s2 = reach.of(h)
+        _, aside_s2, up_s2 = reach.of(h)
         needed = math.hypot(dx / aside_s2, dy / aside_s2, dz / up_s2) / most
         needed = max(needed, math.hypot(dx, dy, dz) / (bounds.speed_m_s * h))
         if needed > 1.0 and kept_s is None and (1.0 - 1.0 / needed) * math.hypot(dx, dy, dz) > MISS_M:
             continue
-        effort = needed + ASKEW * (1.0 - facing)
-        if kept_s is not None and abs(point.t_s - kept_s) < 1e-6:
-            effort -= KEPT
-        found.append((effort, point, (dx, dy, dz)))
-    found.sort(key=_effort)
+        kept = KEPT if kept_s is not None and abs(point.t_s - kept_s) < 1e-6 else 0.0
+        found.append((needed + ASKEW * (1.0 - facing) - kept, point, (dx, dy, dz)))
+    found.sort(key=operator.itemgetter(0))
     for _, point, away_m in found[:TRIED_MAX]:
         yield reach.plan(point, point.t_s - t_s, away_m, most, (nx, ny))
-
-
-def _effort(candidate: tuple[float, Point, Vec3]) -> float:
-    return candidate[0]
 
 
 def _integrated(first: Vec3, rates: list[Vec3], h: float) -> list[Vec3]:

@@ -358,14 +358,9 @@ class Intercept(Phase):
 
 def _planned(s: Interception, plan: Plan, left_s: float) -> Interception:
     """Return the state with a plan that is new or replaces the one before."""
-    before, point = s.chase, plan.point
-    chase = ChaseState(
-        meeting_s=point.t_s,
-        meeting_world_m=point.position_m,
-        predicted_s=left_s if before is None else before.predicted_s,
-        replans=0 if before is None else before.replans + 1,
-        relative_speed_m_s=math.dist(point.velocity_m_s, s.now.velocity_m_s),
-    )
+    speed_m_s, before = math.dist(plan.point.velocity_m_s, s.now.velocity_m_s), s.chase
+    predicted_s, replans = (left_s, 0) if before is None else (before.predicted_s, before.replans + 1)
+    chase = ChaseState(predicted_s=predicted_s, replans=replans, relative_speed_m_s=speed_m_s)
     return replace(s, plan=plan, chase=chase)
 
 
