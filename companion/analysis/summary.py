@@ -52,6 +52,7 @@ def empty_summary(
         "events": [],
         "tether": {"min_slack_m": None},
         "contact": None,
+        "intercept": None,
         "graded_every": 1,
         "world": None,
         "autopilot": None,
@@ -113,9 +114,23 @@ def summarise(
         events=_events(log),
         tether={"min_slack_m": metrics.min_slack_m(log)},
         contact=contact_summary(log),
+        intercept=_chase(log),
         graded_every=log.stride,
     )
     return summary
+
+
+def _chase(log: FlightLog) -> dict[str, Any] | None:
+    """Return how the newest plan met a ball; None if none was to be met. The launcher adds the world's `miss_m`."""
+    chase = next((outputs.chase for outputs in reversed(log.outputs) if outputs.chase is not None), None)
+    if chase is None:
+        return None
+    return {
+        "predicted_s": chase.predicted_s,
+        "replans": chase.replans,
+        "miss_m": None,
+        "relative_speed_m_s": chase.relative_speed_m_s,
+    }
 
 
 def effective_config(log: FlightLog, summary: dict[str, Any]) -> dict[str, Any]:

@@ -136,6 +136,7 @@ class LawConfig(ControllerConfig):
     """Fraction of the vehicle file's `arm.joint_friction_nm` that is fed forward in the direction of the requested joint rate:
     alpha'_d, and in the adaptive law alpha' - s."""
     lateral_force_max_n: Positive = 12.0
+    """Largest horizontal force of a vehicle that may tilt by 20 deg. If it may tilt by more, in the ratio of the tangents more."""
     attitude_filter_rad_s: Positive = 30.0
     attitude_filter_damping: Annotated[float, Field(ge=0.5, le=2)] = 1.0
 

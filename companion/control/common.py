@@ -123,11 +123,12 @@ class Actuation:
 
     def __init__(self, config: LawConfig, vehicle: Vehicle, hover_thrust: float) -> None:
         weight_n = vehicle.airframe.mass_kg * GRAVITY_M_S2
+        tilt_max_tan = math.tan(math.radians(vehicle.airframe.tilt_max_deg))
         self._limits = ForceLimits(
             vertical_min_n=0.3 * weight_n,
             vertical_max_n=min(0.9 * vehicle.airframe.thrust_max_n, 0.9 / hover_thrust * weight_n),
-            lateral_max_n=config.lateral_force_max_n,
-            tilt_max_tan=math.tan(math.radians(vehicle.airframe.tilt_max_deg)),
+            lateral_max_n=config.lateral_force_max_n * max(1.0, tilt_max_tan / math.tan(math.radians(20.0))),
+            tilt_max_tan=tilt_max_tan,
         )
         self._torque_max_nm = [(number, joint.torque_max_nm) for number, joint in enumerate(vehicle.arm.joints)]
         """Number and torque limit of each joint."""

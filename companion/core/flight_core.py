@@ -152,6 +152,7 @@ class FlightCore:
             mocap_innovation_m=self._monitors.mocap_innovation_m,
             contact=state.expected.contact,
             ball=state.expected.ball,
+            chase=state.expected.chase,
         )
 
     def forwards(self, pose: MocapPose, vehicle: VehicleState | None) -> bool:

@@ -106,6 +106,8 @@ def _summary(
         **knobs,
         "contact": result.world.get("contact"),
     }
+    if summary["intercept"] is not None:
+        summary["intercept"]["miss_m"] = result.world.get("miss_m")
     logged = {event["id"] for event in summary["events"]}
     summary["events"] += [event for event in result.events if event["id"] not in logged]
     summary["events"] += result.guardian_events

@@ -13,7 +13,7 @@ from companion.model.best_pose import best_pose
 from companion.model.codec import Record
 from companion.model.frames import quat_rotate
 from companion.model.markers import BallState
-from companion.model.types import ContactState, Inputs, MocapPose, Reference, TetherState, Vec3
+from companion.model.types import ChaseState, ContactState, Inputs, MocapPose, Reference, TetherState, Vec3
 from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
 
@@ -37,6 +37,8 @@ class Expectation(Record, frozen=True):
     """State of the contact for the log and for the displays."""
     ball: BallState | None = None
     """The ball that the phase follows, for the log and for the displays."""
+    chase: ChaseState | None = None
+    """The way to a thrown ball, for the log."""
 
 
 NOTHING = Expectation()

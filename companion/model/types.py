@@ -383,6 +383,17 @@ class ContactState(Record, frozen=True, kw_only=True):
     """Time for which the tip has been too far behind its reference."""
 
 
+class ChaseState(Record, frozen=True, kw_only=True):
+    """How the net is to meet a ball in flight."""
+
+    predicted_s: float
+    """Time from the first plan to its meeting."""
+    replans: int
+    """Number of plans after the first."""
+    relative_speed_m_s: float
+    """Speed of the ball relative to the net at the meeting, if the vehicle keeps its velocity."""
+
+
 class Reference(Record, frozen=True, kw_only=True):
     """Reference motion of vehicle and arm at one instant."""
 
@@ -541,6 +552,8 @@ class Outputs(Record, frozen=True, kw_only=True):
     """Contact with a surface; None outside contact phases."""
     ball: BallState | None = None
     """The ball that the phase follows; None without one, and in older logs."""
+    chase: ChaseState | None = None
+    """Way to a thrown ball; None before one is met."""
 
 
 class Sent(Record, frozen=True, kw_only=True):

@@ -23,14 +23,14 @@ from companion.model.types import Inputs, OperatorCommand, Reference, Vec3
 from companion.phases.intercept import ball
 from companion.phases.intercept.ball import Candidate
 from companion.phases.intercept.meeting import (
-    FOLLOWS_S,
+    BODY_S2,
     RISES_S,
-    SWING_S2_M,
+    TILT_S2_M,
     Bounds,
     Lag,
     State,
-    meeting,
-    shift_of_net,
+    meetings,
+    reach_of,
 )
 from companion.phases.intercept.phase import Intercept, Interception, Mode, net_m, opening
 from companion.safety.governor import SafeSet
@@ -48,6 +48,7 @@ NET_M = net_m(MANIPULATOR, HOME)
 NET_WORLD_M: Vec3 = tuple(a + b for a, b in zip(HOME.position_world_m, NET_M, strict=True))  # type: ignore[assignment]
 OPENING = opening(MANIPULATOR, HOME)
 BOUNDS = Bounds(CONFIG.vehicle, LIMITS, SAFE, HOME.position_world_m, PHASE.box_m)
+REACH = reach_of(-NET_M[2], 1.5)
 DRAG_PER_M = PHASE.drag_per_m
 NOISE_M = 0.001
 Where = Callable[[float], Vec3 | None]
@@ -160,18 +161,31 @@ def test_a_ball_is_found_again_after_50_ms_without_frames() -> None:
 
 
 def test_the_net_is_where_the_plan_wants_it_if_body_and_tilt_follow_as_assumed() -> None:
-    shift, duration_s, drop_m, steps = (0.05, -0.12, 0.1), 0.4, 0.35, 4000
-    motion = shift_of_net(
-        0.0, State((0.0, 0.0, 1.0), (0.1, 0.0, -0.1), (0.3, 0.2, 0.0)), Lag(), duration_s, drop_m, shift
+    arrival_s, ahead_m, dt_s = 0.6, 0.2, 0.001
+    now, lag, reach = State((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Lag(), reach_of(0.35, 1.5)
+    point = ball.Point(arrival_s, (ahead_m + 0.05, -0.2, 0.75), (-3.0, 0.0, -3.0), 0.01)
+    for start_s in (0.0, 0.3):  # replanned once, in motion
+        (plan,) = meetings(start_s, now, lag, [point], (ahead_m, 0.0, -0.35), OPENING, BOUNDS, reach, None)
+        for k in range(300):
+            (ax, ay, az), (vx, vy, vz), (x, y, z) = (
+                plan.push_m_s2(start_s + (k + 0.5) * dt_s, reach.drop_m),
+                now.velocity_m_s,
+                now.position_m,
+            )
+            vx, vy, vz = vx + dt_s * ax, vy + dt_s * ay, vz + dt_s * az
+            now = State((x + dt_s * vx, y + dt_s * vy, z + dt_s * vz), (vx, vy, vz), (ax, ay, az))
+            lag = lag.after(dt_s, (ax, ay, az))
+    (x, y, z), tilt = now.position_m, [_weighed(TILT_S2_M, values) for values in (lag.x_m_s2, lag.y_m_s2)]
+    net_m = (
+        x + _weighed(BODY_S2, lag.x_m_s2) - reach.drop_m * tilt[0] + ahead_m,
+        y + _weighed(BODY_S2, lag.y_m_s2) - reach.drop_m * tilt[1],
+        z - RISES_S * now.velocity_m_s[2] - ahead_m * tilt[0] - 0.35,
     )
-    lag = Lag()
-    for k in range(steps):
-        lag = lag.after(duration_s / steps, motion.at((k + 0.5) * duration_s / steps).acceleration_m_s2)
-    end = motion.at(duration_s)
-    for k in range(2):
-        swing_m = SWING_S2_M * drop_m * lag.second_m_s2[k]
-        assert end.position_m[k] - FOLLOWS_S * end.velocity_m_s[k] - swing_m == pytest.approx(shift[k], abs=1e-3)
-    assert end.position_m[2] - 1.0 - RISES_S * end.velocity_m_s[2] == pytest.approx(shift[2], abs=1e-9)
+    assert math.dist(net_m, point.position_m) < 0.01
+
+
+def _weighed(weights: Sequence[float], values: Sequence[float]) -> float:
+    return sum(weight * value for weight, value in zip(weights, values, strict=True))
 
 
 def throws(count: int, seed: int) -> Iterator[tuple[list[ball.Point], Where, float]]:
@@ -191,35 +205,42 @@ def throws(count: int, seed: int) -> Iterator[tuple[list[ball.Point], Where, flo
         yield ball.path(begun, 1.5, 0.1, DRAG_PER_M), where, left_s
 
 
-def test_no_plan_to_meet_one_of_400_balls_leaves_a_limit() -> None:
-    stops, draw, found = StopModel(CONFIG.vehicle.safety), random.Random(5), 0
-    airframe = CONFIG.vehicle.airframe
+def test_the_way_to_none_of_200_balls_and_the_stop_after_it_leave_a_limit() -> None:
+    stops, draw, found, held = StopModel(CONFIG.vehicle.safety), random.Random(5), 0, 0
+    airframe, reach = CONFIG.vehicle.airframe, REACH
     most_m_s2 = LIMITS.thrust_share_max * airframe.thrust_max_n / (airframe.mass_kg + airframe.payload_max_kg)
-    now: State = State(HOME.position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    for path, _, _ in throws(400, 6):
-        met = meeting(0.0, now, Lag(), path, NET_M, OPENING, BOUNDS, lambda _: True, None)
-        now = State(HOME.position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        if met is None:
+    rest = now = State(HOME.position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    for path, _, _ in throws(200, 6):
+        plan = next(meetings(0.0, now, Lag(), path, NET_M, OPENING, BOUNDS, reach, None), None)
+        if plan is None:
+            now = rest
             continue
         found += 1
-        end_s = met.motion.end_s
-        stop = BOUNDS.stop(end_s, met.motion.at(end_s))
-        for motion in (met.motion, stop):
-            for k in range(51):
-                s = motion.at(motion.start_s + motion.duration_s * k / 50)
-                (ax, ay, az), speed = s.acceleration_m_s2, math.hypot(*s.velocity_m_s)
-                assert speed <= LIMITS.speed_max_m_s and math.hypot(ax, ay, az) <= LIMITS.acceleration_max_m_s2
-                assert math.hypot(*s.jerk_m_s3) <= LIMITS.jerk_max_m_s3
-                assert math.degrees(math.atan2(math.hypot(ax, ay), az + GRAVITY_M_S2)) <= airframe.tilt_max_deg
-                assert math.hypot(ax, ay, az + GRAVITY_M_S2) <= most_m_s2
-                assert all(
-                    abs(p - h) <= b for p, h, b in zip(s.position_m, HOME.position_world_m, PHASE.box_m, strict=True)
-                )
-                place = tuple(p + stops.time_s(speed) * v for p, v in zip(s.position_m, s.velocity_m_s, strict=True))
-                assert SAFE.holds(s.position_m) and SAFE.holds((place[0], place[1], place[2]))
+        states, end_s = [now], draw.uniform(0.1, 1.0) * plan.point.t_s
+        for tick in range(round(end_s / TICK_PERIOD_S)):
+            t_s = tick * TICK_PERIOD_S
+            after = BOUNDS.pushed(t_s, now, TICK_PERIOD_S, plan.push_m_s2(t_s, reach.drop_m))
+            if after is None:
+                held += 1
+                break
+            now = after
+            states.append(now)
+        stop = BOUNDS.stop(0.0, now)
+        states += [stop.at(stop.duration_s * k / 50) for k in range(51)]
+        for s in states:
+            (ax, ay, az), speed = s.acceleration_m_s2, math.hypot(*s.velocity_m_s)
+            assert speed <= LIMITS.speed_max_m_s and math.hypot(ax, ay, az) <= LIMITS.acceleration_max_m_s2
+            assert math.hypot(*s.jerk_m_s3) <= LIMITS.jerk_max_m_s3
+            assert math.degrees(math.atan2(math.hypot(ax, ay), az + GRAVITY_M_S2)) <= airframe.tilt_max_deg
+            assert math.hypot(ax, ay, az + GRAVITY_M_S2) <= most_m_s2
+            assert all(
+                abs(p - h) <= b for p, h, b in zip(s.position_m, HOME.position_world_m, PHASE.box_m, strict=True)
+            )
+            place = tuple(p + stops.time_s(speed) * v for p, v in zip(s.position_m, s.velocity_m_s, strict=True))
+            assert SAFE.holds(s.position_m) and SAFE.holds((place[0], place[1], place[2]))
         assert math.hypot(*stop.at(stop.end_s).velocity_m_s) < 1e-9, "at rest after the stop"
-        now = met.motion.at(draw.uniform(0.1, 0.9) * end_s)  # the next ball comes while the vehicle moves
-    assert found > 100, "too few balls are met to judge"
+    assert found > 50, "too few balls are met to judge"
+    assert held < found / 4, "most ways end at a limit"
 
 
 class Tick(Air):
@@ -285,7 +306,11 @@ def test_the_vehicle_meets_a_ball_comes_to_rest_and_returns() -> None:
     assert flown.ids == ["ball_seen", "meeting_planned"] and flown.over
     assert {state.mode for state in flown.states} == set(Mode)
     at_meeting = next(s for s in flown.states if s.mode is Mode.STOP)
-    assert at_meeting.now.position_m[2] > HOME.position_world_m[2] + 0.05 and at_meeting.replans > 0
+    assert (
+        at_meeting.now.position_m[2] > HOME.position_world_m[2] + 0.05
+        and at_meeting.chase is not None
+        and at_meeting.chase.replans > 0
+    )
     assert math.dist(flown.references[-1].position_world_m, HOME.position_world_m) < 1e-3
     steps_m = [
         math.dist(a.position_world_m, b.position_world_m)
@@ -323,13 +348,13 @@ def test_a_second_ball_is_never_chased() -> None:
     other = flight(beside(-0.12, 0.08), (-3.0, 0.0, -1.5), 0.6)
     both = Flown(frames([MEETABLE, other], 0.6), 6.0)
     assert both.ids.count("meeting_planned") == 1
-    points = [state.point.position_m for state in both.states if state.mode is Mode.CHASE and state.point is not None]
-    assert max(math.dist(points[0], point) for point in points) < 0.08, "the vehicle turns to the other ball"
+    aside_m = [state.plan.point.position_m[1] for state in both.states if state.plan is not None]
+    assert max(aside_m) - min(aside_m) < 0.06, "the vehicle turns to the other ball"
 
 
 def test_a_ball_at_the_rotors_makes_the_vehicle_stay() -> None:
     x, y, z = HOME.position_world_m
-    flown = Flown(frames([flight((x + 0.2, y, z + 0.05), (-1.0, 0.0, -3.0), 0.6)], 0.6), 2.0)
+    flown = Flown(frames([flight((x + 0.2, y + 0.2, z + 0.05), (-4.0, 0.0, -3.0), 0.35)], 0.35), 2.0)
     assert "ball_at_rotors" in flown.ids and flown.farthest_m == 0.0
 
 
@@ -337,14 +362,24 @@ def test_no_ball_crosses_the_rotor_disks_of_a_vehicle_that_moves_to_meet_it() ->
     air, airframe = Tick(0.0, None, True, []), CONFIG.vehicle.airframe
     state, changed = PHASE.begin(air), 0
     for path, _, _ in throws(400, 6):
-        free = meeting(0.0, state.now, state.lag, path, NET_M, OPENING, BOUNDS, lambda _: True, None)
-        met = PHASE._meeting(air, state, path, None)
-        changed += free is not None and met != free
-        for point in path if met is not None else ():
-            if met is not None and point.t_s < met.motion.end_s:
-                x, y, z = met.motion.at(point.t_s).position_m
-                px, py, pz = point.position_m
-                assert abs(pz - z - airframe.rotor_height_m) >= 0.05 or math.hypot(px - x, py - y) >= airframe.radius_m
+        best = next(meetings(0.0, state.now, state.lag, path, NET_M, OPENING, BOUNDS, REACH, None), None)
+        plan = PHASE._meeting(air, state, path, None)
+        changed += plan != best
+        if plan is None:
+            continue
+        now, at = state.now, dict[float, State]()
+        for tick in range(round(plan.point.t_s * 200)):
+            t_s = tick * TICK_PERIOD_S
+            at[round(t_s, 6)] = now
+            pushed = BOUNDS.pushed(t_s, now, TICK_PERIOD_S, plan.push_m_s2(t_s, REACH.drop_m))
+            if pushed is None:
+                break
+            now = pushed
+        for point in path:
+            if (there := at.get(round(point.t_s, 6))) is not None:
+                px, py, pz = (b - o for b, o in zip(point.position_m, there.position_m, strict=True))
+                for x, y, z in airframe.rotor_layout.positions_body_m:
+                    assert abs(pz - z) >= 0.04 or math.hypot(px - x, py - y) >= airframe.disk_radius_m
     assert changed > 0, "the rotors forbid no meeting"
 
 
@@ -386,8 +421,8 @@ def test_the_displays_are_told_the_ball_and_where_it_meets_the_net() -> None:
     chases = [(state, ball) for state, ball in seen if ball is not None and ball.meeting_world_m is not None]
     assert chases and {state.mode for state, _ in chases} == {Mode.CHASE}
     last, at_end = chases[-1]
-    assert last.point is not None and at_end.meeting_s == last.point.t_s
-    assert math.dist(at_end.position_world_m, last.point.position_m) < 0.1, "it is nearly there"
+    assert last.plan is not None and at_end.meeting_s == last.plan.point.t_s
+    assert math.dist(at_end.position_world_m, last.plan.point.position_m) < 0.1, "it is nearly there"
     assert seen[0][1] is None and seen[-1][1] is None
 
 
@@ -403,8 +438,10 @@ def test_without_sight_of_the_ball_with_a_box_beyond_the_tether_or_a_closed_net_
     assert "from upwards (limit 60 deg)" in found("mission.phases[2].arm_deg=[160.0, 20.0]")
 
 
-def test_the_vehicle_of_the_mission_differs_only_by_the_sight_of_the_ball() -> None:
+def test_the_vehicle_of_the_mission_differs_only_by_the_sight_of_the_ball_and_the_tilt() -> None:
     config = load_flight("configs/missions/catch.yaml")
     mocap = config.vehicle.devices.mocap.model_copy(update={"ball": CONFIG.vehicle.devices.mocap.ball})
     devices = config.vehicle.devices.model_copy(update={"mocap": mocap})
-    assert config.vehicle.model_copy(update={"devices": devices, "name": CONFIG.vehicle.name}) == CONFIG.vehicle
+    airframe = config.vehicle.airframe.model_copy(update={"tilt_max_deg": CONFIG.vehicle.airframe.tilt_max_deg})
+    changes = {"devices": devices, "airframe": airframe, "name": CONFIG.vehicle.name}
+    assert config.vehicle.model_copy(update=changes) == CONFIG.vehicle

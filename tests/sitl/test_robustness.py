@@ -158,7 +158,7 @@ def test_careless_people_throw_the_same_to_a_vehicle_that_waits_and_to_one_that_
         assert all(hovers[key] == passes[key] for key in ("payload_kg", "seed"))
         there, here = (flights.with_world(config, world).world for config, world in ((WAITS, hovers), (PASSES, passes)))
         assert (there.people, there.thrower) == (here.people, here.thrower)
-        assert (len(there.people), there.thrower.scatter) == (4, 3.0)
+        assert (len(there.people), there.thrower.scatter) == (2, 3.0)
 
 
 def test_a_row_of_a_careless_throw_has_its_miss() -> None:

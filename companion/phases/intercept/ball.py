@@ -34,6 +34,9 @@ JUDGED_M_S2: Final = 1.0
 """Acceleration beyond free fall that a ball may have in addition to the filter's uncertainty."""
 SURE_M_S2: Final = 2.5
 """Standard deviation below which that acceleration is judged."""
+FAST_M_S: Final = 3.5
+FAST_SURE_M_S2: Final = 15.0
+"""The same for a marker that is faster than this: a hand that swings it so fast accelerates it by more than the test allows."""
 FALLS_FRAMES: Final = 3
 """Number of consecutive frames in which a marker must fall to be a ball."""
 GATE: Final = 5.0
@@ -182,7 +185,8 @@ def _judged(c: Candidate) -> Candidate:
     sigma = math.sqrt(c.bb)
     x, y, z = c.extra_m_s2
     most = JUDGED_M_S2 + (4.0 if c.is_ball else 2.5) * sigma
-    falls = sigma < SURE_M_S2 and x * x + y * y + z * z < most * most
+    sure = FAST_SURE_M_S2 if math.hypot(*c.velocity_m_s) > FAST_M_S else SURE_M_S2
+    falls = sigma < sure and x * x + y * y + z * z < most * most
     if not falls and c.falls == 0:
         return c
     return replace(c, falls=c.falls + 1 if falls else 0)

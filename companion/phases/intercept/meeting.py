@@ -1,15 +1,23 @@
 """Motion of the vehicle to a meeting point, and the choice of that point. Pure.
 
-A motion is a quintic in each axis: the minimum-jerk segment from position, velocity and acceleration to an end of which any part may be
-free (Mueller, Hehn and D'Andrea, IEEE T-RO 31, 2015). Every limit is convex: the box, the safe set of the governor, also for the place
-where the vehicle would come to rest, the cone of the tilt, and the balls of speed, acceleration, thrust and jerk. A polynomial lies in
-the convex hull of its Bernstein coefficients, so a motion whose few coefficients respect the limits respects them at all times.
+Towards a ball, the reference accelerates so that the net is at the meeting with the least integral of the acceleration's square, within
+its limit: a multiple of the net's response to an impulse of acceleration, clipped. The farther the ball, the more of it is clipped, up
+to full tilt in one direction and then in the other, which is as far as the net can come. Every tick ends in a state from which a stop
+respects every limit; otherwise the vehicle pushes less, brakes, or stops as it would have in the tick before.
+
+A stop is a quintic in each axis: the minimum-jerk segment from position, velocity and acceleration (Mueller, Hehn and D'Andrea, IEEE
+T-RO 31, 2015). Every limit is convex: the box, the safe set of the governor, also for the place where the vehicle would come to rest,
+the cone of the tilt, and the balls of speed, acceleration, thrust and jerk. A polynomial lies in the convex hull of its Bernstein
+coefficients, so a motion whose few coefficients respect the limits respects them at all times.
 """
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
-from collections.abc import Callable
+import operator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from companion.config.mission import Limits
@@ -27,31 +35,38 @@ TILT_RESERVE_RAD: Final = math.radians(2.0)
 """Tilt that is left to the control law."""
 STOP_LEAST_S: Final = 0.5
 """Shortest duration of a stop."""
-TILT_S: Final = 0.1
-"""Time constant of each of the two lags with which the tilt follows the reference's acceleration."""
-SWING_S2_M: Final = 0.18
-"""Displacement of the net per lagging acceleration and distance below the body: more than 1 / 9.81, because the arm gives way."""
-FOLLOWS_S: Final = 0.07
+LAG_S: Final = 0.12
+"""Time constant of each of the lags through which body and tilt follow the reference's acceleration."""
+BODY_S2 = (0.0, -0.051, 0.182, -0.421, 0.274)
+"""Displacement of the body from its reference per acceleration after one to five lags, horizontally."""
+TILT_S2_M = (0.0, 0.050, 0.174, 0.186, -0.337)
+"""Slope of the body's tilt, the same. These were identified in the fast loop, in other laboratories than those of the figures."""
+SWINGS: Final = 0.85
+"""Share of the net's distance below the body's origin by which it swings against the tilt: the arm gives way."""
 RISES_S: Final = 0.02
-"""Time by which the body follows the reference, horizontally and vertically. These four were identified in the fast loop."""
+"""Time by which the body follows the reference vertically."""
+FROZEN_S: Final = 0.08
+"""Time before a meeting from which its plan is not changed any more."""
 LEAST_S: Final = 0.15
-"""Shortest duration of a motion to a meeting; in less time, the net hardly moves."""
-MISS_M: Final = 0.05
+"""Shortest time to a meeting that is planned for the first time; in less time, the net hardly moves."""
+MISS_M: Final = 0.08
 """Distance from the net's centre at which a ball is still caught."""
-ASIDE: Final = 3.0
-"""Effort of a horizontal displacement compared with that of a vertical one, which needs no tilt."""
-SHARES = (1.0, 0.8, 0.6, 0.4, 0.2)
-"""Fractions of the net's displacement that are tried one after the other."""
-FACING: Final = 0.3
+FACING: Final = 0.5
 """Smallest cosine between the net's opening and the direction that the ball comes from."""
-ASKEW_M_S2: Final = 2.0
+ASKEW: Final = 0.3
 """Effort of a ball that comes from the side, beyond that of one that comes straight."""
-KEPT_M_S2: Final = 0.3
+KEPT: Final = 0.05
 """Effort by which another meeting must be better than the planned one."""
+STEP_S: Final = 0.02
+"""Step of the sums over the time to a meeting."""
+TRIED_MAX: Final = 10
+"""Number of meetings that are tried, those of the least effort first, until the ball clears the rotors."""
 PIECES: Final = 3
 """Number of pieces of a motion that are compared with the limits: the coefficients of a short piece are close to the curve."""
-TRIED_MAX: Final = 6
-"""Number of meetings that are compared with the limits, those of the least effort first."""
+EASED = (1.0, 0.5, 0.0)
+"""Fractions of the wanted acceleration that are tried one after the other."""
+BRAKE_M_S2: Final = 2.0
+"""Deceleration that is tried after them."""
 
 
 class State(Record, frozen=True):
@@ -80,15 +95,9 @@ class Motion(Record, frozen=True):
 
     def at(self, t_s: float) -> State:
         """Return the state at a time; after the end, that of the end."""
-        h, p, v, a = (
-            min(t_s, self.end_s) - self.start_s,
-            self.begin.position_m,
-            self.begin.velocity_m_s,
-            self.begin.acceleration_m_s2,
-        )
-        (x, vx, ax, jx), (y, vy, ay, jy), (z, vz, az, jz) = [
-            _axis(h, p[k], v[k], a[k], self.gamma[k], self.beta[k], self.alpha[k]) for k in range(3)
-        ]
+        h, s = min(t_s, self.end_s) - self.start_s, self.begin
+        axes = zip(s.position_m, s.velocity_m_s, s.acceleration_m_s2, self.gamma, self.beta, self.alpha, strict=True)
+        (x, vx, ax, jx), (y, vy, ay, jy), (z, vz, az, jz) = [_axis(h, *axis) for axis in axes]
         return State((x, y, z), (vx, vy, vz), (ax, ay, az), (jx, jy, jz))
 
 
@@ -128,69 +137,153 @@ def motion_to(t_s: float, begin: State, duration_s: float, position_m: Vec3 | No
                 (60.0 * beyond - 24.0 * h * faster - 3.0 * h * h * a0) / h**3,
             )
         )
-    return _motion(t_s, begin, h, found)
-
-
-def shift_of_net(t_s: float, begin: State, lag: Lag, duration_s: float, drop_m: float, shift_m: Vec3) -> Motion:
-    """Return the minimum-jerk motion at whose end the net has moved by `shift_m`, world frame.
-
-    The net follows the body, which follows the reference `FOLLOWS_S` later, and swings against the tilt, which follows the horizontal
-    acceleration through the lags of `Lag`. Both are linear in the coefficients of the jerk: min of the integral of jerk^2 with one
-    linear condition per axis. In a short time, the motion tilts away from the ball and swings the net to it.
-
-    Args:
-        t_s: start on the flight clock.
-        begin: state at the start.
-        lag: lagging acceleration at the start.
-        duration_s: time until the net is to be there.
-        drop_m: distance of the net below the body's origin.
-        shift_m: displacement of the net from where it hangs below `begin.position_m` at rest.
-    """
-    h, fade = duration_s, math.exp(-duration_s / TILT_S)
-    found = []
-    for k in range(3):
-        swing, follows_s = (SWING_S2_M * drop_m, FOLLOWS_S) if k < 2 else (0.0, RISES_S)
-        v0, a0 = begin.velocity_m_s[k], begin.acceleration_m_s2[k]
-        # Responses of the two lags to 1, t, t^2 / 2 and t^3 / 6.
-        y0 = 1.0 - fade
-        y1 = h - TILT_S * y0
-        y2 = 0.5 * h * h - TILT_S * y1
-        y3 = h * h * h / 6.0 - TILT_S * y2
-        z0 = 1.0 - fade * (1.0 + h / TILT_S)
-        z1 = y1 - TILT_S * z0
-        z2 = y2 - TILT_S * z1
-        z3 = y3 - TILT_S * z2
-        f0 = h**3 / 6.0 - follows_s * h**2 / 2.0 - swing * z1
-        f1 = h**4 / 24.0 - follows_s * h**3 / 6.0 - swing * z2
-        f2 = h**5 / 120.0 - follows_s * h**4 / 24.0 - swing * z3
-        still = fade * (lag.second_m_s2[k] + lag.first_m_s2[k] * h / TILT_S) + a0 * z0
-        free = h * (v0 + 0.5 * h * a0) - follows_s * (v0 + h * a0) - swing * still
-        # The inverse of the matrix of integrals of the products of 1, t and t^2 / 2.
-        g0 = 9.0 * f0 / h - 36.0 * f1 / h**2 + 60.0 * f2 / h**3
-        g1 = -36.0 * f0 / h**2 + 192.0 * f1 / h**3 - 360.0 * f2 / h**4
-        g2 = 60.0 * f0 / h**3 - 360.0 * f1 / h**4 + 720.0 * f2 / h**5
-        share = (shift_m[k] - free) / (f0 * g0 + f1 * g1 + f2 * g2)
-        found.append((share * g2, share * g1, share * g0))
-    return _motion(t_s, begin, h, found)
-
-
-def _motion(t_s: float, begin: State, duration_s: float, found: list[tuple[float, float, float]]) -> Motion:
     (ax, bx, gx), (ay, by, gy), (az, bz, gz) = found
-    return Motion(t_s, duration_s, begin, (ax, ay, az), (bx, by, bz), (gx, gy, gz))
+    return Motion(t_s, h, begin, (ax, ay, az), (bx, by, bz), (gx, gy, gz))
 
 
 class Lag(Record, frozen=True):
-    """The reference's acceleration after one and after two first-order lags of `TILT_S`: how the tilt follows it."""
+    """The reference's horizontal acceleration after one to five lags of `LAG_S`: how body and tilt follow it."""
 
-    first_m_s2: Vec3 = (0.0, 0.0, 0.0)
-    second_m_s2: Vec3 = (0.0, 0.0, 0.0)
+    x_m_s2: tuple[float, ...] = (0.0,) * len(BODY_S2)
+    y_m_s2: tuple[float, ...] = (0.0,) * len(BODY_S2)
 
     def after(self, dt_s: float, acceleration_m_s2: Vec3) -> Lag:
         """Return the lags after a tick with this acceleration."""
-        share = dt_s / TILT_S
-        (x, y, z), (u, v, w), (a, b, c) = self.first_m_s2, self.second_m_s2, acceleration_m_s2
-        x, y, z = x + share * (a - x), y + share * (b - y), z + share * (c - z)
-        return Lag((x, y, z), (u + share * (x - u), v + share * (y - v), w + share * (z - w)))
+        x, y, _ = acceleration_m_s2
+        return Lag(_lagging(self.x_m_s2, x, dt_s), _lagging(self.y_m_s2, y, dt_s))
+
+    def net_m(self, drop_m: float, ahead_m: tuple[float, float]) -> Vec3:
+        """Return the displacement of the net from where it hangs at the reference.
+
+        Args:
+            drop_m: distance of the net below the body's origin by which it swings.
+            ahead_m: horizontal position of the net relative to the body, world frame.
+        """
+        x, y = (sum(map(operator.mul, TILT_S2_M, lags)) for lags in (self.x_m_s2, self.y_m_s2))
+        u, v = (sum(map(operator.mul, BODY_S2, lags)) for lags in (self.x_m_s2, self.y_m_s2))
+        return (u - drop_m * x, v - drop_m * y, -ahead_m[0] * x - ahead_m[1] * y)
+
+
+def _lagging(values: tuple[float, ...], followed: float, dt_s: float) -> tuple[float, ...]:
+    found = []
+    for value in values:
+        followed = value + dt_s / LAG_S * (followed - value)
+        found.append(followed)
+    return tuple(found)
+
+
+def _fading(values: Sequence[float], weights: Sequence[float]) -> list[float]:
+    """Return the coefficients with which `_faded` gives the weighted sum of the lags a time later, if the acceleration ends."""
+    count = len(values)
+    return [sum([weights[n] * values[n - k] for n in range(k, count)]) / math.factorial(k) for k in range(count)]
+
+
+def _faded(coefficients: Sequence[float], h: float) -> float:
+    total, u = 0.0, h / LAG_S
+    for coefficient in reversed(coefficients):
+        total = total * u + coefficient
+    return total * math.exp(-u)
+
+
+def _impulse_1_s(weights: tuple[float, ...], left_s: float) -> float:
+    """Return the weighted sum of the lags' responses to an impulse of acceleration, a time after it."""
+    return _faded([weight / math.factorial(n) for n, weight in enumerate(weights)], left_s) / LAG_S
+
+
+class Plan(Record, frozen=True):
+    """How the net gets to a meeting: accelerations, and the gains on the net's responses to them."""
+
+    point: Point
+    """The ball."""
+    aside_m_s2: tuple[float, float]
+    """Largest horizontal acceleration, world frame."""
+    up_m_s2: float
+    """Largest vertical acceleration."""
+    aside_gain: float
+    up_gain: float
+
+    def push_m_s2(self, t_s: float, drop_m: float) -> Vec3:
+        """Return the acceleration of the reference at a time."""
+        left_s = self.point.t_s - t_s
+        if left_s <= 0.0:
+            return (0.0, 0.0, 0.0)
+        aside = max(-1.0, min(1.0, self.aside_gain * aside_s(left_s, drop_m)))
+        up = max(-1.0, min(1.0, self.up_gain * (left_s - RISES_S)))
+        return (self.aside_m_s2[0] * aside, self.aside_m_s2[1] * aside, self.up_m_s2 * up)
+
+
+def aside_s(left_s: float, drop_m: float) -> float:
+    """Return the net's horizontal displacement per change of the reference's velocity, a time after it.
+
+    Args:
+        left_s: time since the change.
+        drop_m: distance of the net below the body's origin, by which it swings against the tilt.
+    """
+    return left_s + _impulse_1_s(BODY_S2, left_s) - drop_m * _impulse_1_s(TILT_S2_M, left_s)
+
+
+class Reach:
+    """How far an acceleration of 1 m/s^2 brings the net in a time.
+
+    Args:
+        drop_m: distance of the net below the body's origin.
+        horizon_s: longest time.
+    """
+
+    def __init__(self, drop_m: float, horizon_s: float) -> None:
+        self.drop_m = drop_m = SWINGS * drop_m
+        """Distance by which it swings."""
+        times = [(k + 0.5) * STEP_S for k in range(math.ceil(horizon_s / STEP_S))]
+        self._aside, self._up = [aside_s(t, drop_m) for t in times], [t - RISES_S for t in times]
+        self._tilt = [_impulse_1_s(TILT_S2_M, t) for t in times]
+        self._asides_s2, self._ups_s2 = (
+            list(itertools.accumulate(STEP_S * abs(response) for response in responses))
+            for responses in (self._aside, self._up)
+        )
+
+    def of(self, left_s: float) -> tuple[int, float, float]:
+        """Return the number of steps, the horizontal and the vertical reach."""
+        number = min(len(self._aside), max(1, round(left_s / STEP_S)))
+        return number, self._asides_s2[number - 1], self._ups_s2[number - 1]
+
+    def plan(self, point: Point, left_s: float, away_m: Vec3, most_m_s2: float, ahead_m: tuple[float, float]) -> Plan:
+        """Return the plan with which the net moves by `away_m`.
+
+        Args:
+            point: the ball at the meeting.
+            left_s: time to the meeting.
+            away_m: displacement of the net.
+            most_m_s2: largest acceleration.
+            ahead_m: horizontal position of the net relative to the body, world frame: if that is tilted, the net rises or falls.
+        """
+        number, aside_s2, up_s2 = self.of(left_s)
+        (x, y, z), aside, up, tilt = away_m, self._aside[:number], self._up[:number], self._tilt[:number]
+        aside_m = math.hypot(x, y)
+        effort = math.hypot(aside_m / aside_s2, z / up_s2) or 1.0
+        most = most_m_s2 * aside_m / aside_s2 / effort
+        gain = _gain(aside, aside_m / most) if most > 0.0 else 0.0
+        push = (most * x / aside_m, most * y / aside_m) if most > 0.0 else (0.0, 0.0)
+        swung_s2 = STEP_S * sum([max(-1.0, min(1.0, gain * w)) * slope for w, slope in zip(aside, tilt, strict=True)])
+        z += swung_s2 * (ahead_m[0] * push[0] + ahead_m[1] * push[1])
+        rise = math.copysign(max(1e-9, min(abs(z) / up_s2, math.sqrt(max(0.0, most_m_s2**2 - most**2)))), z)
+        return Plan(point, push, rise, gain, _gain(up, z / rise))
+
+
+reach_of = functools.lru_cache(maxsize=4)(Reach)
+
+
+def _gain(responses: list[float], wanted_s2: float) -> float:
+    """Return the gain for which the clipped multiple of the responses gives the wanted displacement, or the largest one below it."""
+    gain, wanted = 0.0, wanted_s2 / STEP_S
+    for _ in range(8):
+        clipped = sum([abs(r) for r in responses if gain * abs(r) >= 1.0])
+        free = sum([r * r for r in responses if gain * abs(r) < 1.0])
+        if free <= 0.0:
+            break
+        before, gain = gain, (wanted - clipped) / free
+        if gain <= before * 1.001:
+            break
+    return gain
 
 
 class Bounds:
@@ -207,7 +300,7 @@ class Bounds:
     def __init__(self, vehicle: Vehicle, limits: Limits, safe: SafeSet, home_m: Vec3, box_m: Vec3) -> None:
         airframe = vehicle.airframe
         self._safe, self._stop, self._home_m, self._box_m = safe, StopModel(vehicle.safety), home_m, box_m
-        self._speed_m_s = SHARE * limits.speed_max_m_s
+        self.speed_m_s = SHARE * limits.speed_max_m_s
         self.acceleration_m_s2 = SHARE * limits.acceleration_max_m_s2
         self._jerk_m_s3 = SHARE * limits.jerk_max_m_s3
         self._thrust_m_s2 = (
@@ -238,7 +331,7 @@ class Bounds:
             return False
         speeds = _integrated(m.begin.velocity_m_s, pushes, h / 4.0)
         fastest = max([math.hypot(*v) for v in speeds])
-        if fastest > self._speed_m_s or not all(math.hypot(*j) <= self._jerk_m_s3 for j in jerks):
+        if fastest > self.speed_m_s or not all(math.hypot(*j) <= self._jerk_m_s3 for j in jerks):
             return False
         places = _integrated(m.begin.position_m, speeds, h / 5.0)
         # The velocity in the coefficients of degree 5.
@@ -254,6 +347,36 @@ class Bounds:
         up = a[2] + GRAVITY_M_S2
         return math.hypot(a[0], a[1]) <= self._slope * up and math.hypot(a[0], a[1], up) <= self._thrust_m_s2
 
+    def pushed(self, t_s: float, now: State, dt_s: float, push_m_s2: Vec3) -> State | None:
+        """Return the state a tick later with an acceleration as near to the wanted one as the limits allow; None if only the stop from
+        this state respects them.
+        """
+        speed_m_s = math.hypot(*now.velocity_m_s) or 1.0
+        tried = [_scaled(push_m_s2, share) for share in EASED] + [_scaled(now.velocity_m_s, -BRAKE_M_S2 / speed_m_s)]
+        for push in tried:
+            after = self._after(now, dt_s, self._within(push))
+            if self.admit(self.stop(t_s, after)):
+                return after
+        return None
+
+    def _within(self, a: Vec3) -> Vec3:
+        """Return the acceleration within the limits of size and tilt."""
+        a = _scaled(a, min(1.0, self.acceleration_m_s2 / max(1e-9, math.hypot(*a))))
+        aside = min(1.0, 0.999 * self._slope * (a[2] + GRAVITY_M_S2) / max(1e-9, math.hypot(a[0], a[1])))
+        return (aside * a[0], aside * a[1], a[2])
+
+    def _after(self, s: State, dt_s: float, push_m_s2: Vec3) -> State:
+        """Return the state after a tick whose constant jerk, within its limit, leads to an acceleration."""
+        j = _scaled(_plus(push_m_s2, s.acceleration_m_s2, -1.0), 1.0 / dt_s)
+        j = _scaled(j, min(1.0, self._jerk_m_s3 / max(1e-9, math.hypot(*j))))
+        v, a = s.velocity_m_s, s.acceleration_m_s2
+        return State(
+            _plus(_plus(_plus(s.position_m, v, dt_s), a, dt_s**2 / 2.0), j, dt_s**3 / 6.0),
+            _plus(_plus(v, a, dt_s), j, dt_s**2 / 2.0),
+            _plus(a, j, dt_s),
+            j,
+        )
+
     def stop(self, t_s: float, begin: State) -> Motion:
         """Return a stop whose acceleration is half of what the mission allows, or less."""
         needed = max(math.hypot(*begin.velocity_m_s) * 1.5, math.hypot(*begin.acceleration_m_s2) * STOP_LEAST_S)
@@ -261,15 +384,7 @@ class Bounds:
         return motion_to(t_s, begin, duration_s, None)
 
 
-class Meeting(Record, frozen=True):
-    """Where and when the net meets the ball, and the motion to get there."""
-
-    point: Point
-    """The ball."""
-    motion: Motion
-
-
-def meeting(
+def meetings(
     t_s: float,
     now: State,
     lag: Lag,
@@ -277,11 +392,11 @@ def meeting(
     net_m: Vec3,
     opening: Vec3,
     bounds: Bounds,
-    clears: Callable[[Motion], bool],
+    reach: Reach,
     kept_s: float | None,
-) -> Meeting | None:
-    """Return the meeting with the least effort that respects every limit, on the way there and in the stop after it; None if there is
-    none. If the net cannot come to the ball, it comes as near as the limits allow, at least to `MISS_M`.
+) -> Iterator[Plan]:
+    """Yield the plans of the meetings with the least effort, which is the fraction of the reach that they need, the least first. If the
+    net cannot come to the ball, it comes as near as it can, at least to `MISS_M`.
 
     Args:
         t_s: flight clock.
@@ -291,35 +406,36 @@ def meeting(
         net_m: the net's centre relative to the body's origin of the level vehicle, world frame.
         opening: unit vector out of the net's opening, world frame.
         bounds: the limits.
-        clears: whether the ball's path keeps clear of the rotors during a motion.
-        kept_s: time of the meeting that was planned before, which is kept unless another one is clearly better.
+        reach: how far the net comes.
+        kept_s: time of the meeting that was planned before, which is kept unless another one is clearly better; None for a first plan.
     """
     found: list[tuple[float, Point, Vec3]] = []
-    (x, y, z), (ox, oy, oz) = now.position_m, opening
+    most = bounds.acceleration_m_s2
+    (x, y, z), (vx, vy, vz), (nx, ny, nz), (ox, oy, oz) = now.position_m, now.velocity_m_s, net_m, opening
+    swings = [body - reach.drop_m * tilt for body, tilt in zip(BODY_S2, TILT_S2_M, strict=True)]
+    left_x, left_y = _fading(lag.x_m_s2, swings), _fading(lag.y_m_s2, swings)
+    left_z = [
+        nx * a + ny * b for a, b in zip(_fading(lag.x_m_s2, TILT_S2_M), _fading(lag.y_m_s2, TILT_S2_M), strict=True)
+    ]
     for point in path:
         h, (bx, by, bz), (ux, uy, uz) = point.t_s - t_s, point.position_m, point.velocity_m_s
-        shift = (bx - net_m[0] - x, by - net_m[1] - y, bz - net_m[2] - z)
         facing = -(ox * ux + oy * uy + oz * uz) / math.hypot(ux, uy, uz)
-        if h < LEAST_S or facing < FACING or not bounds.in_box(_plus(now.position_m, shift, 1.0)):
+        early = h >= (LEAST_S if kept_s is None else FROZEN_S)
+        if not early or facing < FACING or not bounds.in_box((bx - nx, by - ny, bz - nz)):
             continue
-        effort = math.hypot(ASIDE * shift[0], ASIDE * shift[1], shift[2]) / (h * h) + ASKEW_M_S2 * (1.0 - facing)
-        if kept_s is not None and abs(point.t_s - kept_s) < 1e-6:
-            effort -= KEPT_M_S2
-        found.append((effort, point, shift))
-    found.sort(key=_effort)
-    for _, point, shift in found[:TRIED_MAX]:
-        away_m = math.hypot(*shift)
-        for share in SHARES:
-            if (1.0 - share) * away_m > MISS_M:
-                break
-            motion = shift_of_net(t_s, now, lag, point.t_s - t_s, -net_m[2], _scaled(shift, share))
-            if bounds.admit(motion) and bounds.admit(bounds.stop(point.t_s, motion.at(point.t_s))) and clears(motion):
-                return Meeting(point, motion)
-    return None
-
-
-def _effort(candidate: tuple[float, Point, Vec3]) -> float:
-    return candidate[0]
+        dx = bx - nx - x - h * vx - _faded(left_x, h)
+        dy = by - ny - y - h * vy - _faded(left_y, h)
+        dz = bz - nz - z - (h - RISES_S) * vz + _faded(left_z, h)
+        _, aside_s2, up_s2 = reach.of(h)
+        needed = math.hypot(dx / aside_s2, dy / aside_s2, dz / up_s2) / most
+        needed = max(needed, math.hypot(dx, dy, dz) / (bounds.speed_m_s * h))
+        if needed > 1.0 and kept_s is None and (1.0 - 1.0 / needed) * math.hypot(dx, dy, dz) > MISS_M:
+            continue
+        kept = KEPT if kept_s is not None and abs(point.t_s - kept_s) < 1e-6 else 0.0
+        found.append((needed + ASKEW * (1.0 - facing) - kept, point, (dx, dy, dz)))
+    found.sort(key=operator.itemgetter(0))
+    for _, point, away_m in found[:TRIED_MAX]:
+        yield reach.plan(point, point.t_s - t_s, away_m, most, (nx, ny))
 
 
 def _integrated(first: Vec3, rates: list[Vec3], h: float) -> list[Vec3]:

@@ -15,20 +15,29 @@ from companion.config.base import NonNegative, Positive3
 from companion.config.phase import Duration
 from companion.control.arm_model import manipulator_of
 from companion.control.manipulator import Manipulator
-from companion.mission.air import NOTHING, Air, Expectation
+from companion.mission.air import Air, Expectation
 from companion.mission.phase import Checking, Phase, Planning
 from companion.model.codec import Record
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.markers import BallState
-from companion.model.types import Reference, SafetyAction, Severity, Vec3
+from companion.model.types import ChaseState, Reference, SafetyAction, Severity, Vec3
 from companion.phases.intercept import ball
 from companion.phases.intercept.ball import Candidate, Point
-from companion.phases.intercept.meeting import LEAST_S, Bounds, Lag, Meeting, Motion, State, meeting, motion_to
+from companion.phases.intercept.meeting import (
+    FROZEN_S,
+    Bounds,
+    Lag,
+    Motion,
+    Plan,
+    Reach,
+    State,
+    meetings,
+    motion_to,
+    reach_of,
+)
 from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
 
-MOVED_M: Final = 0.003
-"""A plan is made again when its predicted meeting point moves by more than this."""
 ASTRAY_M: Final = 0.3
 """Distance from the planned meeting point beyond which a ball is another one."""
 STALE_S: Final = 0.3
@@ -38,12 +47,15 @@ HORIZON_S: Final = 1.5
 BESIDE_S: Final = 0.5
 """Time constant of the mean distance of the net from its reference, which is what the plan of a meeting adds to it."""
 BESIDE_MAX_M: Final = 0.1
+AMISS: Final = 0.5
+"""Share of the net's deviation from the assumed response that is expected to be left at the meeting."""
 REST_S: Final = 1.0
 """Time at rest after a meeting, before the way back."""
 BACK_M_S: Final = 0.3
 """Largest speed of the way back."""
 BALL_M: Final = 0.05
-"""Distance from the rotor disks at which a ball passes them; it may be this large."""
+BALL_CHASED_M: Final = 0.045
+"""Distance from the rotor disks at which a ball passes them, before and during a chase; it may be this large."""
 
 _NOMINAL: Final = SafetyAction.NOMINAL
 BALL_SEEN = EventDefinition("ball_seen", Severity.INFO, _NOMINAL, "a marker falls freely: it is a ball in flight")
@@ -93,16 +105,15 @@ class Interception(Record, frozen=True, kw_only=True):
     lag: Lag = Lag()
     """The reference's lagging acceleration."""
     motion: Motion | None = None
-    """Motion that is flown; None while waiting, and before a stop is planned."""
+    """Motion that is flown; None while waiting, during a chase, and before a stop is planned."""
+    plan: Plan | None = None
+    """Way to the meeting that was planned last."""
     candidates: tuple[Candidate, ...] = ()
     frame_number: int = -1
     beside_m: Vec3 = (0.0, 0.0, 0.0)
     """Mean position of the net minus that of its reference."""
-    point: Point | None = None
-    """The ball at the meeting that was planned last."""
-    planned_s: float | None = None
-    """Flight clock when a meeting was planned for the first time."""
-    replans: int = 0
+    chase: ChaseState | None = None
+    """The same for the log and for the displays."""
     passing_m: float | None = None
     """Smallest distance from the waiting net of the ball that is seen; None if none is seen."""
     seen: bool = False
@@ -182,7 +193,7 @@ class Intercept(Phase):
         if s.mode is Mode.WAIT:
             return self._waited(air, s, new)
         if s.mode is Mode.CHASE:
-            return self._chased(air, s, new)
+            return self._pushed(air, self._chased(air, s, new))
         if s.motion is None:
             return replace(s, motion=self._bounds(air, s).stop(air.t_s, s.now))
         if s.mode is Mode.STOP and air.t_s >= s.motion.end_s + REST_S:
@@ -201,23 +212,6 @@ class Intercept(Phase):
             return None
         return replace(s, mode=Mode.STOP, motion=None) if s.mode is Mode.CHASE else s
 
-    def expects(self, own: Any) -> Expectation:
-        """Return the ball that is seen: while one is chased, the one that comes nearest to the meeting."""
-        s: Interception = own
-        balls = [candidate for candidate in s.candidates if candidate.is_ball]
-        if not balls:
-            return NOTHING
-        met = s.point if s.mode is Mode.CHASE else None
-        if met is None:
-            return Expectation(ball=BallState(position_world_m=balls[0].position_m))
-        at_m, end_s = met.position_m, met.t_s
-        chased = min(balls, key=lambda c: math.dist(ball.predicted(c, end_s, self.drag_per_m).position_m, at_m))
-        return Expectation(
-            ball=BallState(
-                position_world_m=chased.position_m, meeting_world_m=at_m, meeting_s=end_s, sigma_m=met.sigma_m
-            )
-        )
-
     def reference(self, reference: Reference, own: Any) -> Reference:
         """Return the reference of the state."""
         s: Interception = own
@@ -230,6 +224,21 @@ class Intercept(Phase):
             acceleration_world_m_s2=s.now.acceleration_m_s2,
             jerk_world_m_s3=s.now.jerk_m_s3,
         )
+
+    def expects(self, own: Any) -> Expectation:
+        """Return the ball that is seen, and the way to the one that is met or was met last."""
+        s: Interception = own
+        return Expectation(ball=self._seen(s), chase=s.chase)
+
+    def _seen(self, s: Interception) -> BallState | None:
+        """Return the ball that is seen: while one is chased, the one that comes nearest to the meeting."""
+        balls = [candidate for candidate in s.candidates if candidate.is_ball]
+        met = s.plan.point if s.plan is not None and s.mode is Mode.CHASE else None
+        if met is None or not balls:
+            return BallState(position_world_m=balls[0].position_m) if balls else None
+        at_m, end_s = met.position_m, met.t_s
+        chased = min(balls, key=lambda c: math.dist(ball.predicted(c, end_s, self.drag_per_m).position_m, at_m))
+        return BallState(position_world_m=chased.position_m, meeting_world_m=at_m, meeting_s=end_s, sigma_m=met.sigma_m)
 
     def _waited(self, air: Air, s: Interception, new: bool) -> Interception | None:
         if air.t_s - s.begun_s >= self.wait_max_s:
@@ -252,43 +261,55 @@ class Intercept(Phase):
                 x, y, z = candidate.position_m
                 air.report(BALL_SEEN, f"a ball flies at ({x:.2f}, {y:.2f}, {z:.2f}) m")
             s = replace(
-                s, passing_m=min([s.passing_m or math.inf, *[math.dist(p.position_m, self._net(air, s)) for p in path]])
+                s,
+                seen=True,
+                passing_m=min([s.passing_m or math.inf, *[math.dist(p.position_m, self._net(air, s)) for p in path]]),
             )
-            if self._clears(air, path, None):
-                if (met := self._meeting(air, s, path, None)) is not None:
-                    left_s, to = met.point.t_s - air.t_s, met.motion.at(met.point.t_s).position_m
-                    away_m = math.dist(to, s.home.position_world_m)
-                    air.report(
-                        MEETING_PLANNED,
-                        f"meets the ball in {left_s:.2f} s, {away_m:.2f} m from where the vehicle waits",
-                    )
-                    return replace(s, mode=Mode.CHASE, motion=met.motion, point=met.point, planned_s=air.t_s)
-            elif not s.at_rotors:
+            if (plan := self._meeting(air, s, path, None)) is not None:
+                left_s, away_m = plan.point.t_s - air.t_s, math.dist(plan.point.position_m, self._net(air, s))
+                air.report(MEETING_PLANNED, f"meets the ball in {left_s:.2f} s, {away_m:.2f} m from the waiting net")
+                return self._pushed(air, _planned(replace(s, mode=Mode.CHASE), plan, left_s))
+            if not s.at_rotors and not self._clears(air, s, path, None):
                 air.report(BALL_AT_ROTORS, "a ball flies through the rotor disks; the vehicle stays where it is")
                 s = replace(s, at_rotors=True)
         return s
 
     def _chased(self, air: Air, s: Interception, new: bool) -> Interception:
-        assert s.point is not None and s.motion is not None
-        if air.t_s >= s.point.t_s:
+        """Return the state with the plan that the newest frame gives."""
+        assert s.plan is not None
+        point = s.plan.point
+        if air.t_s >= point.t_s:
             return replace(s, mode=Mode.STOP, motion=self._bounds(air, s).stop(air.t_s, s.now))
-        if not new or s.point.t_s - air.t_s < LEAST_S:
+        if not new or point.t_s - air.t_s < FROZEN_S:
             return s
-        at, point = ASTRAY_M, None
-        for candidate in s.candidates:
-            if candidate.is_ball:
-                p = ball.predicted(candidate, s.point.t_s, self.drag_per_m)
-                if math.dist(p.position_m, s.point.position_m) < at:
-                    at, point, chased = math.dist(p.position_m, s.point.position_m), p, candidate
-        if point is None or not air.nominal:
+        balls = [
+            (math.dist(ball.predicted(c, point.t_s, self.drag_per_m).position_m, point.position_m), n)
+            for n, c in enumerate(s.candidates)
+            if c.is_ball
+        ]
+        at_m, number = min(balls, default=(math.inf, 0))
+        if at_m > ASTRAY_M or not air.nominal:
             air.report(BALL_LOST, "the ball that was to be met is lost; stopping")
-            return replace(s, mode=Mode.STOP, motion=None)
-        if at <= MOVED_M:
+            return replace(s, mode=Mode.STOP)
+        path = self._path(air, s, s.candidates[number])
+        plan = self._meeting(air, s, path, point.t_s)
+        if plan is not None:
+            return _planned(s, plan, plan.point.t_s - air.t_s)
+        if not self._clears(air, s, path, s.plan):
+            air.report(BALL_AT_ROTORS, "a ball flies through the rotor disks; the vehicle stops")
+            return replace(s, mode=Mode.STOP)
+        return s
+
+    def _pushed(self, air: Air, s: Interception) -> Interception:
+        """Return the state of a chase after this tick."""
+        if s.mode is not Mode.CHASE or s.plan is None:
             return s
-        met = self._meeting(air, s, self._path(air, s, chased), s.point.t_s)
-        if met is None:
-            return s
-        return replace(s, motion=met.motion, point=met.point, replans=s.replans + 1)
+        bounds = self._bounds(air, s)
+        now = bounds.pushed(air.t_s, s.now, air.dt_s, s.plan.push_m_s2(air.t_s, self._reach(air, s).drop_m))
+        if now is None:
+            motion = bounds.stop(air.t_s - air.dt_s, s.now)
+            return replace(s, mode=Mode.STOP, motion=motion, now=motion.at(air.t_s))
+        return replace(s, now=now, lag=s.lag.after(air.dt_s, now.acceleration_m_s2))
 
     def _path(self, air: Air, s: Interception, candidate: Candidate) -> list[Point]:
         floor_m = self._net(air, s)[2] - self.box_m[2]
@@ -299,38 +320,59 @@ class Intercept(Phase):
         (x, y, z), (bx, by, bz), (px, py, pz) = net_m(air.manipulator, s.home), s.beside_m, s.home.position_world_m
         return (px + x + bx, py + y + by, pz + z + bz)
 
+    def _reach(self, air: Air, s: Interception) -> Reach:
+        return reach_of(-net_m(air.manipulator, s.home)[2], HORIZON_S)
+
     def _bounds(self, air: Air, s: Interception) -> Bounds:
         return Bounds(air.vehicle, air.limits, air.safe, s.home.position_world_m, self.box_m)
 
-    def _meeting(self, air: Air, s: Interception, path: list[Point], kept_s: float | None) -> Meeting | None:
+    def _meeting(self, air: Air, s: Interception, path: list[Point], kept_s: float | None) -> Plan | None:
         (x, y, z), (bx, by, bz) = net_m(air.manipulator, s.home), s.beside_m
-        return meeting(
-            air.t_s,
-            s.now,
-            s.lag,
-            path,
-            (x + bx, y + by, z + bz),
-            opening(air.manipulator, s.home),
-            self._bounds(air, s),
-            lambda motion: self._clears(air, path, motion),
-            kept_s,
+        tip, (px, py, pz), (u, v, w) = (
+            air.tip_world_m(),
+            s.now.position_m,
+            s.lag.net_m(self._reach(air, s).drop_m, (x, y)),
         )
+        if tip is not None and s.mode is Mode.CHASE:
+            bx += AMISS * (tip[0] - px - x - bx - u)
+            by += AMISS * (tip[1] - py - y - by - v)
+            bz += AMISS * (tip[2] - pz - z - bz - w)
+        net, bounds = (x + bx, y + by, z + bz), self._bounds(air, s)
+        plans = meetings(
+            air.t_s, s.now, s.lag, path, net, opening(air.manipulator, s.home), bounds, self._reach(air, s), kept_s
+        )
+        return next((plan for plan in plans if self._clears(air, s, path, plan)), None)
 
-    def _clears(self, air: Air, path: list[Point], motion: Motion | None) -> bool:
-        """Return whether a ball flies clear of the rotor disks before it is met; without a motion, those of the waiting vehicle."""
-        airframe, home = air.vehicle.airframe, air.plan_reference().position_world_m
+    def _clears(self, air: Air, s: Interception, path: list[Point], plan: Plan | None) -> bool:
+        """Return whether a ball flies clear of the rotor disks before it is met; without a plan, those of the waiting vehicle."""
+        airframe, drop_m = air.vehicle.airframe, self._reach(air, s).drop_m
+        t_s, p, v = air.t_s, s.now.position_m, s.now.velocity_m_s
+        disks = [
+            quat_rotate(quat_from_euler_zyx(0.0, 0.0, s.home.yaw_rad), at)
+            for at in airframe.rotor_layout.positions_body_m
+        ]
+        ball_m = BALL_M if s.mode is Mode.WAIT else BALL_CHASED_M
         for point in path:
-            if motion is not None and point.t_s >= motion.end_s:
-                return True
-            x, y, z = home if motion is None else motion.at(point.t_s).position_m
-            px, py, pz = point.position_m
-            near_m = BALL_M + 0.5 * ball.STEP_S * abs(point.velocity_m_s[2])
-            if (
-                abs(pz - z - airframe.rotor_height_m) < near_m
-                and math.hypot(px - x, py - y) < airframe.radius_m + BALL_M
-            ):
-                return False
+            if plan is not None:
+                if point.t_s >= plan.point.t_s:
+                    return True
+                h, a = point.t_s - t_s, plan.push_m_s2(point.t_s, drop_m)
+                vx, vy, vz = (u + h * w for u, w in zip(v, a, strict=True))
+                t_s, v, p = point.t_s, (vx, vy, vz), (p[0] + h * vx, p[1] + h * vy, p[2] + h * vz)
+            px, py, pz = (b - o for b, o in zip(point.position_m, p, strict=True))
+            near_m = ball_m + 0.5 * ball.STEP_S * abs(point.velocity_m_s[2])
+            for x, y, z in disks:
+                if abs(pz - z) < near_m and math.hypot(px - x, py - y) < airframe.disk_radius_m + ball_m:
+                    return False
         return True
+
+
+def _planned(s: Interception, plan: Plan, left_s: float) -> Interception:
+    """Return the state with a plan that is new or replaces the one before."""
+    speed_m_s, before = math.dist(plan.point.velocity_m_s, s.now.velocity_m_s), s.chase
+    predicted_s, replans = (left_s, 0) if before is None else (before.predicted_s, before.replans + 1)
+    chase = ChaseState(predicted_s=predicted_s, replans=replans, relative_speed_m_s=speed_m_s)
+    return replace(s, plan=plan, chase=chase)
 
 
 FLOOR_M: Final = 0.1
