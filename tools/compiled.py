@@ -65,6 +65,7 @@ INTERPRETED = frozenset(
         "companion/control/types.py",
         "companion/model/check_row.py",
         "companion/model/codec.py",
+        "companion/model/markers.py",
         "companion/model/observations.py",
         "companion/model/packets.py",
         "companion/model/types.py",

@@ -112,7 +112,10 @@ def _phase_of(t: Transition, segment: Segment) -> Phase:
 
 
 def _fly(t: Transition, phase: Phase, own: Record, engaged: Segment) -> None:
-    t.change(own=own, engaged=engaged, expected=checked(Expectation, phase.expects(own)))
+    expected: object = phase.expects(own)
+    if not isinstance(expected, Expectation):
+        raise RecordError(f"expects() returned {type(expected).__name__}, no Expectation")
+    t.change(own=own, engaged=engaged, expected=expected)
 
 
 def _end(t: Transition, engaged: Segment, skips: bool) -> None:
