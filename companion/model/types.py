@@ -553,7 +553,7 @@ class Outputs(Record, frozen=True, kw_only=True):
     ball: BallState | None = None
     """The ball that the phase follows; None without one, and in older logs."""
     chase: ChaseState | None = None
-    """Way to a thrown ball; None before one is met."""
+    """Figures of the plan to meet a thrown ball; None before the first plan, and in older logs."""
 
 
 class Sent(Record, frozen=True, kw_only=True):

@@ -35,8 +35,9 @@ JUDGED_M_S2: Final = 1.0
 SURE_M_S2: Final = 2.5
 """Standard deviation below which that acceleration is judged."""
 FAST_M_S: Final = 3.5
+"""Speed above which a marker is judged earlier: a hand that swings it so fast accelerates it by more than the test allows."""
 FAST_SURE_M_S2: Final = 15.0
-"""The same for a marker that is faster than this: a hand that swings it so fast accelerates it by more than the test allows."""
+"""Standard deviation below which the acceleration of such a marker is judged."""
 FALLS_FRAMES: Final = 3
 """Number of consecutive frames in which a marker must fall to be a ball."""
 GATE: Final = 5.0

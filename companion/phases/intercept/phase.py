@@ -113,7 +113,7 @@ class Interception(Record, frozen=True, kw_only=True):
     beside_m: Vec3 = (0.0, 0.0, 0.0)
     """Mean position of the net minus that of its reference."""
     chase: ChaseState | None = None
-    """The same for the log and for the displays."""
+    """Figures of `plan` for the log; None before the first plan."""
     passing_m: float | None = None
     """Smallest distance from the waiting net of the ball that is seen; None if none is seen."""
     seen: bool = False
