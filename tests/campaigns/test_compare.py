@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from companion.campaigns.compare.aggregate import Spread, adaptation_pairs, aggregate
+from companion.campaigns.compare.aggregate import Spread, adaptation_pairs, aggregate, pairs_with_reference
 from companion.campaigns.compare.grid import ABLATED, ABLATIONS, flights_of, variants_of
-from companion.campaigns.compare.tables import compliance_table, print_tables
+from companion.campaigns.compare.tables import compliance_table, difference_text, print_tables
 from companion.campaigns.runner import Row
 from companion.sitl_config.loader import load_sitl
 from tests.campaigns.made_up import compare_row
@@ -161,10 +161,23 @@ def test_adaptation_is_compared_flight_by_flight() -> None:
     off_m = {1: 0.2, 2: 0.3, 3: 0.2, 4: None, 5: 0.2, 6: None, 8: 0.1}
     rows = [*(row(seed, m) for seed, m in on_m.items()), *(row(seed, m, **off) for seed, m in off_m.items())]
     (pairs,) = adaptation_pairs(aggregate(rows))
-    assert (pairs.preset, len(pairs.off_on), pairs.better) == ("paper", 5, 3)
+    assert (pairs.group.preset, len(pairs.base_m_this_m), pairs.better) == ("paper", 5, 3)
     assert pairs.p_value == pytest.approx(2 * (1 + 5 + 10) / 32), "3 of 5, by the binomial distribution"
     assert (pairs.p50(0), pairs.p50(1)) == (0.2, 0.1)
     assert adaptation_pairs(aggregate([row(1, 0.1)])) == []
+
+
+def test_laws_are_compared_in_the_same_laboratories_with_a_confidence_interval() -> None:
+    base = [row(seed, 0.020, preset="recommended") for seed in range(10)]
+    other = [row(seed, 0.015 + 0.001 * seed, controller="psc") for seed in range(9)] + [row(9, None, controller="psc")]
+    groups = aggregate([*other, *base])
+    (pairs,) = pairs_with_reference(groups).values()
+    assert pairs.group.label == groups[0].label, "the difference of the other law from adaptive/recommended"
+    # Of ten differences the second and the ninth: scipy.stats.quantile_test(d).confidence_interval(0.95) has the same.
+    assert pairs.difference_95 == pytest.approx((-0.001, -0.004, 0.003))
+    assert difference_text(pairs) == "-1.0 (-4.0 to +3.0)"
+    (few,) = pairs_with_reference(aggregate([*other[:5], *base])).values()
+    assert (few.difference_95, difference_text(few)) == (None, "")
 
 
 @pytest.mark.parametrize("columns", [70, 100, 132, 200])

@@ -6,16 +6,24 @@ import argparse
 import json
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from companion.analysis.plot_style import write_svg
-from companion.campaigns.compare.aggregate import Group, adaptation_pairs, aggregate
+from companion.campaigns.compare.aggregate import (
+    REFERENCE,
+    Group,
+    Pairs,
+    adaptation_pairs,
+    aggregate,
+    pairs_with_reference,
+)
 from companion.campaigns.compare.grid import ABLATED, ADAPTATION_OFF, LESS, is_ablation
 from companion.campaigns.compare.paper_results import Printed
 from companion.campaigns.compare.plots import distributions
-from companion.campaigns.compare.tables import by_payload, spread_text
+from companion.campaigns.compare.tables import by_payload, difference_text, spread_text
 from companion.campaigns.runner import Row
 from companion.config.controller import PRESETS, AdaptiveConfig, CscConfig, LawConfig, PscConfig
 from companion.config.loader import load_flight
@@ -67,13 +75,17 @@ def merged(files: Sequence[Results]) -> list[Row]:
     return list(rows.values())
 
 
-def laws_markdown(groups: Sequence[Group]) -> str:
-    """Return one line per payload and preset, with the figures from the paper where available."""
+def laws_markdown(groups: Sequence[Group], differences: Mapping[int, Pairs] | None = None) -> str:
+    """Return one line per payload and preset, with the figures of the paper and `differences` where available."""
     head = ["payload", "law/preset", "with the payload", *(title for title, _, _ in _FIGURES), "e_q, deg"]
     rows = [
         [f"{group.payload_kg:g} kg", group.label, _completed(group), *_spreads(group, _FIGURES), _attitude(group)]
         for group in groups
     ]
+    if differences:
+        head.insert(5, f"after, against {REFERENCE}, mm")
+        for row, group in zip(rows, groups, strict=True):
+            row.insert(5, difference_text(differences[id(group)]) if id(group) in differences else "")
     if any(map(_paper, groups)):
         head.append("printed e_p, m")
         rows = [[*row, _paper(group)] for row, group in zip(rows, groups, strict=True)]
@@ -103,8 +115,8 @@ def adaptation_markdown(groups: Sequence[Group]) -> str:
         change = "–" if off is None or on is None else f"{100 * (on / off - 1):+.0f} %"
         shown = ("–" if value is None else f"{value:.3f}" for value in (off, on))
         rows.append((
-            f"{pairs.controller}/{pairs.preset}", f"{pairs.payload_kg:g} kg", f"{100 * pairs.model_error:g} %", *shown, change,
-            f"{pairs.better} of {len(pairs.off_on)}", f"{pairs.p_value:.1g}",
+            pairs.group.label, f"{pairs.group.payload_kg:g} kg", f"{100 * pairs.group.model_error:g} %", *shown, change,
+            f"{pairs.better} of {len(pairs.base_m_this_m)}", f"{pairs.p_value:.1g}",
         ))  # fmt: skip
     return markdown(head, rows)
 
@@ -262,9 +274,10 @@ def tables(files: Sequence[Results]) -> dict[str, str]:
         if group.label.startswith("/".join(ABLATED) + LESS)
         and (group.payload_kg, group.model_error) == (ABLATION_KG, first[0].model_error)
     ]
+    against = partial(laws_markdown, differences=pairs_with_reference(first))
     made: dict[str, tuple[Callable[[Sequence[Group]], str], Sequence[Group]]] = {
-        "published": (laws_markdown, published),
-        "extras": (laws_markdown, extras),
+        "published": (against, published),
+        "extras": (against, extras),
         "model error": (model_error_markdown, by_error),
         "adaptation": (adaptation_markdown, paired),
         "ablation": (ablation_markdown, ablated),

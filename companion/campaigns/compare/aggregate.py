@@ -1,4 +1,4 @@
-"""Distributions of a comparison's metrics over the seeds, and the paired comparison with the adaptation on and off. `tables`
+"""Distributions of a comparison's metrics over the seeds, and the paired comparison of two variants. `tables`
 formats them.
 
 A *row* holds the results of one flight as plain data: controller, preset, payload_kg, seed, world_seed, model_error, outcome,
@@ -15,12 +15,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from companion.campaigns.compare.grid import ADAPTATION_OFF, is_ablation
+from companion.campaigns.compare.grid import ABLATED, ADAPTATION_OFF, is_ablation
 from companion.campaigns.compare.paper_results import PrintedFlight, printed
 from companion.campaigns.cost import cost_of, flight_cost
 from companion.campaigns.runner import Row, catches, flat
 
 COMPLETED = "completed"
+REFERENCE = "/".join(ABLATED)
+"""Label of the variant from which the difference of all others is shown."""
 MISSED = "missed"
 """Key in `Group.failures` for flights that were completed without the payload, whatever the companion reported."""
 FIGURES = (
@@ -145,49 +147,76 @@ def _failure(row: Row) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Flights with the adaptation off and on, paired by seed, for one law, preset, payload and model error."""
+    """Flights of two variants in the same laboratories, with the same payload and model error."""
 
-    controller: str
-    preset: str
-    """Preset with the adaptation on."""
-    payload_kg: float
-    model_error: float
-    off_on: Sequence[tuple[float, float]]
-    """RMS of ||e_p|| after the catch in m; infinite if the flight failed. Pairs with two failures or a missed payload are left out."""
+    group: Group
+    """The variant that is compared."""
+    base_m_this_m: Sequence[tuple[float, float]]
+    """RMS of ||e_p|| after the catch in m, first with the variant compared with, then with this one; infinite if the flight failed.
+    Pairs with two failures or a missed payload are left out.
+    """
 
     @property
     def better(self) -> int:
-        """Number of pairs in which the error is smaller with the adaptation on."""
-        return sum(on < off for off, on in self.off_on)
+        """Number of pairs in which this variant has the smaller error."""
+        return sum(this < base for base, this in self.base_m_this_m)
 
     @property
     def p_value(self) -> float:
-        """Two-sided p-value of the sign test: the probability of a count at least as uneven as `better` if on and off were equally
-        likely to be better.
+        """Two-sided p-value of the sign test: the probability of a count at least as uneven as `better` if both were equally likely
+        to be better.
         """
-        n = sum(on != off for off, on in self.off_on)
-        least = min(self.better, n - self.better)
-        return min(1.0, sum(math.comb(n, k) for k in range(least + 1)) / math.exp2(n - 1))
+        n = sum(this != base for base, this in self.base_m_this_m)
+        return min(1.0, 2.0 * _at_most(min(self.better, n - self.better), n))
+
+    @property
+    def difference_95(self) -> tuple[float, float, float] | None:
+        """Median of this variant's error minus the other's in m, and its 95 % confidence interval: the medians that the sign
+        test does not reject. None for fewer than six pairs, which have no such interval.
+        """
+        differences = sorted(this - base for base, this in self.base_m_this_m)
+        n = len(differences)
+        outside = next(k for k in range(n + 1) if _at_most(k, n) > 0.025)
+        return (differences[(n - 1) // 2], differences[outside - 1], differences[n - outside]) if outside else None
 
     def p50(self, part: int) -> float | None:
-        """Return the median error with the adaptation off (0) or on (1); None if the median flight failed."""
-        return _percentile(sorted(pair[part] for pair in self.off_on), 0.5)
+        """Return the median error of the variant compared with (0) or of this one (1); None if the median flight failed."""
+        return _percentile(sorted(pair[part] for pair in self.base_m_this_m), 0.5)
 
 
 def adaptation_pairs(groups: Sequence[Group]) -> list[Pairs]:
-    """Return the pairs of every variant that was flown with the adaptation both on and off."""
+    """Return the pairs of every variant with its adaptation that was also flown without it."""
     found = []
-    by_key = {(g.controller, g.preset, g.payload_kg, g.model_error): g for g in groups}
-    for (controller, preset, payload_kg, model_error), on in by_key.items():
-        off = by_key.get((controller, f"{preset}{ADAPTATION_OFF}", payload_kg, model_error))
-        if off is None:
-            continue
-        off_m, on_m = (_post_by_seed(group) for group in (off, on))
-        pairs = [(off_m[seed], on_m[seed]) for seed in off_m if seed in on_m]
-        known = [pair for pair in pairs if any(map(math.isfinite, pair))]
-        if known:
-            found.append(Pairs(controller, preset, payload_kg, model_error, known))
-    return found
+    for on in groups:
+        found += [_pairs(off, on) for off in groups if off.label == f"{on.label}{ADAPTATION_OFF}" and _alike(off, on)]
+    return [pairs for pairs in found if pairs.base_m_this_m]
+
+
+def pairs_with_reference(groups: Sequence[Group]) -> dict[int, Pairs]:
+    """Return, by `id` of each other group, its pairs with the adaptive law's `recommended`, or with the first variant if that was not
+    flown.
+    """
+    labels = [group.label for group in groups]
+    label = REFERENCE if REFERENCE in labels else next(iter(labels), "")
+    base = [group for group in groups if group.label == label]
+    return {
+        id(group): _pairs(one, group) for group in groups for one in base if group is not one and _alike(one, group)
+    }
+
+
+def _alike(one: Group, other: Group) -> bool:
+    return (one.payload_kg, one.model_error) == (other.payload_kg, other.model_error)
+
+
+def _pairs(base: Group, this: Group) -> Pairs:
+    base_m, this_m = _post_by_seed(base), _post_by_seed(this)
+    pairs = [(base_m[seed], this_m[seed]) for seed in base_m if seed in this_m]
+    return Pairs(this, [pair for pair in pairs if any(map(math.isfinite, pair))])
+
+
+def _at_most(k: int, n: int) -> float:
+    """Return the probability of at most k heads in n tosses of a fair coin."""
+    return sum(math.comb(n, j) for j in range(k + 1)) / math.exp2(n)
 
 
 def _post_by_seed(group: Group) -> dict[int, float]:

@@ -20,9 +20,10 @@ from companion.plugins import CONTROL_LAWS, find
 STATISTIC = "RMS, p50 (p95) over seeds; a failed flight counts as worse than all others and is shown as –"
 EXPLAINED = (
     f"{STATISTIC}. e_p and e_q are measured by motion capture, e_q against the attitude setpoint of the "
-    "control law. Impedance: RMS after the catch of M_d e'' + K_d e' + K_p e - e_tau, the deviation from one target (the "
-    "paper's table) for every law. Torque activity: RMS change of the commanded joint torques from one tick to the next. Cost: that of "
-    "companion tune, over all flights, failed ones included."
+    "control law. Difference: ‖e_p‖ after the catch minus that of adaptive/recommended (or of the first variant) in the same "
+    "laboratory, median over the laboratories and its 95 % confidence interval. Impedance: RMS after the catch of M_d e'' + K_d e' + "
+    "K_p e - e_tau, the deviation from one target (the paper's table) for every law. Torque activity: RMS change of the "
+    "commanded joint torques from one tick to the next. Cost: that of companion tune, over all flights, failed ones included."
 )
 
 

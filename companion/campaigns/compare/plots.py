@@ -170,25 +170,25 @@ def _against_model_error(groups: Sequence[Group]) -> Figure:
 
 
 def _paired(pairs: Sequence[Pairs]) -> Figure:
-    shown = list(dict.fromkeys((one.controller, one.preset, one.model_error) for one in pairs))
-    payloads = sorted({one.payload_kg for one in pairs})
+    shown = list(dict.fromkeys((one.group.label, one.group.model_error) for one in pairs))
+    payloads = sorted({one.group.payload_kg for one in pairs})
     columns = min(3, len(shown))
     rows = math.ceil(len(shown) / columns)
     figure = new_figure(1.0 + 3.6 * rows)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    every = [value for one in pairs for pair in one.off_on for value in pair if math.isfinite(value)]
+    every = [value for one in pairs for pair in one.base_m_this_m for value in pair if math.isfinite(value)]
     low, high = 0.8 * min(every), 1.4 * max(every)
     for ax, panel in panels(axes, shown):
         dress(ax)
-        controller, preset, model_error = panel
-        ax.set_title(f"{controller}/{preset}, model error {model_error:.0%}", loc="left", fontsize=9, color=INK)
+        label, model_error = panel
+        ax.set_title(f"{label}, model error {model_error:.0%}", loc="left", fontsize=9, color=INK)
         ax.plot([low, high], [low, high], color=SOFT, lw=1.0, ls=DASHED, zorder=2)
         for one in pairs:
-            if (one.controller, one.preset, one.model_error) == panel:
-                k = payloads.index(one.payload_kg)
-                off, on = (np.minimum([pair[j] for pair in one.off_on], high) for j in range(2))
+            if (one.group.label, one.group.model_error) == panel:
+                k = payloads.index(one.group.payload_kg)
+                off, on = (np.minimum([pair[j] for pair in one.base_m_this_m], high) for j in range(2))
                 ax.plot(off, on, "os^Dv*P"[k % 7], ms=4, mew=0, color=COLOURS[k], alpha=0.7, clip_on=False, zorder=3,
-                        label=f"{one.payload_kg:g} kg: better in {one.better} of {len(one.off_on)}, p = {one.p_value:.2g}")  # fmt: skip
+                        label=f"{one.group.payload_kg:g} kg: better in {one.better} of {len(off)}, p = {one.p_value:.2g}")  # fmt: skip
         # Below the axes: points of failed flights lie on the frame.
         ax.legend(
             loc="upper left", bbox_to_anchor=(0.0, -0.16), fontsize=7.5, frameon=False, handletextpad=0.2, borderpad=0.1

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.measure import Measurement
 
 from companion.analysis.table import Cell, Column, Table, for_terminal, table
-from companion.campaigns.compare.aggregate import MISSED, Group, Spread
+from companion.campaigns.compare.aggregate import MISSED, Group, Pairs, Spread, pairs_with_reference
 from companion.campaigns.compare.grid import is_ablation, short_label
 from companion.campaigns.runner import catches_text
 
@@ -52,6 +52,13 @@ def tracking_table(groups: Sequence[Group], *, p95: bool = True) -> Table:
             # A failure is shown instead of the metrics that it prevents.
             ours = _ours(name, f"{word}\n{title}", unit, digits, p95, failures=(part, key) == ("post", "e_p_m"))
             columns += [ours, _paper(part, key, digits)]
+    pairs = pairs_with_reference(groups)
+    if any(of.difference_95 for of in pairs.values()):
+        columns.append(
+            Column(
+                "difference\nafter [mm]", lambda group: difference_text(pairs[id(group)]) if id(group) in pairs else ""
+            )
+        )
     return _table("Tracking before and after the catch", columns, groups)
 
 
@@ -94,6 +101,12 @@ def spread_text(spread: Spread | None, digits: int, *, p95: bool = True) -> str:
         return ""
     shown = ["–" if value is None else f"{value:.{digits}f}" for value in (spread.p50, spread.p95)]
     return f"{shown[0]} ({shown[1]})" if p95 and spread.flights > 1 else shown[0]
+
+
+def difference_text(pairs: Pairs) -> str:
+    """Return the median difference and its 95 % interval in mm; empty without an interval."""
+    found = pairs.difference_95
+    return "" if found is None else "{:+.1f} ({:+.1f} to {:+.1f})".format(*(1000.0 * value for value in found))
 
 
 def _paper(part: str, key: str, digits: int) -> Column:
