@@ -9,6 +9,7 @@ and a step of the flight core takes an eighth less. Other compilers, and a compu
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import filecmp
 import io
@@ -61,14 +62,6 @@ COMPILED = (
 )
 INTERPRETED = frozenset(
     {
-        # Records: mypyc ignores the options of a class, here kw_only=True, tag=True and those of the base class.
-        "companion/control/types.py",
-        "companion/model/check_row.py",
-        "companion/model/codec.py",
-        "companion/model/markers.py",
-        "companion/model/observations.py",
-        "companion/model/packets.py",
-        "companion/model/types.py",
         # A Pydantic model.
         "companion/mission/phase.py",
         # I/O, which the fast loop does not have; mypyc does not support asynchronous generators.
@@ -80,7 +73,7 @@ INTERPRETED = frozenset(
         "sitl/servo/protocol.py",
     }
 )
-"""Files that match `COMPILED` but stay plain Python."""
+"""Files that match `COMPILED` but stay plain Python, as do those with `_options_of_classes`."""
 FLAGS = f"-ffp-contract=off -fvisibility=hidden -include {shlex.quote(str(ROOT / 'tools' / 'record_fields.h'))}"
 """Compiler flags: without fused multiply-add, which would change the last bits on processors that have it (aarch64), with direct calls
 between the modules, which lie in one library, and with fast reads of records' fields.
@@ -107,7 +100,19 @@ def sources() -> list[Path]:
 def modules() -> list[str]:
     """Return the paths of the files to compile, relative to the root of the repository."""
     found = {str(path.relative_to(ROOT)) for pattern in COMPILED for path in ROOT.glob(pattern)}
-    return sorted(name for name in found - INTERPRETED if not name.endswith("__init__.py"))
+    return sorted(
+        name
+        for name in found - INTERPRETED
+        if not name.endswith("__init__.py") and _options_of_classes(ROOT / name) <= {"frozen"}
+    )
+
+
+def _options_of_classes(path: Path) -> set[str | None]:
+    """Return the options of the classes in a file, such as kw_only and tag. mypyc ignores them and keeps no types of fields, so that
+    records which another process or a log is to decode, which have them, stay plain Python.
+    """
+    classes = (node for node in ast.walk(ast.parse(path.read_bytes())) if isinstance(node, ast.ClassDef))
+    return {option.arg for one in classes for option in one.keywords}
 
 
 def is_current() -> bool:

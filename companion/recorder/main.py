@@ -190,7 +190,8 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
 
 def main(argv: list[str] | None = None) -> int:
     """Run until the channel ends; print {"ready": true} first and the report last. Return 1 if the log is incomplete, else 0."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGHUP):  # a flight that is killed while this process is stopped hangs it up
+        signal.signal(number, signal.SIG_IGN)
     arguments = _arguments(argv)
     try:
         config_json = _read_config(arguments.config)

@@ -86,7 +86,7 @@ AIDED = 16 | 32 | 256
 
 async def test_a_flight_on_the_floor_offboard_arm_land_disarm() -> None:
     port = free_udp_port()
-    async with standing_stub(port), companion(port) as half:
+    async with standing_stub(port, {"COM_OF_LOSS_T": 30.0}), companion(port) as half:
         vehicle = half.autopilot.vehicle
 
         def settled(_: AutopilotStatus) -> bool:

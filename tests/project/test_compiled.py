@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support import CATCH, ROOT
+from tests.support import CATCH, HOVER, LOW_HOVER, ROOT, USUAL, set_options
 from tools.compiled import BUILD, INTERPRETED, is_current, modules, sources
 
 FLIGHT = """
@@ -80,13 +80,18 @@ def test_a_compiled_campaign_gives_the_rows_of_the_interpreted_one(tmp_path: Pat
 
 
 @pytest.mark.skipif(not is_current(), reason="no compiled build of this source: make compile")
-def test_the_compiled_build_makes_the_devices_of_a_flight_over_wires() -> None:
-    made = """
-from companion.io.dynamixel.registers import ServoPort
-from sitl.force_torque import ForceTorqueServer
-print(ServoPort("/dev/none").is_open, ForceTorqueServer().silent)
-"""
-    assert run_by(BUILD, "-c", made).split() == ["False", "False"]
+def test_the_compiled_build_flies_over_wires(tmp_path: Path) -> None:
+    flight = ("fly", str(HOVER), "--sitl", "--speed", "max", "--no-report", "--out", "out")
+    told = set_options(**USUAL, **LOW_HOVER)
+    run_by(BUILD, "-m", "companion", *flight, *told, cwd=tmp_path)
+    summary = json.loads((tmp_path / "out/summary.json").read_bytes())
+    assert summary["outcome"] == "completed"
+
+
+def test_records_that_another_process_decodes_are_not_compiled() -> None:
+    assert not {"companion/model/launcher_messages.py", "companion/model/types.py", "companion/model/verdict.py"} & set(
+        modules()
+    )
 
 
 def test_the_list_of_modules_names_only_files_that_exist() -> None:
