@@ -63,7 +63,7 @@ class Axis:
         b = np.array([[h * h / 2.0 - lag_s * (h - slow)], [h - slow], [1.0 - decay]])
         q = np.diag([position_cost, velocity_cost, 0.0])
         p = q
-        for _ in range(3000):  # Riccati equation, one minute ahead
+        for _ in range(1000):  # Riccati equation, 20 s ahead
             p = q + a.T @ p @ (a - b @ np.linalg.solve(1.0 + b.T @ p @ b, b.T @ p @ a))
         powers = [np.linalg.matrix_power(a, k) for k in range(HORIZON + 1)]
         free = np.vstack(powers[1:])
