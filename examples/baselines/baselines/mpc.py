@@ -38,7 +38,7 @@ class MpcConfig(BaselineConfig):
     tuned_gains = (
         *(TunedGain("position_cost_xyz", 5.0, 2000.0, rows) for rows in ((0, 2), (2, 3))),
         *(TunedGain("velocity_cost_xyz", 0.5, 300.0, rows) for rows in ((0, 2), (2, 3))),
-        *(TunedGain("observer_rad_s", 0.3, 20.0, rows) for rows in ((0, 2), (2, 3))),
+        *(TunedGain("observer_rad_s", 0.3, 5.0, rows) for rows in ((0, 2), (2, 3))),
         TunedGain("model_lag_xyz_s", 0.02, 0.3, (0, 2)),
         TunedGain("feedforward_lead_s", 0.01, 0.4),
     )
