@@ -4,12 +4,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 MINUTES ?= 10
+FIGURES ?= build/figures
 # Without bytecode each of some hundred processes would compile the project anew.
 unexport PYTHONDONTWRITEBYTECODE
 # All targets run the source, also after make compile.
 export PYTHONPATH := $(CURDIR)
 
-.PHONY: install lock audit fly press intercept compile test lint explore mutants debian bench docs clean
+.PHONY: install lock audit fly press intercept compile test lint explore mutants debian bench figures docs clean
 
 install: $(STAMP)
 
@@ -52,6 +53,19 @@ intercept: install
 # Builds a wheel with compiled modules in build/compiled and installs it: .venv/bin/companion computes the same faster.
 compile: install
 	@$(BIN)/python -m tools.compiled
+
+# Every figure of docs/internals/compare.md, flown again: make figures FLY=--plan says how long it takes, FLY="--scheduler ADDRESS" flies
+# on the workers of Dask.
+COMPARE := $(BIN)/companion compare --world lab --first-seed 2001
+SOFT := examples/compare/psc_soft.yaml,examples/compare/csc_soft.yaml
+ONE_LAW := --controllers adaptive --payloads 0.2
+figures: install
+	@set -e; fly() { out=$$1; shift; echo "$$out"; $(COMPARE) "$$@" --out $(FIGURES)/$$out $(FLY); }; \
+	fly laws --seeds 50 --controllers adaptive,psc,csc,$(SOFT); \
+	fly model_error --seeds 50 --presets recommended,model_free,tuned,tuned_extras --payloads 0.2 --model-error 0.2; \
+	fly adaptation --seeds 200 $(ONE_LAW) --presets recommended,model_free --adaptation on,off --model-error 0.2; \
+	fly ablation --seeds 100 $(ONE_LAW) --presets recommended --ablation; \
+	test "$(FLY)" = --plan || $(BIN)/python -m tools.docs.compare docs/internals/compare.md $(FIGURES)/*/compare.json
 
 # The checks of make lint are among the tests. The same examples, checks and skips for everybody.
 test: install debian

@@ -33,7 +33,7 @@ MISSION = Path(__file__).parents[2] / "configs/missions/catch.yaml"
 """Mission with which a configuration is loaded; only the configuration's controller is used."""
 Results = dict[str, Any]
 """Content of a compare.json."""
-AS_PUBLISHED = ("paper", "paper_slow_leakage", "tuned")
+AS_PUBLISHED = ("paper", "paper_slow_leakage", "tuned", "soft")
 """Presets that contain only what the law's paper describes; all others have additional compensation."""
 IN_PAPER = {"adaptive/paper": "proposed", "psc/tuned": "PSC", "csc/tuned": "CSC"}
 """Variants with figures in the paper, by the paper's name of the law."""
