@@ -180,24 +180,23 @@ class FastFlight:
         """Fly until the mission ends, the vehicle crashes, world time reaches `limit_s`, the mission's clock `until_mission_s`, or
         `until` returns True for a tick's outputs.
         """
-        machine = self.plant.machine
-        result = FastResult(layout=machine.layout)
+        result = FastResult()
         with _garbage_collection_paused():
-            self._run(result, limit_s, until_mission_s, until)
-        result.crashed = machine.crashed
-        result.caught = self.plant.scene.payload.caught_t_s is not None
-        result.miss_m = self.plant.scene.payload.miss_m
+            for _ in self.ticks(result, limit_s, until_mission_s, until):
+                pass
         return result
 
-    def _run(
+    def ticks(
         self,
         result: FastResult,
-        limit_s: float,
+        limit_s: float = 90.0,
         until_mission_s: float = math.inf,
         until: Callable[[Outputs], bool] | None = None,
-    ) -> None:
+    ) -> Iterator[Outputs]:
+        """Fly as `run` does, and yield the outputs of each tick; `result` is complete when the iteration has ended."""
         plant, core, px4 = self.plant, self.core, self.px4
         scene, machine, guardian = plant.scene, plant.machine, self._guardian
+        result.layout = machine.layout
         period, tick = round(START_S / TICK_PERIOD_S), 0
         while scene.t_s < START_S - 1e-9:
             self._step()
@@ -226,6 +225,7 @@ class FastFlight:
             result.outputs.append(outputs)
             result.snapshots.append(machine.snapshot())
             tick += 1
+            yield outputs
             if outputs.outcome is not None or machine.crashed or outputs.mission_t_s >= until_mission_s:
                 break
             if until is not None and until(outputs):
@@ -233,7 +233,9 @@ class FastFlight:
         if guardian is not None:
             result.guardian_events = guardian.events
             self._settle(result)
-        result.armed = px4.armed
+        result.armed, result.crashed = px4.armed, machine.crashed
+        result.caught = scene.payload.caught_t_s is not None
+        result.miss_m = scene.payload.miss_m
 
     def _step(self) -> None:
         """Advance the world by a step, and let motion capture and PX4 send what is due."""
