@@ -69,6 +69,8 @@ INTERPRETED = frozenset(
         "companion/model/observations.py",
         "companion/model/packets.py",
         "companion/model/types.py",
+        # Its time is that of onnxruntime.
+        "companion/control/policy.py",
         # A Pydantic model.
         "companion/mission/phase.py",
         # I/O, which the fast loop does not have; mypyc does not support asynchronous generators.

@@ -14,6 +14,7 @@ from typing import Final
 
 from msgspec.structs import replace
 
+from companion.control.types import MakeLaw
 from companion.core.flight_core import FlightCore
 from companion.flight.ticker import SIMULATED_START_S
 from companion.io.mocap.client import KEEP_ALIVE_PERIOD_S
@@ -130,9 +131,10 @@ class FastFlight:
     Args:
         config: effective configuration; the hover thrust is the stub's MPC_THR_HOVER if the vehicle file has none.
         land_at_s: time on the flight clock at which the operator commands a landing; None for never.
+        make_law: makes the control law in place of the configured one.
     """
 
-    def __init__(self, config: SitlConfig, land_at_s: float | None = None) -> None:
+    def __init__(self, config: SitlConfig, land_at_s: float | None = None, make_law: MakeLaw | None = None) -> None:
         config = with_fault_times(with_throws(config))
         vehicle, world, start = config.vehicle, config.world, config.mission.start
         self._land_at_s = land_at_s
@@ -152,7 +154,7 @@ class FastFlight:
             vehicle = vehicle.model_copy(update={"airframe": airframe})
             config = config.model_copy(update={"vehicle": vehicle})
         self.config = config
-        self.core = FlightCore(config.flight)
+        self.core = FlightCore(config.flight, make_law)
         scales = scales_of(vehicle, plugged_in(servos, world))
         watchdog_s = vehicle.arm_device.watchdog_ms * 1e-3 if drives else 0.0
         self._bus = FastBus(drives, scales, watchdog_s, self.faults if world.faults else None)
