@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from companion import DISTRIBUTION
 from companion.analysis.log import FlightLog, LogError
 from companion.model.constants import TICK_PERIOD_S
-from companion.model.types import Inputs, Outputs
 
 ABOUT = "columns.json"
 """File beside the tables: for each table its rate, and for each column its unit and frame."""
@@ -46,12 +44,11 @@ def write_tables(log: FlightLog, out: Path, suffix: str) -> list[Path]:
         suffix: `csv` or `parquet`.
 
     Raises:
-        LogError: pandas or pyarrow is not installed.
+        LogError: pandas is not installed.
+        ImportError: pyarrow is not installed, and the suffix is `parquet`.
         OSError: a file cannot be written.
     """
     tables = log.to_pandas()
-    if suffix == "parquet":
-        _arrow()
     out.mkdir(parents=True, exist_ok=True)
     about: dict[str, Any] = {
         "log": log.path.name,
@@ -73,46 +70,46 @@ def write_tables(log: FlightLog, out: Path, suffix: str) -> list[Path]:
     return [*written, out / ABOUT]
 
 
-Frame = tuple[Inputs, Outputs]
-_STATE: dict[str, Callable[[Inputs, Outputs], Sequence[float] | None]] = {
-    "position_world_m": lambda i, o: i.vehicle.position_world_m if i.vehicle else None,
-    "velocity_world_m_s": lambda i, o: i.vehicle.velocity_world_m_s if i.vehicle else None,
-    "attitude_wxyz": lambda i, o: i.vehicle.attitude_wxyz if i.vehicle else None,
-    "angular_rate_body_rad_s": lambda i, o: i.vehicle.angular_rate_body_rad_s if i.vehicle else None,
-    "arm_rad": lambda i, o: i.arm.angle_rad if i.arm else (),
-    "arm_rate_rad_s": lambda i, o: i.arm.velocity_rad_s if i.arm else (),
-    "force_ext_world_n": lambda i, o: o.control.force_ext_world_n if o.control else None,
-    "reference_position_world_m": lambda i, o: o.reference.position_world_m if o.reference else None,
-    "reference_arm_rad": lambda i, o: o.reference.arm_rad if o.reference else None,
+_VECTORS = {
+    "observation.state": (
+        ("/inputs", "vehicle.position_world_m"),
+        ("/inputs", "vehicle.velocity_world_m_s"),
+        ("/inputs", "vehicle.attitude_wxyz"),
+        ("/inputs", "vehicle.angular_rate_body_rad_s"),
+        ("/inputs", "arm.angle_rad"),
+        ("/inputs", "arm.velocity_rad_s"),
+        ("/outputs", "control.force_ext_world_n"),
+        ("/outputs", "reference.position_world_m"),
+        ("/outputs", "reference.arm_rad"),
+    ),
+    "action": (("/outputs", "attitude.attitude_wxyz"), ("/outputs", "attitude.thrust"), ("/outputs", "arm_torque_nm")),
 }
-_ACTION: dict[str, Callable[[Inputs, Outputs], Sequence[float] | None]] = {
-    "attitude_wxyz": lambda i, o: o.attitude.attitude_wxyz if o.attitude else None,
-    "thrust": lambda i, o: (o.attitude.thrust,) if o.attitude else None,
-    "arm_torque_nm": lambda i, o: o.arm_torque_nm if i.arm else (),
-}
+"""Features of a dataset, and the fields of the log that they hold."""
 
 
 def write_lerobot(logs: Sequence[FlightLog], out: Path) -> int:
     """Write flights as a LeRobot dataset of version 2.1, one episode each; return the number of frames.
 
-    A frame is a tick in which the law flew and its command was sent. `timestamp` counts them at the nominal rate; `t_s` is the
-    flight clock.
+    A frame is a tick in which everything is known: the law flew, and its command was sent. `timestamp` counts them at the nominal
+    rate; `t_s` is the flight clock.
 
     Args:
         logs: flights of vehicles with the same number of joints.
         out: folder, which must not exist or be empty.
 
     Raises:
-        LogError: pyarrow is not installed, a flight has no such tick, or the flights do not belong into one dataset.
+        ImportError: pandas or pyarrow is not installed.
+        LogError: a flight has no such tick, or the flights do not belong into one dataset.
         OSError: a file cannot be written.
     """
-    arrow, parquet = _arrow()
+    import pandas
+
     episodes = [_episode(log) for log in logs]
-    names = {key: [column for column, _ in episodes[0][key]] for key in ("observation.state", "action")}
+    names = {key: list(table.columns) for key, table in episodes[0].items()}
     for log, episode in zip(logs, episodes, strict=True):
-        if any([column for column, _ in episode[key]] != wanted for key, wanted in names.items()):
+        if any(list(episode[key].columns) != wanted for key, wanted in names.items()):
             raise LogError(
-                f"{log.path}: its arm has another number of joints than that of {logs[0].path}: export it by itself"
+                f"{log.path}: has other fields than {logs[0].path}, as those of another arm: export it by itself"
             )
     if out.exists() and any(out.iterdir()):
         raise LogError(f"{out}: is not empty; a dataset needs a folder of its own")
@@ -127,22 +124,19 @@ def write_lerobot(logs: Sequence[FlightLog], out: Path) -> int:
     }
     described, statistics, begun = [], [], 0
     for number, (log, episode) in enumerate(zip(logs, episodes, strict=True)):
-        vectors = {key: np.array([value for _, value in episode[key]], np.float32).T for key in names}
+        vectors = {key: table.to_numpy(np.float32) for key, table in episode.items()}
         count = len(vectors["action"])
         frames = np.arange(count)
         task = tasks.index(_named(log, "mission"))
         scalars = {
             "timestamp": (frames * TICK_PERIOD_S).astype(np.float32),
-            "t_s": np.array(episode["t_s"]),
+            "t_s": episode["action"].index.to_numpy(),
             **dict(zip(_INDICES, (frames, frames * 0 + number, frames + begun, frames * 0 + task), strict=True)),
-        }
-        lists = {
-            key: arrow.FixedSizeListArray.from_arrays(arrow.array(value.ravel()), value.shape[1])
-            for key, value in vectors.items()
         }
         path = out / _DATA.format(episode_chunk=number // _CHUNK, episode_index=number)
         path.parent.mkdir(parents=True, exist_ok=True)
-        parquet.write_table(arrow.table({**lists, **scalars}), path)
+        lists = {key: list(value) for key, value in vectors.items()}
+        pandas.DataFrame({**lists, **scalars}).to_parquet(path, index=False)
         described.append({"episode_index": number, "tasks": [tasks[task]], "length": count})
         columns = {**vectors, **{key: value[:, None] for key, value in scalars.items()}}
         statistics.append(
@@ -176,26 +170,21 @@ def write_lerobot(logs: Sequence[FlightLog], out: Path) -> int:
 
 
 def _episode(log: FlightLog) -> dict[str, Any]:
-    """Return the flight clock of the frames, and for state and action each column's name and values."""
-    frames = [
-        (i, o)
-        for i, o, _ in log.rows()
-        if i.vehicle and o.control and o.reference and o.attitude and o.arm_torque_nm is not None
-    ]
-    if not frames:
-        raise LogError(f"{log.path}: its vehicle did not fly: it has no frames")
-    groups = {"observation.state": _STATE, "action": _ACTION}
-    return {
-        "t_s": [i.t_s for i, _ in frames],
-        **{key: list(_columns(frames, fields)) for key, fields in groups.items()},
+    """Return a table for each feature, with the ticks in which every field is known."""
+    import pandas
+
+    tables = log.to_pandas()
+    fields = [(key, topic, field) for key, places in _VECTORS.items() for topic, field in places]
+    found = {
+        (key, column): tables[topic][column]
+        for key, topic, field in fields
+        for column in tables[topic].columns
+        if column.partition("[")[0] == field and tables[topic][column].notna().any()
     }
-
-
-def _columns(frames: Sequence[Frame], fields: dict[str, Any]) -> Iterator[tuple[str, list[float]]]:
-    for name, value in fields.items():
-        rows = [value(*frame) for frame in frames]
-        for index, column in enumerate(zip(*rows, strict=True)):
-            yield name if len(rows[0]) == 1 else f"{name}[{index}]", list(column)
+    frames = pandas.DataFrame(found).dropna()
+    if frames.empty or {key for key, _ in found} != set(_VECTORS):
+        raise LogError(f"{log.path}: its vehicle did not fly: it has no frames")
+    return {key: frames[key] for key in _VECTORS}
 
 
 def _scalar(dtype: str) -> dict[str, Any]:
@@ -209,12 +198,3 @@ def _statistics(values: Any) -> dict[str, list[float]]:
 
 def _named(log: FlightLog, part: str) -> str:
     return str(log.config.get(part, {}).get("name", "unknown"))
-
-
-def _arrow() -> tuple[Any, Any]:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise LogError(f"export: needs pyarrow: pip install '{DISTRIBUTION}[pandas]'") from None
-    return pyarrow, pyarrow.parquet

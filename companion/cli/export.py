@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from companion import DISTRIBUTION
 from companion.analysis.export import write_lerobot, write_tables
 from companion.analysis.log import FlightLog, LogError
 from companion.cli.report import names_of
@@ -52,6 +53,8 @@ def run(arguments: argparse.Namespace) -> int:
                 print(written)
     except LogError as error:
         raise ConfigError(str(error)) from None
+    except ImportError:
+        raise ConfigError(f"companion export: needs pandas and pyarrow: pip install '{DISTRIBUTION}[pandas]'") from None
     except OSError as error:
         raise ConfigError(f"companion export: {error.filename}: cannot be written: {error.strerror}") from None
     return EXIT_OK

@@ -68,10 +68,10 @@ def test_a_dataset_has_the_layout_of_lerobot_and_the_values_of_the_logs(path: Pa
         for key, name, wanted in (
             (
                 "observation.state",
-                "position_world_m[2]",
+                "vehicle.position_world_m[2]",
                 [i.vehicle.position_world_m[2] for i, _ in flown if i.vehicle],
             ),
-            ("action", "thrust", [o.attitude.thrust for _, o in flown if o.attitude]),
+            ("action", "attitude.thrust", [o.attitude.thrust for _, o in flown if o.attitude]),
             ("action", "arm_torque_nm[1]", [o.arm_torque_nm[1] for _, o in flown if o.arm_torque_nm]),
         ):
             feature = info["features"][key]
