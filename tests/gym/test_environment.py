@@ -65,6 +65,19 @@ def test_a_random_wrench_meets_the_supervisor_and_costs_more_than_any_completed_
     assert info["cost"] >= 1.0
 
 
+def test_an_action_that_is_not_finite_is_not_sent_and_the_vehicle_lands() -> None:
+    environment = made("companion/Hover-v0")
+    environment.reset(seed=1)
+    for _ in range(50):
+        environment.step(np.zeros(5, np.float32))
+    _, _, over, _, info = environment.step(np.full(5, np.nan, np.float32))
+    last = environment._result.outputs[-1]
+    assert (last.attitude, last.arm_torque_nm) == (None, None)
+    while not over:
+        _, _, over, _, info = environment.step(np.zeros(5, np.float32))
+    assert info["row"]["outcome"] == Outcome.ABORTED.value
+
+
 def test_it_flies_in_several_processes_each_in_a_laboratory_of_its_own() -> None:
     environments = gymnasium.make_vec("companion/Hover-v0", num_envs=2, vectorization_mode="async")
     try:

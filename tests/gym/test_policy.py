@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import itertools
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +23,7 @@ from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.gym.environment import FlightEnvironment
 from sitl.gym.export import mark, write_policy
-from tests.support import HOVER
+from tests.support import HOVER, ROOT
 
 STEPS, TICKS = 30, 600
 
@@ -66,6 +67,23 @@ def test_what_is_trained_is_what_flies_and_what_is_replayed(environment: FlightE
     written(path, environment.card, gain=0.31)
     with pytest.raises(ValueError, match=r"mine\.onnx: is not the file that flew: its SHA-256 is "):
         FlightCore(logged_flight(logged))
+
+
+def test_the_example_writes_the_network_that_it_trained(
+    environment: FlightEnvironment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "examples/policy"))
+    train = importlib.import_module("train")
+    names = environment.card.observations
+    generator = np.random.default_rng(3)
+    layer, scales = train.layer(generator.standard_normal(train.PARAMETERS), names, 5), np.array(train.scales(names))
+    card = environment.card.model_copy(update={"observation_scale": tuple(scales.tolist())})
+    write_policy([layer], card, tmp_path / "mine.onnx")
+    observation = generator.standard_normal(len(names))
+    action = Network(str(tmp_path / "mine.onnx")).decide(observation.tolist())
+    np.testing.assert_allclose(action, np.tanh(observation / scales @ layer[0]), atol=1e-5)
+    assert min(map(abs, action[:3])) > 0.0
+    assert action[3:] == [0.0, 0.0]
 
 
 def test_a_mission_names_it_relative_to_itself(environment: FlightEnvironment, tmp_path: Path) -> None:
