@@ -62,6 +62,8 @@ COMPILED = (
 )
 INTERPRETED = frozenset(
     {
+        # Its time is that of onnxruntime.
+        "companion/control/policy.py",
         # A Pydantic model.
         "companion/mission/phase.py",
         # I/O, which the fast loop does not have; mypyc does not support asynchronous generators.

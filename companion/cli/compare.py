@@ -38,7 +38,7 @@ def add_parser(commands: Any) -> None:
         type=names,
         default=(),
         metavar="LAW|FILE,...",
-        help=f"control laws, and controller files (*.yaml), e.g. of companion tune (default: {','.join(PRESETS)})",
+        help=f"control laws, and files: *.yaml of companion tune, *.onnx (default: the presets of {','.join(PRESETS)})",
     )
     parser.add_argument(
         "--presets", type=names, default=(), metavar="NAME,...", help="default: all presets of each law"

@@ -22,7 +22,7 @@ def time_stamp() -> str:
 def add_law(parser: argparse.ArgumentParser) -> None:
     """Add `--controller` and `--preset`."""
     parser.add_argument(
-        "--controller", metavar="LAW|FILE", help=f"control law: {', '.join(PRESETS)}, or a controller file (*.yaml)"
+        "--controller", metavar="LAW|FILE", help=f"control law: {', '.join(PRESETS)}, or a file: *.yaml, *.onnx"
     )
     parser.add_argument("--preset", metavar="NAME", help="gains")
 
@@ -32,7 +32,7 @@ def preset_help() -> str:
     gains = []
     for law in PRESETS:
         try:
-            gains.append(f"{law}: {', '.join(reversed(PRESETS[law]))}")
+            gains += [f"{law}: {', '.join(reversed(PRESETS[law]))}"] if PRESETS[law] else []
         except PluginError:
             gains.append(f"{law}: see companion plugins")
     return f"gains, the default first ({'; '.join(gains)})"

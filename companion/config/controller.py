@@ -67,6 +67,8 @@ class ControllerConfig(Model):
     """
     tuned_gains: ClassVar[tuple[TunedGain, ...]] = ()
     """What `companion tune` searches."""
+    needs_file: ClassVar[bool] = False
+    """Whether the law has no presets, because every flight names a file."""
 
     schema_version: Literal[1]
     law: str
@@ -352,7 +354,7 @@ def law_class(law: str) -> Any:
         raise plugin.error("its attribute 'settings' is not a subclass of companion.config.controller.ControllerConfig")
     if get_args(settings.model_fields["law"].annotation) != (law,):
         raise plugin.error(f"the field 'law' of {settings.__name__} is not Literal[\"{law}\"]")
-    if not settings.presets:
+    if not settings.presets and not settings.needs_file:
         raise plugin.error(f"{settings.__name__} names no presets")
     for path in (_preset_file(settings, law, preset) for preset in settings.presets):
         if not path.exists():

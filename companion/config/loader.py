@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -39,7 +39,7 @@ from companion.plugins import ARMS, FORCE_SENSORS, MOCAP_SYSTEMS
 
 M = TypeVar("M", bound=Model)
 
-
+POLICY_SUFFIX = ".onnx"
 MOVED = {
     ("tether", "react_time_s"): ("safety", "react_time_s"),
     ("tether", "stop_deceleration_m_s2"): ("safety", "stop_deceleration_m_s2"),
@@ -84,7 +84,7 @@ def load_flight(
     Args:
         mission_path: mission file, or the name of a shipped one (`companion.config.shipped`).
         vehicle_path: vehicle file in place of the mission's, or the name of a shipped one.
-        controller_law: control law (a key of `PRESETS`) or controller file (`*.yaml`) in place of the mission's.
+        controller_law: control law (a key of `PRESETS`), controller file (`*.yaml`) or policy (`*.onnx`) in place of the mission's.
         preset: built-in preset of that law in place of the mission's.
         overrides: `--set` options, `section.key[index].key=value`, applied before anything is checked. Options of the section
             `world` are ignored, because they belong to the simulated world (`companion.sitl_config`).
@@ -117,7 +117,7 @@ def load_flight(
     if controller_law is not None or preset is not None:
         controller_file = _open_controller(controller_law or (choice.law if choice is not None else None), preset)
     elif choice is not None and choice.file is not None:
-        controller_file = _open_named(mission_file, ("controller", "file"), None, lines)
+        controller_file = _open_named(mission_file, ("controller", "file"), None, lines, read_controller)
     elif choice is not None:
         controller_file = _open_controller(choice.law, choice.preset)
     if controller_file is not None:
@@ -316,7 +316,11 @@ def _validated(model: type[M], document: Document, lines: list[str]) -> M | None
 
 
 def _open_named(
-    mission_file: Document, location: Location, given: str | Path | None, lines: list[str]
+    mission_file: Document,
+    location: Location,
+    given: str | Path | None,
+    lines: list[str],
+    read: Callable[[str], Document] = read_document,
 ) -> Document | None:
     """Read the file `given` or, if that is None, the file that the mission names, relative to the mission file."""
     where = ""
@@ -329,7 +333,7 @@ def _open_named(
         origin = mission_file.origin(location)
         base = Path(mission_file.source).parent if origin.line else Path()
         where = f"{origin}: {key_path(location)}: "
-        return read_document(os.path.normpath(base / named))
+        return read(os.path.normpath(base / named))
     except ConfigError as error:
         lines += [where + line for line in error.lines]
         return None
@@ -344,8 +348,19 @@ def _controller_choice(mission_file: Document) -> ControllerChoice | None:
 
 
 def is_controller_file(law: str) -> bool:
-    """Return whether the name of a controller file was given in place of a control law."""
-    return Path(law).suffix in (".yaml", ".yml")
+    """Return whether the name of a controller file or of a policy was given in place of a control law."""
+    return Path(law).suffix in (".yaml", ".yml", POLICY_SUFFIX)
+
+
+def read_controller(path: str) -> Document:
+    """Read a controller file; for a policy return the one that names it.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
+    if Path(path).suffix != POLICY_SUFFIX:
+        return read_document(path)
+    return Document(path, {"schema_version": 1, "law": "policy", "preset": Path(path).stem, "file": path})
 
 
 def preset_of_file(path: str) -> str:
@@ -354,14 +369,14 @@ def preset_of_file(path: str) -> str:
     Raises:
         ConfigError: the file cannot be read.
     """
-    return str(read_document(path).data.get("preset"))
+    return str(read_controller(path).data.get("preset"))
 
 
 def _open_controller(law: str | None, preset: str | None) -> Document:
     """Read the file of a law's preset, or the file whose path is given in place of the law."""
     law = law or next(iter(PRESETS))
     if is_controller_file(law):
-        document = read_document(law)
+        document = read_controller(law)
         own = document.data.get("preset")
         if preset not in (None, own):
             raise ConfigError(
@@ -370,7 +385,11 @@ def _open_controller(law: str | None, preset: str | None) -> Document:
         return document
     if law not in PRESETS:
         raise ConfigError(
-            [f"--controller {law}: no such controller; available: {', '.join(PRESETS)}, or a file (*.yaml)"]
+            [f"--controller {law}: no such controller; available: {', '.join(PRESETS)}, or a file (*.yaml, *.onnx)"]
+        )
+    if LAWS[law].needs_file:
+        raise ConfigError(
+            [f"control law '{law}' has no presets: name its file in place of the law, such as {law}.onnx"]
         )
     preset = preset or PRESETS[law][-1]
     if preset not in PRESETS[law]:

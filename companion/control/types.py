@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import Enum
 from typing import Protocol
 
+from companion.config.controller import ControllerConfig
+from companion.config.vehicle import Vehicle
 from companion.model.codec import Record
 from companion.model.types import ControlLog, Joints, Quat, Reference, Vec3
 
@@ -66,3 +69,7 @@ class Law(Controller, Protocol):
 
     hover_thrust: float
     """Normalised thrust that carries the vehicle without payload, for the log; set before every step."""
+
+
+MakeLaw = Callable[[ControllerConfig, Vehicle, float], Law]
+"""Makes a law from its settings, the vehicle and the normalised hover thrust, as the class of a law does."""

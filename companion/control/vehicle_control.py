@@ -18,7 +18,7 @@ from companion.control.joint_prediction import JointPrediction
 from companion.control.online import OnlineImpedance
 from companion.control.sensing import CatchDetector, ForceSensing, MeanAcceleration, ObservedCatchDetector
 from companion.control.slide import Slide
-from companion.control.types import Controller, Law, PlantState, Tuning
+from companion.control.types import Controller, Law, MakeLaw, PlantState, Tuning
 from companion.model.algebra import across, dot
 from companion.model.codec import Record
 from companion.model.constants import GRAVITY_M_S2
@@ -43,12 +43,13 @@ class VehicleControl:
 
     Args:
         config: the effective configuration; `vehicle.airframe.hover_thrust` must be set.
+        make_law: makes the law in place of the configured one's class.
 
     Raises:
         ValueError: the hover thrust is not set.
     """
 
-    def __init__(self, config: FlightConfig) -> None:
+    def __init__(self, config: FlightConfig, make_law: MakeLaw | None = None) -> None:
         vehicle = config.vehicle
         hover_thrust = vehicle.airframe.hover_thrust
         if hover_thrust is None:
@@ -80,7 +81,8 @@ class VehicleControl:
         """
         self._state: PlantState | None = None
         """State in the last tick in which the law ran."""
-        self._law: Law = law_class(config.controller.law)(config.controller, vehicle, hover_thrust)
+        make_law = make_law or law_class(config.controller.law)
+        self._law: Law = make_law(config.controller, vehicle, hover_thrust)
         self._controller: Controller = self._law
         self.online: OnlineImpedance | None = getattr(self._law, "online", None)
         """Optimisation of the law's target impedance; None if it is off or the law has none."""

@@ -12,7 +12,7 @@ import msgspec
 
 from companion.config.loader import FlightConfig
 from companion.config.vehicle import OBSERVER
-from companion.control.types import Tuning
+from companion.control.types import MakeLaw, Tuning
 from companion.control.vehicle_control import Command, VehicleControl
 from companion.core.flight_state import Request, Tare
 from companion.core.phase_tick import checked, failed
@@ -67,12 +67,13 @@ class FlightCore:
 
     Args:
         config: the effective configuration; `vehicle.airframe.hover_thrust` must already be set.
+        make_law: makes the control law in place of the configured one, as in training.
     """
 
-    def __init__(self, config: FlightConfig) -> None:
+    def __init__(self, config: FlightConfig, make_law: MakeLaw | None = None) -> None:
         vehicle = config.vehicle
         self._vehicle = vehicle
-        self._control = VehicleControl(config)
+        self._control = VehicleControl(config, make_law)
         # Solved once here, so that planning from the measured start costs next to nothing in a tick.
         Plan.build(config.mission, config.vehicle)
         self._monitors = Monitors(vehicle)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from companion.config.controller import LAWS
 from companion.sitl_config.loader import SitlConfig
-from sitl.campaigns.flights import fly_to_end, laboratory_of, row_of, with_world
+from sitl.campaigns.flights import Flown, fly_to_end, laboratory_of, row_of, with_world
 from sitl.campaigns.runner import Data
 
 
@@ -32,6 +32,12 @@ def fly(config: SitlConfig, flight: Data) -> Data:
     controller = LAWS[given["law"]].model_validate_json(json.dumps(given))
     config = with_world(config.model_copy(update={"controller": controller}), flight["world"])
     flown = fly_to_end(config, flight["limit_s"], math.inf if until_s is None else until_s)
-    row, _ = row_of(flown.config.flight, flown.result, flown.caught_t_s, flown.error, cut=until_s is not None)
+    return {"row": graded(flown, cut=until_s is not None)}
+
+
+def graded(flown: Flown, cut: bool) -> Data:
+    """Return the row of a flight, from which `companion.campaigns.cost.flight_cost` computes its cost; `cut` is as in `row_of`."""
+    config = flown.config
+    row, _ = row_of(config.flight, flown.result, flown.caught_t_s, flown.error, cut=cut)
     payload_kg = config.world.payload_kg if config.mission.catch is not None else 0.0
-    return {"row": {"payload_kg": payload_kg, **laboratory_of(flown.config), **row}}
+    return {"payload_kg": payload_kg, **laboratory_of(config), **row}

@@ -14,6 +14,7 @@ from typing import Final
 
 from msgspec.structs import replace
 
+from companion.control.types import MakeLaw
 from companion.core.flight_core import FlightCore
 from companion.flight.ticker import SIMULATED_START_S
 from companion.io.mocap.client import KEEP_ALIVE_PERIOD_S
@@ -130,9 +131,10 @@ class FastFlight:
     Args:
         config: effective configuration; the hover thrust is the stub's MPC_THR_HOVER if the vehicle file has none.
         land_at_s: time on the flight clock at which the operator commands a landing; None for never.
+        make_law: makes the control law in place of the configured one.
     """
 
-    def __init__(self, config: SitlConfig, land_at_s: float | None = None) -> None:
+    def __init__(self, config: SitlConfig, land_at_s: float | None = None, make_law: MakeLaw | None = None) -> None:
         config = with_fault_times(with_throws(config))
         vehicle, world, start = config.vehicle, config.world, config.mission.start
         self._land_at_s = land_at_s
@@ -152,7 +154,7 @@ class FastFlight:
             vehicle = vehicle.model_copy(update={"airframe": airframe})
             config = config.model_copy(update={"vehicle": vehicle})
         self.config = config
-        self.core = FlightCore(config.flight)
+        self.core = FlightCore(config.flight, make_law)
         scales = scales_of(vehicle, plugged_in(servos, world))
         watchdog_s = vehicle.arm_device.watchdog_ms * 1e-3 if drives else 0.0
         self._bus = FastBus(drives, scales, watchdog_s, self.faults if world.faults else None)
@@ -180,24 +182,23 @@ class FastFlight:
         """Fly until the mission ends, the vehicle crashes, world time reaches `limit_s`, the mission's clock `until_mission_s`, or
         `until` returns True for a tick's outputs.
         """
-        machine = self.plant.machine
-        result = FastResult(layout=machine.layout)
+        result = FastResult()
         with _garbage_collection_paused():
-            self._run(result, limit_s, until_mission_s, until)
-        result.crashed = machine.crashed
-        result.caught = self.plant.scene.payload.caught_t_s is not None
-        result.miss_m = self.plant.scene.payload.miss_m
+            for _ in self.ticks(result, limit_s, until_mission_s, until):
+                pass
         return result
 
-    def _run(
+    def ticks(
         self,
         result: FastResult,
-        limit_s: float,
+        limit_s: float = 90.0,
         until_mission_s: float = math.inf,
         until: Callable[[Outputs], bool] | None = None,
-    ) -> None:
+    ) -> Iterator[Outputs]:
+        """Fly as `run` does, and yield the outputs of each tick; `result` is complete when the iteration has ended."""
         plant, core, px4 = self.plant, self.core, self.px4
         scene, machine, guardian = plant.scene, plant.machine, self._guardian
+        result.layout = machine.layout
         period, tick = round(START_S / TICK_PERIOD_S), 0
         while scene.t_s < START_S - 1e-9:
             self._step()
@@ -226,6 +227,7 @@ class FastFlight:
             result.outputs.append(outputs)
             result.snapshots.append(machine.snapshot())
             tick += 1
+            yield outputs
             if outputs.outcome is not None or machine.crashed or outputs.mission_t_s >= until_mission_s:
                 break
             if until is not None and until(outputs):
@@ -233,7 +235,9 @@ class FastFlight:
         if guardian is not None:
             result.guardian_events = guardian.events
             self._settle(result)
-        result.armed = px4.armed
+        result.armed, result.crashed = px4.armed, machine.crashed
+        result.caught = scene.payload.caught_t_s is not None
+        result.miss_m = scene.payload.miss_m
 
     def _step(self) -> None:
         """Advance the world by a step, and let motion capture and PX4 send what is due."""

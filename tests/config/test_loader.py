@@ -255,7 +255,7 @@ def test_problems_of_all_files_are_reported_together(project: Path) -> None:
 
 def test_unknown_controller_and_preset(project: Path) -> None:
     assert lines_of(lambda: load_sitl(CATCH, controller_law="cscc")) == [
-        "--controller cscc: no such controller; available: adaptive, csc, psc, or a file (*.yaml)"
+        "--controller cscc: no such controller; available: adaptive, csc, psc, policy, or a file (*.yaml, *.onnx)"
     ]
     assert lines_of(lambda: load_sitl(CATCH, controller_law="psc", preset="paper")) == [
         "--preset paper: no such preset of 'psc'; available: tuned_extras, tuned"
@@ -268,7 +268,7 @@ def test_unknown_controller_and_preset(project: Path) -> None:
 BAD_LAW_IN_MISSION = [
     (
         "{law: psk}",
-        'controller.law: expected one of "adaptive", "csc", "psc", got "psk" (did you mean psc?)',
+        'controller.law: expected one of "adaptive", "csc", "psc", "policy", got "psk" (did you mean psc?)',
     ),
     (
         "{law: psc, preset: paper}",
@@ -302,9 +302,9 @@ def test_the_preset_option_is_of_the_missions_law(project: Path) -> None:
 
 
 BAD_LAW_IN_FILE = [
-    ("law: csk", ':2:6: law: expected one of adaptive, csc, psc, got "csk" (did you mean csc?)'),
-    ("law: 3", ":2:6: law: expected one of adaptive, csc, psc, got 3"),
-    ("# law: csc", ":1:1: law: missing; expected one of adaptive, csc, psc"),
+    ("law: csk", ':2:6: law: expected one of adaptive, csc, psc, policy, got "csk" (did you mean csc?)'),
+    ("law: 3", ":2:6: law: expected one of adaptive, csc, psc, policy, got 3"),
+    ("# law: csc", ":1:1: law: missing; expected one of adaptive, csc, psc, policy"),
 ]
 
 

@@ -37,7 +37,7 @@ LOG, LAW = ROOT / "docs/internals/log.md", ROOT / "docs/internals/control-law.md
 MADE_LATER = {
     "flight.mcap", "flight.log", "flight.pid", "guardian.log", "guardian.pid", "summary.json", "report.html", "config.json",
     "sitl_config.json", "sitl.log", "world.json", "preflight.json", "mine.yaml", "my_vehicle.yaml", "flights/",
-    "compare.json", "compare.html", "LAW_PRESET.yaml", "identified_world.yaml", "identified.json",
+    "compare.json", "compare.html", "LAW_PRESET.yaml", "identified_world.yaml", "identified.json", "columns.json",
 }  # fmt: skip
 EXAMPLES = (ROOT / "examples/law", ROOT / "examples/phase")
 """The folders that the readers of docs/own-law.md and docs/own-phase.md make."""

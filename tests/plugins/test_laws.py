@@ -38,8 +38,8 @@ def site(tmp_path: Path) -> Iterator[Path]:
 def test_it_is_chosen_on_the_command_line_and_shown_where_the_others_are(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", "hover", "--plan-only", "--controller", "lift", "--preset", "stiff"]) == 0
     for words, shown in (
-        (["fly", "--help"], ("control law: adaptive, csc, psc, lift", "lift: soft, stiff")),
-        (["compare", "--help"], ("default: adaptive,csc,psc,lift",)),
+        (["fly", "--help"], ("control law: adaptive, csc, psc, policy, lift", "lift: soft, stiff")),
+        (["compare", "--help"], ("default: the presets of adaptive,csc,psc,policy,lift",)),
     ):
         with pytest.raises(SystemExit):
             main(words)
@@ -67,7 +67,9 @@ def test_it_is_listed_with_its_distribution(capsys: pytest.CaptureFixture[str]) 
     assert heading == ["name", "kind", "distribution", "version", "what", "it", "is"]
     laws = [row for row in rows if row[1] == "control"]
     assert laws[-1] == ["lift", "control", "law", "lab-a", "1.0", "A", "law", "for", "tests."]
-    assert [(row[0], row[3]) for row in laws[:-1]] == [(law, DISTRIBUTION) for law in ("adaptive", "csc", "psc")]
+    assert [(row[0], row[3]) for row in laws[:-1]] == [
+        (law, DISTRIBUTION) for law in ("adaptive", "csc", "psc", "policy")
+    ]
 
 
 @pytest.mark.usefixtures("site")

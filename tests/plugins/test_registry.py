@@ -16,7 +16,7 @@ from tests.support import ROOT
 
 def test_the_laws_of_the_companion_are_announced_as_every_other() -> None:
     found = plugins.installed(CONTROL_LAWS)
-    assert list(found)[:3] == ["adaptive", "csc", "psc"]
+    assert list(found)[:4] == ["adaptive", "csc", "psc", "policy"]
     assert str(found["csc"]) == f"control law 'csc' ({DISTRIBUTION} {__version__})"
     assert LAWS["adaptive"] is AdaptiveConfig
     assert PRESETS["psc"][-1] == "tuned"
@@ -34,7 +34,7 @@ def test_without_a_source_tree_the_metadata_of_the_installation_announce_them(
     assert plugins.installed(CONTROL_LAWS) == {}
     monkeypatch.setattr(plugins, "_SOURCE_TREE", ROOT)
     plugins.installed.cache_clear()
-    assert list(plugins.installed(CONTROL_LAWS)) == ["adaptive", "csc", "psc"]
+    assert list(plugins.installed(CONTROL_LAWS)) == ["adaptive", "csc", "psc", "policy"]
     monkeypatch.undo()
     monkeypatch.setattr(plugins, "_SOURCE_TREE", tmp_path)
     write_distribution(tmp_path, DISTRIBUTION, __version__, {"psc": "companion.control.psc:PscController"})
@@ -45,7 +45,7 @@ def test_without_a_source_tree_the_metadata_of_the_installation_announce_them(
 def test_the_laws_of_others_follow_in_the_order_of_their_names(tmp_path: Path) -> None:
     write_distribution(tmp_path, "lab-b", "2.0", {"swing": "lab_b:Law", "Lift": "lab_b:Law"})
     with on_path(tmp_path):
-        assert list(PRESETS) == ["adaptive", "csc", "psc", "Lift", "swing"]
+        assert list(PRESETS) == ["adaptive", "csc", "psc", "policy", "Lift", "swing"]
         assert str(plugins.find(CONTROL_LAWS, "swing")) == "control law 'swing' (lab-b 2.0)"
     assert "swing" not in PRESETS
 
@@ -79,5 +79,7 @@ def test_a_name_that_two_distributions_announce_is_refused(tmp_path: Path) -> No
 
 
 def test_a_plug_in_that_is_absent_is_named_with_those_that_are_there() -> None:
-    with pytest.raises(PluginError, match=r"^control law 'lift': is not installed; installed: adaptive, csc, psc$"):
+    with pytest.raises(
+        PluginError, match=r"^control law 'lift': is not installed; installed: adaptive, csc, psc, policy$"
+    ):
         plugins.find(CONTROL_LAWS, "lift")

@@ -155,7 +155,7 @@ def flights_differ(usual: Settings, changed: SitlConfig, limit_s: float) -> bool
         after=Watched(flown.after),
     )
     try:
-        FastFlight(changed)._run(result, limit_s)
+        list(FastFlight(changed).ticks(result, limit_s))
     except Unlike:
         return True
     return len(result.inputs) < len(flown.inputs)

@@ -88,6 +88,9 @@ def variants_of(
         if law not in available:
             raise ValueError(f"--controllers {law}: no such controller; available: {', '.join(available)}")
     laws = list(dict.fromkeys(controllers)) or list(available)
+    for law in controllers:
+        if not available[law]:
+            raise ValueError(f"--controllers {law}: has no presets; name its file, such as {law}.onnx")
     known = list(dict.fromkeys(preset for law in laws for preset in available[law]))
     for preset in presets:
         if preset not in known:

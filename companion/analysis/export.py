@@ -1,0 +1,200 @@
+"""Writes flights as tables (CSV, Parquet) and as a LeRobot dataset, with names, units and rates."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from companion.analysis.log import FlightLog, LogError
+from companion.model.constants import TICK_PERIOD_S
+
+ABOUT = "columns.json"
+"""File beside the tables: for each table its rate, and for each column its unit and frame."""
+_UNITS: Final = {
+    "_m_s3": "m/s^3", "_m_s2": "m/s^2", "_m_s": "m/s", "_deg_s": "deg/s", "_rad_s2": "rad/s^2", "_rad_s": "rad/s", "_n_m": "N/m",
+    "_nm": "N m", "_kg": "kg", "_deg": "deg", "_rad": "rad", "_hz": "Hz", "_ms": "ms", "_m": "m", "_s": "s", "_n": "N", "_v": "V",
+    "_c": "deg C", "_wxyz": "unit quaternion w, x, y, z",
+}  # fmt: skip
+_FRAMES: Final = ("world", "body", "sensor", "ned")
+_CODEBASE, _CHUNK = "v2.1", 1000
+"""Version of the LeRobot dataset's layout, and the number of episodes in one of its folders."""
+_DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+_INDICES = ("frame_index", "episode_index", "index", "task_index")
+
+
+def about_column(name: str) -> dict[str, str | None]:
+    """Return unit and frame of a column, which its name states; None where it has none."""
+    field = re.sub(r"\[\d+\]", "", name).rpartition(".")[2]
+    unit = next((unit for suffix, unit in _UNITS.items() if field.endswith(suffix)), None)
+    frame = next((frame for frame in _FRAMES if f"_{frame}" in field), None)
+    return {"unit": unit, "frame": frame}
+
+
+def write_tables(log: FlightLog, out: Path, suffix: str) -> list[Path]:
+    """Write the tables of `FlightLog.to_pandas` and `ABOUT`; return the paths.
+
+    Args:
+        log: the flight.
+        out: folder, which is made.
+        suffix: `csv` or `parquet`.
+
+    Raises:
+        LogError: pandas is not installed.
+        ImportError: pyarrow is not installed, and the suffix is `parquet`.
+        OSError: a file cannot be written.
+    """
+    tables = log.to_pandas()
+    out.mkdir(parents=True, exist_ok=True)
+    about: dict[str, Any] = {
+        "log": log.path.name,
+        "index": {"name": "t_s", "unit": "s", "clock": "flight"},
+        "tables": {},
+    }
+    written = []
+    for topic, table in tables.items():
+        path = out / f"{topic.removeprefix('/')}.{suffix}"
+        table.to_csv(path) if suffix == "csv" else table.to_parquet(path)
+        periods_s = np.diff(table.index.to_numpy())
+        rate_hz = round(1.0 / float(np.median(periods_s)), 3) if len(periods_s) and topic != "/events" else None
+        about["tables"][path.name] = {
+            "rate_hz": rate_hz,
+            "columns": {name: about_column(name) for name in table.columns},
+        }
+        written.append(path)
+    (out / ABOUT).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    return [*written, out / ABOUT]
+
+
+_VECTORS = {
+    "observation.state": (
+        ("/inputs", "vehicle.position_world_m"),
+        ("/inputs", "vehicle.velocity_world_m_s"),
+        ("/inputs", "vehicle.attitude_wxyz"),
+        ("/inputs", "vehicle.angular_rate_body_rad_s"),
+        ("/inputs", "arm.angle_rad"),
+        ("/inputs", "arm.velocity_rad_s"),
+        ("/outputs", "control.force_ext_world_n"),
+        ("/outputs", "reference.position_world_m"),
+        ("/outputs", "reference.arm_rad"),
+    ),
+    "action": (("/outputs", "attitude.attitude_wxyz"), ("/outputs", "attitude.thrust"), ("/outputs", "arm_torque_nm")),
+}
+"""Features of a dataset, and the fields of the log that they hold."""
+
+
+def write_lerobot(logs: Sequence[FlightLog], out: Path) -> int:
+    """Write flights as a LeRobot dataset of version 2.1, one episode each; return the number of frames.
+
+    A frame is a tick in which everything is known: the law flew, and its command was sent. `timestamp` counts them at the nominal
+    rate; `t_s` is the flight clock.
+
+    Args:
+        logs: flights of vehicles with the same number of joints.
+        out: folder, which must not exist or be empty.
+
+    Raises:
+        ImportError: pandas or pyarrow is not installed.
+        LogError: a flight has no such tick, or the flights do not belong into one dataset.
+        OSError: a file cannot be written.
+    """
+    import pandas
+
+    episodes = [_episode(log) for log in logs]
+    names = {key: list(table.columns) for key, table in episodes[0].items()}
+    for log, episode in zip(logs, episodes, strict=True):
+        if any(list(episode[key].columns) != wanted for key, wanted in names.items()):
+            raise LogError(
+                f"{log.path}: has other fields than {logs[0].path}, as those of another arm: export it by itself"
+            )
+    if out.exists() and any(out.iterdir()):
+        raise LogError(f"{out}: is not empty; a dataset needs a folder of its own")
+    tasks = list(dict.fromkeys(_named(log, "mission") for log in logs))
+    features: dict[str, Any] = {
+        key: {"dtype": "float32", "shape": [len(value)], "names": value} for key, value in names.items()
+    }
+    features |= {
+        "timestamp": _scalar("float32"),
+        "t_s": _scalar("float64"),
+        **{key: _scalar("int64") for key in _INDICES},
+    }
+    described, statistics, begun = [], [], 0
+    for number, (log, episode) in enumerate(zip(logs, episodes, strict=True)):
+        vectors = {key: table.to_numpy(np.float32) for key, table in episode.items()}
+        count = len(vectors["action"])
+        frames = np.arange(count)
+        task = tasks.index(_named(log, "mission"))
+        scalars = {
+            "timestamp": (frames * TICK_PERIOD_S).astype(np.float32),
+            "t_s": episode["action"].index.to_numpy(),
+            **dict(zip(_INDICES, (frames, frames * 0 + number, frames + begun, frames * 0 + task), strict=True)),
+        }
+        path = out / _DATA.format(episode_chunk=number // _CHUNK, episode_index=number)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lists = {key: list(value) for key, value in vectors.items()}
+        pandas.DataFrame({**lists, **scalars}).to_parquet(path, index=False)
+        described.append({"episode_index": number, "tasks": [tasks[task]], "length": count})
+        columns = {**vectors, **{key: value[:, None] for key, value in scalars.items()}}
+        statistics.append(
+            {"episode_index": number, "stats": {key: _statistics(value) for key, value in columns.items()}}
+        )
+        begun += count
+    info = {
+        "codebase_version": _CODEBASE,
+        "robot_type": _named(logs[0], "vehicle"),
+        "total_episodes": len(logs),
+        "total_frames": begun,
+        "total_tasks": len(tasks),
+        "total_videos": 0,
+        "total_chunks": -(-len(logs) // _CHUNK),
+        "chunks_size": _CHUNK,
+        "fps": round(1.0 / TICK_PERIOD_S),
+        "splits": {"train": f"0:{len(logs)}"},
+        "data_path": _DATA,
+        "video_path": None,
+        "features": features,
+    }
+    meta = out / "meta"
+    meta.mkdir()
+    (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n", encoding="utf-8")
+    units = {key: {column: about_column(column) for column in columns} for key, columns in names.items()}
+    (out / ABOUT).write_text(json.dumps({"rate_hz": info["fps"], "columns": units}, indent=1) + "\n", encoding="utf-8")
+    listed = [{"task_index": index, "task": task} for index, task in enumerate(tasks)]
+    for name, rows in (("tasks", listed), ("episodes", described), ("episodes_stats", statistics)):
+        (meta / f"{name}.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
+    return begun
+
+
+def _episode(log: FlightLog) -> dict[str, Any]:
+    """Return a table for each feature, with the ticks in which every field is known."""
+    import pandas
+
+    tables = log.to_pandas()
+    fields = [(key, topic, field) for key, places in _VECTORS.items() for topic, field in places]
+    found = {
+        (key, column): tables[topic][column]
+        for key, topic, field in fields
+        for column in tables[topic].columns
+        if column.partition("[")[0] == field and tables[topic][column].notna().any()
+    }
+    frames = pandas.DataFrame(found).dropna()
+    if frames.empty or {key for key, _ in found} != set(_VECTORS):
+        raise LogError(f"{log.path}: its vehicle did not fly: it has no frames")
+    return {key: frames[key] for key in _VECTORS}
+
+
+def _scalar(dtype: str) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": [1], "names": None}
+
+
+def _statistics(values: Any) -> dict[str, list[float]]:
+    found = {name: getattr(values, name)(axis=0).tolist() for name in ("min", "max", "mean", "std")}
+    return {**found, "count": [len(values)]}
+
+
+def _named(log: FlightLog, part: str) -> str:
+    return str(log.config.get(part, {}).get("name", "unknown"))

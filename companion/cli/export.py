@@ -1,0 +1,60 @@
+"""`companion export`: write logs as CSV or Parquet tables, or as a LeRobot dataset."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from companion import DISTRIBUTION
+from companion.analysis.export import write_lerobot, write_tables
+from companion.analysis.log import FlightLog, LogError
+from companion.cli.report import names_of
+from companion.config.document import ConfigError
+from companion.model.exit_codes import EXIT_OK
+
+
+def add_parser(commands: Any) -> None:
+    export = commands.add_parser(
+        "export",
+        help="write logs as CSV or Parquet tables, or as a LeRobot dataset",
+        description="csv, parquet: one table for each of inputs, outputs, sent and events, and columns.json with units and rates. "
+        "lerobot: one dataset (v2.1) with an episode for each log.",
+    )
+    export.add_argument("log", type=Path, nargs="+", help="flight.mcap")
+    export.add_argument("--format", choices=("csv", "parquet", "lerobot"), required=True)
+    export.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder to write to (default: csv, parquet: that of the log; several logs get a folder each)",
+    )
+    export.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Read and write the logs; return the exit code.
+
+    Raises:
+        ConfigError: one line that says what the user must change.
+    """
+    paths: list[Path] = arguments.log
+    out: Path | None = arguments.out
+    try:
+        if arguments.format == "lerobot":
+            if out is None:
+                raise ConfigError("companion export: --format lerobot needs --out, the folder of the dataset")
+            frames = write_lerobot([FlightLog.read(path) for path in paths], out)
+            print(f"{out}: {len(paths)} episodes, {frames} frames")
+            return EXIT_OK
+        for path, name in zip(paths, names_of(paths), strict=True):
+            folder = path.parent if out is None else out / name if len(paths) > 1 else out
+            for written in write_tables(FlightLog.read(path), folder, arguments.format):
+                print(written)
+    except LogError as error:
+        raise ConfigError(str(error)) from None
+    except ImportError:
+        raise ConfigError(f"companion export: needs pandas and pyarrow: pip install '{DISTRIBUTION}[pandas]'") from None
+    except OSError as error:
+        raise ConfigError(f"companion export: {error.filename}: cannot be written: {error.strerror}") from None
+    return EXIT_OK
