@@ -28,12 +28,12 @@ def made(name: str, **settings: Any) -> FlightEnvironment:
     return environment
 
 
-def test_gymnasium_accepts_it() -> None:
+def test_the_environment_keeps_the_rules_of_gymnasium() -> None:
     check_env(made("companion/Catch-v0"), skip_render_check=True)
 
 
 @pytest.mark.parametrize("name", ["Hover", "Press", "Intercept"])
-def test_another_mission_is_the_same_environment(name: str) -> None:
+def test_a_step_of_every_environment_passes_the_checks_of_gymnasium(name: str) -> None:
     """With Gymnasium's own checks of every call."""
     environment = gymnasium.make(f"companion/{name}-v0")
     environment.reset(seed=1)
@@ -78,7 +78,7 @@ def test_an_action_that_is_not_finite_is_not_sent_and_the_vehicle_lands() -> Non
     assert info["row"]["outcome"] == Outcome.ABORTED.value
 
 
-def test_it_flies_in_several_processes_each_in_a_laboratory_of_its_own() -> None:
+def test_environments_fly_in_several_processes_each_in_a_laboratory_of_its_own() -> None:
     environments = gymnasium.make_vec("companion/Hover-v0", num_envs=2, vectorization_mode="async")
     try:
         observations, info = environments.reset(seed=1)
@@ -104,7 +104,7 @@ print(picture.shape, picture.std() > 5.0)
 """
 
 
-def test_it_renders_without_a_screen() -> None:
+def test_the_environment_draws_a_picture_without_a_screen() -> None:
     done = subprocess.run(
         [sys.executable, "-c", PICTURE], env={**os.environ, "MUJOCO_GL": "egl"}, capture_output=True, text=True
     )

@@ -44,7 +44,9 @@ def written(path: Path, card: PolicyCard, gain: float = 0.3) -> Path:
     return path
 
 
-def test_what_is_trained_is_what_flies_and_what_is_replayed(environment: FlightEnvironment, tmp_path: Path) -> None:
+def test_a_policy_commands_the_same_in_training_flight_and_replay(
+    environment: FlightEnvironment, tmp_path: Path
+) -> None:
     path = written(tmp_path / "mine.onnx", environment.card)
     observation, _ = environment.reset(options={"laboratory": 5})
     network = Network(str(path))
@@ -86,7 +88,7 @@ def test_the_example_writes_the_network_that_it_trained(
     assert action[3:] == [0.0, 0.0]
 
 
-def test_a_mission_names_it_relative_to_itself(environment: FlightEnvironment, tmp_path: Path) -> None:
+def test_a_mission_finds_the_file_of_its_policy_beside_itself(environment: FlightEnvironment, tmp_path: Path) -> None:
     path = written(tmp_path / "mine.onnx", environment.card)
     text = HOVER.read_text(encoding="utf-8").replace("../", f"{HOVER.parents[1]}/")
     mission = tmp_path / "mission.yaml"
@@ -170,7 +172,7 @@ REFUSED: dict[str, tuple[Callable[[Path, PolicyCard], object], str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_one_that_cannot_fly_is_refused_in_one_line(
+def test_a_policy_that_cannot_fly_is_refused_in_one_line(
     environment: FlightEnvironment, tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str
 ) -> None:
     write, reason = REFUSED[case]

@@ -82,8 +82,8 @@ def test_a_compiled_campaign_gives_the_rows_of_the_interpreted_one(tmp_path: Pat
 @pytest.mark.skipif(not is_current(), reason="no compiled build of this source: make compile")
 def test_the_compiled_build_flies_over_wires(tmp_path: Path) -> None:
     flight = ("fly", str(HOVER), "--sitl", "--speed", "max", "--no-report", "--out", "out")
-    told = set_options(**USUAL, **LOW_HOVER)
-    run_by(BUILD, "-m", "companion", *flight, *told, cwd=tmp_path)
+    settings = set_options(**USUAL, **LOW_HOVER)
+    run_by(BUILD, "-m", "companion", *flight, *settings, cwd=tmp_path)
     summary = json.loads((tmp_path / "out/summary.json").read_bytes())
     assert summary["outcome"] == "completed"
 

@@ -284,9 +284,12 @@ def test_a_full_disk_is_said_once_and_the_log_so_far_is_kept(tmp_path: Path, cap
     assert capfd.readouterr().err.count("File too large") == 1
 
 
-def test_sigterm_closes_the_log_and_ctrl_c_does_not(recorder: RecorderProcess) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_sigterm_closes_the_log_and_ctrl_c_and_a_closed_terminal_do_not(
+    recorder: RecorderProcess, number: signal.Signals
+) -> None:
     offer(recorder, range(50))
-    recorder.process.send_signal(signal.SIGINT)
+    recorder.process.send_signal(number)
     offer(recorder, range(50, 100))
     recorder.process.send_signal(signal.SIGTERM)
     recorder.process.wait(DEADLINE_S)
