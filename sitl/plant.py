@@ -29,6 +29,7 @@ from sitl.world.effects.imu import ImuErrors
 from sitl.world.effects.mocap import MocapErrors
 from sitl.world.effects.transmission import Transmission, transmissions_of
 from sitl.world.handling import Handling, HungWeight
+from sitl.world.jaws import Jaws
 from sitl.world.mocap_misalignment import MocapMisalignment
 from sitl.world.noise import noise
 from sitl.world.scene import Scene
@@ -87,6 +88,8 @@ class MocapFrame(NamedTuple):
     """Time for which the network holds the frame after its transmission."""
     markers: tuple[Vec3, ...] = ()
     """Markers that belong to no rigid body, in any order; if the ball is a rigid body, that body alone while it is tracked."""
+    bar: tuple[Vec3, Quat] | None = None
+    """Pose of the bar that two vehicles carry; None without one."""
 
 
 def _zero_rad(joint: Joint, servo: Servo) -> float:
@@ -100,7 +103,7 @@ def battery_voltage_v(remaining: float, cells: int) -> float:
 
 
 _MOCAP, _IMU, _FORCE = range(3)
-_IMU_DRIFT: Final = 11
+_IMU_DRIFT, _BAR = 11, 12
 
 
 class Plant:
@@ -113,6 +116,8 @@ class Plant:
         drives: motor of each joint.
         start: pose of the vehicle at the start.
         between_steps: whether the cameras expose at the exact time between physics steps instead of at the end of a step.
+        jaws: motor of the clamp's servo; None without a clamp.
+        scene: the scene of which this is machine `number`; None for a scene of its own.
     """
 
     def __init__(
@@ -124,6 +129,9 @@ class Plant:
         start: Start,
         *,
         between_steps: bool = False,
+        jaws: JointDrive | None = None,
+        scene: Scene | None = None,
+        number: int = 0,
     ) -> None:
         self._between_steps = between_steps
         joints = vehicle.arm.joints
@@ -132,8 +140,11 @@ class Plant:
         self._px4 = px4
         for drive in drives:
             drive.goal_delay_s = config.arm_delay_s
-        self.scene = Scene([MachineSpec(vehicle, config, start)])
-        self.machine = self.scene.machines[0]
+        self.scene = scene or Scene([MachineSpec(vehicle, config, start)])
+        self.machine = self.scene.machines[number]
+        self.number = number
+        self.jaws = None if vehicle.jaws is None or jaws is None else Jaws(vehicle.jaws, jaws)
+        """Jaws of the clamp; None without a clamp."""
         servos = [config.servo(joint) for joint in range(len(joints))]
         mechanics = config.servo_mechanics
         more = of_joints(mechanics.torque_per_amp_error if mechanics.on else (0.0,), len(joints))
@@ -193,8 +204,8 @@ class Plant:
         """Start one noise sequence per sensor. The sequences restart at arming, so that the noise in flight depends only on the seed,
         not on the time before arming or on the reading of other sensors.
         """
-        self._mocap_noise, self._imu_noise, self._force_noise = (
-            noise(self._config.seed, sensor) for sensor in (_MOCAP, _IMU, _FORCE)
+        self._mocap_noise, self._imu_noise, self._force_noise, self._bar_noise = (
+            noise(self._config.seed, sensor) for sensor in (_MOCAP, _IMU, _FORCE, _BAR)
         )
         self.machine.restart_noise()
 
@@ -228,8 +239,14 @@ class Plant:
 
     def step(self, armed: bool) -> None:
         """Advance by one physics step."""
-        scene, machine, config = self.scene, self.machine, self._config
-        t_s = scene.t_s
+        self.act(armed)
+        self.scene.step(armed)
+        self.sense()
+
+    def act(self, armed: bool) -> None:
+        """Set what acts on the machine in the next step of the scene."""
+        machine, config = self.machine, self._config
+        t_s = self.scene.t_s
         if armed and self.armed_t_s is None:
             self.armed_t_s = t_s
             self._seed_noise()
@@ -262,8 +279,15 @@ class Plant:
             machine.push(self._load_on_net(config.push, self._weight))
         if self._handling is not None:
             machine.hold(None if armed else self._handling.wrench(t_s, q, v))
+        if self.jaws is not None:
+            self.jaws.step(t_s)
+            if self.scene.bar is not None:
+                self.scene.bar.closed[self.number] = self.jaws.closed
         machine.command(self._rotors, tuple(torques_nm))
-        scene.step(armed)
+
+    def sense(self) -> None:
+        """Let the cameras see the machine after a step of the scene."""
+        scene = self.scene
         if scene.t_s >= self._mocap_next_s - 1e-9:
             self._expose_mocap(min(scene.t_s, self._mocap_next_s) if self._between_steps else scene.t_s)
 
@@ -334,6 +358,7 @@ class Plant:
             markers = self._markers.frame(t_s, since_s, ball_is_body=self._ball_is_body)
             if self._misalignment is not None:
                 markers = tuple([self._misalignment.position(marker) for marker in markers])
+        bar = None if self.scene.bar is None else self.scene.bar.streamed(noise_m, next(self._bar_noise))
         self._mocap_queue.append(
             (
                 arrives_s,
@@ -345,6 +370,7 @@ class Plant:
                     valid=valid,
                     network_s=arrives_s - sent_s,
                     markers=markers,
+                    bar=bar,
                 ),
             )
         )

@@ -77,7 +77,7 @@ def add_parser(commands: Any) -> None:
     check.set_defaults(run=_check)
 
     schema = commands.add_parser("schema", help="print the JSON Schema of a file, for editors")
-    schema.add_argument("kind", choices=("mission", "vehicle", "controller", "world"))
+    schema.add_argument("kind", choices=("mission", "vehicle", "controller", "team", "world"))
     schema.set_defaults(run=lambda a: print(schema_json(a.kind)) or EXIT_OK)
 
     sitl = commands.add_parser("sitl", help="run only the simulated world, for QGroundControl or your own script")

@@ -18,6 +18,7 @@ from pydantic.json_schema import GenerateJsonSchema
 from companion.config.base import Model
 from companion.config.controller import LAWS
 from companion.config.mission import Mission
+from companion.config.team import Team
 from companion.config.vehicle import Vehicle
 from companion.sitl_config.distributions import Distribution
 from companion.sitl_config.world import World
@@ -32,6 +33,7 @@ KINDS: dict[str, Callable[[], TypeAdapter[Any]]] = {
     "mission": lambda: TypeAdapter(Mission),
     "vehicle": lambda: TypeAdapter(Vehicle),
     "controller": _controller,
+    "team": lambda: TypeAdapter(Team),
     "world": lambda: TypeAdapter(World),
 }
 """Type of each kind of file; the type of a controller file depends on the installed control laws."""

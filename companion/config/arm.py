@@ -253,16 +253,46 @@ TOOL_KEYS = {
     "net": ("net_mass_kg", "net_radius_m"),
     "rod": ("mass_kg", "length_m", "tip_radius_m"),
     "brush": ("mass_kg", "length_m", "tip_radius_m", "stiffness_n_m"),
+    "clamp": ("mass_kg", "length_m", "tip_radius_m", "jaws"),
 }
 """Keys of each kind of tool, in addition to those of the sensor. A rod may have `stiffness_n_m` as well."""
 
 
-class Tool(Model):
-    """Force-torque sensor and, beyond it, the net, rod or brush with which the arm works."""
+class Jaws(Model):
+    """The servo that opens and closes a clamp, on the bus of the arm's servos. It holds its angle by itself (operating mode 5,
+    current-based position control), so that the clamp stays as it is when the companion falls silent.
+    """
 
-    kind: Literal["net", "rod", "brush"] = "net"
+    servo: ServoName = "XL330-M288"
+    """Model of the servo."""
+    servo_id: Annotated[int, Field(ge=0, le=252)]
+    open_deg: Annotated[float, Field(ge=-360, le=360)]
+    """Angle of the shaft (register 132) with open jaws."""
+    closed_deg: Annotated[float, Field(ge=-360, le=360)]
+    """Angle of the shaft with the jaws closed around the handle."""
+    current_a: Annotated[float, Field(gt=0, le=5)] = 0.4
+    """Largest current (register 102), with which the jaws press."""
+
+    @model_validator(mode="after")
+    def _opens(self) -> Self:
+        if abs(self.open_deg - self.closed_deg) < 4.0 * JAWS_TOLERANCE_DEG:
+            least_deg = 4.0 * JAWS_TOLERANCE_DEG
+            text = f"expected at least {least_deg:g} deg from closed_deg ({self.closed_deg:g} deg), got {self.open_deg:g} deg"
+            refuse("jaws", [(("open_deg",), text)])
+        return self
+
+
+JAWS_TOLERANCE_DEG = 5.0
+"""The jaws are open or closed if their servo is this near to the angle."""
+
+
+class Tool(Model):
+    """Force-torque sensor and, beyond it, the net, rod, brush or clamp with which the arm works."""
+
+    kind: Literal["net", "rod", "brush", "clamp"] = "net"
     """net: catches a payload; sensor and net are at the tip of the arm. rod: a rod with a ball at its end, in line with the last link.
-    brush: a rod with a brush at its end."""
+    brush: a rod with a brush at its end. clamp: a rod with jaws at its end, which close around the spherical handle of a bar: a ball
+    joint."""
     sensor_mass_kg: NonNegative
     """Mass of the sensor and the mount on the arm's side, which the sensor does not measure."""
     net_mass_kg: NonNegative | None = None
@@ -270,12 +300,14 @@ class Tool(Model):
     net_radius_m: Positive | None = None
     """Nets only."""
     mass_kg: NonNegative | None = None
-    """Mass of rod and ball or brush, all beyond the sensor; its weight is subtracted from the readings. Rods and brushes only."""
+    """Mass of all parts beyond the sensor; its weight is subtracted from the readings. Rods, brushes and clamps only."""
     length_m: Positive | None = None
-    """Distance of the centre of the ball or brush from the sensor, which is at the end of the last link, along the x axis of the tip's
-    frame. It is the tip of the arm that missions, checks and control laws mean. Rods and brushes only."""
+    """Distance of the centre of the ball, brush or jaws from the sensor, which is at the end of the last link, along the x axis of the
+    tip's frame. It is the tip of the arm that missions, checks and control laws mean. Rods, brushes and clamps only."""
     tip_radius_m: Positive | None = None
-    """Radius of the ball or brush. Rods and brushes only."""
+    """Radius of the ball, brush or jaws. Rods, brushes and clamps only."""
+    jaws: Jaws | None = None
+    """The clamp's servo. Clamps only."""
     stiffness_n_m: Positive | None = None
     """Stiffness of the bristles, or of a rod's ball; a rod without it has a hard ball, which hits a hard surface harder."""
     sensor_rpy_deg: Vector3 = (0.0, 0.0, 0.0)
@@ -317,5 +349,5 @@ class Tool(Model):
 
     @property
     def radius_m(self) -> float:
-        """Radius of the net, ball or brush."""
+        """Radius of the net, ball, brush or jaws."""
         return (self.net_radius_m if self.is_net else self.tip_radius_m) or 0.0

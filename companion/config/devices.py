@@ -75,6 +75,9 @@ class MocapDevice(Model):
     """Expected frame rate."""
     ball: TrackedBall | None = None
     """The thrown ball, for missions that follow it; null if none is followed, and no other marker is then read."""
+    bar_id: Annotated[int, Field(ge=0)] | None = None
+    """Streaming id of the rigid body of a bar that two vehicles carry; null if it has none. Its pivot is the middle between the
+    handles, and its x axis points to the left end."""
     options: dict[str, JsonValue] = Field(default={})
     """Settings of the system that a plug-in provides; must be empty for natnet and external."""
 
@@ -94,6 +97,9 @@ class MocapDevice(Model):
         if self.ball is not None and self.ball.id == self.rigid_body_id:
             text = f"{self.ball.id} is the vehicle's own body (rigid_body_id); give the ball's"
             refuse("motion capture", [(("ball", "id"), text)])
+        if self.bar_id is not None and self.bar_id == self.rigid_body_id:
+            text = f"{self.bar_id} is the vehicle's own body (rigid_body_id); give the bar's"
+            refuse("motion capture", [(("bar_id",), text)])
         return self
 
 
@@ -168,6 +174,19 @@ class ForceDevice(Model):
         return self
 
 
+class TeamDevice(Model):
+    """The link to the other vehicle of a team: a signed datagram 50 times a second in each direction (docs/team.md)."""
+
+    port: Annotated[int, Field(ge=0, le=65535)] = 14700
+    """UDP port at which this vehicle receives."""
+    partner: Ipv4Address = "127.0.0.1"
+    """Address of the other vehicle's computer."""
+    partner_port: Annotated[int, Field(gt=0, le=65535)] = 14700
+    """UDP port at which the other vehicle receives."""
+    key_file: str | None = None
+    """File with the key that both vehicles share, 32 bytes or more; with `--sitl`, one is made."""
+
+
 class Devices(Model):
     """Addresses and settings of the devices."""
 
@@ -178,3 +197,5 @@ class Devices(Model):
     force: ForceDevice | None
     """Force-torque sensor; null states that there is none: the control law then runs without a measured force, and no catch is detected
     (docs/hardware.md)."""
+    team: TeamDevice | None = None
+    """Link to the other vehicle of a team; null for a vehicle that flies alone."""

@@ -75,7 +75,7 @@ def load_flight(
     vehicle_path: str | Path | None = None,
     controller_law: str | None = None,
     preset: str | None = None,
-    overrides: Sequence[str] = (),
+    overrides: Sequence[str | Override] = (),
     *,
     hardware: bool = False,
 ) -> FlightConfig:
@@ -108,7 +108,7 @@ def load_flight(
         if hardware and vehicle is not None:
             of_vehicle += _open_to_every_network(vehicle, vehicle_file) + _unusable_devices(vehicle, vehicle_file)
     _place_arm(mission_file, vehicle)
-    mission = _validated(Mission, mission_file, lines)
+    mission = validated(Mission, mission_file, lines)
     lines += of_vehicle
 
     controller: ControllerConfig | None = None
@@ -139,7 +139,7 @@ def load_flight(
             vehicle=vehicle_file.source,
             controller=controller_file.source,
             phases=tuple(str(mission_file.origin(("phases", index))) for index in range(len(mission.phases))),
-            overrides=tuple(text for text, one in zip(overrides, parsed, strict=True) if one.section != "world"),
+            overrides=tuple(str(text) for text, one in zip(overrides, parsed, strict=True) if one.section != "world"),
         ),
     )
 
@@ -183,7 +183,7 @@ def _check_vehicle(document: Document, overrides: list[Override], lines: list[st
     if document.data.get("arm", NO_ARM) is None:
         document.replace(("arm",), copy.deepcopy(NO_ARM), document.origin(("arm",)))
     _read_urdf(document)
-    return _validated(Vehicle, document, lines)
+    return validated(Vehicle, document, lines)
 
 
 def _read_urdf(document: Document) -> None:
@@ -290,7 +290,7 @@ def _check_controller(document: Document, overrides: list[Override], lines: list
     _override(document, "controller", overrides, lines)
     law = document.find(("law",))
     if isinstance(law, str) and law in LAWS:
-        return _validated(LAWS[law], document, lines)
+        return validated(LAWS[law], document, lines)
     expected = f"expected one of {', '.join(LAWS)}"
     if law is None:
         document.report(("law",), f"missing; {expected}", RANK_MISSING)
@@ -309,7 +309,8 @@ def _override(document: Document, section: Section, overrides: list[Override], l
         lines += error.lines
 
 
-def _validated(model: type[M], document: Document, lines: list[str]) -> M | None:
+def validated(model: type[M], document: Document, lines: list[str]) -> M | None:
+    """Return the model of a document; if it has problems, add one line for each of them and return None."""
     built = validate(model, document)
     lines += problem_lines(document.problems)
     return built

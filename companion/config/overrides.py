@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -28,9 +29,13 @@ class Override:
     value: Data
     origin: Origin
 
+    def __str__(self) -> str:
+        """Return the option."""
+        return f"{self.section}.{key_path(self.location)}={json.dumps(self.value)}"
 
-def parse_overrides(texts: Iterable[str]) -> list[Override]:
-    """Parse `--set` options.
+
+def parse_overrides(texts: Iterable[str | Override]) -> list[Override]:
+    """Parse `--set` options; those that are parsed already, as from a team file, stay as they are.
 
     Raises:
         ConfigError: options are invalid; the exception has one message for each.
@@ -39,7 +44,7 @@ def parse_overrides(texts: Iterable[str]) -> list[Override]:
     lines: list[str] = []
     for text in texts:
         try:
-            overrides.append(_parse(text))
+            overrides.append(text if isinstance(text, Override) else _parse(text))
         except ConfigError as error:
             lines += error.lines
     if lines:
@@ -72,6 +77,23 @@ def _parse(text: str) -> Override:
     origin = Origin(f"--set {name}")
     if not equals:
         raise ConfigError([f"{origin}: no '='; {_EXAMPLE}"])
+    section, location = _location(name, origin)
+    if not value_text.strip():
+        raise ConfigError([f"{origin}: no value; {_EXAMPLE}"])
+    return Override(section, location, parse_value(value_text, origin), origin)
+
+
+def override_of(name: str, value: Data, origin: Origin) -> Override:
+    """Return the override of a key that a file gives.
+
+    Raises:
+        ConfigError: the key cannot be read.
+    """
+    section, location = _location(name, origin)
+    return Override(section, location, value, origin)
+
+
+def _location(name: str, origin: Origin) -> tuple[Section, Location]:
     steps: list[str | int] = []
     end = 0
     while end < len(name):
@@ -89,9 +111,7 @@ def _parse(text: str) -> Override:
         raise ConfigError([f"{origin}: unknown section '{section}'; {hint}"])
     if len(steps) == 1:
         raise ConfigError([f"{origin}: the key names a whole section; {_EXAMPLE}"])
-    if not value_text.strip():
-        raise ConfigError([f"{origin}: no value; {_EXAMPLE}"])
-    return Override(section, tuple(steps[1:]), parse_value(value_text, origin), origin)
+    return section, tuple(steps[1:])
 
 
 def _make_way(document: Document, override: Override) -> None:

@@ -146,3 +146,11 @@ class Safety(Model):
     land_speed_m_s: Positive = 0.35
     fold_arm_deg: PerJoint = (165.0, 140.0)
     """Joint angles of the folded arm, the pose `folded` of missions. The default is for an arm of two joints."""
+
+    # A bar that two vehicles carry
+    partner_timeout_s: Positive = 0.3
+    """Longest silence of the other vehicle, which announces its state 50 times a second."""
+    bar_force_max_n: Positive = 10.0
+    """Force of the bar on the clamp above which both vehicles land."""
+    bar_let_go_n: Positive = 18.0
+    """Force of the bar on the clamp above which it is let go at once, whatever the height: the other vehicle falls or pulls away."""

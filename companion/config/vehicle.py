@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import model_validator
 
 from companion.config.airframe import Airframe
-from companion.config.arm import FOLDED, LINK_RADIUS_M, UNFOLDED, Arm, Tool
+from companion.config.arm import FOLDED, LINK_RADIUS_M, UNFOLDED, Arm, Jaws, Tool
 from companion.config.base import Location, Model, OrElse, refuse
 from companion.config.computer import Computer
 from companion.config.device_plugins import DYNAMIXEL
@@ -77,7 +77,7 @@ class Vehicle(Model):
 
     @property
     def tip_radius_m(self) -> float:
-        """Radius around the tip, m: that of the net, ball or brush or, without a tool, half the thickness of the link."""
+        """Radius around the tip, m: that of the net, ball, brush or jaws or, without a tool, half the thickness of the link."""
         return self.tool.radius_m if self.tool is not None else LINK_RADIUS_M
 
     @property
@@ -101,6 +101,11 @@ class Vehicle(Model):
     def has_net(self) -> bool:
         """Whether a payload can be caught."""
         return self.tool is not None and self.tool.is_net
+
+    @property
+    def jaws(self) -> Jaws | None:
+        """The servo of the clamp; None without a clamp."""
+        return self.tool.jaws if self.tool is not None else None
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Self:

@@ -15,6 +15,7 @@ from companion.config.vehicle import OBSERVER
 from companion.control.types import MakeLaw, Tuning
 from companion.control.vehicle_control import Command, VehicleControl
 from companion.core.flight_state import Request, Tare
+from companion.core.let_go import team_state_of
 from companion.core.phase_tick import checked, failed
 from companion.core.sequence import missing_inputs
 from companion.core.state_machine import transition
@@ -154,6 +155,9 @@ class FlightCore:
             contact=state.expected.contact,
             ball=state.expected.ball,
             chase=state.expected.chase,
+            clamp=state.clamp,
+            team=None if self._vehicle.devices.team is None else team_state_of(state, i),
+            carry=state.expected.carry,
         )
 
     def forwards(self, pose: MocapPose, vehicle: VehicleState | None) -> bool:
@@ -186,7 +190,7 @@ class FlightCore:
             context.found_armed = None
         context.tracking_error_m = self._control.tracking_error_m if stage is _MISSION else None
         context.control, context.disturbance_world_n = self._log, self._control.disturbance_world_n
-        context.contact_n = self._state.expected.contact_n
+        context.contact_n, context.grip = self._state.expected.contact_n, self._state.grip
         context.waiting = stage is Stage.WAIT and bool(missing_inputs(inputs, self._vehicle))
         armed_by_others = stage in seq.BEFORE_ARMING and seq.is_armed(inputs.status)
         if armed_by_others:
@@ -323,7 +327,9 @@ class FlightCore:
         return self._control.wait(i)
 
     def _is_tool_a_bumper(self, i: Inputs) -> bool:
-        """Return whether the tool may touch a surface and does not touch the floor before the landing gear."""
+        """Return whether the tool holds a bar, or may touch a surface and does not touch the floor before the landing gear."""
+        if self._state.bar is not None:
+            return True
         if self._state.expected.into_world is None or i.arm is None:
             return False
         z_m = self._parameters.manipulator.net_body_m(i.arm.angle_rad)[2]

@@ -6,13 +6,14 @@ import math
 from enum import Enum
 
 from companion.mission.active_plan import ActiveTrajectory
-from companion.mission.air import NOTHING, Expectation
+from companion.mission.air import NOTHING, Expectation, HeldBar
 from companion.mission.plan import Plan
 from companion.mission.segments import Segment
 from companion.mission.settled import SettledEstimate
 from companion.model import flight_stage as seq
 from companion.model.codec import Record
 from companion.model.flight_stage import Stage
+from companion.model.team import ClampCommand, Grip
 from companion.model.types import (
     AutopilotRequest,
     Event,
@@ -82,6 +83,14 @@ class FlightState(Record, frozen=True):
     """Whether that state has ended early: phases that go on with it are skipped."""
     expected: Expectation = NOTHING
     """What that state expects of the flight."""
+    clamp: ClampCommand | None = None
+    """The newest command for the clamp; None before the first."""
+    grip: Grip = Grip.FREE
+    """What the vehicle has in its clamp; a landing keeps it until it lets go."""
+    bar: HeldBar | None = None
+    """The bar whose end the clamp holds; a landing keeps it until it lets go."""
+    opens_s: float = math.inf
+    """Flight clock at which a landing opens the clamp."""
 
     @property
     def pilot_flies(self) -> bool:

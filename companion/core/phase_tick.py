@@ -116,6 +116,8 @@ def _fly(t: Transition, phase: Phase, own: Record, engaged: Segment) -> None:
     if not isinstance(expected, Expectation):
         raise RecordError(f"expects() returned {type(expected).__name__}, no Expectation")
     t.change(own=own, engaged=engaged, expected=expected)
+    if expected.clamp is not None:
+        t.change(clamp=expected.clamp, grip=expected.grip, bar=expected.bar)
 
 
 def _end(t: Transition, engaged: Segment, skips: bool) -> None:

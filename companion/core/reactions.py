@@ -6,6 +6,7 @@ from typing import Final
 
 from companion.core.phase_tick import PhaseFailed, leave
 from companion.core.transition import Transition
+from companion.mission.bar_landing import landing_with_bar
 from companion.mission.plan import landing_from
 from companion.mission.retract import inward_only, retract_from
 from companion.model import flight_stage as seq
@@ -124,6 +125,9 @@ def _retract(t: Transition) -> None:
     if now is None or course is None or course.segment(t.i.t_s).kind is PhaseKind.LANDING:
         land_instead(t, "already landing; no retract")
         return
+    if t.state.bar is not None:
+        land_instead(t, "another vehicle holds the same bar; no retract")
+        return
     if _faces_the_anchor(t):
         land_instead(t, "the surface is between vehicle and anchor; no retract")
         return
@@ -162,6 +166,11 @@ def _before_surface_m(t: Transition, now: Reference) -> Vec3 | None:
 def land_instead(t: Transition, text: str, notice: EventDefinition = notices.NO_ROOM_TO_STAY) -> None:
     """Land for a reason that the monitors do not know, and report it."""
     t.report(notice, text)
+    land_now(t)
+
+
+def land_now(t: Transition) -> None:
+    """Land because of an event that is reported already, and that the monitors do not know."""
     t.change(supervisor=update(t.state.supervisor, t.events, t.i.t_s, t.parameters.times))
     _land(t)
 
@@ -172,6 +181,19 @@ def _land(t: Transition) -> None:
     if now is None:  # the controller has not flown yet
         t.finish(Outcome.ABORTED)
         t.enter(Stage.AUTOPILOT_LAND)
+        return
+    if t.state.bar is not None:
+        plan, opens_s = landing_with_bar(
+            now,
+            _allowed_velocity(t, now),
+            t.state.bar.stands_m,
+            p.manipulator,
+            p.fold_rad,
+            p.vehicle.safety.land_speed_m_s,
+            p.vehicle,
+        )
+        t.leave_mission(plan)
+        t.change(opens_s=t.i.t_s + opens_s)
         return
     t.leave_mission(
         landing_from(

@@ -8,7 +8,7 @@ from typing import Final
 from companion.config.vehicle import Vehicle
 from companion.core.flight_state import Tare
 from companion.core.phase_tick import PhaseFailed, advance_phase
-from companion.core.reactions import land_instead
+from companion.core.reactions import land_instead, land_now
 from companion.core.transition import Transition
 from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.check import check_start
@@ -228,8 +228,12 @@ def _spool(t: Transition, elapsed_s: float) -> AutopilotRequest:
 
 def _fly(t: Transition, _: float) -> AutopilotRequest:
     if t.parameters.acts and not t.state.aborting:
+        before = len(t.events)
         try:
             advance_phase(t)
+            if any(event.action.rank >= SafetyAction.LAND.rank for event in t.events[before:]):
+                land_now(t)
+                return _NONE
         except PhaseFailed as failure:
             land_instead(t, str(failure), notices.PHASE_FAILED)
             return _NONE
@@ -343,6 +347,10 @@ def missing_inputs(i: Inputs, vehicle: Vehicle) -> list[str]:
         devices["arm"] = i.arm
     if vehicle.devices.force is not None:
         devices["force sensor"] = i.force
+    if vehicle.jaws is not None:
+        devices["clamp"] = i.clamp
+    if vehicle.devices.team is not None:
+        devices["other vehicle"] = i.partner
     return [name for name, value in devices.items() if value is None]
 
 

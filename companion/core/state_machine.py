@@ -7,6 +7,7 @@ sequence of stages (`companion.core.sequence`, `companion.model.flight_stage`).
 from __future__ import annotations
 
 from companion.core.flight_state import FlightState, Request
+from companion.core.let_go import let_go_if_better
 from companion.core.reactions import supervise
 from companion.core.sequence import advance
 from companion.core.transition import Parameters, Transition
@@ -35,4 +36,6 @@ def transition(
         t.start_asked = any(event.id == OPERATOR_START for event in events)
     supervise(t)
     request = advance(t)
+    if t.state.bar is not None:
+        let_go_if_better(t)
     return t.state, Request(request, tuple(t.events), tuple(t.tare), t.resumed)

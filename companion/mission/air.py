@@ -13,9 +13,21 @@ from companion.model.best_pose import best_pose
 from companion.model.codec import Record
 from companion.model.frames import quat_rotate
 from companion.model.markers import BallState
+from companion.model.team import CarryState, ClampCommand, Grip
 from companion.model.types import ChaseState, ContactState, Inputs, MocapPose, Reference, TetherState, Vec3
 from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
+
+
+class HeldBar(Record, frozen=True, kw_only=True):
+    """What a landing must know of the bar whose end the clamp holds."""
+
+    stands_m: float
+    """Height of the clamp's centre above the floor at which the bar stands on its feet."""
+    let_go_m: float
+    """Height of the clamp's centre below which the bar may be let go before it stands."""
+    weight_n: float
+    """Measured downward force of the bar on the clamp, low-passed."""
 
 
 class Expectation(Record, frozen=True):
@@ -39,6 +51,16 @@ class Expectation(Record, frozen=True):
     """The ball that the phase follows, for the log and for the displays."""
     chase: ChaseState | None = None
     """The way to a thrown ball, for the log."""
+    clamp: ClampCommand | None = None
+    """Command for the clamp; None to leave it as it is."""
+    grip: Grip = Grip.FREE
+    """What the vehicle has in its clamp, for the other vehicle of a team."""
+    lift_server_s: float | None = None
+    """Time on the motion-capture server's clock at which the bar is lifted, if this vehicle sets it."""
+    bar: HeldBar | None = None
+    """The bar whose end the clamp holds; None if it holds nothing."""
+    carry: CarryState | None = None
+    """How the bar is carried, for the log and the displays."""
 
 
 NOTHING = Expectation()
@@ -133,7 +155,7 @@ class Air:
         raise NotImplementedError
 
     def report(self, notice: EventDefinition, text: str) -> None:
-        """Add an event."""
+        """Add an event; one whose action is LAND ends the mission by a landing."""
         raise NotImplementedError
 
     def fail(self, notice: EventDefinition, text: str) -> None:

@@ -138,7 +138,7 @@ def least_snap(points_m: tuple[Vec3, ...], shares: tuple[float, ...]) -> NDArray
     count = len(shares)
     powers = np.arange(4)
     scale = t[:, None] ** powers  # of a state, in units of the piece's duration
-    to_coefficients = np.array([_septic(tuple(row[:4]), tuple(row[4:]), 1.0) for row in np.eye(8)]).T
+    to_coefficients = np.array([septic(tuple(row[:4]), tuple(row[4:]), 1.0) for row in np.eye(8)]).T
     high = np.array([[math.perm(k, order) if k >= order else 0 for k in range(8)] for order in (4, 5, 6)], dtype=float)
     at_start = np.where(np.arange(8) == np.array([[4], [5], [6]]), high, 0.0) @ to_coefficients
     at_end = high @ to_coefficients
@@ -207,7 +207,7 @@ def _rebuilt(
     for index, share in enumerate(shares):
         knots.append(knots[-1] + share)
         x, y, z = (
-            _septic(
+            septic(
                 (points_m[index][axis], *states[index][axis]),
                 (points_m[index + 1][axis], *states[index + 1][axis]),
                 share,
@@ -218,7 +218,7 @@ def _rebuilt(
     return Route(tuple(knots), tuple(pieces), scale_s)
 
 
-def _septic(start: tuple[float, ...], end: tuple[float, ...], duration: float) -> Septic:
+def septic(start: tuple[float, ...], end: tuple[float, ...], duration: float) -> Septic:
     """Return the polynomial of degree 7 with the given value and first three derivatives at 0 and at `duration`."""
     p0, v0, a0, j0 = start
     p1, v1, a1, j1 = end

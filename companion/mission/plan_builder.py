@@ -6,9 +6,11 @@ The durations come from the mission file, and nothing here reacts to a catch.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 
 from companion.mission.arm_motion import ArmLimits, plan_arm
-from companion.mission.minsnap import VehicleLimits, least_line_s, route
+from companion.mission.minsnap import VehicleLimits, least_line_s, route, septic
 from companion.mission.reference import (
     REST_TO_REST_PEAK_SPEED,
     Curve,
@@ -66,6 +68,11 @@ class PlanBuilder:
         x_m, y_m, z_m = self._at[0]
         return (x_m, y_m, z_m)
 
+    @property
+    def yaw_rad(self) -> float:
+        """Return the current yaw, rad."""
+        return self._at[1][0]
+
     def line_m(self, to_world_m: Vec3) -> float:
         """Return the distance of a point from the current position, m."""
         return math.dist(self._at[0], to_world_m)
@@ -100,6 +107,37 @@ class PlanBuilder:
             ),
         )
         return duration_s
+
+    def pieces(self, knots_s: Sequence[float], states: Sequence[tuple[Vec3, Vec3, Vec3, Vec3]]) -> None:
+        """Append polynomial pieces of degree 7 through states of the vehicle; the first is its present one, at rest, and the last is at
+        rest.
+
+        Args:
+            knots_s: times of the states, from 0.
+            states: position, velocity, acceleration and jerk, world frame.
+        """
+        pieces = []
+        for (begin_s, end_s), (before, after) in zip(pairwise(knots_s), pairwise(states), strict=True):
+            x, y, z = (
+                septic(
+                    (before[0][i], before[1][i], before[2][i], before[3][i]),
+                    (after[0][i], after[1][i], after[2][i], after[3][i]),
+                    end_s - begin_s,
+                )
+                for i in range(3)
+            )
+            pieces.append((x, y, z))
+        self._append(
+            0,
+            Curve(
+                start_s=self.t_s,
+                duration_s=knots_s[-1],
+                scale_s=1.0,
+                knots=tuple(knots_s),
+                pieces=tuple(pieces),
+                end=states[-1][0],
+            ),
+        )
 
     def turn(self, to_yaw_rad: float, duration_s: float) -> None:
         """Append a turn to the given yaw in the shorter direction."""

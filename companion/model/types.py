@@ -17,6 +17,7 @@ from enum import Enum
 from companion.model.codec import Record
 from companion.model.estimator import EstimatorReport
 from companion.model.markers import BallState, MarkerFrame
+from companion.model.team import BarPose, CarryState, ClampCommand, ClampState, PartnerState, TeamState
 from companion.model.verdict import Verdict
 
 Vec2 = tuple[float, float]
@@ -257,6 +258,12 @@ class Inputs(Record, frozen=True, kw_only=True):
     """Newest ESTIMATOR_STATUS, if another program feeds PX4 with poses (`devices.mocap.type: external`); else None."""
     markers: MarkerFrame | None = None
     """Single markers of the newest motion-capture frame, if the mission uses them (`devices.mocap.ball`); else None."""
+    clamp: ClampState | None = None
+    """Newest state of the clamp; None without a clamp (`tool.kind`)."""
+    bar: BarPose | None = None
+    """The bar's rigid body in the newest frame that had it; None without one (`devices.mocap.bar_id`)."""
+    partner: PartnerState | None = None
+    """Newest announcement of the other vehicle of a team; None without one."""
 
 
 class ContactMode(Enum):
@@ -554,6 +561,12 @@ class Outputs(Record, frozen=True, kw_only=True):
     """The ball that the phase follows; None without one, and in older logs."""
     chase: ChaseState | None = None
     """Figures of the plan to meet a thrown ball; None before the first plan, and in older logs."""
+    clamp: ClampCommand | None = None
+    """Command for the clamp; None before the first one, and without a clamp."""
+    team: TeamState | None = None
+    """What is announced to the other vehicle of a team; None without one."""
+    carry: CarryState | None = None
+    """How the bar is carried; None while it is not."""
 
 
 class Sent(Record, frozen=True, kw_only=True):

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
+from companion.model.team import Grip
 from companion.model.types import ControlLog, TetherState, Vec3
 
 Values = tuple[object, ...]
@@ -37,6 +38,8 @@ class FlightContext:
     """Event text if PX4 was armed without a request from the companion; `airborne` then shows whether the vehicle is flying."""
     torque_refused: str | None = None
     """Why the gate sent none of the law's joint torques in the last tick; None if they were sent."""
+    grip: Grip = Grip.FREE
+    """What the vehicle has in its clamp."""
     waiting: bool = False
     """Inputs are still missing on the ground: only rules with `while_waiting` are evaluated."""
 

@@ -20,6 +20,7 @@ from companion.safety.pose_filter import PoseFilter
 from companion.safety.process import ProcessTracker
 from companion.safety.px4 import Px4Tracker
 from companion.safety.rule import Subject
+from companion.safety.team import TeamTracker
 from companion.safety.validity import InputFilter
 from companion.safety.vision import VisionTracker
 
@@ -67,6 +68,9 @@ class Monitors:
             trackers[Subject.FORCE] = self._force
         if vehicle.tether is not None:
             trackers[Subject.TETHER] = self._flight
+        self._team = TeamTracker() if vehicle.devices.team is not None else None
+        if self._team is not None:
+            trackers[Subject.PARTNER] = self._team
         self._evaluation = Evaluation(vehicle, trackers)
         self._awake_s = self._located_awake_s = 0.0
         self._last_t_s: float | None = None
@@ -139,6 +143,8 @@ class Monitors:
                 self._located_awake_s = awake_s
             if airborne:
                 self._flight.update(i, context, gap_s, located=awake_s - self._located_awake_s < LOCATED_S)
+            if self._team is not None:
+                self._team.update(i, context, awake_s)
             if not self._force.trusted:
                 i = msgspec.structs.replace(i, force=None)
         self.trusted = i

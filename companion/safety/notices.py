@@ -121,6 +121,11 @@ SURFACE_MISSING = EventDefinition(
     "nothing was touched within `distance_max_m`, or the touched points lie on a plane tilted by more than 30 deg: the vehicle moves "
     "back, and the mission continues as aborted",
 )  # fmt: skip
+BAR_LET_GO = EventDefinition(
+    "bar_let_go", _CRITICAL, _LAND,
+    "a vehicle that lands opens its clamp: the bar stands, it is low enough and the other vehicle does not land with this one, or it "
+    "pulls harder than `bar_let_go_n`",
+)  # fmt: skip
 TOUCHDOWN = EventDefinition("touchdown", _INFO, _NOMINAL, "the vehicle is on the ground")
 NO_TOUCHDOWN = EventDefinition(
     "no_touchdown", _CRITICAL, _PX4_LANDS, "no touchdown 5 s after the plan's end: PX4 lands"
@@ -150,6 +155,6 @@ NO_ROOM_TO_STAY = EventDefinition(
 NOTICES: tuple[EventDefinition, ...] = (
     INPUTS_MISSING, VISION_NOT_FUSED, ESTIMATE_UNSTEADY, START_REFUSED, OFFBOARD_REFUSED, ARMING_REFUSED, NOT_READY, START_DECLINED,
     TAKEOFF_CANCELLED, RESUME_REFUSED, TAKEOFF, CATCH, PAYLOAD_LEFT, IMPEDANCE_SCALED, PHASE_FAILED, TOUCHED, CONTACT_INTERRUPTED,
-    CONTACT_LOST, CONTACT_DISAGREES, CONTACT_BOUNCE, CONTACT_BESIDE, CONTACT_SLIPPED, CONTACT_STUCK, SURFACE_MISSING, TOUCHDOWN,
-    NO_TOUCHDOWN, DISARM_REFUSED, AUTOPILOT_LANDING, GATE, HOLD_EXPIRED, RETRACT_EXPIRED, RETRACT_DONE, NO_ROOM_TO_STAY,
+    CONTACT_LOST, CONTACT_DISAGREES, CONTACT_BOUNCE, CONTACT_BESIDE, CONTACT_SLIPPED, CONTACT_STUCK, SURFACE_MISSING, BAR_LET_GO,
+    TOUCHDOWN, NO_TOUCHDOWN, DISARM_REFUSED, AUTOPILOT_LANDING, GATE, HOLD_EXPIRED, RETRACT_EXPIRED, RETRACT_DONE, NO_ROOM_TO_STAY,
 )  # fmt: skip

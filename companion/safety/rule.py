@@ -26,6 +26,7 @@ class Subject(Enum):
     PROCESS = "process"
     FLIGHT = "flight"
     TETHER = "tether"
+    PARTNER = "partner"
 
 
 class Lamp(StrEnum):
@@ -42,6 +43,7 @@ class Lamp(StrEnum):
     GUARDIAN = "guardian"
     BATTERY = "battery"
     TETHER = "tether"
+    PARTNER = "partner"
 
 
 _LAMPS: Mapping[Subject, Lamp] = {
@@ -55,6 +57,7 @@ _LAMPS: Mapping[Subject, Lamp] = {
     Subject.PROCESS: Lamp.LOOP,
     Subject.FLIGHT: Lamp.FLIGHT,
     Subject.TETHER: Lamp.TETHER,
+    Subject.PARTNER: Lamp.PARTNER,
 }
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 from companion.model.types import OperatorCommand, SafetyAction, Severity
-from companion.safety import arm, flight, mocap, process, px4, vision
+from companion.safety import arm, flight, mocap, process, px4, team, vision
 from companion.safety.process import commanded
 from companion.safety.rule import Lamp, Repeat, Rule, Subject
 from companion.safety.validity import invalid
@@ -468,5 +468,39 @@ RULES: tuple[Rule, ...] = (
         id="tether_separated", subject=Subject.TETHER, what="the distance to the anchor exceeds the tether's length: the tether is cut",
         predicate=flight.tether_separated, tracked_by=("tether.separation_m",), hold_time=0.1, ground=None, air=_LAND,
         repeat=Repeat.NEVER, message="{:.2f} m from the anchor without a pull: the tether is cut or detached",
+    ),
+
+    Rule(
+        id="partner_quiet", subject=Subject.PARTNER, what="nothing is heard from the other vehicle; this one holds no bar",
+        predicate=team.partner_quiet, thresholds=("partner_timeout_s",), ground=_WARN, air=_WARN,
+        message="nothing from the other vehicle for more than {:.1f} s",
+    ),
+    Rule(
+        id="partner_silent", subject=Subject.PARTNER, what="nothing is heard from the other vehicle, which holds the same bar",
+        predicate=team.partner_silent, thresholds=("partner_timeout_s",), ground=None, air=_LAND,
+        message="nothing from the other vehicle for more than {:.1f} s, and both hold the bar",
+    ),
+    Rule(
+        id="partner_holds", subject=Subject.PARTNER, what="the other vehicle, which holds the same bar, has stopped",
+        predicate=team.partner_holds, ground=None, air=_HOLD, message="the other vehicle holds",
+    ),
+    Rule(
+        id="partner_lands", subject=Subject.PARTNER, what="the other vehicle, which holds the same bar, lands because of an event",
+        predicate=team.partner_lands, ground=None, air=_LAND, message="the other vehicle lands",
+    ),
+    Rule(
+        id="partner_let_go", subject=Subject.PARTNER, what="the other vehicle has let go of a bar that is in the air",
+        predicate=team.partner_let_go, hold_time=0.1, ground=None, air=_LAND,
+        message="the other vehicle has let go of the bar",
+    ),
+    Rule(
+        id="partner_near", subject=Subject.PARTNER, what="the rotor circles of the two vehicles nearly touch",
+        predicate=team.partner_near, thresholds=("airframe.radius_m",), hold_time=0.05, ground=None, air=_LAND,
+        message="the other vehicle is {:.2f} m away (limit {:.2f} m)",
+    ),
+    Rule(
+        id="bar_force_high", subject=Subject.PARTNER, what="the bar pulls too hard",
+        predicate=team.bar_force_high, thresholds=("bar_force_max_n",), hold_time=0.3, ground=None, air=_LAND,
+        message="the bar pulls with {:.1f} N (limit {:.1f} N)",
     ),
 )  # fmt: skip

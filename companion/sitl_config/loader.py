@@ -8,7 +8,7 @@ from pathlib import Path
 
 from companion.config.document import ConfigError, Data, Document
 from companion.config.loader import FlightConfig, load_flight
-from companion.config.overrides import apply_overrides, parse_overrides
+from companion.config.overrides import Override, apply_overrides, parse_overrides
 from companion.config.shipped import named_file, names, shipped_file
 from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import read_document
@@ -55,7 +55,7 @@ def load_sitl(
     vehicle_path: str | Path | None = None,
     controller_law: str | None = None,
     preset: str | None = None,
-    overrides: Sequence[str] = (),
+    overrides: Sequence[str | Override] = (),
     *,
     hardware: bool = False,
     world: str = DEFAULT_WORLD,
@@ -113,7 +113,7 @@ def _faults_of_absent_parts(world: World, vehicle: Vehicle) -> Iterator[str]:
 
 
 def load_world(
-    overrides: Sequence[str] = (),
+    overrides: Sequence[str | Override] = (),
     world: str = DEFAULT_WORLD,
     joints: int = 0,
     rotors: int = 0,

@@ -13,6 +13,7 @@ from companion.config.devices import NatNetVersion, ServoBaud
 from companion.config.explain import nearest
 from companion.model.servos import ServoName
 from companion.px4.defaults import PX4_DEFAULTS
+from companion.sitl_config.bar import Bar
 from companion.sitl_config.effects.air import Air
 from companion.sitl_config.effects.battery import Battery
 from companion.sitl_config.effects.compliance import Compliance
@@ -101,7 +102,7 @@ class Servo(Model):
 class World(Model):
     """The simulated world."""
 
-    extends: Literal["careless", "ideal", "lab", "robustness", "wall"] | None = None
+    extends: Literal["careless", "ideal", "lab", "pair", "robustness", "wall"] | None = None
     """Built-in world whose values hold for every key that this file does not give; null for the default of each key."""
     payload_kg: Annotated[float, Field(ge=0, le=2)] = 0.2
     """Mass of the payload; 0 if nothing is thrown."""
@@ -199,6 +200,8 @@ class World(Model):
     faults: tuple[Fault, ...] = ()
     surfaces: Annotated[tuple[Surface, ...], Field(max_length=8)] = ()
     """Surfaces that the tip of the arm can touch. Touching one with a rotor is a crash."""
+    bar: Bar | None = None
+    """The bar of a team of two vehicles; null for the defaults of `Bar`."""
     air: Air = Air()
     downwash: Downwash = Downwash()
     tether_line: TetherLine = TetherLine()

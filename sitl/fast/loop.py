@@ -26,6 +26,7 @@ from companion.model.frames import (
     ned_from_enu,
 )
 from companion.model.markers import MarkerFrame
+from companion.model.team import BarPose, Grip, PartnerState, TeamState
 from companion.model.types import (
     AutopilotRequest,
     Event,
@@ -47,6 +48,7 @@ from sitl.autopilot.commander import FORCE_MAGIC, Command
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.types import AttitudeTarget, Command7
 from sitl.fast.bus import FastBus, scales_of
+from sitl.fast.clamp import FastClamp
 from sitl.fast.guardian import TAKE_OVER_S, FastGuardian, Landing
 from sitl.fast.link import FastLink
 from sitl.fast.telemetry import FastTelemetry
@@ -55,6 +57,7 @@ from sitl.faults.timing import with_fault_times
 from sitl.force_torque import TIME_EPSILON_S, overloaded, quantised
 from sitl.plant import MocapFrame, Plant
 from sitl.servo.from_config import plugged_in, servos_of
+from sitl.world.scene import Scene
 from sitl.world.start import start_of
 from sitl.world.state import Layout, Snapshot, Truth
 from sitl.world.throws import with_throws
@@ -111,7 +114,7 @@ class FastResult:
 
 
 @contextlib.contextmanager
-def _garbage_collection_paused() -> Iterator[None]:
+def garbage_collection_paused() -> Iterator[None]:
     """Pause garbage collection: a flight creates many records and no reference cycles, so collecting only costs time."""
     was_on = gc.isenabled()
     gc.disable()
@@ -132,9 +135,19 @@ class FastFlight:
         config: effective configuration; the hover thrust is the stub's MPC_THR_HOVER if the vehicle file has none.
         land_at_s: time on the flight clock at which the operator commands a landing; None for never.
         make_law: makes the control law in place of the configured one.
+        scene: the scene of which this is machine `number`; None for a scene of its own.
+        number: number of the machine.
     """
 
-    def __init__(self, config: SitlConfig, land_at_s: float | None = None, make_law: MakeLaw | None = None) -> None:
+    def __init__(
+        self,
+        config: SitlConfig,
+        land_at_s: float | None = None,
+        make_law: MakeLaw | None = None,
+        *,
+        scene: Scene | None = None,
+        number: int = 0,
+    ) -> None:
         config = with_fault_times(with_throws(config))
         vehicle, world, start = config.vehicle, config.world, config.mission.start
         self._land_at_s = land_at_s
@@ -142,7 +155,9 @@ class FastFlight:
         servos = servos_of(vehicle, world)
         drives = [servo.drive for servo in servos]
         pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
-        self.plant = Plant(vehicle, world, self.px4, drives, pose)
+        self._clamp = FastClamp.of(vehicle)
+        jaws = None if self._clamp is None else self._clamp.drive
+        self.plant = Plant(vehicle, world, self.px4, drives, pose, jaws=jaws, scene=scene, number=number)
         self.faults = Faults(world, self.plant.scene, self.plant.machine, self.px4, drives, vehicle.tether)
         if world.faults:
             self.plant.faults = self.faults
@@ -163,6 +178,8 @@ class FastFlight:
         self._mocap: MocapPose | None = None
         self._sees_ball = vehicle.devices.mocap.ball is not None
         self._markers: MarkerFrame | None = None
+        self._sees_bar = vehicle.devices.mocap.bar_id is not None
+        self._bar: BarPose | None = None
         self._tracked_m: Vec3 = (0.0, 0.0, 0.0)
         """Newest position at which the vehicle's body was tracked."""
         self._server_clock, self._echo_due_s = ServerClock(), 0.0
@@ -175,6 +192,22 @@ class FastFlight:
         self._vehicle: VehicleState | None = None
         """PX4's state as the core has last received it."""
         self._dropped = 0
+        self.partner: PartnerState | None = None
+        """Newest announcement of the other vehicle of a team, as it has arrived."""
+        self._result = FastResult()
+        self._limit_s = self._until_mission_s = math.inf
+        self._until: Callable[[Outputs], bool] | None = None
+        self._period = 0
+        """Number of the next tick's period; 0 before the first."""
+        self._opens_s = math.inf
+        self._landing: Landing | None = None
+        """Time at which the guardian that has decided to land takes over, and its landing; infinite and None without one."""
+        self._lands_s = 0.0
+        """Time of the newest record of a landing without the flight process."""
+        self._settles_until_s: float | None = None
+        """Time until which PX4 may finish a landing; None before the flight has ended."""
+        self.over = False
+        """Whether the flight has ended and `result` is complete."""
 
     def run(
         self, limit_s: float = 90.0, until_mission_s: float = math.inf, until: Callable[[Outputs], bool] | None = None
@@ -183,7 +216,7 @@ class FastFlight:
         `until` returns True for a tick's outputs.
         """
         result = FastResult()
-        with _garbage_collection_paused():
+        with garbage_collection_paused():
             for _ in self.ticks(result, limit_s, until_mission_s, until):
                 pass
         return result
@@ -196,53 +229,91 @@ class FastFlight:
         until: Callable[[Outputs], bool] | None = None,
     ) -> Iterator[Outputs]:
         """Fly as `run` does, and yield the outputs of each tick; `result` is complete when the iteration has ended."""
-        plant, core, px4 = self.plant, self.core, self.px4
-        scene, machine, guardian = plant.scene, plant.machine, self._guardian
-        result.layout = machine.layout
-        period, tick = round(START_S / TICK_PERIOD_S), 0
-        while scene.t_s < START_S - 1e-9:
-            self._step()
-            self._bus.keep_alive(scene.t_s)
-        self._telemetry.start_sums()
-        while scene.t_s < limit_s:
-            period += 1
-            due_s = period * TICK_PERIOD_S - 1e-9
-            while scene.t_s < due_s:
-                self._step()
-            if guardian is not None and self._flight_process_stalled(guardian):
-                if guardian.decides_to_take_over(scene.t_s, False, plant.fault("kill_flight") is not None):
-                    self._guardian_lands(guardian, result, limit_s)
-                    break
-                result.after.append(machine.snapshot())
-                if machine.crashed:
-                    break
-                continue
-            inputs = self._inputs(tick)
-            outputs = core.step(inputs)
-            self._carry_out(outputs)
-            if guardian is not None:
-                guardian.heartbeat(inputs, outputs)
-                guardian.decides_to_take_over(scene.t_s, True, False)
-            result.inputs.append(inputs)
-            result.outputs.append(outputs)
-            result.snapshots.append(machine.snapshot())
-            tick += 1
-            yield outputs
-            if outputs.outcome is not None or machine.crashed or outputs.mission_t_s >= until_mission_s:
-                break
-            if until is not None and until(outputs):
-                break
-        if guardian is not None:
-            result.guardian_events = guardian.events
-            self._settle(result)
-        result.armed, result.crashed = px4.armed, machine.crashed
-        result.caught = scene.payload.caught_t_s is not None
-        result.miss_m = scene.payload.miss_m
+        plant, px4 = self.plant, self.px4
+        scene = plant.scene
+        self.begin(result, limit_s, until_mission_s, until)
+        while not self.over:
+            plant.act(px4.armed)
+            scene.step(px4.armed)
+            outputs = self.after_step()
+            if outputs is not None:
+                yield outputs
 
-    def _step(self) -> None:
-        """Advance the world by a step, and let motion capture and PX4 send what is due."""
+    def begin(
+        self,
+        result: FastResult,
+        limit_s: float = 90.0,
+        until_mission_s: float = math.inf,
+        until: Callable[[Outputs], bool] | None = None,
+    ) -> None:
+        """Begin the flight whose record is `result`; the arguments are those of `run`. From then on, call `Plant.act`, a step of the
+        scene and `after_step`, until the flight is over.
+        """
+        result.layout = self.plant.machine.layout
+        self._result, self._limit_s, self._until_mission_s, self._until = result, limit_s, until_mission_s, until
+
+    def after_step(self) -> Outputs | None:
+        """Do everything that is due after a step of the scene; return the outputs of a control tick, if one was due."""
         plant = self.plant
-        plant.step(self.px4.armed)
+        scene = plant.scene
+        plant.sense()
+        if self.over:
+            return None
+        if self._landing is not None or self._opens_s < math.inf:
+            self._guardian_lands()
+            return None
+        if self._settles_until_s is not None:
+            self._settle()
+            return None
+        self._receive()
+        if scene.t_s < START_S - 1e-9:
+            self._bus.keep_alive(scene.t_s)
+            return None
+        if self._period == 0:
+            self._telemetry.start_sums()
+            self._period = round(START_S / TICK_PERIOD_S) + 1
+        if scene.t_s < self._period * TICK_PERIOD_S - 1e-9:
+            return None
+        self._period += 1
+        outputs = self._tick()
+        if not self.over and self._settles_until_s is None and scene.t_s >= self._limit_s:
+            self._end()
+        return outputs
+
+    def _tick(self) -> Outputs | None:
+        """Run a control tick; return its outputs, or None while the flight process is stalled."""
+        plant, guardian, result = self.plant, self._guardian, self._result
+        scene, machine = plant.scene, plant.machine
+        if guardian is not None and self._flight_process_stalled(guardian):
+            if guardian.decides_to_take_over(scene.t_s, False, plant.fault("kill_flight") is not None):
+                self._opens_s = self._lands_s = scene.t_s
+                self._opens_s += TAKE_OVER_S
+                return None
+            result.after.append(machine.snapshot())
+            if machine.crashed:
+                self._end()
+            return None
+        inputs = self._inputs(len(result.inputs))
+        outputs = self.core.step(inputs)
+        self._carry_out(outputs)
+        if guardian is not None:
+            guardian.heartbeat(inputs, outputs)
+            guardian.decides_to_take_over(scene.t_s, True, False)
+        result.inputs.append(inputs)
+        result.outputs.append(outputs)
+        result.snapshots.append(machine.snapshot())
+        if (
+            outputs.outcome is not None
+            or machine.crashed
+            or outputs.mission_t_s >= self._until_mission_s
+            or (self._until is not None and self._until(outputs))
+        ):
+            self._end()
+        return outputs
+
+    def _receive(self) -> None:
+        """Let motion capture and PX4 send what is due after a step."""
+        plant = self.plant
         if plant.faults is not None:
             self._bus.step(plant.scene.t_s)
         for frame in plant.take_mocap()[-1:]:  # of frames that wait, the driver delivers the newest
@@ -251,6 +322,23 @@ class FastFlight:
             self._force_due_s += self._force_period_s
             self._sample_force()
         self._telemetry.pump(plant.scene.t_s)
+
+    def _end(self) -> None:
+        """End the flight; with faults, PX4 then finishes its landing."""
+        if self._guardian is None:
+            self._over()
+            return
+        self._result.guardian_events = self._guardian.events
+        self._lands_s = self.plant.scene.t_s
+        self._settles_until_s = self._lands_s + SETTLE_S
+        if not self._settling():
+            self._over()
+
+    def _over(self) -> None:
+        self.over, result, scene = True, self._result, self.plant.scene
+        result.armed, result.crashed = self.px4.armed, self.plant.machine.crashed
+        result.caught = scene.payload.caught_t_s is not None
+        result.miss_m = scene.payload.miss_m
 
     def _sample_force(self) -> None:
         """Take a sample of the force sensor, which the next tick reads."""
@@ -261,18 +349,23 @@ class FastFlight:
         overload = overloaded(force_n, torque_nm)
         self._force = ForceSample(stamp_s=math.nan, force_sensor_n=force, torque_sensor_nm=torque, overload=overload)
 
-    def _settle(self, result: FastResult) -> None:
+    def _settling(self) -> bool:
+        assert self._settles_until_s is not None
+        return self.px4.armed and not self.plant.machine.crashed and self.plant.scene.t_s < self._settles_until_s
+
+    def _settle(self) -> None:
         """Let PX4 finish the landing of a flight that has ended in the air."""
-        scene, machine, px4 = self.plant.scene, self.plant.machine, self.px4
-        end_s = scene.t_s + SETTLE_S
-        period_s = scene.t_s
-        while px4.armed and not machine.crashed and scene.t_s < end_s:
-            self.plant.step(px4.armed)
-            if self._external:
-                self._poses_for_guardian()
-            if scene.t_s >= period_s + TICK_PERIOD_S - 1e-9:
-                period_s += TICK_PERIOD_S
-                result.after.append(machine.snapshot())
+        if self._external:
+            self._poses_for_guardian()
+        self._record_landing()
+        if not self._settling():
+            self._over()
+
+    def _record_landing(self) -> None:
+        """Record the state of the world, if that is due."""
+        if self.plant.scene.t_s >= self._lands_s + TICK_PERIOD_S - 1e-9:
+            self._lands_s += TICK_PERIOD_S
+            self._result.after.append(self.plant.machine.snapshot())
 
     def _flight_process_stalled(self, guardian: FastGuardian) -> bool:
         """Return whether a fault stops the control ticks of the flight process. If only its event loop is stalled, also do what its bus
@@ -284,23 +377,22 @@ class FastFlight:
             self._bus.keep_alive(t_s)
         return not active.keys().isdisjoint(FLIGHT_PROCESS_FAULTS)
 
-    def _guardian_lands(self, guardian: FastGuardian, result: FastResult, limit_s: float) -> None:
-        plant, px4 = self.plant, self.px4
-        scene, machine = plant.scene, plant.machine
-        open_s = scene.t_s + TAKE_OVER_S
-        landing: Landing | None = None
-        period_s = scene.t_s
-        while scene.t_s < limit_s and not machine.crashed and (landing is None or landing.landed is None):
-            plant.step(px4.armed)
-            poses = self._poses_for_guardian()
-            if landing is None and scene.t_s >= open_s:
-                landing = guardian.take_over(scene.t_s)
-            if landing is not None:
-                landing.step(scene.t_s, poses)
-            if scene.t_s >= period_s + TICK_PERIOD_S - 1e-9:
-                period_s += TICK_PERIOD_S
-                result.after.append(machine.snapshot())
-        result.guardian_landed = landing.landed if landing is not None else False
+    def _guardian_lands(self) -> None:
+        """Let the guardian land the vehicle, from `TAKE_OVER_S` after its decision."""
+        scene, machine, guardian = self.plant.scene, self.plant.machine, self._guardian
+        assert guardian is not None
+        poses = self._poses_for_guardian()
+        if self._landing is None and scene.t_s >= self._opens_s:
+            self._landing = guardian.take_over(scene.t_s)
+        landing = self._landing
+        if landing is not None:
+            landing.step(scene.t_s, poses)
+        self._record_landing()
+        ended = landing is not None and landing.landed is not None
+        if ended or machine.crashed or scene.t_s >= self._limit_s:
+            self._result.guardian_landed = landing.landed if landing is not None else False
+            self._landing, self._opens_s = None, math.inf
+            self._end()
 
     def _poses_for_guardian(self) -> list[MocapPose]:
         """Return the poses of this step; none if another program sends them to PX4 itself, which it does here."""
@@ -315,6 +407,9 @@ class FastFlight:
         pose = self._pose(frame)
         if not self._external:
             self._mocap = pose
+        if self._sees_bar and frame.bar is not None:
+            at, turned = frame.bar
+            self._bar = BarPose(stamp_s=pose.stamp_s, position_world_m=at, attitude_wxyz=turned, tracking_valid=True)
         if self._sees_ball:
             self._tracked_m = pose.position_world_m if pose.tracking_valid else self._tracked_m
             self._markers = marker_frame(
@@ -332,7 +427,7 @@ class FastFlight:
 
     def _pose(self, frame: MocapFrame) -> MocapPose:
         t_s = self.plant.scene.t_s
-        number, exposure_s, position, attitude, valid, network_s, _ = frame
+        number, exposure_s, position, attitude, valid, network_s, _, _ = frame
         latency_s, exposure_server_s = t_s - exposure_s, exposure_s
         if self.plant.faults is not None:
             clock = self.faults.server_clock_s
@@ -383,7 +478,21 @@ class FastFlight:
             guardian_ready=guardian_ready,
             estimator=self._telemetry.estimator(t_s) if self._external else None,
             markers=self._markers,
+            clamp=None if self._clamp is None else self._clamp.read(t_s),
+            bar=self._bar,
+            partner=self.partner,
         )
+
+    def announced(self, outputs: Outputs | None) -> TeamState | None:
+        """Return what the vehicle tells its partner after this step: the core in a tick, the guardian while it lands the vehicle; None
+        between ticks and while both are silent.
+        """
+        if outputs is not None:
+            return outputs.team
+        guardian, pose = self._guardian, self._mocap
+        if self._landing is None or guardian is None or not guardian.alive or pose is None:
+            return None
+        return TeamState(grip=Grip.FREE, holds=True, lands=True, px4_lands=True, position_world_m=pose.position_world_m)
 
     def _carry_out(self, outputs: Outputs) -> None:
         setpoint, request = outputs.attitude, outputs.request
@@ -395,6 +504,8 @@ class FastFlight:
             else:
                 self.px4.on_setpoint(self.plant.scene.t_s, target)
         self._bus.write(self.plant.scene.t_s, outputs.arm_torque_nm)
+        if self._clamp is not None:
+            self._clamp.write(outputs.clamp)
         if request is not _NO_REQUEST:
             if with_faults:
                 self._link.send(lambda: self._request(request))

@@ -9,6 +9,7 @@ from companion.config.devices import ArmDevice
 from companion.config.vehicle import Vehicle
 from companion.sitl_config.world import Servo, World
 from sitl.servo import registers as reg
+from sitl.servo.drive import MODE_CURRENT_POSITION
 from sitl.servo.kinds import KINDS
 from sitl.servo.model import ServoModel
 
@@ -20,6 +21,16 @@ def servos_of(vehicle: Vehicle, config: World) -> list[ServoModel]:
     for servo in servos:
         servo.drive.current_loop_s = mechanics.current_loop_s if mechanics.on else 0.0
     return servos
+
+
+def jaws_servo_of(vehicle: Vehicle) -> ServoModel | None:
+    """Return the servo of the clamp; None without a clamp."""
+    jaws = vehicle.jaws
+    if jaws is None:
+        return None
+    servo = ServoModel(jaws.servo_id, baud_bps=vehicle.arm_device.baud, kind=jaws.servo)
+    servo.write(reg.OPERATING_MODE.address, reg.OPERATING_MODE.encode(MODE_CURRENT_POSITION))
+    return servo
 
 
 def plugged_in(servos: Sequence[ServoModel], config: World) -> list[ServoModel]:

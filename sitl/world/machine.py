@@ -31,6 +31,8 @@ FALL_M_S: Final = 2.5
 """Speed of impact on the floor at which the legs break: the speed after a fall from 0.3 m. PX4 descends at 0.7 m/s at most."""
 TURNING_N: Final = 0.1
 """Thrust of all rotors above which they turn."""
+ROTORS_APART_M: Final = 0.05
+"""Difference of height up to which two rotor disks above each other touch."""
 _EFFECT_STEPS: Final = round(EFFECT_PERIOD_S / PHYSICS_DT_S)
 
 
@@ -264,6 +266,29 @@ class Machine:
             math.hypot(x - rotor_x, y - rotor_y) < self._disk_m + radius_m for rotor_x, rotor_y in self._rotors_at_m
         ):
             self._crash(t_s, "rotor_hit")
+
+    def watch_rotors_of(self, t_s: float, other: Machine) -> None:
+        """Detect rotor disks of two machines that touch, which ends the flight of both."""
+        if math.dist(self.q[0:3], other.q[0:3]) > self._reach_m + other._reach_m:
+            return
+        for x, y, z in other.rotors_world_m():
+            for own_x, own_y, own_z in self.rotors_world_m():
+                near_m = self._disk_m + other._disk_m
+                if math.hypot(x - own_x, y - own_y) < near_m and abs(z - own_z) < ROTORS_APART_M:
+                    self._crash(t_s, "rotors_touched")
+                    other._crash(t_s, "rotors_touched")
+                    return
+
+    def rotors_world_m(self) -> list[Vec3]:
+        """Return the centres of the rotors, world frame."""
+        x, y, z, *attitude = self.q[0:7]
+        found = []
+        for rotor_x, rotor_y in self._rotors_at_m:
+            dx, dy, dz = quat_rotate(
+                (attitude[0], attitude[1], attitude[2], attitude[3]), (rotor_x, rotor_y, self._rotor_height_m)
+            )
+            found.append((x + dx, y + dy, z + dz))
+        return found
 
     def watch_crash(self, t_s: float) -> None:
         """Detect a crash: the vehicle is far below its standing height, tilted by more than 72 deg, or has hit the floor too fast."""

@@ -247,18 +247,20 @@ def _balls(world: World) -> tuple[str, str, str]:
     return bodies, pairs, connect
 
 
-def mjcf(machines: Sequence[tuple[Vehicle, World]], timestep_s: float) -> str:
+def mjcf(machines: Sequence[tuple[Vehicle, World]], timestep_s: float, bar: tuple[str, str, str] = ("", "", "")) -> str:
     """Return the MuJoCo model of a scene as MJCF text. Bodies touch only where a pair says so, which costs less than a search.
 
     Args:
         machines: vehicle file and configuration of each machine; the configuration of the first has the objects of the scene, and its
             machine catches the payload.
         timestep_s: physics step.
+        bar: body, contacts and constraints of the bar that the machines carry.
     """
     vehicle, world = machines[0]
     parts = [_Parts.of(*each, prefix_of(number)) for number, each in enumerate(machines)]
     worldbody, equality, tendon, pairs, actuator, sensor = ("".join(texts) for texts in zip(*parts, strict=True))
     balls, ball_pairs, connect = _balls(world)
+    bar_body, bar_pairs, clamps = bar
     options = surfaces.OPTIONS if world.surfaces else 'cone="pyramidal"'
     return f"""
 <mujoco model="{vehicle.name}">
@@ -266,11 +268,11 @@ def mjcf(machines: Sequence[tuple[Vehicle, World]], timestep_s: float) -> str:
   <option timestep="{timestep_s}" gravity="0 0 -{GRAVITY_M_S2}" integrator="implicitfast" {options}/>
   <size memory="2M"/>
   <worldbody>
-    <geom name="floor" type="plane" size="20 20 1" contype="0" conaffinity="0"/>{surfaces.geoms(world)}{worldbody}{balls}
+    <geom name="floor" type="plane" size="20 20 1" contype="0" conaffinity="0"/>{surfaces.geoms(world)}{worldbody}{balls}{bar_body}
   </worldbody>
-  <equality>{equality}{connect}</equality>
+  <equality>{equality}{connect}{clamps}</equality>
   <tendon>{tendon}</tendon>
-  <contact>{pairs}{ball_pairs}</contact>
+  <contact>{pairs}{ball_pairs}{bar_pairs}</contact>
   <actuator>{actuator}</actuator>
   <sensor>{sensor}</sensor>
 </mujoco>"""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import mujoco
 
+from sitl.world.bar import Bar, BarSpec, bar_mjcf
 from sitl.world.loads import Bodies, Loads
 from sitl.world.machine import Machine
 from sitl.world.model import mjcf, prefix_of
@@ -23,23 +24,28 @@ class Scene:
 
     Args:
         machines: at least one machine.
+        bar: the bar that the two machines carry; None if there is none.
     """
 
-    def __init__(self, machines: Sequence[MachineSpec]) -> None:
+    def __init__(self, machines: Sequence[MachineSpec], bar: BarSpec | None = None) -> None:
         first = machines[0]
         shared = {"surfaces": first.config.surfaces}
         machines = (first, *(each._replace(config=each.config.model_copy(update=shared)) for each in machines[1:]))
-        model = mujoco.MjModel.from_xml_string(mjcf([each[:2] for each in machines], PHYSICS_DT_S))
+        prefixes = tuple(prefix_of(number) for number in range(len(machines)))
+        parts = ("", "", "") if bar is None else bar_mjcf(bar, prefixes)
+        model = mujoco.MjModel.from_xml_string(mjcf([each[:2] for each in machines], PHYSICS_DT_S, parts))
         self.model, self.data = model, mujoco.MjData(model)
         self.loads, self._events = Loads(self.data), Events()
         self.surfaces = Surfaces(first.config, model) if first.config.surfaces else None
         """Surfaces; None if there are none."""
-        bodies = [Bodies(model, self.data, self.loads, prefix_of(number)) for number in range(len(machines))]
+        bodies = tuple(Bodies(model, self.data, self.loads, prefix) for prefix in prefixes)
         self.machines = tuple(
             Machine(spec, each, self._events, self.surfaces) for spec, each in zip(machines, bodies, strict=True)
         )
         mujoco.mj_forward(model, self.data)
         self.payload = Payload(self.machines[0], bodies[0], first.vehicle, first.config, self._events)
+        self.bar = None if bar is None else Bar(bar, bodies, self.machines, self._events)
+        """The bar that the machines carry; None if there is none."""
         self.t_s = 0.0
 
     def step(self, airborne: bool = True) -> None:
@@ -62,6 +68,8 @@ class Scene:
         if (ball := self.payload.flying) is not None:
             for machine in self.machines:
                 machine.watch_ball(t_s, *ball)
+        if self.bar is not None:
+            self.bar.step(t_s)
         for machine in self.machines:
             machine.watch_crash(t_s)
 

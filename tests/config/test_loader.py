@@ -89,14 +89,14 @@ BAD_MISSION = [
         "type: takeoff ",
         "type: takeof ",
         [
-            f'{CATCH}:29:11: phases[0].type: expected one of approach, arm, detach, hold, intercept, land, line, path, press, probe, slide, takeoff, got "takeof" '
+            f'{CATCH}:29:11: phases[0].type: expected one of approach, arm, carry, detach, grip, hold, intercept, land, line, path, press, probe, release, slide, takeoff, got "takeof" '
             "(did you mean takeoff?)"
         ],
     ),
     (
         "type: takeoff               # 0.0 s\n    height_m: 1.0",
         "height_m: 1.0",
-        [f"{CATCH}:29:5: phases[0].type: missing; expected one of approach, arm, detach, hold, intercept, land, line, path, press, probe, slide, takeoff"],
+        [f"{CATCH}:29:5: phases[0].type: missing; expected one of approach, arm, carry, detach, grip, hold, intercept, land, line, path, press, probe, release, slide, takeoff"],
     ),
     ("  - type: land                  # 18.0 s\n    speed_m_s: 0.35\n", "", [f"{CATCH}:51:11: phases[5].type: the last phase must be of type land"]),
     (

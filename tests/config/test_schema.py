@@ -19,7 +19,13 @@ from companion.sitl_config.loader import WORLDS
 from companion.sitl_config.world import World
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-FOLDERS = {"missions": "mission", "vehicles": "vehicle", "controllers": "controller", "worlds": "world"}
+FOLDERS = {
+    "missions": "mission",
+    "vehicles": "vehicle",
+    "controllers": "controller",
+    "teams": "team",
+    "worlds": "world",
+}
 FILES = [(path, kind) for folder, kind in FOLDERS.items() for path in sorted((CONFIGS / folder).glob("*.yaml"))]
 
 
@@ -72,5 +78,5 @@ def test_every_preset_is_shipped() -> None:
 
 
 def test_every_world_is_shipped() -> None:
-    assert WORLDS == ("careless", "ideal", "lab", "robustness", "wall")
+    assert WORLDS == ("careless", "ideal", "lab", "pair", "robustness", "wall")
     assert set(get_args(get_args(World.model_fields["extends"].annotation)[0])) == set(WORLDS)

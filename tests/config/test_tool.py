@@ -33,7 +33,7 @@ FOLDED, PRESS = (tuple(map(math.radians, ROD.poses_deg[name])) for name in ("fol
         ),
         (
             "{kind: rot, sensor_mass_kg: 0.1}",
-            'kind: expected one of "net", "rod", "brush", got "rot" (did you mean rod?)',
+            'kind: expected one of "net", "rod", "brush", "clamp", got "rot" (did you mean rod?)',
         ),
     ],
 )

@@ -22,6 +22,7 @@ _INTRO = {
     "`safety`.",
     "controller": "One control law with its gains; `law` names the law. [The control law](../control-law.md) describes the "
     "implementation.",
+    "team": "Two vehicles that carry a bar: the mission of both, and what each has of its own.",
     "world": "True parameters of the simulated world, which the companion does not know. Give a file with `--world`, or keys with "
     "`--set world.KEY=VALUE`. Any number may be a distribution, `{uniform: [low, high]}` or `{normal: [mean, sigma]}`, from which the "
     "seed draws it. With examples: [the laboratory](../world.md), [the simulated world](../sitl.md#knobs).",

@@ -1,0 +1,72 @@
+"""The landing of a vehicle that holds one end of a bar, while the other vehicle does the same at the other end."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from companion.config.vehicle import Vehicle
+from companion.control.manipulator import Manipulator
+from companion.mission.plan import BELOW_GROUND_M, Plan, fold_time_s
+from companion.mission.plan_builder import PlanBuilder
+from companion.mission.segments import Segment
+from companion.model.frames import quat_from_euler_zyx, quat_rotate
+from companion.model.types import Joints, PhaseKind, Reference, Vec3
+
+PRESS_M: Final = 0.01
+"""Depth by which the clamp is led below the height at which the bar stands."""
+STAND_S: Final = 1.0
+"""Time on the floor until the clamp opens: the other vehicle may have begun a little later."""
+OPENING_S: Final = 1.0
+BACK_M: Final = 0.6
+BACK_S: Final = 3.0
+RISE_M: Final = 0.1
+RISE_S: Final = 1.0
+
+
+def landing_with_bar(
+    now: Reference,
+    velocity_world_m_s: Vec3,
+    stands_m: float,
+    manipulator: Manipulator,
+    arm_fold_rad: Joints,
+    speed_m_s: float,
+    vehicle: Vehicle,
+) -> tuple[Plan, float]:
+    """Plan an immediate landing: come to rest, set the bar down with the arm as it is, let it go, move backwards, and land.
+
+    Args:
+        now: the last reference.
+        velocity_world_m_s: initial velocity.
+        stands_m: height of the clamp at which the bar stands.
+        manipulator: kinematics of the arm.
+        arm_fold_rad: joint angles at the end.
+        speed_m_s: speed of the descent, the same for both vehicles.
+        vehicle: provides the height of the floor.
+
+    Returns:
+        The plan, whose segments are all of PhaseKind.LANDING, and the time on its clock at which the clamp is to open.
+    """
+    builder = PlanBuilder(now.position_world_m, now.yaw_rad, now.arm_rad)
+    builder.t_s = builder.stop(velocity_world_m_s)
+    drop_m = -manipulator.net_body_m(now.arm_rad)[2]
+    builder.t_s = builder.descend(speed_m_s, stands_m - PRESS_M + drop_m)
+    opens_s = builder.t_s + STAND_S
+    builder.t_s = opens_s + OPENING_S
+    _segment(builder, "set the bar down", 0.0)
+    begun_s = builder.t_s
+    x, y, z = builder.position_m
+    builder.go((x, y, z + RISE_M), RISE_S)
+    builder.t_s += RISE_S
+    dx, dy, _ = quat_rotate(quat_from_euler_zyx(0.0, 0.0, now.yaw_rad), (-BACK_M, 0.0, 0.0))
+    builder.go((x + dx, y + dy, z + RISE_M), BACK_S)
+    builder.fold_arm(arm_fold_rad, max(BACK_S, fold_time_s(now.arm_rad, arm_fold_rad)))
+    builder.t_s += max(BACK_S, fold_time_s(now.arm_rad, arm_fold_rad))
+    _segment(builder, "leave the bar", begun_s)
+    begun_s = builder.t_s
+    builder.t_s = builder.descend(speed_m_s, vehicle.airframe.ground_clearance_m - BELOW_GROUND_M)
+    _segment(builder, "land", begun_s)
+    return Plan.of("landing", builder), opens_s
+
+
+def _segment(builder: PlanBuilder, name: str, begun_s: float) -> None:
+    builder.segments.append(Segment(name=name, kind=PhaseKind.LANDING, start_s=begun_s, end_s=builder.t_s, index=-1))

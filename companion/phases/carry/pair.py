@@ -1,0 +1,99 @@
+"""Checks whether two vehicles can carry their bar together as planned."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+from companion.config.loader import FlightConfig
+from companion.config.vehicle import Vehicle
+from companion.mission.phase import phases_of
+from companion.mission.plan import Plan
+from companion.model.types import Reference, Vec3
+from companion.phases.carry.carry import Carry
+from companion.phases.carry.grip import APART_M
+
+STEP_S: Final = 0.05
+TETHERS_APART_M: Final = 0.3
+"""Least distance between the straight lines of the two tethers."""
+
+
+def pair_problems(left: FlightConfig, right: FlightConfig) -> Iterator[str]:
+    """Yield each reason not to let these two members fly together; one line each."""
+    for what, one, other, advice in (
+        ("devices.mocap.rigid_body_id", _body(left), _body(right), "give each vehicle a rigid body of its own"),
+        (
+            "devices.team.port",
+            _port(left),
+            _port(right),
+            "both are on one computer in simulation: give each a port of its own",
+        ),
+    ):
+        if one == other:
+            yield f"both members have {what} {one}; {advice}"
+    if left.mission.limits != right.mission.limits or left.mission.phases[2:] != right.mission.phases[2:]:
+        yield "both members must fly the same phases after grip, and with the same limits: they move one bar"
+        return
+    one_server = left.vehicle.devices.mocap.server == right.vehicle.devices.mocap.server
+    if not one_server:
+        yield "devices.mocap.server differs between the members; both must receive the frames of one server, whose clock they share"
+    yield from _near(left, right)
+
+
+def _body(config: FlightConfig) -> int:
+    return config.vehicle.devices.mocap.rigid_body_id
+
+
+def _port(config: FlightConfig) -> int | None:
+    team = config.vehicle.devices.team
+    return None if team is None else team.port
+
+
+def _near(left: FlightConfig, right: FlightConfig) -> Iterator[str]:
+    """Yield where the vehicles or their tethers come too near to each other."""
+    plans = [Plan.build(config.mission, config.vehicle) for config in (left, right)]
+    index = next(number for number, phase in enumerate(phases_of(left.mission)) if isinstance(phase, Carry))
+    least_m = left.vehicle.airframe.radius_m + right.vehicle.airframe.radius_m + APART_M
+    near: tuple[float, float] | None = None
+    crossed: tuple[float, float] | None = None
+    begun = [next(s.start_s for s in plan.segments if s.index == index) for plan in plans]
+    end_s = max(plan.duration_s - start_s for plan, start_s in zip(plans, begun, strict=True))
+    # Before the bar is lifted each is on its own side, at a time of its own; then both move at once.
+    for n in range(int(end_s / STEP_S)):
+        at = [plan.reference(start_s + n * STEP_S) for plan, start_s in zip(plans, begun, strict=True)]
+        apart_m = math.dist(at[0].position_world_m[:2], at[1].position_world_m[:2])
+        if apart_m < least_m and (near is None or apart_m < near[1]):
+            near = (n * STEP_S, apart_m)
+        lines_m = _tethers_apart_m(left.vehicle, at[0], right.vehicle, at[1])
+        if lines_m < TETHERS_APART_M and (crossed is None or lines_m < crossed[1]):
+            crossed = (n * STEP_S, lines_m)
+    if near is not None:
+        yield (
+            f"the vehicles come as near as {near[1]:.2f} m, {near[0]:.1f} s after the lift (minimum {least_m:.2f} m: two rotor circles "
+            f"and {APART_M:g} m); use a longer bar, or change the waypoints"
+        )
+    if crossed is not None:
+        yield (
+            f"the tethers come as near as {crossed[1]:.2f} m, {crossed[0]:.1f} s after the lift (minimum {TETHERS_APART_M:g} m): they "
+            "may cross; move the anchors apart, or change the waypoints"
+        )
+
+
+def _tethers_apart_m(left: Vehicle, at_left: Reference, right: Vehicle, at_right: Reference) -> float:
+    """Return the distance between the straight lines from anchor to vehicle; infinite without one of the tethers."""
+    if left.tether is None or right.tether is None:
+        return math.inf
+    return _segments_apart_m(
+        (left.tether.anchor_world_m, at_left.position_world_m), (right.tether.anchor_world_m, at_right.position_world_m)
+    )
+
+
+def _segments_apart_m(one: tuple[Vec3, Vec3], other: tuple[Vec3, Vec3]) -> float:
+    """Return the distance between two line segments, sampled at a twentieth of their length."""
+    return min(math.dist(_along(one, i / 20), _along(other, j / 20)) for i in range(21) for j in range(21))
+
+
+def _along(line: tuple[Vec3, Vec3], share: float) -> Vec3:
+    (ax, ay, az), (bx, by, bz) = line
+    return (ax + share * (bx - ax), ay + share * (by - ay), az + share * (bz - az))
