@@ -26,7 +26,8 @@ import math
 from collections.abc import Sequence
 from typing import ClassVar, Final
 
-from companion.config.controller import AdaptiveConfig, fitted
+from companion.config.controller import AdaptiveConfig
+from companion.config.gains import fitted
 from companion.config.vehicle import Vehicle
 from companion.control.common import AccelerationFilter, Actuation, DesiredForce, ForceFilter, tracking_errors
 from companion.control.compensation import Compensation
