@@ -16,6 +16,7 @@ from typing import Final
 
 from companion.config.mission import Limits
 from companion.config.vehicle import Vehicle
+from companion.model.algebra import scaled
 from companion.model.codec import Record
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Vec3
@@ -157,7 +158,7 @@ class Bounds:
             return False
         places = _integrated(m.begin.position_m, speeds, h / 5.0)
         # The velocity in the coefficients of degree 5.
-        raised = [_plus(_scaled(speeds[max(0, k - 1)], 0.2 * k), speeds[min(4, k)], 1.0 - 0.2 * k) for k in range(6)]
+        raised = [_plus(scaled(speeds[max(0, k - 1)], 0.2 * k), speeds[min(4, k)], 1.0 - 0.2 * k) for k in range(6)]
         stop_s, safe = self._stop.time_s(fastest), self._safe
         return all(
             self.in_box(p) and safe.holds(p) and safe.holds(_plus(p, v, stop_s))
@@ -174,7 +175,7 @@ class Bounds:
         this state respects them.
         """
         speed_m_s = math.hypot(*now.velocity_m_s) or 1.0
-        tried = [_scaled(push_m_s2, share) for share in EASED] + [_scaled(now.velocity_m_s, -BRAKE_M_S2 / speed_m_s)]
+        tried = [scaled(push_m_s2, share) for share in EASED] + [scaled(now.velocity_m_s, -BRAKE_M_S2 / speed_m_s)]
         for push in tried:
             after = self._after(now, dt_s, self._within(push))
             if self.admit(self.stop(t_s, after)):
@@ -183,14 +184,14 @@ class Bounds:
 
     def _within(self, a: Vec3) -> Vec3:
         """Return the acceleration within the limits of size and tilt."""
-        a = _scaled(a, min(1.0, self.acceleration_m_s2 / max(1e-9, math.hypot(*a))))
+        a = scaled(a, min(1.0, self.acceleration_m_s2 / max(1e-9, math.hypot(*a))))
         aside = min(1.0, 0.999 * self._slope * (a[2] + GRAVITY_M_S2) / max(1e-9, math.hypot(a[0], a[1])))
         return (aside * a[0], aside * a[1], a[2])
 
     def _after(self, s: State, dt_s: float, push_m_s2: Vec3) -> State:
         """Return the state after a tick whose constant jerk, within its limit, leads to an acceleration."""
-        j = _scaled(_plus(push_m_s2, s.acceleration_m_s2, -1.0), 1.0 / dt_s)
-        j = _scaled(j, min(1.0, self._jerk_m_s3 / max(1e-9, math.hypot(*j))))
+        j = scaled(_plus(push_m_s2, s.acceleration_m_s2, -1.0), 1.0 / dt_s)
+        j = scaled(j, min(1.0, self._jerk_m_s3 / max(1e-9, math.hypot(*j))))
         v, a = s.velocity_m_s, s.acceleration_m_s2
         return State(
             _plus(_plus(_plus(s.position_m, v, dt_s), a, dt_s**2 / 2.0), j, dt_s**3 / 6.0),
@@ -216,7 +217,3 @@ def _integrated(first: Vec3, rates: list[Vec3], h: float) -> list[Vec3]:
 
 def _plus(a: Vec3, b: Vec3, k: float) -> Vec3:
     return (a[0] + k * b[0], a[1] + k * b[1], a[2] + k * b[2])
-
-
-def _scaled(a: Vec3, k: float) -> Vec3:
-    return (k * a[0], k * a[1], k * a[2])
