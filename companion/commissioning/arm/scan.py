@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 from companion.commissioning.arm import bus
@@ -31,6 +32,7 @@ from companion.model.servos import hardware_error_text, kind_of, model_text
 from companion.preflight import arm as preflight
 from companion.preflight.checks import Check
 
+SYSFS: Final = Path("/sys/class/tty")
 SEARCHED: tuple[int, ...] = tuple(reversed(bus.BAUDS))
 """Baud rates of a full scan, in this order, after the vehicle file's rate."""
 
@@ -71,7 +73,9 @@ def scan_for(session: Session, only: int | None = None) -> Scan:
         return scan(device, progress=lambda text: status.update(f"searching for servos at {text}"), only=only)
 
 
-def scan(device: ArmDevice, *, progress: Callable[[str], None] = lambda _: None, only: int | None = None) -> Scan:
+def scan(
+    device: ArmDevice, *, progress: Callable[[str], None] = lambda _: None, sysfs: Path = SYSFS, only: int | None = None
+) -> Scan:
     """Ping at every baud rate and read the registers of every servo that answers. Nothing is written; torque stays off.
 
     Args:
@@ -98,7 +102,7 @@ def scan(device: ArmDevice, *, progress: Callable[[str], None] = lambda _: None,
             unreadable = any(kind_of(one.model) is not None and not one.registers for one in found)
             if answers.garbled or unreadable:
                 garbled.append(baud)
-    return Scan(tuple(tried), tuple(servos), tuple(garbled), dxl.usb_latency_ms(device.port))
+    return Scan(tuple(tried), tuple(servos), tuple(garbled), dxl.usb_latency_ms(device.port, sysfs))
 
 
 def _read(talk: ServoTalk, servo_id: int, model: int, firmware: int) -> FoundServo:
