@@ -7,16 +7,15 @@ import msgspec
 from companion.guardian.client import GuardianClient
 from companion.guardian.heartbeat import Heartbeat
 from companion.model.best_pose import best_pose, pose_used_s
+from companion.model.contact import ContactMode, ContactState
 from companion.model.flight_stage import PILOT_FLIES
+from companion.model.outputs import Outputs
 from companion.model.types import (
     IDENTITY_QUAT,
     AutopilotRequest,
     AutopilotStatus,
-    ContactMode,
-    ContactState,
     Inputs,
     LinkIdentity,
-    Outputs,
     PhaseKind,
     Vec3,
 )

@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from companion.model.types import ControlLog, TetherState, Vec3
+from companion.model.outputs import ControlLog, TetherState
+from companion.model.types import Vec3
 
 Values = tuple[object, ...]
 """Values for a rule's message, returned by a predicate whose condition holds."""

@@ -13,7 +13,8 @@ from typing import Final
 from companion.config.tether import Tether
 from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_rotate
-from companion.model.types import Joints, Quat, TetherState, Vec3
+from companion.model.outputs import TetherState
+from companion.model.types import Joints, Quat, Vec3
 from companion.safety.stop import StopModel
 from companion.safety.tether_pull import PullEstimate
 from companion.safety.tether_shape import Clearance, steepest_slope

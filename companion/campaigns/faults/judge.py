@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from companion.campaigns.faults.variants import Variant
 from companion.campaigns.runner import Row
 from companion.config.vehicle import Vehicle
-from companion.model.types import Event, Outcome, Outputs, PhaseKind, SafetyAction, Vec3
+from companion.model.outputs import Outputs
+from companion.model.types import Event, Outcome, PhaseKind, SafetyAction, Vec3
 from companion.sitl_config.faults import KINDS, FaultKind, FlightPhase
 
 COLUMNS = (

@@ -13,7 +13,8 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.io.qgroundcontrol.token_bucket import TokenBucket
-from companion.model.types import Event, Inputs, Outcome, Outputs, SafetyAction, Severity
+from companion.model.outputs import Outputs
+from companion.model.types import Event, Inputs, Outcome, SafetyAction, Severity
 
 COMPONENT = int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
 TEXT_BYTES = 50

@@ -13,8 +13,9 @@ import math
 
 from msgspec.structs import replace
 
+from companion.model.contact import ContactMode, ContactShift, ContactState
 from companion.model.frames import wrap_rad
-from companion.model.types import ContactMode, ContactShift, ContactState, Joints, Reference, Vec3
+from companion.model.types import Joints, Reference, Vec3
 
 TARE_S = 1.0
 """Time at rest before the approach, in which the force without contact is averaged."""

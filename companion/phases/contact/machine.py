@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from companion.config.vehicle import OBSERVER
 from companion.mission.air import Air
-from companion.model.types import ContactMode, ContactState
+from companion.model.contact import ContactMode, ContactState
 from companion.phases.contact import force as c
 from companion.phases.contact import points, sliding
 from companion.phases.contact.sliding import Stroke

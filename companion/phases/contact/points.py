@@ -13,7 +13,8 @@ from msgspec.structs import replace
 from companion.mission.air import Air
 from companion.model.algebra import dot
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import ContactMode, ContactState, FoundSurface, TouchedPoint, Vec3
+from companion.model.contact import ContactMode, ContactState, FoundSurface, TouchedPoint
+from companion.model.types import Vec3
 from companion.phases.contact import force as c
 from companion.phases.contact.surface import TILT_MAX_RAD, axes, plane, tool_turn_rad, turn_to
 from companion.phases.contact.way import Way, back_from_point_m

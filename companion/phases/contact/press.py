@@ -8,7 +8,7 @@ from typing import Literal
 from companion.config.phase import Duration
 from companion.mission.air import Air
 from companion.mission.phase import Checking, Planning
-from companion.model.types import ContactState
+from companion.model.contact import ContactState
 from companion.phases.contact import checks, machine
 from companion.phases.contact.base import Pressing, opening_of
 from companion.phases.contact.force import PRESS_RAMP_S

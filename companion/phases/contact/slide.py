@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from companion.config.base import Vector2, refuse
 from companion.mission.air import Air, Expectation
 from companion.mission.phase import Checking, Planning
-from companion.model.types import ContactMode, ContactState
+from companion.model.contact import ContactMode, ContactState
 from companion.phases.contact import checks, machine
 from companion.phases.contact.base import ContactSpeed, Pressing, opening_of
 from companion.phases.contact.force import PRESS_RAMP_S

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 from msgspec.structs import replace
 
 from companion.mission.air import Air
-from companion.model.types import ContactMode, ContactState, Vec2, Vec3
+from companion.model.contact import ContactMode, ContactState
+from companion.model.types import Vec2, Vec3
 from companion.phases.contact import force as c
 from companion.phases.contact.points import ahead_m
 from companion.phases.contact.surface import axes

@@ -19,7 +19,8 @@ from companion.mission.phase import Checking, Phase, Planning
 from companion.model.codec import Record
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.markers import BallState
-from companion.model.types import ChaseState, Reference, SafetyAction, Severity, Vec3
+from companion.model.outputs import ChaseState
+from companion.model.types import Reference, SafetyAction, Severity, Vec3
 from companion.phases.intercept import ball
 from companion.phases.intercept.ball import Candidate, Point
 from companion.phases.intercept.meeting import FROZEN_S, Lag, Plan, Reach, meetings, reach_of
