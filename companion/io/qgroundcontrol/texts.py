@@ -12,9 +12,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.io.qgroundcontrol.token_bucket import TokenBucket
 from companion.model.outputs import Outputs
 from companion.model.types import Event, Inputs, Outcome, SafetyAction, Severity
+from companion.runtime.token_bucket import TokenBucket
 
 COMPONENT = int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
 TEXT_BYTES = 50
