@@ -40,11 +40,6 @@ class Wanted:
     measured: bool = False
     """Whether the value is measured on each installation. If so, a value within `limits` other than PX4's default is left unchanged."""
 
-    @property
-    def integer(self) -> bool:
-        """Whether PX4 stores the parameter as an INT32."""
-        return isinstance(self.value, int)
-
     def accepts(self, value: Value, vehicle: Vehicle) -> bool:
         """Return whether this vehicle can fly with the value in PX4."""
         if self.ok:
