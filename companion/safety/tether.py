@@ -42,11 +42,6 @@ def slack_m(tether: Tether, position_world_m: Vec3, attitude_wxyz: Quat) -> floa
     return tether.length_m - distance_m(tether, position_world_m, attitude_wxyz)
 
 
-def allowed_m(tether: Tether) -> float:
-    """Return the largest distance from the anchor that a plan may use, m."""
-    return tether.length_m - tether.margin_m
-
-
 class Winding:
     """Counts the turns of a direction, starting at the first direction given."""
 
