@@ -40,7 +40,7 @@ def weighed(air: Air, contact: ContactState, way: Way) -> ContactState:
 def touching(air: Air, contact: ContactState, way: Way) -> ContactState:
     """Return the state after one tick at a point: the light force is held, and the tip's position averaged."""
     dt_s, t_s = air.dt_s, air.t_s
-    contact = c.pressed(contact, t_s, dt_s, way.touch_n, way.touch_n)
+    contact = c.pressed(contact, dt_s, way.touch_n, way.touch_n)
     felt = c.touches(contact, way.touch_n)
     contact = c.timed(contact, dt_s, not felt)
     if contact.beyond_s >= c.LOST_S:  # gusts have feigned a touch

@@ -33,7 +33,7 @@ class Press(Pressing):
     def problems(self, c: Checking) -> Iterator[str]:
         """Check the reserves for the force."""
         way = opening_of(c.earlier).way
-        yield from checks.force_problems(c.vehicle, c.begin, way.direction_world, self.force_n)
+        yield from checks.force_problems(c.vehicle, way.direction_world, self.force_n)
         yield from checks.torque_problems(c.vehicle, c.begin, way, self.force_n)
 
     def touching(self, air: Air, contact: ContactState, way: Way) -> ContactState:

@@ -64,7 +64,7 @@ class Slide(Pressing):
         for phase in takewhile(lambda phase: phase is not opening, reversed(c.earlier)):
             if isinstance(phase, Slide):
                 right_m, up_m = right_m + phase.displacement_m[0], up_m + phase.displacement_m[1]
-        yield from checks.force_problems(c.vehicle, c.begin, opening.way.direction_world, self.force_n)
+        yield from checks.force_problems(c.vehicle, opening.way.direction_world, self.force_n)
         yield from checks.slide_problems(
             c.vehicle, c.mission.limits, c.begin, opening.way, self.stroke, (right_m, up_m)
         )

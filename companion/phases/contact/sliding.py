@@ -67,7 +67,7 @@ def begun(contact: ContactState, stroke: Stroke) -> ContactState:
 def slid(air: Air, contact: ContactState, stroke: Stroke, touch_n: float) -> ContactState:
     """Return the state after one tick of a slide."""
     dt_s = air.dt_s
-    contact = c.pressed(contact, air.t_s, dt_s, touch_n, stroke.force_n)
+    contact = c.pressed(contact, dt_s, touch_n, stroke.force_n)
     slides = contact.mode is ContactMode.SLIDE
     if not slides and contact.wanted_n != stroke.force_n:
         return contact
