@@ -128,9 +128,7 @@ class LatencyLink(MavsdkAutopilot):
         self._raw.append((arrived_s, 1e-6 * time_us, sample))
 
     def _on_sync(self, arrived_s: float, payload: bytes) -> None:
-        self._take_sync(arrived_s, *_TIMESYNC.unpack_from(payload.ljust(_TIMESYNC.size, b"\0")))
-
-    def _take_sync(self, arrived_s: float, px4_ns: int, asked_ns: int) -> None:
+        px4_ns, asked_ns = _TIMESYNC.unpack_from(payload.ljust(_TIMESYNC.size, b"\0"))
         if px4_ns == 0 or asked_ns not in self._asked_ns:
             return  # PX4's own request, or an answer to another program
         self._asked_ns.discard(asked_ns)
