@@ -31,7 +31,8 @@ from companion.cli.main import main
 from companion.config.arm import Tool
 from companion.config.tether import Tether
 from companion.config.vehicle import Vehicle
-from companion.model.types import Inputs, Outputs
+from companion.model.outputs import Outputs
+from companion.model.types import Inputs
 from companion.sitl_config.loader import load_sitl
 
 ROOT = Path(__file__).parents[1]

@@ -20,6 +20,7 @@ from companion.model.observations import (
     ServoReport,
     StateCounts,
 )
+from companion.model.outputs import Outputs
 from companion.model.types import (
     ArmState,
     AttitudeSetpoint,
@@ -30,7 +31,6 @@ from companion.model.types import (
     Joints,
     LinkIdentity,
     MocapPose,
-    Outputs,
     VehicleState,
 )
 

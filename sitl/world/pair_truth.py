@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from companion.model.frames import quat_rotate
+from companion.model.outputs import Outputs
 from companion.model.team import CarryState, Grip
-from companion.model.types import Outputs
 from sitl.world.scene import Scene
 
 

@@ -23,7 +23,8 @@ from companion.analysis.replay import replay
 from companion.analysis.report import write_report
 from companion.analysis.summary import empty_summary, summarise, write_summary
 from companion.model.codec import differences
-from companion.model.types import Inputs, Outputs, PhaseKind, Sent
+from companion.model.outputs import Outputs, Sent
+from companion.model.types import Inputs, PhaseKind
 from tests.analysis.synthetic_flight import CATCH_S, CONFIG, log_of_rows, record_flight, synthetic_flight
 from tests.support import ROOT
 

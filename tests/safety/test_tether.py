@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from companion.config.vehicle import Vehicle
 from companion.model.algebra import plus
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
-from companion.model.types import Joints, Outcome, Outputs, PhaseKind, Quat, SafetyAction, TetherState, Vec3
+from companion.model.outputs import Outputs, TetherState
+from companion.model.types import Joints, Outcome, PhaseKind, Quat, SafetyAction, Vec3
 from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
 from companion.safety.tether_pull import PullEstimate
