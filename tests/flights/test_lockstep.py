@@ -88,8 +88,11 @@ def test_it_leaves_a_summary_a_report_and_a_log_that_replays(flown: Flown) -> No
 
 def test_beside_busy_programs_it_repeats_itself_bit_for_bit(flown: Flown, tmp_path: Path) -> None:
     log = flown.log
-    with busy_programs(len(os.sched_getaffinity(0))), sandbox_in(tmp_path / "again") as sandbox:
-        ended = sandbox.run(*IN_LAB, "--speed", "3")
+    with sandbox_in(tmp_path / "again") as sandbox, sandbox.start(*IN_LAB, "--speed", "3") as running:
+        running.wait_for("  take-off\n")
+        with busy_programs(len(os.sched_getaffinity(0))):
+            running.wait_for("  land\n")
+        ended = running.end()
         assert ended.code == EXIT_OK, ended
         again = FlightLog.read(sandbox.cwd / "out/flight.mcap")
     assert len(again.inputs) == len(log.inputs)
