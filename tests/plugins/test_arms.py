@@ -384,68 +384,53 @@ def test_angles_rates_and_torques_are_those_of_the_joints() -> None:
     assert made().calls == ["open", "torque_off", "close"] and made().written[-1] == (0.0, 0.0)
 
 
-def test_a_torque_that_is_not_renewed_is_withdrawn() -> None:
-    async def run() -> None:
-        async with PluginArm(device("steady"), ARM, flight_clock()) as arm:
-            arm.write_torque((1.0, 1.0))
-            await state_when(arm, lambda state: (1.0, -1.0) in made().written)
-            await state_when(arm, lambda state: made().written[-1] == (0.0, 0.0))
-
-    asyncio.run(run())
+async def test_a_torque_that_is_not_renewed_is_withdrawn() -> None:
+    async with PluginArm(device("steady"), ARM, flight_clock()) as arm:
+        arm.write_torque((1.0, 1.0))
+        await state_when(arm, lambda state: (1.0, -1.0) in made().written)
+        await state_when(arm, lambda state: made().written[-1] == (0.0, 0.0))
 
 
-def test_whole_turns_of_a_motor_do_not_matter() -> None:
-    async def run() -> None:
-        turned = [0.5 + 6.0 * math.pi, -0.25 - 2.0 * math.pi]
-        async with PluginArm(device("steady", angles=turned), ARM, flight_clock()) as arm:
-            state = arm.latest()
-            assert state is not None and state.angle_rad == pytest.approx((0.5, 0.5 * math.pi + 0.25))
-
-    asyncio.run(run())
+async def test_whole_turns_of_a_motor_do_not_matter() -> None:
+    turned = [0.5 + 6.0 * math.pi, -0.25 - 2.0 * math.pi]
+    async with PluginArm(device("steady", angles=turned), ARM, flight_clock()) as arm:
+        state = arm.latest()
+        assert state is not None and state.angle_rad == pytest.approx((0.5, 0.5 * math.pi + 0.25))
 
 
 @pytest.mark.parametrize("name", ["raising", "nan", "short", "unwritable"])
-def test_an_arm_that_fails_in_the_air_counts_failed_cycles(name: str) -> None:
-    async def run() -> None:
-        async with PluginArm(device(name, after=60), ARM, flight_clock()) as arm:
-            async with asyncio.timeout(LONG_S):
-                while (state := await arm.read(1.0)) is None or state.read_failures < 5:
-                    arm.write_torque((0.0, 0.0))
-            assert arm.problem
-
-    asyncio.run(run())
+async def test_an_arm_that_fails_in_the_air_counts_failed_cycles(name: str) -> None:
+    async with PluginArm(device(name, after=60), ARM, flight_clock()) as arm:
+        async with asyncio.timeout(LONG_S):
+            while (state := await arm.read(1.0)) is None or state.read_failures < 5:
+                arm.write_torque((0.0, 0.0))
+        assert arm.problem
 
 
-def test_a_fault_of_a_motor_is_a_hardware_error() -> None:
-    async def run() -> None:
-        async with PluginArm(device("faulty", after=60), ARM, flight_clock()) as arm:
+async def test_a_fault_of_a_motor_is_a_hardware_error() -> None:
+    async with PluginArm(device("faulty", after=60), ARM, flight_clock()) as arm:
+        state = await state_when(arm, lambda state: any(state.hardware_error))
+        assert error_text(state.hardware_error) == "servo 1: fault of the motor"
+
+
+async def test_an_odrive_turns_into_a_joint(monkeypatch: pytest.MonkeyPatch) -> None:
+    with odrives(monkeypatch) as motors:
+        async with PluginArm(odrive(), ODRIVE_ARM, flight_clock()) as arm:
+            assert arm.statement == ArmStatement(
+                "ODrive, firmware 0.6.10 and 0.6.10",
+                "the ODrives' own watchdogs, as set with odrivetool (not read), after 100 ms",
+            )
+            state = arm.latest()
+            assert state is not None and motors.states == {3: 8, 5: 8}
+            assert state.angle_rad == pytest.approx((0.75 / 8 * 2 * math.pi, -1.25 / 8 * 2 * math.pi))
+            assert state.velocity_rad_s == pytest.approx((math.pi / 8, -math.pi / 8))
+            assert state.temperature_c == (42.0, 42.0)
+            # Renewed, because a torque is withdrawn after 0.1 s.
+            state = await state_when(arm, lambda state: arm.write_torque((4.0, 2.0)) and state.torque_nm[1] == 2.0)
+            assert state.torque_nm == (4.0, 2.0)
+            motors.errors[5] = 0x2000
             state = await state_when(arm, lambda state: any(state.hardware_error))
-            assert error_text(state.hardware_error) == "servo 1: fault of the motor"
-
-    asyncio.run(run())
-
-
-def test_an_odrive_turns_into_a_joint(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def run() -> None:
-        with odrives(monkeypatch) as motors:
-            async with PluginArm(odrive(), ODRIVE_ARM, flight_clock()) as arm:
-                assert arm.statement == ArmStatement(
-                    "ODrive, firmware 0.6.10 and 0.6.10",
-                    "the ODrives' own watchdogs, as set with odrivetool (not read), after 100 ms",
-                )
-                state = arm.latest()
-                assert state is not None and motors.states == {3: 8, 5: 8}
-                assert state.angle_rad == pytest.approx((0.75 / 8 * 2 * math.pi, -1.25 / 8 * 2 * math.pi))
-                assert state.velocity_rad_s == pytest.approx((math.pi / 8, -math.pi / 8))
-                assert state.temperature_c == (42.0, 42.0)
-                # Renewed, because a torque is withdrawn after 0.1 s.
-                state = await state_when(arm, lambda state: arm.write_torque((4.0, 2.0)) and state.torque_nm[1] == 2.0)
-                assert state.torque_nm == (4.0, 2.0)
-                motors.errors[5] = 0x2000
-                state = await state_when(arm, lambda state: any(state.hardware_error))
-                assert error_text(state.hardware_error) == "servo 2: fault of the motor"
-
-    asyncio.run(run())
+            assert error_text(state.hardware_error) == "servo 2: fault of the motor"
 
 
 def test_an_odrive_that_is_silent_or_has_a_slow_watchdog_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -526,12 +511,9 @@ def test_the_simulated_world_has_servos_with_the_torque_of_the_motors(tmp_path: 
     ]
 
 
-def test_an_arm_of_strong_motors_opens_in_the_simulated_world() -> None:
-    async def run() -> None:
-        async with servos_of(ODRIVE_ARM) as bus, open_arm(on_bus(bus), ODRIVE_ARM, flight_clock()) as arm:
-            assert arm.write_torque((20.0, -0.5)) == pytest.approx((20.0, -0.5), abs=0.02)
-
-    asyncio.run(run())
+async def test_an_arm_of_strong_motors_opens_in_the_simulated_world() -> None:
+    async with servos_of(ODRIVE_ARM) as bus, open_arm(on_bus(bus), ODRIVE_ARM, flight_clock()) as arm:
+        assert arm.write_torque((20.0, -0.5)) == pytest.approx((20.0, -0.5), abs=0.02)
 
 
 def test_a_vehicle_with_another_arm_completes_the_catch_in_the_fast_loop(tmp_path: Path) -> None:

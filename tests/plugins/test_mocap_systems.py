@@ -204,28 +204,25 @@ def check_pose(pose: MocapPose) -> None:
     assert pose.tracking_valid
 
 
-def test_flight_and_guardian_receive_the_same_poses() -> None:
-    async def run() -> None:
-        port, clock = free_udp_port(), flight_clock()
-        device = vicon(port)
-        poses: list[MocapPose] = []
-        client = GuardianMocap(settings_of(device), lambda: 100.0)
-        async with (
-            broadcasting(port, STRANGER, QUAD),
-            MocapDriver(device, clock, poses.append) as driver,
-        ):
-            pose = driver.latest()
-            assert pose is not None and pose is poses[-1] and 0.0 <= clock() - pose.stamp_s < 1.0
-            check_pose(pose)
-            assert driver.server is not None and driver.server.name == "Vicon Tracker, UDP object stream"
-            assert driver.counts().malformed == 0
-            client.keep_connected()
-            seen = client.poses(origin_s=60.0)
-            assert seen and client.tracked_s == 100.0 and 39.0 < seen[-1].stamp_s <= 40.0
-            check_pose(seen[-1])
-        client.close()
-
-    asyncio.run(run())
+async def test_flight_and_guardian_receive_the_same_poses() -> None:
+    port, clock = free_udp_port(), flight_clock()
+    device = vicon(port)
+    poses: list[MocapPose] = []
+    client = GuardianMocap(settings_of(device), lambda: 100.0)
+    async with (
+        broadcasting(port, STRANGER, QUAD),
+        MocapDriver(device, clock, poses.append) as driver,
+    ):
+        pose = driver.latest()
+        assert pose is not None and pose is poses[-1] and 0.0 <= clock() - pose.stamp_s < 1.0
+        check_pose(pose)
+        assert driver.server is not None and driver.server.name == "Vicon Tracker, UDP object stream"
+        assert driver.counts().malformed == 0
+        client.keep_connected()
+        seen = client.poses(origin_s=60.0)
+        assert seen and client.tracked_s == 100.0 and 39.0 < seen[-1].stamp_s <= 40.0
+        check_pose(seen[-1])
+    client.close()
 
 
 def test_the_example_and_a_system_that_answers_every_call_keep_the_contract() -> None:
@@ -292,16 +289,13 @@ def test_options_that_the_system_refuses_break_the_contract() -> None:
         check_mocap(MocapDevice(type="vicon", server="server", rigid_body_id=1))
 
 
-def test_an_object_that_is_not_tracked_is_reported() -> None:
-    async def run() -> None:
-        port = free_udp_port()
-        device = vicon(port)
-        driver = MocapDriver(device, flight_clock(), lambda _: None, body_timeout_s=0.3)
-        async with broadcasting(port, ("quad", (0.0,) * 6)):
-            with pytest.raises(DeviceError, match="rigid body 1 was not tracked within"):
-                await driver.__aenter__()
-
-    asyncio.run(run())
+async def test_an_object_that_is_not_tracked_is_reported() -> None:
+    port = free_udp_port()
+    device = vicon(port)
+    driver = MocapDriver(device, flight_clock(), lambda _: None, body_timeout_s=0.3)
+    async with broadcasting(port, ("quad", (0.0,) * 6)):
+        with pytest.raises(DeviceError, match="rigid body 1 was not tracked within"):
+            await driver.__aenter__()
 
 
 def test_damaged_datagrams_are_rejected() -> None:
@@ -401,15 +395,12 @@ INVALID: list[tuple[dict[str, JsonValue], str]] = [
 
 
 @pytest.mark.parametrize(("options", "expected"), INVALID[:1])
-def test_the_flight_rejects_invalid_poses(options: dict[str, JsonValue], expected: str) -> None:
-    async def run() -> None:
-        delivered: list[MocapPose] = []
-        driver = MocapDriver(scripted(**options), flight_clock(), delivered.append, body_timeout_s=0.01)
-        with pytest.raises(DeviceError, match=f"rigid body 1 was never seen .* the newest problem: .*{expected}"):
-            await driver.__aenter__()
-        assert not delivered and driver.counts().malformed >= 1
-
-    asyncio.run(run())
+async def test_the_flight_rejects_invalid_poses(options: dict[str, JsonValue], expected: str) -> None:
+    delivered: list[MocapPose] = []
+    driver = MocapDriver(scripted(**options), flight_clock(), delivered.append, body_timeout_s=0.01)
+    with pytest.raises(DeviceError, match=f"rigid body 1 was never seen .* the newest problem: .*{expected}"):
+        await driver.__aenter__()
+    assert not delivered and driver.counts().malformed >= 1
 
 
 @pytest.mark.parametrize(("options", "expected"), INVALID)
@@ -485,15 +476,11 @@ def test_a_problem_that_raises_is_reported_by_the_guardian() -> None:
     assert client.poses() == [] and client.problem == "ValueError: not connected"
 
 
-def test_a_call_that_waits_is_reported() -> None:
+async def test_a_call_that_waits_is_reported() -> None:
     times_s = count(step=0.02)
     driver = MocapDriver(scripted(), lambda: next(times_s), lambda _: None)
-
-    async def run() -> None:
-        async with driver:
-            assert driver.counts().problem == "keep_connected() took 20 ms, limit 10 ms; no call of a client may wait"
-
-    asyncio.run(run())
+    async with driver:
+        assert driver.counts().problem == "keep_connected() took 20 ms, limit 10 ms; no call of a client may wait"
 
 
 @pytest.mark.parametrize(
@@ -503,21 +490,17 @@ def test_a_call_that_waits_is_reported() -> None:
         ("nonsense", r"TypeError: poses\(\) returned \['a pose'\], expected a list of MocapPose"),
     ],
 )
-def test_exceptions_of_a_client_are_contained(system: str, expected: str) -> None:
+async def test_exceptions_of_a_client_are_contained(system: str, expected: str) -> None:
     device = MocapDevice(type=system, server="server", rigid_body_id=1)
     client = GuardianMocap(settings_of(device))
     client.keep_connected()
     assert client.poses() == [] and client.tracked_s < 0.0
     client.close()
     assert client.problem is not None and re.match(expected, client.problem)
-
-    async def run() -> None:
-        driver = MocapDriver(device, flight_clock(), lambda _: None, body_timeout_s=0.1)
-        with pytest.raises(DeviceError, match=f"rigid body 1 was never seen .* the newest problem: {expected}"):
-            await driver.__aenter__()
-        assert driver.counts().malformed >= 2
-
-    asyncio.run(run())
+    driver = MocapDriver(device, flight_clock(), lambda _: None, body_timeout_s=0.1)
+    with pytest.raises(DeviceError, match=f"rigid body 1 was never seen .* the newest problem: {expected}"):
+        await driver.__aenter__()
+    assert driver.counts().malformed >= 2
 
 
 def test_a_client_that_cannot_be_made_refuses_the_flight() -> None:
