@@ -20,7 +20,8 @@ from companion.io.protocols import DeviceError, ForceTorque
 from companion.model.types import ForceSample
 from companion.runtime.clock import flight_clock
 from sitl.force_torque import ForceTorqueServer
-from tests.support import DEADLINE_S, plugged, serial_line
+from tests.support import DEADLINE_S
+from tests.wires import plugged, serial_line
 
 # 0x55AA and -0x55AB in counts: SOP and EOP in the payload, both ways round.
 AWKWARD = Wrench(

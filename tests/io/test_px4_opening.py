@@ -24,7 +24,8 @@ from companion.model.types import (
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import PARAMS, Px4Peer
 from tests.io.test_px4 import ARM_DISARM, armed, edge, linked, refused
-from tests.support import DEADLINE_S, eventually, free_udp_port, serial_line
+from tests.support import DEADLINE_S, eventually, free_udp_port
+from tests.wires import serial_line
 
 
 async def test_parameters_and_firmware_are_read_from_the_wire_and_parameters_written() -> None:
