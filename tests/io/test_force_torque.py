@@ -189,12 +189,7 @@ async def test_start_and_stop_bytes_in_the_payload_and_noise_between_packets() -
     async with ForceTorqueServer() as server, world(server):
         server.set_wrench(AWKWARD.force_n, AWKWARD.torque_nm)
         async with driver(server.port) as edge:
-            for noise in (
-                b"\x55\xaa\x55",
-                b"\x00" * 7,
-                rft.encode_wrench(Command.START, AWKWARD)[:9],
-                b"\x55" * 30,
-            ):
+            for noise in (b"\x55\xaa\x55", b"\x00" * 7, rft.encode_wrench(Command.START, AWKWARD)[:9], b"\x55" * 30):
                 server.inject(noise)
                 for sample in await edge.tare_samples(0.05):
                     assert sample.force_sensor_n == AWKWARD.force_n

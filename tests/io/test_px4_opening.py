@@ -17,10 +17,7 @@ from companion.io.protocols import DeviceError
 from companion.io.px4 import params as autopilot_params
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.estimator import EstimatorReport
-from companion.model.types import (
-    AttitudeSetpoint,
-    AutopilotRequest,
-)
+from companion.model.types import AttitudeSetpoint, AutopilotRequest
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import PARAMS, Px4Peer
 from tests.io.test_px4 import ARM_DISARM, armed, edge, linked, refused

@@ -123,10 +123,7 @@ async def test_flight_and_guardian_receive_the_same_poses() -> None:
     device = vicon(port)
     poses: list[MocapPose] = []
     client = GuardianMocap(settings_of(device), lambda: 100.0)
-    async with (
-        broadcasting(port, STRANGER, QUAD),
-        MocapDriver(device, clock, poses.append) as driver,
-    ):
+    async with broadcasting(port, STRANGER, QUAD), MocapDriver(device, clock, poses.append) as driver:
         pose = driver.latest()
         assert pose is not None and pose is poses[-1] and 0.0 <= clock() - pose.stamp_s < 1.0
         check_pose(pose)

@@ -20,10 +20,7 @@ def event_ids(result: FastResult) -> list[str]:
 
 @pytest.mark.parametrize(
     "overrides",
-    [
-        ("world.payload_kg=0.1", "world.wind_m_s=[3, 0, 0]"),
-        ("world.payload_kg=0.4", "world.hover_thrust_error=-0.1"),
-    ],
+    [("world.payload_kg=0.1", "world.wind_m_s=[3, 0, 0]"), ("world.payload_kg=0.4", "world.hover_thrust_error=-0.1")],
 )
 def test_an_ordinary_flight_raises_no_alarm(overrides: tuple[str, ...]) -> None:
     result = FastFlight(config(*overrides)).run(until_mission_s=11.0)

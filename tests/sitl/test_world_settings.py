@@ -33,12 +33,7 @@ ELSEWHERE = {
 }
 """Settings that the fast closed loop does not read, and why."""
 
-PLATE = {
-    "point_m": (-0.544, -0.03, 0.136),
-    "normal": (0.1, 0.1, 1.0),
-    "size_m": (0.05, 0.05),
-    "stiffness_n_m": 500.0,
-}
+PLATE = {"point_m": (-0.544, -0.03, 0.136), "normal": (0.1, 0.1, 1.0), "size_m": (0.05, 0.05), "stiffness_n_m": 500.0}
 """A surface whose corner is under the tip of the folded rod."""
 
 
