@@ -16,7 +16,7 @@ CARRY = Path("configs/teams/carry.yaml")
 def problems(*overrides: str) -> list[str]:
     with pytest.raises(ConfigError) as refused:
         load_team(CARRY, overrides)
-    return refused.value.lines
+    return list(refused.value.lines)
 
 
 def test_the_shipped_team_has_two_members_that_differ_where_they_must() -> None:

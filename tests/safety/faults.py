@@ -12,6 +12,7 @@ from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.outputs import ControlLog
+from companion.model.team import Grip
 from companion.model.types import FlightMode, Inputs, OperatorCommand
 from companion.safety.flight_context import FlightContext
 from companion.safety.rule import Rule, Subject
@@ -29,12 +30,17 @@ from tests.safety.healthy import (
     healthy,
     put,
     stopped,
+    with_partner,
 )
 
 VEHICLE = load_vehicle("configs/vehicles/tarot650_2r.yaml")
 
 
 EXTERNAL = load_vehicle("configs/vehicles/tarot650_2r.yaml", overrides=["vehicle.devices.mocap.type=external"])
+
+
+MEMBER = load_vehicle("configs/vehicles/tarot650_2r.yaml", overrides=["vehicle.devices.team.port=14700"])
+"""One of a team of two."""
 
 
 NO_INERTIAL = load_vehicle(
@@ -181,7 +187,34 @@ def swinging_joint(i: Inputs) -> Inputs:
     return put("arm", velocity_rad_s=(0.7 + 1.5 * math.sin(math.tau * 16.0 * (i.t_s - START_S)), 0.0))(i)
 
 
+def heard(**fields: object) -> Change:
+    """What the other vehicle of a team says."""
+
+    def change(i: Inputs) -> Inputs:
+        partner = with_partner(i).partner
+        assert partner is not None
+        return replace(i, partner=replace(partner, said=replace(partner.said, **fields)))
+
+    return change
+
+
+def carrying(**changes: object) -> FlightContext:
+    return flying(grip=Grip.CARRYING, **changes)
+
+
+def unheard(i: Inputs) -> Inputs:
+    """The other vehicle has said nothing since the start."""
+    return replace(i, partner=with_partner(healthy()).partner)
+
+
 FAULTS: dict[str, Fault] = {
+    "partner_quiet": Fault(unheard),
+    "partner_silent": Fault(unheard, carrying),
+    "partner_holds": Fault(heard(holds=True), carrying),
+    "partner_lands": Fault(heard(lands=True), carrying),
+    "partner_let_go": Fault(heard(grip=Grip.FREE), carrying),
+    "partner_near": Fault(heard(position_world_m=(0.0, 1.0, 1.0)), carrying),
+    "bar_force_high": Fault(context=lambda: carrying(control=control(force_ext_world_n=(0.0, 12.0, 0.0)))),
     "estimator_silent": Fault(lambda i: replace(i, estimator=fed_by_another(healthy()).estimator)),
     "vision_lost": Fault(estimator(flags=0b1111)),
     "vision_rejected": Fault(estimator(position_horizontal_ratio=1.2)),
@@ -290,6 +323,8 @@ def stream(rule_id: str) -> list[Inputs]:
 
 def seen_by(rule: Rule) -> tuple[Vehicle, list[Inputs]]:
     """The machine to which the rule belongs, and what it sees."""
+    if rule.subject is Subject.PARTNER:
+        return MEMBER, [i if i.partner is not None else with_partner(i) for i in stream(rule.id)]
     if rule.subject is not Subject.VISION:
         return VEHICLE, stream(rule.id)
     return EXTERNAL, [fed_by_another(i) for i in stream(rule.id)]

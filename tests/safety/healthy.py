@@ -12,6 +12,7 @@ from companion.config.vehicle import Vehicle
 from companion.model.estimator import EstimatorReport
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.outputs import ControlLog, TetherState
+from companion.model.team import Grip, PartnerState, TeamState
 from companion.model.types import (
     ArmState,
     AutopilotStatus,
@@ -116,6 +117,13 @@ def fed_by_another(i: Inputs) -> Inputs:
         position_vertical_accuracy_m=0.005,
     )
     return msgspec.structs.replace(i, mocap=None, estimator=i.estimator or report)
+
+
+def with_partner(i: Inputs) -> Inputs:
+    """The same machine in a team, 1.6 m from the other, which is heard 50 times a second."""
+    said = TeamState(grip=Grip.CARRYING, holds=False, lands=False, px4_lands=False, position_world_m=(0.0, 1.6, 1.0))
+    heard_s = START_S + TICK_S * (i.tick - i.tick % 4)
+    return msgspec.structs.replace(i, partner=PartnerState(stamp_s=heard_s, said=said))
 
 
 def flying(**changes: object) -> FlightContext:

@@ -111,6 +111,13 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "tether_near": (None, WARN, 0.205),
     "tether_wound": (None, HOLD, 0.205),
     "tether_separated": (None, LAND, 0.105),
+    "partner_quiet": (WARN, WARN, 0.305),  # nothing connects the two yet
+    "partner_silent": (None, LAND, 0.305),
+    "partner_holds": (None, HOLD, 0.015),
+    "partner_lands": (None, LAND, 0.015),
+    "partner_let_go": (None, LAND, 0.115),
+    "partner_near": (None, LAND, 0.065),
+    "bar_force_high": (None, LAND, 0.300),
 }
 """What each rule must request on the ground and in the air (None: it is not reported), and how long after the start of the stream,
 in s, its event must come. Written from the hazards, not from the table of the rules: a change of a row must be made here as well.
@@ -131,7 +138,8 @@ READS = """
     too_fast 2.1 2.0; climbs_too_fast 1.6 1.5; sinks_too_fast 1.6 1.5; geofence_left -1.90 0.00 1.00;
     geofence_near 2.29 0.00 1.00; tracking_warn 0.50 0.45; tracking_hold 0.70 0.60; tracking_error 1.20 0.80;
     thrust_saturated 54 1.0; contact_force_high 15.0 12.0; tether_short 0.05 0.10; tether_taut 1.20 0;
-    tether_snagged 0 1.20; tether_near 0.00 0.01; tether_wound 1.6 1.5; tether_separated 1.80
+    tether_snagged 0 1.20; tether_near 0.00 0.01; tether_wound 1.6 1.5; tether_separated 1.80; partner_quiet 0.3;
+    partner_silent 0.3; partner_near 1.00 1.03; bar_force_high 12.0 10.0
 """
 """The numbers that the operator reads in a rule's text, in its units: what was found, then the limit."""
 
@@ -178,6 +186,7 @@ def test_each_fault_is_reported_once_by_name_in_time_and_requests_its_action(rul
 def test_on_the_ground_only_what_matters_there_is_reported(rule: Rule) -> None:
     fault = FAULTS[rule.id]
     context = standing(
+        grip=fault.context().grip,
         offboard_expected=rule.id in ("pilot_took_over", "offboard_left"),
         found_armed=FOUND if rule.id == "armed_externally" else None,
         torque_refused="joint torque (nan, 0.0) is not finite" if rule.id == "torque_refused" else None,

@@ -46,7 +46,7 @@ def test_wind_of_5_m_s_from_ahead_is_no_tether_that_pulls() -> None:
 
 def snag(flight: FastFlight, at_s: float, anchor: Vec3, extra_m: float) -> None:
     """From `at_s` after arming on the line is held at `anchor`, and is that much longer than it is away."""
-    step, plant = flight.plant.step, flight.plant
+    act, plant = flight.plant.act, flight.plant
     done = False
 
     def hooked(armed: bool) -> None:
@@ -57,9 +57,9 @@ def snag(flight: FastFlight, at_s: float, anchor: Vec3, extra_m: float) -> None:
             scene = plant.scene
             scene.model.site_pos[scene.model.site("anchor").id] = anchor
             scene.model.tendon_range[0, 1] = math.dist(anchor, plant.truth.position_world_m) + extra_m
-        step(armed)
+        act(armed)
 
-    flight.plant.step = hooked  # type: ignore[method-assign]
+    flight.plant.act = hooked  # type: ignore[method-assign]
 
 
 def first_s(result: FastResult, is_so: Callable[[Outputs, Truth], bool]) -> float:

@@ -74,7 +74,7 @@ def test_a_member_whose_process_is_killed_brings_both_down(end: str) -> None:
 
 
 def test_a_member_that_lands_takes_the_other_and_the_bar_with_it() -> None:
-    team, result = flown("left.world.faults=[{kind: battery_sag, t_s: 14.0, size: 3.0}]")
+    team, result = flown("left.world.faults=[{kind: battery_sag, t_s: 14.0, size: 4.0}]")
     assert outcomes(result) == [Outcome.ABORTED, Outcome.ABORTED]
     assert "partner_lands" in ids(result.members[1])
     assert_both_down_unharmed(team)

@@ -1,0 +1,116 @@
+"""When a vehicle that holds a bar lets it go."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from companion.core.flight_state import FlightState
+from companion.core.let_go import let_go_if_better
+from companion.core.transition import Parameters, Transition
+from companion.mission.air import HeldBar, Observation
+from companion.model.flight_stage import Stage
+from companion.model.team import ClampCommand, Grip, PartnerState, TeamState
+from companion.model.types import ArmState, Inputs, SafetyAction
+from companion.safety.supervisor import SupervisorState
+from companion.sitl_config.team import load_team
+from tests.safety.healthy import ZERO3, healthy
+
+CONFIG = load_team("carry", world="ideal").left
+PARAMETERS = Parameters.of(CONFIG)
+BAR = HeldBar(stands_m=0.35, let_go_m=0.45, weight_n=1.5)
+CARRY_RAD = (1.309, 0.349)
+"""The clamp is 0.49 m below the body's origin."""
+T_S = 20.0
+
+
+def state(**fields: Any) -> FlightState:
+    held = replace(
+        PARAMETERS.initial_state(), stage=Stage.MISSION, grip=Grip.CARRYING, bar=BAR, clamp=ClampCommand.CLOSE
+    )
+    return replace(held, **fields)
+
+
+def inputs(height_m: float, partner: PartnerState | None) -> Inputs:
+    i = healthy(0, T_S)
+    assert i.vehicle is not None and i.mocap is not None and i.arm is not None
+    at = (0.0, 0.0, height_m)
+    arm: ArmState = replace(i.arm, angle_rad=CARRY_RAD)
+    level = (1.0, 0.0, 0.0, 0.0)
+    vehicle = replace(i.vehicle, position_world_m=at, attitude_wxyz=level)
+    mocap = replace(i.mocap, position_world_m=at, attitude_wxyz=level)
+    return replace(i, vehicle=vehicle, mocap=mocap, arm=arm, partner=partner)
+
+
+def said(**fields: Any) -> PartnerState:
+    nominal = TeamState(grip=Grip.CARRYING, holds=False, lands=False, px4_lands=False, position_world_m=ZERO3)
+    return PartnerState(stamp_s=T_S - 0.01, said=replace(nominal, **fields))
+
+
+def after(
+    held: FlightState, height_m: float = 1.3, partner: PartnerState | None = None, force_n: float = 2.0
+) -> FlightState:
+    observation = Observation(
+        inputs=inputs(height_m, partner),
+        airborne=True,
+        armed_by_others=False,
+        standing=None,
+        reference=None,
+        tether=None,
+        thrust_share=1.0,
+        pose_s=T_S,
+        dt_s=0.005,
+        force_world_n=(0.0, 0.0, -force_n),
+        disturbance_world_n=None,
+        position_error_m=ZERO3,
+        yaw_error_rad=0.0,
+    )
+    t = Transition(PARAMETERS, held, (), observation)
+    let_go_if_better(t)
+    return t.state
+
+
+def let_go(found: FlightState) -> bool:
+    assert (found.clamp is ClampCommand.OPEN) is (found.bar is None) is (found.grip is Grip.FREE)
+    return found.bar is None
+
+
+def test_a_bar_that_is_carried_is_kept_at_any_height() -> None:
+    for height_m in (0.85, 1.3):
+        assert not let_go(after(state(), height_m, said()))
+        assert not let_go(after(state(), height_m, said(px4_lands=True))), "the rules land it first"
+
+
+@pytest.mark.parametrize("stage", [Stage.MISSION, Stage.AUTOPILOT_LAND])
+def test_a_bar_that_pulls_too_hard_is_let_go_at_any_height(stage: Stage) -> None:
+    assert not let_go(after(state(stage=stage), 1.3, said(), force_n=17.0))
+    assert let_go(after(state(stage=stage), 1.3, said(), force_n=19.0))
+
+
+def test_a_vehicle_that_falls_lets_go_at_once() -> None:
+    assert let_go(after(state(supervisor=SupervisorState(action=SafetyAction.TERMINATE)), 1.3, said()))
+
+
+def test_a_landing_of_both_opens_the_clamp_at_its_time_and_not_by_height() -> None:
+    landing = state(aborting=True, opens_s=T_S + 0.01)
+    assert not let_go(after(landing, 0.85, said(lands=True)))
+    assert let_go(after(replace(landing, opens_s=T_S), 0.85, said(lands=True)))
+
+
+@pytest.mark.parametrize(
+    "partner",
+    [None, said(px4_lands=True), said(grip=Grip.FREE), replace(said(), stamp_s=T_S - 0.4)],
+    ids=["never heard", "landed by PX4", "free", "silent"],
+)
+def test_a_landing_of_one_alone_lets_go_when_the_feet_are_low(partner: PartnerState | None) -> None:
+    landing = state(aborting=True)
+    assert not let_go(after(landing, 0.96, partner))
+    assert let_go(after(landing, 0.93, partner))
+
+
+def test_a_vehicle_that_px4_lands_lets_go_when_the_feet_are_low() -> None:
+    landing = state(stage=Stage.AUTOPILOT_LAND)
+    assert not let_go(after(landing, 0.96, said()))
+    assert let_go(after(landing, 0.93, said()))
