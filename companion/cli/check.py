@@ -130,7 +130,7 @@ def _rows(
         line = stack.enter_context(_Line(people))
         if arguments.sitl is not None:
             line("starting the simulated world")
-            world = SitlProcess(sitl_config, scratch, px4=arguments.sitl == "px4")
+            world = SitlProcess.start(sitl_config, scratch, px4=arguments.sitl == "px4")
             stack.callback(world.stop)
             config = replace_device_settings(config, world.devices(line.world))
         line("recorder")
