@@ -144,7 +144,7 @@ class Launcher:
         self._recorder_pid: int | None = None
         self._guardian: GuardianProcess | None = None
         self._cpu_contention = CpuContention({})
-        self._flying = False
+        self.flying = False
         """Whether the flight process is ticking and sending ten status messages per second; False after the flight."""
 
     def request_landing(self) -> None:
@@ -349,7 +349,7 @@ class Launcher:
             elif flight_open and process.poll() is not None:
                 self._receive(channel)  # its last messages may have come after `select`
                 flight_open = False
-            elif flight_open and self._flying and not guardian.took_over and self._silent(heard_s):
+            elif flight_open and self.flying and not guardian.took_over and self._silent(heard_s):
                 text = f"flight: the flight process sent nothing for {FLIGHT_SILENT_TIMEOUT_S:g} s and was killed"
                 self._failures.append(text)
                 process.kill()
@@ -379,7 +379,7 @@ class Launcher:
             self._pace = (now_s - from_s) / (wall_s - from_wall_s)
 
     def _report_pace(self) -> None:
-        pace = None if self._time is None or not self._flying else self._time.pace()
+        pace = None if self._time is None or not self.flying else self._time.pace()
         if pace is not None and self._speed is not None:
             self._on_message(Pace(pace, self._speed))
 
@@ -403,7 +403,7 @@ class Launcher:
                 self._recorder_pid = message.recorder_pid
             case Status():
                 self._measure_pace()
-                self._flying = message.kind is not PhaseKind.DONE
+                self.flying = message.kind is not PhaseKind.DONE
             case FlightEvent():
                 self._events.append(message.for_summary())
                 if message.ends_flight:
