@@ -65,6 +65,8 @@ class Sitl:
         self._others = () if other is None else ((other, OTHER_BODY),)
         self._ball = mocap.ball
         """How motion capture sees the ball; None if the mission does not follow it."""
+        self._bar_body = () if mocap.bar_id is None else ((mocap.bar_id, "bar"),)
+        """Id and name of the bar's rigid body; empty if it has none."""
         self.slipped_s = self._slip_reported_s = 0.0
         self._origin_s = 0.0
         """World time 0 on the event loop's clock."""
@@ -126,6 +128,7 @@ class Sitl:
                 *((each.vehicle.devices.mocap.rigid_body_id, each.vehicle.name) for each in self.machines),
                 *self._others,
                 *self._ball_body,
+                *self._bar_body,
             ),
             clock=asyncio.get_running_loop().time if self._keeper is None else lambda: self._t_s,
             stamps=self._server_clock_s,
@@ -280,6 +283,8 @@ class Sitl:
             BodyPose(number, (*frame.markers, (0.0, 0.0, 0.0))[0], IDENTITY_QUAT, bool(frame.markers))
             for number, _ in self._ball_body
         ]
+        if frame.bar is not None:
+            poses += [BodyPose(number, *frame.bar) for number, _ in self._bar_body]
         for machine in self.machines:
             seen = frame if machine is first else machine.plant.mocap_at(frame.exposure_t_s)
             body = machine.vehicle.devices.mocap.rigid_body_id

@@ -103,11 +103,11 @@ class MachineWires:
             vehicle,
             config,
             self.autopilot,
-            [servo.drive for servo in self.servos],
+            self.servos,
             self._start,
             # In lockstep as in the fast closed loop: cameras expose at the end of a step, and all else happens there, too.
             between_steps=self.time is None,
-            jaws=None if self._jaws is None else self._jaws.drive,
+            jaws=self._jaws,
             scene=scene,
             number=number,
         )
