@@ -82,13 +82,13 @@ class SitlProcess:
     ) -> list[Self]:
         """Start the world of several vehicles, each with a flight of its own; as `start`."""
         times = [None if speed is None else SharedTime(speed) for _ in members]
-        pipes = [(*os.pipe(), *os.pipe()) for _ in members[1:]]
         arguments, inherited = [sys.executable, "-P", "-m", "sitl", "--for-launcher"], []
         for config, out in members:
             path = out / "sitl_config.json"
             write_text(path, config.model_dump_json(indent=1))
             arguments += ["--config", str(path)]
-        for hears, _, _, speaks in pipes:
+        pipes = [(*os.pipe(), *os.pipe()) for _ in members]
+        for hears, _, _, speaks in pipes[1:]:
             arguments += ["--channel", f"{hears},{speaks}"]
             inherited += [hears, speaks]
         for time_of in times:
@@ -102,16 +102,15 @@ class SitlProcess:
             process = subprocess.Popen(
                 arguments,
                 pass_fds=inherited,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
+                stdin=pipes[0][0],
+                stdout=pipes[0][3],
                 stderr=log,
                 start_new_session=True,
             )
         for time_of in times:
             if time_of is not None:
                 time_of.world_started()
-        assert process.stdin is not None and process.stdout is not None
-        ends: list[tuple[IO[bytes], IO[bytes]]] = [(process.stdin, process.stdout)]
+        ends: list[tuple[IO[bytes], IO[bytes]]] = []
         for hears, tells, listens, speaks in pipes:
             os.close(hears)
             os.close(speaks)
