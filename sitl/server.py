@@ -31,7 +31,7 @@ from sitl.plant import MocapFrame, Plant
 from sitl.px4.hil_link import Px4Error
 from sitl.record import TrueCourse, final_report
 from sitl.servo.bus import ServoBus
-from sitl.servo.from_config import plugged_in, servos_of
+from sitl.servo.from_config import jaws_servo_of, plugged_in, servos_of
 from sitl.servo.model import ServoModel
 from sitl.world.arm_handling import ArmHandling
 from sitl.world.start import Start
@@ -88,7 +88,8 @@ class Sitl:
         self._config = config
         self._on_message = on_message
         self.servos = servos_of(vehicle, config)
-        self._on_bus = plugged_in(self.servos, config)
+        self._jaws = jaws_servo_of(vehicle)
+        self._on_bus = plugged_in(self.servos, config) + ([] if self._jaws is None else [self._jaws])
         stub_ports = LinkPorts(ports.autopilot_local, ports.autopilot_remote)
         self.autopilot: AutopilotBackend = autopilot or StubBackend(
             vehicle.airframe,
@@ -111,6 +112,9 @@ class Sitl:
         self._others = () if other is None else ((other, OTHER_BODY),)
         self._ball = vehicle.devices.mocap.ball
         """How motion capture sees the ball; None if the mission does not follow it."""
+        bar_id = vehicle.devices.mocap.bar_id
+        self._bar_body = () if bar_id is None else ((bar_id, "bar"),)
+        """Id and name of the bar's rigid body; empty if it has none."""
         self._arm_handling = ArmHandling(vehicle.arm, start.arm_rad) if config.arm_handling and self.servos else None
         self.flight = ProcessFaults()
         self._course = TrueCourse()
@@ -129,7 +133,9 @@ class Sitl:
         vehicle, config = self._vehicle, self._config
         # In lockstep as in the fast closed loop: cameras expose at the end of a step, and all else happens there, too.
         between_steps = self._keeper is None
-        self.plant = Plant(vehicle, config, self.autopilot, self.servos, self._start, between_steps=between_steps)
+        self.plant = Plant(
+            vehicle, config, self.autopilot, self.servos, self._start, jaws=self._jaws, between_steps=between_steps
+        )
         self.autopilot.attach(self.plant.machine)
         self.faults = Faults(
             config,
@@ -150,7 +156,7 @@ class Sitl:
         assert self._keeper is not None
         if not self.autopilot.start_over():
             return
-        for servo in self.servos:
+        for servo in (*self.servos, *(() if self._jaws is None else (self._jaws,))):
             servo.drive.start_over()
         self._make_plant()
         if self.force is not None:
@@ -193,7 +199,7 @@ class Sitl:
             command_port=self._ports.mocap_command,
             data_port=self._ports.mocap_data,
             multicast_group=mocap.multicast_group if self._ports.multicast else None,
-            bodies=((mocap.rigid_body_id, self._vehicle.name), *self._others, *self._ball_body),
+            bodies=((mocap.rigid_body_id, self._vehicle.name), *self._others, *self._ball_body, *self._bar_body),
             clock=asyncio.get_running_loop().time if self._keeper is None else lambda: self.plant.t_s,
             stamps=self._server_clock_s,
         )
@@ -359,6 +365,8 @@ class Sitl:
             BodyPose(number, (*frame.markers, (0.0, 0.0, 0.0))[0], IDENTITY_QUAT, bool(frame.markers))
             for number, _ in self._ball_body
         ]
+        if frame.bar is not None:
+            others += [BodyPose(number, *frame.bar) for number, _ in self._bar_body]
         clock, ahead_s = self.faults.server_clock_s, self._ahead_s
         sent_s = t_s - frame.network_s
         single = {"markers": frame.markers} if self._ball is not None and not self._ball_body else {}
