@@ -6,12 +6,15 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from companion.campaigns.pair import PairRobustness
 from companion.campaigns.robustness.campaign import Robustness
 from companion.campaigns.robustness.cases import Case, Cases, read_cases
 from companion.cli.campaign import add_options, add_plan, checked, common, count, fly
 from companion.cli.options import MISSION_OR_DEFAULT_HELP
 from companion.config.document import ConfigError
-from companion.config.shipped import DEFAULT_MISSION
+from companion.config.shipped import DEFAULT_MISSION, names
+from companion.mission.check import check_mission
+from companion.sitl_config.team import TEAM_WORLD, load_team
 
 
 def add_parser(commands: Any) -> None:
@@ -57,7 +60,42 @@ def _model_error_override(text: str) -> str:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    return fly(_campaign(arguments), arguments, "robustness")
+    mission = arguments.mission or ""
+    team = mission in names("teams") or Path(mission).parent.name == "teams"
+    return fly(_of_team(arguments) if team else _campaign(arguments), arguments, "robustness")
+
+
+def _of_team(arguments: argparse.Namespace) -> PairRobustness:
+    """Return the campaign of a team file.
+
+    Raises:
+        ConfigError: one line per problem.
+    """
+    if arguments.cases is not None or arguments.keep is not None or arguments.vehicle is not None:
+        raise ConfigError("companion robustness: a team file takes no --cases, --keep and --vehicle")
+    world = arguments.world or TEAM_WORLD
+    team = load_team(
+        arguments.mission,
+        arguments.overrides,
+        controller_law=arguments.controller,
+        preset=arguments.preset,
+        world=world,
+    )
+    problems = [
+        text
+        for _, config in team.members
+        for text in check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases)
+    ]
+    if problems:
+        raise ConfigError(problems)
+    numbers = range(arguments.first, arguments.first + arguments.draws)
+    return PairRobustness(
+        configs=[team.left, team.right],
+        flights=[{"variant": 0, "name": f"draw {n}", "number": n} for n in numbers],
+        **common(arguments),
+        team=arguments.mission,
+        seed=arguments.seed,
+    )
 
 
 def _campaign(arguments: argparse.Namespace) -> Robustness:

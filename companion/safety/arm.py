@@ -13,6 +13,7 @@ from companion.model.algebra import dot, minus, plus, scaled
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.listing import listed
 from companion.model.servos import WATCHDOG_ERROR, hardware_error_text
+from companion.model.team import Grip
 from companion.model.types import ArmState, ForceSample, Inputs, Joints, Vec2, Vec3
 from companion.safety.flight_context import HOLDS, Age, FlightContext, Values
 from companion.safety.joint_swing import JointSwing
@@ -301,7 +302,7 @@ class ForceTracker:
             self._measured, self._felt = _Change(), _Change()
         elif self.trusted:
             self._disagree(dt_s, self._measured.update(dt_s, measured_n), self._felt.update(dt_s, felt_n))
-        if context.caught:
+        if context.caught or context.grip is not Grip.FREE:
             self.mean_n = _NO_FORCE
         else:
             self.mean_n = _lowpassed(self.mean_n, measured_n, dt_s / DRIFT_TIME_S)

@@ -27,6 +27,8 @@ class TeamTracker:
         """The newest announcement."""
         self.grip = Grip.FREE
         """What this vehicle has in its clamp."""
+        self.done = False
+        """Whether this vehicle has let go of the bar: the other may end its flight first."""
         self.force_n = 0.0
         """Force of the bar on the clamp; 0 while it holds nothing."""
         self.apart_m = math.inf
@@ -37,6 +39,7 @@ class TeamTracker:
         partner = i.partner
         self.said = None if partner is None else partner.said
         self.age_s = self._age.update(awake_s, None if partner is None else partner.stamp_s)
+        self.done = self.done or (self.grip in HELD and context.grip not in HELD)
         self.grip = context.grip
         log = context.control
         self.force_n = 0.0 if log is None or self.grip not in HELD else math.hypot(*log.force_ext_world_n)
@@ -48,7 +51,7 @@ class TeamTracker:
 
 def partner_quiet(t: TeamTracker, timeout_s: float) -> Values | None:
     """Fires if the other vehicle is silent while this one holds nothing."""
-    return (timeout_s,) if t.age_s > timeout_s and t.grip not in HELD else None
+    return (timeout_s,) if t.age_s > timeout_s and t.grip not in HELD and not t.done else None
 
 
 def partner_silent(t: TeamTracker, timeout_s: float) -> Values | None:

@@ -53,7 +53,7 @@ def load_team(
 
     Args:
         path: team file, or the name of a shipped one.
-        overrides: `--set` options for both members, after those of the file.
+        overrides: `--set` options for both members, or for one of them with `left.` or `right.` in front, after those of the file.
         controller_law: as in `load_flight`, for both members.
         preset: as in `load_flight`, for both members.
         hardware: as in `load_flight`.
@@ -74,7 +74,7 @@ def load_team(
     configs: dict[str, SitlConfig] = {}
     for end in ENDS:
         member: Member = getattr(team.members, end)
-        own = [*_overrides_of(end, member, document, grips), *overrides]
+        own = [*_overrides_of(end, member, document, grips), *_of_member(end, overrides)]
         if end == "right" and configs:
             origin = document.origin(("members", end))
             own.append(override_of("world.seed", configs["left"].world.seed + SEED_APART, origin))
@@ -96,6 +96,12 @@ def load_team(
     if lines := [f"{document.source}: {text}" for text in pair_problems(found.left, found.right)]:
         raise ConfigError(lines)
     return found
+
+
+def _of_member(end: End, overrides: Sequence[str]) -> list[str]:
+    """Return the options that hold for a member."""
+    named = [(text.lstrip().partition("."), text) for text in overrides]
+    return [rest if head in ENDS else text for (head, _, rest), text in named if head not in ENDS or head == end]
 
 
 def _grips_of(mission: Path, document: Document) -> list[int]:

@@ -12,11 +12,12 @@ from queue import SimpleQueue
 
 from companion.campaigns.process import CampaignError
 from companion.sitl_config.loader import SitlConfig
-from sitl.campaigns import compare, faults, robustness, tune
+from sitl.campaigns import compare, faults, pair, robustness, tune
 from sitl.campaigns.runner import Data, fly_all
 
 _CAMPAIGNS = {
     "compare": (compare.prepare, compare.fly),
+    "pair": (pair.prepare, pair.fly),
     "robustness": (robustness.prepare, robustness.fly),
     "faults": (faults.prepare, faults.fly),
     "tune": (tune.prepare, tune.fly),

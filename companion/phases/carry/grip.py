@@ -31,7 +31,7 @@ NOT_GRIPPED = EventDefinition(
     "the clamp did not reach the handle or did not close, or the other vehicle was not ready in time: the vehicle lets go and lands",
 )  # fmt: skip
 
-SETTLE_S: Final = 0.5
+SETTLE_S: Final = 1.5
 """Time for which the clamp must be at the handle before it closes."""
 LIFT_AFTER_S: Final = 0.5
 """Time from the decision to lift until both vehicles do, in which the announcement arrives many times."""
@@ -46,8 +46,10 @@ class Gripping(Record, frozen=True, kw_only=True):
     """Flight clock since which the clamp has been at the handle; infinite while it is not."""
     waits_since_s: float = math.inf
     """Flight clock at the end of the way to the handle."""
-    handle_m: Vec3 | None = None
-    """Measured minus planned place of the handle, world frame, low-passed; None while the bar is not seen."""
+    handle_m: Vec3 = (0.0, 0.0, 0.0)
+    """Measured minus planned place of the handle, world frame, low-passed; 0 while the bar has not been seen."""
+    beside_m: Vec3 = (math.inf, 0.0, 0.0)
+    """Place of the clamp minus that of the handle, low-passed; infinite before the end of the way."""
     offset_m: Vec3 = (0.0, 0.0, 0.0)
     """Offset of the reference: to where the handle is, and from the grip on to where the vehicle is held."""
     closes: bool = False
@@ -71,7 +73,7 @@ class GripHandle(Phase):
     """Height of the clamp above the handle before it is lowered."""
     lower_s: Duration = 2.0
     """Duration of the lowering."""
-    tolerance_m: Annotated[float, Field(ge=0.005, le=0.05)] = 0.02
+    tolerance_m: Annotated[float, Field(ge=0.005, le=0.05)] = 0.015
     """Distance of the clamp from the handle up to which it closes: the jaws are wider than the handle by this much."""
     wait_max_s: Duration = 30.0
     """Longest time at the handle until both vehicles are ready."""
@@ -183,11 +185,7 @@ class GripHandle(Phase):
         return HeldBar(stands_m=stands_m, let_go_m=stands_m + self.let_go_height_m, weight_n=0.0)
 
     def _at_handle_since_s(self, air: Air, s: Gripping) -> float:
-        tip = air.tip_world_m()
-        at = plus(self._handle_m(), s.handle_m or (0.0, 0.0, 0.0))
-        if tip is None or math.dist(tip, at) > self.tolerance_m:
-            return math.inf
-        return min(s.at_handle_s, air.t_s)
+        return math.inf if math.hypot(*s.beside_m) > self.tolerance_m else min(s.at_handle_s, air.t_s)
 
     def _half(self) -> Vec3:
         return (sign_of(self.end) * 0.5 * self.bar.length_m, 0.0, 0.0)
@@ -197,16 +195,19 @@ class GripHandle(Phase):
 
     def _seeing(self, air: Air, s: Gripping) -> Gripping:
         """Return the state whose reference leads to the handle that motion capture sees."""
-        bar = air.i.bar
-        if bar is None or not bar.tracking_valid or air.t_s - bar.stamp_s > SEEN_S:
+        bar, tip, share = air.i.bar, air.tip_world_m(), air.dt_s / SEE_S
+        if bar is not None and bar.tracking_valid and air.t_s - bar.stamp_s <= SEEN_S:
+            at = plus(bar.position_world_m, quat_rotate(bar.attitude_wxyz, self._half()))
+            s = replace(s, handle_m=toward(s.handle_m, minus(at, self._handle_m()), share))
+        if s.waits_since_s == math.inf:
+            offset = toward(s.offset_m, s.handle_m, share)
+        elif tip is None:
             return s
-        at = plus(bar.position_world_m, quat_rotate(bar.attitude_wxyz, self._half()))
-        off, before = minus(at, self._handle_m()), s.handle_m
-        share = 1.0 if before is None else air.dt_s / SEE_S
-        found = off if before is None else plus(before, scaled(minus(off, before), share))
-        if math.hypot(*found) > BESIDE_MAX_M:
-            return replace(s, handle_m=found)
-        return replace(s, handle_m=found, offset_m=plus(s.offset_m, scaled(minus(found, s.offset_m), air.dt_s / SEE_S)))
+        else:
+            beside = minus(tip, plus(self._handle_m(), s.handle_m))
+            s = replace(s, beside_m=beside if s.beside_m[0] == math.inf else toward(s.beside_m, beside, share))
+            offset = minus(s.offset_m, scaled(s.beside_m, air.dt_s / LEAD_S))
+        return s if math.hypot(*offset) > BESIDE_MAX_M else replace(s, offset_m=offset)
 
     def _yielding(self, air: Air, s: Gripping) -> Gripping:
         """Return the state whose reference moves to where the standing bar holds the vehicle, so that the two do not pull at it."""
@@ -221,7 +222,9 @@ class GripHandle(Phase):
         if partner is None or not fresh or not air.nominal or s.closed_s == math.inf or partner.said.holds:
             return None
         if self.end == "right":
-            return partner.said.lift_server_s
+            if partner.said.grip is Grip.CARRYING and s.lift_server_s is None:
+                return server_s(air.i)
+            return partner.said.lift_server_s or s.lift_server_s
         if s.lift_server_s is None and partner.said.grip is Grip.READY:
             return server_s(air.i) + LIFT_AFTER_S
         return s.lift_server_s
@@ -237,13 +240,20 @@ ARRIVED_M: Final = 1e-3
 SEEN_S: Final = 0.2
 """Age up to which a pose of the bar counts."""
 SEE_S: Final = 0.5
-"""Time constant with which the reference follows the handle that is seen."""
+"""Time constant of the low-passes of what is seen."""
+LEAD_S: Final = 1.5
+"""Time constant with which the clamp is led to the handle."""
 YIELD_S: Final = 1.0
 """Time constant with which the reference of a gripping vehicle moves to where it is."""
 BESIDE_MAX_M: Final = 0.1
 """Largest offset; a bar further from its place in the mission is not gripped."""
 APART_M: Final = 0.3
 """Least distance between the rotor circles of the two vehicles."""
+
+
+def toward(value: Vec3, goal: Vec3, share: float) -> Vec3:
+    """Return the value after a step of a low-pass."""
+    return plus(value, scaled(minus(goal, value), share))
 
 
 def is_at(i: Inputs, jaws: Jaws | None, command: ClampCommand) -> bool:
